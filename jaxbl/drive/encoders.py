@@ -1,0 +1,33 @@
+"""Position sensors: Gaussian noise and quantisation, each side by itself."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .parameters import Scalar, parameter
+
+
+class Encoders(eqx.Module):
+    """Encoders on motor and load shaft, sampled without delay."""
+
+    noise: Scalar = parameter("rad", "rms noise of the motor encoder", default=0.0, minimum=0.0)
+    load_noise: Scalar | None = parameter(
+        "rad", "rms noise of the load encoder; left out: noise / gear_ratio", default=None, minimum=0.0
+    )
+    motor_resolution: Scalar = parameter("rad", "motor encoder count; 0 is ideal", default=0.0, minimum=0.0)
+    load_resolution: Scalar = parameter("rad", "load encoder count; 0 is ideal", default=0.0, minimum=0.0)
+
+    def noise_of(self, side: str, ratio: Scalar) -> Scalar:
+        """Rms noise of a side's encoder in rad; `ratio` is motor angle per angle of the side."""
+        if side == "motor":
+            return self.noise
+        return self.noise / ratio if self.load_noise is None else self.load_noise
+
+    def measure(
+        self, side: str, position: Float[Array, ""], unit_noise: Float[Array, ""], ratio: Scalar
+    ) -> Float[Array, ""]:
+        """Reading in rad for a true position in rad and one sample of unit noise."""
+        noisy = position + self.noise_of(side, ratio) * unit_noise
+        resolution = self.motor_resolution if side == "motor" else self.load_resolution
+        count = jnp.where(resolution > 0.0, resolution, 1.0)
+        return jnp.where(resolution > 0.0, count * jnp.round(noisy / count), noisy)

@@ -1,0 +1,122 @@
+"""Input torque u(t), evaluated once a sample and held until the next (zero-order hold, as a drive does it)."""
+
+import abc
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from scipy.signal import max_len_seq
+
+from .parameters import Scalar, option, parameter
+
+
+class AbstractExcitation(eqx.Module):
+    """An input signal."""
+
+    name: ClassVar[str]
+
+    @abc.abstractmethod
+    def __call__(self, time: Float[Array, ""]) -> Float[Array, ""]:
+        """Torque in N m at a time in s."""
+
+
+class Sine(AbstractExcitation):
+    """offset + amplitude sin(2 pi frequency t + phase)."""
+
+    name: ClassVar[str] = "sine"
+    amplitude: Scalar = parameter("N m", "amplitude")
+    frequency: Scalar = parameter("Hz", "frequency", minimum=0.0)
+    phase: Scalar = parameter("rad", "phase at t = 0", default=0.0)
+    offset: Scalar = parameter("N m", "constant part", default=0.0)
+
+    def __call__(self, time):
+        return self.offset + self.amplitude * jnp.sin(2.0 * jnp.pi * self.frequency * time + self.phase)
+
+
+class Multisine(AbstractExcitation):
+    """`count` harmonics of `frequency` with equal amplitudes and Schroeder phases -pi k (k - 1) / count.
+
+    `amplitude` is that of a sine of the same power: each harmonic has amplitude / sqrt(count).
+    Reference: M. R. Schroeder, IEEE Trans. Inf. Theory 16 (1970).
+    """
+
+    name: ClassVar[str] = "multisine"
+    amplitude: Scalar = parameter("N m", "amplitude of the sine of equal power")
+    frequency: Scalar = parameter("Hz", "fundamental frequency", above=0.0)
+    count: int = option("number of harmonics", default=8, minimum=1)
+
+    def __call__(self, time):
+        k = jnp.arange(1, self.count + 1, dtype=jnp.result_type(time))
+        phases = -jnp.pi * k * (k - 1.0) / self.count
+        waves = jnp.cos(2.0 * jnp.pi * self.frequency * time * k + phases)
+        return self.amplitude / jnp.sqrt(float(self.count)) * jnp.sum(waves)
+
+
+class Chirp(AbstractExcitation):
+    """Sine whose frequency moves linearly from `start_frequency` to `stop_frequency` over `sweep_time`, then stays."""
+
+    name: ClassVar[str] = "chirp"
+    amplitude: Scalar = parameter("N m", "amplitude")
+    start_frequency: Scalar = parameter("Hz", "frequency at t = 0", minimum=0.0)
+    stop_frequency: Scalar = parameter("Hz", "frequency at the end of the sweep", minimum=0.0)
+    sweep_time: Scalar = parameter("s", "length of the sweep", above=0.0)
+
+    def __call__(self, time):
+        swept = jnp.minimum(time, self.sweep_time)
+        rate = (self.stop_frequency - self.start_frequency) / self.sweep_time
+        turns = (self.start_frequency + 0.5 * rate * swept) * swept + self.stop_frequency * (time - swept)
+        return self.amplitude * jnp.sin(2.0 * jnp.pi * turns)
+
+
+def _held(hold: Float[Array, ""], time: Float[Array, ""]) -> Array:
+    """Index of the hold interval; a little early rather than a sample late where rounding meets an edge."""
+    return jnp.floor(time / hold + 1e-4).astype(jnp.int32)
+
+
+class Steps(AbstractExcitation):
+    """Random levels, uniform in [-amplitude, amplitude], each held for `hold` seconds."""
+
+    name: ClassVar[str] = "steps"
+    amplitude: Scalar = parameter("N m", "largest level")
+    hold: Scalar = parameter("s", "time that each level is held", above=0.0)
+    seed: int = option("seed of the levels", default=0, minimum=0)
+
+    def __call__(self, time):
+        key = jax.random.fold_in(jax.random.key(self.seed), _held(self.hold, time))
+        level = jax.random.uniform(key, (), jnp.float32, -1.0, 1.0)
+        return self.amplitude * level.astype(jnp.result_type(time))
+
+
+class Prbs(AbstractExcitation):
+    """Pseudo-random binary sequence +-amplitude: a maximum-length shift register of `order` bits, one bit per `hold`."""
+
+    name: ClassVar[str] = "prbs"
+    amplitude: Scalar = parameter("N m", "amplitude")
+    hold: Scalar = parameter("s", "time of one bit", above=0.0)
+    order: int = option("bits of the shift register; the sequence has 2^order - 1 bits", default=10, minimum=2, maximum=20)
+
+    def __call__(self, time):
+        bits, _ = max_len_seq(self.order)
+        levels = 2.0 * jnp.asarray(bits, jnp.result_type(time)) - 1.0
+        return self.amplitude * levels[_held(self.hold, time) % len(levels)]
+
+
+class Recorded(AbstractExcitation):
+    """Samples played back with zero-order hold; the last one is held on."""
+
+    name: ClassVar[str] = "recorded"
+    times: Float[Array, " samples"]
+    torques: Float[Array, " samples"]
+    gain: Scalar = parameter("", "factor on the recorded torque", default=1.0)
+
+    def __call__(self, time):
+        # half a microsecond of slack: time stamps are decimal numbers
+        index = jnp.searchsorted(self.times, time + 5e-7, side="right") - 1
+        return self.gain * self.torques[jnp.clip(index, 0)]
+
+
+EXCITATIONS: dict[str, type[AbstractExcitation]] = {
+    excitation.name: excitation for excitation in (Sine, Multisine, Chirp, Steps, Prbs, Recorded)
+}

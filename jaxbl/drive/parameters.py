@@ -1,0 +1,138 @@
+"""Physical numbers as leaves: how modules declare them, and how a dotted config path finds them.
+
+Every number of a drive, effect, sensor or observer is declared once, by :func:`parameter`, with its unit, its range
+and a line of text. The config validation, the axis labels of the figures and the reference pages are read from there.
+"""
+
+import dataclasses
+import keyword
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Scalar = float | Float[Array, ""]
+"""A number of a module: a Python float before, a zero-dimensional array after :func:`as_arrays`."""
+
+Tree = TypeVar("Tree")
+
+
+class Parameter(NamedTuple):
+    """What is known of one number: SI unit, description, and the range in which it makes sense."""
+
+    unit: str
+    doc: str
+    minimum: float | None = None
+    above: float | None = None
+    maximum: float | None = None
+
+
+def parameter(unit: str, doc: str, *, default: Any = dataclasses.MISSING, **limits: float) -> Any:
+    """Declare a number of a module as an `equinox` field.
+
+    Args:
+        unit: SI unit as printed on axes; "" where dimensionless.
+        doc: one line for the reference.
+        default: value where the config gives none; without it the key is required.
+        **limits: `minimum` (inclusive), `above` (exclusive), `maximum` (inclusive).
+    """
+    metadata = {"parameter": Parameter(unit, doc, **limits)}
+    if default is dataclasses.MISSING:
+        return eqx.field(metadata=metadata)
+    return eqx.field(default=default, metadata=metadata)
+
+
+def option(doc: str, *, default: Any = dataclasses.MISSING, **limits: float) -> Any:
+    """Declare a choice that is fixed at compile time (a count, a seed, a name), not a leaf."""
+    metadata = {"parameter": Parameter("", doc, **limits)}
+    if default is dataclasses.MISSING:
+        return eqx.field(static=True, metadata=metadata)
+    return eqx.field(static=True, default=default, metadata=metadata)
+
+
+def parameters(module: Any) -> Iterator[tuple[dataclasses.Field, Parameter]]:
+    """The declared fields of a module or module class, in order."""
+    for field in dataclasses.fields(module):
+        if "parameter" in field.metadata:
+            yield field, field.metadata["parameter"]
+
+
+def key_of(field_name: str) -> str:
+    """Config key of a field: `lambda_` is a Python name for `lambda`."""
+    return field_name[:-1] if field_name.endswith("_") and keyword.iskeyword(field_name[:-1]) else field_name
+
+
+def _attribute_of(key: str) -> str:
+    return f"{key}_" if keyword.iskeyword(key) else key
+
+
+def leaf_paths(tree: Any, prefix: str = "") -> dict[str, Parameter]:
+    """Dotted paths of all numeric leaves that an axis may vary, e.g. `observer.motor.alpha`.
+
+    A member of a tuple is named by its `name` attribute (effects: `effects.load.coulomb_friction.torque`), or by its
+    position where two members share a name. Leaves that are `None`, static or not scalar are left out.
+    """
+    found: dict[str, Parameter] = {}
+    for field in dataclasses.fields(tree):
+        value = getattr(tree, field.name)
+        path = f"{prefix}{key_of(field.name)}"
+        if isinstance(value, tuple):
+            for key, member in _members(value).items():
+                if dataclasses.is_dataclass(member):
+                    found |= leaf_paths(member, f"{path}.{key}.")
+        elif dataclasses.is_dataclass(value):
+            found |= leaf_paths(value, f"{path}.")
+        elif "parameter" in field.metadata and value is not None and not field.metadata.get("static"):
+            if jnp.ndim(value) == 0:
+                found[path] = field.metadata["parameter"]
+    return found
+
+
+def _members(values: tuple) -> dict[str, Any]:
+    names = [getattr(value, "name", str(i)) for i, value in enumerate(values)]
+    return {
+        name if names.count(name) == 1 else str(i): value
+        for i, (name, value) in enumerate(zip(names, values, strict=True))
+    }
+
+
+def get_leaf(tree: Any, path: str) -> Any:
+    """The leaf that a dotted path names. Raises `KeyError` where there is none."""
+    keys = path.split(".")
+    while keys:
+        if isinstance(tree, tuple):
+            members = _members(tree)
+            # a member's own name may hold dots (`load.coulomb_friction`)
+            for count in range(1, len(keys) + 1):
+                if (name := ".".join(keys[:count])) in members:
+                    tree, keys = members[name], keys[count:]
+                    break
+            else:
+                raise KeyError(path)
+        elif hasattr(tree, _attribute_of(keys[0])):
+            tree, keys = getattr(tree, _attribute_of(keys[0])), keys[1:]
+        else:
+            raise KeyError(path)
+    return tree
+
+
+def set_leaves(tree: Tree, values: Mapping[str, Any]) -> Tree:
+    """A copy of `tree` in which the leaves named by dotted paths have new values."""
+    if not values:
+        return tree
+    paths = list(values)
+    return eqx.tree_at(lambda t: [get_leaf(t, path) for path in paths], tree, [values[path] for path in paths])
+
+
+def as_arrays(tree: Tree, dtype: Any) -> Tree:
+    """Cast every inexact leaf to `dtype`, so that one compiled program serves all values."""
+
+    def cast(leaf: Any) -> Any:
+        if isinstance(leaf, float) or (eqx.is_array(leaf) and jnp.issubdtype(leaf.dtype, jnp.inexact)):
+            return jnp.asarray(leaf, dtype)
+        return leaf
+
+    return jax.tree.map(cast, tree)

@@ -1,0 +1,209 @@
+"""The drive as it moves: eqs. (1)-(2) with a transmission law and any effects, one time step at a time.
+
+Time stepping is Moreau's midpoint rule: drift half a step, kick, drift half a step. The kick takes the elastic torque at
+the midpoint position, viscous friction implicitly, and dry friction as the set-valued law it is, by projection: the side
+sticks exactly while the rest of the torque stays below the friction level. On smooth drives this is the Stoermer-Verlet
+scheme (second order, symplectic, one evaluation of the law a step). Measured against others in benchmarks/integrators.py.
+References: J. J. Moreau, Numerical aspects of the sweeping process, CMAME 177 (1999); V. Acary, B. Brogliato, Numerical
+Methods for Nonsmooth Dynamical Systems, Springer (2008), ch. 10.
+"""
+
+import abc
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .effects import AbstractEffect, Motion
+from .parameters import Scalar, parameter
+from .transmission import AbstractTransmission
+
+Sides = dict[str, Float[Array, ""]]
+"""One number for each side of the drive: keys "motor" and, on two inertias, "load"."""
+
+
+class AbstractDrive(eqx.Module):
+    """Inertias and viscous frictions. Linear axes use kg, N, m in place of kg m^2, N m, rad."""
+
+    name: ClassVar[str]
+    sides: ClassVar[tuple[str, ...]]
+
+    @abc.abstractmethod
+    def inertia(self, side: str) -> Scalar:
+        """Nominal inertia, kg m^2."""
+
+    @abc.abstractmethod
+    def viscous(self, side: str) -> Scalar:
+        """Nominal viscous friction, N m s/rad."""
+
+    @abc.abstractmethod
+    def torque_gain(self, side: str) -> Scalar:
+        """Factor of the transmitted torque C in the side's equation of motion: -1 on the motor, N_0 on the load."""
+
+    def ratio(self, side: str) -> Scalar:
+        """Motor angle for one unit of the side's angle."""
+        return 1.0
+
+    def acceleration(self, side: str, velocity: Scalar, torque: Scalar) -> Scalar:
+        """Nominal acceleration f(x_2, u) without transmitted torque, as the observers (7) know it; rad/s^2.
+
+        `torque` is the input u, which acts on the motor only.
+        """
+        driving = torque if side == "motor" else 0.0
+        return (driving - self.viscous(side) * velocity) / self.inertia(side)
+
+
+class TwoInertia(AbstractDrive):
+    """Motor and load over a gear, eq. (1)."""
+
+    name: ClassVar[str] = "two_inertia"
+    sides: ClassVar[tuple[str, ...]] = ("motor", "load")
+    motor_inertia: Scalar = parameter("kg m²", "motor inertia J_e", above=0.0)
+    motor_viscous: Scalar = parameter("N m s/rad", "motor viscous friction f_e", minimum=0.0)
+    load_inertia: Scalar = parameter("kg m²", "load inertia J_s", above=0.0)
+    load_viscous: Scalar = parameter("N m s/rad", "load viscous friction f_s", minimum=0.0)
+    gear_ratio: Scalar = parameter("", "gear ratio N_0: motor turns for one load turn", above=0.0)
+
+    def inertia(self, side):
+        return self.motor_inertia if side == "motor" else self.load_inertia
+
+    def viscous(self, side):
+        return self.motor_viscous if side == "motor" else self.load_viscous
+
+    def torque_gain(self, side):
+        return -1.0 if side == "motor" else self.gear_ratio
+
+    def ratio(self, side):
+        return 1.0 if side == "motor" else self.gear_ratio
+
+
+class Rigid(AbstractDrive):
+    """One inertia: everything beyond it is disturbance. `motor.*` effects act on it."""
+
+    name: ClassVar[str] = "rigid"
+    sides: ClassVar[tuple[str, ...]] = ("motor",)
+    motor_inertia: Scalar = parameter("kg m²", "inertia (a mass in kg on a linear axis)", above=0.0)
+    motor_viscous: Scalar = parameter("N m s/rad", "viscous friction", minimum=0.0)
+
+    def inertia(self, side):
+        return self.motor_inertia
+
+    def viscous(self, side):
+        return self.motor_viscous
+
+    def torque_gain(self, side):
+        return -1.0
+
+
+DRIVES: dict[str, type[AbstractDrive]] = {drive.name: drive for drive in (TwoInertia, Rigid)}
+
+
+class Initial(eqx.Module):
+    """Positions and velocities at t = 0; `load_*` have no meaning on a rigid drive."""
+
+    motor_position: Scalar = parameter("rad", "motor position at t = 0", default=0.0)
+    motor_velocity: Scalar = parameter("rad/s", "motor velocity at t = 0", default=0.0)
+    load_position: Scalar = parameter("rad", "load position at t = 0", default=0.0)
+    load_velocity: Scalar = parameter("rad/s", "load velocity at t = 0", default=0.0)
+
+
+class PlantState(eqx.Module):
+    """Positions (rad) and velocities (rad/s) of the sides, and the effects' own states."""
+
+    position: Sides
+    velocity: Sides
+    effects: tuple[Any, ...]
+
+
+class Plant(eqx.Module):
+    """Drive, transmission law and effects together."""
+
+    drive: AbstractDrive
+    transmission: AbstractTransmission | None
+    effects: tuple[AbstractEffect, ...] = ()
+
+    def init(self, initial: Initial) -> PlantState:
+        sides = self.drive.sides
+        return PlantState(
+            position={side: getattr(initial, f"{side}_position") for side in sides},
+            velocity={side: getattr(initial, f"{side}_velocity") for side in sides},
+            effects=tuple(effect.init() for effect in self.effects),
+        )
+
+    def inertia(self, side: str) -> Scalar:
+        """True inertia of a side, kg m^2."""
+        return self.drive.inertia(side) + sum(e.added_inertia() for e in self._at(side))
+
+    def twist(self, position: Sides) -> Float[Array, ""]:
+        """z = theta_e - N_0 theta_s in rad."""
+        return position["motor"] - self.drive.ratio("load") * position["load"]
+
+    def transmitted(self, position: Sides, velocity: Sides) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Transmitted torque C (N m) and the motor angle that one unit of load angle takes up (N_0 without effects)."""
+        assert self.transmission is not None
+        effects = self._at("transmission")
+        ratio = self.drive.ratio("load")
+        z = self.twist(position)
+        rate = velocity["motor"] - ratio * velocity["load"]
+        for effect in effects:
+            error, slope = jax.jvp(
+                lambda angle, effect=effect: jnp.asarray(effect.transmission_error(angle), angle.dtype),
+                (position["load"],),
+                (jnp.ones_like(position["load"]),),
+            )
+            z, rate, ratio = z + error, rate + slope * velocity["load"], ratio - slope
+
+        def contact(z):
+            for effect in effects:
+                z = effect.deflect(z)
+            assert self.transmission is not None
+            return self.transmission.deflection(z)
+
+        deflection, rate = jax.jvp(contact, (z,), (rate,))
+        torque = self.transmission.torque(deflection)
+        for effect in effects:
+            torque = torque + effect.transmit(deflection, rate)
+        return torque, ratio
+
+    def advance(self, state: PlantState, torque: Scalar, time: Scalar, step: Scalar) -> PlantState:
+        """One step of Moreau's midpoint rule under a commanded torque (N m) held over `step` seconds from `time`."""
+        states = list(state.effects)
+        for i, effect in enumerate(self.effects):
+            states[i], torque = effect.actuate(states[i], torque, step)
+        middle = {side: state.position[side] + 0.5 * step * state.velocity[side] for side in self.drive.sides}
+        middle_time = time + 0.5 * step
+        velocity = self._kick(state.velocity, middle, state.velocity, torque, middle_time, step)
+        if any(effect.velocity_dependent for effect in self.effects):
+            mean = {side: 0.5 * (state.velocity[side] + velocity[side]) for side in self.drive.sides}
+            velocity = self._kick(state.velocity, middle, mean, torque, middle_time, step)
+        position = {side: middle[side] + 0.5 * step * velocity[side] for side in self.drive.sides}
+        return PlantState(position, velocity, tuple(states))
+
+    def _kick(self, velocity: Sides, position: Sides, seen: Sides, torque: Scalar, time: Scalar, step: Scalar) -> Sides:
+        """Velocities after `step`; `seen` are the velocities at which velocity-dependent effects are evaluated."""
+        gains: dict[str, Scalar] = {"motor": -1.0}
+        transmitted: Scalar = 0.0
+        if self.transmission is not None:
+            transmitted, gains["load"] = self.transmitted(position, seen)
+        new = {}
+        for side in self.drive.sides:
+            total = gains[side] * transmitted + (torque if side == "motor" else 0.0)
+            level: Scalar = 0.0
+            for effect in self._at(side):
+                total = total - effect.resist(Motion(time, position[side], seen[side]))
+                level = level + effect.dry_friction(seen[side])
+            mass = self.inertia(side) / step
+            drag = 0.5 * self.drive.viscous(side)
+            free = ((mass - drag) * velocity[side] + total) / (mass + drag)
+            new[side] = free if isinstance(level, float) else _soften(free, level / (mass + drag))
+        return new
+
+    def _at(self, place: str) -> list[AbstractEffect]:
+        return [effect for effect in self.effects if effect.place == place]
+
+
+def _soften(velocity: Float[Array, ""], stop: Float[Array, ""]) -> Float[Array, ""]:
+    """Projection of set-valued friction: the impulse takes off `stop`, or all of the velocity if that is less."""
+    return velocity - jnp.clip(velocity, -stop, stop)

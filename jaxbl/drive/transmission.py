@@ -1,0 +1,120 @@
+"""Transmission laws: torque over the gear as a function of the deflection z = theta_e - N_0 theta_s.
+
+Each law also knows itself as a linear regression, torque = regressors(z) . theta, which is what the recursive
+identifier of eqs. (18)-(28) works on, and how theta reads in the law's own parameters.
+"""
+
+import abc
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .parameters import Scalar, parameter
+
+
+class AbstractTransmission(eqx.Module):
+    """A transmission law. `deflection` is what of z is left once contact is made; torque follows from it."""
+
+    name: ClassVar[str]
+
+    def deflection(self, z: Float[Array, ""]) -> Float[Array, ""]:
+        """Elastic deflection in rad that the twist z (rad) leaves; z itself unless the law has a free gap."""
+        return z
+
+    @abc.abstractmethod
+    def torque(self, deflection: Float[Array, ""]) -> Float[Array, ""]:
+        """Transmitted torque C in N m on the motor shaft, for a deflection in rad."""
+
+    @abc.abstractmethod
+    def regressors(self, z: Float[Array, ""]) -> tuple[Float[Array, ""], ...]:
+        """Functions of z, linear in the unknowns theta: C = sum(r_i theta_i)."""
+
+    @abc.abstractmethod
+    def from_theta(self, theta: tuple[Float[Array, ""], ...]) -> dict[str, Float[Array, ""]]:
+        """The law's parameters (and `half_gap`) from regression coefficients."""
+
+    @abc.abstractmethod
+    def truth(self) -> dict[str, Scalar]:
+        """The same parameters as they are in this law."""
+
+
+class SigmoidBacklash(AbstractTransmission):
+    """Smooth backlash, eq. (3): C = K (z - 4 j_0 (1 - e^{-gamma z}) / (1 + e^{-gamma z})), with tanh(gamma z / 2).
+
+    Far from zero C tends to K (z -+ 4 j_0): the gap has half-width 4 j_0, not j_0. Where 2 gamma j_0 > 1 the stiffness
+    at z = 0, K (1 - 2 gamma j_0), is negative and C changes sign near +-4 j_0; below that the law is only softer there.
+    """
+
+    name: ClassVar[str] = "sigmoid_backlash"
+    stiffness: Scalar = parameter("N m/rad", "stiffness K", above=0.0)
+    dead_zone: Scalar = parameter("rad", "dead-zone amplitude j_0 of law (3); the half gap is 4 j_0", minimum=0.0)
+    slope: Scalar = parameter("1/rad", "slope gamma of law (3)", above=0.0)
+
+    def torque(self, deflection):
+        return self.stiffness * (deflection - 4.0 * self.dead_zone * jnp.tanh(0.5 * self.slope * deflection))
+
+    def regressors(self, z):
+        return z, -4.0 * jnp.tanh(0.5 * self.slope * z)
+
+    def from_theta(self, theta):
+        stiffness, product = theta
+        dead_zone = product / stiffness
+        return {"stiffness": stiffness, "dead_zone": dead_zone, "half_gap": 4.0 * dead_zone}
+
+    def truth(self):
+        return {"stiffness": self.stiffness, "dead_zone": self.dead_zone, "half_gap": 4.0 * self.dead_zone}
+
+
+class LinearShaft(AbstractTransmission):
+    """Flexible shaft without play, eq. (5): C = K z."""
+
+    name: ClassVar[str] = "linear_shaft"
+    stiffness: Scalar = parameter("N m/rad", "stiffness K", above=0.0)
+
+    def torque(self, deflection):
+        return self.stiffness * deflection
+
+    def regressors(self, z):
+        return (z,)
+
+    def from_theta(self, theta):
+        return {"stiffness": theta[0]}
+
+    def truth(self):
+        return {"stiffness": self.stiffness}
+
+
+class DeadZone(AbstractTransmission):
+    """Hard dead zone: C = K (z - clip(z, -half_gap, half_gap)).
+
+    Its regression, C = K z - K b sign(z) in contact and 0 in the gap, takes the contact from the nominal half gap, as
+    the paper takes gamma: with a true half gap b near the nominal one, K and K b follow.
+    """
+
+    name: ClassVar[str] = "dead_zone"
+    stiffness: Scalar = parameter("N m/rad", "stiffness K in contact", above=0.0)
+    half_gap: Scalar = parameter("rad", "half of the free play, on the motor side", minimum=0.0)
+
+    def deflection(self, z):
+        return z - jnp.clip(z, -self.half_gap, self.half_gap)
+
+    def torque(self, deflection):
+        return self.stiffness * deflection
+
+    def regressors(self, z):
+        contact = jnp.where(jnp.abs(z) > self.half_gap, 1.0, 0.0).astype(z.dtype)
+        return contact * z, -contact * jnp.sign(z)
+
+    def from_theta(self, theta):
+        stiffness, product = theta
+        return {"stiffness": stiffness, "half_gap": product / stiffness}
+
+    def truth(self):
+        return {"stiffness": self.stiffness, "half_gap": self.half_gap}
+
+
+TRANSMISSIONS: dict[str, type[AbstractTransmission]] = {
+    law.name: law for law in (SigmoidBacklash, LinearShaft, DeadZone)
+}

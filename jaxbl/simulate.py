@@ -1,0 +1,286 @@
+"""One experiment through time: drive, encoders, observers, equivalent control and identifier in one step function.
+
+:func:`step` is the whole chain for one sample, elementwise over whatever batch its leaves carry. :func:`scan` is the one
+loop over time that calls it, for simulated and for recorded positions, with or without a trace, with any reducers.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .drive.effects import AbstractEffect
+from .drive.encoders import Encoders
+from .drive.excitation import AbstractExcitation
+from .drive.parameters import Scalar, parameter
+from .drive.plant import AbstractDrive, Initial, Plant, PlantState
+from .drive.transmission import AbstractTransmission
+from .observer.equivalent_control import EquivalentControl
+from .observer.recursive import Identifier, IdentifierState
+from .observer.super_twisting import Observers, ObserverState
+
+Number = Float[Array, ""]
+
+
+class Run(eqx.Module):
+    """Time grid and tolerances."""
+
+    sample_period: Scalar
+    steps: int = eqx.field(static=True)
+    substeps: int = eqx.field(static=True, default=10)
+    position_tolerance: Scalar = parameter(
+        "rad", "largest position error of a converged observer (load: divided by the gear ratio)", default=1e-3, above=0.0
+    )
+    velocity_tolerance: Scalar = parameter(
+        "rad/s", "largest velocity error of a converged observer (load: divided by the gear ratio)", default=0.05, above=0.0
+    )
+
+
+class Experiment(eqx.Module):
+    """A drive, its input, its sensors and what observes it. Every number is a leaf named by its config path."""
+
+    drive: AbstractDrive
+    transmission: AbstractTransmission | None
+    effects: tuple[AbstractEffect, ...]
+    initial: Initial
+    excitation: AbstractExcitation
+    encoders: Encoders
+    observer: Observers
+    equivalent_control: EquivalentControl
+    identifier: Identifier | None
+    run: Run
+
+    @property
+    def plant(self) -> Plant:
+        return Plant(self.drive, self.transmission, self.effects)
+
+    @property
+    def sides(self) -> tuple[str, ...]:
+        """The sides of the drive that have an encoder and an observer."""
+        return self.drive.sides
+
+
+class State(eqx.Module):
+    """What the loop over time carries."""
+
+    plant: PlantState | None
+    observer: dict[str, ObserverState]
+    equivalent_control: dict[str, Number]
+    identifier: IdentifierState | None
+
+
+class Sample(NamedTuple):
+    """What a step is given: time, and either unit noise (simulation) or input and measured positions (a record)."""
+
+    time: Number
+    noise: dict[str, Number] | None = None
+    input: Number | None = None
+    measured: dict[str, Number] | None = None
+
+
+class SideSignals(NamedTuple):
+    """One side at one sample, SI units. True values are None on a record.
+
+    `acceleration` is the mean true one from this sample to the next; `torque_estimate` is the transmitted torque by this
+    side's equivalent control (17); `perturbation` is the true right-hand side error f(x_2) - f(x_2_hat) + xi.
+    """
+
+    measured: Number
+    position_estimate: Number
+    velocity_estimate: Number
+    equivalent_control: Number
+    torque_estimate: Number
+    position: Number | None = None
+    velocity: Number | None = None
+    acceleration: Number | None = None
+    perturbation: Number | None = None
+
+
+class Signals(NamedTuple):
+    """All signals at one sample: time (s), input (N m), twist z (rad), transmitted torque C (N m), and the sides.
+
+    On a rigid drive `torque` is everything that resists beyond the nominal model, and `twist` is None.
+    """
+
+    time: Number
+    input: Number
+    twist: Number | None
+    torque: Number | None
+    motor: SideSignals
+    load: SideSignals | None
+
+    def side(self, side: str) -> SideSignals:
+        return self.motor if side == "motor" else self.load  # type: ignore[return-value]
+
+
+def initial_state(experiment: Experiment, measured: dict[str, Number] | None = None) -> State:
+    """State at t = 0; for a record, from its first measured positions (rad) and standstill."""
+    zero = jnp.zeros_like(jnp.asarray(experiment.run.sample_period))
+    plant = experiment.plant.init(experiment.initial) if measured is None else None
+    observer = {}
+    for side in experiment.sides:
+        position = plant.position[side] if plant is not None else measured[side]  # type: ignore[index]
+        velocity = plant.velocity[side] if plant is not None else zero
+        observer[side] = getattr(experiment.observer, side).init(position, velocity)
+    identifier = None
+    if experiment.identifier is not None and experiment.transmission is not None:
+        identifier = experiment.identifier.init(experiment.transmission, experiment.sides, zero)
+    return State(plant, observer, dict.fromkeys(experiment.sides, zero), identifier)
+
+
+def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, Signals]:
+    """The whole chain for one sample: sense, observe, filter, identify, and move the plant on to the next sample."""
+    drive, plant, period = experiment.drive, experiment.plant, experiment.run.sample_period
+    if sample.measured is None:
+        assert sample.noise is not None and state.plant is not None
+        torque_in = experiment.excitation(sample.time)
+        measured = {
+            side: experiment.encoders.measure(side, state.plant.position[side], sample.noise[side], drive.ratio(side))
+            for side in drive.sides
+        }
+        moved = _move(plant, experiment.run, state.plant, torque_in, sample.time)
+    else:
+        assert sample.input is not None
+        torque_in, measured, moved = sample.input, sample.measured, None
+
+    observers, filtered, estimates = {}, {}, {}
+    for side in drive.sides:
+
+        def nominal(velocity: Number, side: str = side) -> Number:
+            return drive.acceleration(side, velocity, torque_in)
+
+        observer = getattr(experiment.observer, side)
+        observers[side], estimates[side] = observer.step(state.observer[side], measured[side], nominal, period)
+        filtered[side] = experiment.equivalent_control.filter(
+            state.equivalent_control[side], estimates[side].control, period
+        )
+    torques = {side: drive.inertia(side) * filtered[side] / drive.torque_gain(side) for side in drive.sides}
+
+    identifier = state.identifier
+    twist = plant.twist(measured) if len(drive.sides) == 2 else None
+    if identifier is not None:
+        assert experiment.identifier is not None and experiment.transmission is not None and twist is not None
+        identifier = experiment.identifier.step(
+            identifier, experiment.transmission, experiment.equivalent_control, twist, torques, sample.time, period
+        )
+
+    sides = {}
+    for side in drive.sides:
+        estimate = estimates[side]
+        seen = SideSignals(measured[side], estimate.position, estimate.velocity, filtered[side], torques[side])
+        if moved is not None:
+            assert state.plant is not None
+            acceleration = (moved.velocity[side] - state.plant.velocity[side]) / period
+            seen = seen._replace(
+                position=state.plant.position[side],
+                velocity=state.plant.velocity[side],
+                acceleration=acceleration,
+                perturbation=acceleration - drive.acceleration(side, estimate.velocity, torque_in),
+            )
+        sides[side] = seen
+    torque = None
+    if moved is not None:
+        assert state.plant is not None
+        if experiment.transmission is not None:
+            torque, _ = plant.transmitted(state.plant.position, state.plant.velocity)
+        else:
+            expected = drive.acceleration("motor", state.plant.velocity["motor"], torque_in)
+            torque = drive.inertia("motor") * (expected - sides["motor"].acceleration)
+    signals = Signals(sample.time, torque_in, twist, torque, sides["motor"], sides.get("load"))
+    return State(moved, observers, filtered, identifier), signals
+
+
+def _move(plant: Plant, run: Run, state: PlantState, torque: Number, time: Number) -> PlantState:
+    """The plant from one sample to the next, in `substeps` steps under a held input."""
+    small = run.sample_period / run.substeps
+
+    def substep(i: Int[Array, ""], state: PlantState) -> PlantState:
+        return plant.advance(state, torque, time + i * small, small)
+
+    if run.substeps == 1:
+        return substep(jnp.asarray(0), state)
+    return jax.lax.fori_loop(0, run.substeps, substep, state, unroll=True)
+
+
+class Reducer(NamedTuple):
+    """A figure over a whole run, computed as it goes: memory does not grow with duration.
+
+    `init(experiment)` gives the carry, `update(experiment, carry, index, signals)` takes in sample `index`, and
+    `result(experiment, carry, state)` gives a dict of numbers from the last carry and the last state.
+    """
+
+    init: Callable[[Experiment], Any]
+    update: Callable[[Experiment, Any, Int[Array, ""], Signals], Any]
+    result: Callable[[Experiment, Any, State], dict[str, Array]]
+
+
+def unit_noise(seed: Int[Array, ""], indices: Int[Array, " samples"], sides: tuple[str, ...]) -> dict[str, Array]:
+    """Common random numbers: standard normal noise of each side, a function of seed and sample index alone.
+
+    Drawn in float32 whatever the precision of the run, so that both precisions see the same noise.
+    """
+    key = jax.random.key(seed)
+    keys = jax.vmap(lambda index: jax.random.fold_in(key, index))(indices)
+    draws = jax.vmap(lambda key: jax.random.normal(key, (2,), jnp.float32))(keys)
+    return {side: draws[:, i] for i, side in enumerate(sides)}
+
+
+def _block(steps: int) -> int:
+    """Samples whose noise is drawn at once: the largest divisor of `steps` up to 512, or 256 with a rest."""
+    divisors = [n for n in range(64, 513) if steps % n == 0]
+    return divisors[-1] if divisors else min(256, steps)
+
+
+def scan(
+    experiment: Experiment,
+    seed: Int[Array, ""],
+    reducers: tuple[Reducer, ...] = (),
+    record: Callable[[State, Signals], Any] | None = None,
+    every: int = 1,
+) -> tuple[dict[str, Array], Any]:
+    """Simulate one experiment.
+
+    Args:
+        experiment: with array leaves (:func:`jaxbl.drive.as_arrays`).
+        seed: seed of the encoder noise.
+        reducers: figures to compute along the run.
+        record: what to keep of every `every`-th sample; None keeps nothing.
+        every: decimation of the record; must divide the number of steps.
+
+    Returns:
+        The reducers' figures, and the record with a leading time axis (None without one).
+    """
+    dtype = jnp.result_type(experiment.run.sample_period)
+    start = (initial_state(experiment), tuple(reducer.init(experiment) for reducer in reducers))
+
+    def sample(carry: Any, given: tuple[Array, dict[str, Array]]) -> tuple[Any, Any]:
+        (state, totals), (index, noise) = carry, given
+        time = index.astype(dtype) * experiment.run.sample_period
+        noise = {side: value.astype(dtype) for side, value in noise.items()}
+        new, signals = step(experiment, state, Sample(time, noise))
+        totals = tuple(r.update(experiment, total, index, signals) for r, total in zip(reducers, totals, strict=True))
+        return (new, totals), None if record is None else record(new, signals)
+
+    def block(carry: Any, first: Array, length: int) -> tuple[Any, Any]:
+        indices = first + jnp.arange(length, dtype=jnp.int32)
+        carry, kept = jax.lax.scan(sample, carry, (indices, unit_noise(seed, indices, experiment.sides)))
+        return carry, jax.tree.map(lambda x: x[::every], kept)
+
+    steps = experiment.run.steps
+    length = _block(steps) if record is None or every == 1 else every
+    blocks, rest = divmod(steps, length)
+    carry, kept = jax.lax.scan(
+        lambda carry, i: block(carry, i * length, length), start, jnp.arange(blocks, dtype=jnp.int32)
+    )
+    kept = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), kept)
+    if rest:
+        carry, last = block(carry, jnp.asarray(blocks * length, jnp.int32), rest)
+        kept = jax.tree.map(lambda *parts: jnp.concatenate(parts), kept, last)
+    state, totals = carry
+    figures: dict[str, Array] = {}
+    for reducer, total in zip(reducers, totals, strict=True):
+        figures |= reducer.result(experiment, total, state)
+    return figures, kept

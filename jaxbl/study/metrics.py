@@ -1,0 +1,166 @@
+"""Figures of a run, computed in the loop over time: observation errors, convergence, gain margins, identification.
+
+RMS figures are over the last quarter of the run, in SI units. Position and velocity tolerances of the load are those of
+the motor divided by the gear ratio.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxbl.observer import conditions
+from jaxbl.simulate import Experiment, Reducer, Signals, State
+
+Number = Float[Array, ""]
+
+
+class Metric(NamedTuple):
+    """What a column holds: unit and meaning."""
+
+    unit: str
+    doc: str
+
+
+SIDE_METRICS: dict[str, Metric] = {
+    "converged": Metric("", "position and velocity errors stay within tolerance over the last quarter"),
+    "convergence_time": Metric("s", "time from which both errors stay within tolerance; NaN where they never do"),
+    "convergence_time_bound": Metric("s", "bound (42) on it for the noise-free observer; inf where (32) fails"),
+    "position_rmse": Metric("rad", "rms position error"),
+    "velocity_rmse": Metric("rad/s", "rms velocity error"),
+    "torque_rmse": Metric("N m", "rms error of the transmitted torque from this side's equivalent control"),
+    "chatter": Metric("rad/s", "rms sample-to-sample change of the velocity error, divided by √2"),
+    "f_plus": Metric("rad/s²", "largest true right-hand side error |f(x₂) − f(x̂₂) + ξ| along the run"),
+    "f_plus_acceleration": Metric("rad/s²", "twice the largest acceleration: the paper's text for f⁺"),
+    "margin_alpha": Metric("", "α / f⁺"),
+    "margin_davila_fridman": Metric("", "λ over the least λ of condition (32)"),
+    "margin_seeber_horn": Metric("", "λ over the least λ of Seeber and Horn"),
+    "margin_exact": Metric("", "λ over the least λ of the exact condition ρ < 1"),
+    "stiffness_error": Metric("", "relative error of the identified stiffness"),
+    "dead_zone_error": Metric("", "relative error of the identified dead zone (half gap of law dead_zone)"),
+    "excitation": Metric("", "smallest eigenvalue of the normalised information matrix"),
+}
+
+
+class _Totals(NamedTuple):
+    """Carry of one side."""
+
+    last_outside: Number
+    position: Number
+    velocity: Number
+    torque: Number
+    change: Number
+    previous: Number
+    f_plus: Number
+    acceleration: Number
+
+
+def window_start(steps: int) -> int:
+    """First sample of the last quarter."""
+    return steps - max(steps // 4, 1)
+
+
+def _init(experiment: Experiment) -> dict[str, _Totals]:
+    zero = jnp.zeros_like(experiment.run.sample_period)
+    return {side: _Totals(zero - 1.0, *[zero] * 7) for side in experiment.sides}
+
+
+def _update(
+    experiment: Experiment, totals: dict[str, _Totals], index: Int[Array, ""], signals: Signals
+) -> dict[str, _Totals]:
+    run = experiment.run
+    inside = (index >= window_start(run.steps)).astype(signals.time.dtype)
+    new = {}
+    for side, old in totals.items():
+        s = signals.side(side)
+        ratio = experiment.drive.ratio(side)
+        position = s.position - s.position_estimate
+        velocity = s.velocity - s.velocity_estimate
+        torque = signals.torque - s.torque_estimate
+        within = (jnp.abs(position) * ratio <= run.position_tolerance) & (
+            jnp.abs(velocity) * ratio <= run.velocity_tolerance
+        )
+        change = velocity - old.previous
+        new[side] = _Totals(
+            jnp.where(within, old.last_outside, signals.time),
+            old.position + inside * position * position,
+            old.velocity + inside * velocity * velocity,
+            old.torque + inside * torque * torque,
+            old.change + inside * change * change,
+            velocity,
+            jnp.maximum(old.f_plus, jnp.abs(s.perturbation)),
+            jnp.maximum(old.acceleration, jnp.abs(s.acceleration)),
+        )
+    return new
+
+
+def _result(experiment: Experiment, totals: dict[str, _Totals], state: State) -> dict[str, Array]:
+    run = experiment.run
+    count = run.steps - window_start(run.steps)
+    start = window_start(run.steps) * run.sample_period
+    end = (run.steps - 1) * run.sample_period
+    identified = {}
+    if state.identifier is not None:
+        assert experiment.identifier is not None and experiment.transmission is not None
+        identified = experiment.identifier.estimate(state.identifier, experiment.transmission)
+    figures: dict[str, Array] = {}
+    finite = jnp.asarray(True)
+    for side, total in totals.items():
+        observer = getattr(experiment.observer, side)
+        settled = total.last_outside < end - 0.5 * run.sample_period
+        out = {
+            "converged": total.last_outside < start - 0.5 * run.sample_period,
+            "convergence_time": jnp.where(
+                settled, jnp.where(total.last_outside < 0.0, 0.0, total.last_outside + run.sample_period), jnp.nan
+            ),
+            "convergence_time_bound": conditions.convergence_time_bound(
+                observer.lambda_, observer.alpha, total.f_plus, observer.position_error, observer.velocity_error
+            ),
+            "position_rmse": jnp.sqrt(total.position / count),
+            "velocity_rmse": jnp.sqrt(total.velocity / count),
+            "torque_rmse": jnp.sqrt(total.torque / count),
+            "chatter": jnp.sqrt(0.5 * total.change / count),
+            "f_plus": total.f_plus,
+            "f_plus_acceleration": 2.0 * total.acceleration,
+            "margin_alpha": observer.alpha / total.f_plus,
+        }
+        for name, least in conditions.LEAST_LAMBDA.items():
+            out[f"margin_{name}"] = observer.lambda_ / least(observer.alpha, total.f_plus)
+        if side in identified:
+            assert experiment.transmission is not None and experiment.identifier is not None
+            truth, found = experiment.transmission.truth(), identified[side]
+            out["stiffness_error"] = found["stiffness"] / truth["stiffness"] - 1.0
+            if "half_gap" in truth:
+                out["dead_zone_error"] = found["half_gap"] / truth["half_gap"] - 1.0
+            out["excitation"] = experiment.identifier.excitation(state.identifier)
+        # sums overflow with the lane: they tell whether it stayed finite
+        ok = jnp.isfinite(total.position + total.velocity + total.torque + total.f_plus + total.acceleration)
+        out["converged"] = out["converged"] & ok
+        finite = finite & ok
+        figures |= {f"{side}.{name}": value for name, value in out.items()}
+    return {"finite": finite, **figures}
+
+
+METRICS = Reducer(_init, _update, _result)
+"""The metrics of every sweep."""
+
+
+def describe(column: str) -> Metric:
+    """Unit and meaning of a metric column such as `motor.velocity_rmse`."""
+    if column == "finite":
+        return Metric("", "no number of the lane overflowed")
+    return SIDE_METRICS[column.partition(".")[2]]
+
+
+def metric_columns(experiment: Experiment) -> list[str]:
+    """The columns that :data:`METRICS` gives for this experiment."""
+    names = list(SIDE_METRICS)
+    if experiment.identifier is None or experiment.transmission is None:
+        names = [n for n in names if n not in ("stiffness_error", "dead_zone_error", "excitation")]
+    elif "half_gap" not in experiment.transmission.truth():
+        names.remove("dead_zone_error")
+    return ["finite", *(f"{side}.{name}" for side in experiment.sides for name in names)]
+
+
+__all__ = ["METRICS", "SIDE_METRICS", "Metric", "describe", "metric_columns", "window_start"]
+_: Any = None
