@@ -272,9 +272,7 @@ def scan(
     steps = experiment.run.steps
     length = _block(steps) if record is None or every == 1 else every
     blocks, rest = divmod(steps, length)
-    carry, kept = jax.lax.scan(
-        lambda carry, i: block(carry, i * length, length), start, jnp.arange(blocks, dtype=jnp.int32)
-    )
+    carry, kept = jax.lax.scan(lambda carry, i: block(carry, i * length, length), start, jnp.arange(blocks, dtype=jnp.int32))
     kept = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), kept)
     if rest:
         carry, last = block(carry, jnp.asarray(blocks * length, jnp.int32), rest)

@@ -94,8 +94,7 @@ def leaf_paths(tree: Any, prefix: str = "") -> dict[str, Parameter]:
 def _members(values: tuple) -> dict[str, Any]:
     names = [getattr(value, "name", str(i)) for i, value in enumerate(values)]
     return {
-        name if names.count(name) == 1 else str(i): value
-        for i, (name, value) in enumerate(zip(names, values, strict=True))
+        name if names.count(name) == 1 else str(i): value for i, (name, value) in enumerate(zip(names, values, strict=True))
     }
 
 

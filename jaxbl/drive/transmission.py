@@ -115,6 +115,4 @@ class DeadZone(AbstractTransmission):
         return {"stiffness": self.stiffness, "half_gap": self.half_gap}
 
 
-TRANSMISSIONS: dict[str, type[AbstractTransmission]] = {
-    law.name: law for law in (SigmoidBacklash, LinearShaft, DeadZone)
-}
+TRANSMISSIONS: dict[str, type[AbstractTransmission]] = {law.name: law for law in (SigmoidBacklash, LinearShaft, DeadZone)}

@@ -90,8 +90,7 @@ class Identifier(eqx.Module):
         )
         right = {
             side: tuple(
-                total.decay_and_add(self.forgetting, w * torque[side])
-                for total, w in zip(totals, weighted, strict=True)
+                total.decay_and_add(self.forgetting, w * torque[side]) for total, w in zip(totals, weighted, strict=True)
             )
             for side, totals in state.right.items()
         }

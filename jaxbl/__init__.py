@@ -1,0 +1,1 @@
+"""Drives with backlash, thousands at once."""
