@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from .drive.effects import AbstractEffect
 from .drive.encoders import Encoders
@@ -22,7 +22,7 @@ from .observer.equivalent_control import EquivalentControl
 from .observer.recursive import Identifier, IdentifierState
 from .observer.super_twisting import Observers, ObserverState
 
-Number = Float[Array, ""]
+Number = Any  # an array of one number a lane: Float[Array, ""] inside a step
 
 
 class Run(eqx.Module):
@@ -81,22 +81,26 @@ class Sample(NamedTuple):
     measured: dict[str, Number] | None = None
 
 
-class SideSignals(NamedTuple):
-    """One side at one sample, SI units. True values are None on a record.
+class TrueSide(NamedTuple):
+    """What only the simulator knows of a side: position (rad), velocity (rad/s), the mean acceleration (rad/s^2) from
+    this sample to the next, and the right-hand side error f(x_2) - f(x_2_hat) + xi (rad/s^2) of the observer."""
 
-    `acceleration` is the mean true one from this sample to the next; `torque_estimate` is the transmitted torque by this
-    side's equivalent control (17); `perturbation` is the true right-hand side error f(x_2) - f(x_2_hat) + xi.
-    """
+    position: Number
+    velocity: Number
+    acceleration: Number
+    perturbation: Number
+
+
+class SideSignals(NamedTuple):
+    """One side at one sample, SI units: reading, estimates, filtered equivalent control (rad/s^2), the transmitted torque
+    that this stands for (17) (N m), and the truth (None on a record)."""
 
     measured: Number
-    position_estimate: Number
-    velocity_estimate: Number
+    position_estimate: Scalar
+    velocity_estimate: Scalar
     equivalent_control: Number
     torque_estimate: Number
-    position: Number | None = None
-    velocity: Number | None = None
-    acceleration: Number | None = None
-    perturbation: Number | None = None
+    true: TrueSide | None
 
 
 class Signals(NamedTuple):
@@ -170,17 +174,17 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
     sides = {}
     for side in drive.sides:
         estimate = estimates[side]
-        seen = SideSignals(measured[side], estimate.position, estimate.velocity, filtered[side], torques[side])
+        true = None
         if moved is not None:
             assert state.plant is not None
             acceleration = (moved.velocity[side] - state.plant.velocity[side]) / period
-            seen = seen._replace(
+            true = TrueSide(
                 position=state.plant.position[side],
                 velocity=state.plant.velocity[side],
                 acceleration=acceleration,
                 perturbation=acceleration - drive.acceleration(side, estimate.velocity, torque_in),
             )
-        sides[side] = seen
+        sides[side] = SideSignals(measured[side], estimate.position, estimate.velocity, filtered[side], torques[side], true)
     torque = None
     if moved is not None:
         assert state.plant is not None
@@ -188,12 +192,12 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
             torque, _ = plant.transmitted(state.plant.position, state.plant.velocity)
         else:
             expected = drive.acceleration("motor", state.plant.velocity["motor"], torque_in)
-            torque = drive.inertia("motor") * (expected - sides["motor"].acceleration)
+            torque = drive.inertia("motor") * (expected - sides["motor"].true.acceleration)
     signals = Signals(sample.time, torque_in, twist, torque, sides["motor"], sides.get("load"))
     return State(moved, observers, filtered, identifier), signals
 
 
-def _move(plant: Plant, run: Run, state: PlantState, torque: Number, time: Number) -> PlantState:
+def _move(plant: Plant, run: Run, state: PlantState, torque: Scalar, time: Number) -> PlantState:
     """The plant from one sample to the next, in `substeps` steps under a held input."""
     small = run.sample_period / run.substeps
 

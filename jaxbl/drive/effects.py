@@ -16,12 +16,11 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
-from .parameters import Scalar, option, parameter
+from .parameters import Scalar, parameter
 
 Side = Literal["motor", "load"]
-Value = Float[Array, ""] | float
+Value = Any  # a number or an array of one: hooks are duck-typed, neutral ones answer the Python number 0.0
 
 
 class Motion(NamedTuple):

@@ -70,7 +70,7 @@ class Chirp(AbstractExcitation):
         return self.amplitude * jnp.sin(2.0 * jnp.pi * turns)
 
 
-def _held(hold: Float[Array, ""], time: Float[Array, ""]) -> Array:
+def _held(hold: Scalar, time: Float[Array, ""]) -> Array:
     """Index of the hold interval; a little early rather than a sample late where rounding meets an edge."""
     return jnp.floor(time / hold + 1e-4).astype(jnp.int32)
 

@@ -73,7 +73,7 @@ def leaf_paths(tree: Any, prefix: str = "") -> dict[str, Parameter]:
     """Dotted paths of all numeric leaves that an axis may vary, e.g. `observer.motor.alpha`.
 
     A member of a tuple is named by its `name` attribute (effects: `effects.load.coulomb_friction.torque`), or by its
-    position where two members share a name. Leaves that are `None`, static or not scalar are left out.
+    position where two members share a name. Leaves that are `None` or static are left out.
     """
     found: dict[str, Parameter] = {}
     for field in dataclasses.fields(tree):
@@ -86,8 +86,7 @@ def leaf_paths(tree: Any, prefix: str = "") -> dict[str, Parameter]:
         elif dataclasses.is_dataclass(value):
             found |= leaf_paths(value, f"{path}.")
         elif "parameter" in field.metadata and value is not None and not field.metadata.get("static"):
-            if jnp.ndim(value) == 0:
-                found[path] = field.metadata["parameter"]
+            found[path] = field.metadata["parameter"]
     return found
 
 

@@ -140,7 +140,7 @@ class Plant(eqx.Module):
         """z = theta_e - N_0 theta_s in rad."""
         return position["motor"] - self.drive.ratio("load") * position["load"]
 
-    def transmitted(self, position: Sides, velocity: Sides) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def transmitted(self, position: Sides, velocity: Sides) -> tuple[Float[Array, ""], Scalar]:
         """Transmitted torque C (N m) and the motor angle that one unit of load angle takes up (N_0 without effects)."""
         assert self.transmission is not None
         effects = self._at("transmission")
@@ -204,6 +204,6 @@ class Plant(eqx.Module):
         return [effect for effect in self.effects if effect.place == place]
 
 
-def _soften(velocity: Float[Array, ""], stop: Float[Array, ""]) -> Float[Array, ""]:
+def _soften(velocity: Float[Array, ""], stop: Scalar) -> Float[Array, ""]:
     """Projection of set-valued friction: the impulse takes off `stop`, or all of the velocity if that is less."""
     return velocity - jnp.clip(velocity, -stop, stop)

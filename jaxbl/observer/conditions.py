@@ -34,8 +34,9 @@ def peak_ratio(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
     """Worst-case ratio rho of successive velocity peaks, in closed form; the error converges in finite time iff rho < 1.
 
     With y = sqrt(x) the outermost trajectory of (34) is a homogeneous first-order equation in each quadrant:
-    rho = sqrt(c2 / c1) exp(-(lambda / 2) (I1 + I2)), c1 = 2 (alpha - f), c2 = 2 (alpha + f), I1 = int dp / (p^2 + lambda p + c1),
-    I2 = int dp / (p^2 - lambda p + c2), both from 0 to infinity; rho = 0 where lambda^2 >= 4 c2. `inf` where alpha <= f.
+    rho = sqrt(c2 / c1) exp(-(lambda / 2) (I1 + I2)) with c1 = 2 (alpha - f), c2 = 2 (alpha + f) and, from 0 to infinity,
+    I1 = int dp / (p^2 + lambda p + c1), I2 = int dp / (p^2 - lambda p + c2).
+    rho is 0 where lambda^2 >= 4 c2, and `inf` where alpha <= f.
     Source: derived for this project (docs/theory.md), checked against simulation.
     """
     possible = alpha > f_plus

@@ -60,7 +60,7 @@ class Identifier(eqx.Module):
         return IdentifierState(
             regressors=(zero,) * n,
             information=(empty,) * (n * (n + 1) // 2),
-            right={side: (empty,) * n for side in sides},
+            right=dict.fromkeys(sides, (empty,) * n),
         )
 
     def step(

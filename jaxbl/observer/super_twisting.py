@@ -17,15 +17,15 @@ from jaxbl.drive.parameters import Scalar, parameter
 class ObserverState(NamedTuple):
     """Position (rad) and velocity (rad/s) predicted for the coming sample."""
 
-    position: Float[Array, ""]
-    velocity: Float[Array, ""]
+    position: Scalar
+    velocity: Scalar
 
 
 class Estimate(NamedTuple):
     """Position (rad), velocity (rad/s) and equivalent control z_2 (rad/s^2, unfiltered) at the sample."""
 
-    position: Float[Array, ""]
-    velocity: Float[Array, ""]
+    position: Scalar
+    velocity: Scalar
     control: Float[Array, ""]
 
 
@@ -47,7 +47,7 @@ class AbstractSuperTwisting(eqx.Module):
         self,
         state: ObserverState,
         measured: Float[Array, ""],
-        acceleration: Callable[[Float[Array, ""]], Float[Array, ""]],
+        acceleration: Callable[[Scalar], Scalar],
         step: Scalar,
     ) -> tuple[ObserverState, Estimate]:
         """Take in one sample and predict the next.

@@ -4,7 +4,7 @@ RMS figures are over the last quarter of the run, in SI units. Position and velo
 the motor divided by the gear ratio.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -73,9 +73,11 @@ def _update(
     new = {}
     for side, old in totals.items():
         s = signals.side(side)
+        true = s.true
+        assert true is not None
         ratio = experiment.drive.ratio(side)
-        position = s.position - s.position_estimate
-        velocity = s.velocity - s.velocity_estimate
+        position = true.position - s.position_estimate
+        velocity = true.velocity - s.velocity_estimate
         torque = signals.torque - s.torque_estimate
         within = (jnp.abs(position) * ratio <= run.position_tolerance) & (
             jnp.abs(velocity) * ratio <= run.velocity_tolerance
@@ -88,8 +90,8 @@ def _update(
             old.torque + inside * torque * torque,
             old.change + inside * change * change,
             velocity,
-            jnp.maximum(old.f_plus, jnp.abs(s.perturbation)),
-            jnp.maximum(old.acceleration, jnp.abs(s.acceleration)),
+            jnp.maximum(old.f_plus, jnp.abs(true.perturbation)),
+            jnp.maximum(old.acceleration, jnp.abs(true.acceleration)),
         )
     return new
 
@@ -126,7 +128,7 @@ def _result(experiment: Experiment, totals: dict[str, _Totals], state: State) ->
         }
         for name, least in conditions.LEAST_LAMBDA.items():
             out[f"margin_{name}"] = observer.lambda_ / least(observer.alpha, total.f_plus)
-        if side in identified:
+        if state.identifier is not None:
             assert experiment.transmission is not None and experiment.identifier is not None
             truth, found = experiment.transmission.truth(), identified[side]
             out["stiffness_error"] = found["stiffness"] / truth["stiffness"] - 1.0
@@ -160,7 +162,3 @@ def metric_columns(experiment: Experiment) -> list[str]:
     elif "half_gap" not in experiment.transmission.truth():
         names.remove("dead_zone_error")
     return ["finite", *(f"{side}.{name}" for side in experiment.sides for name in names)]
-
-
-__all__ = ["METRICS", "SIDE_METRICS", "Metric", "describe", "metric_columns", "window_start"]
-_: Any = None
