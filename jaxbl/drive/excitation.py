@@ -70,9 +70,15 @@ class Chirp(AbstractExcitation):
         return self.amplitude * jnp.sin(2.0 * jnp.pi * turns)
 
 
+def _rounding(value: Float[Array, ""]) -> Float[Array, ""]:
+    """Bound on the rounding error of a time (or a ratio of times) that is a multiple of a rounded period."""
+    return 4.0 * float(jnp.finfo(jnp.result_type(value)).eps) * value
+
+
 def _held(hold: Scalar, time: Float[Array, ""]) -> Array:
     """Index of the hold interval; a little early rather than a sample late where rounding meets an edge."""
-    return jnp.floor(time / hold + 1e-4).astype(jnp.int32)
+    holds = time / hold
+    return jnp.floor(holds + 1e-4 + _rounding(holds)).astype(jnp.int32)
 
 
 class Steps(AbstractExcitation):
@@ -113,7 +119,7 @@ class Recorded(AbstractExcitation):
 
     def __call__(self, time):
         # half a microsecond of slack: time stamps are decimal numbers
-        index = jnp.searchsorted(self.times, time + 5e-7, side="right") - 1
+        index = jnp.searchsorted(self.times, time + 5e-7 + _rounding(time), side="right") - 1
         return self.gain * self.torques[jnp.clip(index, 0)]
 
 

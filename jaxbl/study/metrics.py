@@ -24,7 +24,7 @@ class Metric(NamedTuple):
 
 SIDE_METRICS: dict[str, Metric] = {
     "converged": Metric("", "position and velocity errors stay within tolerance over the last quarter"),
-    "convergence_time": Metric("s", "time from which both errors stay within tolerance; NaN where they never do"),
+    "convergence_time": Metric("s", "time from which both errors stay within tolerance; NaN where not converged"),
     "convergence_time_bound": Metric("s", "bound (42) on it for the noise-free observer; inf where (32) fails"),
     "position_rmse": Metric("rad", "rms position error"),
     "velocity_rmse": Metric("rad/s", "rms velocity error"),
@@ -100,7 +100,6 @@ def _result(experiment: Experiment, totals: dict[str, _Totals], state: State) ->
     run = experiment.run
     count = run.steps - window_start(run.steps)
     start = window_start(run.steps) * run.sample_period
-    end = (run.steps - 1) * run.sample_period
     identified = {}
     if state.identifier is not None:
         assert experiment.identifier is not None and experiment.transmission is not None
@@ -109,12 +108,11 @@ def _result(experiment: Experiment, totals: dict[str, _Totals], state: State) ->
     finite = jnp.asarray(True)
     for side, total in totals.items():
         observer = getattr(experiment.observer, side)
-        settled = total.last_outside < end - 0.5 * run.sample_period
+        converged = total.last_outside < start - 0.5 * run.sample_period
+        entered = jnp.where(total.last_outside < 0.0, 0.0, total.last_outside + run.sample_period)
         out = {
-            "converged": total.last_outside < start - 0.5 * run.sample_period,
-            "convergence_time": jnp.where(
-                settled, jnp.where(total.last_outside < 0.0, 0.0, total.last_outside + run.sample_period), jnp.nan
-            ),
+            "converged": converged,
+            "convergence_time": jnp.where(converged, entered, jnp.nan),
             "convergence_time_bound": conditions.convergence_time_bound(
                 observer.lambda_, observer.alpha, total.f_plus, observer.position_error, observer.velocity_error
             ),

@@ -1,0 +1,344 @@
+"""Figures of a study: heatmaps with gain conditions over them, and lines over one axis."""
+
+import re
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import matplotlib.patheffects as path_effects
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from jaxbl.errors import InputError
+from jaxbl.observer.conditions import LEAST_LAMBDA
+from jaxbl.study.config import Config, FigureTable, nearest, numeric_paths
+from jaxbl.study.metrics import describe
+
+from .style import COLOURS, MAP, MISSING, style, with_unit
+
+_CONDITIONS = {
+    "davila_fridman": ("Davila-Fridman (32), q → 0", "-"),
+    "seeber_horn": ("Seeber-Horn", "--"),
+    "exact": ("exact, ρ = 1", ":"),
+}
+_BOOLEAN = ("converged", "finite")
+
+
+class Drawn(NamedTuple):
+    """A figure, the file name it should have, and a sentence that says what it shows."""
+
+    name: str
+    figure: Figure
+    caption: str
+
+
+def default_figures(config: Config, frame: pd.DataFrame) -> list[FigureTable]:
+    """Figures for a study that asks for none: a heatmap over its first two axes, or lines over its one."""
+    varying = [axis for axis in config.axes if frame[axis.path].nunique() > 1 and frame[axis.path].dtype != object]
+    if not varying:
+        return []
+    value = "motor.velocity_rmse"
+    if len(varying) == 1:
+        return [FigureTable(kind="line", x=varying[0].path, value=value)]
+    x, y, *rest = (axis.path for axis in reversed(varying))
+    return [FigureTable(kind="heatmap", x=x, y=y, value=value, facet=rest[0] if rest else None)]
+
+
+def draw(config: Config, frame: pd.DataFrame) -> list[Drawn]:
+    """All figures of a study.
+
+    Raises:
+        InputError: a figure names an axis or a metric that the study does not have.
+    """
+    figures = config.figures or default_figures(config, frame)
+    check_figures(config, figures, list(frame.columns))
+    drawn, names = [], set()
+    for figure in figures:
+        drawing = _heatmap(config, frame, figure) if figure.kind == "heatmap" else _lines(config, frame, figure)
+        name, i = drawing.name, 2
+        while name in names:
+            name, i = f"{drawing.name}-{i}", i + 1
+        names.add(name)
+        drawn.append(drawing._replace(name=name))
+    return drawn
+
+
+def check_figures(config: Config, figures: list[FigureTable], columns: list[str]) -> None:
+    """Raise `InputError` where a figure names an axis or metric that does not exist."""
+    axes = [axis.path for axis in config.axes]
+    for i, figure in enumerate(figures):
+        for key in ("x", "y", "facet", "series"):
+            path = getattr(figure, key)
+            if path is not None and path not in axes:
+                hint = nearest(path, axes) if axes else "the study has no axes"
+                raise InputError(f"figures[{i}].{key}: '{path}' is not an axis of this study; {hint}")
+        metrics = [column for column in columns if column not in (*axes, "seed")]
+        if figure.value not in metrics:
+            raise InputError(f"figures[{i}].value: '{figure.value}' is no metric; {nearest(figure.value, metrics)}")
+
+
+def _label(config: Config, path: str) -> str:
+    return with_unit(path, numeric_paths(config)[path].unit)
+
+
+def _value_label(value: str) -> str:
+    side, _, _ = value.rpartition(".")
+    about = describe(value)
+    return with_unit(f"{side}: {about.doc}" if side else about.doc, about.unit)
+
+
+def _reduce(frame: pd.DataFrame, keys: list[str], value: str) -> pd.Series:
+    """One number for each combination of keys: the median over what else varies, or the share that is true."""
+    groups = frame.groupby(keys, sort=True)[value]
+    return groups.mean() if frame[value].dtype == bool else groups.median()
+
+
+def _over(config: Config, frame: pd.DataFrame, keys: list[str]) -> str:
+    """What was averaged over, for the caption."""
+    zipped = {axis.zip for axis in config.axes if axis.path in keys and axis.zip}
+    others = [
+        axis.path
+        for axis in config.axes
+        if axis.path not in keys and axis.zip not in zipped and frame[axis.path].nunique() > 1
+    ]
+    if config.sweep.seeds > 1:
+        others.append(f"{config.sweep.seeds} seeds")
+    return f"; median over {', '.join(others)}" if others else ""
+
+
+def _norm(values: np.ndarray, scale: str) -> Normalize:
+    """Colour scale: logarithmic where values are positive and span more than a factor of 30."""
+    finite = values[np.isfinite(values)]
+    if finite.size == 0:
+        return Normalize(0.0, 1.0)
+    low, high = float(finite.min()), float(finite.max())
+    if low == high:
+        return Normalize(low - 0.5 * abs(low) - 1e-12, high + 0.5 * abs(high) + 1e-12)
+    if scale == "log" or (scale == "auto" and low > 0.0 and high / low > 30.0):
+        positive = finite[finite > 0.0]
+        return LogNorm(float(positive.min()), high) if positive.size else Normalize(low, high)
+    if scale == "auto" and low < 0.0 < high:
+        # signed errors: a few wild lanes must not hide the rest
+        reach = float(np.quantile(np.abs(finite), 0.95))
+        return Normalize(-reach, reach)
+    return Normalize(low, high)
+
+
+def _edges(centres: np.ndarray, log: bool) -> np.ndarray:
+    """Cell edges halfway between centres, in the axis's own scale."""
+    points = np.log(centres) if log else centres
+    if len(points) == 1:
+        half = 0.5 if log else 0.5 * (abs(points[0]) or 1.0)
+        edges = np.array([points[0] - half, points[0] + half])
+    else:
+        middle = 0.5 * (points[1:] + points[:-1])
+        edges = np.concatenate([[2 * points[0] - middle[0]], middle, [2 * points[-1] - middle[-1]]])
+    return np.exp(edges) if log else edges
+
+
+def _is_log(config: Config, path: str, values: np.ndarray) -> bool:
+    """Whether an axis is drawn logarithmically: as declared, or listed values that grow geometrically."""
+    axis = next(a for a in config.axes if a.path == path)
+    if axis.values is None:
+        return axis.scale == "log"
+    values = np.unique(values)
+    return bool(len(values) > 2 and values[0] > 0.0 and values[-1] / values[0] > 20.0)
+
+
+def _panels(config: Config, frame: pd.DataFrame, facet: str | None) -> list[tuple[str, pd.DataFrame]]:
+    if facet is None:
+        return [("", frame)]
+    unit = numeric_paths(config)[facet].unit
+    return [
+        (f"{facet} = {value if isinstance(value, str) else f'{value:g}'} {unit}".strip(), part)
+        for value, part in frame.groupby(facet, sort=True)
+    ]
+
+
+def _grid_of_axes(count: int, width: float, height: float, extra: float = 0.0) -> tuple[Figure, list[Axes]]:
+    columns = min(count, 3)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(width * columns + extra, height * rows + 0.7), layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    flat = list(axes.ravel())
+    for unused in flat[count:]:
+        unused.set_visible(False)
+    for column in range(columns):
+        last = max(i for i in range(column, count, columns))
+        flat[last].tick_params(labelbottom=True)
+    return figure, flat[:count]
+
+
+def _diverged(part: pd.DataFrame) -> int:
+    return int((~part["finite"].astype(bool)).sum())
+
+
+def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
+    assert spec.y is not None
+    with style():
+        panels = _panels(config, frame, spec.facet)
+        keys = [spec.y, spec.x]
+        boolean = spec.value.rpartition(".")[2] in _BOOLEAN
+        tables = [_reduce(part.assign(**{spec.value: _shown(part, spec.value)}), keys, spec.value) for _, part in panels]
+        norm = Normalize(0.0, 1.0) if boolean else _norm(np.concatenate([t.to_numpy(float) for t in tables]), spec.scale)
+        figure, axes = _grid_of_axes(len(panels), 3.5, 3.4, extra=1.0)
+        handles: list[Any] = []
+        gridded = config.sweep.design == "grid"
+        missing = diverged = 0
+        for ax, (title, part), table in zip(axes, panels, tables, strict=True):
+            ax.grid(False)
+            ax.set_facecolor(MISSING)
+            xs, ys = (np.sort(part[path].unique()).astype(float) for path in (spec.x, spec.y))
+            logs = [_is_log(config, path, v) for path, v in ((spec.x, xs), (spec.y, ys))]
+            if logs[0]:
+                ax.set_xscale("log")
+            if logs[1]:
+                ax.set_yscale("log")
+            if gridded:
+                grid = table.unstack().to_numpy(float)
+                ax.pcolormesh(_edges(xs, logs[0]), _edges(ys, logs[1]), grid, cmap=MAP, norm=norm, rasterized=True)
+                if (outline := _outline(ax, part, keys, spec, xs, ys)) is not None and not handles:
+                    handles.append(outline)
+                if spec.overlays:
+                    curves = _overlay(ax, part, spec, xs, ys)
+                    handles += [] if len(handles) > 1 else curves
+            else:
+                ax.scatter(part[spec.x], part[spec.y], c=_shown(part, spec.value), cmap=MAP, norm=norm, s=9, linewidths=0)
+            missing += int(table.isna().sum())
+            diverged += _diverged(part)
+            best = _best(table, spec)
+            if best is not None and gridded:
+                ax.plot(best[0], best[1], "*", ms=13, mfc="white", mec="black", mew=1.0)
+                title += f"\nbest ★ {best[2]:.2g} {describe(spec.value).unit}".rstrip() if best else ""
+            ax.set_title(title.strip())
+            ax.set_xlim(*_edges(xs, logs[0])[[0, -1]])
+            ax.set_ylim(*_edges(ys, logs[1])[[0, -1]])
+            if ax.get_subplotspec().is_first_col():  # type: ignore[union-attr]
+                ax.set_ylabel(_label(config, spec.y))
+            ax.set_xlabel(_label(config, spec.x))
+        if missing or diverged:
+            word = "diverged" if diverged == missing else "not converged" if "time" in spec.value else "undefined"
+            handles.append(Patch(facecolor=MISSING, label=f"{word} ({max(missing, diverged)} points)"))
+        bar = figure.colorbar(ScalarMappable(norm, MAP), ax=axes, pad=0.01, aspect=28, extend=_extend(tables, norm))
+        bar.set_label(_wrap(_value_label(spec.value)))
+        if handles:
+            figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4))
+    caption = f"{_value_label(spec.value)} over {spec.x} and {spec.y}{_over(config, frame, [*keys, spec.facet or ''])}."
+    return Drawn(_file_name(spec), figure, caption)
+
+
+def _shown(part: pd.DataFrame, value: str) -> pd.Series:
+    """The values to draw: those of diverged lanes are left out."""
+    if part[value].dtype == bool:
+        return part[value]
+    return part[value].where(part["finite"].astype(bool)).replace([np.inf, -np.inf], np.nan)
+
+
+def _extend(tables: list[pd.Series], norm: Normalize) -> str:
+    values = np.concatenate([t.to_numpy(float) for t in tables])
+    below = bool(np.nanmin(values, initial=np.inf) < norm.vmin)  # type: ignore[operator]
+    above = bool(np.nanmax(values, initial=-np.inf) > norm.vmax)  # type: ignore[operator]
+    return {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}[below, above]
+
+
+def _best(table: pd.Series, spec: FigureTable) -> tuple[float, float, float] | None:
+    """Place and value of the smallest figure, for errors and times."""
+    if not re.search(r"rmse|chatter|convergence_time$|error$", spec.value) or table.isna().all():
+        return None
+    y, x = table.abs().idxmin()  # type: ignore[misc]
+    return float(x), float(y), float(table[(y, x)])
+
+
+def _outline(
+    ax: Axes, part: pd.DataFrame, keys: list[str], spec: FigureTable, xs: np.ndarray, ys: np.ndarray
+) -> Line2D | None:
+    """Boundary of the region where the observer keeps its tolerance."""
+    side = spec.value.partition(".")[0]
+    column = f"{side}.converged"
+    if column not in part or spec.value == column or min(len(xs), len(ys)) < 2:
+        return None
+    share = _reduce(part, keys, column).unstack().to_numpy(float)
+    if share.min() < 0.5 <= share.max():
+        lines = ax.contour(xs, ys, share, levels=[0.5], colors="white", linewidths=2.2)
+        lines.set_path_effects([path_effects.Stroke(linewidth=3.8, foreground="black"), path_effects.Normal()])
+    handle = Line2D([], [], color="white", lw=2.2, label=f"{side} converged (inside)")
+    handle.set_path_effects([path_effects.Stroke(linewidth=3.8, foreground="black"), path_effects.Normal()])
+    return handle
+
+
+def _overlay(ax: Axes, part: pd.DataFrame, spec: FigureTable, xs: np.ndarray, ys: np.ndarray) -> list[Line2D]:
+    """Curves of the gain conditions, for the median true f_plus of the converged points of the panel."""
+    side = (spec.x if spec.x.startswith("observer.") else spec.y or "").split(".")[1]
+    converged = part[part[f"{side}.converged"].astype(bool)]
+    bound = float((converged if len(converged) else part)[f"{side}.f_plus"].median())
+    alpha_is_x = spec.x.endswith(".alpha")
+    alphas = xs if alpha_is_x else ys
+    fine = np.geomspace(max(alphas.min(), bound * 1.0001), alphas.max(), 400) if alphas.max() > bound else np.array([])
+    handles = []
+    for name, colour in zip(spec.overlays, ("#FF5FA2", "#FFFFFF", "#FFD400"), strict=False):
+        label, dashes = _CONDITIONS[name]
+        with jax.enable_x64(True):
+            least = np.asarray(LEAST_LAMBDA[name](jnp.asarray(fine), jnp.asarray(bound))) if fine.size else fine
+        line = (fine, least) if alpha_is_x else (least, fine)
+        outlined = [path_effects.Stroke(linewidth=3.6, foreground="black"), path_effects.Normal()]
+        ax.plot(*line, dashes, color=colour, lw=2.0, path_effects=outlined)
+        handles.append(Line2D([], [], color=colour, ls=dashes, lw=2.0, label=label, path_effects=outlined))
+    ax.text(
+        0.02, 0.02, f"f⁺ = {bound:.3g} rad/s²", transform=ax.transAxes, color="white", fontsize=8,
+        path_effects=[path_effects.withStroke(linewidth=2.0, foreground="black")],
+    )  # fmt: skip
+    return handles
+
+
+def _lines(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
+    with style():
+        panels = _panels(config, frame, spec.facet)
+        figure, axes = _grid_of_axes(len(panels), 4.2, 3.4)
+        if len(panels) == 1:
+            figure.set_size_inches(6.4, 4.2)
+        shown = _shown(frame, spec.value)
+        magnitude = spec.value.endswith("_error")
+        for ax, (title, part) in zip(axes, panels, strict=True):
+            groups = [("", part)] if spec.series is None else list(part.groupby(spec.series, sort=True))
+            for i, (name, group) in enumerate(groups):
+                values = shown.loc[group.index].astype(float)
+                values = values.abs() if magnitude else values
+                by_x = values.groupby(group[spec.x], sort=True)
+                middle = by_x.median()
+                colour = COLOURS[i % len(COLOURS)]
+                label = None if spec.series is None else f"{name if isinstance(name, str) else f'{name:g}'}"
+                ax.plot(middle.index, middle, "o-", ms=3.5, color=colour, label=label)
+                if (by_x.size() > 1).any():
+                    ax.fill_between(middle.index, by_x.min(), by_x.max(), color=colour, alpha=0.18, linewidth=0)
+            xs = np.sort(part[spec.x].unique())
+            if _is_log(config, spec.x, xs):
+                ax.set_xscale("log")
+            positive = shown.abs() if magnitude else shown
+            if isinstance(_norm(positive.to_numpy(float), spec.scale), LogNorm):
+                ax.set_yscale("log")
+            ax.set_title(title)
+            ax.set_xlabel(_label(config, spec.x))
+        label = _value_label(spec.value)
+        axes[0].set_ylabel(_wrap(f"|{label}|" if magnitude else label))
+        if spec.series is not None:
+            axes[-1].legend(title=_label(config, spec.series))
+    band = "; band: least to largest" if config.sweep.seeds > 1 else ""
+    caption = f"{label} over {spec.x}{_over(config, frame, [spec.x, spec.series or '', spec.facet or ''])}{band}."
+    return Drawn(_file_name(spec), figure, caption)
+
+
+def _wrap(label: str, width: int = 48) -> str:
+    import textwrap
+
+    return "\n".join(textwrap.wrap(label, width))
+
+
+def _file_name(spec: FigureTable) -> str:
+    parts = [spec.value, spec.x, *([spec.y] if spec.y else [])]
+    return re.sub(r"[^A-Za-z0-9]+", "_", f"{spec.kind}_{parts[0]}").strip("_")

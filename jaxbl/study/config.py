@@ -1,0 +1,482 @@
+"""The TOML study: its tables, their validation, and the experiment they describe.
+
+Tables of physical things are generated from the modules that compute with them, so that a key, its unit and its range are
+written once. What the config says is found again in the experiment under the same dotted path.
+"""
+
+import copy
+import dataclasses
+import difflib
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Union
+
+import numpy as np
+import tomli_w
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
+from pydantic_core import PydanticCustomError
+
+from jaxbl.drive.effects import effect_class, effect_kinds
+from jaxbl.drive.encoders import Encoders
+from jaxbl.drive.excitation import EXCITATIONS, Recorded
+from jaxbl.drive.parameters import Parameter, key_of, parameters
+from jaxbl.drive.plant import DRIVES, Initial
+from jaxbl.drive.transmission import TRANSMISSIONS
+from jaxbl.errors import InputError
+from jaxbl.observer.equivalent_control import EquivalentControl
+from jaxbl.observer.recursive import Identifier
+from jaxbl.observer.super_twisting import OBSERVERS, AbstractSuperTwisting, Observers
+from jaxbl.simulate import Experiment, Run
+
+
+def nearest(word: str, words: Any) -> str:
+    """A hint that names the nearest valid word, or all of them where none is near."""
+    close = difflib.get_close_matches(word, list(words), n=1, cutoff=0.6)
+    return f"did you mean '{close[0]}'?" if close else f"valid: {', '.join(words)}"
+
+
+class Table(BaseModel):
+    """A table of the config: strict types, finite numbers, no unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, validate_default=False)
+
+    factory: ClassVar[Callable[..., Any]]
+    """What the table builds (generated tables)."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys(cls, data: Any) -> Any:
+        if isinstance(data, Mapping):
+            keys = [field.alias or name for name, field in cls.model_fields.items()]
+            for key in data:
+                if key not in keys:
+                    hint = nearest(str(key), keys)
+                    raise PydanticCustomError("unknown_key", "unknown key '{key}'; {hint}", {"key": key, "hint": hint})
+        return data
+
+    def build(self) -> Any:
+        """The module that a generated table stands for."""
+        names = {name for name in type(self).model_fields if name not in ("kind", "law")}
+        return self.factory(**{name: getattr(self, name) for name in names})
+
+
+def table_for(module: type, factory: Callable[..., Any] | None = None, **tag: str) -> type[Table]:
+    """Generate the config table of a module class from its declared parameters; `tag` adds a fixed key (`kind="sine"`)."""
+    fields: dict[str, Any] = {key: (Literal[value], ...) for key, value in tag.items()}
+    for field, known in parameters(module):
+        kind: Any = field.type if field.metadata.get("static") else float
+        optional = field.default is None
+        fields[field.name] = (
+            kind | None if optional else kind,
+            Field(
+                default=... if field.default is dataclasses.MISSING else field.default,
+                alias=key_of(field.name) if key_of(field.name) != field.name else None,
+                description=known.doc,
+                json_schema_extra={"unit": known.unit} if known.unit else None,
+                ge=known.minimum,
+                gt=known.above,
+                le=known.maximum,
+            ),
+        )
+    model = create_model(module.__name__, __base__=Table, __doc__=module.__doc__, **fields)
+    model.factory = factory or module
+    return model
+
+
+class RecordedTable(Table):
+    """Input from a CSV or Parquet file, played back with zero-order hold."""
+
+    kind: Literal["recorded"]
+    file: str = Field(description="CSV or Parquet file; relative to the config file")
+    time_column: str = Field(default="t", description="column of times in s")
+    torque_column: str = Field(default="u", description="column of torques in N m")
+    gain: float = Field(default=1.0, description="factor on the recorded torque")
+
+    def build(self) -> Recorded:
+        import pandas as pd
+
+        path = Path(self.file)
+        try:
+            frame = pd.read_parquet(path) if path.suffix == ".parquet" else pd.read_csv(path)
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path}: cannot be read as CSV or Parquet: {str(error).splitlines()[0]}") from None
+        columns = []
+        for column in (self.time_column, self.torque_column):
+            if column not in frame:
+                raise InputError(f"{path}: no column '{column}'; {nearest(column, map(str, frame.columns))}")
+            values = pd.to_numeric(frame[column], errors="coerce").to_numpy(dtype=float)
+            if len(values) == 0 or not np.isfinite(values).all():
+                row = 0 if len(values) == 0 else int(np.argmin(np.isfinite(values)))
+                raise InputError(f"{path}: column '{column}', row {row}: should be a finite number")
+            columns.append(values)
+        times, torques = columns
+        if (np.diff(times) <= 0.0).any():
+            row = int(np.argmax(np.diff(times) <= 0.0)) + 1
+            raise InputError(f"{path}: column '{self.time_column}', row {row}: times should increase")
+        return Recorded(times=times - times[0], torques=torques, gain=self.gain)  # type: ignore[arg-type]
+
+
+def _tagged(tables: list[type[Table]], key: str) -> Any:
+    return Annotated[Union[tuple(tables)], Field(discriminator=key)]  # noqa: UP007
+
+
+_Drive = _tagged([table_for(cls, kind=name) for name, cls in DRIVES.items()], "kind")
+_Transmission = _tagged([table_for(cls, law=name) for name, cls in TRANSMISSIONS.items()], "law")
+_Excitation = _tagged(
+    [RecordedTable if name == "recorded" else table_for(cls, kind=name) for name, cls in EXCITATIONS.items()], "kind"
+)
+_Effect = _tagged([table_for(effect_class(name), kind, kind=name) for name, kind in effect_kinds().items()], "kind")
+_Gains = table_for(AbstractSuperTwisting)
+
+
+class ObserverTable(Table):
+    """Super-twisting observers (7)-(8) of both sides."""
+
+    discretisation: Literal["implicit", "explicit"] = Field(
+        default="implicit", description="implicit: proximal backward Euler; explicit: forward Euler of (7)"
+    )
+    motor: _Gains = Field(description="gains of the motor observer")  # type: ignore[valid-type]
+    load: _Gains | None = Field(default=None, description="gains of the load observer; none on a rigid drive")  # type: ignore[valid-type]
+
+    def build(self) -> Observers:
+        cls = OBSERVERS[self.discretisation]
+        sides = {"motor": self.motor, "load": self.load}
+        return Observers(**{side: None if t is None else cls(**dict(t)) for side, t in sides.items()})
+
+
+class RunTable(Table):
+    """Time grid, precision and tolerances."""
+
+    duration: float = Field(default=20.0, gt=0.0, description="length of the run", json_schema_extra={"unit": "s"})
+    sample_period: float = Field(
+        default=1e-3, gt=0.0, description="period of encoders, observers, identifier", json_schema_extra={"unit": "s"}
+    )
+    substeps: int = Field(default=10, ge=1, description="plant steps per sample")
+    precision: Literal["float64", "float32"] = Field(default="float64", description="floating-point type of the run")
+    position_tolerance: float = Field(
+        default=1e-3,
+        gt=0.0,
+        description="largest position error of a converged observer (load: divided by the gear ratio)",
+        json_schema_extra={"unit": "rad"},
+    )
+    velocity_tolerance: float = Field(
+        default=0.05,
+        gt=0.0,
+        description="largest velocity error of a converged observer (load: divided by the gear ratio)",
+        json_schema_extra={"unit": "rad/s"},
+    )
+
+    @property
+    def steps(self) -> int:
+        """Number of samples."""
+        return round(self.duration / self.sample_period)
+
+    @model_validator(mode="after")
+    def _long_enough(self) -> "RunTable":
+        if self.sample_period > self.duration:
+            raise PydanticCustomError(
+                "period",
+                "sample_period {period} s is longer than duration {duration} s; it should be a small part of it",
+                {"period": self.sample_period, "duration": self.duration},
+            )
+        if self.steps < 8:
+            raise PydanticCustomError(
+                "period",
+                "duration {duration} s holds only {steps} samples of {period} s; at least 8 are needed",
+                {"period": self.sample_period, "duration": self.duration, "steps": self.steps},
+            )
+        return self
+
+    def build(self) -> Run:
+        return Run(self.sample_period, self.steps, self.substeps, self.position_tolerance, self.velocity_tolerance)
+
+
+class SweepTable(Table):
+    """How the axes are combined and repeated."""
+
+    seeds: int = Field(default=1, ge=1, description="noise seeds 0 ... seeds - 1, each run at every point")
+    design: Literal["grid", "sobol", "latin_hypercube"] = Field(
+        default="grid", description="grid: all combinations; else quasi-random points over the axes without num or values"
+    )
+    points: int | None = Field(default=None, ge=1, description="number of quasi-random points")
+    design_seed: int = Field(default=0, ge=0, description="seed of the quasi-random design")
+    chunk: int | None = Field(default=None, ge=1, description="lanes computed at once; left out: chosen for the machine")
+
+
+class UncertaintyTable(Table):
+    """How well the drive's numbers are known: prior of fits and diagnosis."""
+
+    relative: float = Field(default=0.02, gt=0.0, description="relative standard deviation of every number not in exact")
+    exact: list[str] = Field(default=["drive.gear_ratio"], description="dotted paths of numbers that are known exactly")
+
+
+class LogTable(Table):
+    """How a measured log is to be read."""
+
+    hold: Literal["zoh"] = Field(default="zoh", description="input between samples")
+    initial_state: Literal["unknown", "rest"] = Field(default="unknown", description="state at the first sample")
+
+
+class AxisTable(Table):
+    """One axis: a dotted path and its values."""
+
+    path: str = Field(description="dotted path of the number to vary, e.g. observer.motor.alpha")
+    values: list[float | int | str] | None = Field(default=None, description="listed values")
+    start: float | None = Field(default=None, description="first value")
+    stop: float | None = Field(default=None, description="last value")
+    num: int | None = Field(default=None, ge=1, description="number of values; left out in quasi-random designs")
+    scale: Literal["linear", "log"] = Field(default="linear", description="spacing")
+    zip: str | None = Field(default=None, description="axes with the same label advance together")
+
+    @model_validator(mode="after")
+    def _complete(self) -> "AxisTable":
+        def wrong(message: str, **context: Any) -> PydanticCustomError:
+            return PydanticCustomError("axis", message, {"path": self.path, **context})  # type: ignore[arg-type]
+
+        if self.values is not None:
+            if self.start is not None or self.stop is not None or self.num is not None:
+                raise wrong("axis {path} has both values and start/stop/num; give one of them")
+            if not self.values:
+                raise wrong("axis {path} is empty: values should list at least one value")
+            if len({str(v) for v in self.values}) < len(self.values):
+                raise wrong("axis {path} lists a value twice; values should differ")
+            return self
+        if self.start is None or self.stop is None:
+            raise wrong("axis {path} should have values, or start and stop")
+        if self.start >= self.stop:
+            raise wrong("axis {path}: start {start} should be less than stop {stop}", start=self.start, stop=self.stop)
+        if self.scale == "log" and self.start <= 0.0:
+            raise wrong("axis {path}: a log scale needs start > 0, not {start}", start=self.start)
+        if self.num == 1:
+            raise wrong("axis {path}: num = 1 cannot span start ... stop; use values = [...] or num >= 2")
+        return self
+
+
+class FigureTable(Table):
+    """One figure of the report."""
+
+    kind: Literal["heatmap", "line"] = Field(description="heatmap over two axes, or lines over one")
+    x: str = Field(description="axis path")
+    y: str | None = Field(default=None, description="axis path (heatmap)")
+    value: str = Field(description="metric, e.g. motor.velocity_rmse")
+    facet: str | None = Field(default=None, description="axis path: one panel for each value")
+    series: str | None = Field(default=None, description="axis path: one line for each value (line)")
+    scale: Literal["auto", "linear", "log"] = Field(default="auto", description="scale of the value")
+    overlays: list[Literal["davila_fridman", "seeber_horn", "exact"]] = Field(
+        default=[], description="gain conditions drawn over a map of alpha and lambda"
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> "FigureTable":
+        if self.kind == "heatmap" and self.y is None:
+            raise PydanticCustomError("figure", "a heatmap needs y, the path of its second axis", {})
+        if self.overlays and {self.x.rpartition(".")[2], (self.y or "").rpartition(".")[2]} != {"alpha", "lambda"}:
+            raise PydanticCustomError(
+                "figure", "overlays need a map over alpha and lambda of one observer; leave overlays out here", {}
+            )
+        return self
+
+
+class Config(Table):
+    """A study: everything that a run needs, validated."""
+
+    title: str = Field(default="", description="headline of the report")
+    notes: list[str] = Field(default=[], description="remarks of the author, repeated in summary and report")
+    drive: _Drive = Field(description="what is driven")  # type: ignore[valid-type]
+    transmission: _Transmission | None = Field(default=None, description="law of the gear; none on a rigid drive")  # type: ignore[valid-type]
+    effects: list[_Effect] = Field(default=[], description="effects beyond the nominal drive")  # type: ignore[valid-type]
+    initial: table_for(Initial) = Field(default_factory=lambda: table_for(Initial)(), description="state at t = 0")  # type: ignore[valid-type]
+    excitation: _Excitation = Field(description="input torque")  # type: ignore[valid-type]
+    encoders: table_for(Encoders) = Field(default_factory=lambda: table_for(Encoders)(), description="position sensors")  # type: ignore[valid-type]
+    observer: ObserverTable
+    equivalent_control: table_for(EquivalentControl) = Field(  # type: ignore[valid-type]
+        default_factory=lambda: table_for(EquivalentControl)(), description="low-pass on the equivalent control"
+    )
+    identifier: table_for(Identifier) = Field(  # type: ignore[valid-type]
+        default_factory=lambda: table_for(Identifier)(), description="recursive least squares"
+    )
+    run: RunTable = Field(default_factory=RunTable)
+    sweep: SweepTable = Field(default_factory=SweepTable)
+    uncertainty: UncertaintyTable = Field(default_factory=UncertaintyTable)
+    log: LogTable = Field(default_factory=LogTable)
+    axes: list[AxisTable] = Field(default=[])
+    figures: list[FigureTable] = Field(default=[])
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Config":
+        def wrong(message: str, **context: Any) -> PydanticCustomError:
+            return PydanticCustomError("consistency", message, context)  # type: ignore[arg-type]
+
+        rigid = self.drive.kind == "rigid"
+        if rigid and self.transmission is not None:
+            raise wrong("[transmission] has no meaning on a rigid drive; remove it, or use drive.kind = 'two_inertia'")
+        if rigid and self.observer.load is not None:
+            raise wrong("observer.load has no meaning on a rigid drive; remove it")
+        if not rigid and self.transmission is None:
+            raise wrong("[transmission] is missing: a two_inertia drive needs a law")
+        if not rigid and self.observer.load is None:
+            raise wrong("observer.load is missing: a two_inertia drive has a load observer")
+        for i, effect in enumerate(self.effects):
+            place = effect.kind.partition(".")[0]
+            if rigid and place in ("load", "transmission"):
+                raise wrong(
+                    "effects[{i}]: {kind} has no meaning on a rigid drive; motor.* and actuator.* effects act on it",
+                    i=i,
+                    kind=effect.kind,
+                )
+        return self
+
+    def build(self) -> Experiment:
+        """The experiment that the config describes, with Python numbers as leaves."""
+        rigid = self.drive.kind == "rigid"
+        return Experiment(
+            drive=self.drive.build(),
+            transmission=None if self.transmission is None else self.transmission.build(),
+            effects=tuple(effect.build() for effect in self.effects),
+            initial=self.initial.build(),
+            excitation=self.excitation.build(),
+            encoders=self.encoders.build(),
+            observer=self.observer.build(),
+            equivalent_control=self.equivalent_control.build(),
+            identifier=None if rigid else self.identifier.build(),
+            run=self.run.build(),
+        )
+
+    def resolved(self) -> dict[str, Any]:
+        """The whole config as plain data, defaults filled in."""
+        return self.model_dump(by_alias=True, exclude_none=True)
+
+    def to_toml(self) -> str:
+        """The whole config as TOML that :func:`read_config` takes."""
+        return tomli_w.dumps(self.resolved())
+
+
+def read_config(source: str | Path | Mapping[str, Any] | Config) -> Config:
+    """Read and validate a study from a TOML file, a mapping, or a config.
+
+    Raises:
+        InputError: unreadable file, bad TOML, unknown key, wrong type or range; one line that names file and key.
+    """
+    if isinstance(source, Config):
+        return source
+    if isinstance(source, Mapping):
+        return _validate(dict(source), "config")
+    path = Path(source)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a folder; a TOML file is needed") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: is not text in UTF-8; a TOML file is needed") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+    excitation = data.get("excitation")
+    if isinstance(excitation, dict) and isinstance(excitation.get("file"), str):
+        excitation["file"] = str((path.parent / excitation["file"]).resolve())
+    return _validate(data, str(path))
+
+
+def _validate(data: dict[str, Any], name: str = "") -> Config:
+    try:
+        return Config.model_validate(data)
+    except ValidationError as error:
+        raise InputError(f"{name}: {_describe(error)}" if name else _describe(error)) from None
+
+
+_UNIONS = {"drive": 1, "transmission": 1, "excitation": 1, "effects": 2}
+
+
+def _describe(error: ValidationError) -> str:
+    """The first error in one line."""
+    first = error.errors()[0]
+    location = list(first["loc"])
+    # pydantic puts the tag of a union's member into the location
+    tag = _UNIONS.get(str(location[0]) if location else "", None)
+    if tag is not None and len(location) > tag:
+        del location[tag]
+    key = ""
+    for part in location:
+        key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)
+    where = f"{key}: " if key else ""
+    kind, context, given = first["type"], first.get("ctx", {}), first["input"]
+    if kind == "missing":
+        return f"{where}this key is missing"
+    if kind == "union_tag_invalid":
+        tags = [t.strip(" '") for t in context["expected_tags"].split(",")]
+        name = context["discriminator"].strip("'")
+        return f"{key}.{name}: unknown {name} '{context['tag']}'; {nearest(context['tag'], tags)}"
+    if kind == "union_tag_not_found":
+        return f"{where}the key {context['discriminator']} is missing"
+    if kind in ("model_type", "model_attributes_type", "dict_type"):
+        return f"{where}should be a table, not {given!r}"
+    if kind == "list_type":
+        return f"{where}should be an array, not {given!r}"
+    message = first["msg"].removeprefix("Input ")
+    if kind in ("unknown_key", "period", "axis", "figure", "consistency"):
+        return f"{where}{message}"
+    return f"{where}{message}, not {given!r}"
+
+
+def numeric_paths(config: Config) -> dict[str, Parameter]:
+    """Dotted paths of everything that an axis may vary in this config, with unit and description."""
+    found: dict[str, Parameter] = {}
+    for section in ("drive", "transmission", "initial", "excitation", "encoders", "observer", "equivalent_control",
+                    "identifier", "run"):  # fmt: skip
+        table = getattr(config, section)
+        if table is not None:
+            found |= dict(_paths(table, section))
+    kinds = [effect.kind for effect in config.effects]
+    for i, effect in enumerate(config.effects):
+        label = effect.kind if kinds.count(effect.kind) == 1 else str(i)
+        found |= dict(_paths(effect, f"effects.{label}"))
+    found.pop("run.precision", None)
+    return found
+
+
+_NOT_NUMBERS = ("kind", "law", "file", "time_column", "torque_column")
+
+
+def _paths(table: Table, prefix: str) -> Iterator[tuple[str, Parameter]]:
+    for name, field in type(table).model_fields.items():
+        value = getattr(table, name)
+        path = f"{prefix}.{field.alias or name}"
+        if isinstance(value, Table):
+            yield from _paths(value, path)
+        elif name not in _NOT_NUMBERS:
+            extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+            yield path, Parameter(str(extra.get("unit", "")), field.description or "")
+
+
+def with_values(config: Config, values: Mapping[str, Any]) -> Config:
+    """A copy of the config with other values at some dotted paths.
+
+    Raises:
+        InputError: a path that does not exist (the nearest valid one is named), or a value out of range.
+    """
+    data = copy.deepcopy(config.resolved())
+    known = numeric_paths(config)
+    for path, value in values.items():
+        if path not in known:
+            raise InputError(f"unknown path '{path}'; {_nearest_path(path, known)}")
+        section, *keys = path.split(".")
+        if section == "effects":
+            kind, _, key = path.removeprefix("effects.").rpartition(".")
+            kinds = [effect.kind for effect in config.effects]
+            target = data["effects"][int(kind) if kind.isdigit() else kinds.index(kind)]
+        else:
+            *tables, key = keys
+            target = data.setdefault(section, {})
+            for table in tables:
+                target = target.setdefault(table, {})
+        target[key] = value
+    return _validate(data)
+
+
+def _nearest_path(path: str, known: Mapping[str, Parameter]) -> str:
+    close = difflib.get_close_matches(path, list(known), n=1, cutoff=0.3)
+    return f"nearest valid path: '{close[0]}'" if close else f"valid paths: {', '.join(known)}"

@@ -1,0 +1,225 @@
+"""Runs the points of a study: chunks of one static shape over all local devices, one atomic file per chunk.
+
+A chunk is a block of seeds times a block of points. The lane function is vmapped over points inside and seeds outside, so
+that what depends on neither (the excitation, the plant in a gain map) is computed once, and noise once a seed.
+"""
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+from jax.sharding import Mesh, PartitionSpec
+
+from jaxbl.drive.parameters import as_arrays, set_leaves
+from jaxbl.simulate import Experiment, scan
+
+from .config import Config
+from .metrics import METRICS, metric_columns
+from .points import Points
+
+Progress = Callable[[int, int], None]
+"""Called with the number of finished and of all lanes."""
+
+LANES_PER_DEVICE = 4096
+"""Default lanes a device computes at once: the carry then stays in a core's cache (benchmarks/NOTES.md)."""
+
+
+class Layout(NamedTuple):
+    """Shape of a chunk: seeds and points."""
+
+    seeds: int
+    points: int
+
+
+class Chunk(NamedTuple):
+    """One call of a compiled program: group, first seed and first point."""
+
+    index: int
+    group: int
+    first_seed: int
+    first_point: int
+
+
+def precision(config: Config) -> Any:
+    """Context in which the config's floating-point type is JAX's default."""
+    return jax.enable_x64(config.run.precision == "float64")
+
+
+def prepare(config: Config) -> Experiment:
+    """The config's experiment with array leaves of its precision; call inside :func:`precision`."""
+    return as_arrays(config.build(), jnp.dtype(config.run.precision))
+
+
+def layout_for(config: Config, points: Points, devices: int) -> Layout:
+    """Chunk shape: as many lanes as the devices want at once, whole rows of points before several seeds."""
+    capacity = config.sweep.chunk or LANES_PER_DEVICE * devices
+    # chunks of equal size waste no padding on the last one; a multiple of the devices, along the longer side, suits them
+    per_chunk = math.ceil(points.lanes / math.ceil(points.lanes / capacity))
+    if points.lanes >= devices:
+        per_chunk = math.ceil(per_chunk / devices) * devices
+    seeds = min(config.sweep.seeds, max(capacity // per_chunk, 1))
+    if points.lanes < devices:
+        seeds = math.ceil(seeds / devices) * devices
+    return Layout(seeds, per_chunk)
+
+
+class Engine:
+    """Compiles and runs the chunks of a study.
+
+    Args:
+        config: the study.
+        layout: chunk shape; left out, one that suits the devices.
+        devices: left out, all local ones.
+    """
+
+    def __init__(self, config: Config, layout: Layout | None = None, devices: list[Any] | None = None):
+        self.config = config
+        self.points = Points(config)
+        self.devices = devices or jax.local_devices()
+        self.layout = layout or layout_for(config, self.points, len(self.devices))
+        self.compile_seconds = 0.0
+        self.run_seconds = 0.0
+        self._compiled: tuple[int, Any] | None = None
+
+    def __len__(self) -> int:
+        """Number of chunks."""
+        return sum(1 for _ in self.chunks())
+
+    def chunks(self) -> Iterator[Chunk]:
+        index = 0
+        for group in range(len(self.points.groups)):
+            for seed in range(0, self.config.sweep.seeds, self.layout.seeds):
+                for point in range(0, self.points.lanes, self.layout.points):
+                    yield Chunk(index, group, seed, point)
+                    index += 1
+
+    @property
+    def rows(self) -> int:
+        """Rows of the result: points times seeds."""
+        return len(self.points) * self.config.sweep.seeds
+
+    def run(self, chunk: Chunk) -> pd.DataFrame:
+        """Compute one chunk: a frame of one row for each seed and point, padding taken off."""
+        group = self.points.groups[chunk.group]
+        program = self._program(chunk.group)
+        seeds, indices = self.contents(chunk)
+        columns = self.points.columns(indices)
+        with precision(group.config):
+            given = self._arguments(group.config, columns, seeds)
+            start = time.perf_counter()
+            figures = {name: np.asarray(value) for name, value in jax.block_until_ready(program(*given)).items()}
+            self.run_seconds += time.perf_counter() - start
+        shape = (len(seeds), len(indices))
+        data = {}
+        for path in self.points.paths:
+            if path in columns:
+                data[path] = np.broadcast_to(columns[path], shape).ravel()
+            else:
+                data[path] = np.full(shape, group.structural[path]).ravel()
+        data["seed"] = np.broadcast_to(seeds[:, None], shape).ravel()
+        for name in metric_columns(group.config.build()):
+            data[name] = figures[name][: shape[0], : shape[1]].ravel()
+        return pd.DataFrame(data)
+
+    def contents(self, chunk: Chunk) -> tuple[np.ndarray, np.ndarray]:
+        """Seeds and point indices of a chunk."""
+        last_seed = min(chunk.first_seed + self.layout.seeds, self.config.sweep.seeds)
+        last_point = min(chunk.first_point + self.layout.points, self.points.lanes)
+        return np.arange(chunk.first_seed, last_seed), np.arange(chunk.first_point, last_point)
+
+    def _arguments(self, config: Config, columns: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[Any, Any]:
+        """Padded arrays for a compiled program: values by path, seeds."""
+
+        def pad(values: np.ndarray, size: int) -> np.ndarray:
+            return np.concatenate([values, np.repeat(values[-1:], size - len(values), axis=0)])
+
+        dtype = config.run.precision
+        padded = {path: pad(np.asarray(v, dtype), self.layout.points) for path, v in columns.items()}
+        return padded, pad(seeds.astype(np.uint32), self.layout.seeds)
+
+    def _program(self, group: int) -> Any:
+        """The compiled program of a group; the last one is kept."""
+        if self._compiled is None or self._compiled[0] != group:
+            self._compiled = (group, self._compile(self.points.groups[group].config))
+        return self._compiled[1]
+
+    def _compile(self, config: Config) -> Any:
+        with precision(config):
+            experiment = prepare(config)
+
+            def lane(values: dict[str, Any], seed: Any) -> dict[str, Any]:
+                figures, _ = scan(set_leaves(experiment, values), seed, (METRICS,))
+                return figures
+
+            # shards along the longer side that divides evenly; one device does the rest
+            seeds, points = self.layout
+            count = len(self.devices)
+            by_points, by_seeds = points % count == 0, points % count != 0 and seeds % count == 0
+            mesh = Mesh(np.array(self.devices if by_points or by_seeds else self.devices[:1]), ("lanes",))
+            over_points = PartitionSpec("lanes" if by_points else None)
+            over_seeds = PartitionSpec("lanes" if by_seeds else None)
+            local_points = points // count if by_points else points
+            chunk = jax.shard_map(
+                jax.vmap(jax.vmap(lane, in_axes=(0, None), axis_size=local_points), in_axes=(None, 0)),
+                mesh=mesh,
+                in_specs=(over_points, over_seeds),
+                out_specs=PartitionSpec(*over_seeds, *over_points),
+                check_vma=False,
+            )
+            columns = self.points.columns(np.arange(1))
+            start = time.perf_counter()
+            program = jax.jit(chunk).lower(*self._arguments(config, columns, np.arange(1))).compile()
+            self.compile_seconds += time.perf_counter() - start
+        return program
+
+    def estimate(self) -> "Estimate":
+        """Memory and time of the whole study, from a compilation and a short run at the same chunk shape."""
+        short = min(self.config.run.steps, 400)
+        config = self.points.groups[0].config
+        brief = config.model_copy(
+            update={"run": config.run.model_copy(update={"duration": short * config.run.sample_period})}
+        )
+        with precision(config):
+            program = self._compile(brief)
+            compiling = self.compile_seconds
+            given = self._arguments(brief, self.points.columns(np.arange(1)), np.arange(1))
+            seconds = []
+            for _ in range(3):
+                start = time.perf_counter()
+                jax.block_until_ready(program(*given))
+                seconds.append(time.perf_counter() - start)
+        memory = program.memory_analysis()
+        size = 0 if memory is None else memory.temp_size_in_bytes + memory.output_size_in_bytes
+        lane_steps = short * math.prod(self.layout)
+        steps = [group.config.run.steps for group in self.points.groups]
+        chunks_a_group = len(self) // len(steps)
+        return Estimate(
+            points=len(self.points),
+            rows=self.rows,
+            chunks=len(self),
+            lanes_a_chunk=math.prod(self.layout),
+            compile_seconds=compiling * len(steps),
+            run_seconds=min(seconds) / short * sum(steps) * chunks_a_group,
+            lane_steps_per_second=lane_steps / min(seconds),
+            megabytes=size / 1e6,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """What a study will cost."""
+
+    points: int
+    rows: int
+    chunks: int
+    lanes_a_chunk: int
+    compile_seconds: float
+    run_seconds: float
+    lane_steps_per_second: float
+    megabytes: float

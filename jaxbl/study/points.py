@@ -1,0 +1,163 @@
+"""The points of a study: axes crossed, zipped or sampled quasi-randomly, computed a slice at a time.
+
+Axes over leaves of the experiment become lanes of one compiled program. Axes over what is fixed at compile time (sampling
+period, substeps, discretisation, ...) are outermost and split the study into groups, each compiled once.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.stats import qmc
+
+from jaxbl.drive.parameters import leaf_paths
+from jaxbl.errors import InputError
+
+from .config import AxisTable, Config, with_values
+
+Columns = dict[str, np.ndarray]
+
+
+class Block(NamedTuple):
+    """Axes that advance together: columns of equal length by path."""
+
+    columns: Columns
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+
+class Group(NamedTuple):
+    """Points that share one compiled program: the config with its structural values set, and those values."""
+
+    config: Config
+    structural: dict[str, Any]
+
+
+class Points:
+    """All points of a study, first axis slowest, structural axes outermost.
+
+    Attributes:
+        paths: axis paths in the order of the config.
+        groups: one for each combination of structural values.
+        lanes: points of each group.
+    """
+
+    def __init__(self, config: Config):
+        self.paths = [axis.path for axis in config.axes]
+        for i, path in enumerate(self.paths):
+            if path in self.paths[:i]:
+                raise InputError(f"axes[{i}]: path '{path}' has an axis already; each path may have one")
+        base, self.leaves = self._check(config)
+        blocks = self._blocks(config)
+        structural = [b for b in blocks if not all(path in self.leaves for path in b.columns)]
+        self._blocks_of_leaves = [b for b in blocks if all(path in self.leaves for path in b.columns)]
+        self.lanes = math.prod(len(b) for b in self._blocks_of_leaves)
+        self.groups = []
+        for index in range(math.prod(len(b) for b in structural)):
+            values = {path: column[0] for path, column in _take(structural, np.array([index])).items()}
+            values = {path: v.item() if isinstance(v, np.generic) else v for path, v in values.items()}
+            self.groups.append(Group(with_values(base, values), values))
+
+    def __len__(self) -> int:
+        return len(self.groups) * self.lanes
+
+    def columns(self, indices: np.ndarray) -> Columns:
+        """Values of the lane axes at some points of a group, by path; float64 arrays of the shape of `indices`."""
+        return _take(self._blocks_of_leaves, indices)
+
+    def axis_values(self, config: Config) -> dict[str, list[Any]]:
+        """Distinct values of each axis that has a list of them (not the quasi-random ones)."""
+        return {axis.path: list(_values(axis)) for axis in config.axes if axis.values is not None or axis.num is not None}
+
+    @staticmethod
+    def _check(config: Config) -> tuple[Config, set[str]]:
+        """The config with every axis at its first value (so that optional numbers exist), and the paths that are leaves."""
+        first = {}
+        for i, axis in enumerate(config.axes):
+            ends = axis.values if axis.values is not None else [axis.start, axis.stop]
+            for value in ends:
+                try:
+                    with_values(config, {axis.path: value})
+                except InputError as error:
+                    raise InputError(f"axes[{i}]: {error}") from None
+            first[axis.path] = ends[0]
+        base = with_values(config, first)
+        return base, set(leaf_paths(base.build()))
+
+    def _blocks(self, config: Config) -> list[Block]:
+        sampled = [axis for axis in config.axes if axis.values is None and axis.num is None]
+        if sampled and config.sweep.design == "grid":
+            i = config.axes.index(sampled[0])
+            raise InputError(f"axes[{i}]: num is missing for '{sampled[0].path}'; how many values should the grid have?")
+        if config.sweep.design != "grid":
+            if not sampled:
+                raise InputError(
+                    f"sweep.design: '{config.sweep.design}' needs an axis with start and stop and without num and values"
+                )
+            if config.sweep.points is None:
+                raise InputError("sweep.points is missing: how many quasi-random points?")
+        for axis in sampled:
+            if axis.path not in self.leaves:
+                raise InputError(f"axes: '{axis.path}' is fixed at compile time; list its values instead of sampling it")
+            if axis.zip is not None:
+                raise InputError(f"axes: '{axis.path}' is sampled quasi-randomly and cannot be zipped")
+        blocks: list[Block] = []
+        labels: dict[str, int] = {}
+        for axis in config.axes:
+            if axis in sampled:
+                if axis is sampled[0]:
+                    blocks.append(Block(_quasi_random(sampled, config)))
+            elif axis.zip is None:
+                blocks.append(Block({axis.path: _values(axis)}))
+            elif axis.zip not in labels:
+                labels[axis.zip] = len(blocks)
+                blocks.append(Block({axis.path: _values(axis)}))
+            else:
+                block, values = blocks[labels[axis.zip]], _values(axis)
+                if len(values) != len(block):
+                    raise InputError(
+                        f"axes: '{axis.path}' has {len(values)} values, the others zipped as '{axis.zip}' have {len(block)}"
+                    )
+                block.columns[axis.path] = values
+        return blocks
+
+
+def _take(blocks: list[Block], indices: np.ndarray) -> Columns:
+    """Columns of a product of blocks at some flat indices, last block fastest."""
+    out: Columns = {}
+    remaining = indices
+    for block in reversed(blocks):
+        for path, column in block.columns.items():
+            out[path] = column[remaining % len(block)]
+        remaining = remaining // len(block)
+    return out
+
+
+def _values(axis: AxisTable) -> np.ndarray:
+    if axis.values is not None:
+        return np.array(axis.values, dtype=object if any(isinstance(v, str) for v in axis.values) else None)
+    assert axis.start is not None and axis.stop is not None and axis.num is not None
+    if axis.scale == "log":
+        return np.geomspace(axis.start, axis.stop, axis.num)
+    return np.linspace(axis.start, axis.stop, axis.num)
+
+
+def _quasi_random(axes: list[AxisTable], config: Config) -> Columns:
+    """Sobol or Latin hypercube points over the ranges of some axes, uniform in their scale."""
+    assert config.sweep.points is not None
+    rng = np.random.default_rng(config.sweep.design_seed)
+    if config.sweep.design == "sobol":
+        # the first 2^m points are balanced; any number of them is a prefix
+        power = max(math.ceil(math.log2(config.sweep.points)), 0)
+        unit = qmc.Sobol(len(axes), rng=rng).random_base2(power)[: config.sweep.points]
+    else:
+        unit = qmc.LatinHypercube(len(axes), rng=rng).random(config.sweep.points)
+    columns = {}
+    for axis, u in zip(axes, unit.T, strict=True):
+        assert axis.start is not None and axis.stop is not None
+        if axis.scale == "log":
+            columns[axis.path] = axis.start * (axis.stop / axis.start) ** u
+        else:
+            columns[axis.path] = axis.start + (axis.stop - axis.start) * u
+    return columns

@@ -1,0 +1,126 @@
+"""A whole study, from config to frame: the function behind `jaxbl sweep`."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import pandas as pd
+
+from .config import Config, read_config
+from .engine import Engine, Estimate, Layout, Progress
+from .metrics import describe
+from .points import Points
+from .store import Store
+
+if TYPE_CHECKING:
+    import xarray
+
+
+class StudyResult(NamedTuple):
+    """Points of a study with their metrics.
+
+    Attributes:
+        config: the study.
+        frame: one row a point and seed: axis paths, `seed`, metrics (columns and units: docs/metrics.md).
+        cost: seconds of compilation and of computing, and lanes computed in this call.
+    """
+
+    config: Config
+    frame: pd.DataFrame
+    cost: dict[str, float]
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """The frame as a dataset over the axes and `seed` (zipped axes share one dimension); needs xarray.
+
+        Raises:
+            ValueError: a quasi-random design, which has no grid.
+        """
+        import xarray
+
+        if self.config.sweep.design != "grid":
+            raise ValueError(f"a {self.config.sweep.design} design has no grid; use the frame")
+        dims: list[str] = []
+        along: dict[str, list[str]] = {}
+        for axis in self.config.axes:
+            name = axis.zip or axis.path
+            if name not in along:
+                dims.append(name)
+            along.setdefault(name, []).append(axis.path)
+        leading = [along[dim][0] for dim in dims]
+        dataset = self.frame.set_index([*leading, "seed"]).to_xarray()
+        for dim, paths in along.items():
+            for path in paths[1:]:
+                others = [d for d in dataset[path].dims if d != paths[0]]
+                dataset = dataset.assign_coords({path: dataset[path].isel(dict.fromkeys(others, 0))})
+            if dim != paths[0]:
+                dataset = dataset.rename_dims({paths[0]: dim})
+        for name in dataset.data_vars:
+            about = describe(str(name))
+            dataset[name].attrs = {"units": about.unit, "long_name": about.doc}
+        assert isinstance(dataset, xarray.Dataset)
+        return dataset
+
+
+def sweep(
+    study: str | Path | Mapping[str, Any] | Config,
+    out: str | Path | None = None,
+    *,
+    progress: Progress | None = None,
+    devices: list[Any] | None = None,
+) -> StudyResult:
+    """Run all points of a study.
+
+    Args:
+        study: TOML file, mapping or config.
+        out: folder to keep the results in, chunk by chunk; a study that was interrupted there goes on where it stopped,
+            one that is finished is only read. Without it nothing is written.
+        progress: called with finished and total lanes after each chunk.
+        devices: JAX devices to use; left out, all local ones.
+
+    Raises:
+        InputError: wrong config, or a folder that holds something else.
+    """
+    config = read_config(study)
+    if out is None:
+        engine = Engine(config, devices=devices)
+        frames = []
+        for chunk in engine.chunks():
+            frames.append(engine.run(chunk))
+            if progress:
+                progress(sum(len(frame) for frame in frames), engine.rows)
+        return StudyResult(config, pd.concat(frames, ignore_index=True), _cost(engine, engine.rows))
+    folder = Path(out)
+    engine = Engine(config, devices=devices)
+    store = Store.create(folder, config, engine.layout, len(engine), engine.rows)
+    if store.layout != engine.layout:
+        # taken up on another machine: the chunks must stay what they were
+        engine = Engine(config, Layout(*store.layout), devices)
+    done = computed = 0
+    for chunk in engine.chunks():
+        seeds, points = engine.contents(chunk)
+        if not store.has(chunk.index):
+            store.write(chunk.index, engine.run(chunk))
+            computed += len(seeds) * len(points)
+        done += len(seeds) * len(points)
+        if progress:
+            progress(done, engine.rows)
+    if not store.manifest["finished"]:
+        store.update(finished=True, seconds={"compile": engine.compile_seconds, "run": engine.run_seconds})
+    return StudyResult(config, store.read(), _cost(engine, computed))
+
+
+def load(folder: str | Path) -> StudyResult:
+    """Read a study's folder. Raises `InputError` where there is none."""
+    store = Store.open(Path(folder))
+    return StudyResult(store.config(), store.read(), {})
+
+
+def dry_run(study: str | Path | Mapping[str, Any] | Config) -> Estimate:
+    """What a study will cost, from a compilation and a short calibration run."""
+    return Engine(read_config(study)).estimate()
+
+
+def _cost(engine: Engine, lanes: int) -> dict[str, float]:
+    return {"compile_seconds": engine.compile_seconds, "run_seconds": engine.run_seconds, "lanes": lanes}
+
+

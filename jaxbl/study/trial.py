@@ -1,0 +1,182 @@
+"""One experiment with its whole trace: the function behind `jaxbl simulate`."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from jaxbl.errors import InputError
+from jaxbl.observer.conditions import LEAST_LAMBDA, peak_ratio
+from jaxbl.simulate import Experiment, Signals, State, scan
+
+from .config import Config, read_config
+from .engine import precision, prepare
+from .metrics import METRICS
+
+
+class Trial(NamedTuple):
+    """One run.
+
+    Attributes:
+        config: the study (its axes are not used).
+        trace: one row a sample; `t`, `u`, `theta_e`, `theta_s` as a measured log has them, true values and estimates by
+            side, path of the identified parameters (columns and units: docs/files.md).
+        summary: metrics, identified parameters, gain conditions and remarks, as in `summary.json`.
+    """
+
+    config: Config
+    trace: pd.DataFrame
+    summary: dict[str, Any]
+
+
+def simulate(study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every: int = 1) -> Trial:
+    """Run the experiment of a study once, without its axes.
+
+    Args:
+        study: TOML file, mapping or config.
+        seed: seed of the encoder noise.
+        every: keep every so manieth sample of the trace.
+
+    Raises:
+        InputError: wrong config.
+    """
+    config = read_config(study)
+    if not 1 <= every <= config.run.steps:
+        raise InputError(f"every: should be between 1 and the number of samples {config.run.steps}, not {every}")
+    with precision(config):
+        experiment = prepare(config)
+
+        def keep(state: State, signals: Signals) -> dict[str, Any]:
+            return _row(experiment, state, signals)
+
+        figures, kept = eqx.filter_jit(lambda e, s: scan(e, s, (METRICS,), keep, every))(experiment, jnp.asarray(seed))
+        trace = pd.DataFrame({name: np.asarray(column, dtype=float) for name, column in kept.items()})
+    metrics = {name: _plain(value) for name, value in figures.items()}
+    return Trial(config, trace, _summary(config, trace, metrics, seed))
+
+
+_LOG_NAMES = {"motor": "theta_e", "load": "theta_s"}
+
+
+def _row(experiment: Experiment, state: State, signals: Signals) -> dict[str, Any]:
+    """Columns of the trace at one sample."""
+    row = {"t": signals.time, "u": signals.input}
+    row |= {_LOG_NAMES[side]: signals.side(side).measured for side in experiment.sides}
+    if signals.twist is not None:
+        row["z"] = signals.twist
+    row["torque"] = signals.torque
+    for side in experiment.sides:
+        s = signals.side(side)
+        assert s.true is not None
+        row |= {
+            f"{side}.position": s.true.position,
+            f"{side}.velocity": s.true.velocity,
+            f"{side}.acceleration": s.true.acceleration,
+            f"{side}.position_estimate": s.position_estimate,
+            f"{side}.velocity_estimate": s.velocity_estimate,
+            f"{side}.equivalent_control": s.equivalent_control,
+            f"{side}.torque_estimate": s.torque_estimate,
+        }
+    if state.identifier is not None:
+        assert experiment.identifier is not None and experiment.transmission is not None
+        for side, found in experiment.identifier.estimate(state.identifier, experiment.transmission).items():
+            row |= {f"{side}.{name}": value for name, value in found.items()}
+    return row
+
+
+def _plain(value: Any) -> Any:
+    """A JSON value; what is not finite becomes None."""
+    value = np.asarray(value).item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _summary(config: Config, trace: pd.DataFrame, metrics: dict[str, Any], seed: int) -> dict[str, Any]:
+    experiment = config.build()
+    identified: dict[str, Any] = {}
+    if experiment.transmission is not None:
+        for name, true in experiment.transmission.truth().items():
+            sides = {side: _plain(trace[f"{side}.{name}"].iloc[-1]) for side in experiment.sides}
+            identified[name] = {"true": true, **sides}
+    conditions = {}
+    for side in experiment.sides:
+        f_plus = metrics[f"{side}.f_plus"]
+        if f_plus is not None:
+            conditions[side] = _conditions(getattr(experiment.observer, side), f_plus)
+    return {
+        "title": config.title,
+        "seed": seed,
+        "metrics": metrics,
+        "identified": identified,
+        "conditions": conditions,
+        "remarks": [*config.notes, *_remarks(experiment, trace, metrics, conditions)],
+    }
+
+
+def _conditions(observer: Any, f_plus: float) -> dict[str, Any]:
+    """Gains of an observer against what each condition asks at a bound f_plus (rad/s^2)."""
+    with jax.enable_x64(True):
+        lambda_, alpha, bound = (jnp.asarray(x) for x in (float(observer.lambda_), float(observer.alpha), f_plus))
+        least = {name: _plain(condition(alpha, bound)) for name, condition in LEAST_LAMBDA.items()}
+        rho = _plain(peak_ratio(lambda_, alpha, bound))
+    return {
+        "lambda": float(observer.lambda_),
+        "alpha": float(observer.alpha),
+        "f_plus": f_plus,
+        "alpha_exceeds_f_plus": float(observer.alpha) > f_plus,
+        "least_lambda": least,
+        "holds": {name: value is not None and float(observer.lambda_) > value for name, value in least.items()},
+        "peak_ratio": rho,
+    }
+
+
+_CONDITION_NAMES = {"davila_fridman": "condition (32)", "seeber_horn": "Seeber-Horn", "exact": "the exact condition"}
+
+
+def _remarks(
+    experiment: Experiment, trace: pd.DataFrame, metrics: dict[str, Any], conditions: dict[str, Any]
+) -> list[str]:
+    """What a reader of the figures should know, in sentences."""
+    if not metrics["finite"]:
+        return ["The run diverged: its figures are not finite."]
+    remarks = []
+    largest = float(trace["torque"].abs().max())
+    for side, found in conditions.items():
+        inertia = float(experiment.drive.inertia(side))
+        limit = found["alpha"] * inertia / abs(float(experiment.drive.torque_gain(side)))
+        verdict = "holds" if largest < limit else "fails"
+        remarks.append(
+            f"{side}: alpha = {found['alpha']:g} rad/s² covers the transmitted torque while |C| < {limit:.3g} N m; "
+            f"the largest here is {largest:.3g} N m, so that this {verdict}. The true bound along the run, with the "
+            f"observer's own velocity error in it, is f⁺ = {found['f_plus']:.3g} rad/s²; twice the largest acceleration "
+            f"would be {metrics[f'{side}.f_plus_acceleration']:.3g} rad/s²."
+        )
+        if not found["alpha_exceeds_f_plus"]:
+            remarks.append(f"{side}: alpha is below the true f⁺, so that no condition on lambda can hold.")
+            # what lambda would have to be where alpha does cover the torque
+            torque_bound = largest * abs(float(experiment.drive.torque_gain(side))) / inertia
+            if found["alpha"] > torque_bound:
+                found["torque_bound"] = _conditions(getattr(experiment.observer, side), torque_bound)
+        for label, values in (("the true f⁺", found), ("f⁺ = max |C| / J", found.get("torque_bound"))):
+            if values is None or values["least_lambda"]["exact"] is None:
+                continue
+            for name, least in values["least_lambda"].items():
+                if found["lambda"] <= least:
+                    remarks.append(
+                        f"{side}: lambda = {found['lambda']:g} misses {_CONDITION_NAMES[name]} by a factor of "
+                        f"{least / found['lambda']:.3g} (it asks for more than {least:.3g} at {label})."
+                    )
+        converged = metrics[f"{side}.converged"]
+        if converged and not found["holds"]["exact"]:
+            remarks.append(
+                f"{side}: the observer converged all the same: the conditions are for the worst case, and viscous friction, "
+                "which they leave out, shrinks the error asymptotically."
+            )
+        if not converged:
+            remarks.append(f"{side}: the observer did not stay within its tolerance over the last quarter of the run.")
+    return remarks

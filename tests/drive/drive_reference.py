@@ -1,0 +1,147 @@
+"""An oracle for the drive: the equations of motion written out once more in NumPy, integrated by SciPy to tight tolerance.
+
+Nothing of the physics here comes from the package; :func:`trajectory` runs the package's own plant for comparison.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from jaxbl.drive import DeadZone, Initial, LinearShaft, Plant, Rigid, SigmoidBacklash, TwoInertia, as_arrays
+
+DRIVE = {"motor_inertia": 0.05, "motor_viscous": 0.02, "load_inertia": 0.5, "load_viscous": 0.3, "gear_ratio": 2.0}
+SIGMOID = {"stiffness": 3.0, "dead_zone": 0.02, "slope": 20.0}
+START = {"motor_position": 0.3, "motor_velocity": 6.0, "load_position": -0.1, "load_velocity": 3.0}
+HOLD = 0.125
+TORQUES = np.array([0.4, -0.1, 0.5, 0.1, -0.3, 0.6, 0.2, 0.3])
+
+
+def sigmoid(z):
+    """Law (3) with the constants of `SIGMOID`, in the paper's exponential form."""
+    return 3.0 * (z - 4.0 * 0.02 * (1.0 - np.exp(-20.0 * z)) / (1.0 + np.exp(-20.0 * z)))
+
+
+def right_side(t, y, u, law, effects):
+    """d/dt of (theta_e, theta_s, omega_e, omega_s, lagged torque) under a commanded torque u, sliding forwards only."""
+
+    def value(effect, key):
+        return effects.get(effect, {}).get(key, 0.0)
+
+    def side(name, v):
+        stribeck = f"{name}.stribeck_friction"
+        falling = (value(stribeck, "breakaway_torque") - value(stribeck, "torque")) * np.exp(
+            -((v / effects[stribeck]["stribeck_velocity"]) ** 2) if stribeck in effects else 0.0
+        )
+        dry = value(f"{name}.coulomb_friction", "torque") + value(stribeck, "torque") + falling
+        return (
+            dry * np.sign(v)
+            + value(f"{name}.viscous_friction", "viscous") * v
+            + value(f"{name}.quadratic_drag", "drag") * abs(v) * v
+            + value(f"{name}.constant_torque", "torque")
+        )
+
+    theta_e, theta_s, omega_e, omega_s, lagged = y
+    u = u * (1.0 + value("actuator.gain_error", "relative"))
+    if "actuator.saturation" in effects:
+        u = min(max(u, -value("actuator.saturation", "limit")), value("actuator.saturation", "limit"))
+    u_dot = 0.0
+    if "actuator.lag" in effects:
+        u, u_dot = lagged, (u - lagged) / value("actuator.lag", "time_constant")
+
+    amplitude, n, phase = (value("transmission.eccentricity", key) for key in ("amplitude", "harmonic", "phase"))
+    ratio = DRIVE["gear_ratio"] - amplitude * n * np.cos(n * theta_s + phase)
+    z = theta_e - DRIVE["gear_ratio"] * theta_s + amplitude * np.sin(n * theta_s + phase)
+    z_dot = omega_e - ratio * omega_s
+    half_gap = value("transmission.backlash", "half_gap")
+    if abs(z) < half_gap:
+        z, z_dot = 0.0, 0.0
+    else:
+        z -= half_gap * np.sign(z)
+    torque = law(z)
+    torque += value("transmission.hardening", "cubic_stiffness") * z**3 + value("transmission.damping", "damping") * z_dot
+
+    at_motor = side("motor", omega_e) + value("motor.cogging", "amplitude") * np.sin(
+        value("motor.cogging", "harmonic") * theta_e + value("motor.cogging", "phase")
+    )
+    at_load = side("load", omega_s)
+    at_load += value("load.gravity", "torque") * np.sin(theta_s - value("load.gravity", "phase"))
+    at_load += value("load.periodic_disturbance", "amplitude") * np.sin(
+        2.0 * np.pi * value("load.periodic_disturbance", "frequency") * t + value("load.periodic_disturbance", "phase")
+    )
+    omega_e_dot = (u - torque - DRIVE["motor_viscous"] * omega_e - at_motor) / (
+        DRIVE["motor_inertia"] + value("motor.inertia", "inertia")
+    )
+    omega_s_dot = (ratio * torque - DRIVE["load_viscous"] * omega_s - at_load) / (
+        DRIVE["load_inertia"] + value("load.inertia", "inertia")
+    )
+    return [omega_e, omega_s, omega_e_dot, omega_s_dot, u_dot]
+
+
+def reference(law=sigmoid, effects=None, start=START, torques=TORQUES, hold=HOLD):
+    """(theta_e, theta_s, omega_e, omega_s) at the end of each hold, shape (holds, 4)."""
+    y = [start["motor_position"], start["load_position"], start["motor_velocity"], start["load_velocity"], 0.0]
+    states = []
+    for k, u in enumerate(torques):
+        # max_step: an adaptive step must not leap over a gap
+        solution = solve_ivp(
+            right_side,
+            (k * hold, (k + 1) * hold),
+            y,
+            method="DOP853",
+            rtol=1e-12,
+            atol=1e-13,
+            max_step=0.02,
+            args=(u, law, effects or {}),
+        )
+        y = solution.y[:, -1]
+        states.append(y[:4])
+    return np.array(states)
+
+
+def plant(*effects, law=None, dtype=jnp.float64, **changes):
+    """The package's plant with the constants of `DRIVE`."""
+    law = SigmoidBacklash(**SIGMOID) if law is None else law
+    return as_arrays(Plant(TwoInertia(**(DRIVE | changes)), law, effects), dtype)
+
+
+def block(*effects, inertia=0.05, viscous=0.0, dtype=jnp.float64):
+    """A single inertia on whatever the effects make of its support."""
+    return as_arrays(Plant(Rigid(motor_inertia=inertia, motor_viscous=viscous), None, effects), dtype)
+
+
+@eqx.filter_jit
+def _trajectory(plant, initial, torques, substeps, hold):
+    step = hold / substeps.astype(hold.dtype)
+
+    def over(carry, torque):
+        state, start = carry
+
+        def advance(i, state):
+            return plant.advance(state, torque, start + i.astype(hold.dtype) * step, step)
+
+        state = jax.lax.fori_loop(0, substeps, advance, state)
+        sides = [(part, side) for part in (state.position, state.velocity) for side in plant.drive.sides]
+        return (state, start + hold), jnp.stack([part[side] for part, side in sides])
+
+    return jax.lax.scan(over, (plant.init(initial), jnp.zeros_like(hold)), torques)[1]
+
+
+def trajectory(plant, substeps, start=START, torques=TORQUES, hold=HOLD, dtype=jnp.float64):
+    """The package's counterpart of :func:`reference`: positions, then velocities, at the end of each hold."""
+    initial, torques, hold = as_arrays((Initial(**start), jnp.asarray(torques, dtype), float(hold)), dtype)
+    states = _trajectory(plant, initial, torques, jnp.asarray(substeps), hold)
+    assert states.dtype == dtype
+    return np.asarray(states)
+
+
+LAWS = {
+    "sigmoid_backlash": (SigmoidBacklash(**SIGMOID), sigmoid),
+    "linear_shaft": (LinearShaft(stiffness=3.0), lambda z: 3.0 * z),
+    "dead_zone": (
+        DeadZone(stiffness=3.0, half_gap=0.05),
+        lambda z: 3.0 * (z - 0.05) if z > 0.05 else 3.0 * (z + 0.05) if z < -0.05 else 0.0,
+    ),
+}
+"""Law by name: the package's, and the same in NumPy."""

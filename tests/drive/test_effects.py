@@ -1,0 +1,252 @@
+"""Every effect against equations written out independently; dry friction against closed forms; other packages' effects."""
+
+import inspect
+import types
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from drive_reference import HOLD, START, TORQUES, block, plant, reference, trajectory
+
+from jaxbl.drive import LinearShaft, Plant, TwoInertia, as_arrays, effect_class, effect_kinds, effects, parameters
+from jaxbl.drive.effects import CoulombFriction, Motion, SideEffect, StribeckFriction
+from jaxbl.drive.parameters import parameter
+
+DTYPES = pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+
+VALUES = {
+    "motor.coulomb_friction": {"torque": 0.03},
+    "load.coulomb_friction": {"torque": 0.1},
+    "motor.stribeck_friction": {"torque": 0.02, "breakaway_torque": 0.05, "stribeck_velocity": 4.0},
+    "load.stribeck_friction": {"torque": 0.1, "breakaway_torque": 0.2, "stribeck_velocity": 2.0},
+    "motor.viscous_friction": {"viscous": 0.05},
+    "load.viscous_friction": {"viscous": -0.1},
+    "motor.quadratic_drag": {"drag": 0.005},
+    "load.quadratic_drag": {"drag": 0.05},
+    "motor.constant_torque": {"torque": 0.1},
+    "load.constant_torque": {"torque": -0.2},
+    "motor.inertia": {"inertia": 0.02},
+    "load.inertia": {"inertia": -0.1},
+    "load.gravity": {"torque": 0.5, "phase": 0.4},
+    "load.periodic_disturbance": {"amplitude": 0.5, "frequency": 2.0, "phase": 0.5},
+    "motor.cogging": {"amplitude": 0.1, "harmonic": 6.0, "phase": 0.3},
+    "transmission.backlash": {"half_gap": 0.04},
+    "transmission.hardening": {"cubic_stiffness": 20.0},
+    "transmission.damping": {"damping": 0.1},
+    "transmission.eccentricity": {"amplitude": 0.05, "harmonic": 3.0, "phase": 0.7},
+    "actuator.gain_error": {"relative": 0.1},
+    "actuator.saturation": {"limit": 0.25},
+    "actuator.lag": {"time_constant": 0.05},
+}
+"""Numbers large enough to be seen; both sides keep turning forwards, so that dry friction slides throughout."""
+
+
+def made(values):
+    return [effect_kinds()[name](**numbers) for name, numbers in values.items()]
+
+
+def errors(values, substeps):
+    expected = reference(effects=values)
+    assert expected[:, 2:].min() > 0.1  # sliding forwards
+    return [np.abs(trajectory(plant(*made(values)), n) - expected).max() for n in substeps]
+
+
+def test_the_names_are_the_contract():
+    assert set(effect_kinds()) == set(VALUES)
+    for name, effect in zip(VALUES, made(VALUES), strict=True):
+        assert effect.name == name
+        assert inspect.getdoc(effect_class(name)) and list(parameters(effect))
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_each_effect_is_what_its_equation_says_to_second_order(name):
+    values = {name: VALUES[name]}
+    coarse, fine = errors(values, (128, 1024))
+    assert np.abs(reference(effects=values) - reference()).max() > 0.1  # it matters
+    # a hard gap is only piecewise smooth: of second order in the mean
+    tolerance = 0.2 if name == "transmission.backlash" else 0.01
+    assert np.log2(coarse / fine) / 3.0 == pytest.approx(2.0, abs=tolerance)
+    assert fine < 3e-5
+
+
+def test_effects_add_up_in_any_order():
+    values = {name: numbers for name, numbers in VALUES.items() if name != "transmission.backlash"}
+    coarse, fine = errors(values, (256, 1024))
+    assert np.log2(coarse / fine) / 2.0 == pytest.approx(2.0, abs=0.02)
+    # the actuator is a chain, and keeps its order
+    shuffled = sorted(made(values), key=lambda effect: (effect.place == "actuator", effect.place))
+    there, back = (trajectory(plant(*order), 64) for order in (made(values), shuffled))
+    np.testing.assert_allclose(there, back, rtol=1e-11)
+
+
+def test_damping_and_hardening_act_on_the_deflection_that_a_gap_leaves():
+    values = {name: VALUES[f"transmission.{name.split('.')[1]}"] for name in VALUES if name.startswith("transmission.")}
+    # damping sets in with a jump at the edges of the gap: of first order there
+    coarse, fine = errors(values, (1024, 16384))
+    assert fine < 1e-4 and fine < coarse / 8.0
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_float32_stays_float32_and_close(name):
+    effect = made({name: VALUES[name]})
+    double, single = (trajectory(plant(*effect, dtype=dtype), 32, dtype=dtype) for dtype in (jnp.float64, jnp.float32))
+    np.testing.assert_allclose(single, double, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["motor.viscous_friction", "load.quadratic_drag"])
+def test_drags_are_odd(name):
+    (effect,) = made({name: VALUES[name]})
+    assert effect.resist(Motion(0.0, 0.0, 2.0)) == -effect.resist(Motion(0.0, 0.0, -2.0)) != 0.0
+
+
+# Dry friction. A block is the rigid drive, J = 0.05, without viscous friction.
+
+COULOMB = CoulombFriction(side="motor", torque=0.1)
+STRIBECK = StribeckFriction(side="motor", torque=0.05, breakaway_torque=0.1, stribeck_velocity=0.2)
+REST = dict.fromkeys(START, 0.0)
+
+
+def moved(friction, torque, seconds, dtype=jnp.float64, velocity=0.0, **block_values):
+    """Position and velocity of a block at every default sample (1 ms in 10 substeps) under a constant torque."""
+    torques = np.full(round(seconds * 1000), torque)
+    start = REST | {"motor_velocity": velocity}
+    return trajectory(block(friction, dtype=dtype, **block_values), 10, start, torques, 1e-3, dtype).T
+
+
+@DTYPES
+@pytest.mark.parametrize("friction", [COULOMB, STRIBECK])
+@pytest.mark.parametrize("torque", [0.0999, -0.0999, 0.05])
+def test_a_block_below_breakaway_does_not_creep_at_all(friction, torque, dtype):
+    assert not moved(friction, torque, 10.0, dtype).any()
+
+
+@DTYPES
+def test_a_load_below_breakaway_does_not_creep_at_all(dtype):
+    weight = made({"load.constant_torque": {"torque": 0.3}, "motor.coulomb_friction": {"torque": 0.02}})
+    drive = plant(*weight, CoulombFriction(side="load", torque=0.31), dtype=dtype)
+    # the motor holds too, and with it the load sees its weight alone
+    assert not trajectory(drive, 10, REST, np.full(10_000, 0.019), 1e-3, dtype).any()
+    free = trajectory(plant(*weight, CoulombFriction(side="load", torque=0.29), dtype=dtype), 10, REST, [0.0] * 99, 1e-3, dtype)
+    assert free[-1, 1] < 0.0
+
+
+def test_a_block_above_breakaway_accelerates_as_the_closed_form_says():
+    time = 1e-3 * np.arange(1, 2001)
+    position, velocity = moved(COULOMB, -0.11, 2.0)
+    np.testing.assert_allclose(velocity, -0.01 / 0.05 * time, rtol=1e-9)
+    np.testing.assert_allclose(position, -0.5 * 0.01 / 0.05 * time**2, rtol=1e-9)
+    # with viscous friction v = (u - F) / f (1 - exp(-f t / J)): viscous friction is of second order in the step
+    position, velocity = moved(COULOMB, 0.15, 2.0, viscous=0.1)
+    np.testing.assert_allclose(velocity, 0.5 * (1.0 - np.exp(-2.0 * time)), atol=1e-8)
+    np.testing.assert_allclose(position, 0.5 * (time - 0.5 * (1.0 - np.exp(-2.0 * time))), atol=1e-8)
+
+
+@DTYPES
+def test_a_sliding_block_stops_where_and_when_the_closed_form_says_and_stays(dtype):
+    velocity = 1.2345
+    position, speed = moved(COULOMB, 0.03, 10.0, dtype, velocity=velocity)
+    deceleration = (0.1 - 0.03) / 0.05
+    stop = velocity / deceleration
+    # it stops within one substep of h = 1e-4 s, so at most a h^2 / 2 off
+    assert position[-1] == pytest.approx(0.5 * velocity * stop, abs=deceleration * 1e-8 if dtype == jnp.float64 else 1e-4)
+    moving = np.count_nonzero(speed)
+    assert moving * 1e-3 == pytest.approx(stop, abs=1.1e-3)
+    assert not speed[moving:].any() and (position[moving:] == position[-1]).all()
+
+
+def test_stribeck_friction_holds_what_it_would_let_slide():
+    """Between sliding friction and break-away: at rest it stays, in motion it goes on."""
+    assert not moved(STRIBECK, 0.08, 2.0).any()
+    time = 2.0
+    position, velocity = moved(STRIBECK, 0.08, time, velocity=2.0)
+    # far above the Stribeck velocity friction is F_c
+    assert velocity[-1] == pytest.approx(2.0 + (0.08 - 0.05) / 0.05 * time, rel=1e-9)
+    assert moved(STRIBECK, 0.1001, time)[0][-1] > 0.01  # above break-away it runs away
+
+
+@DTYPES
+def test_a_block_on_a_spring_loses_two_friction_deflections_a_swing_and_sticks(dtype):
+    """The load held fast by its own friction, the motor swings on the shaft: x -> -(x - 2 F / K), until |x| <= F / K."""
+    stiffness, level, inertia, start = 2.0, 0.05, 0.05, 0.33
+    frictions = (CoulombFriction(side="motor", torque=level), CoulombFriction(side="load", torque=10.0))
+    drive = as_arrays(Plant(TwoInertia(inertia, 0.0, 1.0, 0.0, 2.0), LinearShaft(stiffness), frictions), dtype)
+    states = trajectory(drive, 10, REST | {"motor_position": start}, np.zeros(10_000), 1e-3, dtype)
+    motor, load = states[:, 0], states[:, 1]
+    assert not load.any()
+    turning = [start]
+    while abs(turning[-1]) > level / stiffness:
+        turning.append(-np.sign(turning[-1]) * (abs(turning[-1]) - 2.0 * level / stiffness))
+    half_period = np.pi * np.sqrt(inertia / stiffness)
+    at = np.round(half_period * np.arange(1, len(turning)) * 1000).astype(int) - 1
+    tolerance = 3e-6 if dtype == jnp.float64 else 2e-5
+    np.testing.assert_allclose(motor[at], turning[1:], atol=tolerance)
+    assert (motor[at[-1] + 2 :] == motor[-1]).all()
+    assert motor[-1] == pytest.approx(turning[-1], abs=tolerance)
+
+
+# Effects of other packages.
+
+
+class TorsionSpring(SideEffect):
+    """A spring to the housing."""
+
+    kind = "torsion_spring"
+    spring_stiffness: float = parameter("N m/rad", "stiffness", above=0.0)
+
+    def resist(self, motion):
+        return self.spring_stiffness * motion.position
+
+
+@pytest.fixture
+def installed(monkeypatch):
+    """Pretend that packages with these entry points are installed."""
+
+    def install(**found):
+        def entry_points(*, group):
+            assert group == "jaxbl.effects"
+            return [types.SimpleNamespace(name=name, load=lambda value=value: value) for name, value in found.items()]
+
+        monkeypatch.setattr(effects, "entry_points", entry_points)
+        effect_kinds.cache_clear()
+
+    yield install
+    effect_kinds.cache_clear()
+
+
+def test_other_packages_add_effects_through_entry_points(installed):
+    installed(**{"motor.torsion_spring": TorsionSpring})
+    assert effect_class("motor.torsion_spring") is TorsionSpring
+    assert set(effect_kinds()) == {*VALUES, "motor.torsion_spring"}
+    spring = effect_kinds()["motor.torsion_spring"](side="motor", spring_stiffness=0.8)
+    assert spring.name == "motor.torsion_spring"
+    # omega = 4 rad/s
+    states = trajectory(block(spring), 10, REST | {"motor_position": 0.5}, np.zeros(1000), 1e-3)
+    np.testing.assert_allclose(states[:, 0], 0.5 * np.cos(4e-3 * np.arange(1, 1001)), atol=1e-7)
+
+
+def test_other_packages_cannot_replace_a_built_in_effect(installed):
+    installed(**{"motor.coulomb_friction": TorsionSpring})
+    assert effect_class("motor.coulomb_friction") is CoulombFriction
+
+
+def test_effects_are_leaves_of_a_grid():
+    """One compiled program serves a batch of friction levels, each lane as if alone."""
+    levels = jnp.asarray([0.0, 0.05, 0.2])
+    run = jax.vmap(
+        lambda level: _end(eqx.tree_at(lambda p: p.effects[0].torque, plant(CoulombFriction(side="motor", torque=0.0)), level))
+    )
+    together = run(levels)
+    alone = [_end(plant(CoulombFriction(side="motor", torque=float(level)))) for level in levels]
+    np.testing.assert_allclose(together, alone, rtol=1e-13)
+    assert len(np.unique(together)) == 3
+
+
+def _end(drive):
+    from jaxbl.drive import Initial
+
+    state = drive.init(as_arrays(Initial(**START), jnp.float64))
+    for i, torque in enumerate(TORQUES):
+        state = drive.advance(state, jnp.asarray(torque), jnp.asarray(i * HOLD), jnp.asarray(HOLD))
+    return state.position["motor"]

@@ -1,0 +1,175 @@
+"""The recursive identifier against batch least squares, the paper's differential form, and long float32 runs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from jaxbl.drive import DeadZone, LinearShaft, SigmoidBacklash, as_arrays
+from jaxbl.observer import EquivalentControl, Identifier
+
+SIGMOID = SigmoidBacklash(1.0, 0.02, 20.0)
+LAWS = [SIGMOID, LinearShaft(2.0), DeadZone(3.0, 0.05)]
+H = 1e-3
+
+
+def identify(identifier, law, z, torques, time_constant=0.0, dtype=jnp.float64):
+    """Last state, estimates and excitation after twists z (rad) and torques (N m) of the sides, one a millisecond."""
+    identifier, law, low_pass = as_arrays((identifier, law, EquivalentControl(time_constant)), dtype)
+    z = jnp.asarray(z, dtype)
+    torques = {side: jnp.asarray(torque, dtype) for side, torque in torques.items()}
+    h = jnp.asarray(H, dtype)
+
+    def one(state, given):
+        i, z, torques = given
+        return identifier.step(state, law, low_pass, z, torques, i.astype(dtype) * h, h), None
+
+    def run():
+        start = identifier.init(law, tuple(torques), jnp.asarray(0.0, dtype))
+        state, _ = jax.lax.scan(one, start, (jnp.arange(z.size), z, torques))
+        return state, identifier.information(state), identifier.estimate(state, law), identifier.excitation(state)
+
+    return jax.jit(run)()
+
+
+def record(law, size=4000, noise=0.05, seed=0):
+    """Twists that work the law, and a noisy torque of each side."""
+    random = np.random.default_rng(seed)
+    z = 0.3 * np.sin(3.0 * H * np.arange(size)) + 0.05 * random.normal(size=size)
+    torque = np.asarray(law.torque(law.deflection(jnp.asarray(z))))
+    return z, {side: torque + noise * random.normal(size=size) for side in ("motor", "load")}
+
+
+def numpy_regressors(law, z):
+    match law:
+        case SigmoidBacklash():
+            e = np.exp(-law.slope * z)
+            return np.stack([z, -4.0 * (1.0 - e) / (1.0 + e)], 1)
+        case LinearShaft():
+            return z[:, None]
+        case DeadZone():
+            contact = 1.0 * (np.abs(z) > law.half_gap)
+            return np.stack([contact * z, -contact * np.sign(z)], 1)
+
+
+def parameters_of(law, theta):
+    match law:
+        case SigmoidBacklash():
+            return {"stiffness": theta[0], "dead_zone": theta[1] / theta[0], "half_gap": 4.0 * theta[1] / theta[0]}
+        case LinearShaft():
+            return {"stiffness": theta[0]}
+        case DeadZone():
+            return {"stiffness": theta[0], "half_gap": theta[1] / theta[0]}
+
+
+@pytest.mark.parametrize("regressor_filter", ["none", "matched"])
+@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
+def test_least_squares_of_both_sides(law, regressor_filter):
+    """With forgetting, a delayed start, and the low-pass of one sample's delay on phi where it is matched."""
+    z, torques = record(law)
+    forgetting, start, time_constant = 0.999, 501, 0.01
+    identifier = Identifier(start * H, forgetting, regressor_filter)
+    _, _, estimates, _ = identify(identifier, law, z, torques, time_constant)
+    phi = numpy_regressors(law, z)
+    if regressor_filter == "matched":
+        filtered, late = np.zeros_like(phi), np.zeros(phi.shape[1])
+        for i, raw in enumerate(phi):
+            filtered[i] = late
+            late = late + (1.0 - np.exp(-H / time_constant)) * (raw - late)
+        phi = filtered
+    root_weight = np.sqrt(forgetting ** np.arange(z.size)[::-1])[start:, None]
+    for side, torque in torques.items():
+        theta, *_ = np.linalg.lstsq(root_weight * phi[start:], root_weight[:, 0] * torque[start:])
+        expected = parameters_of(law, theta)
+        assert estimates[side].keys() == expected.keys()
+        for name, value in expected.items():
+            np.testing.assert_allclose(estimates[side][name], value, rtol=1e-9)
+    assert estimates["motor"]["stiffness"] != estimates["load"]["stiffness"]
+
+
+def test_sums_are_the_solution_of_the_papers_differential_form():
+    """(27)-(28), integrated by SciPy from a large covariance, on a torque that no parameters explain exactly."""
+    duration = 4.0
+
+    def z(t):
+        return 0.3 * np.sin(3.0 * t)
+
+    def torque(t):
+        return z(t) - 0.08 * np.tanh(10.0 * z(t)) + 0.02 * np.sin(7.0 * t)
+
+    def right(t, y):
+        estimate, covariance = y[:2], y[2:].reshape(2, 2)
+        phi = numpy_regressors(SIGMOID, np.array([z(t)]))[0]
+        change = -covariance @ np.outer(phi, phi) @ covariance
+        return np.concatenate([(torque(t) - estimate @ phi) * (phi @ covariance), change.ravel()])
+
+    start = np.concatenate([np.zeros(2), 1e8 * np.eye(2).ravel()])
+    theta = solve_ivp(right, (0.0, duration), start, method="LSODA", rtol=1e-9, atol=1e-12).y[:2, -1]
+    t = H * (np.arange(round(duration / H)) + 0.5)
+    _, _, estimates, _ = identify(Identifier(0.0, 1.0, "none"), SIGMOID, z(t), {"motor": torque(t)})
+    for name, value in parameters_of(SIGMOID, theta).items():
+        np.testing.assert_allclose(estimates["motor"][name], value, rtol=1e-4)
+    # neither is the truth
+    assert abs(theta[0] - 1.0) > 1e-2
+
+
+def test_a_million_samples_in_float32():
+    """Positive and accurate to float32's own rounding, which plain sums are not."""
+    z, torques = record(SIGMOID, 1_000_000)
+    z, torques = z.astype(np.float32), {side: torque.astype(np.float32) for side, torque in torques.items()}
+    identifier = Identifier(0.0, 1.0, "none")
+    state, information, estimates, excitation = identify(identifier, SIGMOID, z, torques, dtype=jnp.float32)
+    _, exact, true, true_excitation = identify(identifier, SIGMOID, z, torques)
+    assert information.dtype == jnp.float32
+    np.testing.assert_array_equal(information, information.T)
+    assert np.all(np.linalg.eigvalsh(np.asarray(information, float)) > 0.0)
+    np.testing.assert_allclose(information, exact, rtol=3e-7)
+    np.testing.assert_allclose(excitation, true_excitation, rtol=1e-4)
+    for name in ("stiffness", "dead_zone"):
+        np.testing.assert_allclose(estimates["motor"][name], true["motor"][name], rtol=1e-5)
+    # the correction is at work: it is more than the final rounding, and a plain float32 sum is worse by far
+    plain = np.cumsum(z * z, dtype=np.float32)[-1]
+    assert abs(plain / exact[0, 0] - 1.0) > 3e-6
+    assert any(float(total.error) != 0.0 for total in state.information)
+
+
+def test_start_and_forgetting_in_the_plain_sums():
+    """The sample at `start` is the first to count, in float32 too, and each later one weighs the earlier ones down."""
+    z = np.array([5.0, 7.0, 1.0, 2.0, 3.0])
+    for dtype in (jnp.float32, jnp.float64):
+        identifier = Identifier(2 * H, 0.5, "none")
+        _, information, estimates, _ = identify(identifier, LinearShaft(1.0), z, {"motor": 4.0 * z}, dtype=dtype)
+        np.testing.assert_allclose(information, [[0.25 * 1.0 + 0.5 * 4.0 + 9.0]])
+        np.testing.assert_allclose(estimates["motor"]["stiffness"], 4.0)
+
+
+@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
+def test_nan_without_excitation(law):
+    at_rest = np.zeros(100)
+    _, _, estimates, excitation = identify(Identifier(), law, at_rest, {"motor": at_rest})
+    assert all(np.isnan(value) for value in estimates["motor"].values())
+    assert excitation == 0.0
+    # before the start nothing is known either
+    z, torques = record(law, 100)
+    _, _, estimates, excitation = identify(Identifier(1.0), law, z, torques)
+    assert all(np.isnan(value) for side in estimates.values() for value in side.values())
+    assert excitation == 0.0
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_one_twist_does_not_determine_two_unknowns(dtype):
+    held = np.full(100, 0.3)
+    _, _, estimates, excitation = identify(Identifier(regressor_filter="none"), SIGMOID, held, {"motor": held}, dtype=dtype)
+    assert all(np.isnan(value) for value in estimates["motor"].values())
+    assert abs(excitation) < 1e-6
+
+
+def test_excitation_is_the_least_eigenvalue_of_the_normalised_matrix():
+    z, torques = record(SIGMOID)
+    _, information, _, excitation = identify(Identifier(regressor_filter="none"), SIGMOID, z, torques)
+    information = np.asarray(information)
+    scale = 1.0 / np.sqrt(np.diag(information))
+    np.testing.assert_allclose(excitation, np.linalg.eigvalsh(information * np.outer(scale, scale))[0], rtol=1e-9)
+    _, _, _, single = identify(Identifier(), LinearShaft(1.0), z, torques)
+    assert single == 1.0

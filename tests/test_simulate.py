@@ -1,0 +1,309 @@
+"""The whole chain: the figures it has to reach, its noise, lanes, records, derivatives, and an independent copy of it."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from paper_drive import DRIVE, paper
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+from scipy.signal import lfilter
+
+from jaxbl.drive import Encoders, Initial, Rigid, set_leaves
+from jaxbl.drive.effects import ConstantTorque, CoulombFriction
+from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, Observers
+from jaxbl.simulate import Reducer, scan, unit_noise
+from jaxbl.study.metrics import METRICS
+
+SEED = jnp.asarray(3)
+
+
+def everything(state, signals):
+    return signals
+
+
+@eqx.filter_jit
+def figures(experiment, seed=SEED):
+    return scan(experiment, seed, (METRICS,))[0]
+
+
+@eqx.filter_jit
+def trace(experiment, seed=SEED, every=1):
+    return scan(experiment, seed, record=everything, every=every)[1]
+
+
+def identification_errors(result):
+    return {
+        name: [abs(float(result[f"{side}.{name}"])) for side in ("motor", "load")]
+        for name in ("stiffness_error", "dead_zone_error")
+    }
+
+
+def test_torque_of_the_implicit_observer_needs_no_low_pass():
+    result, torque = eqx.filter_jit(lambda e: scan(e, SEED, (METRICS,), record=lambda s, g: g.torque))(paper())
+    rms = np.sqrt(np.mean(np.square(torque[15_000:])))
+    assert result["motor.torque_rmse"] < 0.01 * rms
+    assert result["load.torque_rmse"] < 0.01 * rms
+
+
+@pytest.mark.parametrize(("discretisation", "time_constant"), [("implicit", 0.0), ("implicit", 0.02), ("explicit", 0.02)])
+def test_stiffness_and_dead_zone_by_both_sides(discretisation, time_constant):
+    errors = identification_errors(figures(paper(discretisation, time_constant=time_constant)))
+    assert max(errors["stiffness_error"]) < 0.01
+    assert max(errors["dead_zone_error"]) < 0.005
+
+
+@pytest.mark.parametrize("discretisation", ["implicit", "explicit"])
+def test_matched_regressor_beats_none_in_the_dead_zone(discretisation):
+    matched, none = (
+        identification_errors(figures(paper(discretisation, time_constant=0.02, regressor_filter=kind)))
+        for kind in ("matched", "none")
+    )
+    for ours, papers in zip(matched["dead_zone_error"], none["dead_zone_error"], strict=True):
+        assert 5.0 * ours < papers
+
+
+def independent(experiment, noise, steps):
+    """The implicit chain again, of SciPy's parts: integrator on the smooth law, root finder, filter, least squares."""
+    h, time_constant, start = 1e-3, 0.01, 100
+    je, fe, js, fs, n0 = 0.05, 0.15, 7.0, 16.0, 5.0
+
+    def law(z):
+        return z - 0.08 * (1.0 - np.exp(-20.0 * z)) / (1.0 + np.exp(-20.0 * z))
+
+    def right(u):
+        def f(t, s):
+            c = law(s[0] - n0 * s[2])
+            return [s[1], (u - c - fe * s[1]) / je, s[3], (n0 * c - fs * s[3]) / js]
+
+        return f
+
+    def correction(b, lambda_, alpha):
+        reach = h * h * alpha
+        if abs(b) <= reach:
+            return 0.0, b / (h * h)
+        size = brentq(lambda e: e + h * lambda_ * np.sqrt(e) + reach - abs(b), 0.0, abs(b), xtol=1e-18, rtol=1e-14)
+        return np.sign(b) * size, np.sign(b) * alpha
+
+    plant = np.array([0.05, -0.2, 0.004, 0.03])
+    truth, measured, estimates = [], [], {"motor": [], "load": []}
+    predicted = {"motor": [plant[0] - 0.01, plant[1] - 0.5], "load": [plant[2], plant[3]]}
+    parts = {"motor": (4.0, 9.0, fe / je), "load": (0.5, 0.2, fs / js)}
+    for i in range(steps):
+        u = 0.1 * np.sin(2.0 * np.pi * 0.16 * i * h)
+        truth.append(plant)
+        measured.append(plant[[0, 2]] + np.array([1e-4, 2e-5]) * noise[i])
+        for j, (side, (lambda_, alpha, damping)) in enumerate(parts.items()):
+            drive = u / je if side == "motor" else 0.0
+            x, v = predicted[side]
+            e, z2 = correction(measured[-1][j] - x, lambda_, alpha)
+            x, v = measured[-1][j] - e, v + h * z2
+            estimates[side].append([x, v, z2])
+            # nominal acceleration at the mean velocity over the coming step
+            mean = drive - damping * (v + h * (z2 + 0.5 * (drive - damping * v)))
+            predicted[side] = [x + h * (v + 0.5 * h * mean), v + h * mean]
+        plant = solve_ivp(right(u), (0.0, h), plant, method="DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
+    truth, measured = np.array(truth), np.array(measured)
+    share = -np.expm1(-h / time_constant)
+
+    def low_pass(x):
+        return lfilter([share], [1.0, share - 1.0], x, axis=0)
+
+    z = measured[:, 0] - n0 * measured[:, 1]
+    phi = low_pass(np.stack([z, -4.0 * np.tanh(10.0 * z)], 1))
+    found = {}
+    for side, scale in (("motor", -je), ("load", js / n0)):
+        estimate = np.array(estimates[side])
+        torque = scale * low_pass(estimate[:, 2])
+        # the equivalent control of a sample belongs to the twist of the one before
+        theta, *_ = np.linalg.lstsq(phi[start - 1 : -1], torque[start:])
+        found[side] = estimate, torque, (theta[0], theta[1] / theta[0])
+    return truth, measured, law(truth[:, 0] - n0 * truth[:, 2]), found
+
+
+def test_whole_trace_against_an_independent_copy():
+    steps = 400
+    experiment = paper(
+        time_constant=0.01,
+        start=0.1,
+        steps=steps,
+        initial=Initial(0.05, -0.2, 0.004, 0.03),
+        encoders=Encoders(1e-4),
+        observer=Observers(
+            ImplicitSuperTwisting(4.0, 9.0, position_error=0.01, velocity_error=0.5), ImplicitSuperTwisting(0.5, 0.2)
+        ),
+    )
+    signals = trace(experiment)
+    result = figures(experiment)
+    noise = unit_noise(SEED, jnp.arange(steps), experiment.sides)
+    truth, measured, torque, found = independent(experiment, np.stack([noise["motor"], noise["load"]], 1), steps)
+    np.testing.assert_allclose(signals.time, 1e-3 * np.arange(steps), rtol=1e-14)
+    np.testing.assert_allclose(signals.input, 0.1 * np.sin(2.0 * np.pi * 0.16 * signals.time), rtol=1e-12)
+    # the plant's own second order, at 0.1 ms, is what differs
+    np.testing.assert_allclose(signals.torque, torque, atol=1e-9)
+    np.testing.assert_allclose(signals.twist, measured[:, 0] - 5.0 * measured[:, 1], atol=1e-9)
+    for j, side in enumerate(("motor", "load")):
+        mine = signals.side(side)
+        estimate, reconstructed, (stiffness, dead_zone) = found[side]
+        position, velocity = truth[:, 2 * j], truth[:, 2 * j + 1]
+        np.testing.assert_allclose(mine.measured, measured[:, j], atol=1e-9)
+        np.testing.assert_allclose(mine.true.position, position, atol=1e-9)
+        np.testing.assert_allclose(mine.true.velocity, velocity, atol=1e-7)
+        np.testing.assert_allclose(mine.true.acceleration[:-1], np.diff(velocity) / 1e-3, atol=2e-5)
+        np.testing.assert_allclose(mine.position_estimate, estimate[:, 0], atol=1e-8)
+        np.testing.assert_allclose(mine.velocity_estimate, estimate[:, 1], atol=1e-6)
+        np.testing.assert_allclose(mine.torque_estimate, reconstructed, atol=1e-3 * np.abs(reconstructed).max())
+        nominal = (signals.input if side == "motor" else 0.0) - DRIVE.viscous(side) * mine.velocity_estimate
+        np.testing.assert_allclose(
+            mine.true.perturbation, mine.true.acceleration - nominal / DRIVE.inertia(side), atol=1e-12
+        )
+        np.testing.assert_allclose(result[f"{side}.stiffness_error"], stiffness / 1.0 - 1.0, atol=1e-4)
+        np.testing.assert_allclose(result[f"{side}.dead_zone_error"], dead_zone / 0.02 - 1.0, atol=1e-4)
+
+
+def test_unit_noise_is_a_function_of_seed_and_index():
+    sides = ("motor", "load")
+    whole = unit_noise(SEED, jnp.arange(20_000), sides)
+    part = unit_noise(SEED, jnp.arange(777, 1000), sides)
+    for side in sides:
+        np.testing.assert_array_equal(whole[side][777:1000], part[side])
+        # standard normal: 5 sigma of mean, variance and kurtosis
+        np.testing.assert_allclose(np.mean(whole[side]), 0.0, atol=5.0 / np.sqrt(2e4))
+        np.testing.assert_allclose(np.var(whole[side]), 1.0, atol=5.0 * np.sqrt(2.0 / 2e4))
+        np.testing.assert_allclose(np.mean(whole[side] ** 4), 3.0, atol=5.0 * np.sqrt(96.0 / 2e4))
+        assert abs(np.corrcoef(whole[side][1:], whole[side][:-1])[0, 1]) < 5.0 / np.sqrt(2e4)
+    assert abs(np.corrcoef(whole["motor"], whole["load"])[0, 1]) < 5.0 / np.sqrt(2e4)
+    assert not np.any(np.asarray(unit_noise(jnp.asarray(4), jnp.arange(100), sides)["motor"]) == whole["motor"][:100])
+
+
+def test_noise_is_the_same_in_runs_of_any_length_precision_and_level():
+    def noise_of(steps, dtype, level):
+        signals = trace(paper(noise=level, steps=steps, substeps=1, dtype=dtype))
+        return [
+            np.asarray(signals.side(s).measured - signals.side(s).true.position, float) * gain / level
+            for s, gain in (("motor", 1.0), ("load", 5.0))
+        ]
+
+    reference = noise_of(130, jnp.float64, 1e-4)
+    drawn = unit_noise(SEED, jnp.arange(130), ("motor", "load"))
+    np.testing.assert_allclose(reference, [drawn["motor"], drawn["load"]], atol=1e-10)
+    # a prime number of samples (two kinds of blocks), and a level at which float32 positions do not round it away
+    longer = noise_of(523, jnp.float64, 1e-4)
+    np.testing.assert_allclose([side[:130] for side in longer], reference, atol=1e-10)
+    np.testing.assert_allclose(noise_of(130, jnp.float32, 10.0), reference, rtol=1e-5, atol=1e-5)
+
+
+def lane_values(count):
+    return {
+        "observer.motor.alpha": jnp.linspace(2.0, 40.0, count),
+        "observer.motor.lambda": jnp.linspace(1.0, 10.0, count),
+        "encoders.noise": jnp.logspace(-6, -3, count),
+        "transmission.dead_zone": jnp.linspace(0.0, 0.03, count),
+    }
+
+
+@pytest.mark.parametrize("discretisation", ["implicit", "explicit"])
+def test_lanes_equal_single_runs(discretisation):
+    """Also where a plant that no axis varies is simulated once for all lanes."""
+    experiment = paper(discretisation, time_constant=0.01, start=0.2, steps=600, velocity_error=0.5)
+    for values in (lane_values(7), dict(list(lane_values(7).items())[:3])):
+        lanes = jax.jit(jax.vmap(lambda v: scan(set_leaves(experiment, v), SEED, (METRICS,))[0]))(values)
+        for i in (0, 3, 6):
+            single = figures(set_leaves(experiment, {path: value[i] for path, value in values.items()}))
+            for name, value in single.items():
+                np.testing.assert_allclose(lanes[name][i], value, rtol=1e-7, atol=1e-10, err_msg=name)
+
+
+def test_a_diverging_lane_leaves_its_neighbours_alone():
+    experiment = paper(time_constant=0.01, start=0.1, steps=300, noise=1e-4)
+    stiffness = jnp.asarray([1.0, 1e9, 2.0])
+    run = jax.jit(jax.vmap(lambda k: scan(set_leaves(experiment, {"transmission.stiffness": k}), SEED, (METRICS,))[0]))
+    lanes, calm = run(stiffness), run(jnp.asarray([1.0, 1.5, 2.0]))
+    np.testing.assert_array_equal(lanes["finite"], [True, False, True])
+    assert np.all(calm["finite"])
+    assert not lanes["motor.converged"][1]
+    assert not lanes["load.converged"][1]
+    for name, values in lanes.items():
+        np.testing.assert_array_equal(values[::2], calm[name][::2], err_msg=name)
+
+
+@pytest.mark.parametrize("discretisation", ["implicit", "explicit"])
+def test_rigid_drive_observes_what_resists_beyond_the_model(discretisation):
+    observer = {"implicit": ImplicitSuperTwisting, "explicit": ExplicitSuperTwisting}[discretisation]
+    experiment = paper(
+        time_constant=0.02,
+        steps=4000,
+        substeps=1,
+        drive=Rigid(0.05, 0.15),
+        transmission=None,
+        identifier=None,
+        effects=(ConstantTorque(0.015, side="motor"), CoulombFriction(0.02, side="motor")),
+        observer=Observers(observer(4.0, 9.0)),
+    )
+    signals = trace(experiment)
+    assert signals.load is None
+    assert signals.twist is None
+    late = slice(1000, None)
+    moving = np.abs(signals.motor.true.velocity) > 0.02
+    # 0.015 + 0.02 sign(v) resists, and nothing else
+    resisting = 0.015 + 0.02 * np.sign(signals.motor.true.velocity)
+    np.testing.assert_allclose(np.asarray(signals.torque)[moving], resisting[moving], atol=2e-4)
+    error = np.asarray(signals.motor.torque_estimate - signals.torque)[late]
+    assert np.sqrt(np.mean(error**2)) < (1e-3 if discretisation == "implicit" else 2e-2)
+    result = figures(experiment)
+    assert result["finite"]
+    assert result["motor.converged"]
+    assert not any(name.startswith("load.") or "stiffness" in name for name in result)
+
+
+@pytest.mark.parametrize("every", [1, 7, 64, 100, 1000])
+def test_record_keeps_every_so_many_samples(every):
+    experiment = paper(time_constant=0.01, noise=1e-4, steps=523, substeps=1)
+    whole, kept = trace(experiment), trace(experiment, every=every)
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(y, x[::every], rtol=1e-9, atol=1e-12), whole, kept)
+
+
+def test_reducers_see_every_sample_whatever_is_recorded():
+    count = Reducer(
+        lambda experiment: jnp.asarray(0),
+        lambda experiment, carry, index, signals: carry + index,
+        lambda experiment, carry, state: {"sum": carry},
+    )
+    experiment = paper(steps=523, substeps=1)
+    for record, every in ((None, 1), (everything, 1), (everything, 10)):
+        out, _ = jax.jit(lambda e, record=record, every=every: scan(e, SEED, (count,), record, every))(experiment)
+        assert out == {"sum": 523 * 522 // 2}
+
+
+@pytest.mark.parametrize("discretisation", ["implicit", "explicit"])
+def test_derivatives_through_the_run(discretisation):
+    """Forward and reverse, finite from the first sample, where every error is zero, and right on the plant."""
+    experiment = paper(discretisation, time_constant=0.01, steps=200, substeps=2)
+
+    def run(stiffness):
+        signals = scan(set_leaves(experiment, {"transmission.stiffness": stiffness}), SEED, record=everything)[1]
+        return signals.motor.true.position, signals.motor.velocity_estimate, signals.motor.torque_estimate
+
+    one = jnp.asarray(1.0)
+    _, slopes = jax.jit(lambda: jax.jvp(run, (one,), (one,)))()
+    assert all(np.all(np.isfinite(slope)) for slope in slopes)
+    compiled = jax.jit(run)
+    change = (compiled(one + 1e-5)[0] - compiled(one - 1e-5)[0]) / 2e-5
+    np.testing.assert_allclose(slopes[0], change, rtol=1e-5, atol=1e-12)
+    gradient = jax.jit(jax.grad(lambda k: run(k)[0][-1] + run(k)[1][-1]))(one)
+    np.testing.assert_allclose(gradient, slopes[0][-1] + slopes[1][-1], rtol=1e-9)
+
+
+def test_one_compilation_serves_all_values():
+    traces = 0
+
+    def counted(experiment):
+        nonlocal traces
+        traces += 1
+        return scan(experiment, SEED)[0]
+
+    compiled = eqx.filter_jit(counted)
+    for noise in (0.0, 1e-4, 1e-3):
+        compiled(paper(noise=noise, steps=64, substeps=1))
+    assert traces == 1
