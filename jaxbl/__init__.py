@@ -1,1 +1,46 @@
-"""Drives with backlash, thousands at once."""
+"""Drives with backlash, thousands at once: observation, gain maps, identification.
+
+The public names are loaded on first use, so that `import jaxbl` and the command line's help do not wait for JAX.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .errors import InputError as InputError
+    from .report import write_sweep_report as write_sweep_report
+    from .report import write_trial_report as write_trial_report
+    from .study.config import Config as Config
+    from .study.config import read_config as read_config
+    from .study.sweep import StudyResult as StudyResult
+    from .study.sweep import dry_run as dry_run
+    from .study.sweep import load as load
+    from .study.sweep import sweep as sweep
+    from .study.trial import Trial as Trial
+    from .study.trial import run as run
+
+_WHERE = {
+    "InputError": "errors",
+    "write_sweep_report": "report",
+    "write_trial_report": "report",
+    "Config": "study.config",
+    "read_config": "study.config",
+    "StudyResult": "study.sweep",
+    "dry_run": "study.sweep",
+    "load": "study.sweep",
+    "sweep": "study.sweep",
+    "Trial": "study.trial",
+    "run": "study.trial",
+}
+__all__ = sorted(_WHERE)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _WHERE:
+        raise AttributeError(f"module 'jaxbl' has no attribute '{name}'")
+    from importlib import import_module
+
+    return getattr(import_module(f".{_WHERE[name]}", __name__), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -33,7 +33,7 @@ class AbstractSuperTwisting(eqx.Module):
     """A super-twisting observer; `position_error` and `velocity_error` are x - x_hat at t = 0."""
 
     name: ClassVar[str]
-    lambda_: Scalar = parameter("rad^½/s", "gain lambda of the square-root term (8)", minimum=0.0)
+    lambda_: Scalar = parameter("√rad/s", "gain lambda of the square-root term (8)", minimum=0.0)
     alpha: Scalar = parameter("rad/s²", "gain alpha of the switching term (8)", minimum=0.0)
     position_error: Scalar = parameter("rad", "position error x - x_hat at t = 0", default=0.0)
     velocity_error: Scalar = parameter("rad/s", "velocity error x - x_hat at t = 0", default=0.0)
@@ -67,10 +67,12 @@ class ExplicitSuperTwisting(AbstractSuperTwisting):
 
     def step(self, state, measured, acceleration, step):
         error = measured - state.position
-        switch = jnp.sign(error)
+        magnitude, switch = jnp.abs(error), jnp.sign(error)
+        # the slope of the root is infinite at zero; where() keeps it out of derivatives
+        root = switch * jnp.sqrt(jnp.where(magnitude > 0.0, magnitude, 1.0))
         control = self.alpha * switch
         new = ObserverState(
-            state.position + step * (state.velocity + self.lambda_ * jnp.sqrt(jnp.abs(error)) * switch),
+            state.position + step * (state.velocity + self.lambda_ * root),
             state.velocity + step * (acceleration(state.velocity) + control),
         )
         return new, Estimate(state.position, state.velocity, control)

@@ -175,10 +175,6 @@ def _grid_of_axes(count: int, width: float, height: float, extra: float = 0.0) -
     return figure, flat[:count]
 
 
-def _diverged(part: pd.DataFrame) -> int:
-    return int((~part["finite"].astype(bool)).sum())
-
-
 def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
     assert spec.y is not None
     with style():
@@ -189,6 +185,7 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
         norm = Normalize(0.0, 1.0) if boolean else _norm(np.concatenate([t.to_numpy(float) for t in tables]), spec.scale)
         figure, axes = _grid_of_axes(len(panels), 3.5, 3.4, extra=1.0)
         handles: list[Any] = []
+        curves: list[Any] = []
         gridded = config.sweep.design == "grid"
         missing = diverged = 0
         for ax, (title, part), table in zip(axes, panels, tables, strict=True):
@@ -205,18 +202,19 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
                 ax.pcolormesh(_edges(xs, logs[0]), _edges(ys, logs[1]), grid, cmap=MAP, norm=norm, rasterized=True)
                 if (outline := _outline(ax, part, keys, spec, xs, ys)) is not None and not handles:
                     handles.append(outline)
-                if spec.overlays:
-                    curves = _overlay(ax, part, spec, xs, ys)
-                    handles += [] if len(handles) > 1 else curves
             else:
                 ax.scatter(part[spec.x], part[spec.y], c=_shown(part, spec.value), cmap=MAP, norm=norm, s=9, linewidths=0)
             missing += int(table.isna().sum())
-            diverged += _diverged(part)
-            best = _best(table, spec)
-            if best is not None and gridded:
-                ax.plot(best[0], best[1], "*", ms=13, mfc="white", mec="black", mew=1.0)
-                title += f"\nbest ★ {best[2]:.2g} {describe(spec.value).unit}".rstrip() if best else ""
-            ax.set_title(title.strip())
+            diverged += int((~part["finite"].astype(bool)).sum())
+            under = []
+            if gridded and (best := _best(table, spec)) is not None:
+                ax.plot(best[0], best[1], "*", ms=13, mfc="white", mec="black", mew=1.0, clip_on=False, zorder=5)
+                under.append(f"best ★ {best[2]:.2g} {describe(spec.value).unit}".rstrip())
+            if spec.overlays:
+                bound = _bound(part, spec)
+                curves = _overlay(ax, bound, spec, xs, ys)
+                under.append(f"f⁺ = {bound:.3g} rad/s²")
+            ax.set_title("\n".join(line for line in (title, ",  ".join(under)) if line))
             ax.set_xlim(*_edges(xs, logs[0])[[0, -1]])
             ax.set_ylim(*_edges(ys, logs[1])[[0, -1]])
             if ax.get_subplotspec().is_first_col():  # type: ignore[union-attr]
@@ -224,11 +222,11 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
             ax.set_xlabel(_label(config, spec.x))
         if missing or diverged:
             word = "diverged" if diverged == missing else "not converged" if "time" in spec.value else "undefined"
-            handles.append(Patch(facecolor=MISSING, label=f"{word} ({max(missing, diverged)} points)"))
+            curves.append(Patch(facecolor=MISSING, label=f"{word} ({max(missing, diverged)} points)"))
         bar = figure.colorbar(ScalarMappable(norm, MAP), ax=axes, pad=0.01, aspect=28, extend=_extend(tables, norm))
         bar.set_label(_wrap(_value_label(spec.value)))
-        if handles:
-            figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4))
+        if handles := [*handles, *curves]:
+            figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
     caption = f"{_value_label(spec.value)} over {spec.x} and {spec.y}{_over(config, frame, [*keys, spec.facet or ''])}."
     return Drawn(_file_name(spec), figure, caption)
 
@@ -272,16 +270,20 @@ def _outline(
     return handle
 
 
-def _overlay(ax: Axes, part: pd.DataFrame, spec: FigureTable, xs: np.ndarray, ys: np.ndarray) -> list[Line2D]:
-    """Curves of the gain conditions, for the median true f_plus of the converged points of the panel."""
-    side = (spec.x if spec.x.startswith("observer.") else spec.y or "").split(".")[1]
+def _bound(part: pd.DataFrame, spec: FigureTable) -> float:
+    """The f_plus that conditions are drawn for: median of the true bounds of the panel's converged points."""
+    side = spec.x.split(".")[1]
     converged = part[part[f"{side}.converged"].astype(bool)]
-    bound = float((converged if len(converged) else part)[f"{side}.f_plus"].median())
+    return float((converged if len(converged) else part)[f"{side}.f_plus"].median())
+
+
+def _overlay(ax: Axes, bound: float, spec: FigureTable, xs: np.ndarray, ys: np.ndarray) -> list[Line2D]:
+    """Curves of the gain conditions for one f_plus."""
     alpha_is_x = spec.x.endswith(".alpha")
     alphas = xs if alpha_is_x else ys
     fine = np.geomspace(max(alphas.min(), bound * 1.0001), alphas.max(), 400) if alphas.max() > bound else np.array([])
     handles = []
-    for name, colour in zip(spec.overlays, ("#FF5FA2", "#FFFFFF", "#FFD400"), strict=False):
+    for name, colour in zip(spec.overlays, ("#FF5FA2", "#7FDBFF", "#FFD400"), strict=False):
         label, dashes = _CONDITIONS[name]
         with jax.enable_x64(True):
             least = np.asarray(LEAST_LAMBDA[name](jnp.asarray(fine), jnp.asarray(bound))) if fine.size else fine
@@ -289,10 +291,6 @@ def _overlay(ax: Axes, part: pd.DataFrame, spec: FigureTable, xs: np.ndarray, ys
         outlined = [path_effects.Stroke(linewidth=3.6, foreground="black"), path_effects.Normal()]
         ax.plot(*line, dashes, color=colour, lw=2.0, path_effects=outlined)
         handles.append(Line2D([], [], color=colour, ls=dashes, lw=2.0, label=label, path_effects=outlined))
-    ax.text(
-        0.02, 0.02, f"f⁺ = {bound:.3g} rad/s²", transform=ax.transAxes, color="white", fontsize=8,
-        path_effects=[path_effects.withStroke(linewidth=2.0, foreground="black")],
-    )  # fmt: skip
     return handles
 
 

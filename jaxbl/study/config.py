@@ -396,7 +396,7 @@ def _describe(error: ValidationError) -> str:
     first = error.errors()[0]
     location = list(first["loc"])
     # pydantic puts the tag of a union's member into the location
-    tag = _UNIONS.get(str(location[0]) if location else "", None)
+    tag = _UNIONS.get(str(location[0]) if location else "")
     if tag is not None and len(location) > tag:
         del location[tag]
     key = ""

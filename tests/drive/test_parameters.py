@@ -109,9 +109,15 @@ def test_keys_of_fields(field, key):
 
 
 def test_every_number_of_the_package_is_declared_with_a_text():
-    modules = {*DRIVES.values(), *TRANSMISSIONS.values(), *EXCITATIONS.values(), Encoders, *map(effect_class, effect_kinds())}
+    modules = {
+        *DRIVES.values(),
+        *TRANSMISSIONS.values(),
+        *EXCITATIONS.values(),
+        Encoders,
+        *map(effect_class, effect_kinds()),
+    }
     for module in modules:
-        declared = dict((field.name, what) for field, what in parameters(module))
+        declared = {field.name: what for field, what in parameters(module)}
         numbers = {name for name, kind in module.__annotations__.items() if "Scalar" in str(kind) or kind in (float, int)}
         assert numbers <= set(declared), module
         assert all(what.doc for what in declared.values()), module

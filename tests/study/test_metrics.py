@@ -72,18 +72,14 @@ def by_numpy(experiment, signals, identifier):
     return expected
 
 
-def observers(cls, **motor):
-    return Observers(cls(4.0, 9.0, **motor), cls(0.5, 0.2))
-
-
 CASES = {
     "converges": {"velocity_error": 0.5, "noise": 1e-5},
     "never leaves tolerance": {},
     "never converges": {"noise": 1e-2},
     "explicit, load off": {
-        "noise": 1e-4,
+        "noise": 1e-5,
         "observer": Observers(
-            ExplicitSuperTwisting(20.0, 9.0, position_error=0.02), ExplicitSuperTwisting(0.5, 0.2, velocity_error=-0.05)
+            ExplicitSuperTwisting(4.0, 9.0, position_error=0.02), ExplicitSuperTwisting(0.5, 0.2, velocity_error=-0.05)
         ),
     },
     "linear shaft": {"transmission": LinearShaft(1.2), "velocity_error": 0.2},

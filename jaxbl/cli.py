@@ -1,0 +1,206 @@
+"""The command line: parse, call, print. JAX is imported only once a command has work for it."""
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .errors import InputError
+
+if TYPE_CHECKING:
+    from .study.engine import Progress
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    help="Drives with backlash, thousands at once: sliding-mode observation, gain maps, identification.",
+)
+
+ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML study", show_default=False)]
+OutOption = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="folder for the results [default: results/<config name>]")
+]
+
+
+@app.callback()
+def _main() -> None:
+    """Needed by typer to keep subcommands with their names."""
+
+
+@app.command()
+def simulate(
+    config: ConfigArgument,
+    out: OutOption = None,
+    seed: Annotated[int, typer.Option(help="seed of the encoder noise", min=0)] = 0,
+    every: Annotated[int, typer.Option(help="keep every N-th sample of the trace", min=1, metavar="N")] = 1,
+) -> None:
+    """Run the experiment of a study once: trace, figures, summary."""
+    _start_jax()
+    from .report import write_trial_report
+    from .study.config import read_config
+    from .study.store import make_folder
+    from .study.trial import run
+
+    study = read_config(config)
+    folder = _folder(config, out)
+    if (folder / "manifest.json").exists():
+        raise InputError(f"{folder}: holds a sweep; choose another folder with --out")
+    make_folder(folder)
+    trial = run(study, seed=seed, every=every)
+    for line in write_trial_report(trial, folder):
+        typer.echo(line)
+    typer.echo(f"{folder / 'report.html'}")
+    if not trial.summary["metrics"]["finite"]:
+        raise typer.Exit(1)
+
+
+@app.command()
+def sweep(
+    config: ConfigArgument,
+    out: OutOption = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="say what it will cost, and stop")] = False,
+) -> None:
+    """Run all points of a study: table of metrics, maps, report. Goes on where an interrupted run stopped."""
+    _start_jax()
+    from .report import write_sweep_report
+    from .report.maps import check_figures
+    from .study.config import read_config
+    from .study.metrics import metric_columns
+    from .study.sweep import dry_run as estimate_cost
+    from .study.sweep import sweep as run_sweep
+
+    study = read_config(config)
+    if not study.axes and study.sweep.seeds == 1:
+        raise InputError(f"{config}: axes: the study has none; add [[axes]], or use 'jaxbl simulate'")
+    with _naming(config):
+        check_figures(study, study.figures, metric_columns(study.build()))
+        if dry_run:
+            cost = estimate_cost(study)
+            typer.echo(f"points       {cost.points} ({cost.rows} runs with all seeds)")
+            typer.echo(f"chunks       {cost.chunks} of {cost.lanes_a_chunk} lanes")
+            typer.echo(f"memory       {cost.megabytes:.1f} MB a chunk")
+            typer.echo(f"compilation  about {_duration(cost.compile_seconds)}")
+            typer.echo(
+                f"run          about {_duration(cost.run_seconds)} ({cost.lane_steps_per_second:.2g} lane-steps/s measured)"
+            )
+            return
+        folder = _folder(config, out)
+        resume = f"jaxbl sweep {config} --out {folder}"
+        with _resumable(resume), _progress("runs") as progress:
+            result = run_sweep(study, folder, progress=progress)
+    for line in write_sweep_report(result, folder):
+        typer.echo(line)
+    if result.cost["lanes"]:
+        typer.echo(
+            f"Compiled in {_duration(result.cost['compile_seconds'])}, "
+            f"ran {result.cost['lanes']:.0f} lanes in {_duration(result.cost['run_seconds'])}."
+        )
+    typer.echo(f"{folder / 'report.html'}")
+
+
+@app.command()
+def plot(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder of a sweep", show_default=False)],
+    config: Annotated[
+        Path | None, typer.Option("--config", metavar="CONFIG", help="take the figures from this study, not the stored one")
+    ] = None,
+) -> None:
+    """Redraw figures and report of a sweep from its stored points, without simulating."""
+    _start_jax()
+    from .report import write_sweep_report
+    from .study.config import read_config
+    from .study.store import Store, identity
+    from .study.sweep import load
+
+    result = load(folder)
+    if config is not None:
+        study = read_config(config)
+        if identity(study) != Store.open(folder).manifest["identity"]:
+            raise InputError(f"{config}: is not the study in {folder}; only title, notes and figures may differ")
+        result = result._replace(config=study)
+    for line in write_sweep_report(result, folder):
+        typer.echo(line)
+    typer.echo(f"{folder / 'report.html'}")
+
+
+def _folder(config: Path, out: Path | None) -> Path:
+    return out if out is not None else Path("results") / config.stem
+
+
+def _start_jax() -> None:
+    """Use every core as a device, and keep compiled programs between runs."""
+    import jax
+
+    if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+        jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)
+    if jax.config.jax_compilation_cache_dir is None:
+        cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "jaxbl"
+        jax.config.update("jax_compilation_cache_dir", str(cache))
+
+
+@contextmanager
+def _naming(config: Path) -> Iterator[None]:
+    """Put the config's name in front of messages that know only the key."""
+    try:
+        yield
+    except InputError as error:
+        message = str(error)
+        raise InputError(message if "/" in message.split(":")[0] else f"{config}: {message}") from None
+
+
+@contextmanager
+def _resumable(command: str) -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo(f"interrupted; what is finished is kept. Go on with: {command}", err=True)
+        raise typer.Exit(130) from None
+
+
+@contextmanager
+def _progress(unit: str) -> "Iterator[Progress | None]":
+    """A bar with the remaining time on a terminal, nothing in a pipe."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn(unit), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("compiling", total=None)
+
+        def update(done: int, total: int) -> None:
+            bar.update(task, description="running", completed=done, total=total)
+
+        yield update
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 100.0:
+        return f"{seconds:.1f} s"
+    if seconds < 6000.0:
+        return f"{seconds / 60.0:.0f} min"
+    return f"{seconds / 3600.0:.1f} h"
+
+
+def main(run: Callable[..., object] = app) -> None:
+    """Entry point: exit 0 done, 1 failed, 2 bad input (one line), 130 interrupted."""
+    try:
+        run()
+    except InputError as error:
+        typer.echo(f"jaxbl: {error}", err=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        typer.echo("interrupted", err=True)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,5 @@
+"""Figures and reports."""
+
+from .maps import draw as draw
+from .reports import write_sweep_report as write_sweep_report
+from .reports import write_trial_report as write_trial_report

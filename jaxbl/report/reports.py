@@ -1,0 +1,116 @@
+"""What the commands leave behind: figures, summary and report of a sweep and of a single run."""
+
+import json
+from pathlib import Path
+
+import pandas as pd
+
+from jaxbl.study.metrics import SIDE_METRICS
+from jaxbl.study.store import make_folder, write_atomic
+from jaxbl.study.sweep import StudyResult
+from jaxbl.study.trial import Trial
+
+from .maps import Drawn, draw
+from .page import Picture, TableOf, html
+from .style import save
+from .traces import draw_trial
+
+
+def write_sweep_report(result: StudyResult, folder: Path) -> list[str]:
+    """Draw the figures of a study and write `report.html` into its folder. Returns the headline's lines."""
+    pictures = _save(draw(result.config, result.frame), folder)
+    lead = headline(result)
+    page = html(
+        result.config.title or "Study",
+        lead,
+        result.config.notes,
+        pictures,
+        [_axes_table(result), _metric_table(result.frame)],
+        result.config.to_toml(),
+    )
+    write_atomic(folder / "report.html", page)
+    return lead
+
+
+def headline(result: StudyResult) -> list[str]:
+    """What a study found, in sentences."""
+    frame = result.frame
+    sides = [side for side in ("motor", "load") if f"{side}.converged" in frame]
+    shares = ", ".join(f"{100 * frame[f'{side}.converged'].mean():.1f} % ({side})" for side in sides)
+    lines = [f"{len(frame)} runs. The observers converged in {shares} of them."]
+    diverged = int((~frame["finite"].astype(bool)).sum())
+    if diverged:
+        lines.append(f"{diverged} runs diverged: they are in the table with finite = false, and grey in the figures.")
+    for side in sides:
+        best = frame[frame[f"{side}.converged"].astype(bool)]
+        varied = [
+            a.path for a in result.config.axes if frame[a.path].nunique() > 1 and a.path.startswith(f"observer.{side}")
+        ]
+        if len(best) and varied:
+            row = best.loc[best[f"{side}.velocity_rmse"].idxmin()]
+            where = ", ".join(f"{path} = {row[path]:.3g}" for path in varied)
+            lines.append(f"Least {side} velocity error {row[f'{side}.velocity_rmse']:.3g} rad/s rms, at {where}.")
+    return lines
+
+
+def write_trial_report(trial: Trial, folder: Path) -> list[str]:
+    """Write trace, summary, figures and report of a run. Returns the lines for the terminal."""
+    make_folder(folder)
+    draft = folder / ".trace.draft"
+    trial.trace.to_parquet(draft, index=False)
+    draft.replace(folder / "trace.parquet")
+    write_atomic(folder / "summary.json", json.dumps(trial.summary, indent=2, ensure_ascii=False))
+    pictures = _save(draw_trial(trial), folder)
+    metrics = trial.summary["metrics"]
+    sides = [side for side in ("motor", "load") if f"{side}.converged" in metrics]
+    tables = [
+        TableOf(
+            "Metrics",
+            ["", *sides, "unit", "meaning"],
+            [
+                [name, *(metrics.get(f"{side}.{name}") for side in sides), about.unit, about.doc]
+                for name, about in SIDE_METRICS.items()
+                if f"motor.{name}" in metrics
+            ],
+        )
+    ]
+    lead = []
+    if identified := trial.summary["identified"]:
+        rows = [[name, values["true"], *(values[side] for side in sides)] for name, values in identified.items()]
+        tables.insert(0, TableOf("Identified", ["", "true", *sides], rows))
+        for name, values in identified.items():
+            found = ", ".join(f"{_number(values[side])} ({side})" for side in sides)
+            lead.append(f"{name}: {found}; true {values['true']:.4g}")
+    remarks = trial.summary["remarks"]
+    page = html(trial.config.title or "Run", lead, remarks, pictures, tables, trial.config.to_toml())
+    write_atomic(folder / "report.html", page)
+    return [*lead, *remarks]
+
+
+def _number(value: float | None) -> str:
+    return "undetermined" if value is None else f"{value:.4g}"
+
+
+def _save(drawn: list[Drawn], folder: Path) -> list[Picture]:
+    return [Picture(save(d.figure, folder / "figures" / f"{d.name}.png"), d.caption) for d in drawn]
+
+
+def _axes_table(result: StudyResult) -> TableOf:
+    rows: list[list[object]] = []
+    for axis in result.config.axes:
+        column = result.frame[axis.path]
+        ends = ["–", "–"] if column.dtype == object else [column.min(), column.max()]
+        rows.append([axis.path, int(column.nunique()), *ends])
+    return TableOf("Axes", ["path", "values", "least", "largest"], rows)
+
+
+def _metric_table(frame: pd.DataFrame) -> TableOf:
+    rows: list[list[object]] = []
+    for side in ("motor", "load"):
+        for name, about in SIDE_METRICS.items():
+            if f"{side}.{name}" in frame:
+                values = frame[f"{side}.{name}"].astype(float)
+                values = values[values.abs() < float("inf")]
+                quantiles = [values.quantile(q) if len(values) else None for q in (0.05, 0.5, 0.95)]
+                rows.append([f"{side}.{name}", *quantiles, about.unit, about.doc])
+    return TableOf("Metrics over all runs", ["metric", "5 %", "median", "95 %", "unit", "meaning"], rows)

@@ -1,0 +1,130 @@
+"""Figures of one run: the analogues of Figs. 7 to 17 of the paper, and its limit cycle (Fig. 28)."""
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from jaxbl.study.trial import Trial
+
+from .maps import Drawn
+from .style import COLOURS, style
+
+_TRUE, _MOTOR, _LOAD = COLOURS[6], COLOURS[0], COLOURS[1]
+_POINTS = 6000
+
+
+def draw_trial(trial: Trial) -> list[Drawn]:
+    """All figures of a run."""
+    # more points than this no page shows
+    trace = trial.trace.iloc[:: max(len(trial.trace) // _POINTS, 1)]
+    sides = [side for side in ("motor", "load") if f"{side}.position" in trace]
+    with style():
+        drawn = [_input(trace)]
+        for side in sides:
+            for quantity, unit in (("velocity", "rad/s"), ("position", "rad")):
+                drawn.append(_observed(trace, side, quantity, unit))
+        drawn.append(_torque(trace, sides))
+        if len(sides) == 2:
+            drawn += [_identified(trial, trace, sides), _hysteresis(trace), _limit_cycle(trace)]
+    return drawn
+
+
+def _axes(rows: int = 1, columns: int = 1, height: float = 3.2, sharex: bool = True):
+    figure = Figure(figsize=(7.0, height), layout="constrained")
+    return figure, figure.subplots(rows, columns, sharex=sharex, squeeze=False).ravel()
+
+
+def _input(trace: pd.DataFrame) -> Drawn:
+    figure, (ax,) = _axes(height=2.4)
+    ax.plot(trace["t"], trace["u"], color=_TRUE)
+    ax.set(xlabel="time (s)", ylabel="input torque u (N m)")
+    return Drawn("input", figure, "Input torque (analogue of Fig. 7).")
+
+
+_FIGURES = {
+    ("motor", "velocity"): "Figs. 8-9",
+    ("motor", "position"): "Figs. 10-11",
+    ("load", "velocity"): "Figs. 12-13",
+    ("load", "position"): "Figs. 14-15",
+}
+
+
+def _observed(trace: pd.DataFrame, side: str, quantity: str, unit: str) -> Drawn:
+    figure, (above, below) = _axes(rows=2, height=4.4)
+    true, estimate = trace[f"{side}.{quantity}"], trace[f"{side}.{quantity}_estimate"]
+    above.plot(trace["t"], estimate, color=_LOAD, lw=2.4, alpha=0.8, label="observer")
+    above.plot(trace["t"], true, color=_TRUE, lw=1.0, label="true")
+    above.set(ylabel=f"{side} {quantity} ({unit})")
+    above.legend(ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
+    below.plot(trace["t"], true - estimate, color=_MOTOR)
+    below.axhline(0.0, color="#888888", lw=0.8)
+    below.set(xlabel="time (s)", ylabel=f"error ({unit})")
+    return Drawn(
+        f"{side}_{quantity}", figure,
+        f"{side.capitalize()} {quantity}, true and observed, and the error (analogue of {_FIGURES[side, quantity]}).",
+    )  # fmt: skip
+
+
+def _torque(trace: pd.DataFrame, sides: list[str]) -> Drawn:
+    figure, (above, below) = _axes(rows=2, height=4.4)
+    for side, colour in zip(sides, (_MOTOR, _LOAD), strict=False):
+        estimate = trace[f"{side}.torque_estimate"]
+        above.plot(trace["t"], estimate, color=colour, lw=2.0, alpha=0.75, label=f"from the {side} observer")
+        below.plot(trace["t"], trace["torque"] - estimate, color=colour, lw=1.0, alpha=0.75)
+    above.plot(trace["t"], trace["torque"], color=_TRUE, lw=1.0, label="true")
+    name = "transmitted torque C" if len(sides) == 2 else "disturbance torque"
+    above.set(ylabel=f"{name} (N m)")
+    above.legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
+    below.axhline(0.0, color="#888888", lw=0.8)
+    below.set(xlabel="time (s)", ylabel="error (N m)")
+    return Drawn("torque", figure, f"The {name}, true and by the equivalent controls (17) (analogue of Fig. 16).")
+
+
+def _identified(trial: Trial, trace: pd.DataFrame, sides: list[str]) -> Drawn:
+    labels = {"stiffness": "stiffness K (N m/rad)", "dead_zone": "dead zone j₀ (rad)", "half_gap": "half gap (rad)"}
+    names = [name for name in trial.summary["identified"] if name != "half_gap" or len(trial.summary["identified"]) == 2]
+    figure, axes = _axes(rows=len(names), height=2.0 * len(names) + 0.6)
+    for ax, name in zip(axes, names, strict=True):
+        true = trial.summary["identified"][name]["true"]
+        for side, colour in zip(sides, (_MOTOR, _LOAD), strict=True):
+            ax.plot(trace["t"], trace[f"{side}.{name}"], color=colour, label=f"{side} identifier")
+        ax.axhline(true, color=_TRUE, lw=1.0, ls="--", label="true")
+        # the first few samples say nothing yet: keep them from setting the scale
+        late = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]][[f"{side}.{name}" for side in sides]]
+        reach = max(float((late - true).abs().max(axis=None)) * 2.0, 0.02 * abs(true), 1e-12)
+        ax.set(ylabel=labels[name], ylim=(true - reach, true + reach))
+        if name == "dead_zone":
+            right = ax.secondary_yaxis("right", functions=(lambda j: 4.0 * j, lambda gap: gap / 4.0))
+            right.set_ylabel("half gap 4 j₀ (rad)")
+    axes[0].legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
+    axes[-1].set_xlabel("time (s)")
+    return Drawn("dead_zone", figure, "Identified stiffness and dead zone over time (27)-(28) (analogue of Fig. 16).")
+
+
+def _hysteresis(trace: pd.DataFrame) -> Drawn:
+    figure, (left, right) = _axes(columns=2, height=3.4, sharex=False)
+    last = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]]
+    for side, colour in (("motor", _MOTOR), ("load", _LOAD)):
+        left.plot(last["z"], last[f"{side}.torque_estimate"], color=colour, lw=1.6, alpha=0.75, label=f"{side} observer")
+    left.plot(last["z"], last["torque"], ".", ms=1.5, color=_TRUE, label="true")
+    left.set(xlabel="twist z = θe − N₀ θs (rad)", ylabel="transmitted torque C (N m)")
+    left.legend(loc="upper left")
+    right.plot(last["theta_e"], last["theta_s"], color=_LOAD, lw=1.8, label="measured")
+    right.plot(last["motor.position_estimate"], last["load.position_estimate"], color=_TRUE, lw=0.8, label="observed")
+    right.set(xlabel="motor position θe (rad)", ylabel="load position θs (rad)")
+    right.legend(loc="upper left")
+    caption = (
+        "Torque over twist, and load over motor position: the hysteresis of the play, second half (analogue of Fig. 17)."
+    )
+    return Drawn("hysteresis", figure, caption)
+
+
+def _limit_cycle(trace: pd.DataFrame) -> Drawn:
+    figure, (left, right) = _axes(columns=2, height=3.4, sharex=False)
+    last = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]]
+    for ax, side, angle in ((left, "motor", "θe"), (right, "load", "θs")):
+        observed = (last[f"{side}.position_estimate"], last[f"{side}.velocity_estimate"])
+        ax.plot(*observed, color=_LOAD, lw=2.2, alpha=0.8, label="observed")
+        ax.plot(last[f"{side}.position"], last[f"{side}.velocity"], color=_TRUE, lw=0.9, label="true")
+        ax.set(xlabel=f"{side} position {angle} (rad)", ylabel=f"{side} velocity (rad/s)")
+    left.legend(loc="upper left")
+    return Drawn("limit_cycle", figure, "Velocity over position, second half of the run: the limit cycle (cf. Fig. 28).")
