@@ -31,7 +31,6 @@ _WHERE = {
     "Trial": "study.trial",
     "run": "study.trial",
 }
-__all__ = sorted(_WHERE)
 
 
 def __getattr__(name: str) -> Any:
@@ -43,4 +42,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return sorted(_WHERE)

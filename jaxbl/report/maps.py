@@ -1,5 +1,9 @@
 """Figures of a study: heatmaps with gain conditions over them, and lines over one axis."""
 
+# pandas' own annotations are wider than what its methods return
+# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
+# pyright: reportReturnType=false
+
 import re
 from typing import Any, NamedTuple
 
@@ -90,7 +94,7 @@ def _label(config: Config, path: str) -> str:
 def _value_label(value: str) -> str:
     side, _, _ = value.rpartition(".")
     about = describe(value)
-    return with_unit(f"{side}: {about.doc}" if side else about.doc, about.unit)
+    return with_unit(f"{side}: {about.label}" if side else about.label, about.unit)
 
 
 def _reduce(frame: pd.DataFrame, keys: list[str], value: str) -> pd.Series:

@@ -43,9 +43,8 @@ def html(
         for picture in pictures:
             data = base64.b64encode(picture.path.read_bytes()).decode()
             caption = escape(picture.caption)
-            parts.append(
-                f'<figure><img src="data:image/png;base64,{data}" alt="{caption}"><figcaption>{caption}</figcaption></figure>'
-            )
+            image = f'<img src="data:image/png;base64,{data}" alt="{caption}">'
+            parts.append(f"<figure>{image}<figcaption>{caption}</figcaption></figure>")
     for table in tables:
         head = "".join(f"<th>{escape(column)}</th>" for column in table.columns)
         body = "".join(f"<tr>{''.join(_cell(value) for value in row)}</tr>" for row in table.rows)

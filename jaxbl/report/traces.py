@@ -104,14 +104,14 @@ def _hysteresis(trace: pd.DataFrame) -> Drawn:
     figure, (left, right) = _axes(columns=2, height=3.4, sharex=False)
     last = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]]
     for side, colour in (("motor", _MOTOR), ("load", _LOAD)):
-        left.plot(last["z"], last[f"{side}.torque_estimate"], color=colour, lw=1.6, alpha=0.75, label=f"{side} observer")
+        left.plot(last["z"], last[f"{side}.torque_estimate"], color=colour, lw=1.6, alpha=0.75, label=f"{side}")
     left.plot(last["z"], last["torque"], ".", ms=1.5, color=_TRUE, label="true")
     left.set(xlabel="twist z = θe − N₀ θs (rad)", ylabel="transmitted torque C (N m)")
-    left.legend(loc="upper left")
+    left.legend(ncols=3, loc="lower left", bbox_to_anchor=(-0.1, 1.0), borderaxespad=0.1, columnspacing=0.8)
     right.plot(last["theta_e"], last["theta_s"], color=_LOAD, lw=1.8, label="measured")
     right.plot(last["motor.position_estimate"], last["load.position_estimate"], color=_TRUE, lw=0.8, label="observed")
     right.set(xlabel="motor position θe (rad)", ylabel="load position θs (rad)")
-    right.legend(loc="upper left")
+    right.legend(ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
     caption = (
         "Torque over twist, and load over motor position: the hysteresis of the play, second half (analogue of Fig. 17)."
     )
@@ -126,5 +126,5 @@ def _limit_cycle(trace: pd.DataFrame) -> Drawn:
         ax.plot(*observed, color=_LOAD, lw=2.2, alpha=0.8, label="observed")
         ax.plot(last[f"{side}.position"], last[f"{side}.velocity"], color=_TRUE, lw=0.9, label="true")
         ax.set(xlabel=f"{side} position {angle} (rad)", ylabel=f"{side} velocity (rad/s)")
-    left.legend(loc="upper left")
+    left.legend(ncols=2, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.1)
     return Drawn("limit_cycle", figure, "Velocity over position, second half of the run: the limit cycle (cf. Fig. 28).")

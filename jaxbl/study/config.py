@@ -105,7 +105,7 @@ class RecordedTable(Table):
         for column in (self.time_column, self.torque_column):
             if column not in frame:
                 raise InputError(f"{path}: no column '{column}'; {nearest(column, map(str, frame.columns))}")
-            values = pd.to_numeric(frame[column], errors="coerce").to_numpy(dtype=float)
+            values = np.asarray(pd.to_numeric(frame[column], errors="coerce"), dtype=float)
             if len(values) == 0 or not np.isfinite(values).all():
                 row = 0 if len(values) == 0 else int(np.argmin(np.isfinite(values)))
                 raise InputError(f"{path}: column '{column}', row {row}: should be a finite number")
@@ -141,8 +141,7 @@ class ObserverTable(Table):
 
     def build(self) -> Observers:
         cls = OBSERVERS[self.discretisation]
-        sides = {"motor": self.motor, "load": self.load}
-        return Observers(**{side: None if t is None else cls(**dict(t)) for side, t in sides.items()})
+        return Observers(cls(**dict(self.motor)), None if self.load is None else cls(**dict(self.load)))
 
 
 class RunTable(Table):

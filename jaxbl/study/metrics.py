@@ -16,29 +16,42 @@ Number = Float[Array, ""]
 
 
 class Metric(NamedTuple):
-    """What a column holds: unit and meaning."""
+    """What a column holds: unit, short name for axis labels, meaning."""
 
     unit: str
+    label: str
     doc: str
 
 
 SIDE_METRICS: dict[str, Metric] = {
-    "converged": Metric("", "position and velocity errors stay within tolerance over the last quarter"),
-    "convergence_time": Metric("s", "time from which both errors stay within tolerance; NaN where not converged"),
-    "convergence_time_bound": Metric("s", "bound (42) on it for the noise-free observer; inf where (32) fails"),
-    "position_rmse": Metric("rad", "rms position error"),
-    "velocity_rmse": Metric("rad/s", "rms velocity error"),
-    "torque_rmse": Metric("N m", "rms error of the transmitted torque from this side's equivalent control"),
-    "chatter": Metric("rad/s", "rms sample-to-sample change of the velocity error, divided by √2"),
-    "f_plus": Metric("rad/s²", "largest true right-hand side error |f(x₂) − f(x̂₂) + ξ| along the run"),
-    "f_plus_acceleration": Metric("rad/s²", "twice the largest acceleration: the paper's text for f⁺"),
-    "margin_alpha": Metric("", "α / f⁺"),
-    "margin_davila_fridman": Metric("", "λ over the least λ of condition (32)"),
-    "margin_seeber_horn": Metric("", "λ over the least λ of Seeber and Horn"),
-    "margin_exact": Metric("", "λ over the least λ of the exact condition ρ < 1"),
-    "stiffness_error": Metric("", "relative error of the identified stiffness"),
-    "dead_zone_error": Metric("", "relative error of the identified dead zone (half gap of law dead_zone)"),
-    "excitation": Metric("", "smallest eigenvalue of the normalised information matrix"),
+    "converged": Metric("", "converged", "position and velocity errors stay within tolerance over the last quarter"),
+    "convergence_time": Metric(
+        "s", "convergence time", "time from which both errors stay within tolerance; NaN where not converged"
+    ),
+    "convergence_time_bound": Metric(
+        "s", "bound on convergence time", "bound (42) on it for the noise-free observer; inf where (32) fails"
+    ),
+    "position_rmse": Metric("rad", "position error, rms", "rms position error"),
+    "velocity_rmse": Metric("rad/s", "velocity error, rms", "rms velocity error"),
+    "torque_rmse": Metric(
+        "N m", "torque error, rms", "rms error of the transmitted torque from this side's equivalent control"
+    ),
+    "chatter": Metric(
+        "rad/s", "chatter of the velocity", "rms sample-to-sample change of the velocity error, divided by √2"
+    ),
+    "f_plus": Metric("rad/s²", "true bound f⁺", "largest true right-hand side error |f(x₂) − f(x̂₂) + ξ| along the run"),
+    "f_plus_acceleration": Metric(
+        "rad/s²", "twice the largest acceleration", "twice the largest acceleration: the paper's text for f⁺"
+    ),
+    "margin_alpha": Metric("", "α / f⁺", "gain alpha over the true bound f_plus"),
+    "margin_davila_fridman": Metric("", "margin to Davila-Fridman (32)", "λ over the least λ of condition (32)"),
+    "margin_seeber_horn": Metric("", "margin to Seeber-Horn", "λ over the least λ of Seeber and Horn"),
+    "margin_exact": Metric("", "margin to ρ < 1", "λ over the least λ of the exact condition ρ < 1"),
+    "stiffness_error": Metric("", "error of K", "relative error of the identified stiffness"),
+    "dead_zone_error": Metric(
+        "", "error of the dead zone", "relative error of the identified dead zone (half gap of law dead_zone)"
+    ),
+    "excitation": Metric("", "excitation", "smallest eigenvalue of the normalised information matrix"),
 }
 
 
@@ -148,7 +161,7 @@ METRICS = Reducer(_init, _update, _result)
 def describe(column: str) -> Metric:
     """Unit and meaning of a metric column such as `motor.velocity_rmse`."""
     if column == "finite":
-        return Metric("", "no number of the lane overflowed")
+        return Metric("", "finite", "no number of the lane overflowed")
     return SIDE_METRICS[column.partition(".")[2]]
 
 

@@ -143,7 +143,7 @@ def _remarks(experiment: Experiment, trace: pd.DataFrame, metrics: dict[str, Any
     if not metrics["finite"]:
         return ["The run diverged: its figures are not finite."]
     remarks = []
-    largest = float(trace["torque"].abs().max())
+    largest = float(np.abs(trace["torque"].to_numpy()).max())
     for side, found in conditions.items():
         inertia = float(experiment.drive.inertia(side))
         limit = found["alpha"] * inertia / abs(float(experiment.drive.torque_gain(side)))
