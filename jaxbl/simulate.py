@@ -22,6 +22,11 @@ from .observer.equivalent_control import EquivalentControl
 from .observer.recursive import Identifier, IdentifierState
 from .observer.super_twisting import Observers, ObserverState
 
+import os
+
+BARRIER = int(os.environ.get("BARRIER", "0"))
+UNROLL_SUBSTEPS = True
+
 Number = Any  # an array of one number a lane: Float[Array, ""] inside a step
 
 
@@ -202,11 +207,12 @@ def _move(plant: Plant, run: Run, state: PlantState, torque: Scalar, time: Numbe
     small = run.sample_period / run.substeps
 
     def substep(i: Int[Array, ""], state: PlantState) -> PlantState:
-        return plant.advance(state, torque, time + i * small, small)
+        state = plant.advance(state, torque, time + i * small, small)
+        return jax.lax.optimization_barrier(state) if BARRIER else state
 
     if run.substeps == 1:
         return substep(jnp.asarray(0), state)
-    return jax.lax.fori_loop(0, run.substeps, substep, state, unroll=True)
+    return jax.lax.fori_loop(0, run.substeps, substep, state, unroll=UNROLL_SUBSTEPS)
 
 
 class Reducer(NamedTuple):

@@ -94,7 +94,13 @@ def _label(config: Config, path: str) -> str:
 def _value_label(value: str) -> str:
     side, _, _ = value.rpartition(".")
     about = describe(value)
-    return with_unit(f"{side}: {about.label}" if side else about.label, about.unit)
+    label = f"|{about.label}|" if _is_magnitude(value) else about.label
+    return with_unit(f"{side}: {label}" if side else label, about.unit)
+
+
+def _is_magnitude(value: str) -> bool:
+    """Signed relative errors are drawn by their size: a median over seeds must not cancel them."""
+    return value.endswith("_error")
 
 
 def _reduce(frame: pd.DataFrame, keys: list[str], value: str) -> pd.Series:
@@ -127,10 +133,6 @@ def _norm(values: np.ndarray, scale: str) -> Normalize:
     if scale == "log" or (scale == "auto" and low > 0.0 and high / low > 30.0):
         positive = finite[finite > 0.0]
         return LogNorm(float(positive.min()), high) if positive.size else Normalize(low, high)
-    if scale == "auto" and low < 0.0 < high:
-        # signed errors: a few wild lanes must not hide the rest
-        reach = float(np.quantile(np.abs(finite), 0.95))
-        return Normalize(-reach, reach)
     return Normalize(low, high)
 
 
@@ -239,7 +241,8 @@ def _shown(part: pd.DataFrame, value: str) -> pd.Series:
     """The values to draw: those of diverged lanes are left out."""
     if part[value].dtype == bool:
         return part[value]
-    return part[value].where(part["finite"].astype(bool)).replace([np.inf, -np.inf], np.nan)
+    values = part[value].abs() if _is_magnitude(value) else part[value]
+    return values.where(part["finite"].astype(bool)).replace([np.inf, -np.inf], np.nan)
 
 
 def _extend(tables: list[pd.Series], norm: Normalize) -> str:
@@ -251,9 +254,9 @@ def _extend(tables: list[pd.Series], norm: Normalize) -> str:
 
 def _best(table: pd.Series, spec: FigureTable) -> tuple[float, float, float] | None:
     """Place and value of the smallest figure, for errors and times."""
-    if not re.search(r"rmse|chatter|convergence_time$|error$", spec.value) or table.isna().all():
+    if not re.search(r"rmse|chatter|convergence_time$", spec.value) or table.isna().all():
         return None
-    y, x = table.abs().idxmin()  # type: ignore[misc]
+    y, x = table.idxmin()  # type: ignore[misc]
     return float(x), float(y), float(table[(y, x)])
 
 
@@ -305,12 +308,10 @@ def _lines(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
         if len(panels) == 1:
             figure.set_size_inches(6.4, 4.2)
         shown = _shown(frame, spec.value)
-        magnitude = spec.value.endswith("_error")
         for ax, (title, part) in zip(axes, panels, strict=True):
             groups = [("", part)] if spec.series is None else list(part.groupby(spec.series, sort=True))
             for i, (name, group) in enumerate(groups):
                 values = shown.loc[group.index].astype(float)
-                values = values.abs() if magnitude else values
                 by_x = values.groupby(group[spec.x], sort=True)
                 middle = by_x.median()
                 colour = COLOURS[i % len(COLOURS)]
@@ -321,13 +322,12 @@ def _lines(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
             xs = np.sort(part[spec.x].unique())
             if _is_log(config, spec.x, xs):
                 ax.set_xscale("log")
-            positive = shown.abs() if magnitude else shown
-            if isinstance(_norm(positive.to_numpy(float), spec.scale), LogNorm):
+            if isinstance(_norm(shown.to_numpy(float), spec.scale), LogNorm):
                 ax.set_yscale("log")
             ax.set_title(title)
             ax.set_xlabel(_label(config, spec.x))
         label = _value_label(spec.value)
-        axes[0].set_ylabel(_wrap(f"|{label}|" if magnitude else label))
+        axes[0].set_ylabel(_wrap(label))
         if spec.series is not None:
             axes[-1].legend(title=_label(config, spec.series))
     band = "; band: least to largest" if config.sweep.seeds > 1 else ""

@@ -7,6 +7,7 @@ written once. What the config says is found again in the experiment under the sa
 import copy
 import dataclasses
 import difflib
+import math
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -204,14 +205,14 @@ class SweepTable(Table):
 
 
 class UncertaintyTable(Table):
-    """How well the drive's numbers are known: prior of fits and diagnosis."""
+    """How well the drive's numbers are known. Accepted in every study; simulate and sweep do not use it."""
 
     relative: float = Field(default=0.02, gt=0.0, description="relative standard deviation of every number not in exact")
     exact: list[str] = Field(default=["drive.gear_ratio"], description="dotted paths of numbers that are known exactly")
 
 
 class LogTable(Table):
-    """How a measured log is to be read."""
+    """How a measured log is to be read. Accepted in every study; simulate and sweep do not use it."""
 
     hold: Literal["zoh"] = Field(default="zoh", description="input between samples")
     initial_state: Literal["unknown", "rest"] = Field(default="unknown", description="state at the first sample")
@@ -316,6 +317,18 @@ class Config(Table):
             raise wrong("[transmission] is missing: a two_inertia drive needs a law")
         if not rigid and self.observer.load is None:
             raise wrong("observer.load is missing: a two_inertia drive has a load observer")
+        if self.transmission is not None:
+            rate = self.transmission.stiffness
+            rate *= 1.0 / self.drive.motor_inertia + self.drive.gear_ratio**2 / self.drive.load_inertia
+            # the scheme is stable while step * frequency < 2
+            least = math.floor(self.run.sample_period * math.sqrt(rate) / 2.0) + 1
+            if self.run.substeps < least:
+                raise wrong(
+                    "run.substeps: {given} plant steps a sample are unstable for this stiffness and sample_period; "
+                    "at least {least} are needed, ten times as many for accuracy",
+                    given=self.run.substeps,
+                    least=least,
+                )
         for i, effect in enumerate(self.effects):
             place = effect.kind.partition(".")[0]
             if rigid and place in ("load", "transmission"):

