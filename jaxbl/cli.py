@@ -1,5 +1,6 @@
 """The command line: parse, call, print. JAX is imported only once a command has work for it."""
 
+import dataclasses
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -123,7 +124,7 @@ def plot(
         study = read_config(config)
         if identity(study) != Store.open(folder).manifest["identity"]:
             raise InputError(f"{config}: is not the study in {folder}; only title, notes and figures may differ")
-        result = result._replace(config=study)
+        result = dataclasses.replace(result, config=study)
     for line in write_sweep_report(result, folder):
         typer.echo(line)
     typer.echo(f"{folder / 'report.html'}")

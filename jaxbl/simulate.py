@@ -4,6 +4,7 @@
 loop over time that calls it, for simulated and for recorded positions, with or without a trace, with any reducers.
 """
 
+import os
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -22,10 +23,9 @@ from .observer.equivalent_control import EquivalentControl
 from .observer.recursive import Identifier, IdentifierState
 from .observer.super_twisting import Observers, ObserverState
 
-import os
-
 BARRIER = int(os.environ.get("BARRIER", "0"))
 UNROLL_SUBSTEPS = True
+UNROLL_SUB = int(os.environ.get('UNROLL','0'))
 
 Number = Any  # an array of one number a lane: Float[Array, ""] inside a step
 
@@ -212,7 +212,7 @@ def _move(plant: Plant, run: Run, state: PlantState, torque: Scalar, time: Numbe
 
     if run.substeps == 1:
         return substep(jnp.asarray(0), state)
-    return jax.lax.fori_loop(0, run.substeps, substep, state, unroll=UNROLL_SUBSTEPS)
+    return jax.lax.fori_loop(0, run.substeps, substep, state, unroll=UNROLL_SUB or UNROLL_SUBSTEPS)
 
 
 class Reducer(NamedTuple):

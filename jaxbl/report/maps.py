@@ -23,6 +23,7 @@ from jaxbl.errors import InputError
 from jaxbl.observer.conditions import LEAST_LAMBDA
 from jaxbl.study.config import Config, FigureTable, nearest, numeric_paths
 from jaxbl.study.metrics import describe
+from jaxbl.study.sweep import StudyResult
 
 from .style import COLOURS, MAP, MISSING, style, with_unit
 
@@ -31,6 +32,7 @@ _CONDITIONS = {
     "seeber_horn": ("Seeber-Horn", "--"),
     "exact": ("exact, ρ = 1", ":"),
 }
+SIDES = ("motor", "load")
 _BOOLEAN = ("converged", "finite")
 
 
@@ -42,9 +44,13 @@ class Drawn(NamedTuple):
     caption: str
 
 
-def default_figures(config: Config, frame: pd.DataFrame) -> list[FigureTable]:
-    """Figures for a study that asks for none: a heatmap over its first two axes, or lines over its one."""
-    varying = [axis for axis in config.axes if frame[axis.path].nunique() > 1 and frame[axis.path].dtype != object]
+def default_figures(config: Config) -> list[FigureTable]:
+    """Figures for a study that asks for none: a heatmap over its last two axes, or lines over its one."""
+    varying = [
+        axis
+        for axis in config.axes
+        if axis.values is None or (len(axis.values) > 1 and not any(isinstance(v, str) for v in axis.values))
+    ]
     if not varying:
         return []
     value = "motor.velocity_rmse"
@@ -54,16 +60,19 @@ def default_figures(config: Config, frame: pd.DataFrame) -> list[FigureTable]:
     return [FigureTable(kind="heatmap", x=x, y=y, value=value, facet=rest[0] if rest else None)]
 
 
-def draw(config: Config, frame: pd.DataFrame) -> list[Drawn]:
+def draw(result: StudyResult) -> list[Drawn]:
     """All figures of a study.
 
     Raises:
         InputError: a figure names an axis or a metric that the study does not have.
     """
-    figures = config.figures or default_figures(config, frame)
-    check_figures(config, figures, list(frame.columns))
+    config = result.config
+    figures = config.figures or default_figures(config)
+    check_figures(config, figures, result.columns)
     drawn, names = [], set()
     for figure in figures:
+        wanted = {figure.value, "finite", *(f"{side}.{name}" for side in SIDES for name in ("converged", "f_plus"))}
+        frame = result.read([*(axis.path for axis in config.axes), *(c for c in result.columns if c in wanted)])
         drawing = _heatmap(config, frame, figure) if figure.kind == "heatmap" else _lines(config, frame, figure)
         name, i = drawing.name, 2
         while name in names:

@@ -7,14 +7,12 @@
 import json
 from pathlib import Path
 
-import pandas as pd
-
 from jaxbl.study.metrics import SIDE_METRICS
 from jaxbl.study.store import make_folder, write_atomic
 from jaxbl.study.sweep import StudyResult
 from jaxbl.study.trial import Trial
 
-from .maps import Drawn, draw
+from .maps import SIDES, Drawn, draw
 from .page import Picture, TableOf, html
 from .style import save
 from .traces import draw_trial
@@ -22,14 +20,14 @@ from .traces import draw_trial
 
 def write_sweep_report(result: StudyResult, folder: Path) -> list[str]:
     """Draw the figures of a study and write `report.html` into its folder. Returns the headline's lines."""
-    pictures = _save(draw(result.config, result.frame), folder)
+    pictures = _save(draw(result), folder)
     lead = headline(result)
     page = html(
         result.config.title or "Study",
         lead,
         result.config.notes,
         pictures,
-        [_axes_table(result), _metric_table(result.frame)],
+        [_axes_table(result), _metric_table(result)],
         result.config.to_toml(),
     )
     write_atomic(folder / "report.html", page)
@@ -38,8 +36,9 @@ def write_sweep_report(result: StudyResult, folder: Path) -> list[str]:
 
 def headline(result: StudyResult) -> list[str]:
     """What a study found, in sentences."""
-    frame = result.frame
-    sides = [side for side in ("motor", "load") if f"{side}.converged" in frame]
+    sides = [side for side in SIDES if f"{side}.converged" in result.columns]
+    figures = [f"{side}.{name}" for side in sides for name in ("converged", "velocity_rmse")]
+    frame = result.read([*(axis.path for axis in result.config.axes), "finite", *figures])
     shares = ", ".join(f"{100 * frame[f'{side}.converged'].mean():.1f} % ({side})" for side in sides)
     lines = [f"{len(frame)} runs. The observers converged in {shares} of them."]
     diverged = int((~frame["finite"].astype(bool)).sum())
@@ -66,7 +65,7 @@ def write_trial_report(trial: Trial, folder: Path) -> list[str]:
     write_atomic(folder / "summary.json", json.dumps(trial.summary, indent=2, ensure_ascii=False))
     pictures = _save(draw_trial(trial), folder)
     metrics = trial.summary["metrics"]
-    sides = [side for side in ("motor", "load") if f"{side}.converged" in metrics]
+    sides = [side for side in SIDES if f"{side}.converged" in metrics]
     tables = [
         TableOf(
             "Metrics",
@@ -102,19 +101,20 @@ def _save(drawn: list[Drawn], folder: Path) -> list[Picture]:
 def _axes_table(result: StudyResult) -> TableOf:
     rows: list[list[object]] = []
     for axis in result.config.axes:
-        column = result.frame[axis.path]
+        column = result.read([axis.path])[axis.path]
         ends = ["–", "–"] if column.dtype == object else [column.min(), column.max()]
         rows.append([axis.path, int(column.nunique()), *ends])
     return TableOf("Axes", ["path", "values", "least", "largest"], rows)
 
 
-def _metric_table(frame: pd.DataFrame) -> TableOf:
+def _metric_table(result: StudyResult) -> TableOf:
     rows: list[list[object]] = []
-    for side in ("motor", "load"):
+    for side in SIDES:
         for name, about in SIDE_METRICS.items():
-            if f"{side}.{name}" in frame:
-                values = frame[f"{side}.{name}"].astype(float)
+            column = f"{side}.{name}"
+            if column in result.columns:
+                values = result.read([column])[column].astype(float)
                 values = values[values.abs() < float("inf")]
                 quantiles = [values.quantile(q) if len(values) else None for q in (0.05, 0.5, 0.95)]
-                rows.append([f"{side}.{name}", *quantiles, about.unit, about.doc])
+                rows.append([column, *quantiles, about.unit, about.doc])
     return TableOf("Metrics over all runs", ["metric", "5 %", "median", "95 %", "unit", "meaning"], rows)

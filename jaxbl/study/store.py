@@ -137,9 +137,18 @@ class Store:
         frame.to_parquet(draft, index=False)
         draft.replace(self.part(index))
 
-    def read(self, columns: list[str] | None = None) -> pd.DataFrame:
-        """The rows of all chunks that are there."""
+    def parts(self) -> list[Path]:
+        """Files of the chunks that are there. Raises `InputError` where there is none."""
         parts = sorted((self.folder / "points").glob("part-*.parquet"))
         if not parts:
             raise InputError(f"{self.folder}: holds no points yet; run 'jaxbl sweep' to the end")
+        return parts
+
+    def columns(self) -> list[str]:
+        """Names of the columns."""
+        return pq.read_schema(self.parts()[0]).names
+
+    def read(self, columns: list[str] | None = None) -> pd.DataFrame:
+        """Rows of all chunks that are there; all columns, or some."""
+        parts = self.parts()
         return pd.concat([pd.read_parquet(part, columns=columns) for part in parts], ignore_index=True)

@@ -1,8 +1,10 @@
 """A whole study, from config to frame: the function behind `jaxbl sweep`."""
 
-from collections.abc import Mapping
+import dataclasses
+import functools
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
@@ -15,18 +17,36 @@ if TYPE_CHECKING:
     import xarray
 
 
-class StudyResult(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class StudyResult:
     """Points of a study with their metrics.
 
     Attributes:
         config: the study.
-        frame: one row a point and seed: axis paths, `seed`, metrics (columns and units: docs/metrics.md).
         cost: seconds of compilation and of computing, and lanes computed in this call.
+        source: where the rows are: a folder, or memory.
     """
 
     config: Config
-    frame: pd.DataFrame
-    cost: dict[str, float]
+    source: Store | pd.DataFrame
+    cost: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    @functools.cached_property
+    def frame(self) -> pd.DataFrame:
+        """One row a point and seed: axis paths, `seed`, metrics (columns and units: docs/reference.md)."""
+        return self.read()
+
+    @property
+    def columns(self) -> list[str]:
+        """Names of all columns."""
+        return self.source.columns() if isinstance(self.source, Store) else list(self.source.columns)
+
+    def read(self, columns: Iterable[str] | None = None) -> pd.DataFrame:
+        """Some columns of the frame, read for this call: a large study need not fit into memory whole."""
+        names = None if columns is None else list(dict.fromkeys(columns))
+        if isinstance(self.source, Store):
+            return self.source.read(names)
+        return self.source if names is None else self.source.loc[:, names]
 
     def to_xarray(self) -> "xarray.Dataset":
         """The frame as a dataset over the axes and `seed` (zipped axes share one dimension); needs xarray.
@@ -105,13 +125,13 @@ def sweep(
             progress(done, engine.rows)
     if not store.manifest["finished"]:
         store.update(finished=True, seconds={"compile": engine.compile_seconds, "run": engine.run_seconds})
-    return StudyResult(config, store.read(), _cost(engine, computed))
+    return StudyResult(config, store, _cost(engine, computed))
 
 
 def load(folder: str | Path) -> StudyResult:
     """Read a study's folder. Raises `InputError` where there is none."""
     store = Store.open(Path(folder))
-    return StudyResult(store.config(), store.read(), {})
+    return StudyResult(store.config(), store)
 
 
 def dry_run(study: str | Path | Mapping[str, Any] | Config) -> Estimate:
