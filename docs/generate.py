@@ -79,8 +79,8 @@ def page() -> str:
             lead = f"| `{name}` | {doc} " if i == 0 else "| | "
             parts.append(f"{lead}| `{field.name}`: {known.doc} | {known.unit} | {default} |")
     parts.append(
-        "\n## Metrics\n\nColumns of `points/part-*.parquet`: one for each `side` in motor, load. Besides them: the axis paths, "
-        "`seed`, and `finite` (no number of the lane overflowed).\n\n| column | unit | meaning |\n|---|---|---|"
+        "\n## Metrics\n\nColumns of `points/part-*.parquet`: one for each `side` in motor, load. Besides them: the axis "
+        "paths, `seed`, and `finite` (no number of the lane overflowed).\n\n| column | unit | meaning |\n|---|---|---|"
     )
     parts += [f"| `side.{name}` | {about.unit} | {about.doc} |" for name, about in SIDE_METRICS.items()]
     return "\n".join(parts) + "\n"

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -27,6 +28,7 @@ ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML stu
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="DIR", help="folder for the results [default: results/<config name>]")
 ]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="remove the results of another study from the folder")]
 
 
 @app.callback()
@@ -40,19 +42,18 @@ def simulate(
     out: OutOption = None,
     seed: Annotated[int, typer.Option(help="seed of the encoder noise", min=0)] = 0,
     every: Annotated[int, typer.Option(help="keep every N-th sample of the trace", min=1, metavar="N")] = 1,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Run the experiment of a study once: trace, figures, summary."""
     _start_jax()
     from .report import write_trial_report
     from .study.config import read_config
-    from .study.store import make_folder
+    from .study.store import claim
     from .study.trial import run
 
     study = read_config(config)
     folder = _folder(config, out)
-    if (folder / "manifest.json").exists():
-        raise InputError(f"{folder}: holds a sweep; choose another folder with --out")
-    make_folder(folder)
+    claim(folder, study, single=True, overwrite=overwrite)
     trial = run(study, seed=seed, every=every)
     for line in write_trial_report(trial, folder):
         typer.echo(line)
@@ -66,6 +67,7 @@ def sweep(
     config: ConfigArgument,
     out: OutOption = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what it will cost, and stop")] = False,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Run all points of a study: table of metrics, maps, report. Goes on where an interrupted run stopped."""
     _start_jax()
@@ -73,6 +75,7 @@ def sweep(
     from .report.maps import check_figures
     from .study.config import read_config
     from .study.metrics import metric_columns
+    from .study.points import Points
     from .study.sweep import dry_run as estimate_cost
     from .study.sweep import sweep as run_sweep
 
@@ -80,6 +83,7 @@ def sweep(
     if not study.axes and study.sweep.seeds == 1:
         raise InputError(f"{config}: axes: the study has none; add [[axes]], or use 'jaxbl simulate'")
     with _naming(config):
+        Points(study)
         check_figures(study, study.figures, metric_columns(study.build()))
         if dry_run:
             cost = estimate_cost(study)
@@ -91,10 +95,10 @@ def sweep(
                 f"run          about {_duration(cost.run_seconds)} ({cost.lane_steps_per_second:.2g} lane-steps/s measured)"
             )
             return
-        folder = _folder(config, out)
-        resume = f"jaxbl sweep {config} --out {folder}"
-        with _resumable(resume), _progress("runs") as progress:
-            result = run_sweep(study, folder, progress=progress)
+    folder = _folder(config, out)
+    resume = shlex.join(["jaxbl", "sweep", str(config), "--out", str(folder)])
+    with _resumable(resume), _progress("runs") as progress:
+        result = run_sweep(study, folder, progress=progress, overwrite=overwrite)
     for line in write_sweep_report(result, folder):
         typer.echo(line)
     if result.cost["lanes"]:

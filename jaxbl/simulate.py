@@ -25,7 +25,7 @@ from .observer.super_twisting import Observers, ObserverState
 
 BARRIER = int(os.environ.get("BARRIER", "0"))
 UNROLL_SUBSTEPS = True
-UNROLL_SUB = int(os.environ.get('UNROLL','0'))
+UNROLL_SUB = int(os.environ.get("UNROLL", "0"))
 
 Number = Any  # an array of one number a lane: Float[Array, ""] inside a step
 

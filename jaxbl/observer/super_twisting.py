@@ -91,15 +91,15 @@ class ImplicitSuperTwisting(AbstractSuperTwisting):
     def step(self, state, measured, acceleration, step):
         innovation = measured - state.position
         reach = step * step * self.alpha
-        magnitude = jnp.abs(innovation)
         damping = step * self.lambda_
-        beyond = jnp.maximum(magnitude - reach, 0.0)
-        # 2 c / (b + sqrt(b^2 + 4 c)): the root without cancellation
-        denominator = damping + jnp.sqrt(damping * damping + 4.0 * beyond)
-        root = 2.0 * beyond / jnp.where(denominator > 0.0, denominator, 1.0)
-        error = jnp.copysign(root * root, innovation)
         # what is left of the innovation in the sliding set, alpha s h^2, is its clip
-        control = jnp.clip(innovation, -reach, reach) / (step * step)
+        sliding = jnp.clip(innovation, -reach, reach)
+        beyond = innovation - sliding
+        # sqrt|e| = 2 c / (b + sqrt(b^2 + 4 c)): the root without cancellation; the floor is for lambda = 0 at rest
+        denominator = damping + jnp.sqrt(damping * damping + 4.0 * jnp.abs(beyond))
+        half = beyond / jnp.maximum(denominator, jnp.finfo(denominator.dtype).tiny)
+        error = 4.0 * half * jnp.abs(half)
+        control = sliding / (step * step)
         position = measured - error
         velocity = state.velocity + step * control
         # the estimate lags by half a step of the perturbation; the mean velocity over the coming step makes up for it,

@@ -32,6 +32,7 @@ _CONDITIONS = {
     "seeber_horn": ("Seeber-Horn", "--"),
     "exact": ("exact, ρ = 1", ":"),
 }
+_HATCH = (1.0, 1.0, 1.0, 0.45)
 SIDES = ("motor", "load")
 _BOOLEAN = ("converged", "finite")
 
@@ -85,12 +86,16 @@ def draw(result: StudyResult) -> list[Drawn]:
 def check_figures(config: Config, figures: list[FigureTable], columns: list[str]) -> None:
     """Raise `InputError` where a figure names an axis or metric that does not exist."""
     axes = [axis.path for axis in config.axes]
+    words = [axis.path for axis in config.axes if any(isinstance(value, str) for value in axis.values or ())]
     for i, figure in enumerate(figures):
         for key in ("x", "y", "facet", "series"):
             path = getattr(figure, key)
             if path is not None and path not in axes:
                 hint = nearest(path, axes) if axes else "the study has no axes"
                 raise InputError(f"figures[{i}].{key}: '{path}' is not an axis of this study; {hint}")
+            if path in words and key in ("x", "y"):
+                other = "facet" if figure.kind == "heatmap" else "facet or series"
+                raise InputError(f"figures[{i}].{key}: '{path}' has no numeric values; use it as {other}")
         metrics = [column for column in columns if column not in (*axes, "seed")]
         if figure.value not in metrics:
             raise InputError(f"figures[{i}].value: '{figure.value}' is no metric; {nearest(figure.value, metrics)}")
@@ -222,7 +227,7 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
             missing += int(table.isna().sum())
             diverged += int((~part["finite"].astype(bool)).sum())
             under = []
-            if gridded and (best := _best(table, spec)) is not None:
+            if gridded and (best := _best(table, part, spec)) is not None:
                 ax.plot(best[0], best[1], "*", ms=13, mfc="white", mec="black", mew=1.0, clip_on=False, zorder=5)
                 under.append(f"best ★ {best[2]:.2g} {describe(spec.value).unit}".rstrip())
             if spec.overlays:
@@ -261,29 +266,34 @@ def _extend(tables: list[pd.Series], norm: Normalize) -> str:
     return {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}[below, above]
 
 
-def _best(table: pd.Series, spec: FigureTable) -> tuple[float, float, float] | None:
-    """Place and value of the smallest figure, for errors and times."""
-    if not re.search(r"rmse|chatter|convergence_time$", spec.value) or table.isna().all():
+def _best(table: pd.Series, part: pd.DataFrame, spec: FigureTable) -> tuple[float, float, float] | None:
+    """Place and value of the smallest figure, for errors and times, among the points that converged if any did."""
+    if not re.search(r"rmse|chatter|convergence_time$", spec.value):
         return None
-    y, x = table.idxmin()  # type: ignore[misc]
-    return float(x), float(y), float(table[(y, x)])
+    assert spec.y is not None
+    kept = table[_reduce(part, [spec.y, spec.x], f"{spec.value.partition('.')[0]}.converged") >= 0.5].dropna()
+    kept = kept if len(kept) else table.dropna()
+    if not len(kept):
+        return None
+    y, x = kept.idxmin()
+    return float(x), float(y), float(kept[(y, x)])
 
 
 def _outline(
     ax: Axes, part: pd.DataFrame, keys: list[str], spec: FigureTable, xs: np.ndarray, ys: np.ndarray
-) -> Line2D | None:
-    """Boundary of the region where the observer keeps its tolerance."""
+) -> Patch | None:
+    """Mark where the observer does not keep its tolerance."""
     side = spec.value.partition(".")[0]
     column = f"{side}.converged"
     if column not in part or spec.value == column or min(len(xs), len(ys)) < 2:
         return None
     share = _reduce(part, keys, column).unstack().to_numpy(float)
     if share.min() < 0.5 <= share.max():
-        lines = ax.contour(xs, ys, share, levels=[0.5], colors="white", linewidths=2.2)
-        lines.set_path_effects([path_effects.Stroke(linewidth=3.8, foreground="black"), path_effects.Normal()])
-    handle = Line2D([], [], color="white", lw=2.2, label=f"{side} converged (inside)")
-    handle.set_path_effects([path_effects.Stroke(linewidth=3.8, foreground="black"), path_effects.Normal()])
-    return handle
+        hatched = ax.contourf(xs, ys, share, levels=[-1.0, 0.5], colors="none", hatches=["//"])
+        hatched.set(edgecolor=_HATCH, linewidth=0.0)
+        lines = ax.contour(xs, ys, share, levels=[0.5], colors="white", linewidths=1.8)
+        lines.set_path_effects([path_effects.Stroke(linewidth=3.2, foreground="black"), path_effects.Normal()])
+    return Patch(facecolor="#808080", edgecolor="white", hatch="///", label=f"{side} not converged")
 
 
 def _bound(part: pd.DataFrame, spec: FigureTable) -> float:
@@ -322,7 +332,7 @@ def _lines(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
             for i, (name, group) in enumerate(groups):
                 values = shown.loc[group.index].astype(float)
                 by_x = values.groupby(group[spec.x], sort=True)
-                middle = by_x.median()
+                middle = by_x.mean() if shown.dtype == bool else by_x.median()
                 colour = COLOURS[i % len(COLOURS)]
                 label = None if spec.series is None else f"{name if isinstance(name, str) else f'{name:g}'}"
                 ax.plot(middle.index, middle, "o-", ms=3.5, color=colour, label=label)

@@ -7,8 +7,10 @@
 import json
 from pathlib import Path
 
+import pandas as pd
+
 from jaxbl.study.metrics import SIDE_METRICS
-from jaxbl.study.store import make_folder, write_atomic
+from jaxbl.study.store import write_atomic
 from jaxbl.study.sweep import StudyResult
 from jaxbl.study.trial import Trial
 
@@ -57,8 +59,7 @@ def headline(result: StudyResult) -> list[str]:
 
 
 def write_trial_report(trial: Trial, folder: Path) -> list[str]:
-    """Write trace, summary, figures and report of a run. Returns the lines for the terminal."""
-    make_folder(folder)
+    """Write trace, summary, figures and report of a run into a folder that exists. Returns the lines for the terminal."""
     draft = folder / ".trace.draft"
     trial.trace.to_parquet(draft, index=False)
     draft.replace(folder / "trace.parquet")
@@ -102,7 +103,7 @@ def _axes_table(result: StudyResult) -> TableOf:
     rows: list[list[object]] = []
     for axis in result.config.axes:
         column = result.read([axis.path])[axis.path]
-        ends = ["–", "–"] if column.dtype == object else [column.min(), column.max()]
+        ends = ["–", "–"] if not pd.api.types.is_numeric_dtype(column) else [column.min(), column.max()]
         rows.append([axis.path, int(column.nunique()), *ends])
     return TableOf("Axes", ["path", "values", "least", "largest"], rows)
 

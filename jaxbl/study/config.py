@@ -145,6 +145,10 @@ class ObserverTable(Table):
         return Observers(cls(**dict(self.motor)), None if self.load is None else cls(**dict(self.load)))
 
 
+_MOST_STEPS = 2e9
+"""Samples are counted in 32 bits."""
+
+
 class RunTable(Table):
     """Time grid, precision and tolerances."""
 
@@ -179,6 +183,12 @@ class RunTable(Table):
                 "period",
                 "sample_period {period} s is longer than duration {duration} s; it should be a small part of it",
                 {"period": self.sample_period, "duration": self.duration},
+            )
+        if self.duration / self.sample_period > _MOST_STEPS:
+            raise PydanticCustomError(
+                "period",
+                "duration {duration} s holds more than {most} samples of {period} s; it should hold fewer",
+                {"period": self.sample_period, "duration": self.duration, "most": f"{_MOST_STEPS:.0e}"},
             )
         if self.steps < 8:
             raise PydanticCustomError(
@@ -239,7 +249,7 @@ class AxisTable(Table):
                 raise wrong("axis {path} has both values and start/stop/num; give one of them")
             if not self.values:
                 raise wrong("axis {path} is empty: values should list at least one value")
-            if len({str(v) for v in self.values}) < len(self.values):
+            if self.zip is None and len(set(self.values)) < len(self.values):
                 raise wrong("axis {path} lists a value twice; values should differ")
             return self
         if self.start is None or self.stop is None:
@@ -271,7 +281,20 @@ class FigureTable(Table):
     def _complete(self) -> "FigureTable":
         if self.kind == "heatmap" and self.y is None:
             raise PydanticCustomError("figure", "a heatmap needs y, the path of its second axis", {})
-        if self.overlays and {self.x.rpartition(".")[2], (self.y or "").rpartition(".")[2]} != {"alpha", "lambda"}:
+        idle = "series" if self.kind == "heatmap" else "y"
+        if getattr(self, idle) is not None:
+            hint = "use facet" if self.kind == "heatmap" else "use series or facet"
+            raise PydanticCustomError(
+                "figure", "a {kind} has no {key}; {hint}", {"kind": self.kind, "key": idle, "hint": hint}
+            )
+        paths = [path for path in (self.x, self.y, self.facet, self.series) if path is not None]
+        for path in paths:
+            if paths.count(path) > 1:
+                raise PydanticCustomError(
+                    "figure", "{path} is used twice; x, y, facet and series should be different axes", {"path": path}
+                )
+        gains = [{f"observer.{side}.alpha", f"observer.{side}.lambda"} for side in ("motor", "load")]
+        if self.overlays and {self.x, self.y} not in gains:
             raise PydanticCustomError(
                 "figure", "overlays need a map over alpha and lambda of one observer; leave overlays out here", {}
             )
@@ -337,6 +360,10 @@ class Config(Table):
                     i=i,
                     kind=effect.kind,
                 )
+        known = numeric_paths(self)
+        for path in self.uncertainty.exact:
+            if path not in known and path != "drive.gear_ratio":
+                raise wrong("uncertainty.exact: unknown path '{path}'; {hint}", path=path, hint=_nearest_path(path, known))
         return self
 
     def build(self) -> Experiment:
@@ -376,7 +403,7 @@ def read_config(source: str | Path | Mapping[str, Any] | Config) -> Config:
         return _validate(dict(source), "config")
     path = Path(source)
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except IsADirectoryError:
@@ -397,7 +424,9 @@ def _validate(data: dict[str, Any], name: str = "") -> Config:
     try:
         return Config.model_validate(data)
     except ValidationError as error:
-        raise InputError(f"{name}: {_describe(error)}" if name else _describe(error)) from None
+        # keys and values may hold line breaks; the message is one line
+        message = "".join(c if c.isprintable() else repr(c)[1:-1] for c in _describe(error))
+        raise InputError(f"{name}: {message}" if name else message) from None
 
 
 _UNIONS = {"drive": 1, "transmission": 1, "excitation": 1, "effects": 2}
@@ -411,11 +440,13 @@ def _describe(error: ValidationError) -> str:
     tag = _UNIONS.get(str(location[0]) if location else "")
     if tag is not None and len(location) > tag:
         del location[tag]
+    if location[:1] == ["axes"] and "values" in location:
+        del location[4:]  # the member of the union that came last
     key = ""
     for part in location:
         key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)
     where = f"{key}: " if key else ""
-    kind, context, given = first["type"], first.get("ctx", {}), first["input"]
+    kind, context, given = first["type"], first.get("ctx", {}), _brief(first["input"])
     if kind == "missing":
         return f"{where}this key is missing"
     if kind == "union_tag_invalid":
@@ -425,13 +456,18 @@ def _describe(error: ValidationError) -> str:
     if kind == "union_tag_not_found":
         return f"{where}the key {context['discriminator']} is missing"
     if kind in ("model_type", "model_attributes_type", "dict_type"):
-        return f"{where}should be a table, not {given!r}"
+        return f"{where}should be a table, not {given}"
     if kind == "list_type":
-        return f"{where}should be an array, not {given!r}"
+        return f"{where}should be an array, not {given}"
     message = first["msg"].removeprefix("Input ")
     if kind in ("unknown_key", "period", "axis", "figure", "consistency"):
         return f"{where}{message}"
-    return f"{where}{message}, not {given!r}"
+    return f"{where}{message}, not {given}"
+
+
+def _brief(given: Any) -> str:
+    text = repr(given)
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def numeric_paths(config: Config) -> dict[str, Parameter]:
@@ -485,6 +521,8 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
             target = data.setdefault(section, {})
             for table in tables:
                 target = target.setdefault(table, {})
+        if type(target.get(key)) is int and isinstance(value, float) and value.is_integer():
+            value = int(value)  # a whole number from start, stop and num
         target[key] = value
     return _validate(data)
 

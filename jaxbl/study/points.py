@@ -17,6 +17,8 @@ from .config import AxisTable, Config, with_values
 
 Columns = dict[str, np.ndarray]
 
+_MOST_RUNS = 1e10
+
 
 class Block(NamedTuple):
     """Axes that advance together: columns of equal length by path."""
@@ -53,6 +55,9 @@ class Points:
         structural = [b for b in blocks if not all(path in self.leaves for path in b.columns)]
         self._blocks_of_leaves = [b for b in blocks if all(path in self.leaves for path in b.columns)]
         self.lanes = math.prod(len(b) for b in self._blocks_of_leaves)
+        runs = math.prod(len(b) for b in blocks) * config.sweep.seeds
+        if runs > _MOST_RUNS:
+            raise InputError(f"axes: {runs:.2g} runs are more than {_MOST_RUNS:.0e}; fewer values, or a quasi-random design")
         self.groups = []
         for index in range(math.prod(len(b) for b in structural)):
             values = {path: column[0] for path, column in _take(structural, np.array([index])).items()}
@@ -97,6 +102,8 @@ class Points:
                 )
             if config.sweep.points is None:
                 raise InputError("sweep.points is missing: how many quasi-random points?")
+        elif config.sweep.points is not None:
+            raise InputError("sweep.points belongs to design = 'sobol' or 'latin_hypercube'; a grid has num on its axes")
         for axis in sampled:
             if axis.path not in self.leaves:
                 raise InputError(f"axes: '{axis.path}' is fixed at compile time; list its values instead of sampling it")

@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import platform
+import shutil
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,14 +20,56 @@ from .engine import Layout
 FORMAT = 1
 
 
-def identity(config: Config) -> str:
-    """Hash of everything that decides the numbers (title, figures and chunk size do not)."""
+def identity(config: Config, *, single: bool = False) -> str:
+    """Hash of everything that decides the numbers of a study, or of its `single` run (which has no axes).
+
+    Title, notes, figures and chunk size decide nothing.
+    """
     data = config.resolved()
-    data.pop("title", None)
-    data.pop("notes", None)
-    data.pop("figures", None)
     data["sweep"].pop("chunk", None)
+    for key in ("title", "notes", "figures", *(("axes", "sweep") if single else ())):
+        data.pop(key, None)
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
+
+
+_OUTPUTS = ("manifest.json", "summary.json", "study.toml", "trace.parquet", "points", "figures", "report.html")
+
+
+def claim(folder: Path, config: Config, *, single: bool = False, overwrite: bool = False) -> None:
+    """Make sure that a study, or its single run, may write its results into a folder; make the folder.
+
+    Both may share one folder. With `overwrite`, results of other studies are removed from it first.
+
+    Raises:
+        InputError: the folder holds another study or other files, or cannot be written to.
+    """
+    make_folder(folder)
+    found = {}
+    for name in ("manifest.json", "summary.json"):
+        try:
+            found[name] = json.loads((folder / name).read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            continue
+        except ValueError:
+            found[name] = {}
+    same = [data.get("single_run") == identity(config, single=True) for data in found.values()]
+    if not single and "manifest.json" in found:
+        same.append(found["manifest.json"].get("identity") == identity(config))
+    if all(same) and (found or not any(folder.iterdir())):
+        return
+    if not found:
+        raise InputError(f"{folder}: is not empty and holds no study; choose another folder with --out")
+    if not overwrite:
+        title = next((data["title"] for data in found.values() if data.get("title")), "untitled")
+        raise InputError(
+            f"{folder}: holds another study ('{title}', other numbers); choose another folder with --out, or --overwrite"
+        )
+    for name in _OUTPUTS:
+        path = folder / name
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
@@ -60,23 +103,15 @@ class Store:
 
     @classmethod
     def create(cls, folder: Path, config: Config, layout: Layout, parts: int, rows: int) -> "Store":
-        """Open the folder for this study, or take up the one that is there.
-
-        Raises:
-            InputError: the folder holds another study or other files, or cannot be written to.
-        """
-        make_folder(folder)
-        path = folder / "manifest.json"
-        if path.exists():
+        """Open a folder that this study may have (:func:`claim`), or take up the one that is there."""
+        if (folder / "manifest.json").exists():
             store = cls.open(folder)
-            if store.manifest["identity"] != identity(config):
-                raise InputError(f"{folder}: holds another study ({store.title()}); choose another folder with --out")
         else:
-            if any(folder.iterdir()):
-                raise InputError(f"{folder}: is not empty and holds no study; choose another folder with --out")
             manifest = {
                 "format": FORMAT,
                 "identity": identity(config),
+                "single_run": identity(config, single=True),
+                "title": config.title,
                 "layout": {"seeds": layout.seeds, "points": layout.points},
                 "parts": parts,
                 "rows": rows,
@@ -103,9 +138,6 @@ class Store:
         if manifest.get("format") != FORMAT:
             raise InputError(f"{path}: has format {manifest.get('format')}; this version reads {FORMAT}")
         return cls(folder, manifest)
-
-    def title(self) -> str:
-        return self.config().title or self.manifest["identity"]
 
     def config(self) -> Config:
         return read_config(self.folder / "study.toml")

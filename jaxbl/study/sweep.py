@@ -11,7 +11,7 @@ import pandas as pd
 from .config import Config, read_config
 from .engine import Engine, Estimate, Layout, Progress
 from .metrics import describe
-from .store import Store
+from .store import Store, claim
 
 if TYPE_CHECKING:
     import xarray
@@ -86,6 +86,7 @@ def sweep(
     *,
     progress: Progress | None = None,
     devices: list[Any] | None = None,
+    overwrite: bool = False,
 ) -> StudyResult:
     """Run all points of a study.
 
@@ -95,6 +96,7 @@ def sweep(
             one that is finished is only read. Without it nothing is written.
         progress: called with finished and total lanes after each chunk.
         devices: JAX devices to use; left out, all local ones.
+        overwrite: remove the results of another study from `out`.
 
     Raises:
         InputError: wrong config, or a folder that holds something else.
@@ -110,6 +112,7 @@ def sweep(
         return StudyResult(config, pd.concat(frames, ignore_index=True), _cost(engine, engine.rows))
     folder = Path(out)
     engine = Engine(config, devices=devices)
+    claim(folder, config, overwrite=overwrite)
     store = Store.create(folder, config, engine.layout, len(engine), engine.rows)
     if store.layout != engine.layout:
         # taken up on another machine: the chunks must stay what they were

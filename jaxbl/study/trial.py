@@ -18,6 +18,7 @@ from jaxbl.simulate import Experiment, Signals, State, scan
 from .config import Config, read_config
 from .engine import precision, prepare
 from .metrics import METRICS
+from .store import identity
 
 
 class Trial(NamedTuple):
@@ -110,6 +111,7 @@ def _summary(config: Config, trace: pd.DataFrame, metrics: dict[str, Any], seed:
             conditions[side] = _conditions(getattr(experiment.observer, side), f_plus)
     return {
         "title": config.title,
+        "single_run": identity(config, single=True),
         "seed": seed,
         "metrics": metrics,
         "identified": identified,
