@@ -102,13 +102,14 @@ def main() -> None:
     parser.add_argument("--workload", nargs="+", default=["gains", "dead_zone"])
     parser.add_argument("--observer", nargs="+", default=["implicit"])
     parser.add_argument("--precision", nargs="+", type=int, default=[32])
-    parser.add_argument("--lanes", nargs="+", type=int, default=[512, 2048, 8192, 32768], help="lanes per device")
+    parser.add_argument("--lanes", nargs="+", type=int, default=[1024, 4096, 16384], help="lanes per device")
     parser.add_argument("--devices", nargs="+", type=int, default=[1])
     parser.add_argument("--substeps", nargs="+", type=int, default=[10])
-    parser.add_argument("--loop", nargs="+", default=["unrolled"], help="substeps: unrolled, rolled")
-    parser.add_argument("--lane-steps", type=float, default=1e6, help="work of one timed run per device")
-    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--loop", nargs="+", default=["rolled"], help="substeps: unrolled, rolled")
+    parser.add_argument("--steps", type=int, default=4096, help="many, so that what a run costs once does not count")
+    parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args()
+    steps = options.steps
 
     runs = []
     for choice in itertools.product(
@@ -121,25 +122,24 @@ def main() -> None:
         options.loop,
     ):
         variant = Variant(*choice)
-        steps = 128 * max(1, round(options.lane_steps / variant.lanes / 128))
         start = time.perf_counter()
         compiled, arguments = compile_variant(variant, steps)
         seconds = time.perf_counter() - start
         text = compiled.as_text()
         if variant.precision == 32:
             assert "f64[" not in text, "float64 slipped into a float32 program"
-        runs.append((variant, steps, seconds, compiled, arguments, body_operations(text)))
+        runs.append((variant, seconds, compiled, arguments, body_operations(text)))
         jax.block_until_ready(compiled(*arguments))
     least = {run[0]: (float("inf"), float("inf")) for run in runs}
     for _ in range(options.rounds):
-        for variant, _, _, compiled, arguments, _ in runs:
+        for variant, _, compiled, arguments, _ in runs:
             wall, cpu = time.perf_counter(), time.process_time()
             jax.block_until_ready(compiled(*arguments))
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
             least[variant] = (min(least[variant][0], wall), min(least[variant][1], cpu))
 
     print("workload   observer  bits    lanes dev sub loop      wall ns  cpu ns  lane-steps/s  compile s  kernels copies")
-    for variant, steps, seconds, _, _, operations in runs:
+    for variant, seconds, _, _, operations in runs:
         work = steps * variant.lanes * variant.devices
         wall, cpu = least[variant]
         print(

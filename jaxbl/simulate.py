@@ -4,7 +4,6 @@
 loop over time that calls it, for simulated and for recorded positions, with or without a trace, with any reducers.
 """
 
-import os
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -23,9 +22,8 @@ from .observer.equivalent_control import EquivalentControl
 from .observer.recursive import Identifier, IdentifierState
 from .observer.super_twisting import Observers, ObserverState
 
-BARRIER = int(os.environ.get("BARRIER", "0"))
-UNROLL_SUBSTEPS = True
-UNROLL_SUB = int(os.environ.get("UNROLL", "0"))
+UNROLL_SUBSTEPS = False
+# unrolled, XLA fuses each substep with copies of all before it: quadratic work (benchmarks/NOTES.md)
 
 Number = Any  # an array of one number a lane: Float[Array, ""] inside a step
 
@@ -207,12 +205,19 @@ def _move(plant: Plant, run: Run, state: PlantState, torque: Scalar, time: Numbe
     small = run.sample_period / run.substeps
 
     def substep(i: Int[Array, ""], state: PlantState) -> PlantState:
-        state = plant.advance(state, torque, time + i * small, small)
-        return jax.lax.optimization_barrier(state) if BARRIER else state
+        return plant.advance(state, torque, time + i * small, small)
 
     if run.substeps == 1:
         return substep(jnp.asarray(0), state)
-    return jax.lax.fori_loop(0, run.substeps, substep, state, unroll=UNROLL_SUB or UNROLL_SUBSTEPS)
+    return jax.lax.fori_loop(0, run.substeps, substep, state, unroll=UNROLL_SUBSTEPS)
+
+
+def settle(experiment: Experiment, state: State) -> State:
+    """The same state, ready for further samples without loss; for loops of more than some thousand samples in float32."""
+    if state.identifier is None:
+        return state
+    assert experiment.identifier is not None
+    return State(state.plant, state.observer, state.equivalent_control, experiment.identifier.settle(state.identifier))
 
 
 class Reducer(NamedTuple):
@@ -277,7 +282,8 @@ def scan(
     def block(carry: Any, first: Array, length: int) -> tuple[Any, Any]:
         indices = first + jnp.arange(length, dtype=jnp.int32)
         carry, kept = jax.lax.scan(sample, carry, (indices, unit_noise(seed, indices, experiment.sides)))
-        return carry, jax.tree.map(lambda x: x[::every], kept)
+        state, totals = carry
+        return (settle(experiment, state), totals), jax.tree.map(lambda x: x[::every], kept)
 
     steps = experiment.run.steps
     length = _block(steps) if record is None or every == 1 else every

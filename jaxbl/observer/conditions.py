@@ -77,7 +77,9 @@ def least_lambda_exact(alpha: Values, f_plus: Values) -> Values:
 
     # rho is zero, so below one, at lambda^2 = 4 c2
     upper = jnp.sqrt(8.0 * (ratio + 1.0))
-    (_, least), _ = jax.lax.scan(halve, (jnp.zeros_like(ratio), upper), length=60)
+    # each halving gives a bit
+    length = jnp.finfo(ratio.dtype).nmant + 4
+    (_, least), _ = jax.lax.scan(halve, (jnp.zeros_like(ratio), upper), length=length)
     return _above(alpha, f_plus, jnp.where(f_plus > 0.0, jnp.sqrt(f_plus) * least, 0.0))
 
 

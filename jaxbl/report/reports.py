@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 
 from jaxbl.study.metrics import SIDE_METRICS
-from jaxbl.study.store import write_atomic
+from jaxbl.study.store import Store, write_atomic
 from jaxbl.study.sweep import StudyResult
 from jaxbl.study.trial import Trial
 
@@ -43,6 +43,8 @@ def headline(result: StudyResult) -> list[str]:
     frame = result.read([*(axis.path for axis in result.config.axes), "finite", *figures])
     shares = ", ".join(f"{100 * frame[f'{side}.converged'].mean():.1f} % ({side})" for side in sides)
     lines = [f"{len(frame)} runs. The observers converged in {shares} of them."]
+    if isinstance(result.source, Store) and len(frame) < result.source.manifest["rows"]:
+        lines.append(f"The study is not finished: it has {result.source.manifest['rows']} runs. Go on with 'jaxbl sweep'.")
     diverged = int((~frame["finite"].astype(bool)).sum())
     if diverged:
         lines.append(f"{diverged} runs diverged: they are in the table with finite = false, and grey in the figures.")

@@ -424,9 +424,7 @@ def _validate(data: dict[str, Any], name: str = "") -> Config:
     try:
         return Config.model_validate(data)
     except ValidationError as error:
-        # keys and values may hold line breaks; the message is one line
-        message = "".join(c if c.isprintable() else repr(c)[1:-1] for c in _describe(error))
-        raise InputError(f"{name}: {message}" if name else message) from None
+        raise InputError(f"{name}: {_describe(error)}" if name else _describe(error)) from None
 
 
 _UNIONS = {"drive": 1, "transmission": 1, "excitation": 1, "effects": 2}
@@ -483,6 +481,8 @@ def numeric_paths(config: Config) -> dict[str, Parameter]:
         label = effect.kind if kinds.count(effect.kind) == 1 else str(i)
         found |= dict(_paths(effect, f"effects.{label}"))
     found.pop("run.precision", None)
+    if config.drive.kind == "rigid":
+        return {path: known for path, known in found.items() if "load" not in path and not path.startswith("identifier.")}
     return found
 
 

@@ -57,14 +57,19 @@ def prepare(config: Config) -> Experiment:
 
 
 def layout_for(config: Config, points: Points, devices: int) -> Layout:
-    """Chunk shape: as many lanes as the devices want at once, whole rows of points before several seeds."""
+    """Chunk shape: as many lanes as the devices want at once, whole rows of points before several seeds.
+
+    Every device gets two lanes or more: one alone is compiled to other roundings than a row of them.
+    """
     capacity = config.sweep.chunk or LANES_PER_DEVICE * devices
     # chunks of equal size waste no padding on the last one; a multiple of the devices, along the longer side, suits them
     per_chunk = math.ceil(points.lanes / math.ceil(points.lanes / capacity))
-    if points.lanes >= devices:
-        per_chunk = math.ceil(per_chunk / devices) * devices
+    if points.lanes >= devices and points.lanes > 1:
+        per_chunk = max(math.ceil(per_chunk / devices), 2) * devices
     seeds = min(config.sweep.seeds, max(capacity // per_chunk, 1))
-    if points.lanes < devices:
+    if points.lanes == 1:
+        seeds = max(math.ceil(seeds / devices), 2) * devices
+    elif points.lanes < devices:
         seeds = math.ceil(seeds / devices) * devices
     return Layout(seeds, per_chunk)
 

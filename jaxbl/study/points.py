@@ -127,6 +127,14 @@ class Points:
                         f"axes: '{axis.path}' has {len(values)} values, the others zipped as '{axis.zip}' have {len(block)}"
                     )
                 block.columns[axis.path] = values
+        for label, index in labels.items():
+            columns = blocks[index].columns
+            if len(columns) < 2 or label in (*self.paths, "seed"):
+                raise InputError(
+                    f"axes: zip = '{label}' should be a word of its own, the same on all axes that advance together"
+                )
+            if len(set(zip(*(column.tolist() for column in columns.values()), strict=True))) < len(blocks[index]):
+                raise InputError(f"axes: the axes zipped as '{label}' list a point twice; their points should differ")
         return blocks
 
 

@@ -27,6 +27,10 @@ def identity(config: Config, *, single: bool = False) -> str:
     """
     data = config.resolved()
     data["sweep"].pop("chunk", None)
+    if config.excitation.kind == "recorded":
+        # what was recorded counts, not where it lies
+        record = config.excitation.build()
+        data["excitation"]["file"] = hashlib.sha256(record.times.tobytes() + record.torques.tobytes()).hexdigest()
     for key in ("title", "notes", "figures", *(("axes", "sweep") if single else ())):
         data.pop(key, None)
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
@@ -46,12 +50,13 @@ def claim(folder: Path, config: Config, *, single: bool = False, overwrite: bool
     make_folder(folder)
     found = {}
     for name in ("manifest.json", "summary.json"):
-        try:
-            found[name] = json.loads((folder / name).read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            continue
-        except ValueError:
-            found[name] = {}
+        if (folder / name).exists():
+            try:
+                found[name] = _read_json(folder / name)
+            except InputError:
+                if not overwrite:
+                    raise
+                found[name] = {}
     same = [data.get("single_run") == identity(config, single=True) for data in found.values()]
     if not single and "manifest.json" in found:
         same.append(found["manifest.json"].get("identity") == identity(config))
@@ -70,6 +75,17 @@ def claim(folder: Path, config: Config, *, single: bool = False, overwrite: bool
             shutil.rmtree(path)
         else:
             path.unlink(missing_ok=True)
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """An object from a file of ours."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError(f"{path}: is damaged ({error}); remove it, or choose another folder with --out") from None
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: is not one of jaxbl's files; choose another folder with --out")
+    return data
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
@@ -129,12 +145,9 @@ class Store:
     def open(cls, folder: Path) -> "Store":
         """Open a study that is there. Raises `InputError` where there is none."""
         path = folder / "manifest.json"
-        try:
-            manifest = json.loads(path.read_text())
-        except (FileNotFoundError, NotADirectoryError):
-            raise InputError(f"{folder}: holds no study (no manifest.json); run 'jaxbl sweep' first") from None
-        except ValueError as error:
-            raise InputError(f"{path}: is damaged ({error}); remove the folder and run the sweep again") from None
+        if not path.exists():
+            raise InputError(f"{folder}: holds no study (no manifest.json); run 'jaxbl sweep' first")
+        manifest = _read_json(path)
         if manifest.get("format") != FORMAT:
             raise InputError(f"{path}: has format {manifest.get('format')}; this version reads {FORMAT}")
         return cls(folder, manifest)
@@ -182,5 +195,10 @@ class Store:
 
     def read(self, columns: list[str] | None = None) -> pd.DataFrame:
         """Rows of all chunks that are there; all columns, or some."""
-        parts = self.parts()
-        return pd.concat([pd.read_parquet(part, columns=columns) for part in parts], ignore_index=True)
+        frames = []
+        for part in self.parts():
+            try:
+                frames.append(pd.read_parquet(part, columns=columns))
+            except (OSError, ValueError):
+                raise InputError(f"{part}: is damaged; run 'jaxbl sweep' again, which computes it anew") from None
+        return pd.concat(frames, ignore_index=True)

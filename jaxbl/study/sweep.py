@@ -58,21 +58,17 @@ class StudyResult:
 
         if self.config.sweep.design != "grid":
             raise ValueError(f"a {self.config.sweep.design} design has no grid; use the frame")
-        dims: list[str] = []
         along: dict[str, list[str]] = {}
         for axis in self.config.axes:
-            name = axis.zip or axis.path
-            if name not in along:
-                dims.append(name)
-            along.setdefault(name, []).append(axis.path)
-        leading = [along[dim][0] for dim in dims]
-        dataset = self.frame.set_index([*leading, "seed"]).to_xarray()
-        for dim, paths in along.items():
-            for path in paths[1:]:
-                others = [d for d in dataset[path].dims if d != paths[0]]
-                dataset = dataset.assign_coords({path: dataset[path].isel(dict.fromkeys(others, 0))})
-            if dim != paths[0]:
-                dataset = dataset.rename_dims({paths[0]: dim})
+            along.setdefault(axis.zip or axis.path, []).append(axis.path)
+        zipped = {dim: paths for dim, paths in along.items() if paths != [dim]}
+        frame = self.frame.copy(deep=False)
+        for dim, paths in zipped.items():
+            frame[dim] = frame.groupby(paths, sort=False).ngroup()
+        dataset = frame.set_index([*along, "seed"]).to_xarray()
+        for dim, paths in zipped.items():
+            first = {other: 0 for other in dataset.dims if other != dim}
+            dataset = dataset.assign_coords({path: dataset[path].isel(first, drop=True) for path in paths}).drop_vars(dim)
         for name in dataset.data_vars:
             about = describe(str(name))
             dataset[name].attrs = {"units": about.unit, "long_name": about.doc}

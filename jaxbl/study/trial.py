@@ -53,11 +53,15 @@ def run(study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every:
     with precision(config):
         experiment = prepare(config)
 
+        names: list[str] = []
+
         def keep(state: State, signals: Signals) -> dict[str, Any]:
-            return _row(experiment, state, signals)
+            row = _row(experiment, state, signals)
+            names[:] = row  # in this order: compiled programs give dicts back sorted
+            return row
 
         figures, kept = eqx.filter_jit(lambda e, s: scan(e, s, (METRICS,), keep, every))(experiment, jnp.asarray(seed))
-        trace = pd.DataFrame({name: np.asarray(column, dtype=float) for name, column in kept.items()})
+        trace = pd.DataFrame({name: np.asarray(kept[name], dtype=float) for name in names})
     metrics = {name: _plain(value) for name, value in figures.items()}
     return Trial(config, trace, _summary(config, trace, metrics, seed))
 
@@ -86,8 +90,9 @@ def _row(experiment: Experiment, state: State, signals: Signals) -> dict[str, An
         }
     if state.identifier is not None:
         assert experiment.identifier is not None and experiment.transmission is not None
-        for side, found in experiment.identifier.estimate(state.identifier, experiment.transmission).items():
-            row |= {f"{side}.{name}": value for name, value in found.items()}
+        identified = experiment.identifier.estimate(state.identifier, experiment.transmission)
+        for side in experiment.sides:
+            row |= {f"{side}.{name}": value for name, value in identified[side].items()}
     return row
 
 

@@ -134,7 +134,7 @@ def test_recorded_positions_give_the_estimates_of_the_run_that_produced_them(dis
             for side in (signals.motor, signals.load)
         ]
         read = {side: signals.side(side).measured for side in experiment.sides}
-        return (signals.time, signals.input, read), (kept, state.identifier)
+        return (signals.time, signals.input, read), (kept, experiment.identifier.information(state.identifier))
 
     _, ((time, torque, measured), simulated) = eqx.filter_jit(lambda e: scan(e, jnp.asarray(5), record=keep))(experiment)
 

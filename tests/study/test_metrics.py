@@ -55,8 +55,8 @@ def by_numpy(experiment, signals, identifier):
             out[f"margin_{name}"] = observer.lambda_ / least(observer.alpha, f_plus)
         if identifier is not None:
             law = experiment.transmission
-            information = np.array([float(total.total[-1]) for total in identifier.information])
-            right = np.array([float(total.total[-1]) for total in identifier.right[side]])
+            information = np.array([float(total.value(identifier.weight)[-1]) for total in identifier.information])
+            right = np.array([float(total.value(identifier.weight)[-1]) for total in identifier.right[side]])
             if right.size == 1:
                 out["stiffness_error"] = right[0] / information[0] / law.stiffness - 1.0
                 out["excitation"] = 1.0

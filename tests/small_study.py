@@ -1,0 +1,58 @@
+"""A study small enough to run in a test: the paper's drive for a moment, as a mapping to be changed."""
+
+import copy
+from typing import Any
+
+ALPHA, LAMBDA, NOISE = "observer.motor.alpha", "observer.motor.lambda", "encoders.noise"
+
+_BASE: dict[str, Any] = {
+    "title": "small",
+    "drive": {
+        "kind": "two_inertia",
+        "motor_inertia": 0.05,
+        "motor_viscous": 0.15,
+        "load_inertia": 7.0,
+        "load_viscous": 16.0,
+        "gear_ratio": 5.0,
+    },
+    "transmission": {"law": "sigmoid_backlash", "stiffness": 1.0, "dead_zone": 0.02, "slope": 20.0},
+    "excitation": {"kind": "sine", "amplitude": 0.1, "frequency": 2.0},
+    "encoders": {"noise": 1e-4},
+    "observer": {
+        "motor": {"lambda": 4.0, "alpha": 9.0, "velocity_error": 0.5},
+        "load": {"lambda": 0.5, "alpha": 0.2},
+    },
+    "run": {"duration": 0.2, "substeps": 1},
+}
+
+
+def small(changes: dict[str, Any] | None = None, **tables: Any) -> dict[str, Any]:
+    """The study with some dotted keys set (None removes one) and some whole tables replaced."""
+    data = copy.deepcopy(_BASE) | tables
+    for path, value in (changes or {}).items():
+        *names, key = path.split(".")
+        table = data
+        for name in names:
+            table = table.setdefault(name, {})
+        if value is None:
+            table.pop(key, None)
+        else:
+            table[key] = value
+    return data
+
+
+def rigid(changes: dict[str, Any] | None = None, **tables: Any) -> dict[str, Any]:
+    """The same with one inertia."""
+    tables = {"drive": {"kind": "rigid", "motor_inertia": 0.05, "motor_viscous": 0.15}} | tables
+    without = {path: None for path in ("transmission", "observer.load") if path not in tables}
+    return small(without | (changes or {}), **tables)
+
+
+def listed(path: str, *values: Any, **keys: Any) -> dict[str, Any]:
+    """An axis of listed values."""
+    return {"path": path, "values": list(values), **keys}
+
+
+def spaced(path: str, start: float, stop: float, num: int | None = None, scale: str = "log", **keys: Any) -> dict[str, Any]:
+    """An axis between two ends."""
+    return {"path": path, "start": start, "stop": stop, "scale": scale, **({} if num is None else {"num": num}), **keys}
