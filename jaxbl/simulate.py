@@ -263,7 +263,7 @@ def scan(
         seed: seed of the encoder noise.
         reducers: figures to compute along the run.
         record: what to keep of every `every`-th sample; None keeps nothing.
-        every: decimation of the record; must divide the number of steps.
+        every: decimation of the record.
 
     Returns:
         The reducers' figures, and the record with a leading time axis (None without one).

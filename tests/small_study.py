@@ -3,6 +3,14 @@
 import copy
 from typing import Any
 
+import numpy as np
+import pandas as pd
+
+from jaxbl.study.config import read_config
+from jaxbl.study.metrics import metric_columns
+from jaxbl.study.points import Points
+from jaxbl.study.sweep import StudyResult
+
 ALPHA, LAMBDA, NOISE = "observer.motor.alpha", "observer.motor.lambda", "encoders.noise"
 
 _BASE: dict[str, Any] = {
@@ -28,7 +36,7 @@ _BASE: dict[str, Any] = {
 
 def small(changes: dict[str, Any] | None = None, **tables: Any) -> dict[str, Any]:
     """The study with some dotted keys set (None removes one) and some whole tables replaced."""
-    data = copy.deepcopy(_BASE) | tables
+    data = copy.deepcopy(_BASE | tables)
     for path, value in (changes or {}).items():
         *names, key = path.split(".")
         table = data
@@ -56,3 +64,20 @@ def listed(path: str, *values: Any, **keys: Any) -> dict[str, Any]:
 def spaced(path: str, start: float, stop: float, num: int | None = None, scale: str = "log", **keys: Any) -> dict[str, Any]:
     """An axis between two ends."""
     return {"path": path, "start": start, "stop": stop, "scale": scale, **({} if num is None else {"num": num}), **keys}
+
+
+def made(data: dict[str, Any], **columns: Any) -> StudyResult:
+    """A result without a run: `columns` are functions of the frame of points; other metrics are all 1 and true."""
+    config = read_config(data)
+    points, seeds = Points(config), config.sweep.seeds
+    rows = []
+    for group in points.groups:
+        lanes = points.columns(np.arange(points.lanes))
+        values = {path: lanes.get(path, np.full(points.lanes, group.structural.get(path))) for path in points.paths}
+        rows += [pd.DataFrame(values | {"seed": np.full(points.lanes, seed)}) for seed in range(seeds)]
+    frame = pd.concat(rows, ignore_index=True)
+    for name in metric_columns(config.build()):
+        frame[name] = True if name.endswith(("finite", "converged")) else 1.0
+    for name, column in columns.items():
+        frame[name.replace("__", ".")] = column(frame)
+    return StudyResult(config, frame)

@@ -94,12 +94,16 @@ class SideEffect(AbstractEffect):
 
 
 class TransmissionEffect(AbstractEffect):
+    """An effect in the gear."""
+
     @property
     def place(self) -> str:
         return "transmission"
 
 
 class ActuatorEffect(AbstractEffect):
+    """An effect on the input torque. Several act one after the other, in the order of the config."""
+
     @property
     def place(self) -> str:
         return "actuator"

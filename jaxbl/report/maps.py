@@ -28,9 +28,9 @@ from jaxbl.study.sweep import StudyResult
 from .style import COLOURS, MAP, MISSING, style, with_unit
 
 _CONDITIONS = {
-    "davila_fridman": ("Davila-Fridman (32), q → 0", "-"),
-    "seeber_horn": ("Seeber-Horn", "--"),
-    "exact": ("exact, ρ = 1", ":"),
+    "davila_fridman": ("Davila-Fridman (32), q → 0", "-", "#FF5FA2"),
+    "seeber_horn": ("Seeber-Horn", "--", "#7FDBFF"),
+    "exact": ("exact, ρ = 1", ":", "#FFD400"),
 }
 _HATCH = (1.0, 1.0, 1.0, 0.45)
 SIDES = ("motor", "load")
@@ -120,20 +120,32 @@ def _is_magnitude(value: str) -> bool:
 def _reduce(frame: pd.DataFrame, keys: list[str], value: str) -> pd.Series:
     """One number for each combination of keys: the median over what else varies, or the share that is true."""
     groups = frame.groupby(keys, sort=True)[value]
-    return groups.mean() if frame[value].dtype == bool else groups.median()
+    return groups.mean() if _is_boolean(value) else groups.median()
 
 
-def _over(config: Config, frame: pd.DataFrame, keys: list[str]) -> str:
+def _is_boolean(value: str) -> bool:
+    return value.rpartition(".")[2] in _BOOLEAN
+
+
+def _over(config: Config, frame: pd.DataFrame, spec: FigureTable) -> str:
     """What was averaged over, for the caption."""
+    keys = (spec.x, spec.y, spec.facet, spec.series)
     zipped = {axis.zip for axis in config.axes if axis.path in keys and axis.zip}
     others = [
         axis.path
         for axis in config.axes
         if axis.path not in keys and axis.zip not in zipped and frame[axis.path].nunique() > 1
     ]
+    if any(path in _sampled(config) for path in keys):  # one point of the design at each place
+        others = [path for path in others if path not in _sampled(config)]
     if config.sweep.seeds > 1:
         others.append(f"{config.sweep.seeds} seeds")
-    return f"; median over {', '.join(others)}" if others else ""
+    return f"; {'share' if _is_boolean(spec.value) else 'median'} over {', '.join(others)}" if others else ""
+
+
+def _sampled(config: Config) -> list[str]:
+    """Axes of a quasi-random design."""
+    return [axis.path for axis in config.axes if axis.values is None and axis.num is None]
 
 
 def _norm(values: np.ndarray, scale: str) -> Normalize:
@@ -182,7 +194,7 @@ def _panels(config: Config, frame: pd.DataFrame, facet: str | None) -> list[tupl
 
 
 def _grid_of_axes(count: int, width: float, height: float, extra: float = 0.0) -> tuple[Figure, list[Axes]]:
-    columns = min(count, 3)
+    columns = 2 if count == 4 else min(count, 3)
     rows = -(-count // columns)
     figure = Figure(figsize=(width * columns + extra, height * rows + 0.7), layout="constrained")
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
@@ -200,9 +212,12 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
     with style():
         panels = _panels(config, frame, spec.facet)
         keys = [spec.y, spec.x]
-        boolean = spec.value.rpartition(".")[2] in _BOOLEAN
         tables = [_reduce(part.assign(**{spec.value: _shown(part, spec.value)}), keys, spec.value) for _, part in panels]
-        norm = Normalize(0.0, 1.0) if boolean else _norm(np.concatenate([t.to_numpy(float) for t in tables]), spec.scale)
+        norm = (
+            Normalize(0.0, 1.0)
+            if _is_boolean(spec.value)
+            else _norm(np.concatenate([t.to_numpy(float) for t in tables]), spec.scale)
+        )
         figure, axes = _grid_of_axes(len(panels), 3.5, 3.4, extra=1.0)
         handles: list[Any] = []
         curves: list[Any] = []
@@ -210,7 +225,7 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
         missing = diverged = 0
         for ax, (title, part), table in zip(axes, panels, tables, strict=True):
             ax.grid(False)
-            ax.set_facecolor(MISSING)
+            ax.set_facecolor(MISSING if gridded else "white")
             xs, ys = (np.sort(part[path].unique()).astype(float) for path in (spec.x, spec.y))
             logs = [_is_log(config, path, v) for path, v in ((spec.x, xs), (spec.y, ys))]
             if logs[0]:
@@ -220,12 +235,15 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
             if gridded:
                 grid = table.unstack().to_numpy(float)
                 ax.pcolormesh(_edges(xs, logs[0]), _edges(ys, logs[1]), grid, cmap=MAP, norm=norm, rasterized=True)
-                if (outline := _outline(ax, part, keys, spec, xs, ys)) is not None and not handles:
-                    handles.append(outline)
+                outline = _outline(ax, part, spec, (xs, ys), logs)
+                handles = handles or ([] if outline is None else [outline])
             else:
-                ax.scatter(part[spec.x], part[spec.y], c=_shown(part, spec.value), cmap=MAP, norm=norm, s=9, linewidths=0)
+                shown = _shown(part, spec.value)
+                there, gone = part[shown.notna()], part[shown.isna()]
+                ax.scatter(there[spec.x], there[spec.y], c=shown[shown.notna()], cmap=MAP, norm=norm, s=16, linewidths=0)
+                ax.plot(gone[spec.x], gone[spec.y], "x", ms=4, color=MISSING)
             missing += int(table.isna().sum())
-            diverged += int((~part["finite"].astype(bool)).sum())
+            diverged += int((_reduce(part, keys, "finite")[table.isna()] < 1.0).sum())
             under = []
             if gridded and (best := _best(table, part, spec)) is not None:
                 ax.plot(best[0], best[1], "*", ms=13, mfc="white", mec="black", mew=1.0, clip_on=False, zorder=5)
@@ -240,22 +258,26 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
             if ax.get_subplotspec().is_first_col():  # type: ignore[union-attr]
                 ax.set_ylabel(_label(config, spec.y))
             ax.set_xlabel(_label(config, spec.x))
-        if missing or diverged:
+        if missing:
             word = "diverged" if diverged == missing else "not converged" if "time" in spec.value else "undefined"
-            curves.append(Patch(facecolor=MISSING, label=f"{word} ({max(missing, diverged)} points)"))
+            label = f"{word} ({missing} points)"
+            cross = Line2D([], [], color=MISSING, ls="", marker="x", label=label)
+            curves.append(Patch(facecolor=MISSING, label=label) if gridded else cross)
         bar = figure.colorbar(ScalarMappable(norm, MAP), ax=axes, pad=0.01, aspect=28, extend=_extend(tables, norm))
         bar.set_label(_wrap(_value_label(spec.value)))
         if handles := [*handles, *curves]:
-            figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
-    caption = f"{_value_label(spec.value)} over {spec.x} and {spec.y}{_over(config, frame, [*keys, spec.facet or ''])}."
+            columns = max(int(figure.get_figwidth() / 2.4), 1)
+            figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), columns))
+    caption = f"{_value_label(spec.value)} over {spec.x} and {spec.y}{_over(config, frame, spec)}."
     return Drawn(_file_name(spec), figure, caption)
 
 
 def _shown(part: pd.DataFrame, value: str) -> pd.Series:
     """The values to draw: those of diverged lanes are left out."""
-    if part[value].dtype == bool:
-        return part[value]
-    values = part[value].abs() if _is_magnitude(value) else part[value]
+    values = part[value].astype(float)
+    if value == "finite":
+        return values
+    values = values.abs() if _is_magnitude(value) else values
     return values.where(part["finite"].astype(bool)).replace([np.inf, -np.inf], np.nan)
 
 
@@ -280,17 +302,23 @@ def _best(table: pd.Series, part: pd.DataFrame, spec: FigureTable) -> tuple[floa
 
 
 def _outline(
-    ax: Axes, part: pd.DataFrame, keys: list[str], spec: FigureTable, xs: np.ndarray, ys: np.ndarray
+    ax: Axes, part: pd.DataFrame, spec: FigureTable, centres: tuple[np.ndarray, np.ndarray], logs: list[bool]
 ) -> Patch | None:
     """Mark where the observer does not keep its tolerance."""
     side = spec.value.partition(".")[0]
     column = f"{side}.converged"
-    if column not in part or spec.value == column or min(len(xs), len(ys)) < 2:
+    if column not in part or spec.value == column:
         return None
-    share = _reduce(part, keys, column).unstack().to_numpy(float)
-    if share.min() < 0.5 <= share.max():
-        hatched = ax.contourf(xs, ys, share, levels=[-1.0, 0.5], colors="none", hatches=["//"])
-        hatched.set(edgecolor=_HATCH, linewidth=0.0)
+    assert spec.y is not None
+    share = _reduce(part, [spec.y, spec.x], column).unstack().to_numpy(float)
+    if not share.min() < 0.5:
+        return None
+    # out to the edges of the outer cells
+    share = np.pad(share, 1, mode="edge")
+    xs, ys = (np.concatenate([e[:1], c, e[-1:]]) for c, e in zip(centres, map(_edges, centres, logs), strict=True))
+    hatched = ax.contourf(xs, ys, share, levels=[-1.0, 0.5], colors="none", hatches=["//"])
+    hatched.set(edgecolor=_HATCH, linewidth=0.0)
+    if share.max() >= 0.5:
         lines = ax.contour(xs, ys, share, levels=[0.5], colors="white", linewidths=1.8)
         lines.set_path_effects([path_effects.Stroke(linewidth=3.2, foreground="black"), path_effects.Normal()])
     return Patch(facecolor="#808080", edgecolor="white", hatch="///", label=f"{side} not converged")
@@ -309,8 +337,8 @@ def _overlay(ax: Axes, bound: float, spec: FigureTable, xs: np.ndarray, ys: np.n
     alphas = xs if alpha_is_x else ys
     fine = np.geomspace(max(alphas.min(), bound * 1.0001), alphas.max(), 400) if alphas.max() > bound else np.array([])
     handles = []
-    for name, colour in zip(spec.overlays, ("#FF5FA2", "#7FDBFF", "#FFD400"), strict=False):
-        label, dashes = _CONDITIONS[name]
+    for name in spec.overlays:
+        label, dashes, colour = _CONDITIONS[name]
         with jax.enable_x64(True):
             least = np.asarray(LEAST_LAMBDA[name](jnp.asarray(fine), jnp.asarray(bound))) if fine.size else fine
         line = (fine, least) if alpha_is_x else (least, fine)
@@ -327,16 +355,18 @@ def _lines(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
         if len(panels) == 1:
             figure.set_size_inches(6.4, 4.2)
         shown = _shown(frame, spec.value)
+        sampled, band = spec.x in _sampled(config), ""
         for ax, (title, part) in zip(axes, panels, strict=True):
             groups = [("", part)] if spec.series is None else list(part.groupby(spec.series, sort=True))
             for i, (name, group) in enumerate(groups):
-                values = shown.loc[group.index].astype(float)
+                values = shown.loc[group.index]
                 by_x = values.groupby(group[spec.x], sort=True)
-                middle = by_x.mean() if shown.dtype == bool else by_x.median()
+                middle = by_x.mean() if _is_boolean(spec.value) else by_x.median()
                 colour = COLOURS[i % len(COLOURS)]
                 label = None if spec.series is None else f"{name if isinstance(name, str) else f'{name:g}'}"
-                ax.plot(middle.index, middle, "o-", ms=3.5, color=colour, label=label)
-                if (by_x.size() > 1).any():
+                ax.plot(middle.index, middle, "o" if sampled else "o-", ms=3.5, color=colour, label=label)
+                if (by_x.size() > 1).any() and not _is_boolean(spec.value):
+                    band = "; band: least to largest"
                     ax.fill_between(middle.index, by_x.min(), by_x.max(), color=colour, alpha=0.18, linewidth=0)
             xs = np.sort(part[spec.x].unique())
             if _is_log(config, spec.x, xs):
@@ -345,12 +375,11 @@ def _lines(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
                 ax.set_yscale("log")
             ax.set_title(title)
             ax.set_xlabel(_label(config, spec.x))
-        label = _value_label(spec.value)
-        axes[0].set_ylabel(_wrap(label))
+            if ax.get_subplotspec().is_first_col():  # type: ignore[union-attr]
+                ax.set_ylabel(_wrap(_value_label(spec.value)))
         if spec.series is not None:
             axes[-1].legend(title=_label(config, spec.series))
-    band = "; band: least to largest" if config.sweep.seeds > 1 else ""
-    caption = f"{label} over {spec.x}{_over(config, frame, [spec.x, spec.series or '', spec.facet or ''])}{band}."
+    caption = f"{_value_label(spec.value)} over {spec.x}{_over(config, frame, spec)}{band}."
     return Drawn(_file_name(spec), figure, caption)
 
 

@@ -1,5 +1,6 @@
 """Figures of one run: the analogues of Figs. 7 to 17 of the paper, and its limit cycle (Fig. 28)."""
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
@@ -90,7 +91,8 @@ def _identified(trial: Trial, trace: pd.DataFrame, sides: list[str]) -> Drawn:
         ax.axhline(true, color=_TRUE, lw=1.0, ls="--", label="true")
         # the first few samples say nothing yet: keep them from setting the scale
         late = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]][[f"{side}.{name}" for side in sides]]
-        reach = max(float((late - true).abs().max(axis=None)) * 2.0, 0.02 * abs(true), 1e-12)
+        largest = float((late - true).abs().max(axis=None))
+        reach = max(2.0 * largest if np.isfinite(largest) else 0.0, 0.02 * abs(true), 1e-12)
         ax.set(ylabel=labels[name], ylim=(true - reach, true + reach))
         if name == "dead_zone":
             right = ax.secondary_yaxis("right", functions=(lambda j: 4.0 * j, lambda gap: gap / 4.0))

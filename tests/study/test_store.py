@@ -16,7 +16,7 @@ FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
 
 
 def study(changes=None, **tables):
-    """Nine runs in four chunks: 3 seeds of 3 points, in chunks of 4 lanes padded."""
+    """Nine runs in three chunks: 3 seeds of 3 points, padded to 4."""
     return rigid(changes, **{"axes": [listed(ALPHA, 5.0, 9.0, 20.0)], "sweep": {"seeds": 3, "chunk": 2}} | tables)
 
 

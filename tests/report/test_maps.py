@@ -1,0 +1,244 @@
+"""Figures of a study, looked at as matplotlib objects."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.collections import PathCollection, QuadMesh
+from matplotlib.colors import LogNorm
+from small_study import ALPHA, LAMBDA, NOISE, listed, made, rigid, small, spaced
+
+from jaxbl.errors import InputError
+from jaxbl.observer.conditions import least_lambda_seeber_horn
+from jaxbl.report.maps import check_figures, draw
+from jaxbl.report.style import save
+from jaxbl.study.config import read_config
+
+RMSE = "motor.velocity_rmse"
+GAINS = [spaced(ALPHA, 1.0, 50.0, 5), spaced(LAMBDA, 1.0, 20.0, 4)]
+
+
+def heatmap(**keys):
+    return {"kind": "heatmap", "x": ALPHA, "y": LAMBDA, "value": RMSE} | keys
+
+
+def line(**keys):
+    return {"kind": "line", "x": ALPHA, "value": RMSE} | keys
+
+
+def product(frame):
+    return frame[ALPHA] * frame[LAMBDA]
+
+
+def drawn(tmp_path, data, **columns):
+    """The one figure of a study, drawn to the end."""
+    (drawing,) = draw(made(data, **columns))
+    assert save(drawing.figure, tmp_path / "a" / f"{drawing.name}.png").stat().st_size > 5000
+    assert plt.get_fignums() == []  # nothing is left in pyplot's own list
+    return drawing
+
+
+def panels(drawing):
+    """Axes of the panels, the colour bar left out."""
+    return [ax for ax in drawing.figure.axes if ax.get_visible() and ax.get_xlabel()]
+
+
+def mesh(ax):
+    (found,) = (c for c in ax.collections if isinstance(c, QuadMesh))
+    return found
+
+
+def legend(drawing):
+    return [text.get_text() for legend in drawing.figure.legends for text in legend.get_texts()]
+
+
+def test_heatmap_has_each_value_in_its_cell_with_units_on_its_axes(tmp_path):
+    drawing = drawn(tmp_path, small(axes=GAINS, figures=[heatmap()]), motor__velocity_rmse=product)
+    (ax,) = panels(drawing)
+    values, corners = mesh(ax).get_array(), mesh(ax).get_coordinates()
+    alphas, lambdas = np.geomspace(1.0, 50.0, 5), np.geomspace(1.0, 20.0, 4)
+    np.testing.assert_allclose(values, lambdas[:, None] * alphas)
+    np.testing.assert_allclose(np.sqrt(corners[0, :-1, 0] * corners[0, 1:, 0]), alphas)
+    np.testing.assert_allclose(np.sqrt(corners[:-1, 0, 1] * corners[1:, 0, 1]), lambdas)
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    assert ax.get_xlabel() == "observer.motor.alpha (rad/s²)"
+    assert ax.get_ylabel() == "observer.motor.lambda (√rad/s)"
+    assert drawing.figure.axes[-1].get_ylabel() == "motor: velocity error, rms (rad/s)"
+    # from 1 to 1000: a logarithmic colour scale, and the best point marked
+    assert isinstance(mesh(ax).norm, LogNorm)
+    assert "best ★ 1 rad/s" in ax.get_title()
+    assert drawing.caption == "motor: velocity error, rms (rad/s) over observer.motor.alpha and observer.motor.lambda."
+
+
+def test_panels_share_one_colour_scale(tmp_path):
+    data = small(axes=[*GAINS, listed(NOISE, 1e-4, 1e-5)], figures=[heatmap(facet=NOISE)])
+    drawing = drawn(tmp_path, data, motor__velocity_rmse=lambda frame: frame[NOISE] * 1e5)
+    low, high = panels(drawing)
+    assert low.get_title().startswith("encoders.noise = 1e-05 rad")
+    assert high.get_title().startswith("encoders.noise = 0.0001 rad")
+    assert mesh(low).norm is mesh(high).norm
+    np.testing.assert_allclose([mesh(low).get_array().min(), mesh(high).get_array().max()], [1.0, 10.0])
+
+
+def test_median_over_seeds_and_share_of_what_is_true(tmp_path):
+    data = small(axes=GAINS, sweep={"seeds": 5}, figures=[heatmap()])
+    drawing = drawn(tmp_path, data, motor__velocity_rmse=lambda frame: frame["seed"] ** 3.0)
+    assert (mesh(panels(drawing)[0]).get_array() == 8.0).all()
+    assert drawing.caption.endswith("; median over 5 seeds.")
+    data = small(axes=GAINS, sweep={"seeds": 5}, figures=[heatmap(value="motor.converged")])
+    drawing = drawn(tmp_path, data, motor__converged=lambda frame: frame["seed"] < 2)
+    np.testing.assert_allclose(mesh(panels(drawing)[0]).get_array(), 0.4)
+    assert mesh(panels(drawing)[0]).get_clim() == (0.0, 1.0)
+    assert drawing.caption.endswith("; share over 5 seeds.")
+
+
+def test_errors_with_a_sign_are_drawn_by_size(tmp_path):
+    data = small(axes=GAINS, figures=[heatmap(value="motor.dead_zone_error")])
+    drawing = drawn(tmp_path, data, motor__dead_zone_error=lambda frame: -product(frame))
+    assert mesh(panels(drawing)[0]).get_array().min() > 0.0
+    assert drawing.caption.startswith("motor: |error of the dead zone|")
+
+
+@pytest.mark.parametrize("value", [RMSE, "motor.converged"])
+def test_diverged_points_are_left_grey_and_counted(tmp_path, value):
+    data = small(axes=GAINS, figures=[heatmap(value=value)])
+    columns = {"motor__velocity_rmse": product, "motor__converged": lambda frame: frame[ALPHA] < 0.0}
+    drawing = drawn(tmp_path, data, finite=lambda frame: frame[ALPHA] < 40.0, **columns)
+    (ax,) = panels(drawing)
+    gone = np.ma.getmaskarray(mesh(ax).get_array())
+    assert gone[:, -1].all()
+    assert not gone[:, :-1].any()
+    assert legend(drawing)[-1] == "diverged (4 points)"
+
+
+def test_what_did_not_converge_is_hatched(tmp_path):
+    data = small(axes=GAINS, figures=[heatmap()])
+    none = drawn(tmp_path, data, motor__velocity_rmse=product)
+    some = drawn(tmp_path, data, motor__velocity_rmse=product, motor__converged=lambda frame: frame[ALPHA] > 5.0)
+    all_ = drawn(tmp_path, data, motor__velocity_rmse=product, motor__converged=lambda frame: frame[ALPHA] < 0.0)
+    assert legend(none) == []
+    assert legend(some) == legend(all_) == ["motor not converged"]
+    # the best is sought among those that converged
+    assert "best ★ 7.1" in panels(some)[0].get_title()
+
+
+def test_conditions_are_drawn_for_the_median_bound_of_the_panel(tmp_path):
+    data = small(axes=GAINS, figures=[heatmap(overlays=["davila_fridman", "seeber_horn", "exact"])])
+    drawing = drawn(tmp_path, data, motor__f_plus=lambda frame: np.full(len(frame), 2.0))
+    (ax,) = panels(drawing)
+    assert "f⁺ = 2 rad/s²" in ax.get_title()
+    assert legend(drawing) == ["Davila-Fridman (32), q → 0", "Seeber-Horn", "exact, ρ = 1"]
+    alpha, least = next(curve for curve in ax.lines if curve.get_linestyle() == "--").get_data()
+    np.testing.assert_allclose(least, least_lambda_seeber_horn(alpha, 2.0))
+    assert alpha[0] == pytest.approx(2.0, rel=1e-3)
+    assert alpha[-1] == pytest.approx(50.0)
+
+
+ODD = {
+    "all NaN": (small(axes=GAINS, figures=[heatmap()]), {"motor__velocity_rmse": lambda frame: frame[ALPHA] * np.nan}),
+    "all inf": (small(axes=GAINS, figures=[heatmap()]), {"motor__velocity_rmse": lambda frame: frame[ALPHA] * np.inf}),
+    "all zero": (small(axes=GAINS, figures=[heatmap()]), {"motor__velocity_rmse": lambda frame: frame[ALPHA] * 0.0}),
+    "log of zeros": (
+        small(axes=GAINS, figures=[heatmap(scale="log")]),
+        {"motor__velocity_rmse": lambda frame: 1.0 * (frame[ALPHA] > 40.0)},
+    ),
+    "one row": (small(axes=[GAINS[0], listed(LAMBDA, 3.0)], figures=[heatmap()]), {"motor__velocity_rmse": product}),
+    "one cell": (small(axes=[listed(ALPHA, 3.0), listed(LAMBDA, 0.0)], figures=[heatmap()]), {}),
+    "bound above all gains": (
+        small(axes=GAINS, figures=[heatmap(overlays=["exact"])]),
+        {"motor__f_plus": lambda frame: 99.0 * frame[ALPHA]},
+    ),
+    "no bound": (small(axes=GAINS, figures=[heatmap(overlays=["exact"])]), {"motor__f_plus": lambda f: f[ALPHA] * np.nan}),
+    "zipped": (small(axes=[listed(p, 1.0, 2.0, 4.0, zip="g") for p in (ALPHA, LAMBDA)], figures=[heatmap()]), {}),
+    "lines of NaN": (small(axes=GAINS, figures=[line()]), {"motor__velocity_rmse": lambda frame: frame[ALPHA] * np.nan}),
+    "default of three axes": (small(axes=[listed(NOISE, 0.0, 1e-4), *GAINS]), {}),
+    "default of one": (rigid(axes=[listed("observer.discretisation", "implicit", "explicit"), GAINS[0]]), {}),
+    "seven panels": (small(axes=[*GAINS, spaced(NOISE, 1e-5, 1e-3, 7)], figures=[line(facet=NOISE, series=LAMBDA)]), {}),
+}
+
+
+@pytest.mark.parametrize("case", ODD)
+def test_odd_studies_are_drawn(tmp_path, case):
+    data, columns = ODD[case]
+    assert panels(drawn(tmp_path, data, **columns))
+
+
+def test_a_study_of_words_alone_has_no_default_figure():
+    assert draw(made(rigid(axes=[listed("observer.discretisation", "implicit", "explicit")]))) == []
+
+
+def test_words_as_panels(tmp_path):
+    axes = [*GAINS, listed("observer.discretisation", "implicit", "explicit")]
+    drawing = drawn(tmp_path, rigid(axes=axes, figures=[heatmap(facet="observer.discretisation")]))
+    assert [ax.get_title().split("\n")[0] for ax in panels(drawing)] == [
+        "observer.discretisation = explicit",
+        "observer.discretisation = implicit",
+    ]
+
+
+def test_quasi_random_points_are_dots_and_diverged_ones_crosses(tmp_path):
+    axes = [spaced(ALPHA, 1.0, 50.0), spaced(LAMBDA, 1.0, 20.0)]
+    sweep = {"design": "sobol", "points": 32}
+    wild = {"finite": lambda frame: frame[ALPHA] < 10.0}
+    drawing = drawn(tmp_path, small(axes=axes, sweep=sweep, figures=[heatmap()]), motor__velocity_rmse=product, **wild)
+    (ax,) = panels(drawing)
+    (dots,) = (c for c in ax.collections if isinstance(c, PathCollection))
+    x, y = dots.get_offsets().T
+    assert (x < 10.0).all()
+    np.testing.assert_allclose(dots.get_array(), x * y)
+    assert len(dots.get_offsets()) + len(ax.lines[0].get_xdata()) == 32
+    assert legend(drawing) == [f"diverged ({len(ax.lines[0].get_xdata())} points)"]
+    # over one of its axes a design has no line
+    drawing = drawn(tmp_path, small(axes=axes, sweep=sweep, figures=[line()]), motor__velocity_rmse=product)
+    assert panels(drawing)[0].lines[0].get_linestyle() == "None"
+    assert "median" not in drawing.caption
+
+
+def test_lines_have_a_median_a_band_and_a_legend_with_units(tmp_path):
+    data = small(axes=GAINS, sweep={"seeds": 3}, figures=[line(series=LAMBDA)])
+    drawing = drawn(tmp_path, data, motor__velocity_rmse=lambda frame: product(frame) * (1.0 + frame["seed"]))
+    (ax,) = panels(drawing)
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), 2.0 * np.geomspace(1.0, 50.0, 5))
+    band = ax.collections[0].get_paths()[0].vertices[:, 1]
+    assert (band.min(), band.max()) == pytest.approx((1.0, 150.0))
+    assert ax.get_legend().get_title().get_text() == "observer.motor.lambda (√rad/s)"
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    assert ax.get_ylabel() == "motor: velocity error, rms (rad/s)"
+    assert drawing.caption.endswith("; median over 3 seeds; band: least to largest.")
+
+
+def test_figures_of_one_metric_get_names_of_their_own():
+    names = [d.name for d in draw(made(small(axes=GAINS, figures=[heatmap(), line(), line(series=LAMBDA)])))]
+    assert names == ["heatmap_motor_velocity_rmse", "line_motor_velocity_rmse", "line_motor_velocity_rmse-2"]
+
+
+WORDS = "observer.discretisation"
+BAD = {
+    "unknown axis": (
+        line(x="observer.motor.alfa"),
+        f"figures[0].x: 'observer.motor.alfa' is not an axis of this study; did you mean '{ALPHA}'?",
+    ),
+    "no axis": (heatmap(facet=NOISE), "figures[0].facet: 'encoders.noise' is not an axis of this study; valid: "),
+    "unknown metric": (
+        line(value="motor.velocity_rms"),
+        f"figures[0].value: 'motor.velocity_rms' is no metric; did you mean '{RMSE}'?",
+    ),
+    "axis as metric": (line(value=ALPHA), "is no metric"),
+    "metric of no load": (line(value="load.velocity_rmse"), "is no metric; did you mean 'motor.velocity_rmse'?"),
+    "words as x": (line(x=WORDS), f"figures[0].x: '{WORDS}' has no numeric values; use it as facet or series"),
+    "words as y": (heatmap(y=WORDS), f"figures[0].y: '{WORDS}' has no numeric values; use it as facet"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_figure_of_what_is_not_there(case):
+    figure, message = BAD[case]
+    result = made(rigid(axes=[*GAINS, listed(WORDS, "implicit", "explicit")], figures=[figure]))
+    with pytest.raises(InputError) as error:
+        draw(result)
+    assert message in str(error.value)
+
+
+def test_figures_of_a_study_without_axes():
+    config = read_config(rigid(figures=[line()]))
+    with pytest.raises(InputError, match="the study has no axes"):
+        check_figures(config, config.figures, [RMSE])

@@ -1,0 +1,85 @@
+"""The HTML page: well-formed, complete, and nothing of the user's text taken for markup."""
+
+import json
+from html.parser import HTMLParser
+
+import pandas as pd
+from small_study import ALPHA, LAMBDA, listed, made, rigid, small, spaced
+
+from jaxbl.report import write_sweep_report, write_trial_report
+from jaxbl.report.page import Picture, TableOf, html
+from jaxbl.study.trial import run
+
+VOID = {"meta", "img"}
+
+
+class Page(HTMLParser):
+    """Checks that tags nest, and collects text, tags and pictures."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.tags, self.text, self.images = [], [], "", []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        if tag == "img":
+            self.images.append(dict(attrs))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+HOSTILE = "<script>alert('a')</script> & \"b\" <b>"
+
+
+def test_everything_is_escaped_and_in_its_place(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"png")
+    table = TableOf(HOSTILE, [HOSTILE, "n"], [[HOSTILE, 1.23456789], [None, True], ["x", float("nan")], ["y", 3]])
+    text = html(HOSTILE, [HOSTILE], [HOSTILE], [Picture(tmp_path / "a.png", HOSTILE)], [table], f'title = "{HOSTILE}"')
+    page = Page(text)
+    assert "script" not in page.tags
+    assert "b" not in page.tags
+    assert page.images == [{"src": "data:image/png;base64,cG5n", "alt": HOSTILE}]
+    # title twice, lead, remark, caption, table's heading, head and cell, config
+    assert page.text.count(HOSTILE) == 9
+    for cell in ("1.235", "–", "yes", "nan", ">3<"):
+        assert cell in text
+
+
+def test_page_of_a_sweep(tmp_path):
+    axes = [
+        spaced(ALPHA, 1.0, 50.0, 5),
+        spaced(LAMBDA, 1.0, 20.0, 4),
+        listed("observer.discretisation", "implicit", "explicit"),
+    ]
+    data = rigid({"title": "a <b> c", "notes": ["first remark"]}, axes=axes)
+    result = made(data, motor__velocity_rmse=lambda frame: frame[ALPHA], motor__converged=lambda frame: frame[ALPHA] > 2.0)
+    lead = write_sweep_report(result, tmp_path)
+    assert lead == [
+        "40 runs. The observers converged in 80.0 % (motor) of them.",
+        "Least motor velocity error 2.66 rad/s rms, at observer.motor.alpha = 2.66, observer.motor.lambda = 1.",
+    ]
+    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert len(page.images) == len(list((tmp_path / "figures").iterdir())) == 1
+    for text in (*lead, "a <b> c", "first remark", "observer.discretisation", "motor.convergence_time_bound"):
+        assert text in page.text
+
+
+def test_page_of_a_run_and_its_files(tmp_path):
+    trial = run(small({"title": "one run", "identifier.start": 10.0}))
+    lines = write_trial_report(trial, tmp_path)
+    assert "stiffness: undetermined (motor), undetermined (load); true 1" in lines
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["figures", "report.html", "summary.json", "trace.parquet"]
+    assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8")) == trial.summary
+    pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "trace.parquet"), trial.trace)
+    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert len(page.images) == 9
+    for text in (*lines, "one run", "half_gap", "rms velocity error"):
+        assert text in page.text

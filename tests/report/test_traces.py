@@ -1,0 +1,39 @@
+"""Figures of a single run."""
+
+import pytest
+from small_study import rigid, small
+
+from jaxbl.report.style import save
+from jaxbl.report.traces import draw_trial
+from jaxbl.study.trial import run
+
+BOTH = ["input", "motor_velocity", "motor_position", "load_velocity", "load_position", "torque", "dead_zone", "hysteresis",
+        "limit_cycle"]  # fmt: skip
+CASES = {
+    "sigmoid": (small({"run.duration": 1.0}), BOTH),
+    "dead zone": (small(transmission={"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.01}), BOTH),
+    "shaft": (small(transmission={"law": "linear_shaft", "stiffness": 1.0}), BOTH),
+    "rigid": (rigid(), ["input", "motor_velocity", "motor_position", "torque"]),
+    # nothing moves, nothing is identified
+    "at rest": (small({"excitation.amplitude": 0.0, "encoders.noise": 0.0, "observer.motor.velocity_error": 0.0}), BOTH),
+    "not identified": (small({"identifier.start": 10.0}), BOTH),
+    "diverged": (rigid(effects=[{"kind": "motor.viscous_friction", "viscous": 1e4}]), ["input", "motor_velocity",
+                 "motor_position", "torque"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_all_figures_are_drawn_with_units(tmp_path, case):
+    data, names = CASES[case]
+    drawn = draw_trial(run(data))
+    assert [d.name for d in drawn] == names
+    for d in drawn:
+        assert d.caption.endswith(".")
+        assert save(d.figure, tmp_path / f"{d.name}.png").stat().st_size > 5000
+        for ax in d.figure.axes:
+            assert "(" in ax.get_ylabel(), d.name
+        assert "(" in d.figure.axes[-1].get_xlabel() or d.name == "dead_zone"
+    if case == "sigmoid":
+        zone = next(d for d in drawn if d.name == "dead_zone").figure.axes
+        assert [ax.get_ylabel() for ax in zone] == ["stiffness K (N m/rad)", "dead zone j₀ (rad)"]
+        assert zone[1].child_axes[0].get_ylabel() == "half gap 4 j₀ (rad)"
