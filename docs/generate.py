@@ -65,7 +65,7 @@ def page() -> str:
             tag = next((f for n, f in table.model_fields.items() if n in ("kind", "law")), None)
             value = get_args(tag.annotation)[0] if tag is not None and len(tables) > 1 else ""
             key = "law" if name == "transmission" else "kind"
-            parts.append(section(f"`{brackets}`" + (f" with `{key} = \"{value}\"`" if value else ""), table))
+            parts.append(section(f"`{brackets}`" + (f' with `{key} = "{value}"`' if value else ""), table))
     parts.append(
         "## Effects\n\n`[[effects]]` tables; axes name them as `effects.<kind>.<key>`. Torques of effects are subtracted on "
         "their side: a positive number resists a positive drive torque.\n\n"

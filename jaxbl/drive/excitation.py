@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from scipy.signal import max_len_seq
 
 from .parameters import Scalar, option, parameter
 
@@ -104,6 +103,8 @@ class Prbs(AbstractExcitation):
     order: int = option("bits of the shift register; the sequence has 2^order - 1 bits", default=10, minimum=2, maximum=20)
 
     def __call__(self, time):
+        from scipy.signal import max_len_seq  # half a second that only this input needs
+
         bits, _ = max_len_seq(self.order)
         levels = 2.0 * jnp.asarray(bits, jnp.result_type(time)) - 1.0
         return self.amplitude * levels[_held(self.hold, time) % len(levels)]

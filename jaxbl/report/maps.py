@@ -368,9 +368,11 @@ def _lines(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
                 if (by_x.size() > 1).any() and not _is_boolean(spec.value):
                     band = "; band: least to largest"
                     ax.fill_between(middle.index, by_x.min(), by_x.max(), color=colour, alpha=0.18, linewidth=0)
-            xs = np.sort(part[spec.x].unique())
-            if _is_log(config, spec.x, xs):
+            xs = np.sort(part[spec.x].unique()).astype(float)
+            log = _is_log(config, spec.x, xs)
+            if log:
                 ax.set_xscale("log")
+            ax.set_xlim(*_edges(xs, log)[[0, -1]])
             if isinstance(_norm(shown.to_numpy(float), spec.scale), LogNorm):
                 ax.set_yscale("log")
             ax.set_title(title)

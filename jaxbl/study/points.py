@@ -8,7 +8,6 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import qmc
 
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.errors import InputError
@@ -160,6 +159,8 @@ def _values(axis: AxisTable) -> np.ndarray:
 
 def _quasi_random(axes: list[AxisTable], config: Config) -> Columns:
     """Sobol or Latin hypercube points over the ranges of some axes, uniform in their scale."""
+    from scipy.stats import qmc  # a third of a second that only these designs need
+
     assert config.sweep.points is not None
     rng = np.random.default_rng(config.sweep.design_seed)
     if config.sweep.design == "sobol":

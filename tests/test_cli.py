@@ -1,0 +1,259 @@
+"""The command line: what it prints, what it leaves, how it ends."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import tomli_w
+from small_study import ALPHA, listed, rigid
+from typer.testing import CliRunner
+
+from jaxbl import cli
+from jaxbl.study.engine import Engine
+
+FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
+AXES = [listed(ALPHA, 5.0, 9.0, 20.0)]
+
+
+def jaxbl(*arguments, cwd, **environment):
+    """The command as a process of its own, its output in pipes."""
+    return subprocess.run(
+        [sys.executable, "-m", "jaxbl.cli", *arguments], cwd=cwd, capture_output=True, text=True, timeout=120, check=False,
+        env=os.environ | environment,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def call(monkeypatch, tmp_path):
+    """The command in this process: exit code, lines on stdout, lines on stderr."""
+    monkeypatch.setattr(cli, "_start_jax", lambda: None)
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        result = CliRunner().invoke(cli.app, list(map(str, arguments)), standalone_mode=False)
+        ended = result.exception if isinstance(result.exception, SystemExit) else None
+        if result.exception is not None and ended is None:
+            raise result.exception
+        code = ended.code if ended else (result.return_value or 0)
+        return code, result.stdout.splitlines(), result.stderr.splitlines()
+
+    return run
+
+
+def write(folder, data=None, name="study.toml"):
+    path = folder / name
+    path.write_text(tomli_w.dumps(data or rigid(axes=AXES, figures=[FIGURE])))
+    return path
+
+
+def left(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def test_help_does_not_wait_for_jax(tmp_path):
+    heavy = "{'jax', 'numpy', 'pandas', 'matplotlib', 'scipy', 'pydantic'}"
+    code = f"import sys, jaxbl, jaxbl.cli; print(sorted({heavy} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+    shown = jaxbl("--help", cwd=tmp_path)
+    assert shown.returncode == 0
+    for command in ("simulate", "sweep", "plot"):
+        assert command in shown.stdout
+
+
+def test_a_sweep_and_its_second_call(tmp_path):
+    """As a user sees it: what is printed, what is left, no progress bar in a pipe, no work done twice."""
+    write(tmp_path, rigid(axes=AXES, sweep={"seeds": 2}))
+    cache = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    first = jaxbl("sweep", "study.toml", cwd=tmp_path, **cache)
+    assert (first.returncode, first.stderr) == (0, "")
+    folder = tmp_path / "results" / "study"
+    assert left(folder) == [
+        "figures/line_motor_velocity_rmse.png", "manifest.json", "points/part-00000.parquet", "report.html", "study.toml",
+    ]  # fmt: skip
+    lines = first.stdout.splitlines()
+    assert lines[0].startswith("6 runs. The observers converged in ")
+    assert re.fullmatch(r"Compiled in [\d.]+ s, ran 6 lanes in [\d.]+ s\.", lines[-2])
+    assert lines[-1] == "results/study/report.html"
+    second = jaxbl("sweep", "study.toml", cwd=tmp_path, **cache)
+    assert second.stdout.splitlines() == [line for line in lines if not line.startswith("Compiled")]
+
+
+def test_interrupted_sweep_says_how_to_go_on(tmp_path):
+    """SIGINT while chunks are computed; the line that it prints finishes the study."""
+    axes = [listed("run.sample_period", *(1e-3 * (1 + i / 100) for i in range(30)))]
+    study = write(tmp_path, rigid(axes=axes), "a study.toml")
+    folder = tmp_path / "out"
+    command = [sys.executable, "-m", "jaxbl.cli", "sweep", study.name, "--out", "out"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        for _ in range(1200):
+            if list(folder.glob("points/part-*.parquet")) or process.poll() is not None:
+                break
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert errors == "interrupted; what is finished is kept. Go on with: jaxbl sweep 'a study.toml' --out out\n"
+    assert 1 <= len(list(folder.glob("points/part-*.parquet"))) < 30
+    assert not json.loads((folder / "manifest.json").read_text())["finished"]
+
+
+def test_interrupt_anywhere_else():
+    def interrupt():
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as end:
+        cli.main(interrupt)
+    assert end.value.code == 130
+
+
+BAD = {
+    "no such file": (["sweep", "none.toml"], "none.toml: no such file"),
+    "a folder": (["simulate", "."], ".: is a folder; a TOML file is needed"),
+    "no axes": (["sweep", "plain.toml"], "plain.toml: axes: the study has none; add [[axes]], or use 'jaxbl simulate'"),
+    "wrong key": (["simulate", "wrong.toml"], "wrong.toml: run: unknown key 'durations'; did you mean 'duration'?"),
+    "wrong axis": (
+        ["sweep", "axis.toml"],
+        "axis.toml: axes[0]: unknown path 'observer.motor.alfa'; nearest valid path: 'observer.motor.alpha'",
+    ),
+    "wrong axis, dry": (
+        ["sweep", "axis.toml", "--dry-run"],
+        "axis.toml: axes[0]: unknown path 'observer.motor.alfa'; nearest valid path: 'observer.motor.alpha'",
+    ),
+    "wrong figure": (
+        ["sweep", "figure.toml"],
+        "figure.toml: figures[0].value: 'motor.velocity' is no metric; did you mean 'motor.velocity_rmse'?",
+    ),
+    "foreign folder": (
+        ["sweep", "study.toml", "--out", "full"],
+        "full: is not empty and holds no study; choose another folder with --out",
+    ),
+    "foreign folder, run": (
+        ["simulate", "study.toml", "--out", "full"],
+        "full: is not empty and holds no study; choose another folder with --out",
+    ),
+    "a file as folder": (
+        ["sweep", "study.toml", "--out", "plain.toml"],
+        "plain.toml: is a file; --out should name a folder",
+    ),
+    "too sparse": (
+        ["simulate", "study.toml", "--every", "201"],
+        "every: should be between 1 and the number of samples 200, not 201",
+    ),
+    "nothing to plot": (["plot", "full"], "full: holds no study (no manifest.json); run 'jaxbl sweep' first"),
+    "nowhere to plot": (["plot", "none"], "none: holds no study (no manifest.json); run 'jaxbl sweep' first"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_line_and_exit_2(case, tmp_path, monkeypatch, capsys):
+    arguments, message = BAD[case]
+    write(tmp_path)
+    write(tmp_path, rigid(), "plain.toml")
+    write(tmp_path, rigid({"run.durations": 1.0}), "wrong.toml")
+    write(tmp_path, rigid(axes=[listed("observer.motor.alfa", 1.0)]), "axis.toml")
+    write(tmp_path, rigid(axes=AXES, figures=[FIGURE | {"value": "motor.velocity"}]), "figure.toml")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("mine")
+    before = left(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli, "_start_jax", lambda: None)
+    monkeypatch.setattr(sys, "argv", ["jaxbl", *arguments])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 2
+    assert capsys.readouterr() == ("", f"jaxbl: {message}\n")
+    assert left(tmp_path) == before
+
+
+@pytest.mark.parametrize("arguments", [["sweep"], ["sweep", "study.toml", "--outt", "a"], ["swep", "study.toml"]])
+def test_wrong_usage_exits_2(arguments, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["jaxbl", *arguments])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 2
+    assert "Usage: jaxbl" in capsys.readouterr().err
+
+
+def test_dry_run_says_the_cost_and_writes_nothing(call, tmp_path):
+    write(tmp_path, rigid(axes=AXES, sweep={"seeds": 4, "chunk": 4}))
+    code, lines, _ = call("sweep", "study.toml", "--dry-run")
+    assert code == 0
+    assert left(tmp_path) == ["study.toml"]
+    assert lines[0] == "points       3 (12 runs with all seeds)"
+    assert lines[1] == "chunks       4 of 4 lanes"
+    assert [line.split()[0] for line in lines[2:]] == ["memory", "compilation", "run"]
+
+
+def test_plot_draws_other_figures_from_the_stored_points(call, tmp_path, monkeypatch):
+    study = write(tmp_path)
+    call("sweep", study, "--out", "out")
+    folder = tmp_path / "out"
+    monkeypatch.setattr(Engine, "__init__", lambda *_: pytest.fail("plot simulates"))
+    for path in [*folder.glob("figures/*"), folder / "report.html"]:
+        path.unlink()
+    code, lines, _ = call("plot", folder)
+    assert code == 0
+    assert lines[-1] == str(folder / "report.html")
+    assert [path.name for path in folder.glob("figures/*")] == ["line_motor_velocity_rmse.png"]
+    write(tmp_path, rigid({"title": "other title"}, axes=AXES, figures=[FIGURE | {"value": "motor.chatter"}]), "b.toml")
+    call("plot", folder, "--config", "b.toml")
+    assert "other title" in (folder / "report.html").read_text()
+    assert (folder / "figures" / "line_motor_chatter.png").exists()
+    write(tmp_path, rigid({"run.duration": 0.3}, axes=AXES), "c.toml")
+    with pytest.raises(ValueError, match=r"c\.toml: is not the study in .*; only title, notes and figures may differ"):
+        call("plot", folder, "--config", "c.toml")
+
+
+def test_simulate_leaves_trace_summary_figures_and_report(call, tmp_path):
+    write(tmp_path, rigid(axes=AXES))
+    code, lines, _ = call("simulate", "study.toml", "--every", 10, "--seed", 3)
+    folder = tmp_path / "results" / "study"
+    assert code == 0
+    assert lines[-1] == "results/study/report.html"
+    assert {"trace.parquet", "summary.json", "report.html", "figures/torque.png"} <= set(left(folder))
+    assert len(pd.read_parquet(folder / "trace.parquet")) == 20
+    assert json.loads((folder / "summary.json").read_text())["seed"] == 3
+
+
+def test_a_run_that_diverges_is_reported_and_exits_1(call, tmp_path):
+    write(tmp_path, rigid(effects=[{"kind": "motor.viscous_friction", "viscous": 1e4}]))
+    code, lines, _ = call("simulate", "study.toml")
+    assert code == 1
+    assert any(line.startswith("The run diverged") for line in lines)
+    assert (tmp_path / "results" / "study" / "summary.json").exists()
+
+
+def test_results_of_another_study_stay_until_overwriting_is_asked_for(call, tmp_path):
+    write(tmp_path)
+    call("sweep", "study.toml", "--out", "out")
+    write(tmp_path, rigid({"title": "second", "run.duration": 0.3}, axes=AXES), "b.toml")
+    for command in ("sweep", "simulate"):
+        with pytest.raises(ValueError, match=r"out: holds another study \('small', other numbers\)"):
+            call(command, "b.toml", "--out", "out")
+    call("sweep", "b.toml", "--out", "out", "--overwrite")
+    assert json.loads((tmp_path / "out" / "manifest.json").read_text())["title"] == "second"
+
+
+def test_progress_bar_on_a_terminal_only(monkeypatch, capsys):
+    with cli._progress("runs") as progress:
+        assert progress is None
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with cli._progress("runs") as progress:
+        progress(2, 3)
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0.04, "0.0 s"), (99.0, "99.0 s"), (600.0, "10 min"), (7200.0, "2.0 h")])
+def test_durations(seconds, text):
+    assert cli._duration(seconds) == text
+
+
+def test_default_folder():
+    assert cli._folder(Path("a/b.toml"), None) == Path("results/b")
