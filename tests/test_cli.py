@@ -16,6 +16,7 @@ from small_study import ALPHA, listed, rigid
 from typer.testing import CliRunner
 
 from jaxbl import cli
+from jaxbl.errors import InputError
 from jaxbl.study.engine import Engine
 
 FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
@@ -207,7 +208,7 @@ def test_plot_draws_other_figures_from_the_stored_points(call, tmp_path, monkeyp
     assert "other title" in (folder / "report.html").read_text()
     assert (folder / "figures" / "line_motor_chatter.png").exists()
     write(tmp_path, rigid({"run.duration": 0.3}, axes=AXES), "c.toml")
-    with pytest.raises(ValueError, match=r"c\.toml: is not the study in .*; only title, notes and figures may differ"):
+    with pytest.raises(InputError, match=r"c\.toml: is not the study in .*; only title, notes and figures may differ"):
         call("plot", folder, "--config", "c.toml")
 
 
@@ -235,7 +236,7 @@ def test_results_of_another_study_stay_until_overwriting_is_asked_for(call, tmp_
     call("sweep", "study.toml", "--out", "out")
     write(tmp_path, rigid({"title": "second", "run.duration": 0.3}, axes=AXES), "b.toml")
     for command in ("sweep", "simulate"):
-        with pytest.raises(ValueError, match=r"out: holds another study \('small', other numbers\)"):
+        with pytest.raises(InputError, match=r"out: holds another study \('small', other numbers\)"):
             call(command, "b.toml", "--out", "out")
     call("sweep", "b.toml", "--out", "out", "--overwrite")
     assert json.loads((tmp_path / "out" / "manifest.json").read_text())["title"] == "second"

@@ -1,0 +1,1 @@
+"""A study: config, points, engine, store, metrics, single runs."""

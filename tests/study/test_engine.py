@@ -183,10 +183,10 @@ def test_structural_axes_end_to_end(tmp_path):
 
 @pytest.mark.slow
 def test_float32_and_float64_agree_on_what_converges_in_the_demo():
-    """At least 99.5 % of the demo's cells.
+    """In at least 99.5 % of the demo's runs.
 
-    Where they differ, the largest error of the last quarter meets the tolerance, and gains are so weak that the noisy
-    observer is chaotic: a relative change of the input by 1e-13 in float64 flips as many.
+    The others lie where seeds and neighbouring gains do not agree either: the largest error of the last quarter is about
+    the tolerance, and the noisy observer is chaotic. A relative change of the input by 1e-13 in float64 flips as many.
     """
     demo = read_config("sweeps/gain_map.toml")
     double, single = (sweep(with_precision(demo, name)).frame for name in ("float64", "float32"))

@@ -1,0 +1,89 @@
+"""The package as others see it: public names, direction of imports, docstrings, and the studies that come with it."""
+
+import ast
+import importlib
+import inspect
+from pathlib import Path
+
+import pytest
+
+import jaxbl
+from jaxbl.report.maps import check_figures
+from jaxbl.study.config import read_config
+from jaxbl.study.metrics import metric_columns
+from jaxbl.study.points import Points
+
+ROOT = Path(__file__).parents[1]
+FILES = sorted((ROOT / "jaxbl").rglob("*.py"))
+MODULES = [".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for file in FILES]
+
+# what a part may import from the package besides itself
+BELOW = {
+    "errors": set(),
+    "records": {"errors"},
+    "drive": {"errors"},
+    "observer": {"drive", "errors"},
+    "simulate": {"observer", "drive", "errors"},
+    "identify": {"simulate", "observer", "drive", "records", "errors"},
+}
+BELOW["study"] = {*BELOW["identify"], "identify"}
+BELOW["discrepancy"] = {*BELOW["identify"], "identify"}
+BELOW["report"] = {*BELOW["study"], "study", "discrepancy"}
+BELOW["cli"] = {*BELOW["report"], "report"}
+
+
+def test_public_names_resolve_and_are_documented():
+    assert {"run", "sweep", "load", "read_config", "Config", "InputError"} <= set(dir(jaxbl))
+    for name in dir(jaxbl):
+        assert inspect.getdoc(getattr(jaxbl, name)), name
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        _ = jaxbl.nothing
+    # names for type checkers are those that load
+    tree = ast.parse((ROOT / "jaxbl" / "__init__.py").read_text())
+    declared = {
+        alias.asname for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.level for alias in node.names
+    }
+    assert declared - {None} == set(dir(jaxbl))
+
+
+def imported(file):
+    """Modules of the package that a file imports, wherever in it."""
+    package = ["jaxbl", *file.relative_to(ROOT / "jaxbl").parent.parts]
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name.split(".")[0] == "jaxbl")
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) + 1 - node.level] if node.level else []
+            base = [*base, *(node.module.split(".") if node.module else [])]
+            if base[0] == "jaxbl":
+                yield from (".".join([*base, alias.name]) for alias in node.names)
+
+
+@pytest.mark.parametrize("file", [f for f in FILES if f != ROOT / "jaxbl" / "__init__.py"], ids=lambda f: f.stem)
+def test_imports_run_downward(file):
+    part = file.relative_to(ROOT / "jaxbl").with_suffix("").parts[0]
+    for name in imported(file):
+        target = name.split(".")[1]
+        assert target == part or target in BELOW[part], f"{part} imports {name}"
+
+
+def test_the_import_check_sees_imports():
+    assert "jaxbl.errors.InputError" in set(imported(ROOT / "jaxbl" / "study" / "store.py"))
+    assert "jaxbl.study.sweep.StudyResult" in set(imported(ROOT / "jaxbl" / "report" / "reports.py"))
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_every_public_module_class_and_function_has_a_docstring(name):
+    module = importlib.import_module(name)
+    assert module.__doc__, name
+    for member, value in vars(module).items():
+        if not member.startswith("_") and (inspect.isclass(value) or inspect.isfunction(value)) and value.__module__ == name:
+            assert value.__doc__, f"{name}.{member}"
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "sweeps").glob("*.toml")), ids=lambda f: f.stem)
+def test_every_study_is_valid_with_its_axes_and_figures(file):
+    config = read_config(file)
+    assert config.title
+    assert len(Points(config)) >= 1
+    check_figures(config, config.figures, metric_columns(config.build()))
