@@ -148,7 +148,7 @@ def _result(experiment: Experiment, totals: dict[str, _Totals], state: State) ->
             out["excitation"] = experiment.identifier.excitation(state.identifier)
         # sums overflow with the lane: they tell whether it stayed finite
         ok = jnp.isfinite(total.position + total.velocity + total.torque + total.f_plus + total.acceleration)
-        out["converged"] = out["converged"] & ok
+        out = {name: jnp.where(ok, value, False if name == "converged" else jnp.nan) for name, value in out.items()}
         finite = finite & ok
         figures |= {f"{side}.{name}": value for name, value in out.items()}
     return {"finite": finite, **figures}

@@ -136,9 +136,10 @@ class Store:
                 "machine": {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count()},
             }
             store = cls(folder, manifest)
-            (folder / "points").mkdir(exist_ok=True)
-        write_atomic(folder / "study.toml", config.to_toml())
+        # the manifest first: it is what makes the folder this study's
         store.update()
+        (folder / "points").mkdir(exist_ok=True)
+        write_atomic(folder / "study.toml", config.to_toml())
         return store
 
     @classmethod
