@@ -263,7 +263,7 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
             label = f"{word} ({missing} points)"
             cross = Line2D([], [], color=MISSING, ls="", marker="x", label=label)
             curves.append(Patch(facecolor=MISSING, label=label) if gridded else cross)
-        bar = figure.colorbar(ScalarMappable(norm, MAP), ax=axes, pad=0.01, aspect=28, extend=_extend(tables, norm))
+        bar = figure.colorbar(ScalarMappable(norm, MAP), ax=axes, pad=0.02, aspect=28, extend=_extend(tables, norm))
         bar.set_label(_wrap(_value_label(spec.value)))
         if handles := [*handles, *curves]:
             columns = max(int(figure.get_figwidth() / 2.4), 1)
