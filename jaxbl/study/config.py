@@ -129,6 +129,10 @@ _Excitation = _tagged(
 )
 _Effect = _tagged([table_for(effect_class(name), kind, kind=name) for name, kind in effect_kinds().items()], "kind")
 _Gains = table_for(AbstractSuperTwisting)
+_Initial = table_for(Initial)
+_Encoders = table_for(Encoders)
+_EquivalentControl = table_for(EquivalentControl)
+_Identifier = table_for(Identifier)
 
 
 class ObserverTable(Table):
@@ -309,16 +313,14 @@ class Config(Table):
     drive: _Drive = Field(description="what is driven")  # type: ignore[valid-type]
     transmission: _Transmission | None = Field(default=None, description="law of the gear; none on a rigid drive")  # type: ignore[valid-type]
     effects: list[_Effect] = Field(default=[], description="effects beyond the nominal drive")  # type: ignore[valid-type]
-    initial: table_for(Initial) = Field(default_factory=lambda: table_for(Initial)(), description="state at t = 0")  # type: ignore[valid-type]
+    initial: _Initial = Field(default_factory=_Initial, description="state at t = 0")  # type: ignore[valid-type]
     excitation: _Excitation = Field(description="input torque")  # type: ignore[valid-type]
-    encoders: table_for(Encoders) = Field(default_factory=lambda: table_for(Encoders)(), description="position sensors")  # type: ignore[valid-type]
+    encoders: _Encoders = Field(default_factory=_Encoders, description="position sensors")  # type: ignore[valid-type]
     observer: ObserverTable
-    equivalent_control: table_for(EquivalentControl) = Field(  # type: ignore[valid-type]
-        default_factory=lambda: table_for(EquivalentControl)(), description="low-pass on the equivalent control"
+    equivalent_control: _EquivalentControl = Field(  # type: ignore[valid-type]
+        default_factory=_EquivalentControl, description="low-pass on the equivalent control"
     )
-    identifier: table_for(Identifier) = Field(  # type: ignore[valid-type]
-        default_factory=lambda: table_for(Identifier)(), description="recursive least squares"
-    )
+    identifier: _Identifier = Field(default_factory=_Identifier, description="recursive least squares")  # type: ignore[valid-type]
     run: RunTable = Field(default_factory=RunTable)
     sweep: SweepTable = Field(default_factory=SweepTable)
     uncertainty: UncertaintyTable = Field(default_factory=UncertaintyTable)

@@ -70,10 +70,6 @@ class Points:
         """Values of the lane axes at some points of a group, by path; float64 arrays of the shape of `indices`."""
         return _take(self._blocks_of_leaves, indices)
 
-    def axis_values(self, config: Config) -> dict[str, list[Any]]:
-        """Distinct values of each axis that has a list of them (not the quasi-random ones)."""
-        return {axis.path: list(_values(axis)) for axis in config.axes if axis.values is not None or axis.num is not None}
-
     @staticmethod
     def _check(config: Config) -> tuple[Config, set[str]]:
         """The config with every axis at its first value (so that optional numbers exist), and the paths that are leaves."""
