@@ -90,7 +90,7 @@ class Engine:
         self.layout = layout or layout_for(config, self.points, len(self.devices))
         self.compile_seconds = 0.0
         self.run_seconds = 0.0
-        self._compiled: tuple[int, Any] | None = None
+        self._compiled: tuple[int, tuple[Any, list[str]]] | None = None
 
     def __len__(self) -> int:
         """Number of chunks."""
@@ -112,7 +112,7 @@ class Engine:
     def run(self, chunk: Chunk) -> pd.DataFrame:
         """Compute one chunk: a frame of one row for each seed and point, padding taken off."""
         group = self.points.groups[chunk.group]
-        program = self._program(chunk.group)
+        program, names = self._program(chunk.group)
         seeds, indices = self.contents(chunk)
         columns = self.points.columns(indices)
         with precision(group.config):
@@ -128,7 +128,7 @@ class Engine:
             else:
                 data[path] = np.full(shape, group.structural[path]).ravel()
         data["seed"] = np.broadcast_to(seeds[:, None], shape).ravel()
-        for name in metric_columns(group.config.build()):
+        for name in names:
             data[name] = figures[name][: shape[0], : shape[1]].ravel()
         return pd.DataFrame(data)
 
@@ -148,13 +148,13 @@ class Engine:
         padded = {path: pad(np.asarray(v, dtype), self.layout.points) for path, v in columns.items()}
         return padded, pad(seeds.astype(np.uint32), self.layout.seeds)
 
-    def _program(self, group: int) -> Any:
-        """The compiled program of a group; the last one is kept."""
+    def _program(self, group: int) -> tuple[Any, list[str]]:
+        """The compiled program of a group and the names of its figures; the last one is kept."""
         if self._compiled is None or self._compiled[0] != group:
             self._compiled = (group, self._compile(self.points.groups[group].config))
         return self._compiled[1]
 
-    def _compile(self, config: Config) -> Any:
+    def _compile(self, config: Config) -> tuple[Any, list[str]]:
         with precision(config):
             experiment = prepare(config)
 
@@ -181,17 +181,18 @@ class Engine:
             start = time.perf_counter()
             program = jax.jit(chunk).lower(*self._arguments(config, columns, np.arange(1))).compile()
             self.compile_seconds += time.perf_counter() - start
-        return program
+        return program, metric_columns(experiment)
 
     def estimate(self) -> "Estimate":
         """Memory and time of the whole study, from a compilation and a short run at the same chunk shape."""
-        short = min(self.config.run.steps, 400)
         config = self.points.groups[0].config
+        # long enough for what a run costs once not to count
+        short = min(config.run.steps, 2000)
         brief = config.model_copy(
             update={"run": config.run.model_copy(update={"duration": short * config.run.sample_period})}
         )
         with precision(config):
-            program = self._compile(brief)
+            program, _ = self._compile(brief)
             compiling = self.compile_seconds
             given = self._arguments(brief, self.points.columns(np.arange(1)), np.arange(1))
             seconds = []

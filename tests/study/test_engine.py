@@ -109,7 +109,7 @@ def test_memory_grows_neither_with_points_nor_with_duration():
         config = read_config(rigid({"run.duration": duration}, axes=[spaced(ALPHA, 1.0, 2.0, points)], sweep={"chunk": 64}))
         engine = Engine(config)
         assert tuple(engine.layout) == (1, 64)
-        found = engine._compile(config).memory_analysis()
+        found = engine._compile(config)[0].memory_analysis()
         return found.temp_size_in_bytes + found.output_size_in_bytes + found.argument_size_in_bytes
 
     # both durations draw their noise in blocks of the same length; a trace of 102.4 s would be 800 kB a lane
