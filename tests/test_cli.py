@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import pandas as pd
@@ -258,3 +259,15 @@ def test_durations(seconds, text):
 
 def test_default_folder():
     assert cli._folder(Path("a/b.toml"), None) == Path("results/b")
+
+
+@pytest.mark.parametrize(("name", "command"), [("gain_map", "sweep"), ("load_gains", "sweep"), ("paper_table1", "simulate")])
+def test_shipped_studies_run_without_a_word_on_stderr(name, command, tmp_path):
+    # in a process of its own, where float64 is on only inside the engine
+    study = tomllib.loads((Path(__file__).parents[1] / "sweeps" / f"{name}.toml").read_text(encoding="utf-8"))
+    study["run"]["duration"] = 0.5
+    for axis in study.get("axes", []):
+        if "num" in axis:
+            axis["num"] = 2
+    done = jaxbl(command, write(tmp_path, study), cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")

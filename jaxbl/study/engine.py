@@ -181,7 +181,7 @@ class Engine:
             start = time.perf_counter()
             program = jax.jit(chunk).lower(*self._arguments(config, columns, np.arange(1))).compile()
             self.compile_seconds += time.perf_counter() - start
-        return program, metric_columns(experiment)
+            return program, metric_columns(experiment)
 
     def estimate(self) -> "Estimate":
         """Memory and time of the whole study, from a compilation and a short run at the same chunk shape."""
