@@ -150,13 +150,14 @@ def _remarks(experiment: Experiment, trace: pd.DataFrame, metrics: dict[str, Any
     if not metrics["finite"]:
         return ["The run diverged: its figures are not finite."]
     remarks = []
+    what = "the disturbance torque" if experiment.transmission is None else "the transmitted torque |C|"
     largest = float(np.abs(trace["torque"].to_numpy()).max())
     for side, found in conditions.items():
         inertia = float(experiment.drive.inertia(side))
         limit = found["alpha"] * inertia / abs(float(experiment.drive.torque_gain(side)))
         verdict = "holds" if largest < limit else "fails"
         remarks.append(
-            f"{side}: alpha = {found['alpha']:g} rad/s² covers the transmitted torque while |C| < {limit:.3g} N m; "
+            f"{side}: alpha = {found['alpha']:g} rad/s² covers {what} while it is below {limit:.3g} N m; "
             f"the largest here is {largest:.3g} N m, so that this {verdict}. The true bound along the run, with the "
             f"observer's own velocity error in it, is f⁺ = {found['f_plus']:.3g} rad/s²; twice the largest acceleration "
             f"would be {metrics[f'{side}.f_plus_acceleration']:.3g} rad/s²."
@@ -183,5 +184,10 @@ def _remarks(experiment: Experiment, trace: pd.DataFrame, metrics: dict[str, Any
                 "which they leave out, shrinks the error asymptotically."
             )
         if not converged:
-            remarks.append(f"{side}: the observer did not stay within its tolerance over the last quarter of the run.")
+            run, ratio = experiment.run, float(experiment.drive.ratio(side))
+            remarks.append(
+                f"{side}: the observer did not stay within {run.position_tolerance / ratio:.2g} rad and "
+                f"{run.velocity_tolerance / ratio:.2g} rad/s over the last quarter of the run "
+                "(run.position_tolerance, run.velocity_tolerance; on the load divided by the gear ratio)."
+            )
     return remarks

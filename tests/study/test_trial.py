@@ -54,7 +54,7 @@ def test_summary_of_table_1_names_what_it_misses(table1):
     missed = [line for line in remarks if line.startswith("motor: lambda = 0.005 misses condition (32) by a factor of")]
     # sqrt(2 alpha) / lambda = 380 at the least, however small f_plus
     assert float(missed[0].split("factor of ")[1].split()[0]) > 379
-    assert any("|C| < 0.09 N m" in line and line.startswith("motor: alpha = 1.8") for line in remarks)
+    assert any("torque |C| while it is below 0.09 N m" in line and line.startswith("motor: alpha = 1.8") for line in remarks)
     for side, gains in (("motor", (0.005, 1.8)), ("load", (0.004, 0.08))):
         found = summary["conditions"][side]
         assert (found["lambda"], found["alpha"]) == gains
