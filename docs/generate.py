@@ -73,7 +73,7 @@ def page() -> str:
     )
     for name in sorted(effect_kinds()):
         cls = effect_class(name)
-        doc = " ".join((cls.__doc__ or "").strip().split("\n\n")[0].split())
+        doc = " ".join((cls.__doc__ or "").strip().split("\n\n")[0].split()).replace("|", "\\|")
         for i, (field, known) in enumerate(parameters(cls)):
             default = "required" if repr(field.default).startswith("<") else f"`{field.default}`"
             lead = f"| `{name}` | {doc} " if i == 0 else "| | "
@@ -82,7 +82,9 @@ def page() -> str:
         "\n## Metrics\n\nColumns of `points/part-*.parquet`: one for each `side` in motor, load. Besides them: the axis "
         "paths, `seed`, and `finite` (no number of the lane overflowed).\n\n| column | unit | meaning |\n|---|---|---|"
     )
-    parts += [f"| `side.{name}` | {about.unit} | {about.doc} |" for name, about in SIDE_METRICS.items()]
+    parts += [
+        f"| `side.{name}` | {about.unit} | {about.doc.replace('|', chr(92) + '|')} |" for name, about in SIDE_METRICS.items()
+    ]
     return "\n".join(parts) + "\n"
 
 

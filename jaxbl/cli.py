@@ -40,7 +40,7 @@ def _main() -> None:
 def simulate(
     config: ConfigArgument,
     out: OutOption = None,
-    seed: Annotated[int, typer.Option(help="seed of the encoder noise", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="seed of the encoder noise", min=0, max=2**31 - 1)] = 0,
     every: Annotated[int, typer.Option(help="keep every N-th sample of the trace", min=1, metavar="N")] = 1,
     overwrite: OverwriteOption = False,
 ) -> None:

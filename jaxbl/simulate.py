@@ -1,6 +1,6 @@
 """One experiment through time: drive, encoders, observers, equivalent control and identifier in one step function.
 
-:func:`step` is the whole chain for one sample, elementwise over whatever batch its leaves carry. :func:`scan` is the one
+:func:`step` is the whole chain for one sample of one lane; `vmap` makes it many. :func:`scan` is the one
 loop over time that calls it, for simulated and for recorded positions, with or without a trace, with any reducers.
 """
 
@@ -76,7 +76,10 @@ class State(eqx.Module):
 
 
 class Sample(NamedTuple):
-    """What a step is given: time, and either unit noise (simulation) or input and measured positions (a record)."""
+    """What a step is given: time, and either unit noise (simulation) or input and measured positions (a record).
+
+    With unit noise, an `input` (N m) takes the place of the excitation's.
+    """
 
     time: Number
     noise: dict[str, Number] | None = None
@@ -143,7 +146,7 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
     drive, plant, period = experiment.drive, experiment.plant, experiment.run.sample_period
     if sample.measured is None:
         assert sample.noise is not None and state.plant is not None
-        torque_in = experiment.excitation(sample.time)
+        torque_in = experiment.excitation(sample.time) if sample.input is None else sample.input
         measured = {
             side: experiment.encoders.measure(side, state.plant.position[side], sample.noise[side], drive.ratio(side))
             for side in drive.sides

@@ -89,7 +89,8 @@ class Steps(AbstractExcitation):
     seed: int = option("seed of the levels", default=0, minimum=0)
 
     def __call__(self, time):
-        key = jax.random.fold_in(jax.random.key(self.seed), _held(self.hold, time))
+        # a stream of its own: encoder noise is drawn from the plain key of its seed
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self.seed), 0x57E9), _held(self.hold, time))
         level = jax.random.uniform(key, (), jnp.float32, -1.0, 1.0)
         return self.amplitude * level.astype(jnp.result_type(time))
 

@@ -1,8 +1,9 @@
 """Gain conditions of the super-twisting observer, for the error system (34) with bound f_plus.
 
-All functions are elementwise over JAX arrays that broadcast, and differentiable away from their limits. `least_lambda_*`
-return the smallest lambda (rad^0.5/s) that a condition allows for given alpha and f_plus (rad/s^2); where no lambda does
-(alpha <= f_plus) that is `inf`. By homogeneity all of them are sqrt(f_plus) times a function of alpha / f_plus.
+All functions are elementwise over JAX arrays that broadcast, and differentiable away from their limits, but for
+`least_lambda_exact` (a bisection). `least_lambda_*` return the smallest lambda (rad^0.5/s) that a condition allows for given
+alpha and f_plus (rad/s^2); where no lambda does (alpha <= f_plus) that is `inf`. By homogeneity all of them are sqrt(f_plus)
+times a function of alpha / f_plus.
 """
 
 import jax

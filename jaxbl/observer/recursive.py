@@ -90,7 +90,7 @@ class Identifier(eqx.Module):
         filtered = tuple(low_pass.filter(old, new, step) for old, new in zip(state.regressors, raw, strict=True))
         # the equivalent control at a sample balances what acted up to it: it is one sample late, and so must phi be
         phi = state.regressors if self.regressor_filter == "matched" else raw
-        # a sample period of slack: time is a rounded multiple of it
+        # half a sample period of slack: time is a rounded multiple of it
         counts = (time > self.start - 0.5 * step).astype(z.dtype)
         weighted = tuple(counts * p for p in phi)
         # before the start nothing must be forgotten either: the sums are still zero

@@ -207,12 +207,18 @@ def _grid_of_axes(count: int, width: float, height: float, extra: float = 0.0) -
     return figure, flat[:count]
 
 
+def _table(part: pd.DataFrame, keys: list[str], value: str) -> pd.Series:
+    """What a map draws; empty where any run diverged, for the others alone would look too good."""
+    table = _reduce(part.assign(**{value: _shown(part, value)}), keys, value)
+    return table if value == "finite" else table.where(_reduce(part, keys, "finite") == 1.0)
+
+
 def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
     assert spec.y is not None
     with style():
         panels = _panels(config, frame, spec.facet)
         keys = [spec.y, spec.x]
-        tables = [_reduce(part.assign(**{spec.value: _shown(part, spec.value)}), keys, spec.value) for _, part in panels]
+        tables = [_table(part, keys, spec.value) for _, part in panels]
         norm = (
             Normalize(0.0, 1.0)
             if _is_boolean(spec.value)
@@ -392,5 +398,4 @@ def _wrap(label: str, width: int = 48) -> str:
 
 
 def _file_name(spec: FigureTable) -> str:
-    parts = [spec.value, spec.x, *([spec.y] if spec.y else [])]
-    return re.sub(r"[^A-Za-z0-9]+", "_", f"{spec.kind}_{parts[0]}").strip("_")
+    return re.sub(r"[^A-Za-z0-9]+", "_", f"{spec.kind}_{spec.value}").strip("_")

@@ -5,6 +5,7 @@
 # pyright: reportReturnType=false
 
 import json
+import os
 from pathlib import Path
 
 import pandas as pd
@@ -62,10 +63,11 @@ def headline(result: StudyResult) -> list[str]:
 
 def write_trial_report(trial: Trial, folder: Path) -> list[str]:
     """Write trace, summary, figures and report of a run into a folder that exists. Returns the lines for the terminal."""
-    draft = folder / ".trace.draft"
+    # the summary first: it is what makes the folder this study's
+    write_atomic(folder / "summary.json", json.dumps(trial.summary, indent=2, ensure_ascii=False))
+    draft = folder / f".trace.{os.getpid()}.draft"
     trial.trace.to_parquet(draft, index=False)
     draft.replace(folder / "trace.parquet")
-    write_atomic(folder / "summary.json", json.dumps(trial.summary, indent=2, ensure_ascii=False))
     pictures = _save(draw_trial(trial), folder)
     metrics = trial.summary["metrics"]
     sides = [side for side in SIDES if f"{side}.converged" in metrics]

@@ -115,7 +115,8 @@ def _hysteresis(trace: pd.DataFrame) -> Drawn:
     right.set(xlabel="motor position θe (rad)", ylabel="load position θs (rad)")
     right.legend(ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
     caption = (
-        "Torque over twist, and load over motor position: the hysteresis of the play, second half (analogue of Fig. 17)."
+        "Torque over twist (its band is chatter and lag of the estimates), and load over motor position: the hysteresis of "
+        "the drive. Second half of the run (analogue of Fig. 17)."
     )
     return Drawn("hysteresis", figure, caption)
 

@@ -209,11 +209,11 @@ class RunTable(Table):
 class SweepTable(Table):
     """How the axes are combined and repeated."""
 
-    seeds: int = Field(default=1, ge=1, description="noise seeds 0 ... seeds - 1, each run at every point")
+    seeds: int = Field(default=1, ge=1, le=1_000_000_000, description="noise seeds 0 ... seeds - 1, each run at every point")
     design: Literal["grid", "sobol", "latin_hypercube"] = Field(
         default="grid", description="grid: all combinations; else quasi-random points over the axes without num or values"
     )
-    points: int | None = Field(default=None, ge=1, description="number of quasi-random points")
+    points: int | None = Field(default=None, ge=1, le=100_000_000, description="number of quasi-random points")
     design_seed: int = Field(default=0, ge=0, description="seed of the quasi-random design")
     chunk: int | None = Field(default=None, ge=1, description="lanes computed at once; left out: chosen for the machine")
 
@@ -239,7 +239,9 @@ class AxisTable(Table):
     values: list[float | int | str] | None = Field(default=None, description="listed values")
     start: float | None = Field(default=None, description="first value")
     stop: float | None = Field(default=None, description="last value")
-    num: int | None = Field(default=None, ge=1, description="number of values; left out in quasi-random designs")
+    num: int | None = Field(
+        default=None, ge=1, le=10_000_000, description="number of values; left out in quasi-random designs"
+    )
     scale: Literal["linear", "log"] = Field(default="linear", description="spacing")
     zip: str | None = Field(default=None, description="axes with the same label advance together")
 
@@ -361,6 +363,16 @@ class Config(Table):
                     "effects[{i}]: {kind} has no meaning on a rigid drive; motor.* and actuator.* effects act on it",
                     i=i,
                     kind=effect.kind,
+                )
+        for side in ("motor",) if rigid else ("motor", "load"):
+            nominal = getattr(self.drive, f"{side}_inertia")
+            total = nominal + sum(effect.inertia for effect in self.effects if effect.kind == f"{side}.inertia")
+            if total <= 0.0:
+                raise wrong(
+                    "effects: {side}.inertia leaves a total of {total} on the {side}; it should stay above -{nominal}",
+                    side=side,
+                    total=f"{total:g}",
+                    nominal=f"{nominal:g}",
                 )
         known = numeric_paths(self)
         for path in self.uncertainty.exact:

@@ -57,6 +57,9 @@ def claim(folder: Path, config: Config, *, single: bool = False, overwrite: bool
                 if not overwrite:
                     raise
                 found[name] = {}
+    # a damaged file of ours is read as an empty one above
+    if any(data and "single_run" not in data for data in found.values()):
+        raise InputError(f"{folder}: holds files that are not of a study; choose another folder with --out")
     same = [data.get("single_run") == identity(config, single=True) for data in found.values()]
     if not single and "manifest.json" in found:
         same.append(found["manifest.json"].get("identity") == identity(config))
@@ -179,7 +182,7 @@ class Store:
             return False
 
     def write(self, index: int, frame: pd.DataFrame) -> None:
-        draft = self.part(index).with_suffix(".draft")
+        draft = self.part(index).with_suffix(f".{os.getpid()}.draft")
         frame.to_parquet(draft, index=False)
         draft.replace(self.part(index))
 

@@ -13,7 +13,7 @@ import pandas as pd
 
 from jaxbl.errors import InputError
 from jaxbl.observer.conditions import LEAST_LAMBDA, peak_ratio
-from jaxbl.simulate import Experiment, Signals, State, scan
+from jaxbl.simulate import Experiment, Reducer, Signals, State, scan
 
 from .config import Config, read_config
 from .engine import precision, prepare
@@ -27,7 +27,7 @@ class Trial(NamedTuple):
     Attributes:
         config: the study (its axes are not used).
         trace: one row a sample; `t`, `u`, `theta_e`, `theta_s` as a measured log has them, true values and estimates by
-            side, path of the identified parameters (columns and units: docs/files.md).
+            side, path of the identified parameters (columns and units: README).
         summary: metrics, identified parameters, gain conditions and remarks, as in `summary.json`.
     """
 
@@ -42,7 +42,7 @@ def run(study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every:
     Args:
         study: TOML file, mapping or config.
         seed: seed of the encoder noise.
-        every: keep every so manieth sample of the trace.
+        every: keep every N-th sample of the trace.
 
     Raises:
         InputError: wrong config.
@@ -60,10 +60,28 @@ def run(study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every:
             names[:] = row  # in this order: compiled programs give dicts back sorted
             return row
 
-        figures, kept = eqx.filter_jit(lambda e, s: scan(e, s, (METRICS,), keep, every))(experiment, jnp.asarray(seed))
+        figures, kept = eqx.filter_jit(lambda e, s: scan(e, s, (METRICS, _LAST), keep, every))(experiment, jnp.asarray(seed))
         trace = pd.DataFrame({name: np.asarray(kept[name], dtype=float) for name in names})
+    last = {name: _plain(figures.pop(name)) for name in list(figures) if name.startswith("last.")}
     metrics = {name: _plain(value) for name, value in figures.items()}
-    return Trial(config, trace, _summary(config, trace, metrics, seed))
+    return Trial(config, trace, _summary(config, last, metrics, seed))
+
+
+def _last(experiment: Experiment, largest: Any, state: State) -> dict[str, Any]:
+    figures = {"last.largest_torque": largest}
+    if state.identifier is not None:
+        assert experiment.identifier is not None and experiment.transmission is not None
+        for side, found in experiment.identifier.estimate(state.identifier, experiment.transmission).items():
+            figures |= {f"last.{side}.{name}": value for name, value in found.items()}
+    return figures
+
+
+# over all samples, whatever the trace keeps of them
+_LAST = Reducer(
+    lambda experiment: jnp.zeros_like(experiment.run.sample_period),
+    lambda experiment, largest, index, signals: jnp.maximum(largest, jnp.abs(signals.torque)),
+    _last,
+)
 
 
 _LOG_NAMES = {"motor": "theta_e", "load": "theta_s"}
@@ -102,12 +120,12 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _summary(config: Config, trace: pd.DataFrame, metrics: dict[str, Any], seed: int) -> dict[str, Any]:
+def _summary(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed: int) -> dict[str, Any]:
     experiment = config.build()
     identified: dict[str, Any] = {}
     if experiment.transmission is not None:
         for name, true in experiment.transmission.truth().items():
-            sides = {side: _plain(trace[f"{side}.{name}"].iloc[-1]) for side in experiment.sides}
+            sides = {side: last[f"last.{side}.{name}"] for side in experiment.sides}
             identified[name] = {"true": true, **sides}
     conditions = {}
     for side in experiment.sides:
@@ -121,7 +139,7 @@ def _summary(config: Config, trace: pd.DataFrame, metrics: dict[str, Any], seed:
         "metrics": metrics,
         "identified": identified,
         "conditions": conditions,
-        "remarks": [*config.notes, *_remarks(experiment, trace, metrics, conditions)],
+        "remarks": [*config.notes, *_remarks(experiment, last, metrics, conditions)],
     }
 
 
@@ -145,13 +163,13 @@ def _conditions(observer: Any, f_plus: float) -> dict[str, Any]:
 _CONDITION_NAMES = {"davila_fridman": "condition (32)", "seeber_horn": "Seeber-Horn", "exact": "the exact condition"}
 
 
-def _remarks(experiment: Experiment, trace: pd.DataFrame, metrics: dict[str, Any], conditions: dict[str, Any]) -> list[str]:
+def _remarks(experiment: Experiment, last: dict[str, Any], metrics: dict[str, Any], conditions: dict[str, Any]) -> list[str]:
     """What a reader of the figures should know, in sentences."""
     if not metrics["finite"]:
         return ["The run diverged: its figures are not finite."]
     remarks = []
     what = "the disturbance torque" if experiment.transmission is None else "the transmitted torque |C|"
-    largest = float(np.abs(trace["torque"].to_numpy()).max())
+    largest = last["last.largest_torque"]
     for side, found in conditions.items():
         inertia = float(experiment.drive.inertia(side))
         limit = found["alpha"] * inertia / abs(float(experiment.drive.torque_gain(side)))
@@ -180,8 +198,8 @@ def _remarks(experiment: Experiment, trace: pd.DataFrame, metrics: dict[str, Any
         converged = metrics[f"{side}.converged"]
         if converged and not found["holds"]["exact"]:
             remarks.append(
-                f"{side}: the observer converged all the same: the conditions are for the worst case, and viscous friction, "
-                "which they leave out, shrinks the error asymptotically."
+                f"{side}: the observer converged all the same: the conditions are for the worst disturbance, which this run "
+                "need not contain, and they leave out viscous friction, which can shrink the error asymptotically."
             )
         if not converged:
             run, ratio = experiment.run, float(experiment.drive.ratio(side))
