@@ -126,3 +126,14 @@ def test_every_signal_scales_with_its_amplitude_as_a_grid_axis(dtype):
         assert values.dtype == dtype
         assert values[0] == 0.0 and values[1] != 0.0
         assert values[2] == pytest.approx(float(-3.0 * values[1]), rel=1e-6)
+
+
+def test_steps_are_independent_of_encoder_noise():
+    from scipy.stats import norm
+
+    from jaxbl.simulate import unit_noise
+
+    steps = Steps(1.0, 1.0, seed=3)
+    levels = np.array([float(steps(jnp.asarray(i + 0.5))) for i in range(40)])
+    for noise in unit_noise(jnp.asarray(3), jnp.arange(40), ("motor", "load")).values():
+        assert abs(np.corrcoef(levels, 2.0 * norm.cdf(np.asarray(noise)) - 1.0)[0, 1]) < 0.5

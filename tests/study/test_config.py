@@ -464,3 +464,8 @@ def test_any_mutation_is_valid_or_an_input_error_of_one_line(mutations):
         message = ""
         assert read_config(tomllib.loads(config.to_toml())).resolved() == config.resolved()
     assert message.isprintable()
+
+
+def test_inertia_effects_must_leave_some():
+    with pytest.raises(InputError, match=r"motor.inertia leaves a total of .* on the motor"):
+        read_config(rigid(effects=[{"kind": "motor.inertia", "inertia": -1e3}]))

@@ -9,7 +9,7 @@ from small_study import ALPHA, listed, rigid
 from jaxbl.errors import InputError
 from jaxbl.study.config import read_config
 from jaxbl.study.engine import Engine
-from jaxbl.study.store import Store, identity, make_folder
+from jaxbl.study.store import Store, claim, identity, make_folder
 from jaxbl.study.sweep import load, sweep
 
 FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
@@ -204,3 +204,12 @@ def test_a_record_is_known_by_its_content(tmp_path):
     first = of("t,u\n0,1\n1,2\n")
     assert of("t,u\n0,1\n1,3\n") != first
     assert of("t,u\n0,1.0\n1,2.0\n", "b.csv") == first
+
+
+def test_files_of_others_are_never_removed(tmp_path):
+    (tmp_path / "summary.json").write_text('{"mine": 1}')
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "mine.png").write_bytes(b"x")
+    with pytest.raises(InputError, match="not of a study"):
+        claim(tmp_path, read_config(rigid()), overwrite=True)
+    assert (tmp_path / "figures" / "mine.png").exists()

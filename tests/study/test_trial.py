@@ -114,3 +114,12 @@ def test_a_diverged_run_says_so():
 def test_axes_are_not_used():
     config = read_config(rigid(axes=[listed("observer.motor.alpha", 1.0, 2.0)]))
     assert run(config).summary["conditions"]["motor"]["alpha"] == 9.0
+
+
+def test_decimation_thins_the_trace_and_nothing_else():
+    study = small({"run.duration": 2.0})
+    whole, thin = (run(study, every=every) for every in (1, 1999))
+    assert len(thin.trace) < 5
+    assert thin.summary["remarks"] == whole.summary["remarks"]
+    for name, found in whole.summary["identified"].items():
+        assert thin.summary["identified"][name] == pytest.approx(found, rel=1e-9)
