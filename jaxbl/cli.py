@@ -53,7 +53,7 @@ def simulate(
 
     study = read_config(config)
     folder = _folder(config, out)
-    claim(folder, study, single=True, overwrite=overwrite)
+    claim(folder, study, "simulate", overwrite=overwrite)
     trial = run(study, seed=seed, every=every)
     for line in write_trial_report(trial, folder):
         typer.echo(line)

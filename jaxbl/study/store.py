@@ -20,10 +20,20 @@ from .engine import Layout
 FORMAT = 1
 
 
-def identity(config: Config, *, single: bool = False) -> str:
-    """Hash of everything that decides the numbers of a study, or of its `single` run (which has no axes).
+_COMMANDS = {
+    # command: its marker, which says whose the folder is; what it leaves; keys of the config that decide none of its numbers
+    "simulate": ("summary.json", ("trace.parquet",), ("axes", "sweep", "verify", "tune")),
+    "sweep": ("manifest.json", ("study.toml", "points"), ("verify", "tune")),
+    "verify": ("verify/manifest.json", ("verdict.json", "verify"), ("tune",)),
+    "tune": ("tune/manifest.json", ("gains.toml", "tuning.json", "tune"), ("axes", "verify")),
+}
+_COMMON = ("figures", "report.html")
 
-    Title, notes, figures and chunk size decide nothing.
+
+def identity(config: Config, command: str = "sweep") -> str:
+    """Hash of everything that decides the numbers that a command finds for a study.
+
+    Title, notes, figures, chunk size and tables that only other commands read decide nothing.
     """
     data = config.resolved()
     data["sweep"].pop("chunk", None)
@@ -31,38 +41,41 @@ def identity(config: Config, *, single: bool = False) -> str:
         # what was recorded counts, not where it lies
         record = config.excitation.build()
         data["excitation"]["file"] = hashlib.sha256(record.times.tobytes() + record.torques.tobytes()).hexdigest()
-    for key in ("title", "notes", "figures", *(("axes", "sweep") if single else ())):
+    for key in ("title", "notes", "figures", *_COMMANDS[command][2]):
         data.pop(key, None)
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 
-_OUTPUTS = ("manifest.json", "summary.json", "study.toml", "trace.parquet", "points", "figures", "report.html")
+def mark(config: Config, command: str) -> dict[str, Any]:
+    """What a command's marker says of its study: its own identity, and that of the study's single run."""
+    own = {} if command == "simulate" else {"identity": identity(config, command)}
+    return own | {"single_run": identity(config, "simulate"), "title": config.title}
 
 
-def claim(folder: Path, config: Config, *, single: bool = False, overwrite: bool = False) -> None:
-    """Make sure that a study, or its single run, may write its results into a folder; make the folder.
+def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bool = False) -> None:
+    """Make sure that a command may write its results for a study into a folder; make the folder.
 
-    Both may share one folder. With `overwrite`, results of other studies are removed from it first.
+    All commands of one study may share one folder. With `overwrite`, results of other studies are removed from it first.
 
     Raises:
         InputError: the folder holds another study or other files, or cannot be written to.
     """
     make_folder(folder)
     found = {}
-    for name in ("manifest.json", "summary.json"):
-        if (folder / name).exists():
+    for other, (marker, _, _) in _COMMANDS.items():
+        if (folder / marker).exists():
             try:
-                found[name] = _read_json(folder / name)
+                found[other] = _read_json(folder / marker)
             except InputError:
                 if not overwrite:
                     raise
-                found[name] = {}
+                found[other] = {}
     # a damaged file of ours is read as an empty one above
     if any(data and "single_run" not in data for data in found.values()):
         raise InputError(f"{folder}: holds files that are not of a study; choose another folder with --out")
-    same = [data.get("single_run") == identity(config, single=True) for data in found.values()]
-    if not single and "manifest.json" in found:
-        same.append(found["manifest.json"].get("identity") == identity(config))
+    same = [data.get("single_run") == identity(config, "simulate") for data in found.values()]
+    if command != "simulate" and command in found:
+        same.append(found[command].get("identity") == identity(config, command))
     if all(same) and (found or not any(folder.iterdir())):
         return
     if not found:
@@ -72,12 +85,18 @@ def claim(folder: Path, config: Config, *, single: bool = False, overwrite: bool
         raise InputError(
             f"{folder}: holds another study ('{title}', other numbers); choose another folder with --out, or --overwrite"
         )
-    for name in _OUTPUTS:
-        path = folder / name
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
+    for marker, outputs, _ in _COMMANDS.values():
+        for name in (marker, *outputs):
+            _remove(folder / name)
+    for name in _COMMON:
+        _remove(folder / name)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -128,9 +147,7 @@ class Store:
         else:
             manifest = {
                 "format": FORMAT,
-                "identity": identity(config),
-                "single_run": identity(config, single=True),
-                "title": config.title,
+                **mark(config, "sweep"),
                 "layout": {"seeds": layout.seeds, "points": layout.points},
                 "parts": parts,
                 "rows": rows,

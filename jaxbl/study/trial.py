@@ -134,7 +134,7 @@ def _summary(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed
             conditions[side] = _conditions(getattr(experiment.observer, side), f_plus)
     return {
         "title": config.title,
-        "single_run": identity(config, single=True),
+        "single_run": identity(config, "simulate"),
         "seed": seed,
         "metrics": metrics,
         "identified": identified,
