@@ -51,7 +51,7 @@ def by_numpy(experiment, signals, identifier):
                 observer.lambda_, observer.alpha, f_plus, np.abs(position[0]), np.abs(velocity[0])
             ),
         }
-        for name, least in conditions.LEAST_LAMBDA.items():
+        for name, (_, least) in conditions.CONDITIONS.items():
             out[f"margin_{name}"] = observer.lambda_ / least(observer.alpha, f_plus)
         if identifier is not None:
             law = experiment.transmission
