@@ -54,9 +54,9 @@ def least_lambda_seeber_horn(alpha: Values, f_plus: Values) -> Values:
 def least_lambda_moreno_osorio(alpha: Values, f_plus: Values) -> Values:
     """lambda^2 > 4 (alpha - sqrt(alpha^2 - f^2)): all that a quadratic strict Lyapunov function can show.
 
-    Moreno and Osorio take V = zeta' P zeta with zeta = (sqrt|x1| sign x1, x2), for which zeta' = (A zeta + B w) / (2 sqrt|x1|)
-    with A = [[-lambda, 1], [-2 alpha, 0]], B = (0, 2)' and |w| <= f |zeta_1|. A matrix P that makes V fall for all such w
-    solves their linear matrix inequality; by the bounded real lemma there is one exactly if
+    Moreno and Osorio take V = zeta' P zeta with zeta = (sqrt|x1| sign x1, x2), for which
+    zeta' = (A zeta + B w) / (2 sqrt|x1|) with A = [[-lambda, 1], [-2 alpha, 0]], B = (0, 2)' and |w| <= f |zeta_1|. A matrix P
+    that makes V fall for all such w solves their linear matrix inequality; by the bounded real lemma there is one exactly if
     |2 / (s^2 + lambda s + 2 alpha)| f < 1 on the imaginary axis (circle criterion). The peak of that
     is 1 / alpha if lambda^2 >= 4 alpha, else 2 / (lambda sqrt(2 alpha - lambda^2 / 4)): hence the form above.
 
@@ -111,8 +111,10 @@ def _log_peak_ratio(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
 
 
 def least_lambda_exact(alpha: Values, f_plus: Values) -> Values:
-    """Least lambda with rho < 1: by bisection on :func:`peak_ratio` (which falls with lambda), then a step of Newton's method
-    that carries the derivatives. Zero where f_plus is."""
+    """Least lambda with rho < 1; zero where f_plus is.
+
+    By bisection on :func:`peak_ratio`, which falls with lambda, then a step of Newton's method that carries the derivatives.
+    """
     known = (alpha > f_plus) & (f_plus > 0.0)
     ratio = jnp.where(known, alpha, 2.0) / jnp.where(known, f_plus, 1.0)
     one = jnp.ones_like(ratio)
@@ -280,7 +282,7 @@ class Condition(NamedTuple):
 
 
 CONDITIONS = {
-    "davila_fridman": Condition("Davila-Fridman (32)", least_lambda_davila_fridman),
+    "davila_fridman": Condition("Davila-Fridman (32), q → 0", least_lambda_davila_fridman),
     "levant": Condition("Levant 1998", least_lambda_levant),
     "seeber_horn": Condition("Seeber-Horn 2017", least_lambda_seeber_horn),
     "moreno_osorio": Condition("Lyapunov, Moreno-Osorio 2012", least_lambda_moreno_osorio),

@@ -149,8 +149,8 @@ def least_lambda_simulated(
 ) -> Values:
     """Least lambda (rad^0.5/s) at which the simulated worst case shrinks an error of a given speed (rad/s).
 
-    By bisection on :func:`half_cycle` to 1.5e-8 of sqrt(alpha + f); 0 where damping alone is enough, and `inf` where no lambda
-    up to 4 sqrt(alpha + f) is.
+    By bisection on :func:`half_cycle` to 1.5e-8 of sqrt(alpha + f); 0 where damping alone is enough, and `inf` where no
+    lambda up to 4 sqrt(alpha + f) is.
     """
     given = jnp.broadcast_arrays(*(jnp.asarray(x, float) for x in (alpha, f_plus, damping, speed)))
     alpha, f_plus, damping, speed = given
