@@ -56,9 +56,9 @@ def least_lambda_moreno_osorio(alpha: Values, f_plus: Values) -> Values:
 
     Moreno and Osorio take V = zeta' P zeta with zeta = (sqrt|x1| sign x1, x2), for which
     zeta' = (A zeta + B w) / (2 sqrt|x1|) with A = [[-lambda, 1], [-2 alpha, 0]], B = (0, 2)' and |w| <= f |zeta_1|.
-    A matrix P that makes V fall for all such w solves their linear matrix inequality; by the bounded real lemma there is one exactly if
-    |2 / (s^2 + lambda s + 2 alpha)| f < 1 on the imaginary axis (circle criterion). The peak of that
-    is 1 / alpha if lambda^2 >= 4 alpha, else 2 / (lambda sqrt(2 alpha - lambda^2 / 4)): hence the form above.
+    A matrix P that makes V fall for all such w solves their linear matrix inequality; by the bounded real lemma there is one
+    exactly if |2 / (s^2 + lambda s + 2 alpha)| f < 1 on the imaginary axis (circle criterion). The peak of that is 1 / alpha
+    if lambda^2 >= 4 alpha, else 2 / (lambda sqrt(2 alpha - lambda^2 / 4)): hence the form above.
 
     Reference: J. A. Moreno, M. Osorio, Strict Lyapunov functions for the super-twisting algorithm, IEEE Trans. Autom.
     Control 57 (2012), for V and the inequality; its elimination is ours (docs/theory.md).
