@@ -87,7 +87,14 @@ def sweep(
         check_figures(study, study.figures, metric_columns(study.build()))
         if dry_run:
             cost = estimate_cost(study)
-            typer.echo(f"points       {cost.points} ({cost.rows} runs with all seeds)")
+            refined = study.sweep.refine is not None
+            coarse = " on the coarse grid" if refined else ""
+            typer.echo(f"points       {cost.points}{coarse} ({cost.rows} runs with all seeds)")
+            if refined:
+                typer.echo(
+                    f"refinement   of {cost.most_points} points of the fine grid, as many as the boundaries turn out to need; "
+                    "what follows is for the coarse grid"
+                )
             typer.echo(f"chunks       {cost.chunks} of {cost.lanes_a_chunk} lanes")
             typer.echo(f"memory       {cost.megabytes:.1f} MB a chunk")
             typer.echo(f"compilation  about {_duration(cost.compile_seconds)}")

@@ -9,6 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 
@@ -37,6 +38,8 @@ def identity(config: Config, command: str = "sweep") -> str:
     """
     data = config.resolved()
     data["sweep"].pop("chunk", None)
+    if data["sweep"]["first_seed"] == 0:
+        del data["sweep"]["first_seed"]  # as it was before there was such a key
     if config.excitation.kind == "recorded":
         # what was recorded counts, not where it lies
         record = config.excitation.build()
@@ -202,6 +205,28 @@ class Store:
         draft = self.part(index).with_suffix(f".{os.getpid()}.draft")
         frame.to_parquet(draft, index=False)
         draft.replace(self.part(index))
+
+    def read_part(self, index: int, labels: dict[str, np.ndarray], columns: list[str]) -> pd.DataFrame | None:
+        """Some columns of a chunk, or None where it is damaged or holds other rows than those of `labels`."""
+        try:
+            frame = pd.read_parquet(self.part(index), columns=[*labels, *columns])
+        except (OSError, ValueError):
+            return None
+        same = all(np.array_equal(frame[name].to_numpy(), values) for name, values in labels.items())
+        return frame if same else None
+
+    def grow(self, parts: int, rows: int) -> None:
+        """Say how many chunks and rows a refined study has as far as is known."""
+        if rows > self.manifest["rows"]:
+            self.update(parts=parts, rows=rows)
+
+    def trim(self, parts: int, rows: int) -> None:
+        """Say how many chunks and rows a refined study has in the end, and remove what lies beyond."""
+        if (self.manifest["parts"], self.manifest["rows"]) != (parts, rows):
+            self.update(parts=parts, rows=rows)
+        for path in self.parts():
+            if int(path.stem.removeprefix("part-")) >= parts:
+                path.unlink()
 
     def parts(self) -> list[Path]:
         """Files of the chunks that are there. Raises `InputError` where there is none."""
