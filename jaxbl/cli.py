@@ -92,8 +92,7 @@ def sweep(
             typer.echo(f"points       {cost.points}{coarse} ({cost.rows} runs with all seeds)")
             if refined:
                 typer.echo(
-                    f"refinement   of {cost.most_points} points of the fine grid, as many as the boundaries turn out to need; "
-                    "what follows is for the coarse grid"
+                    f"refinement   at most {cost.most_points} points; as many as the boundaries need, not counted below"
                 )
             typer.echo(f"chunks       {cost.chunks} of {cost.lanes_a_chunk} lanes")
             typer.echo(f"memory       {cost.megabytes:.1f} MB a chunk")

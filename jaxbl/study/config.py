@@ -230,7 +230,7 @@ class SweepTable(Table):
     )
     refine_metric: str | None = Field(
         default=None,
-        description="metric in which neighbours are compared; left out: converged, of the observers whose gains are refined, "
+        description="metric in which neighbours are compared; left out: converged, of observers whose gains are refined, "
         "else of all",
     )
     refine_tolerance: float | None = Field(

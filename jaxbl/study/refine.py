@@ -49,7 +49,8 @@ class Criterion(NamedTuple):
         numbers = np.isfinite(a) & np.isfinite(b)
         with np.errstate(invalid="ignore"):
             far = np.abs(a - b) > np.array(self.tolerances) * np.maximum(np.abs(a), np.abs(b))
-        return np.where(numbers, far, (a != b) & ~(np.isnan(a) & np.isnan(b))).any(axis=(1, 2))
+        apart = np.where(numbers, far, (a != b) & ~(np.isnan(a) & np.isnan(b)))
+        return np.logical_or.reduce(apart, axis=(1, 2))
 
 
 def is_boolean(column: str) -> bool:

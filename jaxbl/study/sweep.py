@@ -79,7 +79,7 @@ class StudyResult:
             size = math.prod(len(frame[dim].unique()) for dim in [*along, "seed"]) * len(frame.columns)
             if size > _MOST_NUMBERS:
                 raise ValueError(f"the whole grid would have {size:.2g} numbers, most of them NaN; use the frame")
-            frame = frame.astype({name: float for name in frame.columns if frame.dtypes[name] == bool})
+            frame = frame.astype(dict.fromkeys(frame.select_dtypes(bool).columns, float))
         dataset = frame.set_index([*along, "seed"]).to_xarray()
         for dim, paths in zipped.items():
             first = {other: 0 for other in dataset.dims if other != dim}
