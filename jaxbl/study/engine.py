@@ -53,8 +53,8 @@ class Chunk(NamedTuple):
     points: np.ndarray
 
 
-REFINED_LANES_PER_DEVICE = 256
-"""The same in a refined study: batches are small, and lanes that pad a chunk cost what others do."""
+REFINED_LANES_PER_DEVICE = 1024
+"""The same in a refined study: its batches are small, and fill larger chunks badly (benchmarks/NOTES.md)."""
 
 
 def precision(config: Config) -> Any:
@@ -73,7 +73,7 @@ def layout_for(config: Config, points: Points, devices: int) -> Layout:
     Every device gets two lanes or more: one alone is compiled to other roundings than a row of them.
     """
     if points.refinement is not None:
-        return _refined_layout(config, points, devices)
+        return _refined_layout(config, devices)
     capacity = config.sweep.chunk or LANES_PER_DEVICE * devices
     # chunks of equal size waste no padding on the last one; a multiple of the devices, along the longer side, suits them
     per_chunk = math.ceil(points.lanes / math.ceil(points.lanes / capacity))
@@ -87,14 +87,11 @@ def layout_for(config: Config, points: Points, devices: int) -> Layout:
     return Layout(seeds, per_chunk)
 
 
-def _refined_layout(config: Config, points: Points, devices: int) -> Layout:
+def _refined_layout(config: Config, devices: int) -> Layout:
     """Several seeds before whole rows of points: a batch has few points, and needs all seeds of them."""
     capacity = config.sweep.chunk or REFINED_LANES_PER_DEVICE * devices
-    seeds = min(config.sweep.seeds, max(capacity // (32 * devices), 1))
-    per_chunk = capacity // seeds
-    if points.coarse_lanes > per_chunk:
-        per_chunk = math.ceil(points.coarse_lanes / math.ceil(points.coarse_lanes / per_chunk))
-    return Layout(seeds, max(math.ceil(per_chunk / devices), 2) * devices)
+    seeds = min(config.sweep.seeds, max(capacity // (64 * devices), 1))
+    return Layout(seeds, max(math.ceil(capacity / seeds / devices), 2) * devices)
 
 
 class Engine:
