@@ -13,7 +13,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import tomli_w
-from small_study import ALPHA, listed, rigid
+from small_study import ALPHA, LAMBDA, listed, rigid, spaced
 from typer.testing import CliRunner
 
 from jaxbl import cli
@@ -271,3 +271,24 @@ def test_shipped_studies_run_without_a_word_on_stderr(name, command, tmp_path):
             axis["num"] = 2
     done = jaxbl(command, write(tmp_path, study), cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_refined_sweep_from_the_command_line(call, tmp_path):
+    axes = [spaced(LAMBDA, 0.5, 40.0, 3), spaced(ALPHA, 2.0, 200.0, 3)]
+    figure = {"kind": "heatmap", "x": ALPHA, "y": LAMBDA, "value": "motor.converged"}
+    explicit = {"observer.discretisation": "explicit", "run.duration": 0.1, "run.velocity_tolerance": 0.1}
+    write(tmp_path, rigid(explicit, axes=axes, figures=[figure], sweep={"refine": 3, "chunk": 32}))
+    code, lines, _ = call("sweep", "study.toml", "--dry-run")
+    assert code == 0
+    assert lines[:3] == [
+        "points       9 on the coarse grid (9 runs with all seeds)",
+        "refinement   at most 289 points; as many as the boundaries need, not counted below",
+        "chunks       1 of 32 lanes",
+    ]
+    code, first, _ = call("sweep", "study.toml")
+    assert code == 0
+    assert re.match(r"\d+ of 289 grid points simulated \([\d.]+ %\), \d+ runs\. ", first[0])
+    _, second, _ = call("sweep", "study.toml")
+    assert second == [line for line in first if not line.startswith("Compiled")]
+    _, drawn, _ = call("plot", "results/study")
+    assert drawn == second

@@ -1,0 +1,149 @@
+"""Maps of refined studies: filled from the finest vertex near each place, and nothing counted that was not simulated."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.collections import QuadMesh
+from small_study import ALPHA, LAMBDA, NOISE, listed, rigid, spaced
+
+from jaxbl.report.maps import draw
+from jaxbl.report.refined import Filling
+from jaxbl.report.reports import headline
+from jaxbl.report.style import save
+from jaxbl.study.config import read_config
+from jaxbl.study.metrics import metric_columns
+from jaxbl.study.points import Points
+from jaxbl.study.refine import refine
+from jaxbl.study.sweep import StudyResult
+
+RMSE = "motor.velocity_rmse"
+GAINS = [spaced(LAMBDA, 1.0, 16.0, 5), spaced(ALPHA, 1.0, 9.0, 5, "linear")]
+MAP = {"kind": "heatmap", "x": ALPHA, "y": LAMBDA, "value": RMSE}
+
+
+def made(function, *axes, figures=(MAP,), depth=3, seeds=1):
+    """A refined study without runs: `function` of a frame of points says what converges; the error is lambda."""
+    config = read_config(rigid(axes=[*axes, *GAINS], figures=list(figures), sweep={"refine": depth, "seeds": seeds}))
+    points = Points(config)
+
+    def rows(vertices):
+        frame = pd.DataFrame(points.columns(vertices))
+        return frame.assign(**dict.fromkeys(metric_columns(config.build()), 1.0), seed=0, finite=True)
+
+    vertices, _ = refine(points.refinement.grid, lambda v: function(rows(v)).to_numpy(float), lambda a, b: a != b)
+    frame = rows(vertices)
+    frame["motor.converged"] = function(frame)
+    frame[RMSE] = frame[LAMBDA]
+    frames = [frame.assign(seed=seed) for seed in range(seeds)]
+    return StudyResult(config, pd.concat(frames, ignore_index=True).sample(frac=1.0, random_state=0, ignore_index=True))
+
+
+def disc(frame):
+    return (np.log2(frame[LAMBDA]) - 2.0) ** 2 + ((frame[ALPHA] - 5.0) / 2.0) ** 2 < 1.3
+
+
+def panels(drawing):
+    return [ax for ax in drawing.figure.axes if ax.get_visible() and ax.get_xlabel()]
+
+
+def shown(ax):
+    (mesh,) = (c for c in ax.collections if isinstance(c, QuadMesh))
+    return mesh.get_array()
+
+
+def legend(drawing):
+    return [text.get_text() for legend in drawing.figure.legends for text in legend.get_texts()]
+
+
+def test_the_map_is_whole_and_sharp_at_the_boundary(tmp_path):
+    result = made(disc, figures=[MAP | {"value": "motor.converged"}, MAP])
+    assert len(result.frame) < 0.5 * 33**2
+    converged, error = draw(result)
+    values = shown(panels(converged)[0])
+    assert values.shape == (33, 33)
+    assert not np.ma.is_masked(values) and np.isfinite(values).all()
+    alphas, lambdas = np.linspace(1.0, 9.0, 33), np.geomspace(1.0, 16.0, 33)
+    grid = pd.DataFrame({LAMBDA: np.repeat(lambdas, 33), ALPHA: np.tile(alphas, 33)})
+    np.testing.assert_array_equal(values, disc(grid).to_numpy(float).reshape(33, 33))
+    assert legend(converged) == []
+    # far from the boundary a vertex of the coarse grid stands for the block around it
+    blocks = shown(panels(error)[0])
+    np.testing.assert_allclose(blocks[:5, :5], 1.0)
+    np.testing.assert_allclose(blocks[-4:, :4], 16.0)
+    assert legend(error) == ["motor not converged"]
+    inside = result.frame[result.frame["motor.converged"]]
+    assert f"best ★ {inside[LAMBDA].min():.2g} rad/s" in panels(error)[0].get_title()
+    for drawing in (converged, error):
+        assert save(drawing.figure, tmp_path / f"{drawing.name}.png").stat().st_size > 5000
+    assert plt.get_fignums() == []
+
+
+def test_only_what_was_simulated_is_counted_as_missing():
+    result = made(disc)
+    frame = result.frame
+    frame["finite"] = (frame[LAMBDA] < 16.0) | (frame[ALPHA] < 9.0)
+    (drawing,) = draw(result)
+    assert legend(drawing)[-1] == "diverged (1 points)"
+    gone = np.ma.getmaskarray(shown(panels(drawing)[0])) | np.isnan(shown(panels(drawing)[0]).filled(0.0))
+    assert gone.sum() == 5 * 5  # its block, cut by the edges of the map
+
+
+def test_panels_medians_and_lines_over_what_is_not_drawn():
+    noise = listed(NOISE, 0.0, 1e-4, 1e-3)
+
+    def shrinking(frame):
+        return disc(frame) & (frame[ALPHA] < 7.0 - 2000.0 * frame[NOISE])
+
+    figures = [
+        MAP | {"value": "motor.converged", "facet": NOISE},
+        MAP | {"value": "motor.converged"},
+        {"kind": "heatmap", "x": ALPHA, "y": NOISE, "value": "motor.converged"},
+        {"kind": "line", "x": ALPHA, "value": RMSE, "series": LAMBDA},
+    ]
+    result = made(shrinking, noise, figures=figures, seeds=2)
+    by_panel, together, of_noise, lines = draw(result)
+    each = np.array([shown(ax) for ax in panels(by_panel)])
+    assert each.shape == (3, 33, 33)
+    # a share over noise levels is one over all of them, also where only one has its boundary
+    np.testing.assert_allclose(shown(panels(together)[0]), each.mean(axis=0))
+    assert shown(panels(of_noise)[0]).shape == (3, 33)
+    np.testing.assert_allclose(shown(panels(of_noise)[0]), each[:, ::8].mean(axis=1), atol=0.2)
+    # one line for each value of the coarse grid
+    assert len(panels(lines)[0].lines) == 5
+
+
+def test_filling_is_exact_where_every_vertex_is_known():
+    result = made(lambda frame: frame[ALPHA] > 0.0)
+    points = Points(result.config)
+    frame = pd.DataFrame(points.columns(np.arange(points.lanes)))
+    table = frame.assign(value=np.arange(len(frame))).set_index([LAMBDA, ALPHA])["value"]
+    xs, ys, grid = Filling(points, frame, ALPHA, LAMBDA).dense(table)
+    np.testing.assert_array_equal(grid, np.arange(33**2).reshape(33, 33))
+    np.testing.assert_array_equal(xs, points.values(ALPHA))
+    np.testing.assert_array_equal(ys, points.values(LAMBDA))
+
+
+def test_a_map_shows_no_more_places_than_can_be_seen():
+    result = made(lambda frame: frame[ALPHA] > 3.3, depth=12)
+    drawing = draw(result)[0]
+    assert shown(panels(drawing)[0]).shape == (1025, 1025)
+
+
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_headline_counts_points_and_takes_shares_from_the_coarse_grid(seeds):
+    result = made(disc, seeds=seeds)
+    points = Points(result.config)
+    coarse = disc(pd.DataFrame(points.columns(points.coarse(np.arange(25))))).mean()
+    simulated = len(result.frame) // seeds
+    assert headline(result)[0] == (
+        f"{simulated} of 1089 grid points simulated ({100 * simulated / 1089:.2g} %), {len(result.frame)} runs. "
+        f"The observers converged in {100 * coarse:.1f} % (motor) of those on the coarse grid."
+    )
+
+
+def test_an_unfinished_study_is_drawn_as_far_as_it_goes():
+    result = made(disc, figures=[MAP, MAP | {"value": "motor.converged"}])
+    part = result.frame.iloc[:40]
+    for drawing in draw(StudyResult(result.config, part)):
+        assert panels(drawing)
