@@ -2,7 +2,7 @@
 
 The refined study runs as `jaxbl sweep` runs it, in memory. The full grid is the same study without `refine`, with as many
 values as the fine grid has, in the chunks that suit such a study. Unless `--full` is given only some of its chunks are run,
-evenly spread, between rounds of the refined study; the time of all is extrapolated from their mean. Compilation counts apart.
+evenly spread, between rounds of the refined study; that of all is extrapolated from their mean. Compilation counts apart.
 
 With `--full` all chunks are run, and the two are compared: values bit by bit, and the cells at the boundary that the
 refined study has not simulated.
