@@ -232,6 +232,62 @@ class LogTable(Table):
     initial_state: Literal["unknown", "rest"] = Field(default="unknown", description="state at the first sample")
 
 
+class RangeTable(Table):
+    """Values between two ends, evenly spaced on a log scale."""
+
+    start: float = Field(gt=0.0, description="first value")
+    stop: float = Field(gt=0.0, description="last value")
+    num: int = Field(ge=2, le=8192, description="number of values")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "RangeTable":
+        if self.start >= self.stop:
+            raise PydanticCustomError(
+                "range", "start {start} should be less than stop {stop}", {"start": self.start, "stop": self.stop}
+            )
+        return self
+
+    def values(self) -> np.ndarray:
+        """The values, shape (num,)."""
+        return np.geomspace(self.start, self.stop, self.num)
+
+
+class MarkTable(Table):
+    """A pair of gains to be marked in the atlas, run once on the study's drive."""
+
+    name: str = Field(description="label")
+    side: Literal["motor", "load"] = Field(default="motor", description="observer that has these gains")
+    lambda_: float = Field(alias="lambda", ge=0.0, description="gain lambda", json_schema_extra={"unit": "√rad/s"})
+    alpha: float = Field(ge=0.0, description="gain alpha", json_schema_extra={"unit": "rad/s²"})
+
+
+class VerifyTable(Table):
+    """What `jaxbl verify` does besides the study's own points: the normalised error system, and marks."""
+
+    q: float | None = Field(default=None, gt=0.0, lt=1.0, description="q of condition (32); left out: its limit q → 0")
+    alpha_ratio: RangeTable = Field(
+        default_factory=lambda: RangeTable(start=1.02, stop=20.0, num=512), description="alpha / f_plus of the atlas"
+    )
+    lambda_ratio: RangeTable = Field(
+        default_factory=lambda: RangeTable(start=0.002, stop=25.0, num=512), description="lambda / √f_plus of the atlas"
+    )
+    damping: list[Annotated[float, Field(gt=0.0)]] = Field(
+        default=[0.1, 0.3, 1.0],
+        description="dampings (friction / inertia × velocity error / f_plus) whose boundaries are simulated",
+    )
+    marks: list[MarkTable] = Field(default=[], description="gains to be marked")
+
+    @model_validator(mode="after")
+    def _possible(self) -> "VerifyTable":
+        if self.alpha_ratio.start <= 1.0:
+            raise PydanticCustomError(
+                "range",
+                "alpha_ratio.start {start} should exceed 1: no lambda converges where alpha is not above f_plus",
+                {"start": self.alpha_ratio.start},
+            )
+        return self
+
+
 class AxisTable(Table):
     """One axis: a dotted path and its values."""
 
@@ -327,6 +383,7 @@ class Config(Table):
     sweep: SweepTable = Field(default_factory=SweepTable)
     uncertainty: UncertaintyTable = Field(default_factory=UncertaintyTable)
     log: LogTable = Field(default_factory=LogTable)
+    verify: VerifyTable = Field(default_factory=VerifyTable)
     axes: list[AxisTable] = Field(default=[])
     figures: list[FigureTable] = Field(default=[])
 
@@ -472,7 +529,7 @@ def _describe(error: ValidationError) -> str:
     if kind == "list_type":
         return f"{where}should be an array, not {given}"
     message = first["msg"].removeprefix("Input ")
-    if kind in ("unknown_key", "period", "axis", "figure", "consistency"):
+    if kind in ("unknown_key", "period", "axis", "figure", "range", "consistency"):
         return f"{where}{message}"
     return f"{where}{message}, not {given}"
 

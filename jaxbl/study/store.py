@@ -2,13 +2,16 @@
 
 import hashlib
 import json
+import math
 import os
 import platform
 import shutil
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 
@@ -24,7 +27,7 @@ _COMMANDS = {
     # command: its marker, which says whose the folder is; what it leaves; keys of the config that decide none of its numbers
     "simulate": ("summary.json", ("trace.parquet",), ("axes", "sweep", "verify", "tune")),
     "sweep": ("manifest.json", ("study.toml", "points"), ("verify", "tune")),
-    "verify": ("verify/manifest.json", ("verdict.json", "verify"), ("tune",)),
+    "verify": ("verify/manifest.json", ("verdict.json", "counterexamples.parquet", "verify"), ("tune",)),
     "tune": ("tune/manifest.json", ("gains.toml", "tuning.json", "tune"), ("axes", "verify")),
 }
 _COMMON = ("figures", "report.html")
@@ -97,6 +100,19 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
+
+
+def plain(value: Any) -> Any:
+    """A value that JSON can hold: arrays and tables of numbers become lists, what is not finite becomes None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    value = np.asarray(value)
+    if value.ndim:
+        return [plain(item) for item in value.tolist()]
+    value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _read_json(path: Path) -> dict[str, Any]:
