@@ -16,7 +16,7 @@ from jaxbl.simulate import Experiment, Reducer, Signals, State, scan
 
 from .config import Config, read_config
 from .engine import precision, prepare
-from .metrics import METRICS
+from .metrics import METRICS, observer_gains, with_conditions
 from .store import identity, plain
 
 
@@ -60,6 +60,7 @@ def run(study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every:
             return row
 
         figures, kept = eqx.filter_jit(lambda e, s: scan(e, s, (METRICS, _LAST), keep, every))(experiment, jnp.asarray(seed))
+        figures = with_conditions(figures, observer_gains(experiment))
         trace = pd.DataFrame({name: np.asarray(kept[name], dtype=float) for name in names})
     last = {name: plain(figures.pop(name)) for name in list(figures) if name.startswith("last.")}
     metrics = {name: plain(value) for name, value in figures.items()}
