@@ -36,7 +36,7 @@ def identity(config: Config, *, single: bool = False) -> str:
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 
-_OUTPUTS = ("manifest.json", "summary.json", "study.toml", "trace.parquet", "points", "figures", "report.html")
+_OUTPUTS = ("manifest.json", "summary.json", "study.toml", "trace.parquet", "points", "figures", "laws.json", "report.html")
 
 
 def claim(folder: Path, config: Config, *, single: bool = False, overwrite: bool = False) -> None:
