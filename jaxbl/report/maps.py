@@ -22,7 +22,7 @@ from matplotlib.patches import Patch
 from jaxbl.errors import InputError
 from jaxbl.observer.conditions import LEAST_LAMBDA
 from jaxbl.study.config import Config, FigureTable, nearest, numeric_paths
-from jaxbl.study.laws import Law, accuracy_laws, check_selection, selected
+from jaxbl.study.laws import Law, accuracy_laws, check_selection, fixed_values, selected
 from jaxbl.study.metrics import describe
 from jaxbl.study.sweep import StudyResult
 
@@ -395,7 +395,7 @@ def _lines(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
                 ax.set_ylabel(_wrap(_value_label(spec.value)))
         if spec.series is not None:
             axes[-1].legend(title=_label(config, spec.series))
-    caption = f"{_value_label(spec.value)} over {spec.x}{_where(config, spec.where)}{_over(config, frame, spec)}{band}."
+    caption = f"{_value_label(spec.value)} over {spec.x}{_where(config, spec)}{_over(config, frame, spec)}{band}."
     return Drawn(_file_name(spec), figure, caption)
 
 
@@ -429,7 +429,7 @@ def _laws(config: Config, frame: pd.DataFrame, spec: FigureTable, laws: list[Law
                 ax.set_ylabel(_wrap(_value_label(spec.value)))
             ax.legend(loc="best", handlelength=1.6, title=f"slope (theory {spec.theory:g}, dashed)")
     caption = (
-        f"{_value_label(spec.value)} over {spec.x}{_where(config, spec.where)}; geometric mean over {config.sweep.seeds} "
+        f"{_value_label(spec.value)} over {spec.x}{_where(config, spec)}; geometric mean over {config.sweep.seeds} "
         f"{'seed' if config.sweep.seeds == 1 else 'seeds'}. Lines: least squares over the filled points; hollow points lie "
         "outside the law's range; dashed: theory's slope. The table says why each law ends."
     )
@@ -445,7 +445,8 @@ def _law(ax: Axes, law: Law, i: int) -> np.ndarray:
     ax.plot(x[seen & ~inside], y[seen & ~inside], marker, ms=6, mfc="none", color=colour)
     ax.plot(x[inside], y[inside], marker, ms=6 if i == 0 else 3.5, color=colour)
     if law.fit is None:
-        label = f"no law ({law.stops['below'].partition(':')[0]})"
+        reasons = dict.fromkeys(law.stops[end].partition(":")[0] for end in ("below", "above"))
+        label = f"no law ({', then '.join(reasons)})"
         ax.plot([], [], marker, mfc="none", color=colour, label=f"{name}: {label}" if name else label)
         return y[seen]
     ends = x[[law.fit.first, law.fit.last]]
@@ -468,9 +469,10 @@ def _unit(config: Config, path: str | None) -> str:
     return "" if path is None else numeric_paths(config)[path].unit
 
 
-def _where(config: Config, where: dict[str, Any] | None) -> str:
+def _where(config: Config, spec: FigureTable) -> str:
     """What a figure fixes, for its caption."""
-    fixed = [f"{path} = {_figure(value)} {_unit(config, path)}".rstrip() for path, value in (where or {}).items()]
+    values = fixed_values(config, spec).items()
+    fixed = [f"{path} = {_figure(value)} {_unit(config, path)}".rstrip() for path, value in values]
     return f" where {', '.join(fixed)}" if fixed else ""
 
 

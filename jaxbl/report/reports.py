@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from jaxbl.study.laws import AGREEMENT, Law, accuracy_laws
+from jaxbl.study.laws import AGREEMENT, END_OF_SWEEP, Law, accuracy_laws
 from jaxbl.study.metrics import SIDE_METRICS
 from jaxbl.study.store import Store, write_atomic
 from jaxbl.study.sweep import StudyResult
@@ -84,9 +84,12 @@ def _law_lines(laws: list[Law]) -> list[str]:
 
 
 def _why(law: Law) -> str:
-    """The reasons at both ends, once if they are the same."""
+    """The reasons at the ends; the end of the sweep only where nothing else ends the law."""
     below, above = law.stops["below"], law.stops["above"]
-    return below if below == above else f"below: {below}; above: {above}"
+    if below == above:
+        return below
+    ends = {"below": below, "above": above}.items()
+    return "; ".join(f"{end}: {reason}" for end, reason in ends if reason != END_OF_SWEEP)
 
 
 def _slope_of(law: Law) -> str:
@@ -95,26 +98,23 @@ def _slope_of(law: Law) -> str:
 
 
 def _place(law: Law) -> str:
-    """What a law's line fixes."""
+    """What a law's line fixes; a word speaks for itself."""
     pairs = {**law.series, **law.where}.items()
-    return (
-        ", ".join(f"{path} = {value if isinstance(value, str) else f'{value:g}'}" for path, value in pairs) or "all points"
-    )
+    return ", ".join(value if isinstance(value, str) else f"{path} = {value:g}" for path, value in pairs) or "all points"
 
 
 def _law_table(laws: list[Law]) -> TableOf:
     rows: list[list[object]] = []
     for law in laws:
         fit = law.fit
-        ends = "–" if law.range is None else f"{law.range[0]:g} … {law.range[1]:g}"
-        slope = "no law" if fit is None else _slope_of(law)
-        halves = "–" if fit is None else f"{fit.halves[0]:.3f}, {fit.halves[1]:.3f}"
-        rows.append(
-            [law.value, law.x, _place(law), law.theory, slope, halves, law.agrees, ends, int(law.inside.sum()),
-             law.stops["below"], law.stops["above"]]
-        )  # fmt: skip
-    columns = ["error", "over", "where", "theory", "slope ± standard error", "lower, upper half", "agrees", "range of law",
-               "points", "below the range", "above the range"]  # fmt: skip
+        ends = (
+            "–" if law.range is None else f"{law.range[0]:g} to {law.range[1]:g} ({law.inside.sum()})".replace(" ", "\u00a0")
+        )
+        slope = "no law" if fit is None else _slope_of(law).replace(" ", "\u00a0")
+        halves = "–" if fit is None else f"{fit.halves[0]:.2f}, {fit.halves[1]:.2f}".replace(" ", "\u00a0")
+        line = f"{law.value} over {law.x}"
+        rows.append([line, _place(law), law.theory, slope, halves, law.agrees, ends, _why(law)])
+    columns = ["error", "where", "theory", "slope", "halves", "agrees", "range (points)", "why it ends there"]
     return TableOf("Accuracy laws", columns, rows)
 
 

@@ -34,6 +34,7 @@ LARGEST_RESIDUAL = math.log(1.1)
 """No point of a law lies farther from its line, in ln y: 10 %."""
 LARGEST_BEND = 0.05
 """Slopes of the lower and upper half of a law differ by less, or by less than two standard errors."""
+END_OF_SWEEP = "end of the sweep"
 AGREEMENT = 0.1
 """A slope this close to theory's agrees with it."""
 
@@ -44,7 +45,7 @@ _NEAR = 10.0  # beyond a law's end, a cause of this strength is named: a tenth o
 _PERIOD_EXPONENT = 0.1  # of the error in the period, under noise; white noise alone gives 1/2
 
 
-_SIZES = ("position_rms", "velocity_rms", "velocity_rmse")
+_SIZES = ("position_size", "velocity_size", "velocity_rmse")
 
 
 class Fit(NamedTuple):
@@ -220,12 +221,12 @@ def accuracy_laws(result: "StudyResult", figures: list[FigureTable] | None = Non
 
 def selected(config: Config, frame: pd.DataFrame, figure: FigureTable) -> pd.DataFrame:
     """The rows that a figure's `where` leaves."""
-    return _rows(frame, _fixed(config, figure, 0))
+    return _rows(frame, fixed_values(config, figure))
 
 
 def check_selection(config: Config, figure: FigureTable, index: int) -> None:
     """Raise `InputError` where `where` names no value of an axis, or `theory` asks for a fit to more than one line."""
-    fixed = _fixed(config, figure, index)
+    fixed = fixed_values(config, figure, index)
     if figure.theory is None:
         return
     if figure.value.rpartition(".")[2] in ("finite", "converged"):
@@ -241,8 +242,12 @@ def check_selection(config: Config, figure: FigureTable, index: int) -> None:
             )
 
 
-def _fixed(config: Config, figure: FigureTable, index: int) -> dict[str, Any]:
-    """The figure's `where` with values as the axes have them."""
+def fixed_values(config: Config, figure: FigureTable, index: int = 0) -> dict[str, Any]:
+    """A figure's `where`, by path, with values as the axes have them; `index` is for the message.
+
+    Raises:
+        InputError: no such axis, or no such value of it.
+    """
     axes = {axis.path: axis for axis in config.axes}
     fixed = {}
     for path, wanted in (figure.where or {}).items():
@@ -284,7 +289,7 @@ def _rows(frame: pd.DataFrame, fixed: dict[str, Any]) -> pd.DataFrame:
 def _of_figure(config: Config, frame: pd.DataFrame, figure: FigureTable) -> Iterator[Law]:
     """The laws of a figure: one a panel and series."""
     assert figure.theory is not None
-    fixed = _fixed(config, figure, 0)
+    fixed = fixed_values(config, figure)
     chosen = _rows(frame, fixed)
     for facet in [None] if figure.facet is None else sorted(chosen[figure.facet].unique()):
         for name in [None] if figure.series is None else sorted(chosen[figure.series].unique()):
@@ -397,21 +402,21 @@ class _Line:
 
     def stops(self, fit: Fit | None) -> dict[str, str]:
         """Why the law ends, at each end; without a law why there is none."""
-        end = "end of the sweep"
         if not len(self.x):
             return {"below": "no points", "above": "no points"}
         if fit is None:
             ends = {"below": 0, "above": len(self.x) - 1}
             other = "other: no run of points on one line"
             return {key: self._reason(i, strict=False) or other for key, i in ends.items()}
-        stops = {"below": end, "above": end}
+        stops = {"below": END_OF_SWEEP, "above": END_OF_SWEEP}
         for key, i, inner in (("below", fit.first - 1, fit.first), ("above", fit.last + 1, fit.last)):
             if 0 <= i < len(self.x):
                 stops[key] = self._reason(i, strict=False) or f"other: local slope {self._local(i, inner):.2f}"
         return stops
 
     def _local(self, i: int, j: int) -> float:
-        return math.log(self.y[i] / self.y[j]) / math.log(self.x[i] / self.x[j])
+        slope = math.log(self.y[i] / self.y[j]) / math.log(self.x[i] / self.x[j])
+        return round(slope, 2) + 0.0  # no minus before a zero
 
 
 def _times(ratio: float) -> str:

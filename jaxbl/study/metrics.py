@@ -36,8 +36,8 @@ SIDE_METRICS: dict[str, Metric] = {
     "torque_rmse": Metric(
         "N m", "torque error, rms", "rms error of the transmitted torque from this side's equivalent control"
     ),
-    "position_rms": Metric("rad", "position, rms", "rms true position: the size that its errors compare with"),
-    "velocity_rms": Metric("rad/s", "velocity, rms", "rms true velocity: the size that its errors compare with"),
+    "position_size": Metric("rad", "position, rms", "rms true position: the size that its errors compare with"),
+    "velocity_size": Metric("rad/s", "velocity, rms", "rms true velocity: the size that its errors compare with"),
     "chatter": Metric(
         "rad/s", "chatter of the velocity", "rms sample-to-sample change of the velocity error, divided by √2"
     ),
@@ -138,8 +138,8 @@ def _result(experiment: Experiment, totals: dict[str, _Totals], state: State) ->
             "position_rmse": jnp.sqrt(total.position / count),
             "velocity_rmse": jnp.sqrt(total.velocity / count),
             "torque_rmse": jnp.sqrt(total.torque / count),
-            "position_rms": jnp.sqrt(total.true_position / count),
-            "velocity_rms": jnp.sqrt(total.true_velocity / count),
+            "position_size": jnp.sqrt(total.true_position / count),
+            "velocity_size": jnp.sqrt(total.true_velocity / count),
             "chatter": jnp.sqrt(0.5 * total.change / count),
             "f_plus": total.f_plus,
             "f_plus_acceleration": 2.0 * total.acceleration,
