@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from .report import write_trial_report as write_trial_report
     from .study.config import Config as Config
     from .study.config import read_config as read_config
+    from .study.laws import Law as Law
+    from .study.laws import accuracy_laws as accuracy_laws
     from .study.sweep import StudyResult as StudyResult
     from .study.sweep import dry_run as dry_run
     from .study.sweep import load as load
@@ -24,6 +26,8 @@ _WHERE = {
     "write_trial_report": "report",
     "Config": "study.config",
     "read_config": "study.config",
+    "Law": "study.laws",
+    "accuracy_laws": "study.laws",
     "StudyResult": "study.sweep",
     "dry_run": "study.sweep",
     "load": "study.sweep",

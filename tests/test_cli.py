@@ -130,7 +130,7 @@ BAD = {
     ),
     "wrong figure": (
         ["sweep", "figure.toml"],
-        "figure.toml: figures[0].value: 'motor.velocity' is no metric; did you mean 'motor.velocity_rmse'?",
+        "figure.toml: figures[0].value: 'motor.velocity_rms' is no metric; did you mean 'motor.velocity_rmse'?",
     ),
     "foreign folder": (
         ["sweep", "study.toml", "--out", "full"],
@@ -160,7 +160,7 @@ def test_bad_input_is_one_line_and_exit_2(case, tmp_path, monkeypatch, capsys):
     write(tmp_path, rigid(), "plain.toml")
     write(tmp_path, rigid({"run.durations": 1.0}), "wrong.toml")
     write(tmp_path, rigid(axes=[listed("observer.motor.alfa", 1.0)]), "axis.toml")
-    write(tmp_path, rigid(axes=AXES, figures=[FIGURE | {"value": "motor.velocity"}]), "figure.toml")
+    write(tmp_path, rigid(axes=AXES, figures=[FIGURE | {"value": "motor.velocity_rms"}]), "figure.toml")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("mine")
     before = left(tmp_path)

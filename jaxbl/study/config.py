@@ -324,6 +324,14 @@ class AxisTable(Table):
             raise wrong("axis {path}: num = 1 cannot span start ... stop; use values = [...] or num >= 2")
         return self
 
+    def grid(self) -> np.ndarray:
+        """The values of the axis, in its order; not for an axis that is sampled quasi-randomly (neither num nor values)."""
+        if self.values is not None:
+            return np.array(self.values, dtype=object if any(isinstance(v, str) for v in self.values) else None)
+        assert self.start is not None and self.stop is not None and self.num is not None
+        space = np.geomspace if self.scale == "log" else np.linspace
+        return space(self.start, self.stop, self.num)
+
 
 class FigureTable(Table):
     """One figure of the report."""
@@ -334,6 +342,13 @@ class FigureTable(Table):
     value: str = Field(description="metric, e.g. motor.velocity_rmse")
     facet: str | None = Field(default=None, description="axis path: one panel for each value")
     series: str | None = Field(default=None, description="axis path: one line for each value (line)")
+    where: dict[str, float | int | str] | None = Field(
+        default=None,
+        description="axis path -> value: only these points (line); a value of the axis, or 'least' or 'largest' of them",
+    )
+    theory: float | None = Field(
+        default=None, description="exponent of x that theory gives; asks for the fitted one (line; report, laws.json)"
+    )
     scale: Literal["auto", "linear", "log"] = Field(default="auto", description="scale of the value")
     overlays: list[Literal["davila_fridman", "levant", "seeber_horn", "moreno_osorio", "exact"]] = Field(
         default=[], description="gain conditions drawn over a map of alpha and lambda"
@@ -343,17 +358,21 @@ class FigureTable(Table):
     def _complete(self) -> "FigureTable":
         if self.kind == "heatmap" and self.y is None:
             raise PydanticCustomError("figure", "a heatmap needs y, the path of its second axis", {})
-        idle = "series" if self.kind == "heatmap" else "y"
-        if getattr(self, idle) is not None:
-            hint = "use facet" if self.kind == "heatmap" else "use series or facet"
-            raise PydanticCustomError(
-                "figure", "a {kind} has no {key}; {hint}", {"kind": self.kind, "key": idle, "hint": hint}
-            )
+        idle = {"series": "use facet", "where": "use facet", "theory": "use a line"}
+        for key, hint in (idle if self.kind == "heatmap" else {"y": "use series or facet"}).items():
+            if getattr(self, key) is not None:
+                raise PydanticCustomError(
+                    "figure", "a {kind} has no {key}; {hint}", {"kind": self.kind, "key": key, "hint": hint}
+                )
         paths = [path for path in (self.x, self.y, self.facet, self.series) if path is not None]
         for path in paths:
             if paths.count(path) > 1:
                 raise PydanticCustomError(
                     "figure", "{path} is used twice; x, y, facet and series should be different axes", {"path": path}
+                )
+            if path in (self.where or {}):
+                raise PydanticCustomError(
+                    "figure", "{path} is drawn and cannot be fixed by where; leave it out of one of them", {"path": path}
                 )
         gains = [{f"observer.{side}.alpha", f"observer.{side}.lambda"} for side in ("motor", "load")]
         if self.overlays and {self.x, self.y} not in gains:
@@ -511,6 +530,8 @@ def _describe(error: ValidationError) -> str:
         del location[tag]
     if location[:1] == ["axes"] and "values" in location:
         del location[4:]  # the member of the union that came last
+    if location[:1] == ["figures"] and "where" in location:
+        del location[4:]
     key = ""
     for part in location:
         key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)

@@ -40,6 +40,8 @@ SIDE_METRICS: dict[str, Metric] = {
     "torque_rmse": Metric(
         "N m", "torque error, rms", "rms error of the transmitted torque from this side's equivalent control"
     ),
+    "position_size": Metric("rad", "position, rms", "rms true position: the size that its errors compare with"),
+    "velocity_size": Metric("rad/s", "velocity, rms", "rms true velocity: the size that its errors compare with"),
     "chatter": Metric(
         "rad/s", "chatter of the velocity", "rms sample-to-sample change of the velocity error, divided by √2"
     ),
@@ -67,6 +69,8 @@ class _Totals(NamedTuple):
     position: Number
     velocity: Number
     torque: Number
+    true_position: Number
+    true_velocity: Number
     change: Number
     previous: Number
     f_plus: Number
@@ -80,7 +84,7 @@ def window_start(steps: int) -> int:
 
 def _init(experiment: Experiment) -> dict[str, _Totals]:
     zero = jnp.zeros_like(experiment.run.sample_period)
-    return {side: _Totals(zero - 1.0, *[zero] * 7) for side in experiment.sides}
+    return {side: _Totals(zero - 1.0, *[zero] * 9) for side in experiment.sides}
 
 
 def _update(
@@ -106,6 +110,8 @@ def _update(
             old.position + inside * position * position,
             old.velocity + inside * velocity * velocity,
             old.torque + inside * torque * torque,
+            old.true_position + inside * true.position * true.position,
+            old.true_velocity + inside * true.velocity * true.velocity,
             old.change + inside * change * change,
             velocity,
             jnp.maximum(old.f_plus, jnp.abs(true.perturbation)),
@@ -133,6 +139,8 @@ def _result(experiment: Experiment, totals: dict[str, _Totals], state: State) ->
             "position_rmse": jnp.sqrt(total.position / count),
             "velocity_rmse": jnp.sqrt(total.velocity / count),
             "torque_rmse": jnp.sqrt(total.torque / count),
+            "position_size": jnp.sqrt(total.true_position / count),
+            "velocity_size": jnp.sqrt(total.true_velocity / count),
             "chatter": jnp.sqrt(0.5 * total.change / count),
             "f_plus": total.f_plus,
             "f_plus_acceleration": 2.0 * total.acceleration,

@@ -111,12 +111,12 @@ class Points:
                 if axis is sampled[0]:
                     blocks.append(Block(_quasi_random(sampled, config)))
             elif axis.zip is None:
-                blocks.append(Block({axis.path: _values(axis)}))
+                blocks.append(Block({axis.path: axis.grid()}))
             elif axis.zip not in labels:
                 labels[axis.zip] = len(blocks)
-                blocks.append(Block({axis.path: _values(axis)}))
+                blocks.append(Block({axis.path: axis.grid()}))
             else:
-                block, values = blocks[labels[axis.zip]], _values(axis)
+                block, values = blocks[labels[axis.zip]], axis.grid()
                 if len(values) != len(block):
                     raise InputError(
                         f"axes: '{axis.path}' has {len(values)} values, the others zipped as '{axis.zip}' have {len(block)}"
@@ -142,15 +142,6 @@ def _take(blocks: list[Block], indices: np.ndarray) -> Columns:
             out[path] = column[remaining % len(block)]
         remaining = remaining // len(block)
     return out
-
-
-def _values(axis: AxisTable) -> np.ndarray:
-    if axis.values is not None:
-        return np.array(axis.values, dtype=object if any(isinstance(v, str) for v in axis.values) else None)
-    assert axis.start is not None and axis.stop is not None and axis.num is not None
-    if axis.scale == "log":
-        return np.geomspace(axis.start, axis.stop, axis.num)
-    return np.linspace(axis.start, axis.stop, axis.num)
 
 
 def _quasi_random(axes: list[AxisTable], config: Config) -> Columns:

@@ -26,7 +26,7 @@ FORMAT = 1
 _COMMANDS = {
     # command: its marker, which says whose the folder is; what it leaves; keys of the config that decide none of its numbers
     "simulate": ("summary.json", ("trace.parquet",), ("axes", "sweep", "verify", "tune")),
-    "sweep": ("manifest.json", ("study.toml", "points"), ("verify", "tune")),
+    "sweep": ("manifest.json", ("study.toml", "points", "laws.json"), ("verify", "tune")),
     "verify": ("verify/manifest.json", ("verdict.json", "counterexamples.parquet", "verify"), ("tune",)),
     "tune": ("tune/manifest.json", ("gains.toml", "tuning.json", "tune"), ("axes", "verify")),
 }

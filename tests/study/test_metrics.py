@@ -51,6 +51,8 @@ def by_numpy(experiment, signals, identifier):
             "position_rmse": np.sqrt(np.mean(position[late] ** 2)),
             "velocity_rmse": np.sqrt(np.mean(velocity[late] ** 2)),
             "torque_rmse": np.sqrt(np.mean(torque[late] ** 2)),
+            "position_size": np.sqrt(np.mean(np.asarray(s.true.position)[late] ** 2)),
+            "velocity_size": np.sqrt(np.mean(np.asarray(s.true.velocity)[late] ** 2)),
             "chatter": np.sqrt(np.mean(np.diff(velocity[late.start - 1 :]) ** 2) / 2.0),
             "f_plus": f_plus,
             "f_plus_acceleration": 2.0 * np.abs(s.true.acceleration).max(),
