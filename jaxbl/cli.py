@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .errors import InputError
+from .errors import InputError, NoResult
 
 if TYPE_CHECKING:
     from .study.engine import Progress
@@ -102,10 +102,27 @@ def sweep(
     for line in write_sweep_report(result, folder):
         typer.echo(line)
     if result.cost["lanes"]:
-        typer.echo(
-            f"Compiled in {_duration(result.cost['compile_seconds'])}, "
-            f"ran {result.cost['lanes']:.0f} lanes in {_duration(result.cost['run_seconds'])}."
-        )
+        typer.echo(_spent(result.cost))
+    typer.echo(f"{folder / 'report.html'}")
+
+
+@app.command()
+def tune(config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOption = False) -> None:
+    """Choose lambda and alpha of both observers: gains.toml, comparison, report. Goes on where an interrupted run stopped."""
+    _start_jax()
+    from .report import write_tune_report
+    from .study.config import read_config
+    from .study.tune import tune as run_tune
+
+    study = read_config(config)
+    folder = _folder(config, out)
+    resume = shlex.join(["jaxbl", "tune", str(config), "--out", str(folder)])
+    with _naming(config), _resumable(resume), _progress("runs") as progress:
+        result = run_tune(study, folder, progress=progress, overwrite=overwrite)
+    for line in write_tune_report(result, folder):
+        typer.echo(line)
+    if result.cost["lanes"]:
+        typer.echo(_spent(result.cost))
     typer.echo(f"{folder / 'report.html'}")
 
 
@@ -187,6 +204,10 @@ def _progress(unit: str) -> "Iterator[Progress | None]":
         yield update
 
 
+def _spent(cost: dict[str, float]) -> str:
+    return f"Compiled in {_duration(cost['compile_seconds'])}, ran {cost['lanes']:.0f} lanes in {_duration(cost['run_seconds'])}."
+
+
 def _duration(seconds: float) -> str:
     if seconds < 100.0:
         return f"{seconds:.1f} s"
@@ -202,6 +223,9 @@ def main(run: Callable[..., object] = app) -> None:
     except InputError as error:
         typer.echo(f"jaxbl: {error}", err=True)
         sys.exit(2)
+    except NoResult as error:
+        typer.echo(f"jaxbl: {error}", err=True)
+        sys.exit(1)
     except KeyboardInterrupt:
         typer.echo("interrupted", err=True)
         sys.exit(130)
