@@ -108,7 +108,7 @@ def sweep(
 
 @app.command()
 def tune(config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOption = False) -> None:
-    """Choose lambda and alpha of both observers: gains.toml, comparison, report. Goes on where an interrupted run stopped."""
+    """Choose lambda and alpha of both observers: gains.toml, comparison, report. Goes on where it was interrupted."""
     _start_jax()
     from .report import write_tune_report
     from .study.config import read_config
@@ -205,7 +205,8 @@ def _progress(unit: str) -> "Iterator[Progress | None]":
 
 
 def _spent(cost: dict[str, float]) -> str:
-    return f"Compiled in {_duration(cost['compile_seconds'])}, ran {cost['lanes']:.0f} lanes in {_duration(cost['run_seconds'])}."
+    compiling, running = _duration(cost["compile_seconds"]), _duration(cost["run_seconds"])
+    return f"Compiled in {compiling}, ran {cost['lanes']:.0f} lanes in {running}."
 
 
 def _duration(seconds: float) -> str:

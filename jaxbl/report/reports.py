@@ -16,6 +16,7 @@ from jaxbl.study.store import Store, write_atomic
 from jaxbl.study.sweep import StudyResult
 from jaxbl.study.trial import Trial
 from jaxbl.study.tune import Tuning
+from jaxbl.study.tune_summary import called_gains
 
 from .maps import SIDES, Drawn, draw
 from .page import Picture, TableOf, html
@@ -99,7 +100,7 @@ def write_trial_report(trial: Trial, folder: Path) -> list[str]:
 
 
 def write_tune_report(tuning: Tuning, folder: Path) -> list[str]:
-    """Write `gains.toml`, `tuning.json`, figures and report into a folder that exists. Returns the lines for the terminal."""
+    """Write `gains.toml`, `tuning.json`, figures and report into a folder that exists. Returns lines for the terminal."""
     summary = tuning.summary
     lead = _tune_headline(summary)
     write_atomic(folder / "gains.toml", gains_toml(summary))
@@ -128,16 +129,15 @@ def gains_toml(summary: dict[str, Any]) -> str:
     title = " ".join(summary["title"].split())
     lines.append(f"# Gains chosen by 'jaxbl tune'{f' for: {title}' if title else ''}")
     lines.append(f"# Objective: {summary['objective_metric']}; {_runs_behind(summary)}.")
-    lines.append(
-        f"# Margins asked for: alpha / f+ >= {margins['alpha']:g}, lambda over the exact condition's >= {margins['exact']:g}."
-    )
+    asked = f"alpha / f+ {margins['alpha']:g}, lambda over the least of the exact condition {margins['exact']:g}"
+    lines.append(f"# Margins asked for: {asked}.")
     lines.append('# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.')
     for side, gains in summary["gains"].items():
         found = summary["achieved"][side]
         lines += [
             "",
-            f"# f+ = {summary['f_plus'][side]:.4g} rad/s^2. Reached, worst of all runs: velocity error {found['velocity_rmse']:.3g} "
-            f"rad/s rms,",
+            f"# f+ = {summary['f_plus'][side]:.4g} rad/s^2. Reached, the worst of all runs: velocity error "
+            f"{found['velocity_rmse']:.3g} rad/s rms,",
             f"# torque error {found['torque_rmse']:.3g} N m rms, converged after {found['convergence_time']:.3g} s; "
             f"margins {found['margin_alpha']:.3g} (alpha), {found['margin_exact']:.3g} (exact).",
             f"[observer.{side}]",
@@ -168,8 +168,9 @@ def _tune_headline(summary: dict[str, Any]) -> list[str]:
     for side, gains in summary["gains"].items():
         found = summary["achieved"][side]
         lines.append(
-            f"{side}: lambda = {gains['lambda']:.4g}, alpha = {gains['alpha']:.4g} (lambda / √f⁺ = {gains['lambda_ratio']:.3g}, "
-            f"alpha / f⁺ = {gains['alpha_ratio']:.3g}): {summary['objective']} error {found[metric]:.3g} {unit} rms, converged after "
+            f"{side}: lambda = {gains['lambda']:.4g} √rad/s, alpha = {gains['alpha']:.4g} rad/s² "
+            f"({gains['lambda_ratio']:.3g} √f⁺, {gains['alpha_ratio']:.3g} f⁺): {summary['objective']} error "
+            f"{found[metric]:.3g} {unit} rms, converged after "
             f"{found['convergence_time']:.3g} s, the worst of {_runs_behind(summary)}."
         )
     where = _holdout_title(summary)
@@ -178,21 +179,18 @@ def _tune_headline(summary: dict[str, Any]) -> list[str]:
     for side, others in summary["holdout"]["factors"].items():
         parts = []
         for name, factors in others.items():
-            called = name if name == "usual rule" else "study's own gains" if name == "config" else f"gains '{name}'"
+            called, row = called_gains(name), rows[name, side]
             if "why_none" in factors:
-                parts.append(f"the {called} converge in {100 * rows[name, side]['converged']:.3g} % of the runs")
+                parts.append(f"{called} converge in {100 * row['converged']:.3g} % of the runs")
             else:
-                error, time = factors[metric]["worst"], factors["convergence_time"]["worst"]
-                later = f", converging {_times(time)} as late" if time is not None else ""
-                parts.append(f"{_times(error)} that with the {called}{later}")
-        worst = rows["tuned", side][metric]["worst"]
-        own = "diverges" if worst is None else f"{worst:.3g} {unit} rms"
-        lines.append(f"{side}, {where}: worst {summary['objective']} error {own}; " + "; ".join(parts) + ".")
+                error, time = factors[metric]["worst"], row["convergence_time"]["worst"]
+                parts.append(f"{error:.3g} times as much with {called} (converged after {time:.3g} s)")
+        tuned = rows["tuned", side]
+        error, time = tuned[metric]["worst"], tuned["convergence_time"]["worst"]
+        own = "none: runs diverge" if error is None else f"{error:.3g} {unit} rms"
+        after = "not converged in all runs" if time is None else f"converged after {time:.3g} s"
+        lines.append(f"{side}, {where}: worst {summary['objective']} error {own} ({after}); {'; '.join(parts)}.")
     return lines
-
-
-def _times(factor: float | None) -> str:
-    return "an undefined multiple of" if factor is None else f"{factor:.3g} times"
 
 
 def _gains_table(summary: dict[str, Any]) -> TableOf:

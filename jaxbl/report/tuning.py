@@ -53,7 +53,7 @@ def _map(tuning: Tuning, side: str) -> Drawn:
     )
     xs, ys = table.columns.to_numpy(float), table.index.to_numpy(float)
     grid = table.to_numpy(float)
-    norm = _norm(grid, "auto")
+    norm = _norm(grid, "log")
     figure = Figure(figsize=(6.6, 5.4), layout="constrained")
     ax = figure.subplots()
     ax.grid(False)
@@ -72,8 +72,8 @@ def _map(tuning: Tuning, side: str) -> Drawn:
     handles += condition_curves(ax, _CONDITIONS, 1.0, (edges[0][0], edges[0][-1]))
     for window in summary["stages"][1:2]:
         (left, right), (low, high) = window[side]["alpha_ratio"], window[side]["lambda_ratio"]
-        ax.add_patch(Rectangle((left, low), right - left, high - low, fill=False, ec="white", lw=1.0))
-        handles.append(Patch(facecolor="#808080", edgecolor="white", label="first zoom"))
+        ax.add_patch(Rectangle((left, low), right - left, high - low, fill=False, ec="black", ls="--", lw=1.0))
+        handles.append(Patch(fill=False, ec="black", ls="--", label="first zoom"))
     gains = summary["gains"][side]
     ends = [(e[0], e[-1]) for e in edges]
     for name, mark, row in _others(tuning, side):
@@ -92,8 +92,8 @@ def _map(tuning: Tuning, side: str) -> Drawn:
         handles.append(Patch(facecolor=MISSING, label=f"diverged ({int(np.isnan(grid).sum())} points)"))
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     caption = (
-        f"{side}: {_label(tuning)} over all runs, on the coarse map of normalised gains. Hatched: not converged, or a margin not "
-        "kept. Curves: least λ of the gain conditions. The other gains are compared below."
+        f"{side}: {_label(tuning)} over all runs, on the coarse map of normalised gains. Hatched: not converged, or a "
+        "margin not kept. Curves: least λ of the gain conditions. The other gains are compared below."
     )
     return Drawn(f"tuning_{side}", figure, caption)
 
@@ -102,7 +102,8 @@ def _mark(ax: Axes, place: Any, mark: str, size: float, label: str) -> Line2D:
     """One point, and its entry of the legend."""
     look: dict[str, Any] = {"ls": "", "marker": mark, "ms": size, "mfc": "white", "mec": "black", "mew": 1.2}
     ax.plot(*([value] for value in place), clip_on=False, zorder=6, **look)
-    return Line2D([], [], label=label, **(look | {"ms": min(size, 10.0)}))
+    look["ms"] = min(size, 10.0)
+    return Line2D([], [], label=label, **look)
 
 
 def _front(tuning: Tuning, side: str) -> Drawn:
@@ -135,7 +136,7 @@ def _front(tuning: Tuning, side: str) -> Drawn:
             scale("log")
     ax.set(xlabel="worst convergence time (s)", ylabel=_label(tuning), title=side)
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
-    caption = f"{side}: error against convergence time, each the worst of all runs on the study's excitation. Faster gains are noisier."
+    caption = f"{side}: error against convergence time, each the worst of all runs on the study's excitation."
     return Drawn(f"pareto_{side}", figure, caption)
 
 
@@ -178,7 +179,7 @@ def _comparison(tuning: Tuning, sides: list[str]) -> Drawn:
     held = tuning.summary["holdout"]
     where = "the study's excitation with other noise" if held["same_excitation"] else "the held-out excitation"
     caption = (
-        f"The gains on {where} ({held['excitation']['kind']}, noise seeds {held['seeds'][0]} to {held['seeds'][1]}): worst of all "
-        "runs, and the median (stroke). Hatched: some runs did not converge."
+        f"The gains on {where} ({held['excitation']['kind']}, noise seeds {held['seeds'][0]} to {held['seeds'][1]}): worst "
+        "of all runs, and the median (stroke). Hatched: some runs did not converge."
     )
     return Drawn("tuning_holdout", figure, caption)

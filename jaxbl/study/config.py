@@ -400,8 +400,8 @@ class Config(Table):
     include: str | list[str] = Field(
         default=[],
         exclude=True,
-        description="TOML files, relative to this one, whose tables are merged in key by key: keys of this file win, those of "
-        "later files over those of earlier ones; arrays, and tables of another kind or law, are replaced as a whole",
+        description="TOML files, relative to this one, whose tables are merged in key by key: keys of this file win, those "
+        "of later files over those of earlier ones; arrays, and tables of another kind or law, are replaced as a whole",
     )
     title: str = Field(default="", description="headline of the report")
     notes: list[str] = Field(default=[], description="remarks of the author, repeated in summary and report")
@@ -596,9 +596,12 @@ def _merge(into: dict[str, Any], data: dict[str, Any], origins: dict[Key, str], 
     for name, value in data.items():
         here, old = (*key, name), into.get(name)
         origins[here] = new[here]
-        alike = isinstance(old, dict) and isinstance(value, dict)
         # a table of another kind is another table
-        if alike and all(value.get(tag, old.get(tag)) == old.get(tag) for tag in ("kind", "law")):
+        if (
+            isinstance(old, dict)
+            and isinstance(value, dict)
+            and all(value.get(tag, old.get(tag)) == old.get(tag) for tag in ("kind", "law"))
+        ):
             _merge(old, value, origins, new, here)
         else:
             into[name] = copy.deepcopy(value)
