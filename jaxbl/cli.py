@@ -117,7 +117,7 @@ def tune(config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOpti
     study = read_config(config)
     folder = _folder(config, out)
     resume = shlex.join(["jaxbl", "tune", str(config), "--out", str(folder)])
-    with _naming(config), _resumable(resume), _progress("runs") as progress:
+    with _naming(config, folder), _resumable(resume), _progress("runs") as progress:
         result = run_tune(study, folder, progress=progress, overwrite=overwrite)
     for line in write_tune_report(result, folder):
         typer.echo(line)
@@ -167,13 +167,14 @@ def _start_jax() -> None:
 
 
 @contextmanager
-def _naming(config: Path) -> Iterator[None]:
-    """Put the config's name in front of messages that know only the key."""
+def _naming(config: Path, folder: Path | None = None) -> Iterator[None]:
+    """Put the config's name in front of messages that know only the key, and are not about the folder of the results."""
     try:
         yield
     except InputError as error:
         message = str(error)
-        raise InputError(message if "/" in message.split(":")[0] else f"{config}: {message}") from None
+        named = "/" in message.split(":")[0] or (folder is not None and message.startswith(f"{folder}:"))
+        raise InputError(message if named else f"{config}: {message}") from None
 
 
 @contextmanager

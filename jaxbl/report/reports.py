@@ -184,7 +184,8 @@ def _tune_headline(summary: dict[str, Any]) -> list[str]:
                 parts.append(f"{called} converge in {100 * row['converged']:.3g} % of the runs")
             else:
                 error, time = factors[metric]["worst"], row["convergence_time"]["worst"]
-                parts.append(f"{error:.3g} times as much with {called} (converged after {time:.3g} s)")
+                times = "as much" if error is None or f"{error:.3g}" == "1" else f"{error:.3g} times as much"
+                parts.append(f"{times} with {called} (converged after {time:.3g} s)")
         tuned = rows["tuned", side]
         error, time = tuned[metric]["worst"], tuned["convergence_time"]["worst"]
         own = "none: runs diverge" if error is None else f"{error:.3g} {unit} rms"

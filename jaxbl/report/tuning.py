@@ -72,8 +72,8 @@ def _map(tuning: Tuning, side: str) -> Drawn:
     handles += condition_curves(ax, _CONDITIONS, 1.0, (edges[0][0], edges[0][-1]))
     for window in summary["stages"][1:2]:
         (left, right), (low, high) = window[side]["alpha_ratio"], window[side]["lambda_ratio"]
-        ax.add_patch(Rectangle((left, low), right - left, high - low, fill=False, ec="black", ls="--", lw=1.0))
-        handles.append(Patch(fill=False, ec="black", ls="--", label="first zoom"))
+        ax.add_patch(Rectangle((left, low), right - left, high - low, fill=False, ec="white", ls="--", lw=1.2))
+        handles.append(Patch(fill=False, ec="#777777", ls="--", label="first zoom"))
     gains = summary["gains"][side]
     ends = [(e[0], e[-1]) for e in edges]
     for name, mark, row in _others(tuning, side):
@@ -170,7 +170,7 @@ def _comparison(tuning: Tuning, sides: list[str]) -> Drawn:
                 ax.annotate(f" {value['worst']:.3g}", (value["worst"], i), va="center", fontsize=9)
             if shown:
                 low = 0.5 * min(v["median"] or v["worst"] for v in values if v["worst"]) if log else 0.0
-                ax.set_xlim(low, max(shown) * (3.0 if log else 1.22))
+                ax.set_xlim(low, max(shown) * (3.0 if log else 1.22) or 1.0)
             ax.set_xlabel(label)
             ax.grid(axis="y", visible=False)
         axes[0, column].set_title(side)

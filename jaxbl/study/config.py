@@ -280,7 +280,8 @@ class TuneTable(Table):
     num: int = Field(default=16, ge=3, le=1000, description="values of each gain in the coarse map and in each zoom")
     refine: int = Field(default=2, ge=0, le=10, description="zooms around the best cell; each spans two cells of the last")
     holdout: _Excitation | None = Field(  # type: ignore[valid-type]
-        default=None, description="input that gains are compared on; left out: the study's, with other noise"
+        default=None,
+        description="a table as [excitation]: input that gains are compared on; left out: the study's, with other noise",
     )
     compare: list[CompareTable] = Field(default=[], description="named gains to compare with")
 

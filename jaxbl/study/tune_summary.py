@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 FIGURES = ("converged", "convergence_time", "velocity_rmse", "torque_rmse", "margin_alpha", "margin_exact", "f_plus")
 """Metrics of a side that gains are judged by."""
 
-_FLAT = 0.05
+_FLAT, _WORTH = 0.05, 0.01  # relative differences of errors
 
 
 def pareto_front(candidates: pd.DataFrame) -> pd.DataFrame:
@@ -121,8 +121,8 @@ class _Summary:
             pilot = search.pilot[side]
             if pilot["starting_error_assumed"]:
                 lines.append(
-                    f"{side}: the study gives the observer no starting error, which a convergence time needs: it starts with "
-                    f"a velocity error of {pilot['velocity_error']:.3g} rad/s, the largest velocity of the pilot run."
+                    f"{side}: the study gives the observer no starting error, which a convergence time needs: it starts "
+                    f"with a velocity error of {pilot['velocity_error']:.3g} rad/s, the largest velocity of the pilot run."
                 )
             lines.append(
                 f"{side}: f⁺ = {search.f_plus[side]:.4g} rad/s², the larger of two figures of the pilot run: the largest "
@@ -145,6 +145,9 @@ class _Summary:
         gains = (("alpha", "alpha / f⁺", search.limits.alpha), ("lambda", "lambda / √f⁺", search.limits.lambda_))
         for gain, label, (low, high) in gains:
             ratio, near = row[f"{gain}_ratio"], cells[gain] * (1.0 + 1e-9)
+            if gain == "alpha" and row["margin_alpha"] < self.table.margin_alpha * near:
+                lines.append(f"{side}: the optimum lies at margin_alpha = {self.table.margin_alpha:g}.")
+                low = 0.0  # it is the margin that ends the range there
             lines += [
                 f"{side}: the optimum lies at the end {label} = {end:g} of the range searched (tune.{gain}_ratio); "
                 "beyond it may be better gains."
@@ -156,21 +159,19 @@ class _Summary:
         for key in kept:
             # gains that miss this constraint alone
             missed = found[~kept[key] & np.logical_and.reduce([values for name, values in kept.items() if name != key])]
-            if key != "converged" and len(missed) and missed["error"].min() < row["error"]:
+            if key != "converged" and len(missed) and missed["error"].min() < (1.0 - _WORTH) * row["error"]:
                 least = missed.loc[missed["error"].idxmin()]
                 lines.append(
                     f"{side}: {key} = {getattr(self.table, key):g} holds the optimum back: of the gains tried, lambda = "
-                    f"{least['lambda']:.3g}, alpha = {least['alpha']:.3g} miss it alone, with an error of {least['error']:.3g} "
-                    f"instead of {row['error']:.3g}."
+                    f"{least['lambda']:.3g}, alpha = {least['alpha']:.3g} miss it alone, with an error of "
+                    f"{least['error']:.3g} instead of {row['error']:.3g}."
                 )
         coarse = found.query("stage == 0 and feasible")
         near = coarse[coarse["error"] <= (1.0 + _FLAT) * row["error"]]
         if len(near) > 1:
             ends = ", ".join(f"{gain} from {near[gain].min():.3g} to {near[gain].max():.3g}" for gain in ("alpha", "lambda"))
-            lines.append(
-                f"{side}: the optimum is flat: {len(near)} points of the coarse map are within "
-                f"{100 * _FLAT:.0f} % of it, {ends}."
-            )
+            share = f"{len(near)} points of the coarse map are within {100 * _FLAT:.0f} % of it"
+            lines.append(f"{side}: the optimum is flat: {share}, {ends}.")
         return lines
 
     def _about_holdout(self, side: str) -> list[str]:
