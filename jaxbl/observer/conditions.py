@@ -1,34 +1,91 @@
 """Gain conditions of the super-twisting observer, for the error system (34) with bound f_plus.
 
-All functions are elementwise over JAX arrays that broadcast, and differentiable away from their limits, but for
-`least_lambda_exact` (a bisection). `least_lambda_*` return the smallest lambda (rad^0.5/s) that a condition allows for given
-alpha and f_plus (rad/s^2); where no lambda does (alpha <= f_plus) that is `inf`. By homogeneity all of them are sqrt(f_plus)
-times a function of alpha / f_plus.
+The error system is x1' = x2 - lambda sqrt|x1| sign x1, x2' = d - alpha sign x1 with any d(t) in [-f_plus, f_plus].
+All functions are elementwise over JAX arrays that broadcast, and differentiable away from their limits. `least_lambda_*`
+return the smallest lambda (rad^0.5/s) that a condition allows for given alpha and f_plus (rad/s^2); where no lambda does
+(alpha <= f_plus) that is `inf`, and `nan` only where an argument is. By homogeneity all of them are sqrt(f_plus) times a
+function of alpha / f_plus.
 """
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxbl.errors import InputError
+
 Values = Float[Array, "..."]
 
 
 def _above(alpha: Values, f_plus: Values, value: Values) -> Values:
-    return jnp.where(alpha > f_plus, value, jnp.inf)
+    return jnp.where(alpha > f_plus, value, jnp.where(alpha <= f_plus, jnp.inf, jnp.nan))
+
+
+def _margin(alpha: Values, f_plus: Values) -> Values:
+    """alpha - f_plus where that is positive, else one: what stands below a fraction."""
+    return jnp.where(alpha > f_plus, alpha - f_plus, 1.0)
 
 
 def least_lambda_davila_fridman(alpha: Values, f_plus: Values, q: float = 0.0) -> Values:
-    """Condition (32): lambda > sqrt(2 / (alpha - f)) (alpha + f) (1 + q) / (1 - q), 0 <= q < 1.
+    """Condition (32): lambda > sqrt(2 / (alpha - f)) (alpha + f) (1 + q) / (1 - q), 0 < q < 1; q = 0 stands for the limit.
 
     Reference: J. Davila, L. Fridman, A. Levant, IEEE Trans. Autom. Control 50 (2005).
+
+    Raises:
+        InputError: q outside [0, 1).
     """
-    margin = jnp.where(alpha > f_plus, alpha - f_plus, 1.0)
-    return _above(alpha, f_plus, jnp.sqrt(2.0 / margin) * (alpha + f_plus) * (1.0 + q) / (1.0 - q))
+    if not 0.0 <= q < 1.0:
+        raise InputError(f"q: condition (32) needs 0 < q < 1 (or 0 for the limit), not {q}")
+    return _above(alpha, f_plus, jnp.sqrt(2.0 / _margin(alpha, f_plus)) * (alpha + f_plus) * (1.0 + q) / (1.0 - q))
+
+
+def least_lambda_levant(alpha: Values, f_plus: Values) -> Values:
+    """lambda^2 > 4 f (alpha + f) / (alpha - f). Reference: A. Levant, Automatica 34 (1998)."""
+    return _above(alpha, f_plus, 2.0 * jnp.sqrt(f_plus * (alpha + f_plus) / _margin(alpha, f_plus)))
 
 
 def least_lambda_seeber_horn(alpha: Values, f_plus: Values) -> Values:
     """lambda > sqrt(alpha + f). Reference: R. Seeber, M. Horn, Automatica 84 (2017)."""
     return _above(alpha, f_plus, jnp.sqrt(alpha + f_plus))
+
+
+def least_lambda_moreno_osorio(alpha: Values, f_plus: Values) -> Values:
+    """lambda^2 > 4 (alpha - sqrt(alpha^2 - f^2)): all that a quadratic strict Lyapunov function can show.
+
+    Moreno and Osorio take V = zeta' P zeta with zeta = (sqrt|x1| sign x1, x2), for which
+    zeta' = (A zeta + B w) / (2 sqrt|x1|) with A = [[-lambda, 1], [-2 alpha, 0]], B = (0, 2)' and |w| <= f |zeta_1|.
+    A matrix P that makes V fall for all such w solves their linear matrix inequality; by the bounded real lemma there is one
+    exactly if |2 / (s^2 + lambda s + 2 alpha)| f < 1 on the imaginary axis (circle criterion). The peak of that is 1 / alpha
+    if lambda^2 >= 4 alpha, else 2 / (lambda sqrt(2 alpha - lambda^2 / 4)): hence the form above.
+
+    Reference: J. A. Moreno, M. Osorio, Strict Lyapunov functions for the super-twisting algorithm, IEEE Trans. Autom.
+    Control 57 (2012), for V and the inequality; its elimination is ours (docs/theory.md).
+    """
+    ratio = jnp.where(alpha > f_plus, f_plus / jnp.where(alpha > f_plus, alpha, 1.0), 0.0)
+    # alpha - sqrt(alpha^2 - f^2) without cancellation
+    return _above(alpha, f_plus, 2.0 * jnp.sqrt(f_plus * ratio / (1.0 + jnp.sqrt((1.0 - ratio) * (1.0 + ratio)))))
+
+
+def _arc(h: Values, y: Values, discriminant: Values) -> Values:
+    """int dq / (q^2 + lambda q + c) from p = v / y to infinity, with h = v + lambda y / 2 and discriminant c - lambda^2 / 4.
+
+    `inf` where a real root lies on the way. Complex, real, and nearly double roots.
+    """
+    near = (jnp.abs(discriminant) * y**2 < 1e-6 * h**2) & (h > 0.0)
+    size = jnp.sqrt(jnp.where(near | (discriminant == 0.0), 1.0, jnp.abs(discriminant)))
+    complex_roots = jnp.arctan2(jnp.where(near, 0.0, size * y), jnp.where(near, 1.0, h)) / size
+    passes = h > size * y
+    real = ~near & (discriminant < 0.0)
+    real_roots = jnp.arctanh(jnp.where(real & passes, size * y / jnp.where(real & passes, h, 1.0), 0.0)) / size
+    # atan(x) / x and atanh(x) / x are 1 -+ x^2 / 3 about zero
+    slope = y / jnp.where(near, h, 1.0)
+    double = slope * (1.0 - discriminant * slope**2 / 3.0)
+    blocked = ~near & (discriminant <= 0.0) & ~passes
+    return jnp.where(near, double, jnp.where(real, real_roots, jnp.where(blocked, jnp.inf, complex_roots))) + jnp.where(
+        blocked, jnp.inf, 0.0
+    )
 
 
 def peak_ratio(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
@@ -40,48 +97,46 @@ def peak_ratio(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
     rho is 0 where lambda^2 >= 4 c2, and `inf` where alpha <= f.
     Source: derived for this project (docs/theory.md), checked against simulation.
     """
-    possible = alpha > f_plus
-    c1 = jnp.where(possible, 2.0 * (alpha - f_plus), 1.0)
-    c2 = 2.0 * (alpha + f_plus)
-    direct = lambda_**2 >= 4.0 * c2
-    half2 = jnp.sqrt(jnp.where(direct, 1.0, c2 - 0.25 * lambda_**2))
-    second = (0.5 * jnp.pi + jnp.arctan(0.5 * lambda_ / half2)) / half2
-    exponent = -0.5 * lambda_ * (_first_integral(lambda_, c1) + second)
-    rho = jnp.where(direct, 0.0, jnp.sqrt(c2 / c1) * jnp.exp(exponent))
-    return jnp.where(possible, rho, jnp.inf)
+    log = _log_peak_ratio(lambda_, alpha, f_plus)
+    direct = lambda_**2 >= 8.0 * (alpha + f_plus)
+    return _above(alpha, f_plus, jnp.where(direct, 0.0, jnp.exp(jnp.where(direct, 0.0, log))))
 
 
-def _first_integral(lambda_: Values, c1: Values) -> Values:
-    """int_0^inf dp / (p^2 + lambda p + c1), over the complex, double and real root cases."""
-    half = 0.5 * lambda_
-    discriminant = c1 - half**2
-    # the series about the double root: atan(x) / x and atanh(x) / x are 1 -+ x^2 / 3 there
-    near = jnp.abs(discriminant) < 1e-6 * c1
-    size = jnp.sqrt(jnp.where(near, 1.0, jnp.abs(discriminant)))
-    complex_roots = jnp.arctan2(size, half) / size
-    real = jnp.where(near | (discriminant > 0.0), 0.0, size / jnp.where(half > 0.0, half, 1.0))
-    real_roots = jnp.arctanh(real) / size
-    double = (1.0 - discriminant / (3.0 * c1)) / jnp.where(near, half, 1.0)
-    return jnp.where(near, double, jnp.where(discriminant > 0.0, complex_roots, real_roots))
+def _log_peak_ratio(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
+    """log rho where alpha > f and lambda^2 < 4 c2; any finite number elsewhere."""
+    c1, c2 = 2.0 * _margin(alpha, f_plus), 2.0 * (alpha + f_plus)
+    half, one = 0.5 * lambda_, jnp.ones_like(0.5 * lambda_)
+    below = jnp.where(c2 > half**2, c2 - half**2, 1.0)
+    return 0.5 * jnp.log(c2 / c1) - half * (_arc(half, one, c1 - half**2) + _arc(-half, one, below))
 
 
 def least_lambda_exact(alpha: Values, f_plus: Values) -> Values:
-    """Least lambda with rho < 1, by bisection on :func:`peak_ratio` (which falls with lambda)."""
-    ratio = jnp.where(alpha > f_plus, alpha / jnp.where(f_plus > 0.0, f_plus, 1.0), 2.0)
+    """Least lambda with rho < 1; zero where f_plus is.
+
+    By bisection on :func:`peak_ratio`, which falls with lambda, then a step of Newton's method that carries the derivatives.
+    """
+    known = (alpha > f_plus) & (f_plus > 0.0)
+    ratio = jnp.where(known, alpha, 2.0) / jnp.where(known, f_plus, 1.0)
     one = jnp.ones_like(ratio)
+    fixed = jax.lax.stop_gradient(ratio)
 
     def halve(bounds: tuple[Values, Values], _: None) -> tuple[tuple[Values, Values], None]:
         low, high = bounds
         middle = 0.5 * (low + high)
-        converges = peak_ratio(middle, ratio, one) < 1.0
+        converges = peak_ratio(middle, fixed, one) < 1.0
         return (jnp.where(converges, low, middle), jnp.where(converges, middle, high)), None
 
     # rho is zero, so below one, at lambda^2 = 4 c2
-    upper = jnp.sqrt(8.0 * (ratio + 1.0))
+    upper = jnp.sqrt(8.0 * (fixed + 1.0))
     # each halving gives a bit
     length = jnp.finfo(ratio.dtype).nmant + 4
     (_, least), _ = jax.lax.scan(halve, (jnp.zeros_like(ratio), upper), length=length)
-    return _above(alpha, f_plus, jnp.where(f_plus > 0.0, jnp.sqrt(f_plus) * least, 0.0))
+    least = jax.lax.stop_gradient(least)
+    _, slope = jax.jvp(lambda x: _log_peak_ratio(x, fixed, one), (least,), (one,))
+    least = least - _log_peak_ratio(least, ratio, one) / jax.lax.stop_gradient(slope)
+    # the root's derivative is infinite at zero
+    bound = jnp.where(known, f_plus, 1.0)
+    return _above(alpha, f_plus, jnp.where(known, jnp.sqrt(bound) * least, 0.0))
 
 
 def convergence_time_bound(
@@ -101,9 +156,136 @@ def convergence_time_bound(
     return jnp.where(holds, peak / safe, jnp.inf)
 
 
-LEAST_LAMBDA = {
-    "davila_fridman": least_lambda_davila_fridman,
-    "seeber_horn": least_lambda_seeber_horn,
-    "exact": least_lambda_exact,
+class _Passage(NamedTuple):
+    """From a point of the right half plane to the axis x = 0: time, and speed |x2| there (0 where it ends at the origin)."""
+
+    time: Values
+    speed: Values
+
+
+def _passage(lambda_: Values, alpha: Values, f_plus: Values, y: Values, x2: Values, ray: Values) -> _Passage:
+    """Passage from x1 = y^2 under d = +f until x1' = ray sqrt(x1), and d = -f from there on; ray <= 0, alpha > f.
+
+    Along an arc of constant d, sqrt(v^2 + lambda v y + c y^2) falls by exp(-(lambda / 2) arc), and x2 linearly in time.
+    """
+    c1, c2 = 2.0 * _margin(alpha, f_plus), 2.0 * (alpha + f_plus)
+    half = 0.5 * lambda_
+    v = x2 - lambda_ * y
+    before = v > ray * y
+    # out to the ray, if the point lies before it; at the root's ray, d = +f holds on to the origin
+    eps = jnp.finfo(jnp.result_type(half)).eps
+    ends = before & (ray <= (1.0 - 8.0 * eps) * _lowest_ray(lambda_, c1))
+    turns = before & ~ends
+    start, end = (jnp.where(turns, x, 1.0) for x in (v + half * y, ray + half))
+    start_y, one, d1 = jnp.where(turns, y, 0.0), jnp.ones_like(end), jnp.where(turns, c1 - half**2, 1.0)
+    # q^2 + lambda q + c = (q + lambda / 2)^2 + c - lambda^2 / 4
+    norms = jnp.sqrt((start**2 + d1 * start_y**2) / jnp.maximum(end**2 + d1, eps * end**2))
+    y_ray = norms * jnp.exp(-half * (_arc(end, one, d1) - _arc(start, start_y, d1)))
+    y_turn = jnp.where(turns, y_ray, jnp.where(ends, 0.0, y))
+    x2_turn = jnp.where(turns, (ray + lambda_) * y_ray, jnp.where(ends, 0.0, x2))
+    # home
+    away, d2 = y_turn > 0.0, c2 - half**2
+    h = jnp.where(away, half * y_turn - x2_turn, 1.0)
+    arc = _arc(h, jnp.where(away, y_turn, 0.0), d2)
+    homes = away & jnp.isfinite(arc)
+    level = jnp.where(homes, h**2 + d2 * y_turn**2, 1.0)
+    speed = jnp.where(homes, jnp.sqrt(level) * jnp.exp(-half * jnp.where(homes, arc, 0.0)), 0.0)
+    time = (x2 - x2_turn) / _margin(alpha, f_plus) + (x2_turn + speed) / (alpha + f_plus)
+    return _Passage(time, speed)
+
+
+def _lowest_ray(lambda_: Values, c1: Values) -> Values:
+    """The ray along which d = +f leads to the origin: a root of p^2 + lambda p + c1; -inf where it is complex."""
+    half = 0.5 * lambda_
+    real = half**2 >= c1
+    return jnp.where(real, -c1 / (half + jnp.sqrt(jnp.where(real, half**2 - c1, 0.0))), -jnp.inf)
+
+
+_RAYS = 65
+_GOLDEN = 0.6180339887498949
+
+
+def slowest_ray(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
+    """The ray p <= 0 (rad^0.5/s) of the slowest disturbance: d = +f while x1' > p sqrt(x1), -f after it (for x1 > 0).
+
+    The disturbance that makes the largest peaks turns where x1' = 0, but the one that lasts longest holds on a little.
+    By Pontryagin's principle it switches once in a half cycle: its costates obey l1' = l1 lambda / (2 sqrt x1), l2' = -l1,
+    so that l1 keeps its sign and l2 changes sign at most once; by homogeneity it switches on a ray. Found by search over
+    rays for the largest time to the origin (golden section after a coarse grid). Zero where rho >= 1.
+    """
+    shape = jnp.broadcast_shapes(jnp.shape(lambda_), jnp.shape(alpha), jnp.shape(f_plus))
+    dtype = jnp.result_type(lambda_, alpha, f_plus, float)
+    lambda_, alpha, f_plus = (jnp.broadcast_to(jnp.asarray(x, dtype), shape) for x in (lambda_, alpha, f_plus))
+    c1 = 2.0 * _margin(alpha, f_plus)
+    lowest = _lowest_ray(lambda_, c1)
+    real = jnp.isfinite(lowest)
+    root = jnp.where(real, lowest, -1.0)
+    # near the root's ray, x falls as a power of the distance from it: even steps of what is left of x
+    pace = jnp.maximum((2.0 * root + lambda_) / -root, 1.0)
+
+    def ray(share: Values) -> Values:
+        open_ = jnp.minimum(share, 1.0 - 1e-6)
+        depth = open_ / (1.0 - open_)
+        near = jnp.where(share < 1.0, root * -jnp.expm1(-pace * depth), root)
+        return jnp.where(real, near, -jnp.sqrt(c1) * depth)
+
+    def time(share: Values) -> Values:
+        passage = _passage(lambda_, alpha, f_plus, jnp.zeros_like(lambda_), jnp.ones_like(lambda_), ray(share))
+        return passage.time / jnp.maximum(1.0 - passage.speed, jnp.finfo(dtype).tiny)
+
+    coarse = jnp.linspace(0.0, 1.0, _RAYS, dtype=dtype)
+    best = jnp.argmax(jax.lax.map(lambda share: time(jnp.full(shape, share, dtype)), coarse), axis=0)
+    low, high = (jnp.clip(coarse[jnp.clip(best + k, 0, _RAYS - 1)], 0.0, 1.0) for k in (-1, 1))
+
+    def shrink(bounds: tuple[Values, Values], _: None) -> tuple[tuple[Values, Values], None]:
+        low, high = bounds
+        left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        goes_left = time(left) >= time(right)
+        return (jnp.where(goes_left, low, left), jnp.where(goes_left, right, high)), None
+
+    # the maximum is flat: half of the digits are enough
+    (low, high), _ = jax.lax.scan(shrink, (low, high), length=jnp.finfo(dtype).nmant // 2 + 2)
+    found = 0.5 * (low + high)
+    found = jnp.where(time(jnp.ones_like(found)) >= time(found), 1.0, found)
+    return jnp.where(peak_ratio(lambda_, alpha, f_plus) < 1.0, ray(found), 0.0)
+
+
+def convergence_time_worst(
+    lambda_: Values, alpha: Values, f_plus: Values, position_error: Values, velocity_error: Values
+) -> Values:
+    """Longest convergence time in s that any disturbance within f_plus can cause, exactly; `inf` where rho >= 1.
+
+    From the errors x1 (rad) and x2 (rad/s) at t = 0. Half cycles under the slowest disturbance (:func:`slowest_ray`) take
+    times in proportion to the peak speed |x2| they start with, and the peaks fall by a ratio r: a geometric sum. Within a
+    half cycle x2 changes at the constant rates alpha -+ f.
+    Source: derived for this project (docs/theory.md), checked against simulation.
+    """
+    zero = jnp.zeros_like(jnp.asarray(lambda_ * alpha * f_plus * 1.0))
+    ray = jax.lax.stop_gradient(slowest_ray(lambda_, alpha, f_plus))  # the time is stationary in it
+    cycle = _passage(lambda_, alpha, f_plus, zero, zero + 1.0, ray)
+    converges = peak_ratio(lambda_, alpha, f_plus) < 1.0
+    a_peak = cycle.time / jnp.where(converges & (cycle.speed < 1.0), 1.0 - cycle.speed, 1.0)
+    # the half planes mirror each other
+    x2 = jnp.where(position_error == 0.0, jnp.abs(velocity_error), jnp.sign(position_error) * velocity_error)
+    away = position_error != 0.0
+    y = jnp.where(away, jnp.sqrt(jnp.where(away, jnp.abs(position_error), 1.0)), 0.0)
+    first = _passage(lambda_, alpha, f_plus, y + zero, x2 + zero, ray)
+    moving = (x2 != 0.0) | away
+    return jnp.where(converges, jnp.where(moving, first.time + first.speed * a_peak, 0.0), jnp.inf)
+
+
+class Condition(NamedTuple):
+    """A gain condition: its name in prose, and the least lambda (rad^0.5/s) it allows at alpha and f_plus (rad/s^2)."""
+
+    title: str
+    least_lambda: Callable[[Values, Values], Values]
+
+
+CONDITIONS = {
+    "davila_fridman": Condition("Davila-Fridman (32), q → 0", least_lambda_davila_fridman),
+    "levant": Condition("Levant 1998", least_lambda_levant),
+    "seeber_horn": Condition("Seeber-Horn 2017", least_lambda_seeber_horn),
+    "moreno_osorio": Condition("Lyapunov, Moreno-Osorio 2012", least_lambda_moreno_osorio),
+    "exact": Condition("exact, ρ < 1", least_lambda_exact),
 }
 """Conditions by the names that configs and metrics use."""

@@ -20,17 +20,19 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jaxbl.errors import InputError
-from jaxbl.observer.conditions import LEAST_LAMBDA
+from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.study.config import Config, FigureTable, nearest, numeric_paths
 from jaxbl.study.metrics import describe
 from jaxbl.study.sweep import StudyResult
 
 from .style import COLOURS, MAP, MISSING, style, with_unit
 
-_CONDITIONS = {
-    "davila_fridman": ("Davila-Fridman (32), q → 0", "-", "#FF5FA2"),
-    "seeber_horn": ("Seeber-Horn", "--", "#7FDBFF"),
-    "exact": ("exact, ρ = 1", ":", "#FFD400"),
+_CURVES = {
+    "davila_fridman": ("-", "#FF5FA2"),
+    "levant": ("-.", "#FF9E4A"),
+    "seeber_horn": ("--", "#7FDBFF"),
+    "moreno_osorio": ((0, (5, 1, 1, 1)), "#B6F09C"),
+    "exact": (":", "#FFD400"),
 }
 _HATCH = (1.0, 1.0, 1.0, 0.45)
 SIDES = ("motor", "load")
@@ -352,13 +354,13 @@ def condition_curves(
     fine = np.geomspace(low, high, 400) if high > bound else np.array([])
     handles = []
     for name in names:
-        label, dashes, colour = _CONDITIONS[name]
+        condition, (dashes, colour) = CONDITIONS[name], _CURVES[name]
         with jax.enable_x64(True):
-            least = np.asarray(LEAST_LAMBDA[name](jnp.asarray(fine), jnp.asarray(bound))) if fine.size else fine
+            least = np.asarray(condition.least_lambda(jnp.asarray(fine), jnp.asarray(bound))) if fine.size else fine
         line = (fine, least) if alpha_is_x else (least, fine)
         outlined = [path_effects.Stroke(linewidth=3.6, foreground="black"), path_effects.Normal()]
-        ax.plot(*line, dashes, color=colour, lw=2.0, path_effects=outlined)
-        handles.append(Line2D([], [], color=colour, ls=dashes, lw=2.0, label=label, path_effects=outlined))
+        ax.plot(*line, ls=dashes, color=colour, lw=2.0, path_effects=outlined)
+        handles.append(Line2D([], [], color=colour, ls=dashes, lw=2.0, label=condition.title, path_effects=outlined))
     return handles
 
 

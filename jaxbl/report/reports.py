@@ -215,8 +215,8 @@ def _comparison_table(heading: str, found: list[dict[str, Any]]) -> TableOf:
          row["convergence_time"]["worst"], row["margin_alpha"], row["margin_exact"], row["peak_ratio"]]
         for row in sorted(found, key=lambda row: SIDES.index(row["side"]))
     ]  # fmt: skip
-    columns = ["side", "gains", "λ", "α", "converged (%)", "velocity error (rad/s)", "median", "torque error (N m)", "median",
-               "convergence (s)", "margin α", "margin exact", "ρ"]  # fmt: skip
+    columns = ["side", "gains", "λ", "α", "converged (%)", "velocity error (rad/s)", "median", "torque error (N m)",
+               "median", "convergence (s)", "margin α", "margin exact", "ρ"]  # fmt: skip
     return TableOf(heading, columns, rows)
 
 

@@ -367,7 +367,7 @@ class FigureTable(Table):
     facet: str | None = Field(default=None, description="axis path: one panel for each value")
     series: str | None = Field(default=None, description="axis path: one line for each value (line)")
     scale: Literal["auto", "linear", "log"] = Field(default="auto", description="scale of the value")
-    overlays: list[Literal["davila_fridman", "seeber_horn", "exact"]] = Field(
+    overlays: list[Literal["davila_fridman", "levant", "seeber_horn", "moreno_osorio", "exact"]] = Field(
         default=[], description="gain conditions drawn over a map of alpha and lambda"
     )
 

@@ -31,6 +31,9 @@ SIDE_METRICS: dict[str, Metric] = {
     "convergence_time_bound": Metric(
         "s", "bound on convergence time", "bound (42) on it for the noise-free observer; inf where (32) fails"
     ),
+    "convergence_time_worst": Metric(
+        "s", "worst convergence time", "longest convergence time that a disturbance within f_plus can cause; inf where ρ ≥ 1"
+    ),
     "position_rmse": Metric("rad", "position error, rms", "rms position error"),
     "velocity_rmse": Metric("rad/s", "velocity error, rms", "rms velocity error"),
     "torque_rmse": Metric(
@@ -44,9 +47,10 @@ SIDE_METRICS: dict[str, Metric] = {
         "rad/s²", "twice the largest acceleration", "twice the largest acceleration: the paper's text for f⁺"
     ),
     "margin_alpha": Metric("", "α / f⁺", "gain alpha over the true bound f_plus"),
-    "margin_davila_fridman": Metric("", "margin to Davila-Fridman (32)", "λ over the least λ of condition (32)"),
-    "margin_seeber_horn": Metric("", "margin to Seeber-Horn", "λ over the least λ of Seeber and Horn"),
-    "margin_exact": Metric("", "margin to ρ < 1", "λ over the least λ of the exact condition ρ < 1"),
+    **{
+        f"margin_{name}": Metric("", f"margin to {condition.title}", f"λ over the least λ of {condition.title}")
+        for name, condition in conditions.CONDITIONS.items()
+    },
     "stiffness_error": Metric("", "error of K", "relative error of the identified stiffness"),
     "dead_zone_error": Metric(
         "", "error of the dead zone", "relative error of the identified dead zone (half gap of law dead_zone)"
@@ -123,12 +127,13 @@ def _result(experiment: Experiment, totals: dict[str, _Totals], state: State) ->
         observer = getattr(experiment.observer, side)
         converged = total.last_outside < start - 0.5 * run.sample_period
         entered = jnp.where(total.last_outside < 0.0, 0.0, total.last_outside + run.sample_period)
+        gains = (observer.lambda_, observer.alpha, total.f_plus)
+        start_error = (observer.position_error, observer.velocity_error)
         out = {
             "converged": converged,
             "convergence_time": jnp.where(converged, entered, jnp.nan),
-            "convergence_time_bound": conditions.convergence_time_bound(
-                observer.lambda_, observer.alpha, total.f_plus, observer.position_error, observer.velocity_error
-            ),
+            "convergence_time_bound": conditions.convergence_time_bound(*gains, *start_error),
+            "convergence_time_worst": conditions.convergence_time_worst(*gains, *start_error),
             "position_rmse": jnp.sqrt(total.position / count),
             "velocity_rmse": jnp.sqrt(total.velocity / count),
             "torque_rmse": jnp.sqrt(total.torque / count),
@@ -137,8 +142,8 @@ def _result(experiment: Experiment, totals: dict[str, _Totals], state: State) ->
             "f_plus_acceleration": 2.0 * total.acceleration,
             "margin_alpha": observer.alpha / total.f_plus,
         }
-        for name, least in conditions.LEAST_LAMBDA.items():
-            out[f"margin_{name}"] = observer.lambda_ / least(observer.alpha, total.f_plus)
+        for name, condition in conditions.CONDITIONS.items():
+            out[f"margin_{name}"] = observer.lambda_ / condition.least_lambda(observer.alpha, total.f_plus)
         if state.identifier is not None:
             assert experiment.transmission is not None and experiment.identifier is not None
             truth, found = experiment.transmission.truth(), identified[side]

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.errors import InputError
-from jaxbl.observer.conditions import LEAST_LAMBDA, peak_ratio
+from jaxbl.observer.conditions import CONDITIONS, peak_ratio
 from jaxbl.simulate import Experiment, Reducer, Signals, State, scan
 
 from .config import Config, read_config
@@ -147,7 +147,7 @@ def _conditions(observer: Any, f_plus: float) -> dict[str, Any]:
     """Gains of an observer against what each condition asks at a bound f_plus (rad/s^2)."""
     with jax.enable_x64(True):
         lambda_, alpha, bound = (jnp.asarray(x) for x in (float(observer.lambda_), float(observer.alpha), f_plus))
-        least = {name: _plain(condition(alpha, bound)) for name, condition in LEAST_LAMBDA.items()}
+        least = {name: _plain(condition.least_lambda(alpha, bound)) for name, condition in CONDITIONS.items()}
         rho = _plain(peak_ratio(lambda_, alpha, bound))
     return {
         "lambda": float(observer.lambda_),
@@ -158,9 +158,6 @@ def _conditions(observer: Any, f_plus: float) -> dict[str, Any]:
         "holds": {name: value is not None and float(observer.lambda_) > value for name, value in least.items()},
         "peak_ratio": rho,
     }
-
-
-_CONDITION_NAMES = {"davila_fridman": "condition (32)", "seeber_horn": "Seeber-Horn", "exact": "the exact condition"}
 
 
 def _remarks(experiment: Experiment, last: dict[str, Any], metrics: dict[str, Any], conditions: dict[str, Any]) -> list[str]:
@@ -189,12 +186,13 @@ def _remarks(experiment: Experiment, last: dict[str, Any], metrics: dict[str, An
         for label, values in (("the true f⁺", found), ("f⁺ = max |C| / J", found.get("torque_bound"))):
             if values is None or values["least_lambda"]["exact"] is None:
                 continue
-            for name, least in values["least_lambda"].items():
-                if found["lambda"] <= least:
-                    remarks.append(
-                        f"{side}: lambda = {found['lambda']:g} misses {_CONDITION_NAMES[name]} by a factor of "
-                        f"{least / found['lambda']:.3g} (it asks for more than {least:.3g} at {label})."
-                    )
+            missed = [
+                f"{CONDITIONS[name].title} by a factor of {least / found['lambda']:.3g} (more than {least:.3g})"
+                for name, least in values["least_lambda"].items()
+                if found["lambda"] <= least
+            ]
+            if missed:
+                remarks.append(f"{side}: lambda = {found['lambda']:g} misses, at {label}: {'; '.join(missed)}.")
         converged = metrics[f"{side}.converged"]
         if converged and not found["holds"]["exact"]:
             remarks.append(

@@ -45,9 +45,9 @@ class Tuning:
         config: the study.
         summary: plain data, as in `tuning.json`.
         candidates: for each side, one row for each pair of gains tried: `stage` (0 is the coarse map), `lambda`, `alpha`,
-            `lambda_ratio`, `alpha_ratio`, whether all runs `converged` and are `finite`, worst `velocity_rmse`,
-            `torque_rmse` and `convergence_time`, least `margin_alpha` and `margin_exact`, largest `f_plus`, `error` (the
-            objective) and `feasible`.
+            `lambda_ratio`, `alpha_ratio`, whether all runs `converged` and are `finite`, largest `velocity_rmse`,
+            `torque_rmse`, `convergence_time`, `convergence_time_worst` and `f_plus`, least `margin_alpha` and
+            `margin_exact`, `error` (the objective) and `feasible`.
         cost: seconds of compilation and of computing, and lanes computed in this call.
     """
 
@@ -313,12 +313,15 @@ class Search:
         return result.read([*paths, "seed", "finite", *names])
 
 
+_LARGEST = ("velocity_rmse", "torque_rmse", "convergence_time", "convergence_time_worst", "f_plus")
+
+
 def _worst(frame: pd.DataFrame, side: str) -> pd.DataFrame:
     """One row for each pair of gains: the worst over scenarios and seeds; NaN where a run diverged or did not converge."""
     keys = [f"observer.{side}.lambda", f"observer.{side}.alpha"]
     part = frame[[*keys, "finite"]].assign(**{name: frame[f"{side}.{name}"] for name in FIGURES})
     groups = part.groupby(keys, sort=True)
-    worst = {name: groups[name].max() for name in ("velocity_rmse", "torque_rmse", "convergence_time", "f_plus")}
+    worst = {name: groups[name].max() for name in _LARGEST}
     least = {name: groups[name].min() for name in ("margin_alpha", "margin_exact", "converged", "finite")}
     found = pd.DataFrame(worst | least)
     found["converged"] = found["converged"].astype(bool)

@@ -19,7 +19,16 @@ from .metrics import SIDE_METRICS
 if TYPE_CHECKING:
     from .tune import Search
 
-FIGURES = ("converged", "convergence_time", "velocity_rmse", "torque_rmse", "margin_alpha", "margin_exact", "f_plus")
+FIGURES = (
+    "converged",
+    "convergence_time",
+    "convergence_time_worst",
+    "velocity_rmse",
+    "torque_rmse",
+    "margin_alpha",
+    "margin_exact",
+    "f_plus",
+)
 """Metrics of a side that gains are judged by."""
 
 _FLAT, _WORTH = 0.05, 0.01  # relative differences of errors
@@ -84,7 +93,7 @@ class _Summary:
 
     def _achieved(self, side: str) -> dict[str, Any]:
         row = self.best[side]
-        names = ("velocity_rmse", "torque_rmse", "convergence_time", "margin_alpha", "margin_exact", "f_plus")
+        names = [name for name in FIGURES if name != "converged"]
         return {name: plain_number(row[name]) for name in names} | {
             "peak_ratio": _peak_ratio(row["lambda"], row["alpha"], row["f_plus"])
         }
@@ -216,6 +225,8 @@ def figures_of(name: str, side: str, runs: pd.DataFrame, gains: tuple[float, flo
         row[figure] = {"worst": plain_number(values.max()) if whole else None, "median": plain_number(values.median())}
     for figure in ("margin_alpha", "margin_exact"):
         row[figure] = plain_number(figures[figure].min()) if finite.all() else None
+    # what a disturbance within f_plus could make of it
+    row["convergence_time_worst"] = plain_number(figures["convergence_time_worst"].max()) if finite.all() else None
     return row | {"f_plus": plain_number(bound), "peak_ratio": _peak_ratio(*gains, bound)}
 
 

@@ -90,7 +90,7 @@ def test_peak_ratio_is_that_of_quadrature_and_of_the_simulated_worst_case(case):
 
 # compiled once for the many cases below
 RATIO, BOUND = jax.jit(conditions.peak_ratio), jax.jit(conditions.convergence_time_bound)
-LEAST = {name: jax.jit(least) for name, least in conditions.LEAST_LAMBDA.items()}
+LEAST = {name: jax.jit(least) for name, (_, least) in conditions.CONDITIONS.items()}
 POSITIVE = st.floats(0.1, 10.0)
 
 
@@ -119,7 +119,7 @@ def test_least_lambda_exact_is_where_the_ratio_is_one(ratio, f_plus):
 
 @pytest.mark.parametrize("alpha", [0.0, 0.5, 1.0])
 def test_no_lambda_is_enough_where_alpha_is_not(alpha):
-    for least in conditions.LEAST_LAMBDA.values():
+    for _, least in conditions.CONDITIONS.values():
         assert least(alpha, 1.0) == jnp.inf
     assert conditions.peak_ratio(5.0, alpha, 1.0) == jnp.inf
     assert conditions.convergence_time_bound(5.0, alpha, 1.0, 0.1, 0.1) == jnp.inf

@@ -126,7 +126,7 @@ def test_conditions_are_drawn_for_the_median_bound_of_the_panel(tmp_path):
     drawing = drawn(tmp_path, data, motor__f_plus=lambda frame: np.full(len(frame), 2.0))
     (ax,) = panels(drawing)
     assert "f⁺ = 2 rad/s²" in ax.get_title()
-    assert legend(drawing) == ["Davila-Fridman (32), q → 0", "Seeber-Horn", "exact, ρ = 1"]
+    assert legend(drawing) == ["Davila-Fridman (32), q → 0", "Seeber-Horn 2017", "exact, ρ < 1"]
     alpha, least = next(curve for curve in ax.lines if curve.get_linestyle() == "--").get_data()
     np.testing.assert_allclose(least, least_lambda_seeber_horn(alpha, 2.0))
     assert alpha[0] == pytest.approx(2.0, rel=1e-3)

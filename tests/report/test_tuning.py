@@ -11,6 +11,7 @@ from matplotlib.colors import LogNorm
 from small_study import small
 from test_page import Page
 
+from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.report import write_tune_report
 from jaxbl.report.tuning import draw_tuning
 from jaxbl.study.config import read_config
@@ -79,7 +80,9 @@ def test_map_has_the_coarse_stage_its_optimum_and_the_others(tuned):
     star = next(line for line in ax.lines if line.get_marker() == "*")
     assert (star.get_xdata()[0], star.get_ydata()[0]) == (gains["alpha_ratio"], gains["lambda_ratio"])
     legend = [text.get_text() for legend in drawing.figure.legends for text in legend.get_texts()]
-    assert {"constraints not kept", "exact, ρ = 1", "usual rule", "config", "slow, off the map", "tuned"} <= set(legend)
+    assert {"constraints not kept", CONDITIONS["exact"].title, "usual rule", "config", "slow, off the map", "tuned"} <= set(
+        legend
+    )
     # on the edge, not outside
     low, high = ax.get_xlim()
     assert all(low <= x * (1 + 1e-9) and x <= high * (1 + 1e-9) for line in ax.lines for x in line.get_xdata())

@@ -50,8 +50,11 @@ def by_numpy(experiment, signals, identifier):
             "convergence_time_bound": conditions.convergence_time_bound(
                 observer.lambda_, observer.alpha, f_plus, np.abs(position[0]), np.abs(velocity[0])
             ),
+            "convergence_time_worst": conditions.convergence_time_worst(
+                observer.lambda_, observer.alpha, f_plus, observer.position_error, observer.velocity_error
+            ),
         }
-        for name, least in conditions.LEAST_LAMBDA.items():
+        for name, (_, least) in conditions.CONDITIONS.items():
             out[f"margin_{name}"] = observer.lambda_ / least(observer.alpha, f_plus)
         if identifier is not None:
             law = experiment.transmission
