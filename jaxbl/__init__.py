@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .errors import InputError as InputError
+    from .errors import NoResult as NoResult
     from .report import write_sweep_report as write_sweep_report
     from .report import write_trial_report as write_trial_report
+    from .report import write_tune_report as write_tune_report
     from .study.config import Config as Config
     from .study.config import read_config as read_config
     from .study.laws import Law as Law
@@ -19,11 +21,15 @@ if TYPE_CHECKING:
     from .study.sweep import sweep as sweep
     from .study.trial import Trial as Trial
     from .study.trial import run as run
+    from .study.tune import Tuning as Tuning
+    from .study.tune import tune as tune
 
 _WHERE = {
     "InputError": "errors",
+    "NoResult": "errors",
     "write_sweep_report": "report",
     "write_trial_report": "report",
+    "write_tune_report": "report",
     "Config": "study.config",
     "read_config": "study.config",
     "Law": "study.laws",
@@ -34,6 +40,8 @@ _WHERE = {
     "sweep": "study.sweep",
     "Trial": "study.trial",
     "run": "study.trial",
+    "Tuning": "study.tune",
+    "tune": "study.tune",
 }
 
 

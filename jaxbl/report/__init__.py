@@ -3,3 +3,4 @@
 from .maps import draw as draw
 from .reports import write_sweep_report as write_sweep_report
 from .reports import write_trial_report as write_trial_report
+from .reports import write_tune_report as write_tune_report

@@ -351,9 +351,17 @@ def _overlay(ax: Axes, bound: float, spec: FigureTable, xs: np.ndarray, ys: np.n
     """Curves of the gain conditions for one f_plus."""
     alpha_is_x = spec.x.endswith(".alpha")
     alphas = xs if alpha_is_x else ys
-    fine = np.geomspace(max(alphas.min(), bound * 1.0001), alphas.max(), 400) if alphas.max() > bound else np.array([])
+    return condition_curves(ax, list(spec.overlays), bound, (alphas.min(), alphas.max()), alpha_is_x)
+
+
+def condition_curves(
+    ax: Axes, names: list[str], bound: float, alphas: tuple[float, float], alpha_is_x: bool = True
+) -> list[Line2D]:
+    """Draw the least lambda of gain conditions over a range of alpha, for one f_plus. Returns the legend's handles."""
+    low, high = max(alphas[0], bound * 1.0001), alphas[1]
+    fine = np.geomspace(low, high, 400) if high > bound else np.array([])
     handles = []
-    for name in spec.overlays:
+    for name in names:
         condition, (dashes, colour) = CONDITIONS[name], _CURVES[name]
         with jax.enable_x64(True):
             least = np.asarray(condition.least_lambda(jnp.asarray(fine), jnp.asarray(bound))) if fine.size else fine

@@ -99,7 +99,8 @@ class Engine:
     def chunks(self) -> Iterator[Chunk]:
         index = 0
         for group in range(len(self.points.groups)):
-            for seed in range(0, self.config.sweep.seeds, self.layout.seeds):
+            first = self.config.sweep.first_seed
+            for seed in range(first, first + self.config.sweep.seeds, self.layout.seeds):
                 for point in range(0, self.points.lanes, self.layout.points):
                     yield Chunk(index, group, seed, point)
                     index += 1
@@ -134,7 +135,7 @@ class Engine:
 
     def contents(self, chunk: Chunk) -> tuple[np.ndarray, np.ndarray]:
         """Seeds and point indices of a chunk."""
-        last_seed = min(chunk.first_seed + self.layout.seeds, self.config.sweep.seeds)
+        last_seed = min(chunk.first_seed + self.layout.seeds, self.config.sweep.first_seed + self.config.sweep.seeds)
         last_point = min(chunk.first_point + self.layout.points, self.points.lanes)
         return np.arange(chunk.first_seed, last_seed), np.arange(chunk.first_point, last_point)
 

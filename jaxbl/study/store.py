@@ -40,13 +40,19 @@ def identity(config: Config, command: str = "sweep") -> str:
     """
     data = config.resolved()
     data["sweep"].pop("chunk", None)
-    if config.excitation.kind == "recorded":
-        # what was recorded counts, not where it lies
-        record = config.excitation.build()
-        data["excitation"]["file"] = hashlib.sha256(record.times.tobytes() + record.torques.tobytes()).hexdigest()
     for key in ("title", "notes", "figures", *_COMMANDS[command][2]):
         data.pop(key, None)
+    _name_by_content(data["excitation"], config.excitation)
+    if config.tune is not None and "holdout" in data.get("tune", {}):
+        _name_by_content(data["tune"]["holdout"], config.tune.holdout)
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _name_by_content(data: dict[str, Any], excitation: Any) -> None:
+    """What was recorded counts, not where it lies."""
+    if excitation.kind == "recorded":
+        record = excitation.build()
+        data["file"] = hashlib.sha256(record.times.tobytes() + record.torques.tobytes()).hexdigest()
 
 
 def mark(config: Config, command: str) -> dict[str, Any]:
