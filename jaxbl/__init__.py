@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from .report import write_sweep_report as write_sweep_report
     from .report import write_trial_report as write_trial_report
     from .report import write_tune_report as write_tune_report
+    from .report import write_verify_report as write_verify_report
     from .study.config import Config as Config
     from .study.config import read_config as read_config
     from .study.laws import Law as Law
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from .study.trial import run as run
     from .study.tune import Tuning as Tuning
     from .study.tune import tune as tune
+    from .study.verify import Verdict as Verdict
+    from .study.verify import verify as verify
 
 _WHERE = {
     "InputError": "errors",
@@ -30,6 +33,7 @@ _WHERE = {
     "write_sweep_report": "report",
     "write_trial_report": "report",
     "write_tune_report": "report",
+    "write_verify_report": "report",
     "Config": "study.config",
     "read_config": "study.config",
     "Law": "study.laws",
@@ -42,6 +46,8 @@ _WHERE = {
     "run": "study.trial",
     "Tuning": "study.tune",
     "tune": "study.tune",
+    "Verdict": "study.verify",
+    "verify": "study.verify",
 }
 
 

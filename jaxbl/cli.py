@@ -127,6 +127,24 @@ def tune(config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOpti
 
 
 @app.command()
+def verify(config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOption = False) -> None:
+    """Check the gain conditions on three levels: verdict, counterexamples, atlas. Goes on where it was interrupted."""
+    _start_jax()
+    from .report import write_verify_report
+    from .study.config import read_config
+    from .study.verify import verify as run_verify
+
+    study = read_config(config)
+    folder = _folder(config, out)
+    resume = shlex.join(["jaxbl", "verify", str(config), "--out", str(folder)])
+    with _naming(config, folder), _resumable(resume), _progress("runs") as progress:
+        verdict = run_verify(study, folder, progress=progress, overwrite=overwrite)
+    for line in write_verify_report(verdict, folder):
+        typer.echo(line)
+    typer.echo(f"{folder / 'report.html'}")
+
+
+@app.command()
 def plot(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder of a sweep", show_default=False)],
     config: Annotated[

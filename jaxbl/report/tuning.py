@@ -1,5 +1,7 @@
-"""Figures of a tuning: the objective over normalised gains, error against convergence time, and the comparison."""
+"""What `jaxbl tune` leaves to be read: the objective over normalised gains, error against convergence time, comparison."""
 
+import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +13,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from jaxbl.study.metrics import SIDE_METRICS
+from jaxbl.study.store import write_atomic
 from jaxbl.study.tune import Tuning
+from jaxbl.study.tune_summary import called_gains
 
 from .maps import _HATCH, SIDES, Drawn, _edges, _norm, condition_curves
+from .page import TableOf, html
+from .reports import save_all
 from .style import COLOURS, MAP, MISSING, style, with_unit
 
 _MARKS = ("o", "s", "^", "D", "v", "P", "X")
@@ -183,3 +189,135 @@ def _comparison(tuning: Tuning, sides: list[str]) -> Drawn:
         "of all runs, and the median (stroke). Hatched: some runs did not converge."
     )
     return Drawn("tuning_holdout", figure, caption)
+
+
+def write_tune_report(tuning: Tuning, folder: Path) -> list[str]:
+    """Write `gains.toml`, `tuning.json`, figures and report into a folder that exists. Returns lines for the terminal."""
+    summary = tuning.summary
+    lead = _tune_headline(summary)
+    write_atomic(folder / "gains.toml", gains_toml(summary))
+    write_atomic(folder / "tuning.json", json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False))
+    pictures = save_all(draw_tuning(tuning), folder)
+    page = html(
+        tuning.config.title or "Gains",
+        lead,
+        summary["remarks"],
+        pictures,
+        [
+            _gains_table(summary),
+            _comparison_table(f"{_holdout_title(summary)}, worst and median of all runs", summary["holdout"]["rows"]),
+            _comparison_table("On the study's own excitation, worst and median of all runs", summary["named"]),
+            *_pareto_tables(summary),
+        ],
+        tuning.config.to_toml(),
+    )
+    write_atomic(folder / "report.html", page)
+    return [*lead, *summary["remarks"]]
+
+
+def gains_toml(summary: dict[str, Any]) -> str:
+    """The chosen gains as TOML that a study can `include`; what they were chosen for stands in comments."""
+    margins, lines = summary["margins"], []
+    title = " ".join(summary["title"].split())
+    lines.append(f"# Gains chosen by 'jaxbl tune'{f' for: {title}' if title else ''}")
+    lines.append(f"# Objective: {summary['objective_metric']}; {_runs_behind(summary)}.")
+    asked = f"alpha / f+ {margins['alpha']:g}, lambda over the least of the exact condition {margins['exact']:g}"
+    lines.append(f"# Margins asked for: {asked}.")
+    lines.append('# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.')
+    for side, gains in summary["gains"].items():
+        found = summary["achieved"][side]
+        lines += [
+            "",
+            f"# f+ = {summary['f_plus'][side]:.4g} rad/s^2. Reached, the worst of all runs: velocity error "
+            f"{found['velocity_rmse']:.3g} rad/s rms,",
+            f"# torque error {found['torque_rmse']:.3g} N m rms, converged after {found['convergence_time']:.3g} s; "
+            f"margins {found['margin_alpha']:.3g} (alpha), {found['margin_exact']:.3g} (exact).",
+            f"[observer.{side}]",
+            f"lambda = {gains['lambda']!r}",
+            f"alpha = {gains['alpha']!r}",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _runs_behind(summary: dict[str, Any]) -> str:
+    first, last = summary["seeds"]
+    seeds, drives = last - first + 1, len(summary["scenarios"])
+    parts = [f"{seeds} noise seed{'s' * (seeds > 1)}", f"{drives} drive{'s' * (drives > 1)}"]
+    return " and ".join(parts)
+
+
+def _holdout_title(summary: dict[str, Any]) -> str:
+    held = summary["holdout"]
+    if held["same_excitation"]:
+        return "On the study's excitation with other noise"
+    return f"On the held-out excitation ({held['excitation']['kind']})"
+
+
+def _tune_headline(summary: dict[str, Any]) -> list[str]:
+    """Gains, and what they are worth on the held-out runs, in sentences."""
+    lines, metric = [], f"{summary['objective']}_rmse"
+    unit = SIDE_METRICS[metric].unit
+    for side, gains in summary["gains"].items():
+        found = summary["achieved"][side]
+        lines.append(
+            f"{side}: lambda = {gains['lambda']:.4g} √rad/s, alpha = {gains['alpha']:.4g} rad/s² "
+            f"({gains['lambda_ratio']:.3g} √f⁺, {gains['alpha_ratio']:.3g} f⁺): {summary['objective']} error "
+            f"{found[metric]:.3g} {unit} rms, converged after "
+            f"{found['convergence_time']:.3g} s, the worst of {_runs_behind(summary)}."
+        )
+    where = _holdout_title(summary)
+    where = where[0].lower() + where[1:]
+    rows = {(row["name"], row["side"]): row for row in summary["holdout"]["rows"]}
+    for side, others in summary["holdout"]["factors"].items():
+        parts = []
+        for name, factors in others.items():
+            called, row = called_gains(name), rows[name, side]
+            if "why_none" in factors:
+                parts.append(f"{called} converge in {100 * row['converged']:.3g} % of the runs")
+            else:
+                error, time = factors[metric]["worst"], row["convergence_time"]["worst"]
+                times = "as much" if error is None or f"{error:.3g}" == "1" else f"{error:.3g} times as much"
+                parts.append(f"{times} with {called} (converged after {time:.3g} s)")
+        tuned = rows["tuned", side]
+        error, time = tuned[metric]["worst"], tuned["convergence_time"]["worst"]
+        own = "none: runs diverge" if error is None else f"{error:.3g} {unit} rms"
+        after = "not converged in all runs" if time is None else f"converged after {time:.3g} s"
+        lines.append(f"{side}, {where}: worst {summary['objective']} error {own} ({after}); {'; '.join(parts)}.")
+    return lines
+
+
+def _gains_table(summary: dict[str, Any]) -> TableOf:
+    rows: list[list[object]] = []
+    for side, gains in summary["gains"].items():
+        found, step = summary["achieved"][side], summary["resolution"][side]
+        rows.append(
+            [side, gains["lambda"], gains["alpha"], gains["lambda_ratio"], gains["alpha_ratio"], summary["f_plus"][side],
+             found["velocity_rmse"], found["torque_rmse"], found["convergence_time"], found["margin_alpha"],
+             found["margin_exact"], found["peak_ratio"], 100 * max(step.values())]
+        )  # fmt: skip
+    columns = ["side", "λ (√rad/s)", "α (rad/s²)", "λ/√f⁺", "α/f⁺", "f⁺ (rad/s²)", "velocity error (rad/s)",
+               "torque error (N m)", "convergence (s)", "margin α", "margin exact", "ρ", "last step (%)"]  # fmt: skip
+    return TableOf("Chosen gains, worst of all runs", columns, rows)
+
+
+def _comparison_table(heading: str, found: list[dict[str, Any]]) -> TableOf:
+    rows: list[list[object]] = [
+        [row["side"], row["name"], row["lambda"], row["alpha"], 100.0 * row["converged"],
+         *(row[name][how] for name in ("velocity_rmse", "torque_rmse") for how in ("worst", "median")),
+         row["convergence_time"]["worst"], row["margin_alpha"], row["margin_exact"], row["peak_ratio"]]
+        for row in sorted(found, key=lambda row: SIDES.index(row["side"]))
+    ]  # fmt: skip
+    columns = ["side", "gains", "λ", "α", "converged (%)", "velocity error (rad/s)", "median", "torque error (N m)",
+               "median", "convergence (s)", "margin α", "margin exact", "ρ"]  # fmt: skip
+    return TableOf(heading, columns, rows)
+
+
+def _pareto_tables(summary: dict[str, Any]) -> list[TableOf]:
+    unit = SIDE_METRICS[f"{summary['objective']}_rmse"].unit
+    columns = ["λ", "α", "λ/√f⁺", "α/f⁺", "convergence time (s)", f"{summary['objective']} error ({unit})"]
+    return [
+        TableOf(
+            f"No gains beat these in both convergence time and error: {side}", columns, [list(row.values()) for row in rows]
+        )
+        for side, rows in summary["pareto"].items()
+    ]

@@ -5,6 +5,10 @@ and lambda / sqrt(f_plus). "drive": the study's points with ideal encoders and t
 true f_plus along its run. "sampled": the study as it stands, with its period, quantisation and noise.
 """
 
+# pandas' own annotations are wider than what its methods return
+# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
+# pyright: reportReturnType=false
+
 import dataclasses
 import json
 from collections.abc import Callable, Mapping
@@ -334,12 +338,14 @@ def _judge(config: Config, level: str, side: str, frame: pd.DataFrame) -> tuple[
             if failed.any():
                 extra = {"level": level, "side": side, "condition": name, "bound": bound}
                 counterexamples.append(frame[failed].assign(row=np.flatnonzero(failed), **extra))
-    ratio = (frame[bounds["true"]] / frame[bounds["claimed"]])[converged].replace([np.inf, -np.inf], np.nan).dropna()
+    worked = frame[converged]
+    ratio = (worked[bounds["true"]] / worked[bounds["claimed"]]).replace([np.inf, -np.inf], np.nan).dropna()
     claimed = {
         "definition": "twice the largest acceleration",
         "converged_runs": len(ratio),
         "too_small": float((ratio > 1.0).mean()) if len(ratio) else None,
         "true_over_claimed": {"median": ratio.median(), "max": ratio.max()},
+        "by_input": _by_input(config, worked.assign(too_small=ratio > 1.0), bounds),
         "conditions": summaries["claimed"],
     }
     summary = {
@@ -353,6 +359,23 @@ def _judge(config: Config, level: str, side: str, frame: pd.DataFrame) -> tuple[
     }
     found = pd.concat(counterexamples, ignore_index=True) if counterexamples else pd.DataFrame({"bound": [], "row": []})
     return summary, found
+
+
+def _by_input(config: Config, worked: pd.DataFrame, bounds: dict[str, str]) -> list[dict[str, Any]]:
+    """True and claimed bound (medians, rad/s^2) for each combination of what excites the drive, over runs that converged."""
+    kinds = ("excitation.", "transmission.", "drive.")
+    keys = [axis.path for axis in config.axes if axis.path.startswith(kinds) and axis.path in worked]
+    found = []
+    for values, part in worked.groupby(keys, sort=True) if keys else []:
+        found.append(
+            {
+                "input": dict(zip(keys, values, strict=True)),
+                "converged_runs": len(part),
+                **{bound: part[column].median() for bound, column in bounds.items()},
+                "too_small": float(part["too_small"].mean()),
+            }
+        )
+    return found
 
 
 def _explained(found: pd.DataFrame, study: Config, explain: Callable[[pd.DataFrame], pd.Series]) -> pd.DataFrame:
