@@ -36,7 +36,7 @@ from .sweep import sweep
 SWITCHING_LIMIT = 0.02
 """Relative distance from lambda^2 = 4 c2, the switching limit of the closed form, within which the two are not compared."""
 
-_MOST_EXPLAINED = 1024
+_MOST_EXPLAINED = 4096
 _MOST_LISTED = 200
 _CELLS = 8192
 
