@@ -76,7 +76,7 @@ class Points:
         first = {}
         for i, axis in enumerate(config.axes):
             ends = axis.values if axis.values is not None else [axis.start, axis.stop]
-            for value in ends:
+            for value in _extremes(ends):
                 try:
                     with_values(config, {axis.path: value})
                 except InputError as error:
@@ -131,6 +131,13 @@ class Points:
             if len(set(zip(*(column.tolist() for column in columns.values()), strict=True))) < len(blocks[index]):
                 raise InputError(f"axes: the axes zipped as '{label}' list a point twice; their points should differ")
         return blocks
+
+
+def _extremes(values: list[Any]) -> list[Any]:
+    """The first, least and largest of many numbers: what a key may be is an interval. Other lists as they are."""
+    if len(values) <= 16 or any(isinstance(value, str) for value in values):
+        return values
+    return [values[0], min(values), max(values)]
 
 
 def _take(blocks: list[Block], indices: np.ndarray) -> Columns:
