@@ -20,7 +20,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-import pyarrow.parquet as pq
 
 from jaxbl.errors import InputError
 from jaxbl.observer.conditions import CONDITIONS, least_lambda_davila_fridman, peak_ratio
@@ -32,7 +31,6 @@ from .points import Points
 from .store import claim, mark, plain, write_atomic
 from .sweep import sweep
 
-# a difference of the peak ratio above this would tell the simulation from the closed form
 SWITCHING_LIMIT = 0.02
 """Relative distance from lambda^2 = 4 c2, the switching limit of the closed form, within which the two are not compared."""
 
@@ -230,30 +228,40 @@ def _normalised(config: Config, work: Path | None, devices: list[Any]) -> Normal
     alpha, lambda_ = settings.alpha_ratio.values(), settings.lambda_ratio.values()
     cells = [c.ravel() for c in np.meshgrid(lambda_, alpha, indexing="ij")]
     shape = (len(lambda_), len(alpha))
-    kept = None if work is None else work / "normalised.parquet"
-    with jax.enable_x64(True):
+    dampings = [0.0, *settings.damping]
 
-        def both(x: Any, a: Any) -> Any:
-            one = jnp.ones_like(x)
-            return half_cycle(x, a, one).ratio, peak_ratio(x, a, one)
+    def both(x: Any, a: Any) -> Any:
+        one = jnp.ones_like(x)
+        return half_cycle(x, a, one).ratio, peak_ratio(x, a, one)
 
-        if kept is not None and kept.exists() and pq.read_metadata(kept).num_rows == len(cells[0]):
-            frame = pd.read_parquet(kept)
-            ratio, closed = (frame[name].to_numpy() for name in ("ratio", "closed_form"))
-        else:
-            ratio, closed = _over_cells(both, cells, devices)
-        # from a smaller lambda on: the boundary of a coarse map is as sharp as that of a fine one
-        dampings = [0.0, *settings.damping]
+    def plane() -> pd.DataFrame:
+        ratio, closed = _over_cells(both, cells, devices)
+        return pd.DataFrame({"lambda_ratio": cells[0], "alpha_ratio": cells[1], "ratio": ratio, "closed_form": closed})
+
+    def borders() -> pd.DataFrame:
+        # by bisection: as sharp on a coarse map as on a fine one
         columns = [np.tile(alpha, len(dampings)), np.repeat(dampings, len(alpha))]
         (least,) = _over_cells(lambda a, d: least_lambda_simulated(a, jnp.ones_like(a), damping=d), columns, devices)
-    boundaries = dict(zip(dampings, least.reshape(len(dampings), -1), strict=True))
-    if kept is not None and not kept.exists():
-        frame = pd.DataFrame({"lambda_ratio": cells[0], "alpha_ratio": cells[1], "ratio": ratio, "closed_form": closed})
-        draft = kept.with_suffix(".draft")
-        frame.to_parquet(draft, index=False)
-        draft.replace(kept)
-    boundary = boundaries.pop(0.0)
-    return Normalised(alpha, lambda_, ratio.reshape(shape), closed.reshape(shape), boundary, boundaries)
+        return pd.DataFrame({"alpha_ratio": columns[0], "damping": columns[1], "least_lambda_ratio": least})
+
+    with jax.enable_x64(True):
+        map_ = _kept(work and work / "normalised.parquet", plane)
+        boundary = _kept(work and work / "boundaries.parquet", borders)["least_lambda_ratio"].to_numpy()
+    ratio, closed = (map_[name].to_numpy().reshape(shape) for name in ("ratio", "closed_form"))
+    boundaries = dict(zip(dampings, boundary.reshape(len(dampings), -1), strict=True))
+    return Normalised(alpha, lambda_, ratio, closed, boundaries.pop(0.0), boundaries)
+
+
+def _kept(path: Path | None, compute: Callable[[], pd.DataFrame]) -> pd.DataFrame:
+    """A table from its file, or computed and kept there."""
+    if path is not None and path.exists():
+        return pd.read_parquet(path)
+    table = compute()
+    if path is not None:
+        draft = path.with_suffix(".draft")
+        table.to_parquet(draft, index=False)
+        draft.replace(path)
+    return table
 
 
 def demanded_lambda(config: Config, alpha: np.ndarray, f_plus: np.ndarray) -> dict[str, np.ndarray]:
