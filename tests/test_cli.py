@@ -160,7 +160,8 @@ BAD = {
     ),
     "nothing to verify": (
         ["verify", "study.toml"],
-        "study.toml: axes: verify needs axes over both gains of an observer, such as observer.motor.alpha and observer.motor.lambda",
+        "study.toml: axes: verify needs axes over both gains of an observer, "
+        "such as observer.motor.alpha and observer.motor.lambda",
     ),
     "q of no condition": (["verify", "q.toml"], "q.toml: verify.q: should be less than 1, not 1.2"),
     "no gain above f_plus": (

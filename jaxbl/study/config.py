@@ -781,7 +781,7 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     Raises:
         InputError: a path that does not exist (the nearest valid one is named), or a value out of range.
     """
-    data = copy.deepcopy(config.resolved())
+    data = config.resolved()
     known = numeric_paths(config)
     for path, value in values.items():
         if path not in known:
