@@ -87,7 +87,13 @@ def sweep(
         check_figures(study, study.figures, metric_columns(study.build()))
         if dry_run:
             cost = estimate_cost(study)
-            typer.echo(f"points       {cost.points} ({cost.rows} runs with all seeds)")
+            refined = study.sweep.refine is not None
+            coarse = " on the coarse grid" if refined else ""
+            typer.echo(f"points       {cost.points}{coarse} ({cost.rows} runs with all seeds)")
+            if refined:
+                typer.echo(
+                    f"refinement   at most {cost.most_points} points; as many as the boundaries need, not counted below"
+                )
             typer.echo(f"chunks       {cost.chunks} of {cost.lanes_a_chunk} lanes")
             typer.echo(f"memory       {cost.megabytes:.1f} MB a chunk")
             typer.echo(f"compilation  about {_duration(cost.compile_seconds)}")

@@ -24,8 +24,11 @@ from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.study.config import Config, FigureTable, nearest, numeric_paths
 from jaxbl.study.laws import Law, accuracy_laws, check_selection, fixed_values, selected
 from jaxbl.study.metrics import describe
+from jaxbl.study.points import Points
+from jaxbl.study.refine import is_boolean
 from jaxbl.study.sweep import StudyResult
 
+from .refined import Filling, on_coarse_values
 from .style import COLOURS, MAP, MISSING, style, with_unit
 
 _CURVES = {
@@ -37,7 +40,6 @@ _CURVES = {
 }
 _HATCH = (1.0, 1.0, 1.0, 0.45)
 SIDES = ("motor", "load")
-_BOOLEAN = ("converged", "finite")
 
 
 class Drawn(NamedTuple):
@@ -73,13 +75,16 @@ def draw(result: StudyResult) -> list[Drawn]:
     config = result.config
     figures = config.figures or default_figures(config)
     check_figures(config, figures, result.columns)
+    points = Points(config) if config.sweep.refine is not None else None
     drawn, names = [], set()
     laws = accuracy_laws(result, figures)
     for i, figure in enumerate(figures):
         wanted = {figure.value, "finite", *(f"{side}.{name}" for side in SIDES for name in ("converged", "f_plus"))}
         frame = result.read([*(axis.path for axis in config.axes), *(c for c in result.columns if c in wanted)])
+        if points is not None:
+            frame = on_coarse_values(points, frame, [figure.x, figure.y or figure.x])
         if figure.kind == "heatmap":
-            drawing = _heatmap(config, frame, figure)
+            drawing = _heatmap(config, frame, figure, points)
         elif figure.theory is not None:
             drawing = _laws(config, frame, figure, [law for law in laws if law.figure == i])
         else:
@@ -130,11 +135,7 @@ def _is_magnitude(value: str) -> bool:
 def _reduce(frame: pd.DataFrame, keys: list[str], value: str) -> pd.Series:
     """One number for each combination of keys: the median over what else varies, or the share that is true."""
     groups = frame.groupby(keys, sort=True)[value]
-    return groups.mean() if _is_boolean(value) else groups.median()
-
-
-def _is_boolean(value: str) -> bool:
-    return value.rpartition(".")[2] in _BOOLEAN
+    return groups.mean() if is_boolean(value) else groups.median()
 
 
 def _over(config: Config, frame: pd.DataFrame, spec: FigureTable) -> str:
@@ -150,7 +151,7 @@ def _over(config: Config, frame: pd.DataFrame, spec: FigureTable) -> str:
         others = [path for path in others if path not in _sampled(config)]
     if config.sweep.seeds > 1:
         others.append(f"{config.sweep.seeds} seeds")
-    return f"; {'share' if _is_boolean(spec.value) else 'median'} over {', '.join(others)}" if others else ""
+    return f"; {'share' if is_boolean(spec.value) else 'median'} over {', '.join(others)}" if others else ""
 
 
 def _sampled(config: Config) -> list[str]:
@@ -223,15 +224,21 @@ def _table(part: pd.DataFrame, keys: list[str], value: str) -> pd.Series:
     return table if value == "finite" else table.where(_reduce(part, keys, "finite") == 1.0)
 
 
-def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
+def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable, points: Points | None) -> Drawn:
+    """A map; with `points` of a refined study, those that were not simulated show the nearest that was."""
     assert spec.y is not None
     with style():
         panels = _panels(config, frame, spec.facet)
         keys = [spec.y, spec.x]
+        filling = None
+        if points is not None:
+            filling = Filling(points, frame, spec.x, spec.y)
+            others = [axis.path for axis in config.axes if axis.path not in (*keys, spec.facet)]
+            panels = [(title, filling.complete(part, others)) for title, part in panels]
         tables = [_table(part, keys, spec.value) for _, part in panels]
         norm = (
             Normalize(0.0, 1.0)
-            if _is_boolean(spec.value)
+            if is_boolean(spec.value)
             else _norm(np.concatenate([t.to_numpy(float) for t in tables]), spec.scale)
         )
         figure, axes = _grid_of_axes(len(panels), 3.5, 3.4, extra=1.0)
@@ -242,16 +249,20 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
         for ax, (title, part), table in zip(axes, panels, tables, strict=True):
             ax.grid(False)
             ax.set_facecolor(MISSING if gridded else "white")
-            xs, ys = (np.sort(part[path].unique()).astype(float) for path in (spec.x, spec.y))
+            if filling is None:
+                xs, ys = (np.sort(part[path].unique()).astype(float) for path in (spec.x, spec.y))
+            else:
+                xs, ys, grid = filling.dense(table)
             logs = [_is_log(config, path, v) for path, v in ((spec.x, xs), (spec.y, ys))]
             if logs[0]:
                 ax.set_xscale("log")
             if logs[1]:
                 ax.set_yscale("log")
             if gridded:
-                grid = table.unstack().to_numpy(float)
+                if filling is None:
+                    grid = table.unstack().to_numpy(float)
                 ax.pcolormesh(_edges(xs, logs[0]), _edges(ys, logs[1]), grid, cmap=MAP, norm=norm, rasterized=True)
-                outline = _outline(ax, part, spec, (xs, ys), logs)
+                outline = _outline(ax, part, spec, (xs, ys), logs, filling)
                 handles = handles or ([] if outline is None else [outline])
             else:
                 shown = _shown(part, spec.value)
@@ -265,7 +276,8 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
                 ax.plot(best[0], best[1], "*", ms=13, mfc="white", mec="black", mew=1.0, clip_on=False, zorder=5)
                 under.append(f"best ★ {best[2]:.2g} {describe(spec.value).unit}".rstrip())
             if spec.overlays:
-                bound = _bound(part, spec)
+                # most points of a refined study lie at its boundary, and would count for more than others
+                bound = _bound(part if points is None else part[points.always_simulated(part)], spec)
                 curves = _overlay(ax, bound, spec, xs, ys)
                 under.append(f"f⁺ = {bound:.3g} rad/s²")
             ax.set_title("\n".join(line for line in (title, ",  ".join(under)) if line))
@@ -318,7 +330,12 @@ def _best(table: pd.Series, part: pd.DataFrame, spec: FigureTable) -> tuple[floa
 
 
 def _outline(
-    ax: Axes, part: pd.DataFrame, spec: FigureTable, centres: tuple[np.ndarray, np.ndarray], logs: list[bool]
+    ax: Axes,
+    part: pd.DataFrame,
+    spec: FigureTable,
+    centres: tuple[np.ndarray, np.ndarray],
+    logs: list[bool],
+    filling: Filling | None,
 ) -> Patch | None:
     """Mark where the observer does not keep its tolerance."""
     side = spec.value.partition(".")[0]
@@ -326,7 +343,8 @@ def _outline(
     if column not in part or spec.value == column:
         return None
     assert spec.y is not None
-    share = _reduce(part, [spec.y, spec.x], column).unstack().to_numpy(float)
+    shares = _reduce(part, [spec.y, spec.x], column)
+    share = shares.unstack().to_numpy(float) if filling is None else filling.dense(shares)[2]
     if not share.min() < 0.5:
         return None
     # out to the edges of the outer cells
@@ -385,11 +403,11 @@ def _lines(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
             for i, (name, group) in enumerate(groups):
                 values = shown.loc[group.index]
                 by_x = values.groupby(group[spec.x], sort=True)
-                middle = by_x.mean() if _is_boolean(spec.value) else by_x.median()
+                middle = by_x.mean() if is_boolean(spec.value) else by_x.median()
                 colour = COLOURS[i % len(COLOURS)]
                 label = None if spec.series is None else f"{name if isinstance(name, str) else f'{name:g}'}"
                 ax.plot(middle.index, middle, "o" if sampled else "o-", ms=3.5, color=colour, label=label)
-                if (by_x.size() > 1).any() and not _is_boolean(spec.value):
+                if (by_x.size() > 1).any() and not is_boolean(spec.value):
                     band = "; band: least to largest"
                     ax.fill_between(middle.index, by_x.min(), by_x.max(), color=colour, alpha=0.18, linewidth=0)
             xs = np.sort(part[spec.x].unique()).astype(float)

@@ -12,6 +12,7 @@ import pandas as pd
 
 from jaxbl.study.laws import AGREEMENT, END_OF_SWEEP, Law, accuracy_laws
 from jaxbl.study.metrics import SIDE_METRICS
+from jaxbl.study.points import Points
 from jaxbl.study.store import Store, write_atomic
 from jaxbl.study.sweep import StudyResult
 from jaxbl.study.trial import Trial
@@ -50,11 +51,26 @@ def headline(result: StudyResult) -> list[str]:
     """What a study found, in sentences."""
     sides = [side for side in SIDES if f"{side}.converged" in result.columns]
     figures = [f"{side}.{name}" for side in sides for name in ("converged", "velocity_rmse")]
-    frame = result.read([*(axis.path for axis in result.config.axes), "finite", *figures])
-    shares = ", ".join(f"{100 * frame[f'{side}.converged'].mean():.1f} % ({side})" for side in sides)
-    lines = [f"{len(frame)} runs. The observers converged in {shares} of them."]
-    if isinstance(result.source, Store) and len(frame) < result.source.manifest["rows"]:
-        lines.append(f"The study is not finished: it has {result.source.manifest['rows']} runs. Go on with 'jaxbl sweep'.")
+    frame = result.read([*(axis.path for axis in result.config.axes), "seed", "finite", *figures])
+    # a refined study has most of its runs at the boundary: shares of them all would say nothing
+    refined = result.config.sweep.refine is not None
+    points = Points(result.config) if refined else None
+    even = frame if points is None else frame[points.always_simulated(frame)]
+    shares = ", ".join(f"{100 * even[f'{side}.converged'].mean():.1f} % ({side})" for side in sides)
+    if points is None:
+        lines = [f"{len(frame)} runs. The observers converged in {shares} of them."]
+    else:
+        simulated = len(frame) // result.config.sweep.seeds
+        share = 100 * simulated / len(points)
+        lines = [
+            f"{simulated} of {len(points)} grid points simulated ({share:.2g} %), {len(frame)} runs. "
+            f"The observers converged in {shares} of those on the coarse grid."
+        ]
+    if isinstance(result.source, Store):
+        manifest = result.source.manifest
+        if len(frame) < manifest["rows"] or (refined and not manifest["finished"]):
+            more = " so far" if refined and not manifest["finished"] else ""
+            lines.append(f"The study is not finished: it has {manifest['rows']} runs{more}. Go on with 'jaxbl sweep'.")
     diverged = int((~frame["finite"].astype(bool)).sum())
     if diverged:
         lines.append(f"{diverged} runs diverged: they are in the table with finite = false, and grey in the figures.")

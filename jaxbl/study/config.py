@@ -30,6 +30,8 @@ from jaxbl.observer.recursive import Identifier
 from jaxbl.observer.super_twisting import OBSERVERS, AbstractSuperTwisting, Observers
 from jaxbl.simulate import Experiment, Run
 
+from .refine import TOLERANCE, is_boolean
+
 
 def nearest(word: str, words: Any) -> str:
     """A hint that names the nearest valid word, or all of them where none is near."""
@@ -209,16 +211,47 @@ class RunTable(Table):
 class SweepTable(Table):
     """How the axes are combined and repeated."""
 
-    seeds: int = Field(default=1, ge=1, le=1_000_000_000, description="number of noise seeds, each run at every point")
-    first_seed: int = Field(
-        default=0, ge=0, le=1_000_000_000, description="first noise seed; seeds are first_seed ... first_seed + seeds - 1"
+    seeds: int = Field(
+        default=1, ge=1, le=1_000_000_000, description="noise seeds first_seed, first_seed + 1, ..., each run at every point"
     )
+    first_seed: int = Field(default=0, ge=0, le=2**31 - 1, description="first of the noise seeds")
     design: Literal["grid", "sobol", "latin_hypercube"] = Field(
         default="grid", description="grid: all combinations; else quasi-random points over the axes without num or values"
     )
     points: int | None = Field(default=None, ge=1, le=100_000_000, description="number of quasi-random points")
     design_seed: int = Field(default=0, ge=0, description="seed of the quasi-random design")
     chunk: int | None = Field(default=None, ge=1, description="lanes computed at once; left out: chosen for the machine")
+    refine: int | None = Field(
+        default=None,
+        ge=1,
+        le=30,
+        description="how often to halve the grid where neighbours disagree, along the axes with start, stop and num; "
+        "left out: never",
+    )
+    refine_metric: str | None = Field(
+        default=None,
+        description="metric in which neighbours are compared; left out: converged, of observers whose gains are refined, "
+        "else of all",
+    )
+    refine_tolerance: float | None = Field(
+        default=None,
+        gt=0.0,
+        description=f"relative difference beyond which they disagree in a numeric refine_metric; left out: {TOLERANCE:g}",
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> "SweepTable":
+        def wrong(message: str, **context: Any) -> PydanticCustomError:
+            return PydanticCustomError("sweep", message, context)  # type: ignore[arg-type]
+
+        for key in ("refine_metric", "refine_tolerance"):
+            if self.refine is None and getattr(self, key) is not None:
+                raise wrong("{key} needs refine, the number of times that the grid is halved", key=key)
+        if self.refine_tolerance is not None and (self.refine_metric is None or is_boolean(self.refine_metric)):
+            raise wrong("refine_tolerance needs a numeric refine_metric, e.g. 'motor.velocity_rmse'")
+        if self.refine is not None and self.design != "grid":
+            raise wrong("refine needs design = 'grid'; points of a {design} design have no neighbours", design=self.design)
+        return self
 
 
 class UncertaintyTable(Table):
@@ -412,13 +445,16 @@ class AxisTable(Table):
             raise wrong("axis {path}: num = 1 cannot span start ... stop; use values = [...] or num >= 2")
         return self
 
-    def grid(self) -> np.ndarray:
-        """The values of the axis, in its order; not for an axis that is sampled quasi-randomly (neither num nor values)."""
+    def grid(self, depth: int = 0) -> np.ndarray:
+        """The values of the axis, in its order; not for an axis that is sampled quasi-randomly (neither num nor values).
+
+        Halved `depth` times: every 2^depth-th is then, to the bit, what it is without halving.
+        """
         if self.values is not None:
             return np.array(self.values, dtype=object if any(isinstance(v, str) for v in self.values) else None)
         assert self.start is not None and self.stop is not None and self.num is not None
         space = np.geomspace if self.scale == "log" else np.linspace
-        return space(self.start, self.stop, self.num)
+        return space(self.start, self.stop, (self.num - 1 << depth) + 1)
 
 
 class FigureTable(Table):
@@ -733,7 +769,7 @@ def _describe(error: ValidationError) -> tuple[Key, str]:
     message = first["msg"].removeprefix("Input ")
     if kind == "unknown_key":
         return (*place, context["key"]), f"{where}{message}"
-    if kind in ("period", "axis", "figure", "range", "consistency"):
+    if kind in ("period", "sweep", "axis", "figure", "range", "consistency"):
         return place, f"{where}{message}"
     return place, f"{where}{message}, not {given}"
 

@@ -38,12 +38,23 @@ class Layout(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """One call of a compiled program: group, first seed and first point."""
+    """One call of a compiled program: every one of some seeds at every one of some points of a group.
+
+    Attributes:
+        index: number of the chunk in its study.
+        group: index of the group.
+        seeds: as many as the layout's, or fewer.
+        points: indices of points of the group, as many as the layout's, or fewer.
+    """
 
     index: int
     group: int
-    first_seed: int
-    first_point: int
+    seeds: np.ndarray
+    points: np.ndarray
+
+
+REFINED_LANES_PER_DEVICE = 1024
+"""The same in a refined study: its batches are small, and fill larger chunks badly (benchmarks/NOTES.md)."""
 
 
 def precision(config: Config) -> Any:
@@ -61,6 +72,8 @@ def layout_for(config: Config, points: Points, devices: int) -> Layout:
 
     Every device gets two lanes or more: one alone is compiled to other roundings than a row of them.
     """
+    if points.refinement is not None:
+        return _refined_layout(config, devices)
     capacity = config.sweep.chunk or LANES_PER_DEVICE * devices
     # chunks of equal size waste no padding on the last one; a multiple of the devices, along the longer side, suits them
     per_chunk = math.ceil(points.lanes / math.ceil(points.lanes / capacity))
@@ -72,6 +85,13 @@ def layout_for(config: Config, points: Points, devices: int) -> Layout:
     elif points.lanes < devices:
         seeds = math.ceil(seeds / devices) * devices
     return Layout(seeds, per_chunk)
+
+
+def _refined_layout(config: Config, devices: int) -> Layout:
+    """Several seeds before whole rows of points: a batch has few points, and needs all seeds of them."""
+    capacity = config.sweep.chunk or REFINED_LANES_PER_DEVICE * devices
+    seeds = min(config.sweep.seeds, max(capacity // (64 * devices), 1))
+    return Layout(seeds, max(math.ceil(capacity / seeds / devices), 2) * devices)
 
 
 class Engine:
@@ -93,51 +113,70 @@ class Engine:
         self._compiled: tuple[int, tuple[Any, list[str]]] | None = None
 
     def __len__(self) -> int:
-        """Number of chunks."""
-        return sum(1 for _ in self.chunks())
+        """Number of chunks; of a refined study, those of its coarse grid."""
+        return len(self.points.groups) * self.chunks_for(self.points.coarse_lanes)
+
+    def chunks_for(self, points: int) -> int:
+        """Number of chunks that some points of a group take."""
+        return math.ceil(self.config.sweep.seeds / self.layout.seeds) * math.ceil(points / self.layout.points)
 
     def chunks(self) -> Iterator[Chunk]:
+        """All chunks; of a refined study, those of its coarse grid."""
         index = 0
         for group in range(len(self.points.groups)):
-            first = self.config.sweep.first_seed
-            for seed in range(first, first + self.config.sweep.seeds, self.layout.seeds):
-                for point in range(0, self.points.lanes, self.layout.points):
-                    yield Chunk(index, group, seed, point)
+            for seeds in self._seeds():
+                for first in range(0, self.points.coarse_lanes, self.layout.points):
+                    last = min(first + self.layout.points, self.points.coarse_lanes)
+                    yield Chunk(index, group, seeds, self.points.coarse(np.arange(first, last)))
                     index += 1
+
+    def split(self, group: int, points: np.ndarray, first_index: int = 0) -> list[Chunk]:
+        """Chunks for any points of a group, given by their indices `(points,)`, with all seeds; numbered from `first_index`.
+
+        They share the compiled program of all chunks. Points come in their order, all of them for some seeds first.
+        """
+        parts = [points[first : first + self.layout.points] for first in range(0, len(points), self.layout.points)]
+        crossed = [(seeds, part) for seeds in self._seeds() for part in parts]
+        return [Chunk(index, group, *both) for index, both in enumerate(crossed, first_index)]
+
+    def _seeds(self) -> Iterator[np.ndarray]:
+        """All seeds, as many at once as a chunk takes."""
+        end = self.config.sweep.first_seed + self.config.sweep.seeds
+        for first in range(self.config.sweep.first_seed, end, self.layout.seeds):
+            yield np.arange(first, min(first + self.layout.seeds, end))
 
     @property
     def rows(self) -> int:
-        """Rows of the result: points times seeds."""
-        return len(self.points) * self.config.sweep.seeds
+        """Rows of all chunks: points times seeds."""
+        return len(self.points.groups) * self.points.coarse_lanes * self.config.sweep.seeds
 
     def run(self, chunk: Chunk) -> pd.DataFrame:
         """Compute one chunk: a frame of one row for each seed and point, padding taken off."""
         group = self.points.groups[chunk.group]
         program, names = self._program(chunk.group)
-        seeds, indices = self.contents(chunk)
-        columns = self.points.columns(indices)
         with precision(group.config):
-            given = self._arguments(group.config, columns, seeds)
+            given = self._arguments(group.config, self.points.columns(chunk.points), chunk.seeds)
             start = time.perf_counter()
             figures = jax.block_until_ready(with_conditions(*program(*given)))
             self.run_seconds += time.perf_counter() - start
-        shape = (len(seeds), len(indices))
+        data = self.labels(chunk)
+        for name in names:
+            data[name] = np.asarray(figures[name])[: len(chunk.seeds), : len(chunk.points)].ravel()
+        return pd.DataFrame(data)
+
+    def labels(self, chunk: Chunk) -> dict[str, np.ndarray]:
+        """What tells the rows of a chunk apart: values by axis path, and seeds."""
+        columns = self.points.columns(chunk.points)
+        structural = self.points.groups[chunk.group].structural
+        shape = (len(chunk.seeds), len(chunk.points))
         data = {}
         for path in self.points.paths:
             if path in columns:
                 data[path] = np.broadcast_to(columns[path], shape).ravel()
             else:
-                data[path] = np.full(shape, group.structural[path]).ravel()
-        data["seed"] = np.broadcast_to(seeds[:, None], shape).ravel()
-        for name in names:
-            data[name] = np.asarray(figures[name])[: shape[0], : shape[1]].ravel()
-        return pd.DataFrame(data)
-
-    def contents(self, chunk: Chunk) -> tuple[np.ndarray, np.ndarray]:
-        """Seeds and point indices of a chunk."""
-        last_seed = min(chunk.first_seed + self.layout.seeds, self.config.sweep.first_seed + self.config.sweep.seeds)
-        last_point = min(chunk.first_point + self.layout.points, self.points.lanes)
-        return np.arange(chunk.first_seed, last_seed), np.arange(chunk.first_point, last_point)
+                data[path] = np.full(shape, structural[path]).ravel()
+        data["seed"] = np.broadcast_to(chunk.seeds[:, None], shape).ravel()
+        return data
 
     def _arguments(self, config: Config, columns: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[Any, Any]:
         """Padded arrays for a compiled program: values by path, seeds."""
@@ -186,7 +225,7 @@ class Engine:
             return program, metric_columns(experiment)
 
     def estimate(self) -> "Estimate":
-        """Memory and time of the whole study, from a compilation and a short run at the same chunk shape."""
+        """Memory and time of all chunks, from a compilation and a short run at the same chunk shape."""
         config = self.points.groups[0].config
         # long enough for what a run costs once not to count
         short = min(config.run.steps, 2000)
@@ -208,8 +247,9 @@ class Engine:
         steps = [group.config.run.steps for group in self.points.groups]
         chunks_a_group = len(self) // len(steps)
         return Estimate(
-            points=len(self.points),
+            points=len(self.points.groups) * self.points.coarse_lanes,
             rows=self.rows,
+            most_points=len(self.points),
             chunks=len(self),
             lanes_a_chunk=math.prod(self.layout),
             compile_seconds=compiling * len(steps),
@@ -221,10 +261,23 @@ class Engine:
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """What a study will cost."""
+    """What a study will cost; a refined one, what its coarse grid will cost.
+
+    Attributes:
+        points: points that are simulated in any case.
+        rows: these with all seeds.
+        most_points: points of the study; of a refined one, those of its fine grid.
+        chunks: chunks for `rows`.
+        lanes_a_chunk: lanes of each.
+        compile_seconds: time of all compilations.
+        run_seconds: time of all chunks.
+        lane_steps_per_second: measured rate.
+        megabytes: memory of a chunk, MB.
+    """
 
     points: int
     rows: int
+    most_points: int
     chunks: int
     lanes_a_chunk: int
     compile_seconds: float

@@ -2,9 +2,12 @@
 
 Axes over leaves of the experiment become lanes of one compiled program. Axes over what is fixed at compile time (sampling
 period, substeps, discretisation, ...) are outermost and split the study into groups, each compiled once.
+
+A refined study has the points of its fine grid; those of the coarse grid, where it begins, are among them.
 """
 
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,11 +15,15 @@ import numpy as np
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.errors import InputError
 
-from .config import AxisTable, Config, with_values
+from .config import AxisTable, Config, nearest, with_values
+from .metrics import metric_columns
+from .refine import TOLERANCE, Criterion, Grid
 
 Columns = dict[str, np.ndarray]
 
 _MOST_RUNS = 1e10
+_MOST_VALUES = 10_000_000
+"""Of one axis: its values are kept."""
 
 
 class Block(NamedTuple):
@@ -35,6 +42,14 @@ class Group(NamedTuple):
     structural: dict[str, Any]
 
 
+class Refinement(NamedTuple):
+    """How a study is refined: the axes, their grid with all lane axes, and when neighbours disagree."""
+
+    paths: list[str]
+    grid: Grid
+    criterion: Criterion
+
+
 class Points:
     """All points of a study, first axis slowest, structural axes outermost.
 
@@ -42,6 +57,8 @@ class Points:
         paths: axis paths in the order of the config.
         groups: one for each combination of structural values.
         lanes: points of each group.
+        coarse_lanes: points of each group that are always simulated: all of them, or the coarse grid of a refined study.
+        refinement: how the study is refined, if it is.
     """
 
     def __init__(self, config: Config):
@@ -50,13 +67,27 @@ class Points:
             if path in self.paths[:i]:
                 raise InputError(f"axes[{i}]: path '{path}' has an axis already; each path may have one")
         base, self.leaves = self._check(config)
-        blocks = self._blocks(config)
+        refined = self._refined(config)
+        depth = config.sweep.refine or 0
+        blocks = self._blocks(config, dict.fromkeys(refined, depth))
         structural = [b for b in blocks if not all(path in self.leaves for path in b.columns)]
         self._blocks_of_leaves = [b for b in blocks if all(path in self.leaves for path in b.columns)]
         self.lanes = math.prod(len(b) for b in self._blocks_of_leaves)
-        runs = math.prod(len(b) for b in blocks) * config.sweep.seeds
-        if runs > _MOST_RUNS:
+        self.refinement: Refinement | None = None
+        self.coarse_lanes = self.lanes
+        if refined:
+            halved = [next(iter(b.columns)) in refined for b in self._blocks_of_leaves]
+            sizes = [(len(b) - 1 >> depth) + 1 if h else len(b) for b, h in zip(self._blocks_of_leaves, halved, strict=True)]
+            self.coarse_lanes = math.prod(sizes)
+            self.refinement = Refinement(refined, Grid(sizes, halved, depth), _criterion(config, base, refined))
+        outside = math.prod(len(b) for b in structural) * config.sweep.seeds
+        if (runs := outside * self.coarse_lanes) > _MOST_RUNS:
             raise InputError(f"axes: {runs:.2g} runs are more than {_MOST_RUNS:.0e}; fewer values, or a quasi-random design")
+        if (runs := outside * self.lanes) > _MOST_RUNS:
+            raise InputError(
+                f"sweep.refine: {depth} makes a fine grid of {runs:.2g} runs, more than {_MOST_RUNS:.0e}; "
+                "it should be less, or the axes should have fewer values"
+            )
         self.groups = []
         for index in range(math.prod(len(b) for b in structural)):
             values = {path: column[0] for path, column in _take(structural, np.array([index])).items()}
@@ -69,6 +100,43 @@ class Points:
     def columns(self, indices: np.ndarray) -> Columns:
         """Values of the lane axes at some points of a group, by path; float64 arrays of the shape of `indices`."""
         return _take(self._blocks_of_leaves, indices)
+
+    def coarse(self, positions: np.ndarray) -> np.ndarray:
+        """Points of a group that are always simulated, by their positions 0 ... coarse_lanes - 1 among these."""
+        return positions if self.refinement is None else self.refinement.grid.coarse(positions)
+
+    def values(self, path: str) -> np.ndarray:
+        """All values of a lane axis in their order, those of the fine grid if it is refined."""
+        return next(block.columns[path] for block in self._blocks_of_leaves if path in block.columns)
+
+    def always_simulated(self, columns: Mapping[str, Any]) -> np.ndarray:
+        """Which rows of a frame, or of its columns by name, are on points that are always simulated."""
+        if self.refinement is None:
+            return np.ones(len(columns["seed"]), bool)
+        stride = 1 << self.refinement.grid.depth
+        on_axes = [np.isin(columns[path], self.values(path)[::stride]) for path in self.refinement.paths]
+        return np.logical_and.reduce(on_axes)
+
+    def _refined(self, config: Config) -> list[str]:
+        """Paths of the refined axes."""
+        depth = config.sweep.refine
+        if depth is None:
+            return []
+        axes = [axis for axis in config.axes if axis.num and axis.zip is None and axis.path in self.leaves]
+        if not axes:
+            raise InputError(
+                "sweep.refine: no axis can be refined; one is needed with start, stop and num, not zipped, and not fixed at "
+                "compile time"
+            )
+        for axis in axes:
+            assert axis.num is not None
+            most = ((_MOST_VALUES - 1) // (axis.num - 1)).bit_length() - 1
+            if depth > most:
+                limit = f"should be at most {most}" if most > 0 else "does not fit here: num is too large"
+                raise InputError(
+                    f"sweep.refine: {depth} makes more than {_MOST_VALUES:.0e} values of '{axis.path}'; it {limit}"
+                )
+        return [axis.path for axis in axes]
 
     @staticmethod
     def _check(config: Config) -> tuple[Config, set[str]]:
@@ -85,7 +153,7 @@ class Points:
         base = with_values(config, first)
         return base, set(leaf_paths(base.build()))
 
-    def _blocks(self, config: Config) -> list[Block]:
+    def _blocks(self, config: Config, depths: Mapping[str, int]) -> list[Block]:
         sampled = [axis for axis in config.axes if axis.values is None and axis.num is None]
         if sampled and config.sweep.design == "grid":
             i = config.axes.index(sampled[0])
@@ -111,7 +179,7 @@ class Points:
                 if axis is sampled[0]:
                     blocks.append(Block(_quasi_random(sampled, config)))
             elif axis.zip is None:
-                blocks.append(Block({axis.path: axis.grid()}))
+                blocks.append(Block({axis.path: axis.grid(depths.get(axis.path, 0))}))
             elif axis.zip not in labels:
                 labels[axis.zip] = len(blocks)
                 blocks.append(Block({axis.path: axis.grid()}))
@@ -149,6 +217,21 @@ def _take(blocks: list[Block], indices: np.ndarray) -> Columns:
             out[path] = column[remaining % len(block)]
         remaining = remaining // len(block)
     return out
+
+
+def _criterion(config: Config, base: Config, refined: list[str]) -> Criterion:
+    """When neighbours disagree: in the metric that the study names, or in what converges."""
+    metrics = metric_columns(base.build())
+    metric, tolerance = config.sweep.refine_metric, config.sweep.refine_tolerance
+    if metric is None:
+        converged = [name for name in metrics if name.endswith(".converged")]
+        of_gains = [
+            name for name in converged if any(path.startswith(f"observer.{name.partition('.')[0]}.") for path in refined)
+        ]
+        return Criterion.of(of_gains or converged, TOLERANCE)
+    if metric not in metrics:
+        raise InputError(f"sweep.refine_metric: '{metric}' is no metric; {nearest(metric, metrics)}")
+    return Criterion.of([metric], TOLERANCE if tolerance is None else tolerance)
 
 
 def _quasi_random(axes: list[AxisTable], config: Config) -> Columns:

@@ -225,6 +225,28 @@ class Store:
         frame.to_parquet(draft, index=False)
         draft.replace(self.part(index))
 
+    def read_part(self, index: int, labels: dict[str, np.ndarray], columns: list[str]) -> pd.DataFrame | None:
+        """Some columns of a chunk, or None where it is damaged or holds other rows than those of `labels`."""
+        try:
+            frame = pd.read_parquet(self.part(index), columns=[*labels, *columns])
+        except (OSError, ValueError):
+            return None
+        same = all(np.array_equal(frame[name].to_numpy(), values) for name, values in labels.items())
+        return frame if same else None
+
+    def grow(self, parts: int, rows: int) -> None:
+        """Say how many chunks and rows a refined study has as far as is known."""
+        if rows > self.manifest["rows"]:
+            self.update(parts=parts, rows=rows)
+
+    def trim(self, parts: int, rows: int) -> None:
+        """Say how many chunks and rows a refined study has in the end, and remove what lies beyond."""
+        if (self.manifest["parts"], self.manifest["rows"]) != (parts, rows):
+            self.update(parts=parts, rows=rows)
+        for path in self.parts():
+            if int(path.stem.removeprefix("part-")) >= parts:
+                path.unlink()
+
     def parts(self) -> list[Path]:
         """Files of the chunks that are there. Raises `InputError` where there is none."""
         parts = sorted((self.folder / "points").glob("part-*.parquet"))

@@ -2,19 +2,26 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
 from .config import Config, read_config
-from .engine import Engine, Estimate, Layout, Progress
+from .engine import Chunk, Engine, Estimate, Layout, Progress
 from .metrics import describe
+from .refine import refine
 from .store import Store, claim
 
 if TYPE_CHECKING:
     import xarray
+
+
+_MOST_NUMBERS = 2e8
+"""Of a dataset that is mostly empty."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,8 +58,11 @@ class StudyResult:
     def to_xarray(self) -> "xarray.Dataset":
         """The frame as a dataset over the axes and `seed` (zipped axes share one dimension); needs xarray.
 
+        Of a refined study it has every value of an axis that occurs, and NaN where no point was simulated (`converged` and
+        `finite` are then 1, 0 or NaN).
+
         Raises:
-            ValueError: a quasi-random design, which has no grid.
+            ValueError: a quasi-random design, which has no grid; a refined study with too large a one.
         """
         import xarray
 
@@ -65,6 +75,11 @@ class StudyResult:
         frame = self.frame.copy(deep=False)
         for dim, paths in zipped.items():
             frame[dim] = frame.groupby(paths, sort=False).ngroup()
+        if self.config.sweep.refine is not None:
+            size = math.prod(len(frame[dim].unique()) for dim in [*along, "seed"]) * len(frame.columns)
+            if size > _MOST_NUMBERS:
+                raise ValueError(f"the whole grid would have {size:.2g} numbers, most of them NaN; use the frame")
+            frame = frame.astype(dict.fromkeys(frame.select_dtypes(bool).columns, float))
         dataset = frame.set_index([*along, "seed"]).to_xarray()
         for dim, paths in zipped.items():
             first = {other: 0 for other in dataset.dims if other != dim}
@@ -90,7 +105,7 @@ def sweep(
         study: TOML file, mapping or config.
         out: folder to keep the results in, chunk by chunk; a study that was interrupted there goes on where it stopped,
             one that is finished is only read. Without it nothing is written.
-        progress: called with finished and total lanes after each chunk.
+        progress: called with finished and total lanes after each chunk; the total of a refined study grows.
         devices: JAX devices to use; left out, all local ones.
         overwrite: remove the results of another study from `out`.
 
@@ -98,33 +113,95 @@ def sweep(
         InputError: wrong config, or a folder that holds something else.
     """
     config = read_config(study)
-    if out is None:
-        engine = Engine(config, devices=devices)
-        frames = []
-        for chunk in engine.chunks():
-            frames.append(engine.run(chunk))
-            if progress:
-                progress(sum(len(frame) for frame in frames), engine.rows)
-        return StudyResult(config, pd.concat(frames, ignore_index=True), _cost(engine, engine.rows))
-    folder = Path(out)
     engine = Engine(config, devices=devices)
-    claim(folder, config, overwrite=overwrite)
-    store = Store.create(folder, config, engine.layout, len(engine), engine.rows)
-    if store.layout != engine.layout:
-        # taken up on another machine: the chunks must stay what they were
-        engine = Engine(config, Layout(*store.layout), devices)
-    done = computed = 0
-    for chunk in engine.chunks():
-        seeds, points = engine.contents(chunk)
-        if not store.has(chunk.index):
-            store.write(chunk.index, engine.run(chunk))
-            computed += len(seeds) * len(points)
-        done += len(seeds) * len(points)
-        if progress:
-            progress(done, engine.rows)
-    if not store.manifest["finished"]:
-        store.update(finished=True, seconds={"compile": engine.compile_seconds, "run": engine.run_seconds})
-    return StudyResult(config, store, _cost(engine, computed))
+    store = None
+    if out is not None:
+        folder = Path(out)
+        claim(folder, config, overwrite=overwrite)
+        store = Store.create(folder, config, engine.layout, len(engine), engine.rows)
+        if store.layout != engine.layout:
+            # taken up on another machine: the chunks must stay what they were
+            engine = Engine(config, Layout(*store.layout), devices)
+    run = _Run(engine, store, progress)
+    run.all()
+    if store is None:
+        source = pd.concat(run.frames, ignore_index=True)
+    else:
+        source = store
+        if not store.manifest["finished"]:
+            store.update(finished=True, seconds={"compile": engine.compile_seconds, "run": engine.run_seconds})
+    cost = {"compile_seconds": engine.compile_seconds, "run_seconds": engine.run_seconds, "lanes": run.computed}
+    return StudyResult(config, source, cost)
+
+
+class _Run:
+    """Chunk after chunk of a study, those that are stored already left out."""
+
+    def __init__(self, engine: Engine, store: Store | None, progress: Progress | None):
+        self.engine, self.store, self.progress = engine, store, progress
+        self.frames: list[pd.DataFrame] = []
+        self.computed = self.done = 0
+        self.chunks, self.total = len(engine), engine.rows
+        self._next = 0
+
+    def all(self) -> None:
+        """Run the whole study."""
+        if self.engine.points.refinement is None:
+            for chunk in self.engine.chunks():
+                self._take(chunk)
+            return
+        for group in range(len(self.engine.points.groups)):
+            self._refine(group)
+        if self.store is not None:
+            self.store.trim(self.chunks, self.total)
+
+    def _refine(self, group: int) -> None:
+        """The coarse grid of a group, and what its boundaries need."""
+        assert self.engine.points.refinement is not None
+        _, grid, criterion = self.engine.points.refinement
+        columns, seeds = list(criterion.columns), self.engine.config.sweep.seeds
+        expected = self.engine.points.coarse_lanes
+
+        def evaluate(points: np.ndarray) -> np.ndarray:
+            nonlocal expected
+            # the coarse grid is counted from the start
+            self.total += (len(points) - expected) * seeds
+            self.chunks += self.engine.chunks_for(len(points)) - self.engine.chunks_for(expected)
+            expected = 0
+            if self.store is not None:
+                self.store.grow(self.chunks, self.total)
+            values = np.empty((seeds, len(points), len(columns)))
+            row = column = 0
+            for chunk in self.engine.split(group, points, self._next):
+                shape = (len(chunk.seeds), len(chunk.points), len(columns))
+                found = self._take(chunk, columns)[columns].to_numpy(float).reshape(shape)
+                values[row : row + shape[0], column : column + shape[1]] = found
+                column += shape[1]
+                if column == len(points):
+                    row, column = row + shape[0], 0
+            return values.swapaxes(0, 1)
+
+        refine(grid, evaluate, criterion.differ)
+
+    def _take(self, chunk: Chunk, columns: list[str] | None = None) -> pd.DataFrame:
+        """Compute a chunk, or read some columns of it where it is stored; with no columns, nothing is read."""
+        frame = None
+        if self.store is not None and self.store.has(chunk.index):
+            frame = (
+                pd.DataFrame() if columns is None else self.store.read_part(chunk.index, self.engine.labels(chunk), columns)
+            )
+        if frame is None:
+            frame = self.engine.run(chunk)
+            self.computed += len(frame)
+            if self.store is None:
+                self.frames.append(frame)
+            else:
+                self.store.write(chunk.index, frame)
+        self._next = chunk.index + 1
+        self.done += len(chunk.seeds) * len(chunk.points)
+        if self.progress:
+            self.progress(self.done, self.total)
+        return frame
 
 
 def load(folder: str | Path) -> StudyResult:
@@ -134,9 +211,5 @@ def load(folder: str | Path) -> StudyResult:
 
 
 def dry_run(study: str | Path | Mapping[str, Any] | Config) -> Estimate:
-    """What a study will cost, from a compilation and a short calibration run."""
+    """What a study will cost, from a compilation and a short calibration run; of a refined one, its coarse grid."""
     return Engine(read_config(study)).estimate()
-
-
-def _cost(engine: Engine, lanes: int) -> dict[str, float]:
-    return {"compile_seconds": engine.compile_seconds, "run_seconds": engine.run_seconds, "lanes": lanes}
