@@ -1,7 +1,7 @@
 """Writes docs/reference.md from the config's tables, the effects and the metrics: run after changing any of them."""
 
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
 
@@ -26,8 +26,10 @@ def rows(table: type[BaseModel], prefix: str) -> list[str]:
         key = field.alias or name
         if name in ("kind", "law") and len(get_args(field.annotation)) == 1:
             continue
-        if inner := tables_of(field.annotation):
-            lines += rows(inner[0], f"{prefix}{key}.")
+        inner = tables_of(field.annotation)
+        if len(inner) == 1:
+            several = "[]" if get_origin(field.annotation) is list else ""
+            lines += rows(inner[0], f"{prefix}{key}{several}.")
             continue
         extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
         limits = [f"{word} {getattr(m, attribute):g}" for m in field.metadata for word, attribute in

@@ -7,29 +7,47 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .errors import InputError as InputError
+    from .errors import NoResult as NoResult
     from .report import write_sweep_report as write_sweep_report
     from .report import write_trial_report as write_trial_report
+    from .report import write_tune_report as write_tune_report
+    from .report import write_verify_report as write_verify_report
     from .study.config import Config as Config
     from .study.config import read_config as read_config
+    from .study.laws import Law as Law
+    from .study.laws import accuracy_laws as accuracy_laws
     from .study.sweep import StudyResult as StudyResult
     from .study.sweep import dry_run as dry_run
     from .study.sweep import load as load
     from .study.sweep import sweep as sweep
     from .study.trial import Trial as Trial
     from .study.trial import run as run
+    from .study.tune import Tuning as Tuning
+    from .study.tune import tune as tune
+    from .study.verify import Verdict as Verdict
+    from .study.verify import verify as verify
 
 _WHERE = {
     "InputError": "errors",
+    "NoResult": "errors",
     "write_sweep_report": "report",
     "write_trial_report": "report",
+    "write_tune_report": "report",
+    "write_verify_report": "report",
     "Config": "study.config",
     "read_config": "study.config",
+    "Law": "study.laws",
+    "accuracy_laws": "study.laws",
     "StudyResult": "study.sweep",
     "dry_run": "study.sweep",
     "load": "study.sweep",
     "sweep": "study.sweep",
     "Trial": "study.trial",
     "run": "study.trial",
+    "Tuning": "study.tune",
+    "tune": "study.tune",
+    "Verdict": "study.verify",
+    "verify": "study.verify",
 }
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .errors import InputError
+from .errors import InputError, NoResult
 
 if TYPE_CHECKING:
     from .study.engine import Progress
@@ -108,10 +108,45 @@ def sweep(
     for line in write_sweep_report(result, folder):
         typer.echo(line)
     if result.cost["lanes"]:
-        typer.echo(
-            f"Compiled in {_duration(result.cost['compile_seconds'])}, "
-            f"ran {result.cost['lanes']:.0f} lanes in {_duration(result.cost['run_seconds'])}."
-        )
+        typer.echo(_spent(result.cost))
+    typer.echo(f"{folder / 'report.html'}")
+
+
+@app.command()
+def tune(config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOption = False) -> None:
+    """Choose lambda and alpha of both observers: gains.toml, comparison, report. Goes on where it was interrupted."""
+    _start_jax()
+    from .report import write_tune_report
+    from .study.config import read_config
+    from .study.tune import tune as run_tune
+
+    study = read_config(config)
+    folder = _folder(config, out)
+    resume = shlex.join(["jaxbl", "tune", str(config), "--out", str(folder)])
+    with _naming(config, folder), _resumable(resume), _progress("runs") as progress:
+        result = run_tune(study, folder, progress=progress, overwrite=overwrite)
+    for line in write_tune_report(result, folder):
+        typer.echo(line)
+    if result.cost["lanes"]:
+        typer.echo(_spent(result.cost))
+    typer.echo(f"{folder / 'report.html'}")
+
+
+@app.command()
+def verify(config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOption = False) -> None:
+    """Check the gain conditions on three levels: verdict, counterexamples, atlas. Goes on where it was interrupted."""
+    _start_jax()
+    from .report import write_verify_report
+    from .study.config import read_config
+    from .study.verify import verify as run_verify
+
+    study = read_config(config)
+    folder = _folder(config, out)
+    resume = shlex.join(["jaxbl", "verify", str(config), "--out", str(folder)])
+    with _naming(config, folder), _resumable(resume), _progress("runs") as progress:
+        verdict = run_verify(study, folder, progress=progress, overwrite=overwrite)
+    for line in write_verify_report(verdict, folder):
+        typer.echo(line)
     typer.echo(f"{folder / 'report.html'}")
 
 
@@ -156,13 +191,14 @@ def _start_jax() -> None:
 
 
 @contextmanager
-def _naming(config: Path) -> Iterator[None]:
-    """Put the config's name in front of messages that know only the key."""
+def _naming(config: Path, folder: Path | None = None) -> Iterator[None]:
+    """Put the config's name in front of messages that know only the key, and are not about the folder of the results."""
     try:
         yield
     except InputError as error:
         message = str(error)
-        raise InputError(message if "/" in message.split(":")[0] else f"{config}: {message}") from None
+        named = "/" in message.split(":")[0] or (folder is not None and message.startswith(f"{folder}:"))
+        raise InputError(message if named else f"{config}: {message}") from None
 
 
 @contextmanager
@@ -193,6 +229,11 @@ def _progress(unit: str) -> "Iterator[Progress | None]":
         yield update
 
 
+def _spent(cost: dict[str, float]) -> str:
+    compiling, running = _duration(cost["compile_seconds"]), _duration(cost["run_seconds"])
+    return f"Compiled in {compiling}, ran {cost['lanes']:.0f} lanes in {running}."
+
+
 def _duration(seconds: float) -> str:
     if seconds < 100.0:
         return f"{seconds:.1f} s"
@@ -208,6 +249,9 @@ def main(run: Callable[..., object] = app) -> None:
     except InputError as error:
         typer.echo(f"jaxbl: {error}", err=True)
         sys.exit(2)
+    except NoResult as error:
+        typer.echo(f"jaxbl: {error}", err=True)
+        sys.exit(1)
     except KeyboardInterrupt:
         typer.echo("interrupted", err=True)
         sys.exit(130)

@@ -1,4 +1,4 @@
-"""The one exception that means "the input is wrong": the command line turns it into one line and exit code 2."""
+"""Exceptions that the command line turns into one line: wrong input (exit 2), and no result to give (exit 1)."""
 
 
 class InputError(ValueError):
@@ -7,3 +7,7 @@ class InputError(ValueError):
     def __init__(self, message: str):
         # keys, values and file names may hold line breaks
         super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in message))
+
+
+class NoResult(RuntimeError):
+    """The input is valid, but there is no answer to give. The message is one line: what fails, where, by how much."""

@@ -22,6 +22,7 @@ from jaxbl.study.engine import Engine
 
 FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
 AXES = [listed(ALPHA, 5.0, 9.0, 20.0)]
+GAINS = [listed(ALPHA, 5.0, 9.0), listed(LAMBDA, 3.0, 6.0)]
 
 
 def jaxbl(*arguments, cwd, **environment):
@@ -65,7 +66,7 @@ def test_help_does_not_wait_for_jax(tmp_path):
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
     shown = jaxbl("--help", cwd=tmp_path)
     assert shown.returncode == 0
-    for command in ("simulate", "sweep", "plot"):
+    for command in ("simulate", "sweep", "verify", "tune", "plot"):
         assert command in shown.stdout
 
 
@@ -130,7 +131,7 @@ BAD = {
     ),
     "wrong figure": (
         ["sweep", "figure.toml"],
-        "figure.toml: figures[0].value: 'motor.velocity' is no metric; did you mean 'motor.velocity_rmse'?",
+        "figure.toml: figures[0].value: 'motor.velocity_rms' is no metric; did you mean 'motor.velocity_rmse'?",
     ),
     "foreign folder": (
         ["sweep", "study.toml", "--out", "full"],
@@ -148,6 +149,30 @@ BAD = {
         ["simulate", "study.toml", "--every", "201"],
         "every: should be between 1 and the number of samples 200, not 201",
     ),
+    "nothing to tune for": (
+        ["tune", "rest.toml"],
+        "rest.toml: excitation: leaves the motor undisturbed (f⁺ = 0), so that there is nothing to tune for; "
+        "it should move the drive",
+    ),
+    "foreign folder, tune": (
+        ["tune", "study.toml", "--out", "full"],
+        "full: is not empty and holds no study; choose another folder with --out",
+    ),
+    "nothing to verify": (
+        ["verify", "study.toml"],
+        "study.toml: axes: verify needs axes over both gains of an observer, "
+        "such as observer.motor.alpha and observer.motor.lambda",
+    ),
+    "q of no condition": (["verify", "q.toml"], "q.toml: verify.q: should be less than 1, not 1.2"),
+    "no gain above f_plus": (
+        ["verify", "below.toml"],
+        "below.toml: verify: alpha_ratio.start 0.9 should exceed 1: no lambda converges where alpha is not above f_plus",
+    ),
+    "foreign folder, verify": (
+        ["verify", "gains.toml", "--out", "full"],
+        "full: is not empty and holds no study; choose another folder with --out",
+    ),
+    "nothing to include": (["tune", "part.toml"], "part.toml: include: none.toml: no such file"),
     "nothing to plot": (["plot", "full"], "full: holds no study (no manifest.json); run 'jaxbl sweep' first"),
     "nowhere to plot": (["plot", "none"], "none: holds no study (no manifest.json); run 'jaxbl sweep' first"),
 }
@@ -160,7 +185,13 @@ def test_bad_input_is_one_line_and_exit_2(case, tmp_path, monkeypatch, capsys):
     write(tmp_path, rigid(), "plain.toml")
     write(tmp_path, rigid({"run.durations": 1.0}), "wrong.toml")
     write(tmp_path, rigid(axes=[listed("observer.motor.alfa", 1.0)]), "axis.toml")
-    write(tmp_path, rigid(axes=AXES, figures=[FIGURE | {"value": "motor.velocity"}]), "figure.toml")
+    write(tmp_path, rigid(axes=AXES, figures=[FIGURE | {"value": "motor.velocity_rms"}]), "figure.toml")
+    still = {"excitation.amplitude": 0.0, "observer.motor.velocity_error": 0.0}
+    write(tmp_path, rigid(still), "rest.toml")
+    write(tmp_path, rigid(axes=GAINS), "gains.toml")
+    write(tmp_path, rigid(axes=GAINS, verify={"q": 1.2}), "q.toml")
+    write(tmp_path, rigid(axes=GAINS, verify={"alpha_ratio": {"start": 0.9, "stop": 2.0, "num": 4}}), "below.toml")
+    (tmp_path / "part.toml").write_text('include = "none.toml"')
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("mine")
     before = left(tmp_path)
@@ -224,6 +255,87 @@ def test_simulate_leaves_trace_summary_figures_and_report(call, tmp_path):
     assert json.loads((folder / "summary.json").read_text())["seed"] == 3
 
 
+def test_verify_leaves_a_verdict_counterexamples_figures_and_report(call, tmp_path, monkeypatch):
+    plane = {"start": 1.1, "stop": 5.0, "num": 4}
+    write(tmp_path, rigid(axes=GAINS, verify={"alpha_ratio": plane, "lambda_ratio": plane, "damping": []}))
+    code, lines, _ = call("verify", "study.toml")
+    folder = tmp_path / "results" / "study"
+    assert code == 0
+    figures = {f"figures/{name}.png" for name in ("atlas", "levels_motor", "conservatism", "claimed_bound")}
+    assert {"verdict.json", "counterexamples.parquet", "report.html", "verify/manifest.json"} | figures <= set(left(folder))
+    assert lines[0] == "normalised: 16 cells, no counterexample to any condition."
+    assert lines[-1] == "results/study/report.html"
+    # the second call computes nothing and says the same
+    monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished verification simulates"))
+    assert call("verify", "study.toml")[:2] == (0, lines)
+
+
+def test_an_interrupted_verification_says_how_to_go_on(call, tmp_path, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    write(tmp_path, rigid(axes=GAINS))
+    monkeypatch.setattr(Engine, "run", interrupt)
+    code, _, errors = call("verify", "study.toml", "--out", "out")
+    assert code == 130
+    assert errors == ["interrupted; what is finished is kept. Go on with: jaxbl verify study.toml --out out"]
+
+
+TUNE = {"num": 3, "refine": 1, "alpha_ratio": {"start": 1.2, "stop": 20.0}, "lambda_ratio": {"start": 0.5, "stop": 10.0}}
+
+
+def tunable(**table):
+    """A drive under a constant torque, its observer starting 0.1 rad/s off."""
+    changes = {"encoders.noise": 1e-5, "observer.motor.velocity_error": 0.1, "run.position_tolerance": 0.01}
+    return rigid(changes, effects=[{"kind": "motor.constant_torque", "torque": 0.05}], tune=TUNE | table)
+
+
+def test_tune_leaves_gains_numbers_figures_and_report(call, tmp_path, monkeypatch):
+    write(tmp_path, tunable())
+    code, lines, _ = call("tune", "study.toml")
+    folder = tmp_path / "results" / "study"
+    assert code == 0
+    figures = {f"figures/{name}.png" for name in ("tuning_motor", "pareto_motor", "tuning_holdout")}
+    assert {"gains.toml", "tuning.json", "report.html", "tune/manifest.json"} | figures <= set(left(folder))
+    assert lines[0].startswith("motor: lambda = ")
+    assert re.fullmatch(r"Compiled in [\d.]+ s, ran 24 lanes in [\d.]+ s\.", lines[-2])
+    assert lines[-1] == "results/study/report.html"
+    # the second call computes nothing and says the same
+    monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished search simulates"))
+    assert call("tune", "study.toml")[:2] == (0, [*lines[:-2], lines[-1]])
+    # other commands may share the folder, another study may not
+    assert call("simulate", "study.toml")[0] == 0
+    write(tmp_path, tunable(margin_exact=1.5), "b.toml")
+    with pytest.raises(InputError, match="holds another study"):
+        call("tune", "b.toml", "--out", folder)
+
+
+def test_a_search_that_finds_nothing_leaves_no_gains_and_exits_1(tmp_path, monkeypatch, capsys):
+    write(tmp_path, tunable(margin_exact=1e4))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli, "_start_jax", lambda: None)
+    monkeypatch.setattr(sys, "argv", ["jaxbl", "tune", "study.toml"])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 1
+    out, errors = capsys.readouterr()
+    assert out == ""
+    assert errors.startswith("jaxbl: motor: none of the 9 gains ") and errors.count("\n") == 1
+    assert "margin_exact = 10000: 0 (largest" in errors
+    assert not {"gains.toml", "tuning.json", "report.html"} & {path.name for path in tmp_path.rglob("*")}
+
+
+def test_an_interrupted_search_says_how_to_go_on(call, tmp_path, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    write(tmp_path, tunable())
+    monkeypatch.setattr(Engine, "run", interrupt)
+    code, _, errors = call("tune", "study.toml", "--out", "out")
+    assert code == 130
+    assert errors == ["interrupted; what is finished is kept. Go on with: jaxbl tune study.toml --out out"]
+
+
 def test_a_run_that_diverges_is_reported_and_exits_1(call, tmp_path):
     write(tmp_path, rigid(effects=[{"kind": "motor.viscous_friction", "viscous": 1e4}]))
     code, lines, _ = call("simulate", "study.toml")
@@ -261,11 +373,23 @@ def test_default_folder():
     assert cli._folder(Path("a/b.toml"), None) == Path("results/b")
 
 
-@pytest.mark.parametrize(("name", "command"), [("gain_map", "sweep"), ("load_gains", "sweep"), ("paper_table1", "simulate")])
+@pytest.mark.parametrize(
+    ("name", "command"),
+    [
+        ("gain_map", "sweep"),
+        ("load_gains", "sweep"),
+        ("paper_table1", "simulate"),
+        ("tune_paper_drive", "tune"),
+        ("condition_atlas", "verify"),
+    ],
+)
 def test_shipped_studies_run_without_a_word_on_stderr(name, command, tmp_path):
     # in a process of its own, where float64 is on only inside the engine
     study = tomllib.loads((Path(__file__).parents[1] / "sweeps" / f"{name}.toml").read_text(encoding="utf-8"))
     study["run"]["duration"] = 0.5
+    study.get("tune", {}).update(num=3, refine=0)
+    for name in {"alpha_ratio", "lambda_ratio"} & set(study.get("verify", {})):
+        study["verify"][name]["num"] = 8
     for axis in study.get("axes", []):
         if "num" in axis:
             axis["num"] = 2

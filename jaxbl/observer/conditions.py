@@ -110,10 +110,14 @@ def _log_peak_ratio(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
     return 0.5 * jnp.log(c2 / c1) - half * (_arc(half, one, c1 - half**2) + _arc(-half, one, below))
 
 
+_HALVINGS = 12
+_NEWTON = 2
+
+
 def least_lambda_exact(alpha: Values, f_plus: Values) -> Values:
     """Least lambda with rho < 1; zero where f_plus is.
 
-    By bisection on :func:`peak_ratio`, which falls with lambda, then a step of Newton's method that carries the derivatives.
+    By bisection on :func:`peak_ratio`, which falls with lambda, then Newton's method; its last step carries the derivatives.
     """
     known = (alpha > f_plus) & (f_plus > 0.0)
     ratio = jnp.where(known, alpha, 2.0) / jnp.where(known, f_plus, 1.0)
@@ -128,12 +132,16 @@ def least_lambda_exact(alpha: Values, f_plus: Values) -> Values:
 
     # rho is zero, so below one, at lambda^2 = 4 c2
     upper = jnp.sqrt(8.0 * (fixed + 1.0))
-    # each halving gives a bit
-    length = jnp.finfo(ratio.dtype).nmant + 4
-    (_, least), _ = jax.lax.scan(halve, (jnp.zeros_like(ratio), upper), length=length)
-    least = jax.lax.stop_gradient(least)
-    _, slope = jax.jvp(lambda x: _log_peak_ratio(x, fixed, one), (least,), (one,))
-    least = least - _log_peak_ratio(least, ratio, one) / jax.lax.stop_gradient(slope)
+    (low, high), _ = jax.lax.scan(halve, (jnp.zeros_like(ratio), upper), length=_HALVINGS)
+
+    def newton(least: Values, ratio: Values) -> Values:
+        value, slope = jax.jvp(lambda x: _log_peak_ratio(x, ratio, one), (least,), (one,))
+        return least - value / jax.lax.stop_gradient(slope)
+
+    least = jax.lax.stop_gradient(0.5 * (low + high))
+    for _ in range(_NEWTON):
+        least = jax.lax.stop_gradient(jnp.clip(newton(least, fixed), low, high))
+    least = newton(least, ratio)
     # the root's derivative is infinite at zero
     bound = jnp.where(known, f_plus, 1.0)
     return _above(alpha, f_plus, jnp.where(known, jnp.sqrt(bound) * least, 0.0))
@@ -201,8 +209,8 @@ def _lowest_ray(lambda_: Values, c1: Values) -> Values:
     return jnp.where(real, -c1 / (half + jnp.sqrt(jnp.where(real, half**2 - c1, 0.0))), -jnp.inf)
 
 
-_RAYS = 65
-_GOLDEN = 0.6180339887498949
+_RAYS = 17
+_ROUNDS = 5
 
 
 def slowest_ray(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
@@ -211,7 +219,7 @@ def slowest_ray(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
     The disturbance that makes the largest peaks turns where x1' = 0, but the one that lasts longest holds on a little.
     By Pontryagin's principle it switches once in a half cycle: its costates obey l1' = l1 lambda / (2 sqrt x1), l2' = -l1,
     so that l1 keeps its sign and l2 changes sign at most once; by homogeneity it switches on a ray. Found by search over
-    rays for the largest time to the origin (golden section after a coarse grid). Zero where rho >= 1.
+    rays for the largest time to the origin (grids, each eight times finer). Zero where rho >= 1.
     """
     shape = jnp.broadcast_shapes(jnp.shape(lambda_), jnp.shape(alpha), jnp.shape(f_plus))
     dtype = jnp.result_type(lambda_, alpha, f_plus, float)
@@ -233,20 +241,20 @@ def slowest_ray(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
         passage = _passage(lambda_, alpha, f_plus, jnp.zeros_like(lambda_), jnp.ones_like(lambda_), ray(share))
         return passage.time / jnp.maximum(1.0 - passage.speed, jnp.finfo(dtype).tiny)
 
-    coarse = jnp.linspace(0.0, 1.0, _RAYS, dtype=dtype)
-    best = jnp.argmax(jax.lax.map(lambda share: time(jnp.full(shape, share, dtype)), coarse), axis=0)
-    low, high = (jnp.clip(coarse[jnp.clip(best + k, 0, _RAYS - 1)], 0.0, 1.0) for k in (-1, 1))
+    grid = jnp.linspace(0.0, 1.0, _RAYS, dtype=dtype)
 
-    def shrink(bounds: tuple[Values, Values], _: None) -> tuple[tuple[Values, Values], None]:
+    def zoom(bounds: tuple[Values, Values], _: None) -> tuple[tuple[Values, Values], Values]:
         low, high = bounds
-        left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-        goes_left = time(left) >= time(right)
-        return (jnp.where(goes_left, low, left), jnp.where(goes_left, right, high)), None
+        shares, times = jax.vmap(lambda at: ((share := low + (high - low) * at), time(share)))(grid)
+        best = jnp.argmax(times, axis=0, keepdims=True)
+        found = jnp.take_along_axis(shares, best, axis=0)[0]
+        step = (high - low) / (_RAYS - 1)
+        return (jnp.maximum(found - step, 0.0), jnp.minimum(found + step, 1.0)), found
 
-    # the maximum is flat: half of the digits are enough
-    (low, high), _ = jax.lax.scan(shrink, (low, high), length=jnp.finfo(dtype).nmant // 2 + 2)
-    found = 0.5 * (low + high)
-    found = jnp.where(time(jnp.ones_like(found)) >= time(found), 1.0, found)
+    ends = jnp.zeros(shape, dtype), jnp.ones(shape, dtype)
+    _, found = jax.lax.scan(zoom, ends, length=_ROUNDS)
+    # what is left of x there is below exp(-9): rounding must not choose between it and nothing
+    found = jnp.where(real & (found[-1] > 0.9), 1.0, found[-1])
     return jnp.where(peak_ratio(lambda_, alpha, f_plus) < 1.0, ray(found), 0.0)
 
 

@@ -1,5 +1,7 @@
 """Figures and reports."""
 
+from .atlas import write_verify_report as write_verify_report
 from .maps import draw as draw
 from .reports import write_sweep_report as write_sweep_report
 from .reports import write_trial_report as write_trial_report
+from .tuning import write_tune_report as write_tune_report

@@ -22,6 +22,7 @@ from matplotlib.patches import Patch
 from jaxbl.errors import InputError
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.study.config import Config, FigureTable, nearest, numeric_paths
+from jaxbl.study.laws import Law, accuracy_laws, check_selection, fixed_values, selected
 from jaxbl.study.metrics import describe
 from jaxbl.study.points import Points
 from jaxbl.study.refine import is_boolean
@@ -76,15 +77,21 @@ def draw(result: StudyResult) -> list[Drawn]:
     check_figures(config, figures, result.columns)
     points = Points(config) if config.sweep.refine is not None else None
     drawn, names = [], set()
-    for figure in figures:
+    laws = accuracy_laws(result, figures)
+    for i, figure in enumerate(figures):
         wanted = {figure.value, "finite", *(f"{side}.{name}" for side in SIDES for name in ("converged", "f_plus"))}
         frame = result.read([*(axis.path for axis in config.axes), *(c for c in result.columns if c in wanted)])
         if points is not None:
             frame = on_coarse_values(points, frame, [figure.x, figure.y or figure.x])
-        drawing = _heatmap(config, frame, figure, points) if figure.kind == "heatmap" else _lines(config, frame, figure)
-        name, i = drawing.name, 2
+        if figure.kind == "heatmap":
+            drawing = _heatmap(config, frame, figure, points)
+        elif figure.theory is not None:
+            drawing = _laws(config, frame, figure, [law for law in laws if law.figure == i])
+        else:
+            drawing = _lines(config, selected(config, frame, figure), figure)
+        name, count = drawing.name, 2
         while name in names:
-            name, i = f"{drawing.name}-{i}", i + 1
+            name, count = f"{drawing.name}-{count}", count + 1
         names.add(name)
         drawn.append(drawing._replace(name=name))
     return drawn
@@ -106,6 +113,7 @@ def check_figures(config: Config, figures: list[FigureTable], columns: list[str]
         metrics = [column for column in columns if column not in (*axes, "seed")]
         if figure.value not in metrics:
             raise InputError(f"figures[{i}].value: '{figure.value}' is no metric; {nearest(figure.value, metrics)}")
+        check_selection(config, figure, i)
 
 
 def _label(config: Config, path: str) -> str:
@@ -361,9 +369,17 @@ def _overlay(ax: Axes, bound: float, spec: FigureTable, xs: np.ndarray, ys: np.n
     """Curves of the gain conditions for one f_plus."""
     alpha_is_x = spec.x.endswith(".alpha")
     alphas = xs if alpha_is_x else ys
-    fine = np.geomspace(max(alphas.min(), bound * 1.0001), alphas.max(), 400) if alphas.max() > bound else np.array([])
+    return condition_curves(ax, list(spec.overlays), bound, (alphas.min(), alphas.max()), alpha_is_x)
+
+
+def condition_curves(
+    ax: Axes, names: list[str], bound: float, alphas: tuple[float, float], alpha_is_x: bool = True
+) -> list[Line2D]:
+    """Draw the least lambda of gain conditions over a range of alpha, for one f_plus. Returns the legend's handles."""
+    low, high = max(alphas[0], bound * 1.0001), alphas[1]
+    fine = np.geomspace(low, high, 400) if high > bound else np.array([])
     handles = []
-    for name in spec.overlays:
+    for name in names:
         condition, (dashes, colour) = CONDITIONS[name], _CURVES[name]
         with jax.enable_x64(True):
             least = np.asarray(condition.least_lambda(jnp.asarray(fine), jnp.asarray(bound))) if fine.size else fine
@@ -407,8 +423,85 @@ def _lines(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
                 ax.set_ylabel(_wrap(_value_label(spec.value)))
         if spec.series is not None:
             axes[-1].legend(title=_label(config, spec.series))
-    caption = f"{_value_label(spec.value)} over {spec.x}{_over(config, frame, spec)}{band}."
+    caption = f"{_value_label(spec.value)} over {spec.x}{_where(config, spec)}{_over(config, frame, spec)}{band}."
     return Drawn(_file_name(spec), figure, caption)
+
+
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+
+
+def _laws(config: Config, frame: pd.DataFrame, spec: FigureTable, laws: list[Law]) -> Drawn:
+    """Points of lines that theory gives a slope for, with the lines fitted."""
+    with style():
+        facets = list(dict.fromkeys(None if spec.facet is None else law.where[spec.facet] for law in laws))
+        figure, axes = _grid_of_axes(len(facets), 4.2, 3.8)
+        if len(facets) == 1:
+            figure.set_size_inches(7.2, 4.8)
+        for ax, facet in zip(axes, facets, strict=True):
+            there = [law for law in laws if facet is None or law.where[spec.facet] == facet]
+            ax.set_xscale("log")
+            ax.set_yscale("log")
+            drawn = [_law(ax, law, i) for i, law in enumerate(there)]
+            xs = np.concatenate([law.x_values for law in there])
+            if len(xs):
+                ax.set_xlim(*_edges(np.unique(xs), log=True)[[0, -1]])
+            if len(ys := np.concatenate(drawn)):
+                # the lines of theory run on beyond the points
+                ax.set_ylim(ys.min() / 2.0, ys.max() * 2.0)
+            else:
+                ax.text(0.5, 0.5, "nothing above zero to draw", ha="center", transform=ax.transAxes)
+            if facet is not None:
+                ax.set_title(f"{spec.facet} = {_figure(facet)} {_unit(config, spec.facet)}".strip())
+            ax.set_xlabel(_label(config, spec.x))
+            if ax.get_subplotspec().is_first_col():  # type: ignore[union-attr]
+                ax.set_ylabel(_wrap(_value_label(spec.value)))
+            ax.legend(loc="best", handlelength=1.6, title=f"slope (theory {spec.theory:g}, dashed)")
+    caption = (
+        f"{_value_label(spec.value)} over {spec.x}{_where(config, spec)}; geometric mean over {config.sweep.seeds} "
+        f"{'seed' if config.sweep.seeds == 1 else 'seeds'}. Lines: least squares over the filled points; hollow points lie "
+        "outside the law's range; dashed: theory's slope. The table says why each law ends."
+    )
+    return Drawn(_file_name(spec), figure, caption)
+
+
+def _law(ax: Axes, law: Law, i: int) -> np.ndarray:
+    """One line: points, fit, and theory's slope through the middle of the fit. Returns the y drawn."""
+    colour, marker = COLOURS[i % len(COLOURS)], _MARKERS[i % len(_MARKERS)]
+    x, y, inside = law.x_values, law.y_values, law.inside
+    name = ", ".join(map(_figure, law.series.values()))
+    seen = np.isfinite(y) & (y > 0.0)
+    ax.plot(x[seen & ~inside], y[seen & ~inside], marker, ms=6, mfc="none", color=colour)
+    ax.plot(x[inside], y[inside], marker, ms=6 if i == 0 else 3.5, color=colour)
+    if law.fit is None:
+        reasons = dict.fromkeys(law.stops[end].partition(":")[0] for end in ("below", "above"))
+        label = f"no law ({', then '.join(reasons)})"
+        ax.plot([], [], marker, mfc="none", color=colour, label=f"{name}: {label}" if name else label)
+        return y[seen]
+    ends = x[[law.fit.first, law.fit.last]]
+    label = f"{law.fit.slope:.3f} ± {law.fit.standard_error:.1g}"
+    label = f"{name}: {label}" if name else label
+    ax.plot(ends, law.fit(ends), "-", marker=marker, markevery=[], color=colour, label=label)
+    centre = float(np.sqrt(ends[0] * ends[1]))
+    around = np.array([x[0] / 10.0, x[-1] * 10.0])
+    ax.plot(
+        around, law.fit(centre) * (around / centre) ** law.theory, "--", lw=0.8, color=colour, scalex=False, scaley=False
+    )
+    return y[seen]
+
+
+def _figure(value: Any) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def _unit(config: Config, path: str | None) -> str:
+    return "" if path is None else numeric_paths(config)[path].unit
+
+
+def _where(config: Config, spec: FigureTable) -> str:
+    """What a figure fixes, for its caption."""
+    values = fixed_values(config, spec).items()
+    fixed = [f"{path} = {_figure(value)} {_unit(config, path)}".rstrip() for path, value in values]
+    return f" where {', '.join(fixed)}" if fixed else ""
 
 
 def _wrap(label: str, width: int = 48) -> str:

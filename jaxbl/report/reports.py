@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from jaxbl.study.laws import AGREEMENT, END_OF_SWEEP, Law, accuracy_laws
 from jaxbl.study.metrics import SIDE_METRICS
 from jaxbl.study.points import Points
 from jaxbl.study.store import Store, write_atomic
@@ -23,15 +24,23 @@ from .traces import draw_trial
 
 
 def write_sweep_report(result: StudyResult, folder: Path) -> list[str]:
-    """Draw the figures of a study and write `report.html` into its folder. Returns the headline's lines."""
-    pictures = _save(draw(result), folder)
-    lead = headline(result)
+    """Draw the figures of a study and write `report.html` into its folder, and `laws.json` if figures ask for laws.
+
+    Returns the headline's lines.
+    """
+    pictures = save_all(draw(result), folder)
+    laws = accuracy_laws(result)
+    if laws:
+        write_atomic(folder / "laws.json", json.dumps([law.to_dict() for law in laws], indent=2, ensure_ascii=False))
+    else:
+        (folder / "laws.json").unlink(missing_ok=True)
+    lead = [*headline(result), *_law_lines(laws)]
     page = html(
         result.config.title or "Study",
         lead,
         result.config.notes,
         pictures,
-        [_axes_table(result), _metric_table(result)],
+        [*([_law_table(laws)] if laws else []), _axes_table(result), _metric_table(result)],
         result.config.to_toml(),
     )
     write_atomic(folder / "report.html", page)
@@ -77,6 +86,54 @@ def headline(result: StudyResult) -> list[str]:
     return lines
 
 
+def _law_lines(laws: list[Law]) -> list[str]:
+    """What was found of the laws: how many agree, and each that does not."""
+    if not laws:
+        return []
+    count = sum(law.agrees for law in laws)
+    lines = [f"Accuracy laws: {count} of {len(laws)} have a slope within {AGREEMENT:g} of theory."]
+    for law in laws:
+        if not law.agrees:
+            found = "no power law" if law.fit is None else f"slope {_slope_of(law)}, theory {law.theory:g}"
+            lines.append(f"{law.value} over {law.x} ({_place(law)}): {found}; {_why(law)}.")
+    return lines
+
+
+def _why(law: Law) -> str:
+    """The reasons at the ends; the end of the sweep only where nothing else ends the law."""
+    below, above = law.stops["below"], law.stops["above"]
+    if below == above:
+        return below
+    ends = {"below": below, "above": above}.items()
+    return "; ".join(f"{end}: {reason}" for end, reason in ends if reason != END_OF_SWEEP)
+
+
+def _slope_of(law: Law) -> str:
+    assert law.fit is not None
+    return f"{law.fit.slope:.3f} ± {law.fit.standard_error:.1g}"
+
+
+def _place(law: Law) -> str:
+    """What a law's line fixes; a word speaks for itself."""
+    pairs = {**law.series, **law.where}.items()
+    return ", ".join(value if isinstance(value, str) else f"{path} = {value:g}" for path, value in pairs) or "all points"
+
+
+def _law_table(laws: list[Law]) -> TableOf:
+    rows: list[list[object]] = []
+    for law in laws:
+        fit = law.fit
+        ends = (
+            "–" if law.range is None else f"{law.range[0]:g} to {law.range[1]:g} ({law.inside.sum()})".replace(" ", "\u00a0")
+        )
+        slope = "no law" if fit is None else _slope_of(law).replace(" ", "\u00a0")
+        halves = "–" if fit is None else f"{fit.halves[0]:.2f}, {fit.halves[1]:.2f}".replace(" ", "\u00a0")
+        line = f"{law.value} over {law.x}"
+        rows.append([line, _place(law), law.theory, slope, halves, law.agrees, ends, _why(law)])
+    columns = ["error", "where", "theory", "slope", "halves", "agrees", "range (points)", "why it ends there"]
+    return TableOf("Accuracy laws", columns, rows)
+
+
 def write_trial_report(trial: Trial, folder: Path) -> list[str]:
     """Write trace, summary, figures and report of a run into a folder that exists. Returns the lines for the terminal."""
     # the summary first: it is what makes the folder this study's
@@ -84,7 +141,7 @@ def write_trial_report(trial: Trial, folder: Path) -> list[str]:
     draft = folder / f".trace.{os.getpid()}.draft"
     trial.trace.to_parquet(draft, index=False)
     draft.replace(folder / "trace.parquet")
-    pictures = _save(draw_trial(trial), folder)
+    pictures = save_all(draw_trial(trial), folder)
     metrics = trial.summary["metrics"]
     sides = [side for side in SIDES if f"{side}.converged" in metrics]
     tables = [
@@ -115,7 +172,8 @@ def _number(value: float | None) -> str:
     return "undetermined" if value is None else f"{value:.4g}"
 
 
-def _save(drawn: list[Drawn], folder: Path) -> list[Picture]:
+def save_all(drawn: list[Drawn], folder: Path) -> list[Picture]:
+    """Write figures into the folder's `figures/`; with their captions, for the page."""
     return [Picture(save(d.figure, folder / "figures" / f"{d.name}.png"), d.caption) for d in drawn]
 
 

@@ -255,10 +255,95 @@ class SweepTable(Table):
 
 
 class UncertaintyTable(Table):
-    """How well the drive's numbers are known. Accepted in every study; simulate and sweep do not use it."""
+    """How well the drive's numbers are known. Accepted in every study; simulate and sweep do not use it, tune can."""
 
     relative: float = Field(default=0.02, gt=0.0, description="relative standard deviation of every number not in exact")
     exact: list[str] = Field(default=["drive.gear_ratio"], description="dotted paths of numbers that are known exactly")
+
+
+class AlphaRatioTable(Table):
+    """Range of alpha / f⁺ that is searched, in equal ratios."""
+
+    start: float = Field(default=1.1, gt=1.0, le=1e9, description="least alpha / f⁺; no observer converges below 1")
+    stop: float = Field(default=100.0, gt=1.0, le=1e9, description="largest alpha / f⁺")
+
+
+class LambdaRatioTable(Table):
+    """Range of lambda / √f⁺ that is searched, in equal ratios."""
+
+    start: float = Field(default=0.3, gt=0.0, le=1e9, description="least lambda / √f⁺")
+    stop: float = Field(default=50.0, gt=0.0, le=1e9, description="largest lambda / √f⁺")
+
+
+class GainPairTable(Table):
+    """Gains of one observer."""
+
+    lambda_: float = Field(alias="lambda", ge=0.0, description="gain lambda", json_schema_extra={"unit": "√rad/s"})
+    alpha: float = Field(ge=0.0, description="gain alpha", json_schema_extra={"unit": "rad/s²"})
+
+
+class CompareTable(Table):
+    """Other gains that tuned ones are compared with."""
+
+    name: str = Field(min_length=1, description="how tables and figures call them")
+    motor: GainPairTable = Field(description="gains of the motor observer")
+    load: GainPairTable | None = Field(default=None, description="gains of the load observer; none on a rigid drive")
+
+
+class TuneTable(Table):
+    """How `jaxbl tune` chooses lambda and alpha; f⁺ is the bound that a pilot run of the study finds."""
+
+    objective: Literal["velocity", "torque"] = Field(
+        default="velocity", description="rms error over the last quarter of the run that is made least, worst over the seeds"
+    )
+    worst_over_uncertainty: bool = Field(
+        default=False,
+        description="worst also over the corners of inertias and viscous frictions (1 ± uncertainty.relative)",
+    )
+    margin_exact: float = Field(
+        default=1.1, ge=1.0, description="least lambda over what the exact condition asks at the true f⁺ along each run"
+    )
+    margin_alpha: float = Field(default=1.1, gt=1.0, description="least alpha over the true f⁺ along each run")
+    longest_convergence: float | None = Field(
+        default=None, gt=0.0, description="convergence time allowed; left out: the first three quarters of the run",
+        json_schema_extra={"unit": "s"},
+    )  # fmt: skip
+    alpha_ratio: AlphaRatioTable = Field(default_factory=AlphaRatioTable)
+    lambda_ratio: LambdaRatioTable = Field(default_factory=LambdaRatioTable)
+    num: int = Field(default=16, ge=3, le=1000, description="values of each gain in the coarse map and in each zoom")
+    refine: int = Field(default=2, ge=0, le=10, description="zooms around the best cell; each spans two cells of the last")
+    holdout: _Excitation | None = Field(  # type: ignore[valid-type]
+        default=None,
+        description="a table as [excitation]: input that gains are compared on; left out: the study's, with other noise",
+    )
+    compare: list[CompareTable] = Field(default=[], description="named gains to compare with")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "TuneTable":
+        def wrong(message: str, **context: Any) -> PydanticCustomError:
+            return PydanticCustomError("consistency", message, context)  # type: ignore[arg-type]
+
+        for key in ("alpha_ratio", "lambda_ratio"):
+            span = getattr(self, key)
+            if span.start >= span.stop:
+                raise wrong(
+                    "{key}: start {start} should be less than stop {stop}", key=key, start=span.start, stop=span.stop
+                )
+        if self.alpha_ratio.stop < self.margin_alpha:
+            raise wrong(
+                "alpha_ratio: stop {stop} is below margin_alpha {margin}; it should be above it",
+                stop=self.alpha_ratio.stop,
+                margin=self.margin_alpha,
+            )
+        names = [other.name for other in self.compare]
+        for i, name in enumerate(names):
+            if name in names[:i] or name in TUNE_NAMES:
+                raise wrong("compare[{i}].name: '{name}' is taken; choose another one", i=i, name=name)
+        return self
+
+
+TUNE_NAMES = ("tuned", "usual rule", "config")
+"""What a comparison of gains always holds."""
 
 
 class LogTable(Table):
@@ -266,6 +351,62 @@ class LogTable(Table):
 
     hold: Literal["zoh"] = Field(default="zoh", description="input between samples")
     initial_state: Literal["unknown", "rest"] = Field(default="unknown", description="state at the first sample")
+
+
+class RangeTable(Table):
+    """Values between two ends, evenly spaced on a log scale."""
+
+    start: float = Field(gt=0.0, description="first value")
+    stop: float = Field(gt=0.0, description="last value")
+    num: int = Field(ge=2, le=8192, description="number of values")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "RangeTable":
+        if self.start >= self.stop:
+            raise PydanticCustomError(
+                "range", "start {start} should be less than stop {stop}", {"start": self.start, "stop": self.stop}
+            )
+        return self
+
+    def values(self) -> np.ndarray:
+        """The values, shape (num,)."""
+        return np.geomspace(self.start, self.stop, self.num)
+
+
+class MarkTable(Table):
+    """A pair of gains to be marked in the atlas, run once on the study's drive."""
+
+    name: str = Field(description="label")
+    side: Literal["motor", "load"] = Field(default="motor", description="observer that has these gains")
+    lambda_: float = Field(alias="lambda", ge=0.0, description="gain lambda", json_schema_extra={"unit": "√rad/s"})
+    alpha: float = Field(ge=0.0, description="gain alpha", json_schema_extra={"unit": "rad/s²"})
+
+
+class VerifyTable(Table):
+    """What `jaxbl verify` does besides the study's own points: the normalised error system, and marks."""
+
+    q: float | None = Field(default=None, gt=0.0, lt=1.0, description="q of condition (32); left out: its limit q → 0")
+    alpha_ratio: RangeTable = Field(
+        default_factory=lambda: RangeTable(start=1.02, stop=20.0, num=512), description="alpha / f_plus of the atlas"
+    )
+    lambda_ratio: RangeTable = Field(
+        default_factory=lambda: RangeTable(start=0.002, stop=25.0, num=512), description="lambda / √f_plus of the atlas"
+    )
+    damping: list[Annotated[float, Field(gt=0.0)]] = Field(
+        default=[0.1, 0.3, 1.0],
+        description="dampings (friction / inertia × velocity error / f_plus) whose boundaries are simulated",
+    )
+    marks: list[MarkTable] = Field(default=[], description="gains to be marked")
+
+    @model_validator(mode="after")
+    def _possible(self) -> "VerifyTable":
+        if self.alpha_ratio.start <= 1.0:
+            raise PydanticCustomError(
+                "range",
+                "alpha_ratio.start {start} should exceed 1: no lambda converges where alpha is not above f_plus",
+                {"start": self.alpha_ratio.start},
+            )
+        return self
 
 
 class AxisTable(Table):
@@ -304,6 +445,17 @@ class AxisTable(Table):
             raise wrong("axis {path}: num = 1 cannot span start ... stop; use values = [...] or num >= 2")
         return self
 
+    def grid(self, depth: int = 0) -> np.ndarray:
+        """The values of the axis, in its order; not for an axis that is sampled quasi-randomly (neither num nor values).
+
+        Halved `depth` times: every 2^depth-th is then, to the bit, what it is without halving.
+        """
+        if self.values is not None:
+            return np.array(self.values, dtype=object if any(isinstance(v, str) for v in self.values) else None)
+        assert self.start is not None and self.stop is not None and self.num is not None
+        space = np.geomspace if self.scale == "log" else np.linspace
+        return space(self.start, self.stop, (self.num - 1 << depth) + 1)
+
 
 class FigureTable(Table):
     """One figure of the report."""
@@ -314,6 +466,13 @@ class FigureTable(Table):
     value: str = Field(description="metric, e.g. motor.velocity_rmse")
     facet: str | None = Field(default=None, description="axis path: one panel for each value")
     series: str | None = Field(default=None, description="axis path: one line for each value (line)")
+    where: dict[str, float | int | str] | None = Field(
+        default=None,
+        description="axis path -> value: only these points (line); a value of the axis, or 'least' or 'largest' of them",
+    )
+    theory: float | None = Field(
+        default=None, description="exponent of x that theory gives; asks for the fitted one (line; report, laws.json)"
+    )
     scale: Literal["auto", "linear", "log"] = Field(default="auto", description="scale of the value")
     overlays: list[Literal["davila_fridman", "levant", "seeber_horn", "moreno_osorio", "exact"]] = Field(
         default=[], description="gain conditions drawn over a map of alpha and lambda"
@@ -323,17 +482,21 @@ class FigureTable(Table):
     def _complete(self) -> "FigureTable":
         if self.kind == "heatmap" and self.y is None:
             raise PydanticCustomError("figure", "a heatmap needs y, the path of its second axis", {})
-        idle = "series" if self.kind == "heatmap" else "y"
-        if getattr(self, idle) is not None:
-            hint = "use facet" if self.kind == "heatmap" else "use series or facet"
-            raise PydanticCustomError(
-                "figure", "a {kind} has no {key}; {hint}", {"kind": self.kind, "key": idle, "hint": hint}
-            )
+        idle = {"series": "use facet", "where": "use facet", "theory": "use a line"}
+        for key, hint in (idle if self.kind == "heatmap" else {"y": "use series or facet"}).items():
+            if getattr(self, key) is not None:
+                raise PydanticCustomError(
+                    "figure", "a {kind} has no {key}; {hint}", {"kind": self.kind, "key": key, "hint": hint}
+                )
         paths = [path for path in (self.x, self.y, self.facet, self.series) if path is not None]
         for path in paths:
             if paths.count(path) > 1:
                 raise PydanticCustomError(
                     "figure", "{path} is used twice; x, y, facet and series should be different axes", {"path": path}
+                )
+            if path in (self.where or {}):
+                raise PydanticCustomError(
+                    "figure", "{path} is drawn and cannot be fixed by where; leave it out of one of them", {"path": path}
                 )
         gains = [{f"observer.{side}.alpha", f"observer.{side}.lambda"} for side in ("motor", "load")]
         if self.overlays and {self.x, self.y} not in gains:
@@ -346,6 +509,12 @@ class FigureTable(Table):
 class Config(Table):
     """A study: everything that a run needs, validated."""
 
+    include: str | list[str] = Field(
+        default=[],
+        exclude=True,
+        description="TOML files, relative to this one, whose tables are merged in key by key: keys of this file win, those "
+        "of later files over those of earlier ones; arrays, and tables of another kind or law, are replaced as a whole",
+    )
     title: str = Field(default="", description="headline of the report")
     notes: list[str] = Field(default=[], description="remarks of the author, repeated in summary and report")
     drive: _Drive = Field(description="what is driven")  # type: ignore[valid-type]
@@ -362,7 +531,9 @@ class Config(Table):
     run: RunTable = Field(default_factory=RunTable)
     sweep: SweepTable = Field(default_factory=SweepTable)
     uncertainty: UncertaintyTable = Field(default_factory=UncertaintyTable)
+    tune: TuneTable | None = Field(default=None)
     log: LogTable = Field(default_factory=LogTable)
+    verify: VerifyTable = Field(default_factory=VerifyTable)
     axes: list[AxisTable] = Field(default=[])
     figures: list[FigureTable] = Field(default=[])
 
@@ -371,6 +542,8 @@ class Config(Table):
         def wrong(message: str, **context: Any) -> PydanticCustomError:
             return PydanticCustomError("consistency", message, context)  # type: ignore[arg-type]
 
+        if self.include:
+            raise wrong("include is for read_config, which merges the files in")
         rigid = self.drive.kind == "rigid"
         if rigid and self.transmission is not None:
             raise wrong("[transmission] has no meaning on a rigid drive; remove it, or use drive.kind = 'two_inertia'")
@@ -392,6 +565,11 @@ class Config(Table):
                     given=self.run.substeps,
                     least=least,
                 )
+        for i, other in enumerate(() if self.tune is None else self.tune.compare):
+            if rigid and other.load is not None:
+                raise wrong("tune.compare[{i}].load has no meaning on a rigid drive; remove it", i=i)
+            if not rigid and other.load is None:
+                raise wrong("tune.compare[{i}].load is missing: a two_inertia drive has a load observer", i=i)
         for i, effect in enumerate(self.effects):
             place = effect.kind.partition(".")[0]
             if rigid and place in ("load", "transmission"):
@@ -450,10 +628,24 @@ def read_config(source: str | Path | Mapping[str, Any] | Config) -> Config:
     if isinstance(source, Config):
         return source
     if isinstance(source, Mapping):
-        return _validate(dict(source), "config")
-    path = Path(source)
+        name, data, folder = "config", copy.deepcopy(dict(source)), Path()
+    else:
+        path = Path(source)
+        name, data, folder = str(path), _load(path), path.parent
+        _localise(data, folder)
+    origins: dict[Key, str] = {}
+    chain = [] if isinstance(source, Mapping) else [Path(source).resolve()]
+    return _validate(_included(data, name, folder, chain, origins), name, origins)
+
+
+Key = tuple[str | int, ...]
+"""Where a value lies in a config: keys of tables and positions in arrays."""
+
+
+def _load(path: Path) -> dict[str, Any]:
+    """A TOML file as it stands."""
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except IsADirectoryError:
@@ -464,53 +656,122 @@ def read_config(source: str | Path | Mapping[str, Any] | Config) -> Config:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path}: not valid TOML: {error}") from None
-    excitation = data.get("excitation")
-    if isinstance(excitation, dict) and isinstance(excitation.get("file"), str):
-        excitation["file"] = str((path.parent / excitation["file"]).resolve())
-    return _validate(data, str(path))
 
 
-def _validate(data: dict[str, Any], name: str = "") -> Config:
+def _localise(data: dict[str, Any], folder: Path) -> None:
+    """Make files that a config names relative to the folder it lies in."""
+    tune = data.get("tune")
+    for table in (data.get("excitation"), tune.get("holdout") if isinstance(tune, dict) else None):
+        if isinstance(table, dict) and isinstance(table.get("file"), str):
+            table["file"] = str((folder / table["file"]).resolve())
+
+
+def _included(data: dict[str, Any], name: str, folder: Path, chain: list[Path], origins: dict[Key, str]) -> dict[str, Any]:
+    """The data with the files that it includes merged in.
+
+    Args:
+        data: a config, of which `include` is taken out.
+        name: how messages call it.
+        folder: where the included files are looked for.
+        chain: files that led here.
+        origins: gets the file that each key of an included file came from.
+    """
+    files = data.pop("include", [])
+    files = [files] if isinstance(files, str) else files
+    if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
+        raise InputError(f"{name}: include: should be a file name or an array of them, not {_brief(files)}")
+    merged: dict[str, Any] = {}
+    for file in files:
+        path = folder / file
+        if not path.exists():
+            raise InputError(f"{name}: include: {path}: no such file")
+        if path.resolve() in chain:
+            raise InputError(f"{name}: include: {path} includes this file in turn; files should not include one another")
+        inner = _load(path)
+        _localise(inner, path.parent)
+        found: dict[Key, str] = {}
+        inner = _included(inner, str(path), path.parent, [*chain, path.resolve()], found)
+        _merge(merged, inner, origins, {key: str(path) for key in _keys(inner)} | found)
+    _merge(merged, data, origins, dict.fromkeys(_keys(data), name))
+    return merged
+
+
+def _keys(data: Any, key: Key = ()) -> Iterator[Key]:
+    """Places of everything in a config."""
+    pairs = data.items() if isinstance(data, Mapping) else enumerate(data) if isinstance(data, list) else ()
+    for name, value in pairs:
+        yield (*key, name)
+        yield from _keys(value, (*key, name))
+
+
+def _merge(into: dict[str, Any], data: dict[str, Any], origins: dict[Key, str], new: dict[Key, str], key: Key = ()) -> None:
+    """Put the keys of `data` over those of `into`, and `new` over their `origins`."""
+    for name, value in data.items():
+        here, old = (*key, name), into.get(name)
+        origins[here] = new[here]
+        # a table of another kind is another table
+        if (
+            isinstance(old, dict)
+            and isinstance(value, dict)
+            and all(value.get(tag, old.get(tag)) == old.get(tag) for tag in ("kind", "law"))
+        ):
+            _merge(old, value, origins, new, here)
+        else:
+            into[name] = copy.deepcopy(value)
+            origins |= {place: file for place, file in new.items() if place[: len(here)] == here}
+
+
+def _validate(data: dict[str, Any], name: str = "", origins: Mapping[Key, str] | None = None) -> Config:
     try:
         return Config.model_validate(data)
     except ValidationError as error:
-        raise InputError(f"{name}: {_describe(error)}" if name else _describe(error)) from None
+        place, text = _describe(error)
+        # the file that the key came from, where that is not the one asked for
+        while place and origins is not None and place not in origins:
+            place = place[:-1]
+        name = name if origins is None else origins.get(place, name)
+        raise InputError(f"{name}: {text}" if name else text) from None
 
 
-_UNIONS = {"drive": 1, "transmission": 1, "excitation": 1, "effects": 2}
+_UNIONS = {("drive",): 1, ("transmission",): 1, ("excitation",): 1, ("effects",): 2, ("tune", "holdout"): 2}
+"""Unions, and how far into a location pydantic puts the tag of their member."""
 
 
-def _describe(error: ValidationError) -> str:
-    """The first error in one line."""
+def _describe(error: ValidationError) -> tuple[Key, str]:
+    """The first error: the key that is wrong, and one line that says so."""
     first = error.errors()[0]
     location = list(first["loc"])
-    # pydantic puts the tag of a union's member into the location
-    tag = _UNIONS.get(str(location[0]) if location else "")
-    if tag is not None and len(location) > tag:
-        del location[tag]
+    for union, tag in _UNIONS.items():
+        if tuple(location[: len(union)]) == union and len(location) > tag:
+            del location[tag]
     if location[:1] == ["axes"] and "values" in location:
         del location[4:]  # the member of the union that came last
+    if location[:1] == ["figures"] and "where" in location:
+        del location[4:]
     key = ""
     for part in location:
         key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)
     where = f"{key}: " if key else ""
     kind, context, given = first["type"], first.get("ctx", {}), _brief(first["input"])
+    place = tuple(location)
     if kind == "missing":
-        return f"{where}this key is missing"
+        return place, f"{where}this key is missing"
     if kind == "union_tag_invalid":
         tags = [t.strip(" '") for t in context["expected_tags"].split(",")]
         name = context["discriminator"].strip("'")
-        return f"{key}.{name}: unknown {name} '{context['tag']}'; {nearest(context['tag'], tags)}"
+        return (*place, name), f"{key}.{name}: unknown {name} '{context['tag']}'; {nearest(context['tag'], tags)}"
     if kind == "union_tag_not_found":
-        return f"{where}the key {context['discriminator']} is missing"
+        return place, f"{where}the key {context['discriminator']} is missing"
     if kind in ("model_type", "model_attributes_type", "dict_type"):
-        return f"{where}should be a table, not {given}"
+        return place, f"{where}should be a table, not {given}"
     if kind == "list_type":
-        return f"{where}should be an array, not {given}"
+        return place, f"{where}should be an array, not {given}"
     message = first["msg"].removeprefix("Input ")
-    if kind in ("unknown_key", "period", "sweep", "axis", "figure", "consistency"):
-        return f"{where}{message}"
-    return f"{where}{message}, not {given}"
+    if kind == "unknown_key":
+        return (*place, context["key"]), f"{where}{message}"
+    if kind in ("period", "sweep", "axis", "figure", "range", "consistency"):
+        return place, f"{where}{message}"
+    return place, f"{where}{message}, not {given}"
 
 
 def _brief(given: Any) -> str:
@@ -556,7 +817,7 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     Raises:
         InputError: a path that does not exist (the nearest valid one is named), or a value out of range.
     """
-    data = copy.deepcopy(config.resolved())
+    data = config.resolved()
     known = numeric_paths(config)
     for path, value in values.items():
         if path not in known:

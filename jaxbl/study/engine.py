@@ -20,7 +20,7 @@ from jaxbl.drive.parameters import as_arrays, set_leaves
 from jaxbl.simulate import Experiment, scan
 
 from .config import Config
-from .metrics import METRICS, metric_columns
+from .metrics import METRICS, metric_columns, observer_gains, with_conditions
 from .points import Points
 
 Progress = Callable[[int, int], None]
@@ -157,11 +157,11 @@ class Engine:
         with precision(group.config):
             given = self._arguments(group.config, self.points.columns(chunk.points), chunk.seeds)
             start = time.perf_counter()
-            figures = {name: np.asarray(value) for name, value in jax.block_until_ready(program(*given)).items()}
+            figures = jax.block_until_ready(with_conditions(*program(*given)))
             self.run_seconds += time.perf_counter() - start
         data = self.labels(chunk)
         for name in names:
-            data[name] = figures[name][: len(chunk.seeds), : len(chunk.points)].ravel()
+            data[name] = np.asarray(figures[name])[: len(chunk.seeds), : len(chunk.points)].ravel()
         return pd.DataFrame(data)
 
     def labels(self, chunk: Chunk) -> dict[str, np.ndarray]:
@@ -198,9 +198,10 @@ class Engine:
         with precision(config):
             experiment = prepare(config)
 
-            def lane(values: dict[str, Any], seed: Any) -> dict[str, Any]:
-                figures, _ = scan(set_leaves(experiment, values), seed, (METRICS,))
-                return figures
+            def lane(values: dict[str, Any], seed: Any) -> tuple[dict[str, Any], Any]:
+                experiment_of_lane = set_leaves(experiment, values)
+                figures, _ = scan(experiment_of_lane, seed, (METRICS,))
+                return figures, observer_gains(experiment_of_lane)
 
             # shards along the longer side that divides evenly; one device does the rest
             seeds, points = self.layout

@@ -6,6 +6,7 @@ the motor divided by the gear ratio.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -39,6 +40,8 @@ SIDE_METRICS: dict[str, Metric] = {
     "torque_rmse": Metric(
         "N m", "torque error, rms", "rms error of the transmitted torque from this side's equivalent control"
     ),
+    "position_size": Metric("rad", "position, rms", "rms true position: the size that its errors compare with"),
+    "velocity_size": Metric("rad/s", "velocity, rms", "rms true velocity: the size that its errors compare with"),
     "chatter": Metric(
         "rad/s", "chatter of the velocity", "rms sample-to-sample change of the velocity error, divided by √2"
     ),
@@ -66,6 +69,8 @@ class _Totals(NamedTuple):
     position: Number
     velocity: Number
     torque: Number
+    true_position: Number
+    true_velocity: Number
     change: Number
     previous: Number
     f_plus: Number
@@ -79,7 +84,7 @@ def window_start(steps: int) -> int:
 
 def _init(experiment: Experiment) -> dict[str, _Totals]:
     zero = jnp.zeros_like(experiment.run.sample_period)
-    return {side: _Totals(zero - 1.0, *[zero] * 7) for side in experiment.sides}
+    return {side: _Totals(zero - 1.0, *[zero] * 9) for side in experiment.sides}
 
 
 def _update(
@@ -105,6 +110,8 @@ def _update(
             old.position + inside * position * position,
             old.velocity + inside * velocity * velocity,
             old.torque + inside * torque * torque,
+            old.true_position + inside * true.position * true.position,
+            old.true_velocity + inside * true.velocity * true.velocity,
             old.change + inside * change * change,
             velocity,
             jnp.maximum(old.f_plus, jnp.abs(true.perturbation)),
@@ -124,26 +131,20 @@ def _result(experiment: Experiment, totals: dict[str, _Totals], state: State) ->
     figures: dict[str, Array] = {}
     finite = jnp.asarray(True)
     for side, total in totals.items():
-        observer = getattr(experiment.observer, side)
         converged = total.last_outside < start - 0.5 * run.sample_period
         entered = jnp.where(total.last_outside < 0.0, 0.0, total.last_outside + run.sample_period)
-        gains = (observer.lambda_, observer.alpha, total.f_plus)
-        start_error = (observer.position_error, observer.velocity_error)
         out = {
             "converged": converged,
             "convergence_time": jnp.where(converged, entered, jnp.nan),
-            "convergence_time_bound": conditions.convergence_time_bound(*gains, *start_error),
-            "convergence_time_worst": conditions.convergence_time_worst(*gains, *start_error),
             "position_rmse": jnp.sqrt(total.position / count),
             "velocity_rmse": jnp.sqrt(total.velocity / count),
             "torque_rmse": jnp.sqrt(total.torque / count),
+            "position_size": jnp.sqrt(total.true_position / count),
+            "velocity_size": jnp.sqrt(total.true_velocity / count),
             "chatter": jnp.sqrt(0.5 * total.change / count),
             "f_plus": total.f_plus,
             "f_plus_acceleration": 2.0 * total.acceleration,
-            "margin_alpha": observer.alpha / total.f_plus,
         }
-        for name, condition in conditions.CONDITIONS.items():
-            out[f"margin_{name}"] = observer.lambda_ / condition.least_lambda(observer.alpha, total.f_plus)
         if state.identifier is not None:
             assert experiment.transmission is not None and experiment.identifier is not None
             truth, found = experiment.transmission.truth(), identified[side]
@@ -163,6 +164,50 @@ METRICS = Reducer(_init, _update, _result)
 """The metrics of every sweep."""
 
 
+class Gains(NamedTuple):
+    """What the gain conditions ask of an observer: its gains and its errors at t = 0."""
+
+    lambda_: Array
+    alpha: Array
+    position_error: Array
+    velocity_error: Array
+
+
+def observer_gains(experiment: Experiment) -> dict[str, Gains]:
+    """Gains of the experiment's observers by side."""
+    observers = {side: getattr(experiment.observer, side) for side in experiment.sides}
+    return {side: Gains(*(getattr(observer, name) for name in Gains._fields)) for side, observer in observers.items()}
+
+
+def with_conditions(figures: dict[str, Array], gains: dict[str, Gains]) -> dict[str, Array]:
+    """Figures together with those that follow from gains and f_plus alone: margins to conditions, convergence times.
+
+    Apart from the loop over time, so that they are compiled once for all studies of a chunk's shape.
+    """
+    sides = list(gains)
+    f_plus = jnp.stack([figures[f"{side}.f_plus"] for side in sides])
+    columns = [
+        jnp.stack([jnp.broadcast_to(x, f_plus.shape[1:]) for x in given]) for given in zip(*gains.values(), strict=True)
+    ]
+    judged = _judged(Gains(*columns), f_plus)
+    return figures | {f"{side}.{name}": value[i] for i, side in enumerate(sides) for name, value in judged.items()}
+
+
+@jax.jit
+def _judged(gains: Gains, f_plus: Array) -> dict[str, Array]:
+    given = (gains.lambda_, gains.alpha, f_plus)
+    errors = (gains.position_error, gains.velocity_error)
+    out = {
+        "convergence_time_bound": conditions.convergence_time_bound(*given, *errors),
+        "convergence_time_worst": conditions.convergence_time_worst(*given, *errors),
+        "margin_alpha": gains.alpha / f_plus,
+    }
+    for name, condition in conditions.CONDITIONS.items():
+        out[f"margin_{name}"] = gains.lambda_ / condition.least_lambda(gains.alpha, f_plus)
+    # a lane that overflowed has no bound
+    return {name: jnp.where(jnp.isnan(f_plus), jnp.nan, value) for name, value in out.items()}
+
+
 def describe(column: str) -> Metric:
     """Unit and meaning of a metric column such as `motor.velocity_rmse`."""
     if column == "finite":
@@ -171,7 +216,7 @@ def describe(column: str) -> Metric:
 
 
 def metric_columns(experiment: Experiment) -> list[str]:
-    """The columns that :data:`METRICS` gives for this experiment."""
+    """The columns that :data:`METRICS` and :func:`with_conditions` give for this experiment."""
     names = list(SIDE_METRICS)
     if experiment.identifier is None or experiment.transmission is None:
         names = [n for n in names if n not in ("stiffness_error", "dead_zone_error", "excitation")]

@@ -144,7 +144,7 @@ class Points:
         first = {}
         for i, axis in enumerate(config.axes):
             ends = axis.values if axis.values is not None else [axis.start, axis.stop]
-            for value in ends:
+            for value in _extremes(ends):
                 try:
                     with_values(config, {axis.path: value})
                 except InputError as error:
@@ -179,12 +179,12 @@ class Points:
                 if axis is sampled[0]:
                     blocks.append(Block(_quasi_random(sampled, config)))
             elif axis.zip is None:
-                blocks.append(Block({axis.path: _values(axis, depths.get(axis.path, 0))}))
+                blocks.append(Block({axis.path: axis.grid(depths.get(axis.path, 0))}))
             elif axis.zip not in labels:
                 labels[axis.zip] = len(blocks)
-                blocks.append(Block({axis.path: _values(axis)}))
+                blocks.append(Block({axis.path: axis.grid()}))
             else:
-                block, values = blocks[labels[axis.zip]], _values(axis)
+                block, values = blocks[labels[axis.zip]], axis.grid()
                 if len(values) != len(block):
                     raise InputError(
                         f"axes: '{axis.path}' has {len(values)} values, the others zipped as '{axis.zip}' have {len(block)}"
@@ -199,6 +199,13 @@ class Points:
             if len(set(zip(*(column.tolist() for column in columns.values()), strict=True))) < len(blocks[index]):
                 raise InputError(f"axes: the axes zipped as '{label}' list a point twice; their points should differ")
         return blocks
+
+
+def _extremes(values: list[Any]) -> list[Any]:
+    """The first, least and largest of many numbers: what a key may be is an interval. Other lists as they are."""
+    if len(values) <= 16 or any(isinstance(value, str) for value in values):
+        return values
+    return [values[0], min(values), max(values)]
 
 
 def _take(blocks: list[Block], indices: np.ndarray) -> Columns:
@@ -225,15 +232,6 @@ def _criterion(config: Config, base: Config, refined: list[str]) -> Criterion:
     if metric not in metrics:
         raise InputError(f"sweep.refine_metric: '{metric}' is no metric; {nearest(metric, metrics)}")
     return Criterion.of([metric], TOLERANCE if tolerance is None else tolerance)
-
-
-def _values(axis: AxisTable, depth: int = 0) -> np.ndarray:
-    """Values of an axis, halved some times: every 2^depth-th is then, to the bit, what it is without halving."""
-    if axis.values is not None:
-        return np.array(axis.values, dtype=object if any(isinstance(v, str) for v in axis.values) else None)
-    assert axis.start is not None and axis.stop is not None and axis.num is not None
-    num = (axis.num - 1 << depth) + 1
-    return np.geomspace(axis.start, axis.stop, num) if axis.scale == "log" else np.linspace(axis.start, axis.stop, num)
 
 
 def _quasi_random(axes: list[AxisTable], config: Config) -> Columns:

@@ -2,9 +2,11 @@
 
 import hashlib
 import json
+import math
 import os
 import platform
 import shutil
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -24,8 +26,8 @@ FORMAT = 1
 _COMMANDS = {
     # command: its marker, which says whose the folder is; what it leaves; keys of the config that decide none of its numbers
     "simulate": ("summary.json", ("trace.parquet",), ("axes", "sweep", "verify", "tune")),
-    "sweep": ("manifest.json", ("study.toml", "points"), ("verify", "tune")),
-    "verify": ("verify/manifest.json", ("verdict.json", "verify"), ("tune",)),
+    "sweep": ("manifest.json", ("study.toml", "points", "laws.json"), ("verify", "tune")),
+    "verify": ("verify/manifest.json", ("verdict.json", "counterexamples.parquet", "verify"), ("tune",)),
     "tune": ("tune/manifest.json", ("gains.toml", "tuning.json", "tune"), ("axes", "verify")),
 }
 _COMMON = ("figures", "report.html")
@@ -38,15 +40,19 @@ def identity(config: Config, command: str = "sweep") -> str:
     """
     data = config.resolved()
     data["sweep"].pop("chunk", None)
-    if data["sweep"]["first_seed"] == 0:
-        del data["sweep"]["first_seed"]  # as it was before there was such a key
-    if config.excitation.kind == "recorded":
-        # what was recorded counts, not where it lies
-        record = config.excitation.build()
-        data["excitation"]["file"] = hashlib.sha256(record.times.tobytes() + record.torques.tobytes()).hexdigest()
     for key in ("title", "notes", "figures", *_COMMANDS[command][2]):
         data.pop(key, None)
+    _name_by_content(data["excitation"], config.excitation)
+    if config.tune is not None and "holdout" in data.get("tune", {}):
+        _name_by_content(data["tune"]["holdout"], config.tune.holdout)
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _name_by_content(data: dict[str, Any], excitation: Any) -> None:
+    """What was recorded counts, not where it lies."""
+    if excitation.kind == "recorded":
+        record = excitation.build()
+        data["file"] = hashlib.sha256(record.times.tobytes() + record.torques.tobytes()).hexdigest()
 
 
 def mark(config: Config, command: str) -> dict[str, Any]:
@@ -100,6 +106,19 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
+
+
+def plain(value: Any) -> Any:
+    """A value that JSON can hold: arrays and tables of numbers become lists, what is not finite becomes None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    value = np.asarray(value)
+    if value.ndim:
+        return [plain(item) for item in value.tolist()]
+    value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _read_json(path: Path) -> dict[str, Any]:

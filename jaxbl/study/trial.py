@@ -1,6 +1,5 @@
 """One experiment with its whole trace: the function behind `jaxbl simulate` (`jaxbl.run` in Python)."""
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,8 +16,8 @@ from jaxbl.simulate import Experiment, Reducer, Signals, State, scan
 
 from .config import Config, read_config
 from .engine import precision, prepare
-from .metrics import METRICS
-from .store import identity
+from .metrics import METRICS, observer_gains, with_conditions
+from .store import identity, plain
 
 
 class Trial(NamedTuple):
@@ -61,9 +60,10 @@ def run(study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every:
             return row
 
         figures, kept = eqx.filter_jit(lambda e, s: scan(e, s, (METRICS, _LAST), keep, every))(experiment, jnp.asarray(seed))
+        figures = with_conditions(figures, observer_gains(experiment))
         trace = pd.DataFrame({name: np.asarray(kept[name], dtype=float) for name in names})
-    last = {name: _plain(figures.pop(name)) for name in list(figures) if name.startswith("last.")}
-    metrics = {name: _plain(value) for name, value in figures.items()}
+    last = {name: plain(figures.pop(name)) for name in list(figures) if name.startswith("last.")}
+    metrics = {name: plain(value) for name, value in figures.items()}
     return Trial(config, trace, _summary(config, last, metrics, seed))
 
 
@@ -114,12 +114,6 @@ def _row(experiment: Experiment, state: State, signals: Signals) -> dict[str, An
     return row
 
 
-def _plain(value: Any) -> Any:
-    """A JSON value; what is not finite becomes None."""
-    value = np.asarray(value).item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def _summary(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed: int) -> dict[str, Any]:
     experiment = config.build()
     identified: dict[str, Any] = {}
@@ -147,8 +141,8 @@ def _conditions(observer: Any, f_plus: float) -> dict[str, Any]:
     """Gains of an observer against what each condition asks at a bound f_plus (rad/s^2)."""
     with jax.enable_x64(True):
         lambda_, alpha, bound = (jnp.asarray(x) for x in (float(observer.lambda_), float(observer.alpha), f_plus))
-        least = {name: _plain(condition.least_lambda(alpha, bound)) for name, condition in CONDITIONS.items()}
-        rho = _plain(peak_ratio(lambda_, alpha, bound))
+        least = {name: plain(condition.least_lambda(alpha, bound)) for name, condition in CONDITIONS.items()}
+        rho = plain(peak_ratio(lambda_, alpha, bound))
     return {
         "lambda": float(observer.lambda_),
         "alpha": float(observer.alpha),

@@ -206,6 +206,38 @@ def test_lines_have_a_median_a_band_and_a_legend_with_units(tmp_path):
     assert drawing.caption.endswith("; median over 3 seeds; band: least to largest.")
 
 
+def test_where_leaves_the_other_points_out(tmp_path):
+    data = rigid(axes=GAINS, figures=[line(where={LAMBDA: "largest"})])
+    drawing = drawn(tmp_path, data, motor__velocity_rmse=product)
+    np.testing.assert_allclose(panels(drawing)[0].lines[0].get_ydata(), 20.0 * np.geomspace(1.0, 50.0, 5))
+    assert drawing.caption.endswith(f"over {ALPHA} where {LAMBDA} = 20 √rad/s.")
+
+
+def test_lines_with_a_theory_show_fit_range_and_slope(tmp_path):
+    axes = [spaced(ALPHA, 1.0, 1e4, 9), listed(LAMBDA, 1.0, 2.0)]
+    data = rigid(axes=axes, figures=[line(series=LAMBDA, theory=1.0)])
+    drawing = drawn(
+        tmp_path, data, motor__velocity_rmse=lambda f: np.where(f[LAMBDA] == 1.0, 1e-5 * np.maximum(f[ALPHA], 30.0), 0.0)
+    )
+    (ax,) = panels(drawing)
+    hollow, filled, fitted, theory, *_ = ax.lines
+    assert (hollow.get_markerfacecolor(), len(hollow.get_xdata())) == ("none", 3)
+    np.testing.assert_allclose(filled.get_xdata(), np.geomspace(1.0, 1e4, 9)[3:])
+    np.testing.assert_allclose(fitted.get_ydata(), 1e-5 * fitted.get_xdata())
+    assert theory.get_linestyle() == "--"
+    assert ax.get_ylim()[0] > 1e-5  # theory's line does not stretch the axis
+    texts = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert texts[0].startswith("1: 1.000 ± ")
+    assert texts[1] == "2: no law (float resolution)"
+    assert ax.get_legend().get_title().get_text() == "slope (theory 1, dashed)"
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    # one panel a value, and nothing to draw in one of them
+    data = rigid(axes=axes, figures=[line(facet=LAMBDA, theory=1.0)])
+    drawing = drawn(tmp_path, data, motor__velocity_rmse=lambda f: np.where(f[LAMBDA] == 1.0, 1e-5 * f[ALPHA], 0.0))
+    assert [ax.get_title() for ax in panels(drawing)] == [f"{LAMBDA} = 1 √rad/s", f"{LAMBDA} = 2 √rad/s"]
+    assert panels(drawing)[1].texts[0].get_text() == "nothing above zero to draw"
+
+
 def test_figures_of_one_metric_get_names_of_their_own():
     names = [d.name for d in draw(made(small(axes=GAINS, figures=[heatmap(), line(), line(series=LAMBDA)])))]
     assert names == ["heatmap_motor_velocity_rmse", "line_motor_velocity_rmse", "line_motor_velocity_rmse-2"]

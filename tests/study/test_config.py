@@ -6,6 +6,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pandas as pd
 import pytest
+import tomli_w
 from hypothesis import HealthCheck, given, settings
 from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
 
@@ -14,6 +15,7 @@ from jaxbl.drive.plant import DRIVES
 from jaxbl.errors import InputError
 from jaxbl.study.config import numeric_paths, read_config, with_values
 from jaxbl.study.points import Points
+from jaxbl.study.sweep import sweep
 
 # the config of the design, all of its tables
 EXAMPLE = """
@@ -469,3 +471,131 @@ def test_any_mutation_is_valid_or_an_input_error_of_one_line(mutations):
 def test_inertia_effects_must_leave_some():
     with pytest.raises(InputError, match=r"motor.inertia leaves a total of .* on the motor"):
         read_config(rigid(effects=[{"kind": "motor.inertia", "inertia": -1e3}]))
+
+
+def files(folder, **texts):
+    """TOML files by name; `base` has the rigid drive without gains."""
+    data = rigid({"observer": None})
+    for name, text in {"base": tomli_w.dumps(data), **texts}.items():
+        path = folder / f"{name}.toml"
+        path.parent.mkdir(exist_ok=True, parents=True)
+        path.write_text(text)
+    return folder
+
+
+def test_included_tables_are_merged_key_by_key(tmp_path):
+    files(
+        tmp_path,
+        gains="[observer.motor]\nlambda = 1.0\nalpha = 2.0\n[run]\nduration = 0.3\n",
+        later="[observer.motor]\nalpha = 3.0\n",
+        main='include = ["base.toml", "gains.toml", "later.toml"]\n[observer.motor]\nvelocity_error = 0.25\n',
+    )
+    config = read_config(tmp_path / "main.toml")
+    observer = config.observer.motor
+    assert (observer.lambda_, observer.alpha, observer.velocity_error) == (1.0, 3.0, 0.25)
+    assert (config.run.duration, config.run.substeps) == (0.3, 1)
+    assert "include" not in config.resolved() and "include" not in config.to_toml()
+    (tmp_path / "resolved.toml").write_text(config.to_toml())
+    assert read_config(tmp_path / "resolved.toml").resolved() == config.resolved()
+
+
+def test_keys_of_the_including_file_win_and_tables_of_another_kind_replace(tmp_path):
+    files(
+        tmp_path,
+        main='include = "base.toml"\n[observer.motor]\nlambda = 1.0\nalpha = 2.0\n'
+        '[excitation]\nkind = "prbs"\namplitude = 0.3\nhold = 0.01\n[run]\nduration = 0.4\n',
+        same='include = "main.toml"\n[excitation]\namplitude = 0.5\n',
+    )
+    config = read_config(tmp_path / "main.toml")
+    assert config.run.duration == 0.4
+    assert (config.excitation.kind, config.excitation.hold) == ("prbs", 0.01)
+    # a file may include one that includes
+    config = read_config(tmp_path / "same.toml")
+    assert (config.excitation.kind, config.excitation.amplitude, config.excitation.hold) == ("prbs", 0.5, 0.01)
+
+
+def test_files_of_an_included_file_are_relative_to_it(tmp_path, monkeypatch):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "log.csv").write_text("t,u\n0,0\n1,1\n")
+    recorded = 'kind = "recorded"\nfile = "log.csv"\n'
+    files(
+        tmp_path,
+        **{"parts/input": f"[excitation]\n{recorded}[tune.holdout]\n{recorded}"},
+        main='include = ["base.toml", "parts/input.toml"]\n[observer.motor]\nlambda = 1.0\nalpha = 2.0\n',
+    )
+    config = read_config(tmp_path / "main.toml")
+    for excitation in (config.excitation, config.tune.holdout):
+        assert excitation.file == str(tmp_path / "parts" / "log.csv")
+    # of a mapping: relative to the working directory
+    monkeypatch.chdir(tmp_path)
+    given = {"include": ["base.toml", "parts/input.toml"], "observer": {"motor": {"lambda": 1.0, "alpha": 2.0}}}
+    assert read_config(given).excitation.file == str(tmp_path / "parts" / "log.csv")
+    assert given["include"] == ["base.toml", "parts/input.toml"]
+
+
+GAINS = "[observer.motor]\nlambda = 1.0\nalpha = 2.0\n"
+BAD_INCLUDES = {
+    "missing": ({"main": 'include = "none.toml"\n'}, "main.toml: include: {0}/none.toml: no such file"),
+    "missing, nested": (
+        {"main": 'include = "a.toml"\n', "a": 'include = "none.toml"\n'},
+        "a.toml: include: {0}/none.toml: no such file",
+    ),
+    "itself": ({"main": 'include = "main.toml"\n'}, "main.toml: include: {0}/main.toml includes this file in turn"),
+    "cycle": (
+        {"main": 'include = "a.toml"\n', "a": 'include = "main.toml"\n'},
+        "a.toml: include: {0}/main.toml includes this file in turn; files should not include one another",
+    ),
+    "no name": ({"main": "include = 3\n"}, "main.toml: include: should be a file name or an array of them, not 3"),
+    "no names": ({"main": "include = [3]\n"}, "main.toml: include: should be a file name or an array of them, not [3]"),
+    "a folder": ({"main": 'include = "."\n'}, "{0}: is a folder; a TOML file is needed"),
+    "unknown key": (
+        {"main": f'include = ["base.toml", "a.toml"]\n{GAINS}', "a": "[run]\ndurations = 1.0\n"},
+        "a.toml: run: unknown key 'durations'; did you mean 'duration'?",
+    ),
+    "unknown table": (
+        {"main": f'include = ["base.toml", "a.toml"]\n{GAINS}', "a": "[runs]\nduration = 1.0\n"},
+        "a.toml: unknown key 'runs'; did you mean 'run'?",
+    ),
+    "value, nested": (
+        {
+            "main": f'include = "a.toml"\n{GAINS}',
+            "a": 'include = ["base.toml", "b.toml"]\n',
+            "b": "[run]\nduration = -1.0\n",
+        },
+        "b.toml: run.duration: should be greater than 0, not -1.0",
+    ),
+    "value that is overruled by a wrong one": (
+        {"main": f'include = ["base.toml", "a.toml"]\n{GAINS}[run]\nduration = -2.0\n', "a": "[run]\nduration = 1.0\n"},
+        "main.toml: run.duration: should be greater than 0, not -2.0",
+    ),
+    "value in an array": (
+        {
+            "main": f'include = ["base.toml", "a.toml"]\n{GAINS}',
+            "a": '[[axes]]\npath = "drive.motor_inertia"\nvalues = []\n',
+        },
+        "a.toml: axes[0]: axis drive.motor_inertia is empty",
+    ),
+    "incomplete": (
+        {"main": 'include = "base.toml"\n[observer.motor]\nlambda = 1.0\n'},
+        "main.toml: observer.motor.alpha: this key is missing",
+    ),
+    "bad TOML": ({"main": 'include = "a.toml"\n', "a": "a b"}, "a.toml: not valid TOML"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_INCLUDES)
+def test_bad_includes_are_one_line_that_names_the_file(case, tmp_path):
+    texts, message = BAD_INCLUDES[case]
+    files(tmp_path, **texts)
+    with pytest.raises(InputError) as error:
+        read_config(tmp_path / "main.toml")
+    assert message.format(tmp_path) in str(error.value)
+    assert str(error.value).startswith(str(tmp_path))
+    assert "\n" not in str(error.value)
+
+
+def test_first_seed_shifts_the_noise():
+    early, late = (sweep(rigid(sweep={"seeds": seeds, "first_seed": first})).frame for seeds, first in ((4, 0), (2, 2)))
+    assert list(late["seed"]) == [2, 3]
+    for column in late.columns:
+        np.testing.assert_array_equal(late[column], early[column].iloc[2:])

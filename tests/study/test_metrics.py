@@ -9,7 +9,15 @@ from paper_drive import paper
 from jaxbl.drive import DeadZone, LinearShaft, Rigid, SigmoidBacklash
 from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, Observers, conditions
 from jaxbl.simulate import scan
-from jaxbl.study.metrics import METRICS, SIDE_METRICS, describe, metric_columns, window_start
+from jaxbl.study.metrics import (
+    METRICS,
+    SIDE_METRICS,
+    describe,
+    metric_columns,
+    observer_gains,
+    window_start,
+    with_conditions,
+)
 
 H = 1e-3
 
@@ -43,6 +51,8 @@ def by_numpy(experiment, signals, identifier):
             "position_rmse": np.sqrt(np.mean(position[late] ** 2)),
             "velocity_rmse": np.sqrt(np.mean(velocity[late] ** 2)),
             "torque_rmse": np.sqrt(np.mean(torque[late] ** 2)),
+            "position_size": np.sqrt(np.mean(np.asarray(s.true.position)[late] ** 2)),
+            "velocity_size": np.sqrt(np.mean(np.asarray(s.true.velocity)[late] ** 2)),
             "chatter": np.sqrt(np.mean(np.diff(velocity[late.start - 1 :]) ** 2) / 2.0),
             "f_plus": f_plus,
             "f_plus_acceleration": 2.0 * np.abs(s.true.acceleration).max(),
@@ -102,6 +112,7 @@ def test_columns_against_numpy_on_the_whole_trace(case):
     experiment = paper(time_constant=0.01, start=0.3, steps=1023, **CASES[case])
     figures, (signals, identifier) = run(experiment)
     expected = by_numpy(experiment, signals, identifier)
+    figures = with_conditions(figures, observer_gains(experiment))
     assert set(figures) == set(expected) == set(metric_columns(experiment))
     for name, value in expected.items():
         np.testing.assert_allclose(figures[name], value, rtol=1e-7, atol=1e-12, err_msg=name)

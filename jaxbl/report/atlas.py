@@ -1,0 +1,368 @@
+"""What `jaxbl verify` leaves to be read: the atlas of the error system, the levels of the drive, the page."""
+
+# pandas' own annotations are wider than what its methods return
+# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
+# pyright: reportReturnType=false
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from jaxbl.observer.conditions import CONDITIONS
+from jaxbl.study.store import write_atomic
+from jaxbl.study.verify import Verdict, judged_sides
+
+from .maps import Drawn, condition_curves
+from .page import TableOf, html
+from .reports import save_all
+from .style import COLOURS, MAP, MISSING, style
+
+_USUAL = ("usual pair (1.5, 1.1)", 1.1, 1.5)
+_MARKERS = ("*", "P", "D", "^", "v", "X", "s")
+_LEVELS = {
+    "drive": "drive: ideal encoders, implicit observer",
+    "sampled": "sampled: as the study has it",
+}
+_ALPHA, _LAMBDA = "α / f⁺", "λ / √f⁺"
+
+
+def draw_verdict(verdict: Verdict) -> list[Drawn]:
+    """All figures of a verification."""
+    with style():
+        return [
+            _atlas(verdict),
+            *([_damping(verdict)] if verdict.normalised.damped else []),
+            *(_levels(verdict, side) for side in judged_sides(verdict.config)),
+            _conservatism(verdict),
+            _claimed(verdict),
+        ]
+
+
+def _mark(ax: Axes, verdict: Verdict, dark: bool = False) -> list[Line2D]:
+    """Marks at the usual pair and at the study's marks; those beyond the axes stand on the edge. Returns the legend."""
+    handles = []
+    (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
+    places = [_USUAL, *((mark["name"], mark["alpha_ratio"], mark["lambda_ratio"]) for mark in verdict.summary["marks"])]
+    for i, (name, alpha, lambda_) in enumerate(places):
+        x, y = np.clip(alpha, left, right), np.clip(lambda_, low, high)
+        look = {"marker": _MARKERS[i % len(_MARKERS)], "ms": 12, "mfc": COLOURS[4] if dark else "white", "mec": "black"}
+        ax.plot(x, y, ls="", clip_on=False, zorder=6, **look)
+        handles.append(Line2D([], [], ls="", label=name if (x, y) == (alpha, lambda_) else f"{name} (off the map)", **look))
+    return handles
+
+
+def _axes_of_plane(ax: Axes, xs: np.ndarray, ys: np.ndarray) -> None:
+    ax.set(xscale="log", yscale="log", xlim=(xs[0], xs[-1]), ylim=(ys[0], ys[-1]), xlabel=_ALPHA)
+    ticks = [t for t in (1.1, 1.5, 2, 3, 5, 10, 20, 50, 100) if xs[0] <= t <= xs[-1]]
+    ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    ax.set_xticks([], minor=True)
+
+
+def _atlas(verdict: Verdict) -> Drawn:
+    found = verdict.normalised
+    figure = Figure(figsize=(7.6, 6.6), layout="constrained")
+    ax = figure.subplots()
+    ax.grid(False)
+    norm = LogNorm(0.05, 20.0)
+    shown = np.clip(found.ratio, 1e-6, 1e6)
+    ax.pcolormesh(found.alpha, found.lambda_, shown, cmap="PuOr_r", norm=norm, rasterized=True, shading="nearest")
+    _axes_of_plane(ax, found.alpha, found.lambda_)
+    handles: list[Any] = condition_curves(ax, list(CONDITIONS), 1.0, (found.alpha[0], found.alpha[-1]))
+    step = max(len(found.alpha) // 24, 1)
+    look = {"marker": "o", "ms": 5, "mfc": "white", "mec": "black", "ls": ""}
+    ax.plot(found.alpha[::step], found.boundary[::step], **look, zorder=5)
+    handles += [Line2D([], [], label="simulated boundary", **look), *_mark(ax, verdict)]
+    ax.set_ylabel(_LAMBDA)
+    ax.set_title("Error system under its worst disturbance: below the boundary it grows")
+    bar = figure.colorbar(ScalarMappable(norm, "PuOr_r"), ax=ax, pad=0.02, aspect=30, extend="both")
+    bar.set_label("ratio ρ of successive velocity peaks, simulated")
+    bar.ax.axhline(1.0, color="black", lw=1.0)
+    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    caption = (
+        f"Simulated ratio of successive velocity peaks over {found.ratio.size} cells; every condition demands a λ above its "
+        "curve. White is ρ = 1, where the exact condition and the simulated boundary (found by bisection) lie."
+    )
+    return Drawn("atlas", figure, caption)
+
+
+def _damping(verdict: Verdict) -> Drawn:
+    found = verdict.normalised
+    figure = Figure(figsize=(7.0, 4.8), layout="constrained")
+    ax = figure.subplots()
+    for i, (damping, boundary) in enumerate(sorted({0.0: found.boundary, **found.damped}.items())):
+        label = "no friction (exact condition)" if damping == 0.0 else f"friction number {damping:g}"
+        ax.plot(
+            found.alpha, np.where(boundary > 0.0, boundary, np.nan), color=COLOURS[i % len(COLOURS)], lw=2.0, label=label
+        )
+    _axes_of_plane(ax, found.alpha, found.lambda_)
+    handles = [*ax.get_legend_handles_labels()[0], *_mark(ax, verdict, dark=True)]
+    ax.set_ylabel("least λ / √f⁺ that shrinks the error")
+    figure.legend(handles=handles, loc="outside lower center", ncols=2)
+    caption = (
+        "Least λ at which the worst disturbance no longer enlarges a velocity error v, simulated with viscous friction. "
+        "The friction number is (friction / inertia) v / f⁺: large errors are shrunk by friction, small ones are not."
+    )
+    return Drawn("friction", figure, caption)
+
+
+def _levels(verdict: Verdict, side: str) -> Drawn:
+    """Share of converged runs over the gains in units of each run's own true f_plus."""
+    figure = Figure(figsize=(9.4, 5.2), layout="constrained")
+    axes = figure.subplots(1, len(verdict.levels), sharex=True, sharey=True, squeeze=False)[0]
+    planes = {}
+    for level, frame in verdict.levels.items():
+        bound = frame[f"{side}.f_plus"]
+        alpha, lambda_ = frame[f"observer.{side}.alpha"] / bound, frame[f"observer.{side}.lambda"] / np.sqrt(bound)
+        good = np.isfinite(alpha) & np.isfinite(lambda_) & (lambda_ > 0.0)
+        planes[level] = (alpha[good], lambda_[good], frame[f"{side}.converged"].astype(float)[good])
+    alphas = np.concatenate([plane[0] for plane in planes.values()])
+    lambdas = np.concatenate([plane[1] for plane in planes.values()])
+    bins = [np.geomspace(*np.quantile(values, [0.005, 0.995]), 45) for values in (alphas, lambdas)]
+    handles: list[Any] = []
+    for ax, (level, (alpha, lambda_, converged)) in zip(axes, planes.items(), strict=True):
+        runs, _, _ = np.histogram2d(alpha, lambda_, bins)
+        share, _, _ = np.histogram2d(alpha, lambda_, bins, weights=converged)
+        ax.grid(False)
+        ax.set_facecolor(MISSING)
+        with np.errstate(invalid="ignore"):
+            ax.pcolormesh(*bins, (share / runs).T, cmap=MAP, vmin=0.0, vmax=1.0, rasterized=True)
+        ax.set(xscale="log", yscale="log", xlim=bins[0][[0, -1]], ylim=bins[1][[0, -1]], xlabel=_ALPHA)
+        handles = condition_curves(ax, list(CONDITIONS), 1.0, (max(bins[0][0], 1.0001), bins[0][-1]))
+        wrong = verdict.counterexamples
+        if len(wrong):
+            wrong = wrong[
+                (wrong["level"] == level)
+                & (wrong["side"] == side)
+                & (wrong["bound"] == "true")
+                & (wrong["condition"] == "exact")
+            ]
+            bound = wrong[f"{side}.f_plus"]
+            place = wrong[f"observer.{side}.alpha"] / bound, wrong[f"observer.{side}.lambda"] / np.sqrt(bound)
+            ax.plot(*place, "x", ms=2.5, mew=0.7, color=COLOURS[1])
+        ax.set_title(f"{_LEVELS[level]}\n{len(wrong)} failed though ρ < 1")
+    axes[0].set_ylabel(_LAMBDA)
+    handles.append(Line2D([], [], ls="", marker="x", color=COLOURS[1], label="failed though ρ < 1"))
+    bar = figure.colorbar(ScalarMappable(Normalize(0.0, 1.0), MAP), ax=axes, pad=0.02, aspect=30)
+    bar.set_label(f"share of runs in which the {side} observer converged")
+    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    caption = (
+        f"Runs of the drive, {side} observer, each in units of its own true f⁺: they fall onto the plane of the atlas. A "
+        "real input is not the worst disturbance, so that runs converge below the curves as well; grey: no run."
+    )
+    return Drawn(f"levels_{side}", figure, caption)
+
+
+def _conservatism(verdict: Verdict) -> Drawn:
+    levels = verdict.summary["levels"]
+    figure = Figure(figsize=(7.0, 0.9 + 0.62 * len(CONDITIONS)), layout="constrained")
+    ax = figure.subplots()
+    for i, level in enumerate(levels):
+        label = level["level"] if level.get("side") is None else f"{level['level']}, {level['side']}"
+        colour, shift = COLOURS[i % len(COLOURS)], 0.16 * (i - 0.5 * (len(levels) - 1))
+        for k, entry in enumerate(level["conditions"]):
+            median, largest = entry["conservatism"]["median"], entry["conservatism"]["max"]
+            if median is None:
+                continue
+            ax.plot([median, largest], [k + shift] * 2, color=colour, lw=2.0)
+            ax.plot(median, k + shift, "o", color=colour, ms=7, label=label if k == 0 else None)
+            censored = entry["conservatism"]["at_least"] > 0
+            ax.plot(largest, k + shift, ">" if censored else "|", color=colour, ms=6 if censored else 9)
+    ax.axvline(1.0, color="black", lw=0.8)
+    ax.set(xscale="log", xlabel="λ demanded over the least λ that works")
+    ax.set_yticks(range(len(CONDITIONS)), [condition.title for condition in CONDITIONS.values()])
+    ax.invert_yaxis()
+    ax.grid(axis="y", visible=False)
+    figure.legend(loc="outside lower center", ncols=3)
+    caption = (
+        "How much more λ each condition demands than works: dot median, line to the largest. An arrow head: the least λ on "
+        "the study's axis worked as well, so that the true ratio is larger still."
+    )
+    return Drawn("conservatism", figure, caption)
+
+
+def _claimed(verdict: Verdict) -> Drawn:
+    figure = Figure(figsize=(7.0, 3.4), layout="constrained")
+    ax = figure.subplots()
+    ratios = {}
+    for side in judged_sides(verdict.config):
+        for level, frame in verdict.levels.items():
+            part = frame[frame[f"{side}.converged"].astype(bool)]
+            ratio = part[f"{side}.f_plus"] / part[f"{side}.f_plus_acceleration"]
+            ratios[f"{level}, {side}"] = ratio[np.isfinite(ratio) & (ratio > 0.0)].to_numpy()
+    every = np.concatenate([*ratios.values(), [1.0]])
+    bins = np.geomspace(0.9 * every.min(), 1.1 * every.max(), 40)
+    for i, (label, ratio) in enumerate(ratios.items()):
+        if len(ratio):
+            counts = np.full(len(ratio), 1.0 / len(ratio))
+            share = f"{label}: too small in {100.0 * np.mean(ratio > 1.0):.0f} %"
+            ax.hist(ratio, bins, weights=counts, histtype="step", lw=2.0, color=COLOURS[i % len(COLOURS)], label=share)
+    ax.axvline(1.0, color="black", lw=1.0)
+    ax.set(xscale="log", xlabel="true f⁺ along the run / twice the largest acceleration", ylabel="share of converged runs")
+    ax.legend(loc="upper left", bbox_to_anchor=(0.0, 1.2), ncols=2)
+    caption = (
+        "The bound that the paper's text gives, twice the largest acceleration, against the true one: right of the line "
+        "it is too small, and gains chosen by it may miss every condition."
+    )
+    return Drawn("claimed_bound", figure, caption)
+
+
+def write_verify_report(verdict: Verdict, folder: Path) -> list[str]:
+    """Draw the figures of a verification and write `report.html` into its folder. Returns the lines for the terminal."""
+    lead, remarks = _headline(verdict), [*verdict.config.notes, *_mark_lines(verdict)]
+    tables = [_level_table(level) for level in verdict.summary["levels"]]
+    tables += [t for level in verdict.summary["levels"] for t in _claimed_tables(level)]
+    if verdict.summary["marks"]:
+        tables.append(_mark_table(verdict))
+    if len(verdict.counterexamples):
+        tables.append(_counterexample_table(verdict))
+    pictures = save_all(draw_verdict(verdict), folder)
+    page = html(verdict.config.title or "Gain conditions", lead, remarks, pictures, tables, verdict.config.to_toml())
+    write_atomic(folder / "report.html", page)
+    return [*lead, *remarks]
+
+
+def _headline(verdict: Verdict) -> list[str]:
+    lines = []
+    for level in verdict.summary["levels"]:
+        name = level["level"] if level.get("side") is None else f"{level['level']}, {level['side']}"
+        wrong = [entry for entry in level["conditions"] if entry["counterexamples"]]
+        line = f"{name}: {level['cells']} {'cells' if level.get('side') is None else 'runs'}, "
+        if not wrong:
+            line += "no counterexample to any condition."
+        else:
+            counts = ", ".join(f"{e['title']} {e['counterexamples']} of {e['holds']}" for e in wrong)
+            line += f"the observer failed though the condition held: {counts}."
+            causes = level["causes"].get("true", {})
+            told = ", ".join(f"{cause} ({count})" for cause, count in list(causes.items())[:4])
+            line += f" Causes, by experiment: {told}."
+        lines.append(line)
+    first = verdict.summary["levels"][0]
+    ratios = "; ".join(
+        f"{e['title']} {e['conservatism']['median']:.3g} ({e['conservatism']['max']:.3g})"
+        for e in first["conditions"]
+        if e["name"] != "exact"
+    )
+    lines.append(f"λ demanded over the least that works against the worst disturbance, median (largest): {ratios}.")
+    closed = verdict.summary["closed_form"]
+    lines.append(f"Closed form of ρ and simulation differ by {closed['largest_difference']:.2g} at most.")
+    for level in verdict.summary["levels"][1:]:
+        claimed = level["claimed_bound"]
+        if claimed["too_small"] is not None and level["level"] == "drive":
+            lines.append(
+                f"{level['side']}: twice the largest acceleration, the paper's text for f⁺, is too small in "
+                f"{100.0 * claimed['too_small']:.0f} % of the converged runs, by a factor of up to "
+                f"{claimed['true_over_claimed']['max']:.3g}."
+            )
+    return lines
+
+
+def _mark_lines(verdict: Verdict) -> list[str]:
+    lines = []
+    for mark in verdict.summary["marks"]:
+        rho = mark["peak_ratio"]
+        line = f"{mark['name']}: α / f⁺ = {mark['alpha_ratio']:.3g}, λ / √f⁺ = {mark['lambda_ratio']:.3g}; "
+        if rho is None:
+            line += "α is below the true f⁺: no condition can hold."
+        elif rho < 1.0:
+            line += f"ρ = {rho:.3g}: any disturbance within f⁺ dies out in finite time."
+        else:
+            line += (
+                f"ρ = {rho:.3g}: the worst disturbance enlarges the error until friction holds it, at "
+                f"{mark['upheld_velocity_error']:.3g} rad/s. A disturbance that stays the same lets each half cycle shrink "
+                f"to {mark['peak_ratio_constant']:.3g} of the last (friction number {mark['damping']:.2g})"
+            )
+            seconds = mark["convergence_time"]
+            line += (
+                f": the run here converged, after {seconds:.3g} s." if mark["converged"] else "; the run did not converge."
+            )
+        lines.append(line)
+    return lines
+
+
+def _level_table(level: dict[str, Any]) -> TableOf:
+    name = "Normalised error system, worst disturbance"
+    if level["level"] != "normalised":
+        name = f"{_LEVELS[level['level']].capitalize()}; {level['side']} observer"
+    rows: list[list[object]] = [
+        [
+            entry["title"],
+            entry["holds"],
+            entry["counterexamples"],
+            entry["fails_but_converged"],
+            entry["conservatism"]["median"],
+            entry["conservatism"]["max"],
+            entry["conservatism"]["at_least"] > 0,
+        ]
+        for entry in level["conditions"]
+    ]
+    heading = (
+        f"{name}: {level['cells']} {'cells' if level['level'] == 'normalised' else 'runs'}, {level['converged']} converged"
+    )
+    head = [
+        "condition",
+        "holds",
+        "holds, but failed",
+        "fails, but converged",
+        "λ demanded / least: median",
+        "largest",
+        "at least",
+    ]
+    return TableOf(heading, head, rows)
+
+
+def _claimed_tables(level: dict[str, Any]) -> list[TableOf]:
+    if not (inputs := level.get("claimed_bound", {}).get("by_input")):
+        return []
+    keys = list(inputs[0]["input"])
+    rows: list[list[object]] = [
+        [*row["input"].values(), row["converged_runs"], row["true"], row["claimed"], row["too_small"]] for row in inputs
+    ]
+    heading = f"True and claimed bound by input: {level['level']}, {level['side']}"
+    return [TableOf(heading, [*keys, "runs", "median true f⁺", "2 max |acceleration|", "share too small"], rows)]
+
+
+def _mark_table(verdict: Verdict) -> TableOf:
+    keys = {
+        "lambda": "λ",
+        "alpha": "α",
+        "f_plus": "true f⁺",
+        "alpha_ratio": "α / f⁺",
+        "lambda_ratio": "λ / √f⁺",
+        "peak_ratio": "ρ",
+        "damping": "friction number",
+        "peak_ratio_damped": "ρ with friction",
+        "peak_ratio_constant": "ratio, constant disturbance",
+        "upheld_velocity_error": "upheld error (rad/s)",
+        "margin_davila_fridman": "margin to (32)",
+        "margin_exact": "margin to ρ < 1",
+        "converged": "converged",
+        "convergence_time": "after (s)",
+    }
+    rows: list[list[object]] = [[mark["name"], *(mark[key] for key in keys)] for mark in verdict.summary["marks"]]
+    return TableOf("Marked gains, run on the study's drive with ideal encoders", ["", *keys.values()], rows)
+
+
+def _counterexample_table(verdict: Verdict) -> TableOf:
+    found = verdict.counterexamples[verdict.counterexamples["bound"] == "true"]
+    paths = [axis.path for axis in verdict.config.axes if axis.path in found]
+    counts = found.groupby(["level", "side", "condition", "cause"], sort=False).size().sort_values(ascending=False)
+    examples = found.drop_duplicates(["level", "side", "condition", "cause"]).set_index(
+        ["level", "side", "condition", "cause"]
+    )
+    rows: list[list[object]] = []
+    for key, count in counts.items():
+        example = examples.loc[key]
+        rows.append([*key, int(count), *(_plain(example[path]) for path in paths)])
+    head = ["level", "side", "condition", "cause", "runs", *(f"e.g. {path}" for path in paths)]
+    return TableOf("Counterexamples by cause (all of them, with all figures: counterexamples.parquet)", head, rows)
+
+
+def _plain(value: Any) -> object:
+    return None if pd.isna(value) else value.item() if isinstance(value, np.generic) else value

@@ -1,0 +1,323 @@
+"""What `jaxbl tune` leaves to be read: the objective over normalised gains, error against convergence time, comparison."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+
+from jaxbl.study.metrics import SIDE_METRICS
+from jaxbl.study.store import write_atomic
+from jaxbl.study.tune import Tuning
+from jaxbl.study.tune_summary import called_gains
+
+from .maps import _HATCH, SIDES, Drawn, _edges, _norm, condition_curves
+from .page import TableOf, html
+from .reports import save_all
+from .style import COLOURS, MAP, MISSING, style, with_unit
+
+_MARKS = ("o", "s", "^", "D", "v", "P", "X")
+_CONDITIONS = ["davila_fridman", "seeber_horn", "exact"]
+
+
+def draw_tuning(tuning: Tuning) -> list[Drawn]:
+    """All figures of a tuning."""
+    sides = [side for side in SIDES if side in tuning.candidates]
+    with style():
+        return [
+            *(_map(tuning, side) for side in sides),
+            *(_front(tuning, side) for side in sides),
+            _comparison(tuning, sides),
+        ]
+
+
+def _label(tuning: Tuning) -> str:
+    about = SIDE_METRICS[f"{tuning.summary['objective']}_rmse"]
+    return with_unit(f"worst {about.label}", about.unit)
+
+
+def _others(tuning: Tuning, side: str) -> list[tuple[str, str, dict[str, Any]]]:
+    """Name, mark and figures on the study's own excitation of the gains that the tuned ones are compared with."""
+    rows = [row for row in tuning.summary["named"] if row["side"] == side and row["name"] != "tuned"]
+    return [(row["name"], _MARKS[i % len(_MARKS)], row) for i, row in enumerate(rows)]
+
+
+def _map(tuning: Tuning, side: str) -> Drawn:
+    summary, bound = tuning.summary, tuning.summary["f_plus"][side]
+    coarse = tuning.candidates[side].query("stage == 0")
+    table, feasible = (
+        coarse.assign(feasible=coarse["feasible"].astype(float)).pivot_table(
+            index="lambda_ratio", columns="alpha_ratio", values=value, dropna=False
+        )
+        for value in ("error", "feasible")
+    )
+    xs, ys = table.columns.to_numpy(float), table.index.to_numpy(float)
+    grid = table.to_numpy(float)
+    norm = _norm(grid, "log")
+    figure = Figure(figsize=(6.6, 5.4), layout="constrained")
+    ax = figure.subplots()
+    ax.grid(False)
+    ax.set_facecolor(MISSING)
+    ax.set(xscale="log", yscale="log")
+    edges = _edges(xs, True), _edges(ys, True)
+    ax.pcolormesh(*edges, grid, cmap=MAP, norm=norm, rasterized=True)
+    handles: list[Any] = []
+    share = np.pad(feasible.to_numpy(float), 1, mode="edge")
+    if share.min() < 0.5:
+        padded = [np.concatenate([e[:1], centres, e[-1:]]) for e, centres in zip(edges, (xs, ys), strict=True)]
+        hatched = ax.contourf(*padded, share, levels=[-1.0, 0.5], colors="none", hatches=["//"])
+        hatched.set(edgecolor=_HATCH, linewidth=0.0)
+        ax.contour(*padded, share, levels=[0.5], colors="white", linewidths=1.4)
+        handles.append(Patch(facecolor="#808080", edgecolor="white", hatch="///", label="constraints not kept"))
+    handles += condition_curves(ax, _CONDITIONS, 1.0, (edges[0][0], edges[0][-1]))
+    for window in summary["stages"][1:2]:
+        (left, right), (low, high) = window[side]["alpha_ratio"], window[side]["lambda_ratio"]
+        ax.add_patch(Rectangle((left, low), right - left, high - low, fill=False, ec="white", ls="--", lw=1.2))
+        handles.append(Patch(fill=False, ec="#777777", ls="--", label="first zoom"))
+    gains = summary["gains"][side]
+    ends = [(e[0], e[-1]) for e in edges]
+    for name, mark, row in _others(tuning, side):
+        place = (row["alpha"] / bound, row["lambda"] / np.sqrt(bound))
+        shown = [float(np.clip(value, *limits)) for value, limits in zip(place, ends, strict=True)]
+        off = "" if np.allclose(shown, place) else ", off the map"
+        handles.append(_mark(ax, shown, mark, 8, f"{name}{off}"))
+    handles.append(_mark(ax, (gains["alpha_ratio"], gains["lambda_ratio"]), "*", 15, "tuned"))
+    ax.set(xlim=ends[0], ylim=ends[1], xlabel="α / f⁺", ylabel="λ / √f⁺ (λ in √rad/s)")
+    ax.set_title(
+        f"{side}: tuned ★ λ = {gains['lambda']:.3g} √rad/s, α = {gains['alpha']:.3g} rad/s²,  f⁺ = {bound:.3g} rad/s²"
+    )
+    bar = figure.colorbar(ScalarMappable(norm, MAP), ax=ax, pad=0.02, aspect=28)
+    bar.set_label(_label(tuning))
+    if np.isnan(grid).any():
+        handles.append(Patch(facecolor=MISSING, label=f"diverged ({int(np.isnan(grid).sum())} points)"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    caption = (
+        f"{side}: {_label(tuning)} over all runs, on the coarse map of normalised gains. Hatched: not converged, or a "
+        "margin not kept. Curves: least λ of the gain conditions. The other gains are compared below."
+    )
+    return Drawn(f"tuning_{side}", figure, caption)
+
+
+def _mark(ax: Axes, place: Any, mark: str, size: float, label: str) -> Line2D:
+    """One point, and its entry of the legend."""
+    look: dict[str, Any] = {"ls": "", "marker": mark, "ms": size, "mfc": "white", "mec": "black", "mew": 1.2}
+    ax.plot(*([value] for value in place), clip_on=False, zorder=6, **look)
+    look["ms"] = min(size, 10.0)
+    return Line2D([], [], label=label, **look)
+
+
+def _front(tuning: Tuning, side: str) -> Drawn:
+    summary = tuning.summary
+    feasible = tuning.candidates[side].query("feasible")
+    front = pd.DataFrame(summary["pareto"][side])
+    figure = Figure(figsize=(6.6, 4.4), layout="constrained")
+    ax = figure.subplots()
+    ax.plot(
+        feasible["convergence_time"], feasible["error"], ".", ms=3.5, color=MISSING, label="gains that keep all constraints"
+    )
+    ax.step(front["convergence_time"], front["error"], "o-", where="post", ms=3.5, color=COLOURS[0],
+            label="none better in both")  # fmt: skip
+    times, errors = list(feasible["convergence_time"]), list(feasible["error"])
+    handles = list(ax.get_legend_handles_labels()[0])
+    metric, margins = f"{summary['objective']}_rmse", summary["margins"]
+    for name, mark, row in _others(tuning, side):
+        time, error = row["convergence_time"]["worst"], row[metric]["worst"]
+        if time is None or error is None:
+            handles.append(Line2D([], [], ls="", marker="", label=f"{name}: {100 * row['converged']:.3g} % converge"))
+            continue
+        kept = row["margin_alpha"] >= margins["alpha"] and row["margin_exact"] >= margins["exact"]
+        handles.append(_mark(ax, (time, error), mark, 8, name if kept else f"{name}, margins not kept"))
+        times.append(time)
+        errors.append(error)
+    found = summary["achieved"][side]
+    handles.append(_mark(ax, (found["convergence_time"], found[metric]), "*", 15, "tuned"))
+    for values, scale in ((times, ax.set_xscale), (errors, ax.set_yscale)):
+        if min(values) > 0.0 and max(values) > 10.0 * min(values):
+            scale("log")
+    ax.set(xlabel="worst convergence time (s)", ylabel=_label(tuning), title=side)
+    figure.legend(handles=handles, loc="outside lower center", ncols=2)
+    caption = f"{side}: error against convergence time, each the worst of all runs on the study's excitation."
+    return Drawn(f"pareto_{side}", figure, caption)
+
+
+def _comparison(tuning: Tuning, sides: list[str]) -> Drawn:
+    rows, metric = tuning.summary["holdout"]["rows"], f"{tuning.summary['objective']}_rmse"
+    names = list(dict.fromkeys(row["name"] for row in rows))
+    figure = Figure(figsize=(4.6 * len(sides) + 0.6, 1.8 + 0.62 * len(names)), layout="constrained")
+    axes = figure.subplots(2, len(sides), sharey=True, squeeze=False)
+    for column, side in enumerate(sides):
+        found = {row["name"]: row for row in rows if row["side"] == side}
+        for ax, figure_name, label in ((axes[0, column], metric, _label(tuning)),
+                                       (axes[1, column], "convergence_time", "worst convergence time (s)")):  # fmt: skip
+            values = [found[name][figure_name] for name in names]
+            shown = [v["worst"] for v in values if v["worst"] is not None]
+            log = bool(shown) and min(shown) > 0.0 and max(shown) > 30.0 * min(shown)
+            if log:
+                ax.set_xscale("log")
+            for i, (name, value) in enumerate(zip(names, values, strict=True)):
+                row = found[name]
+                if value["worst"] is None:
+                    text = f"converged in {100 * row['converged']:.3g} %" if row["finite"] == 1.0 else "diverged"
+                    ax.annotate(
+                        text, (0.01, i), xycoords=("axes fraction", "data"), va="center", color="#555555", fontsize=9
+                    )
+                    continue
+                whole = row["converged"] == 1.0
+                ax.barh(i, value["worst"], 0.62, color=COLOURS[1] if name == "tuned" else COLOURS[5],
+                        hatch=None if whole else "//", edgecolor="white", linewidth=0.0)  # fmt: skip
+                if value["median"] is not None:
+                    ax.plot([value["median"]], [i], "|", ms=12, mew=1.6, color="black")
+                ax.annotate(f" {value['worst']:.3g}", (value["worst"], i), va="center", fontsize=9)
+            if shown:
+                low = 0.5 * min(v["median"] or v["worst"] for v in values if v["worst"]) if log else 0.0
+                ax.set_xlim(low, max(shown) * (3.0 if log else 1.22) or 1.0)
+            ax.set_xlabel(label)
+            ax.grid(axis="y", visible=False)
+        axes[0, column].set_title(side)
+    axes[0, 0].set_yticks(range(len(names)), names)
+    axes[0, 0].invert_yaxis()
+    held = tuning.summary["holdout"]
+    where = "the study's excitation with other noise" if held["same_excitation"] else "the held-out excitation"
+    caption = (
+        f"The gains on {where} ({held['excitation']['kind']}, noise seeds {held['seeds'][0]} to {held['seeds'][1]}): worst "
+        "of all runs, and the median (stroke). Hatched: some runs did not converge."
+    )
+    return Drawn("tuning_holdout", figure, caption)
+
+
+def write_tune_report(tuning: Tuning, folder: Path) -> list[str]:
+    """Write `gains.toml`, `tuning.json`, figures and report into a folder that exists. Returns lines for the terminal."""
+    summary = tuning.summary
+    lead = _tune_headline(summary)
+    write_atomic(folder / "gains.toml", gains_toml(summary))
+    write_atomic(folder / "tuning.json", json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False))
+    pictures = save_all(draw_tuning(tuning), folder)
+    page = html(
+        tuning.config.title or "Gains",
+        lead,
+        summary["remarks"],
+        pictures,
+        [
+            _gains_table(summary),
+            _comparison_table(f"{_holdout_title(summary)}, worst and median of all runs", summary["holdout"]["rows"]),
+            _comparison_table("On the study's own excitation, worst and median of all runs", summary["named"]),
+            *_pareto_tables(summary),
+        ],
+        tuning.config.to_toml(),
+    )
+    write_atomic(folder / "report.html", page)
+    return [*lead, *summary["remarks"]]
+
+
+def gains_toml(summary: dict[str, Any]) -> str:
+    """The chosen gains as TOML that a study can `include`; what they were chosen for stands in comments."""
+    margins, lines = summary["margins"], []
+    title = " ".join(summary["title"].split())
+    lines.append(f"# Gains chosen by 'jaxbl tune'{f' for: {title}' if title else ''}")
+    lines.append(f"# Objective: {summary['objective_metric']}; {_runs_behind(summary)}.")
+    asked = f"alpha / f+ {margins['alpha']:g}, lambda over the least of the exact condition {margins['exact']:g}"
+    lines.append(f"# Margins asked for: {asked}.")
+    lines.append('# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.')
+    for side, gains in summary["gains"].items():
+        found = summary["achieved"][side]
+        lines += [
+            "",
+            f"# f+ = {summary['f_plus'][side]:.4g} rad/s^2. Reached, the worst of all runs: velocity error "
+            f"{found['velocity_rmse']:.3g} rad/s rms,",
+            f"# torque error {found['torque_rmse']:.3g} N m rms, converged after {found['convergence_time']:.3g} s; "
+            f"margins {found['margin_alpha']:.3g} (alpha), {found['margin_exact']:.3g} (exact).",
+            f"[observer.{side}]",
+            f"lambda = {gains['lambda']!r}",
+            f"alpha = {gains['alpha']!r}",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _runs_behind(summary: dict[str, Any]) -> str:
+    first, last = summary["seeds"]
+    seeds, drives = last - first + 1, len(summary["scenarios"])
+    parts = [f"{seeds} noise seed{'s' * (seeds > 1)}", f"{drives} drive{'s' * (drives > 1)}"]
+    return " and ".join(parts)
+
+
+def _holdout_title(summary: dict[str, Any]) -> str:
+    held = summary["holdout"]
+    if held["same_excitation"]:
+        return "On the study's excitation with other noise"
+    return f"On the held-out excitation ({held['excitation']['kind']})"
+
+
+def _tune_headline(summary: dict[str, Any]) -> list[str]:
+    """Gains, and what they are worth on the held-out runs, in sentences."""
+    lines, metric = [], f"{summary['objective']}_rmse"
+    unit = SIDE_METRICS[metric].unit
+    for side, gains in summary["gains"].items():
+        found = summary["achieved"][side]
+        lines.append(
+            f"{side}: lambda = {gains['lambda']:.4g} √rad/s, alpha = {gains['alpha']:.4g} rad/s² "
+            f"({gains['lambda_ratio']:.3g} √f⁺, {gains['alpha_ratio']:.3g} f⁺): {summary['objective']} error "
+            f"{found[metric]:.3g} {unit} rms, converged after "
+            f"{found['convergence_time']:.3g} s, the worst of {_runs_behind(summary)}."
+        )
+    where = _holdout_title(summary)
+    where = where[0].lower() + where[1:]
+    rows = {(row["name"], row["side"]): row for row in summary["holdout"]["rows"]}
+    for side, others in summary["holdout"]["factors"].items():
+        parts = []
+        for name, factors in others.items():
+            called, row = called_gains(name), rows[name, side]
+            if "why_none" in factors:
+                parts.append(f"{called} converge in {100 * row['converged']:.3g} % of the runs")
+            else:
+                error, time = factors[metric]["worst"], row["convergence_time"]["worst"]
+                times = "as much" if error is None or f"{error:.3g}" == "1" else f"{error:.3g} times as much"
+                parts.append(f"{times} with {called} (converged after {time:.3g} s)")
+        tuned = rows["tuned", side]
+        error, time = tuned[metric]["worst"], tuned["convergence_time"]["worst"]
+        own = "none: runs diverge" if error is None else f"{error:.3g} {unit} rms"
+        after = "not converged in all runs" if time is None else f"converged after {time:.3g} s"
+        lines.append(f"{side}, {where}: worst {summary['objective']} error {own} ({after}); {'; '.join(parts)}.")
+    return lines
+
+
+def _gains_table(summary: dict[str, Any]) -> TableOf:
+    rows: list[list[object]] = []
+    for side, gains in summary["gains"].items():
+        found, step = summary["achieved"][side], summary["resolution"][side]
+        rows.append(
+            [side, gains["lambda"], gains["alpha"], gains["lambda_ratio"], gains["alpha_ratio"], summary["f_plus"][side],
+             found["velocity_rmse"], found["torque_rmse"], found["convergence_time"], found["margin_alpha"],
+             found["margin_exact"], found["peak_ratio"], 100 * max(step.values())]
+        )  # fmt: skip
+    columns = ["side", "λ (√rad/s)", "α (rad/s²)", "λ/√f⁺", "α/f⁺", "f⁺ (rad/s²)", "velocity error (rad/s)",
+               "torque error (N m)", "convergence (s)", "margin α", "margin exact", "ρ", "last step (%)"]  # fmt: skip
+    return TableOf("Chosen gains, worst of all runs", columns, rows)
+
+
+def _comparison_table(heading: str, found: list[dict[str, Any]]) -> TableOf:
+    rows: list[list[object]] = [
+        [row["side"], row["name"], row["lambda"], row["alpha"], 100.0 * row["converged"],
+         *(row[name][how] for name in ("velocity_rmse", "torque_rmse") for how in ("worst", "median")),
+         row["convergence_time"]["worst"], row["margin_alpha"], row["margin_exact"], row["peak_ratio"]]
+        for row in sorted(found, key=lambda row: SIDES.index(row["side"]))
+    ]  # fmt: skip
+    columns = ["side", "gains", "λ", "α", "converged (%)", "velocity error (rad/s)", "median", "torque error (N m)",
+               "median", "convergence (s)", "margin α", "margin exact", "ρ"]  # fmt: skip
+    return TableOf(heading, columns, rows)
+
+
+def _pareto_tables(summary: dict[str, Any]) -> list[TableOf]:
+    unit = SIDE_METRICS[f"{summary['objective']}_rmse"].unit
+    columns = ["λ", "α", "λ/√f⁺", "α/f⁺", "convergence time (s)", f"{summary['objective']} error ({unit})"]
+    return [
+        TableOf(
+            f"No gains beat these in both convergence time and error: {side}", columns, [list(row.values()) for row in rows]
+        )
+        for side, rows in summary["pareto"].items()
+    ]

@@ -1,0 +1,71 @@
+"""The page and figures of a verification."""
+
+import json
+
+import numpy as np
+import pytest
+from small_study import ALPHA, LAMBDA, listed, rigid, spaced
+
+from jaxbl.report import write_verify_report
+from jaxbl.report.atlas import draw_verdict
+from jaxbl.study.verify import verify
+
+ATLAS = {
+    "alpha_ratio": {"start": 1.02, "stop": 20.0, "num": 24},
+    "lambda_ratio": {"start": 0.002, "stop": 25.0, "num": 24},
+    "damping": [0.3],
+    "marks": [{"name": "small gains", "lambda": 0.005, "alpha": 1.8}, {"name": "good gains", "lambda": 6.0, "alpha": 9.0}],
+}
+# forward Euler at so long a period fails with large gains
+STUDY = rigid(
+    {"observer.discretisation": "explicit", "run.sample_period": 0.01, "encoders.noise": 1e-3},
+    axes=[spaced(LAMBDA, 0.1, 30.0, 6), spaced(ALPHA, 1.0, 50.0, 6), listed("excitation.amplitude", 0.02, 0.1)],
+    verify=ATLAS,
+)
+
+
+@pytest.fixture(scope="module")
+def checked(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("verdict")
+    verdict = verify(STUDY, folder)
+    return verdict, folder, write_verify_report(verdict, folder)
+
+
+def test_figures(checked):
+    verdict, _, _ = checked
+    drawn = {drawing.name: drawing for drawing in draw_verdict(verdict)}
+    assert list(drawn) == ["atlas", "friction", "levels_motor", "conservatism", "claimed_bound"]
+    assert all(drawing.caption for drawing in drawn.values())
+    atlas = drawn["atlas"].figure
+    legend = [text.get_text() for text in atlas.legends[0].get_texts()]
+    for label in ("exact, ρ < 1", "simulated boundary", "usual pair (1.5, 1.1)", "small gains"):
+        assert any(text.startswith(label) for text in legend), label
+    # the boundary's points are those of the bisection
+    (points,) = [line for line in atlas.axes[0].lines if line.get_marker() == "o"]
+    np.testing.assert_array_equal(points.get_ydata(), verdict.normalised.boundary)
+
+
+def test_crosses_are_the_counterexamples_to_the_exact_condition(checked):
+    verdict, _, _ = checked
+    (levels,) = [d.figure for d in draw_verdict(verdict) if d.name == "levels_motor"]
+    for ax, level in zip(levels.axes, ("drive", "sampled"), strict=False):
+        crosses = sum(len(line.get_xdata()) for line in ax.lines if line.get_marker() == "x")
+        entries = next(entry for entry in verdict.summary["levels"] if entry["level"] == level)["conditions"]
+        exact = next(entry for entry in entries if entry["name"] == "exact")
+        assert crosses == exact["counterexamples"]
+    assert exact["counterexamples"] > 0
+
+
+def test_page_and_lines(checked):
+    verdict, folder, lines = checked
+    page = (folder / "report.html").read_text()
+    assert json.loads((folder / "verdict.json").read_text()) == verdict.summary
+    for text in ("Counterexamples by cause", "True and claimed bound by input", "small gains", "Moreno-Osorio"):
+        assert text in page
+    assert any("no counterexample to any condition" in line for line in lines)
+    assert any("failed though the condition held" in line and "Causes, by experiment" in line for line in lines)
+    (marked,) = [line for line in lines if line.startswith("small gains")]
+    assert "no condition can hold" in marked or "worst disturbance enlarges the error" in marked
+    (marked,) = [line for line in lines if line.startswith("good gains")]
+    assert "any disturbance within f⁺ dies out" in marked
+    assert len(list((folder / "figures").glob("*.png"))) == 5

@@ -1,0 +1,105 @@
+"""What a tuning leaves behind: gains that can be included, numbers, figures, page."""
+
+import json
+import tomllib
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import LogNorm
+from small_study import small
+from test_page import Page
+
+from jaxbl.observer.conditions import CONDITIONS
+from jaxbl.report import write_tune_report
+from jaxbl.report.tuning import draw_tuning
+from jaxbl.study.config import read_config
+from jaxbl.study.trial import run
+from jaxbl.study.tune import tune
+
+SLOW = {"lambda": 1e-3, "alpha": 0.05}
+STUDY = small(
+    {"title": "two <b> sides", "run.velocity_tolerance": 0.2, "run.position_tolerance": 0.1, "excitation.amplitude": 0.5},
+    tune={"num": 4, "refine": 1, "alpha_ratio": {"stop": 20.0}, "lambda_ratio": {"stop": 20.0},
+          "compare": [{"name": "slow", "motor": SLOW, "load": SLOW}]},
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def tuned():
+    return tune(STUDY)
+
+
+@pytest.fixture(scope="module")
+def folder(tuned, tmp_path_factory):
+    path = tmp_path_factory.mktemp("tuned")
+    path.joinpath("lines").write_text("\n".join(write_tune_report(tuned, path)))
+    return path
+
+
+def test_gains_can_be_included_and_run(folder, tuned):
+    text = (folder / "gains.toml").read_text(encoding="utf-8")
+    # exact numbers, and what they are for
+    assert {side: tomllib.loads(text)["observer"][side]["alpha"] for side in ("motor", "load")} == {
+        side: gains["alpha"] for side, gains in tuned.summary["gains"].items()
+    }
+    assert "# Objective: worst velocity_rmse (rad/s) over seeds and scenarios; 1 noise seed and 1 drive." in text
+    assert "two <b> sides" in text
+    study = small({"include": str(folder / "gains.toml")}, observer={"motor": {"velocity_error": 0.5}})
+    config = read_config(study)
+    for side, gains in tuned.summary["gains"].items():
+        observer = getattr(config.observer, side)
+        assert (observer.lambda_, observer.alpha) == (gains["lambda"], gains["alpha"])
+    assert config.observer.motor.velocity_error == 0.5
+    assert run(study).summary["conditions"]["motor"]["alpha"] == tuned.summary["gains"]["motor"]["alpha"]
+
+
+def test_numbers_figures_and_page(folder, tuned):
+    assert json.loads((folder / "tuning.json").read_text(encoding="utf-8")) == tuned.summary
+    names = ["pareto_load", "pareto_motor", "tuning_holdout", "tuning_load", "tuning_motor"]
+    assert sorted(path.stem for path in (folder / "figures").iterdir()) == names
+    assert plt.get_fignums() == []
+    page = Page((folder / "report.html").read_text(encoding="utf-8"))
+    assert len(page.images) == 5
+    lines = (folder / "lines").read_text().splitlines()
+    for text in (*lines, "two <b> sides", "usual rule", "slow", "On the study's excitation with other noise"):
+        assert text in page.text
+    assert lines[0].startswith(f"motor: lambda = {tuned.summary['gains']['motor']['lambda']:.4g} √rad/s, alpha = ")
+    assert any("the gains 'slow' converge in 0 % of the runs" in line for line in lines)
+
+
+def test_map_has_the_coarse_stage_its_optimum_and_the_others(tuned):
+    drawing = next(d for d in draw_tuning(tuned) if d.name == "tuning_motor")
+    ax = drawing.figure.axes[0]
+    (mesh,) = (c for c in ax.collections if isinstance(c, QuadMesh))
+    coarse = tuned.candidates["motor"].query("stage == 0").sort_values(["lambda", "alpha"])
+    np.testing.assert_allclose(np.ma.getdata(mesh.get_array()).ravel(), coarse["error"])
+    assert isinstance(mesh.norm, LogNorm)
+    gains = tuned.summary["gains"]["motor"]
+    star = next(line for line in ax.lines if line.get_marker() == "*")
+    assert (star.get_xdata()[0], star.get_ydata()[0]) == (gains["alpha_ratio"], gains["lambda_ratio"])
+    legend = [text.get_text() for legend in drawing.figure.legends for text in legend.get_texts()]
+    assert {"constraints not kept", CONDITIONS["exact"].title, "usual rule", "config", "slow, off the map", "tuned"} <= set(
+        legend
+    )
+    # on the edge, not outside
+    low, high = ax.get_xlim()
+    assert all(low <= x * (1 + 1e-9) and x <= high * (1 + 1e-9) for line in ax.lines for x in line.get_xdata())
+
+
+def test_front_says_who_does_not_converge(tuned):
+    drawing = next(d for d in draw_tuning(tuned) if d.name == "pareto_motor")
+    legend = [text.get_text() for legend in drawing.figure.legends for text in legend.get_texts()]
+    assert "slow: 0 % converge" in legend
+    (line,) = (line for line in drawing.figure.axes[0].lines if line.get_label() == "none better in both")
+    assert list(line.get_xdata()) == [point["convergence_time"] for point in tuned.summary["pareto"]["motor"]]
+
+
+def test_comparison_draws_what_the_numbers_say(tuned):
+    drawing = next(d for d in draw_tuning(tuned) if d.name == "tuning_holdout")
+    rows = [row for row in tuned.summary["holdout"]["rows"] if row["side"] == "motor"]
+    bars = [patch.get_width() for patch in drawing.figure.axes[0].patches]
+    np.testing.assert_allclose(bars, [row["velocity_rmse"]["worst"] for row in rows])
+    texts = [text.get_text() for text in drawing.figure.axes[2].texts]
+    assert "converged in 0 %" in texts
