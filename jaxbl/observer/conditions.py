@@ -107,7 +107,9 @@ def _log_peak_ratio(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
     c1, c2 = 2.0 * _margin(alpha, f_plus), 2.0 * (alpha + f_plus)
     half, one = 0.5 * lambda_, jnp.ones_like(0.5 * lambda_)
     below = jnp.where(c2 > half**2, c2 - half**2, 1.0)
-    return 0.5 * jnp.log(c2 / c1) - half * (_arc(half, one, c1 - half**2) + _arc(-half, one, below))
+    # log(c2 / c1) without cancellation where alpha is far above f_plus
+    gain = 0.5 * jnp.log1p(2.0 * f_plus / _margin(alpha, f_plus))
+    return gain - half * (_arc(half, one, c1 - half**2) + _arc(-half, one, below))
 
 
 _HALVINGS = 12
@@ -119,7 +121,9 @@ def least_lambda_exact(alpha: Values, f_plus: Values) -> Values:
 
     By bisection on :func:`peak_ratio`, which falls with lambda, then Newton's method; its last step carries the derivatives.
     """
-    known = (alpha > f_plus) & (f_plus > 0.0)
+    # where alpha / f_plus would overflow, the root is nothing
+    least_bound = jnp.finfo(jnp.result_type(alpha, f_plus, float)).tiny * alpha
+    known = (alpha > f_plus) & (f_plus > least_bound)
     ratio = jnp.where(known, alpha, 2.0) / jnp.where(known, f_plus, 1.0)
     one = jnp.ones_like(ratio)
     fixed = jax.lax.stop_gradient(ratio)
@@ -182,7 +186,7 @@ def _passage(lambda_: Values, alpha: Values, f_plus: Values, y: Values, x2: Valu
     before = v > ray * y
     # out to the ray, if the point lies before it; at the root's ray, d = +f holds on to the origin
     eps = jnp.finfo(jnp.result_type(half)).eps
-    ends = before & (ray <= (1.0 - 8.0 * eps) * _lowest_ray(lambda_, c1))
+    ends = before & _at_root(lambda_, c1, ray, 64.0)
     turns = before & ~ends
     start, end = (jnp.where(turns, x, 1.0) for x in (v + half * y, ray + half))
     start_y, one, d1 = jnp.where(turns, y, 0.0), jnp.ones_like(end), jnp.where(turns, c1 - half**2, 1.0)
@@ -207,6 +211,22 @@ def _lowest_ray(lambda_: Values, c1: Values) -> Values:
     half = 0.5 * lambda_
     real = half**2 >= c1
     return jnp.where(real, -c1 / (half + jnp.sqrt(jnp.where(real, half**2 - c1, 0.0))), -jnp.inf)
+
+
+def _sliding_speed(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
+    """Least x2 / sqrt(x1) from which d = +f leads to the origin without passing x = 0; inf where there is none.
+
+    On the faster of the two rays, x1' = p sqrt(x1), x2 is (p + lambda) sqrt(x1), which is minus the slower one's root.
+    """
+    return -_lowest_ray(lambda_, 2.0 * _margin(alpha, f_plus))
+
+
+def _at_root(lambda_: Values, c1: Values, ray: Values, eps: float) -> Values:
+    """Whether a ray is the root's or below, to some eps of the squares whose difference p^2 + lambda p + c1 is."""
+    half = 0.5 * lambda_
+    square, least = (ray + half) ** 2, half**2 - c1
+    near = square - least <= eps * float(jnp.finfo(jnp.result_type(half)).eps) * square
+    return (least >= 0.0) & ((ray <= _lowest_ray(lambda_, c1)) | near)
 
 
 _RAYS = 17
@@ -253,9 +273,10 @@ def slowest_ray(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
 
     ends = jnp.zeros(shape, dtype), jnp.ones(shape, dtype)
     _, found = jax.lax.scan(zoom, ends, length=_ROUNDS)
-    # what is left of x there is below exp(-9): rounding must not choose between it and nothing
-    found = jnp.where(real & (found[-1] > 0.9), 1.0, found[-1])
-    return jnp.where(peak_ratio(lambda_, alpha, f_plus) < 1.0, ray(found), 0.0)
+    # rounding must not choose between the root's ray and what lies by it, nor what is left of x below exp(-9) and nothing
+    share, near = found[-1], ray(found[-1])
+    near = jnp.where(real & ((share > 0.9) | _at_root(lambda_, c1, near, 1e3)), root, near)
+    return jnp.where(peak_ratio(lambda_, alpha, f_plus) < 1.0, near, 0.0)
 
 
 def convergence_time_worst(
@@ -278,8 +299,11 @@ def convergence_time_worst(
     away = position_error != 0.0
     y = jnp.where(away, jnp.sqrt(jnp.where(away, jnp.abs(position_error), 1.0)), 0.0)
     first = _passage(lambda_, alpha, f_plus, y + zero, x2 + zero, ray)
+    # a start beyond the root's ray returns to it under d = +f, and holds on to the origin
+    slides = x2 + zero > _sliding_speed(lambda_, alpha, f_plus) * y
+    longest = jnp.maximum(first.time + first.speed * a_peak, jnp.where(slides, x2 / _margin(alpha, f_plus), 0.0))
     moving = (x2 != 0.0) | away
-    return jnp.where(converges, jnp.where(moving, first.time + first.speed * a_peak, 0.0), jnp.inf)
+    return jnp.where(converges, jnp.where(moving, longest, 0.0), jnp.inf)
 
 
 class Condition(NamedTuple):

@@ -7,15 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad, solve_ivp
+from scipy.linalg import solve_continuous_are
 
+from jaxbl.errors import InputError
 from jaxbl.observer import conditions
+from jaxbl.observer.worst_case import half_cycle
 
-# alpha / f: least lambda / sqrt(f) by the exact condition, (32) with q -> 0, Seeber and Horn
+# alpha / f: least lambda / sqrt(f) by the exact condition, (32) with q -> 0, Seeber and Horn, Levant
 TABLE = {
-    1.1: (0.991, 9.39, 1.449),
-    1.5: (0.780, 5.00, 1.581),
-    2.0: (0.656, 4.24, 1.732),
-    5.0: (0.404, 4.24, 2.449),
+    1.1: (0.991, 9.39, 1.449, 9.17),
+    1.5: (0.780, 5.00, 1.581, 4.47),
+    2.0: (0.656, 4.24, 1.732, 3.46),
+    5.0: (0.404, 4.24, 2.449, 2.45),
 }
 
 
@@ -23,15 +26,24 @@ TABLE = {
 @pytest.mark.parametrize("ratio", TABLE)
 def test_table_of_the_design(ratio, dtype):
     alpha, one = jnp.asarray(ratio, dtype), jnp.asarray(1.0, dtype)
-    exact, davila_fridman, seeber_horn = TABLE[ratio]
+    exact, davila_fridman, seeber_horn, levant = TABLE[ratio]
     np.testing.assert_allclose(conditions.least_lambda_exact(alpha, one), exact, atol=6e-4)
     np.testing.assert_allclose(conditions.least_lambda_davila_fridman(alpha, one), davila_fridman, atol=6e-3)
     np.testing.assert_allclose(conditions.least_lambda_seeber_horn(alpha, one), seeber_horn, atol=6e-4)
+    np.testing.assert_allclose(conditions.least_lambda_levant(alpha, one), levant, atol=6e-3)
+    for least in LEAST.values():
+        assert least(alpha, one).dtype == dtype
 
 
 def test_davila_fridman_grows_with_q():
     least = conditions.least_lambda_davila_fridman
     np.testing.assert_allclose(least(2.0, 1.0, 0.5), 3.0 * least(2.0, 1.0))
+
+
+@pytest.mark.parametrize("q", [-0.1, 1.0, 1.5, float("nan"), float("inf")])
+def test_q_outside_of_its_range(q):
+    with pytest.raises(InputError, match=f"q: condition .32. needs 0 < q < 1 .*, not {q}"):
+        conditions.least_lambda_davila_fridman(2.0, 1.0, q)
 
 
 def test_levants_usual_gains_converge():
@@ -117,6 +129,105 @@ def test_least_lambda_exact_is_where_the_ratio_is_one(ratio, f_plus):
     np.testing.assert_allclose(RATIO(least, ratio * f_plus, f_plus), 1.0, rtol=1e-9)
 
 
+@settings(deadline=None, max_examples=100)
+@given(margin=st.floats(1e-3, 1e3), f_plus=POSITIVE)
+def test_order_of_the_conditions(margin, f_plus):
+    """All others are sufficient, so none may ask for less than the exact one; of each other, what algebra says."""
+    alpha = (1.0 + margin) * f_plus
+    least = {name: float(least(alpha, f_plus)) for name, least in LEAST.items()}
+    exact = least.pop("exact")
+    assert 0.0 < exact < min(least.values())
+    assert least["moreno_osorio"] < least["levant"] < least["davila_fridman"]
+    assert least["seeber_horn"] < least["davila_fridman"]
+    # 4 (a - sqrt(a^2 - 1)) = a + 1 at a = (8 sqrt 2 - 3) / 7
+    crossing = (8.0 * np.sqrt(2.0) - 3.0) / 7.0
+    if abs(1.0 + margin - crossing) > 1e-6:
+        assert (least["moreno_osorio"] < least["seeber_horn"]) == (1.0 + margin > crossing)
+
+
+def extremes(lambda_, alpha, f_plus):
+    """Matrices of zeta' = A zeta / (2 sqrt|x1|), zeta = (sqrt|x1| sign x1, x2), under d = -f and +f where x1 > 0."""
+    return [np.array([[-lambda_, 1.0], [-2.0 * (alpha - d), 0.0]]) for d in (-f_plus, f_plus)]
+
+
+@settings(deadline=None, max_examples=100)
+@given(ratio=st.floats(1.01, 50.0), f_plus=POSITIVE, off=st.floats(1e-3, 1.0))
+def test_quadratic_lyapunov_functions_end_where_shorten_and_narendra_say(ratio, f_plus, off):
+    """Two Hurwitz matrices that differ in rank one share a quadratic Lyapunov function iff their product has no negative
+    real eigenvalue (R. Shorten, K. Narendra, 2003)."""
+    alpha = ratio * f_plus
+    least = float(LEAST["moreno_osorio"](alpha, f_plus))
+    for lambda_, shared in ((least * (1.0 + off), True), (least / (1.0 + off), False)):
+        one, other = extremes(lambda_, alpha, f_plus)
+        assert max(np.linalg.eigvals(one).real.max(), np.linalg.eigvals(other).real.max()) < 0.0
+        assert np.linalg.matrix_rank(one - other) == 1
+        eigenvalues = np.linalg.eigvals(one @ other)
+        negative = (np.abs(eigenvalues.imag) < 1e-9 * np.abs(eigenvalues)) & (eigenvalues.real < 0.0)
+        assert negative.any() != shared
+
+
+@settings(deadline=None, max_examples=50)
+@given(ratio=st.floats(1.02, 20.0), f_plus=POSITIVE, off=st.floats(0.02, 3.0))
+def test_moreno_osorio_allows_only_what_a_lyapunov_function_shows(ratio, f_plus, off):
+    """The bounded real lemma's Riccati equation, solved, gives V = zeta' P zeta that falls at both extremes of w."""
+    alpha = ratio * f_plus
+    lambda_ = float(LEAST["moreno_osorio"](alpha, f_plus)) * (1.0 + off)
+    a, b = np.array([[-lambda_, 1.0], [-2.0 * alpha, 0.0]]), np.array([[0.0], [2.0]])
+    # a little more than f zeta_1 is allowed for, and a little of zeta_2: V' < 0 strictly
+    q = np.diag([((1.0 + 1e-3 * off) * f_plus) ** 2, 1e-6 * off**2 * f_plus])
+    p = solve_continuous_are(a, b, q, -np.eye(1))
+    assert np.linalg.eigvalsh(p).min() > 0.0
+    for matrix in extremes(lambda_, alpha, f_plus):
+        assert np.linalg.eigvalsh(matrix.T @ p + p @ matrix).max() < 0.0
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(jnp.float32, 2e-5), (jnp.float64, 1e-6)])
+def test_derivatives_of_the_exact_condition(dtype, tolerance):
+    random = np.random.default_rng(3)
+    f_plus = np.exp(random.uniform(-2.0, 2.0, 40))
+    alpha = f_plus * (1.0 + np.exp(random.uniform(np.log(0.01), np.log(50.0), 40)))
+    least = conditions.least_lambda_exact
+    change = []
+    for d in 1e-6 * np.eye(2):
+        above, below = (LEAST["exact"](alpha * np.exp(s * d[0]), f_plus * np.exp(s * d[1])) for s in (1.0, -1.0))
+        change.append(np.asarray((above - below) / 2e-6))
+    change = np.array(change) / np.array([alpha, f_plus])
+    # Euler: the condition is homogeneous of degree 1/2
+    np.testing.assert_allclose(change[0] * alpha + change[1] * f_plus, 0.5 * LEAST["exact"](alpha, f_plus), rtol=1e-6)
+    found = jax.jit(jax.vmap(jax.grad(least, (0, 1))))(jnp.asarray(alpha, dtype), jnp.asarray(f_plus, dtype))
+    assert found[0].dtype == dtype
+    np.testing.assert_allclose(found, change, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(jnp.float32, 1e-5), (jnp.float64, 1e-12)])
+def test_exact_condition_far_above_the_bound(dtype, tolerance):
+    """log rho tends to f / alpha - pi lambda / sqrt(8 alpha) for small f: without cancellation in either precision."""
+    ratio = np.logspace(7, 20, 14).astype(dtype)
+    found = LEAST["exact"](ratio, np.ones_like(ratio))
+    np.testing.assert_allclose(found * np.sqrt(ratio), np.sqrt(8.0) / np.pi, rtol=tolerance)
+
+
+def test_nan_only_where_an_argument_is():
+    values = np.array([0.0, 1e-300, 1e-30, 1e-3, 0.5, 1.0, np.nextafter(1.0, 2.0), 1.0 + 1e-9, 2.0, 1e6, 1e30, np.nan])
+    alpha, f_plus = (x.ravel() for x in np.meshgrid(values, values))
+    unknown = np.isnan(alpha) | np.isnan(f_plus)
+    for name, least in LEAST.items():
+        found = np.asarray(least(alpha, f_plus))
+        np.testing.assert_array_equal(np.isnan(found), unknown, err_msg=name)
+        np.testing.assert_array_equal(found[~unknown] == np.inf, (alpha <= f_plus)[~unknown], err_msg=name)
+        assert np.all(found[~unknown] >= 0.0), name
+
+
+def test_without_a_disturbance():
+    """Any lambda > 0 is enough then; Davila-Fridman and Seeber-Horn ask for more all the same."""
+    alpha, zero = np.array([0.1, 1.0, 30.0]), np.zeros(3)
+    for name in ("exact", "levant", "moreno_osorio"):
+        np.testing.assert_array_equal(LEAST[name](alpha, zero), zero)
+    np.testing.assert_allclose(LEAST["seeber_horn"](alpha, zero), np.sqrt(alpha))
+    np.testing.assert_allclose(LEAST["davila_fridman"](alpha, zero), np.sqrt(2.0 * alpha))
+    assert np.all(RATIO(np.full(3, 1e-3), alpha, zero) < 1.0)
+
+
 @pytest.mark.parametrize("alpha", [0.0, 0.5, 1.0])
 def test_no_lambda_is_enough_where_alpha_is_not(alpha):
     for _, least in conditions.CONDITIONS.values():
@@ -147,7 +258,7 @@ def test_derivatives_are_finite_on_every_branch(case):
         np.testing.assert_allclose(gradient, change, rtol=1e-6, atol=1e-12)
 
 
-def convergence_times(lambda_, alpha, f_plus, position, velocity, disturbance, duration, step):
+def convergence_times(lambda_, alpha, f_plus, position, velocity, disturbance, duration, step, rest=1e-3):
     """Simulate x1' = x2 - lambda sqrt|x1| sign x1, x2' = d - alpha sign x1, for lanes of cases.
 
     A small step of the set-valued terms taken implicitly, so that rest at the origin is not lost. Returns the time after
@@ -164,7 +275,7 @@ def convergence_times(lambda_, alpha, f_plus, position, velocity, disturbance, d
         beyond = np.maximum(np.abs(b) - reach, 0.0)
         x = np.sign(b) * (0.5 * (-step * lambda_ + np.sqrt((step * lambda_) ** 2 + 4.0 * beyond))) ** 2
         v = v + step * d - np.clip(b, -reach, reach) / step
-        last = np.where(np.abs(v) > 1e-3 * largest, (i + 1) * step, last)
+        last = np.where(np.abs(v) > rest * largest, (i + 1) * step, last)
     return last
 
 
@@ -205,3 +316,175 @@ def test_convergence_time_stays_below_the_bound_where_32_holds(disturbance):
 def test_bound_is_infinite_where_32_fails():
     assert conditions.convergence_time_bound(4.2, 2.0, 1.0, 0.0, 1.0) == jnp.inf
     assert conditions.convergence_time_bound(4.3, 2.0, 1.0, 0.0, 1.0) < jnp.inf
+
+
+WORST, SLOWEST = jax.jit(conditions.convergence_time_worst), jax.jit(conditions.slowest_ray)
+
+
+# one shape, compiled once
+LANES = 300
+
+
+def convergent_gains(seed, nearest=1.02, farthest=40.0):
+    """Gains from just above the exact condition to far above, with bounds of several sizes."""
+    random = np.random.default_rng(seed)
+    f_plus = np.exp(random.uniform(-1.0, 1.0, LANES))
+    alpha = f_plus * (1.0 + np.exp(random.uniform(np.log(0.02), np.log(20.0), LANES)))
+    above = np.exp(random.uniform(np.log(nearest), np.log(farthest), LANES))
+    return np.asarray(LEAST["exact"](alpha, f_plus)) * above, alpha, f_plus
+
+
+def root_ray(lambda_, alpha, f_plus):
+    """The slower of the rays along which d = +f leads to the origin; nan where there is none."""
+    inside = lambda_**2 - 8.0 * (alpha - f_plus)
+    return 0.5 * (np.sqrt(np.where(inside >= 0.0, inside, np.nan)) - lambda_)
+
+
+def switching(ray):
+    """The disturbance that pushes outwards until |x1|' = ray sqrt|x1|, and homewards from there on."""
+
+    def disturbance(t, x, speed):
+        side = np.where(x == 0.0, np.sign(speed), np.sign(x))
+        return np.where(side * speed > ray * np.sqrt(np.abs(x)), side, -side)
+
+    return disturbance
+
+
+HALF = jax.jit(lambda *given, ray, homeward: half_cycle(*given, ray=ray, homeward=homeward))
+
+
+def whole_time(cycle):
+    """Time of half cycles without end, from the first one at unit speed; nan where they do not converge."""
+    ratio = np.asarray(cycle.ratio)
+    return np.where(ratio < 1.0, np.asarray(cycle.time) / np.where(ratio < 1.0, 1.0 - ratio, 1.0), np.nan)
+
+
+def test_worst_time_is_that_of_simulated_half_cycles_and_of_no_other_ray():
+    gains = convergent_gains(0)
+    zero, one = np.zeros(LANES), np.ones(LANES)
+    worst, ray, root = np.asarray(WORST(*gains, zero, one)), np.asarray(SLOWEST(*gains)), root_ray(*gains)
+    at_root = np.isclose(ray, root, rtol=1e-6, atol=0.0)
+    assert 50 < at_root.sum() < 250
+    assert np.all(ray <= 0.0)
+    held = HALF(*gains, ray=np.where(at_root, 0.0, ray), homeward=np.where(at_root, 1.0, -1.0))
+    np.testing.assert_allclose(whole_time(held), worst, rtol=1e-4)
+    # every other ray: as shares of the root's, or of all directions where there is none
+    found = [whole_time(HALF(*gains, ray=zero, homeward=one))]
+    for share in np.linspace(0.0, 1.0, 100, endpoint=False):
+        rays = np.where(np.isnan(root), -np.sqrt(gains[1]) * share / (1.0 - share), share * root)
+        found.append(whole_time(HALF(*gains, ray=rays, homeward=-one)))
+    longest = np.nanmax(found, axis=0)
+    assert np.all(longest <= worst * (1.0 + 1e-4))
+    assert np.all(longest >= worst * (1.0 - 1e-3))
+
+
+def test_no_disturbance_takes_longer_than_the_worst_and_the_slowest_takes_as_long():
+    """By the implicit scheme of small steps, from starts anywhere; what it leaves out is below the rest."""
+    gains, start = convergent_gains(5, nearest=1.3), starts(5)
+    columns = (*gains, *start, SLOWEST(*gains), WORST(*gains, *start))
+    # each case has its worst time as unit
+    lambda_, alpha, f_plus, position, velocity, ray, unit = (np.asarray(c)[::12] for c in columns)
+    cases, random = len(unit), np.random.default_rng(11)
+    lambda_, alpha, f_plus, velocity = lambda_ * unit, alpha * unit**2, f_plus * unit**2, velocity * unit
+    ray = ray * unit
+    levels = random.uniform(-1.0, 1.0, (2, 1000, cases))
+    signs, phases = np.sign(levels[0]), random.uniform(0.0, 2.0 * np.pi, (2, cases))
+    root = root_ray(lambda_, alpha, f_plus)
+    at_root = np.isclose(ray, root, rtol=1e-6)
+    # where the slowest holds on along the root's ray, starts beyond it go home at once or return to it
+    slowest = [switching(np.where(at_root, beyond, ray)) for beyond in (1.1 * root, -lambda_ - root)]
+    first_side = np.where(position == 0.0, np.sign(velocity), np.sign(position))
+
+    def held(until):
+        def disturbance(t, x, speed):
+            at_first = np.sign(x) == first_side
+            return np.where(at_first, first_side if t < until else -first_side, slowest[1](t, x, speed))
+
+        return disturbance
+
+    family = [
+        *slowest,
+        *(held(until) for until in (0.03, 0.1, 0.3)),
+        *(switching(-share * np.sqrt(alpha)) for share in (0.0, 0.1, 0.3, 1.0, 3.0)),
+        lambda t, x, speed: np.sign(x),
+        lambda t, x, speed: np.ones_like(x),
+        lambda t, x, speed: -np.ones_like(x),
+        lambda t, x, speed: levels[1, int(t / 0.02)],
+        lambda t, x, speed: signs[int(t / 0.002)],
+        lambda t, x, speed: np.sin(2.0 * np.pi * 3.0 * t + phases[0]),
+        lambda t, x, speed: np.sin(2.0 * np.pi * 30.0 * t + phases[1]),
+    ]
+
+    def every(t, x, speed):
+        columns = zip(family, x.reshape(-1, cases), speed.reshape(-1, cases), strict=True)
+        return np.concatenate([d(t, a, b) for d, a, b in columns])
+
+    given = [np.tile(column, len(family)) for column in (lambda_, alpha, f_plus, position, velocity)]
+    times = convergence_times(*given, every, 1.1, 5e-5, rest=1e-4).reshape(len(family), cases)
+    # a step too long in one arc lasts as much longer in the next as it is slower
+    off = 1e-3 + 1e-4 * (alpha + f_plus) / (alpha - f_plus)
+    assert np.all(times <= 1.0 + off)
+    # over many half cycles the scheme's own damping adds up
+    few = np.asarray(RATIO(lambda_, alpha, f_plus)) < 0.5
+    assert few.sum() > 15
+    assert np.all(np.abs(times[:2].max(axis=0) - 1.0)[few] <= 3.0 * off[few])
+
+
+def starts(seed):
+    """Errors at t = 0, some of them in position or velocity alone."""
+    position, velocity = np.random.default_rng(seed).uniform(-1.0, 1.0, (2, LANES))
+    position[:50], velocity[50:100] = 0.0, 0.0
+    return position, velocity
+
+
+@pytest.mark.parametrize("scale", [1e-3, 0.3, 50.0])
+def test_worst_time_is_homogeneous_and_odd(scale):
+    lambda_, alpha, f_plus = convergent_gains(4)
+    position, velocity = starts(4)
+    time = WORST(lambda_, alpha, f_plus, position, velocity)
+    np.testing.assert_allclose(WORST(lambda_, alpha, f_plus, -position, -velocity), time, rtol=1e-12)
+    # lengths go with the square of times
+    np.testing.assert_allclose(WORST(lambda_, alpha, f_plus, scale**2 * position, scale * velocity), scale * time, rtol=1e-6)
+    root = np.sqrt(scale)
+    scaled = WORST(root * lambda_, scale * alpha, scale * f_plus, scale * position, scale * velocity)
+    np.testing.assert_allclose(scaled, time, rtol=1e-6)
+
+
+def test_worst_time_lies_below_the_bound():
+    lambda_, alpha, f_plus = convergent_gains(6, farthest=300.0)
+    start = starts(6)
+    bound, worst = (np.asarray(f(lambda_, alpha, f_plus, *start)) for f in (BOUND, WORST))
+    assert np.all(np.isfinite(worst))
+    assert 50 < np.isfinite(bound).sum() < 250
+    assert np.all(worst <= bound * (1.0 + 1e-9))
+
+
+def test_worst_time_is_infinite_where_peaks_do_not_fall():
+    lambda_, alpha, f_plus = convergent_gains(2, nearest=1.0 + 1e-6, farthest=1.0 + 1e-5)
+    start = np.zeros(LANES), np.ones(LANES)
+    assert np.all(np.isfinite(WORST(lambda_, alpha, f_plus, *start)))
+    assert np.all(np.asarray(WORST(lambda_ * (1.0 - 1e-4), alpha, f_plus, *start)) == np.inf)
+    assert np.all(np.asarray(SLOWEST(lambda_ * (1.0 - 1e-4), alpha, f_plus)) == 0.0)
+    assert np.all(np.asarray(WORST(lambda_, f_plus, f_plus, *start)) == np.inf)
+    # nothing to converge from
+    assert np.all(np.asarray(WORST(lambda_, alpha, f_plus, start[0], start[0])) == 0.0)
+
+
+def test_derivatives_of_the_worst_time():
+    position, velocity = np.random.default_rng(1).uniform(-1.0, 1.0, (2, LANES))
+    given = [*convergent_gains(0), position, velocity]
+    found = jax.jit(jax.grad(lambda *x: jnp.sum(conditions.convergence_time_worst(*x)), (0, 1, 2, 3, 4)))(*given)
+    for k, gradient in enumerate(found):
+        step = 1e-6 * np.abs(given[k])
+        above, below = (WORST(*(x + s * step if i == k else x for i, x in enumerate(given))) for s in (1.0, -1.0))
+        change = np.asarray(above - below) / (2.0 * step)
+        scale = np.asarray(WORST(*given)) / np.abs(given[k])
+        np.testing.assert_allclose(gradient / scale, change / scale, rtol=1e-3, atol=1e-5)
+
+
+def test_worst_time_in_float32():
+    gains = convergent_gains(8, nearest=1.2)
+    start = np.zeros(LANES), np.ones(LANES)
+    found = WORST(*(jnp.asarray(x, jnp.float32) for x in (*gains, *start)))
+    assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, WORST(*gains, *start), rtol=2e-3)
