@@ -378,6 +378,7 @@ def test_default_folder():
     [
         ("gain_map", "sweep"),
         ("load_gains", "sweep"),
+        ("gain_boundary", "sweep"),
         ("paper_table1", "simulate"),
         ("tune_paper_drive", "tune"),
         ("condition_atlas", "verify"),
@@ -388,6 +389,8 @@ def test_shipped_studies_run_without_a_word_on_stderr(name, command, tmp_path):
     study = tomllib.loads((Path(__file__).parents[1] / "sweeps" / f"{name}.toml").read_text(encoding="utf-8"))
     study["run"]["duration"] = 0.5
     study.get("tune", {}).update(num=3, refine=0)
+    if "refine" in study.get("sweep", {}):
+        study["sweep"]["refine"] = 1
     for name in {"alpha_ratio", "lambda_ratio"} & set(study.get("verify", {})):
         study["verify"][name]["num"] = 8
     for axis in study.get("axes", []):

@@ -29,7 +29,7 @@ from jaxbl.study.refine import is_boolean
 from jaxbl.study.sweep import StudyResult
 
 from .refined import Filling, on_coarse_values
-from .style import COLOURS, MAP, MISSING, style, with_unit
+from .style import COLOURS, HATCH, MAP, MISSING, style, with_unit
 
 _CURVES = {
     "davila_fridman": ("-", "#FF5FA2"),
@@ -38,7 +38,6 @@ _CURVES = {
     "moreno_osorio": ((0, (5, 1, 1, 1)), "#B6F09C"),
     "exact": (":", "#FFD400"),
 }
-_HATCH = (1.0, 1.0, 1.0, 0.45)
 SIDES = ("motor", "load")
 
 
@@ -159,7 +158,7 @@ def _sampled(config: Config) -> list[str]:
     return [axis.path for axis in config.axes if axis.values is None and axis.num is None]
 
 
-def _norm(values: np.ndarray, scale: str) -> Normalize:
+def color_norm(values: np.ndarray, scale: str) -> Normalize:
     """Colour scale: logarithmic where values are positive and span more than a factor of 30."""
     finite = values[np.isfinite(values)]
     if finite.size == 0:
@@ -173,7 +172,7 @@ def _norm(values: np.ndarray, scale: str) -> Normalize:
     return Normalize(low, high)
 
 
-def _edges(centres: np.ndarray, log: bool) -> np.ndarray:
+def cell_edges(centres: np.ndarray, log: bool) -> np.ndarray:
     """Cell edges halfway between centres, in the axis's own scale."""
     points = np.log(centres) if log else centres
     if len(points) == 1:
@@ -239,7 +238,7 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable, points: Poi
         norm = (
             Normalize(0.0, 1.0)
             if is_boolean(spec.value)
-            else _norm(np.concatenate([t.to_numpy(float) for t in tables]), spec.scale)
+            else color_norm(np.concatenate([t.to_numpy(float) for t in tables]), spec.scale)
         )
         figure, axes = _grid_of_axes(len(panels), 3.5, 3.4, extra=1.0)
         handles: list[Any] = []
@@ -261,7 +260,7 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable, points: Poi
             if gridded:
                 if filling is None:
                     grid = table.unstack().to_numpy(float)
-                ax.pcolormesh(_edges(xs, logs[0]), _edges(ys, logs[1]), grid, cmap=MAP, norm=norm, rasterized=True)
+                ax.pcolormesh(cell_edges(xs, logs[0]), cell_edges(ys, logs[1]), grid, cmap=MAP, norm=norm, rasterized=True)
                 outline = _outline(ax, part, spec, (xs, ys), logs, filling)
                 handles = handles or ([] if outline is None else [outline])
             else:
@@ -281,8 +280,8 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable, points: Poi
                 curves = _overlay(ax, bound, spec, xs, ys)
                 under.append(f"f⁺ = {bound:.3g} rad/s²")
             ax.set_title("\n".join(line for line in (title, ",  ".join(under)) if line))
-            ax.set_xlim(*_edges(xs, logs[0])[[0, -1]])
-            ax.set_ylim(*_edges(ys, logs[1])[[0, -1]])
+            ax.set_xlim(*cell_edges(xs, logs[0])[[0, -1]])
+            ax.set_ylim(*cell_edges(ys, logs[1])[[0, -1]])
             if ax.get_subplotspec().is_first_col():  # type: ignore[union-attr]
                 ax.set_ylabel(_label(config, spec.y))
             ax.set_xlabel(_label(config, spec.x))
@@ -349,9 +348,9 @@ def _outline(
         return None
     # out to the edges of the outer cells
     share = np.pad(share, 1, mode="edge")
-    xs, ys = (np.concatenate([e[:1], c, e[-1:]]) for c, e in zip(centres, map(_edges, centres, logs), strict=True))
+    xs, ys = (np.concatenate([e[:1], c, e[-1:]]) for c, e in zip(centres, map(cell_edges, centres, logs), strict=True))
     hatched = ax.contourf(xs, ys, share, levels=[-1.0, 0.5], colors="none", hatches=["//"])
-    hatched.set(edgecolor=_HATCH, linewidth=0.0)
+    hatched.set(edgecolor=HATCH, linewidth=0.0)
     if share.max() >= 0.5:
         lines = ax.contour(xs, ys, share, levels=[0.5], colors="white", linewidths=1.8)
         lines.set_path_effects([path_effects.Stroke(linewidth=3.2, foreground="black"), path_effects.Normal()])
@@ -414,8 +413,8 @@ def _lines(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
             log = _is_log(config, spec.x, xs)
             if log:
                 ax.set_xscale("log")
-            ax.set_xlim(*_edges(xs, log)[[0, -1]])
-            if isinstance(_norm(shown.to_numpy(float), spec.scale), LogNorm):
+            ax.set_xlim(*cell_edges(xs, log)[[0, -1]])
+            if isinstance(color_norm(shown.to_numpy(float), spec.scale), LogNorm):
                 ax.set_yscale("log")
             ax.set_title(title)
             ax.set_xlabel(_label(config, spec.x))
@@ -444,7 +443,7 @@ def _laws(config: Config, frame: pd.DataFrame, spec: FigureTable, laws: list[Law
             drawn = [_law(ax, law, i) for i, law in enumerate(there)]
             xs = np.concatenate([law.x_values for law in there])
             if len(xs):
-                ax.set_xlim(*_edges(np.unique(xs), log=True)[[0, -1]])
+                ax.set_xlim(*cell_edges(np.unique(xs), log=True)[[0, -1]])
             if len(ys := np.concatenate(drawn)):
                 # the lines of theory run on beyond the points
                 ax.set_ylim(ys.min() / 2.0, ys.max() * 2.0)

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MAP = "viridis"
 MISSING = "#BDBDBD"
+HATCH = (1.0, 1.0, 1.0, 0.45)
 
 _SETTINGS: Any = {
     "font.size": 10,

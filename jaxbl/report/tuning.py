@@ -17,10 +17,10 @@ from jaxbl.study.store import write_atomic
 from jaxbl.study.tune import Tuning
 from jaxbl.study.tune_summary import called_gains
 
-from .maps import _HATCH, SIDES, Drawn, _edges, _norm, condition_curves
+from .maps import SIDES, Drawn, cell_edges, color_norm, condition_curves
 from .page import TableOf, html
 from .reports import save_all
-from .style import COLOURS, MAP, MISSING, style, with_unit
+from .style import COLOURS, HATCH, MAP, MISSING, style, with_unit
 
 _MARKS = ("o", "s", "^", "D", "v", "P", "X")
 _CONDITIONS = ["davila_fridman", "seeber_horn", "exact"]
@@ -59,20 +59,20 @@ def _map(tuning: Tuning, side: str) -> Drawn:
     )
     xs, ys = table.columns.to_numpy(float), table.index.to_numpy(float)
     grid = table.to_numpy(float)
-    norm = _norm(grid, "log")
+    norm = color_norm(grid, "log")
     figure = Figure(figsize=(6.6, 5.4), layout="constrained")
     ax = figure.subplots()
     ax.grid(False)
     ax.set_facecolor(MISSING)
     ax.set(xscale="log", yscale="log")
-    edges = _edges(xs, True), _edges(ys, True)
+    edges = cell_edges(xs, True), cell_edges(ys, True)
     ax.pcolormesh(*edges, grid, cmap=MAP, norm=norm, rasterized=True)
     handles: list[Any] = []
     share = np.pad(feasible.to_numpy(float), 1, mode="edge")
     if share.min() < 0.5:
         padded = [np.concatenate([e[:1], centres, e[-1:]]) for e, centres in zip(edges, (xs, ys), strict=True)]
         hatched = ax.contourf(*padded, share, levels=[-1.0, 0.5], colors="none", hatches=["//"])
-        hatched.set(edgecolor=_HATCH, linewidth=0.0)
+        hatched.set(edgecolor=HATCH, linewidth=0.0)
         ax.contour(*padded, share, levels=[0.5], colors="white", linewidths=1.4)
         handles.append(Patch(facecolor="#808080", edgecolor="white", hatch="///", label="constraints not kept"))
     handles += condition_curves(ax, _CONDITIONS, 1.0, (edges[0][0], edges[0][-1]))
