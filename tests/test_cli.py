@@ -263,7 +263,7 @@ def test_verify_leaves_a_verdict_counterexamples_figures_and_report(call, tmp_pa
     assert code == 0
     figures = {f"figures/{name}.png" for name in ("atlas", "levels_motor", "conservatism", "claimed_bound")}
     assert {"verdict.json", "counterexamples.parquet", "report.html", "verify/manifest.json"} | figures <= set(left(folder))
-    assert lines[0] == "normalised: 16 cells, no counterexample to any condition."
+    assert re.fullmatch(r"normalised: 16 cells, of which \d+ converge, with no counterexample to any condition.", lines[0])
     assert lines[-1] == "results/study/report.html"
     # the second call computes nothing and says the same
     monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished verification simulates"))

@@ -205,7 +205,10 @@ def _claimed(verdict: Verdict) -> Drawn:
             ax.hist(ratio, bins, weights=counts, histtype="step", lw=2.0, color=COLOURS[i % len(COLOURS)], label=share)
     ax.axvline(1.0, color="black", lw=1.0)
     ax.set(xscale="log", xlabel="true f⁺ along the run / twice the largest acceleration", ylabel="share of converged runs")
-    ax.legend(loc="upper left", bbox_to_anchor=(0.0, 1.2), ncols=2)
+    if ax.patches:
+        ax.legend(loc="upper left", bbox_to_anchor=(0.0, 1.2), ncols=2)
+    else:
+        ax.text(0.5, 0.5, "no run converged", ha="center", transform=ax.transAxes)
     caption = (
         "The bound that the paper's text gives, twice the largest acceleration, against the true one: right of the line "
         "it is too small, and gains chosen by it may miss every condition."
@@ -233,12 +236,13 @@ def _headline(verdict: Verdict) -> list[str]:
     for level in verdict.summary["levels"]:
         name = level["level"] if level.get("side") is None else f"{level['level']}, {level['side']}"
         wrong = [entry for entry in level["conditions"] if entry["counterexamples"]]
-        line = f"{name}: {level['cells']} {'cells' if level.get('side') is None else 'runs'}, "
+        kind = "cells" if level.get("side") is None else "runs"
+        line = f"{name}: {level['cells']} {kind}, of which {level['converged']} converge, "
         if not wrong:
-            line += "no counterexample to any condition."
+            line += "with no counterexample to any condition."
         else:
             counts = ", ".join(f"{e['title']} {e['counterexamples']} of {e['holds']}" for e in wrong)
-            line += f"the observer failed though the condition held: {counts}."
+            line += f"and the observer failed though the condition held: {counts}."
             causes = level["causes"].get("true", {})
             told = ", ".join(f"{cause} ({count})" for cause, count in list(causes.items())[:4])
             line += f" Causes, by experiment: {told}."

@@ -225,7 +225,10 @@ class Search:
 
     def _why_none(self, side: str) -> str:
         found, limits = self.candidates[side], self.limits
+        run = self.scenarios.config.run
         least = {
+            "converged": f" (least velocity error {found['velocity_rmse'].min():.3g} rad/s rms, "
+            f"run.velocity_tolerance = {run.velocity_tolerance:g})",
             "margin_alpha": f" (largest {found['margin_alpha'].max():.3g})",
             "margin_exact": f" (largest {found['margin_exact'].max():.3g})",
             "longest_convergence": f" (fastest {found['convergence_time'].min():.3g} s)",
