@@ -228,7 +228,7 @@ class Search:
         run = self.scenarios.config.run
         least = {
             "converged": f" (least velocity error {found['velocity_rmse'].min():.3g} rad/s rms, "
-            f"run.velocity_tolerance = {run.velocity_tolerance:g})",
+            f"run.velocity_tolerance = {run.velocity_tolerance:g}, run.position_tolerance = {run.position_tolerance:g})",
             "margin_alpha": f" (largest {found['margin_alpha'].max():.3g})",
             "margin_exact": f" (largest {found['margin_exact'].max():.3g})",
             "longest_convergence": f" (fastest {found['convergence_time'].min():.3g} s)",
