@@ -1,7 +1,7 @@
 """One experiment through time: drive, encoders, observers, equivalent control and identifier in one step function.
 
-:func:`step` is the whole chain for one sample of one lane; `vmap` makes it many. :func:`scan` is the one
-loop over time that calls it, for simulated and for recorded positions, with or without a trace, with any reducers.
+:func:`step` is the whole chain for one sample of one lane; `vmap` makes it many. One loop over time calls it, with or
+without a trace, with any reducers: :func:`scan` for simulated and :func:`replay` for recorded positions.
 """
 
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from .drive.effects import AbstractEffect
 from .drive.encoders import Encoders
@@ -272,23 +272,78 @@ def scan(
         The reducers' figures, and the record with a leading time axis (None without one).
     """
     dtype = jnp.result_type(experiment.run.sample_period)
-    start = (initial_state(experiment), tuple(reducer.init(experiment) for reducer in reducers))
 
-    def sample(carry: Any, given: tuple[Array, dict[str, Array]]) -> tuple[Any, Any]:
-        (state, totals), (index, noise) = carry, given
+    def samples(indices: Int[Array, " samples"]) -> tuple[dict[str, Array], ...]:
+        return (unit_noise(seed, indices, experiment.sides),)
+
+    def sample(time: Number, noise: dict[str, Number]) -> Sample:
+        return Sample(time, {side: value.astype(dtype) for side, value in noise.items()})
+
+    return _scan(experiment, initial_state(experiment), experiment.run.steps, samples, sample, reducers, record, every)
+
+
+def replay(
+    experiment: Experiment,
+    torque: Float[Array, " samples"],
+    measured: dict[str, Float[Array, " samples"]],
+    reducers: tuple[Reducer, ...] = (),
+    record: Callable[[State, Signals], Any] | None = None,
+    every: int = 1,
+    state: State | None = None,
+) -> tuple[dict[str, Array], Any]:
+    """Run observers, filter and identifier on a record in place of the plant.
+
+    Args:
+        experiment: with array leaves; its sample period is that of the record.
+        torque: input in N m.
+        measured: positions of each side in rad.
+        reducers: figures to compute along the record.
+        record: what to keep of every `every`-th sample; None keeps nothing.
+        every: decimation of what is kept.
+        state: where to begin; left out, at the first position and standstill.
+
+    Returns:
+        As :func:`scan`.
+    """
+    if state is None:
+        state = initial_state(experiment, {side: measured[side][0] for side in experiment.sides})
+
+    def samples(indices: Int[Array, " samples"]) -> tuple[Array, dict[str, Array]]:
+        return torque[indices], {side: measured[side][indices] for side in experiment.sides}
+
+    def sample(time: Number, torque: Number, measured: dict[str, Number]) -> Sample:
+        return Sample(time, None, torque, measured)
+
+    return _scan(experiment, state, len(torque), samples, sample, reducers, record, every)
+
+
+def _scan(
+    experiment: Experiment,
+    state: State,
+    steps: int,
+    samples: Callable[[Int[Array, " samples"]], tuple[Any, ...]],
+    sample_of: Callable[..., Sample],
+    reducers: tuple[Reducer, ...],
+    record: Callable[[State, Signals], Any] | None,
+    every: int,
+) -> tuple[dict[str, Array], Any]:
+    """The loop over time; `samples` gives what samples of a block are made of, `sample_of` makes one of time and that."""
+    dtype = jnp.result_type(experiment.run.sample_period)
+    start = (state, tuple(reducer.init(experiment) for reducer in reducers))
+
+    def sample(carry: Any, given: tuple[Array, tuple[Any, ...]]) -> tuple[Any, Any]:
+        (state, totals), (index, parts) = carry, given
         time = index.astype(dtype) * experiment.run.sample_period
-        noise = {side: value.astype(dtype) for side, value in noise.items()}
-        new, signals = step(experiment, state, Sample(time, noise))
+        new, signals = step(experiment, state, sample_of(time, *parts))
         totals = tuple(r.update(experiment, total, index, signals) for r, total in zip(reducers, totals, strict=True))
         return (new, totals), None if record is None else record(new, signals)
 
     def block(carry: Any, first: Array, length: int) -> tuple[Any, Any]:
         indices = first + jnp.arange(length, dtype=jnp.int32)
-        carry, kept = jax.lax.scan(sample, carry, (indices, unit_noise(seed, indices, experiment.sides)))
+        carry, kept = jax.lax.scan(sample, carry, (indices, samples(indices)))
         state, totals = carry
         return (settle(experiment, state), totals), jax.tree.map(lambda x: x[::every], kept)
 
-    steps = experiment.run.steps
     length = _block(steps) if record is None or every == 1 else every
     blocks, rest = divmod(steps, length)
     carry, kept = jax.lax.scan(lambda carry, i: block(carry, i * length, length), start, jnp.arange(blocks, dtype=jnp.int32))
@@ -301,3 +356,25 @@ def scan(
     for reducer, total in zip(reducers, totals, strict=True):
         figures |= reducer.result(experiment, total, state)
     return figures, kept
+
+
+def trajectory(
+    experiment: Experiment, start: PlantState, torque: Float[Array, " samples"], time: Scalar = 0.0
+) -> PlantState:
+    """The plant alone under a recorded input: its states at the samples, with a leading time axis.
+
+    Args:
+        experiment: with array leaves.
+        start: state at the first sample.
+        torque: input in N m, held from each sample to the next.
+        time: time of the first sample in s.
+    """
+    plant, run = experiment.plant, experiment.run
+
+    def sample(state: PlantState, given: tuple[Array, Array]) -> tuple[PlantState, PlantState]:
+        index, torque = given
+        at = time + index.astype(torque.dtype) * run.sample_period
+        return _move(plant, run, state, torque, at), state
+
+    _, states = jax.lax.scan(sample, start, (jnp.arange(len(torque), dtype=jnp.int32), torque))
+    return states

@@ -1,0 +1,253 @@
+"""Trajectory fit: parameters of an experiment from a record, through the differentiable simulator.
+
+Output error on windows, each with a free initial state (multiple shooting), so that integrating plants and records made in
+closed loop are handled alike. Initial states are eliminated within each window by Gauss-Newton, and what they could explain
+is projected out of the residuals: variable projection with Kaufman's derivative. Levenberg-Marquardt (optimistix) then
+sees the parameters alone, for many starts at once.
+References: G. Golub, V. Pereyra, Separable nonlinear least squares, Inverse Problems 19 (2003); L. Kaufman, BIT 15 (1975);
+H. G. Bock, Recent advances in parameter identification techniques for ODE (1983).
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from jaxbl.drive.parameters import Parameter, get_leaf, leaf_paths, set_leaves
+from jaxbl.errors import InputError
+from jaxbl.simulate import Experiment, PlantState, trajectory
+
+_INNER = 3
+_RIDGE = 1e-10
+_WIDE = 3.0
+
+
+class Free(NamedTuple):
+    """A number to be fitted: value = scale exp(theta) where it must stay positive, nominal + scale theta elsewhere.
+
+    theta is 0 at the nominal value, and a change of theta is a relative change.
+    """
+
+    path: str
+    unit: str
+    nominal: float
+    scale: float
+    positive: bool
+
+    def value(self, theta: Any) -> Any:
+        return self.scale * jnp.exp(theta) if self.positive else self.nominal + self.scale * theta
+
+    def slope(self, theta: Any) -> Any:
+        """Derivative of the value."""
+        return self.scale * jnp.exp(theta) if self.positive else self.scale * jnp.ones_like(theta)
+
+
+def free_parameters(experiment: Experiment, paths: Sequence[str], torque: float) -> tuple[Free, ...]:
+    """Describe the numbers that dotted paths name.
+
+    Args:
+        experiment: holds their nominal values.
+        paths: e.g. `transmission.stiffness`.
+        torque: size of the input, N m: the scale of torques whose nominal value is zero.
+
+    Raises:
+        InputError: unknown path, one that no trajectory depends on, or a positive number without a value to start from.
+    """
+    known = {path: known for path, known in leaf_paths(experiment).items() if path.split(".")[0] in _PHYSICAL}
+    free = []
+    for path in paths:
+        if path not in known:
+            raise InputError(f"'{path}' is no number of the plant; fitted can be: {', '.join(known)}")
+        if path in paths[: len(free)]:
+            raise InputError(f"'{path}' is named twice")
+        nominal, about = float(get_leaf(experiment, path)), known[path]
+        positive = _is_positive(about)
+        if positive and nominal <= 0.0:
+            raise InputError(f"'{path}' must stay positive, and its nominal value is {nominal:g}; give one to start from")
+        scale = abs(nominal) or (torque if about.unit == "N m" else 1.0)
+        free.append(Free(path, about.unit, nominal, scale, positive))
+    return tuple(free)
+
+
+_PHYSICAL = ("drive", "transmission", "effects")
+
+
+def _is_positive(about: Parameter) -> bool:
+    return any(limit is not None and limit >= 0.0 for limit in (about.minimum, about.above))
+
+
+class Windows(eqx.Module):
+    """A record cut into windows of equal length.
+
+    Attributes:
+        torque: input in N m, shape (windows, samples).
+        measured: positions of each side in rad, shape (windows, samples).
+        time: of each window's first sample, s, shape (windows,).
+        start: a guess of the state at each window's first sample, leaves of shape (windows,).
+        noise: standard deviation of each side's readings in rad.
+    """
+
+    torque: Float[Array, "windows samples"]
+    measured: dict[str, Float[Array, "windows samples"]]
+    time: Float[Array, " windows"]
+    start: PlantState
+    noise: dict[str, Float[Array, ""]]
+
+
+class Fit(eqx.Module):
+    """Result of a fit from one start.
+
+    Attributes:
+        theta: shape (parameters,).
+        start: initial state of each window, leaves of shape (windows,).
+        residual: measured minus simulated position over the noise, shape (windows, samples, sides).
+        jacobian: its derivative by theta, what initial states could explain projected out;
+            shape (windows, samples, sides, parameters).
+        cost: half the sum of squared residuals.
+        steps: iterations.
+        converged: whether the solver met its tolerance.
+    """
+
+    theta: Float[Array, " parameters"]
+    start: PlantState
+    residual: Float[Array, "windows samples sides"]
+    jacobian: Float[Array, "windows samples sides parameters"]
+    cost: Float[Array, ""]
+    steps: Array
+    converged: Array
+
+
+def with_values(experiment: Experiment, free: Sequence[Free], theta: Float[Array, " parameters"]) -> Experiment:
+    """The experiment with fitted numbers."""
+    return set_leaves(experiment, {one.path: one.value(theta[i]) for i, one in enumerate(free)})
+
+
+def _residual(experiment: Experiment, start: PlantState, window: Windows) -> Float[Array, "samples sides"]:
+    simulated = trajectory(experiment, start, window.torque, window.time).position
+    sides = [(window.measured[side] - simulated[side]) / window.noise[side] for side in experiment.sides]
+    return jnp.stack(sides, axis=-1)
+
+
+class _Eliminated(NamedTuple):
+    start: Array
+    basis: Array
+
+
+def _eliminate(experiment: Experiment, window: Windows) -> _Eliminated:
+    """Initial state of one window by Gauss-Newton, and an orthonormal basis of what it can explain."""
+    guess, unravel = ravel_pytree(window.start)
+
+    def residual(start: Array) -> Array:
+        return _residual(experiment, unravel(start), window)
+
+    def derivatives(start: Array) -> tuple[Array, Array]:
+        def twice(start: Array) -> tuple[Array, Array]:
+            value = residual(start).ravel()
+            return value, value
+
+        slope, value = jax.jacfwd(twice, has_aux=True)(start)
+        return value, slope
+
+    def improve(start: Array, _: None) -> tuple[Array, None]:
+        value, slope = derivatives(start)
+        size = jnp.sqrt(jnp.sum(slope**2, axis=0))
+        scaled = slope / jnp.where(size > 0.0, size, 1.0)
+        normal = scaled.T @ scaled + _RIDGE * jnp.eye(len(start))
+        change = jnp.linalg.solve(normal, scaled.T @ value) / jnp.where(size > 0.0, size, jnp.inf)
+        return start - change, None
+
+    start, _ = jax.lax.scan(improve, guess, length=_INNER)
+    _, slope = derivatives(start)
+    basis, _ = jnp.linalg.qr(slope / jnp.maximum(jnp.sqrt(jnp.sum(slope**2, axis=0)), jnp.finfo(slope.dtype).tiny))
+    return _Eliminated(start, basis)
+
+
+def _projected(experiment: Experiment, window: Windows) -> tuple[Array, Array]:
+    """Residual of one window without what its initial state could explain, and that state."""
+    held = _eliminate(jax.lax.stop_gradient(experiment), window)
+    start, basis = jax.lax.stop_gradient((held.start, held.basis))
+    _, unravel = ravel_pytree(window.start)
+    value = _residual(experiment, unravel(start), window)
+    flat = value.ravel()
+    return (flat - basis @ (basis.T @ flat)).reshape(value.shape), start
+
+
+def fit(
+    experiment: Experiment,
+    free: Sequence[Free],
+    windows: Windows,
+    theta: Float[Array, " parameters"],
+    most_steps: int = 100,
+) -> Fit:
+    """Fit from one start; `vmap` it over starts, or over records.
+
+    A weak pull to the nominal values (a factor of e^3 each) keeps what a record does not show from running away.
+
+    Args:
+        experiment: with array leaves; its sample period is that of the record.
+        free: what is fitted.
+        windows: the record.
+        theta: the start, shape (parameters,); zeros are the nominal values.
+        most_steps: of the solver.
+    """
+    mapped = windows, Windows(0, 0, 0, 0, None)  # type: ignore[arg-type]
+
+    def projected(theta: Array) -> tuple[Array, Array]:
+        at = with_values(experiment, free, theta)
+        return jax.vmap(lambda window: _projected(at, window), in_axes=(mapped[1],))(windows)
+
+    def residual(theta: Array, _: None) -> tuple[Array, Array]:
+        return projected(theta)[0], theta / _WIDE
+
+    solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
+    found = optx.least_squares(residual, solver, theta, max_steps=most_steps, throw=False)
+    value, push, start = jax.linearize(projected, found.value, has_aux=True)
+    jacobian = jnp.moveaxis(jax.vmap(push)(jnp.eye(len(theta))), 0, -1)
+    unravel = ravel_pytree(jax.tree.map(lambda x: x[0], windows.start))[1]
+    return Fit(
+        found.value,
+        jax.vmap(unravel)(start),
+        value,
+        jacobian,
+        0.5 * jnp.sum(value**2),
+        found.stats["num_steps"],
+        found.result == optx.RESULTS.successful,
+    )
+
+
+def cut(
+    torque: np.ndarray,
+    measured: dict[str, np.ndarray],
+    period: float,
+    start: Any,
+    noise: dict[str, float],
+    samples: int,
+) -> Windows:
+    """Cut a record into as many windows as fit into it.
+
+    Args:
+        torque: input in N m, shape (samples,).
+        measured: positions in rad.
+        period: sampling period in s.
+        start: states at all samples (:class:`jaxbl.simulate.PlantState`, leaves of shape (samples,)).
+        noise: standard deviation of each side's readings in rad.
+        samples: length of a window.
+    """
+    count = len(torque) // samples
+
+    def split(values: Any) -> Array:
+        return jnp.asarray(values)[: count * samples].reshape(count, samples)
+
+    return Windows(
+        torque=split(torque),
+        measured={side: split(values) for side, values in measured.items()},
+        time=period * samples * jnp.arange(count),
+        start=jax.tree.map(lambda x: jnp.asarray(x)[: count * samples : samples], start),
+        noise={side: jnp.asarray(value, float) for side, value in noise.items()},
+    )
