@@ -1,4 +1,4 @@
-"""How well fitted numbers are known: covariance with correlated residuals, intervals, directions that a record does not show.
+"""How well fitted numbers are known: covariance with correlated residuals, intervals, what a record does not show.
 
 References: W. Newey, K. West, Econometrica 55 (1987); D. Andrews, Econometrica 59 (1991), for the bandwidth.
 """
@@ -52,9 +52,12 @@ def spread(fit: Fit) -> Spread:
     middle = middle * fit.residual.size / freedom
     inverse = jnp.linalg.pinv(normal / jnp.outer(size, size), hermitian=True)
     plain = variance * inverse / jnp.outer(size, size)
-    covariance = inverse @ middle @ inverse / jnp.outer(size, size)
-    inflation = jnp.sqrt(jnp.diag(covariance) / jnp.diag(plain))
-    return Spread(covariance, normal / variance, variance, inflation, bandwidth)
+    sandwich = inverse @ middle @ inverse / jnp.outer(size, size)
+    inflation = jnp.sqrt(jnp.diag(sandwich) / jnp.diag(plain))
+    # elimination of the initial states leaves a little negative correlation behind: nothing to gain confidence from
+    more = jnp.maximum(1.0 / inflation, 1.0)
+    covariance = sandwich * jnp.outer(more, more)
+    return Spread(covariance, normal / variance, variance, inflation * more, bandwidth)
 
 
 def _long_run(scores: Float[Array, "samples parameters"]) -> tuple[Array, Array]:

@@ -154,17 +154,18 @@ def _eliminate(experiment: Experiment, window: Windows) -> _Eliminated:
         slope, value = jax.jacfwd(twice, has_aux=True)(start)
         return value, slope
 
-    def improve(start: Array, _: None) -> tuple[Array, None]:
+    def improve(start: Array) -> tuple[Array, Array]:
         value, slope = derivatives(start)
         size = jnp.sqrt(jnp.sum(slope**2, axis=0))
-        scaled = slope / jnp.where(size > 0.0, size, 1.0)
-        normal = scaled.T @ scaled + _RIDGE * jnp.eye(len(start))
-        change = jnp.linalg.solve(normal, scaled.T @ value) / jnp.where(size > 0.0, size, jnp.inf)
-        return start - change, None
+        basis, triangle = jnp.linalg.qr(slope / jnp.where(size > 0.0, size, 1.0))
+        # a state without influence stays where it is
+        triangle = triangle + _RIDGE * jnp.eye(len(start))
+        change = jax.scipy.linalg.solve_triangular(triangle, basis.T @ value)
+        return start - change / jnp.where(size > 0.0, size, jnp.inf), basis
 
-    start, _ = jax.lax.scan(improve, guess, length=_INNER)
-    _, slope = derivatives(start)
-    basis, _ = jnp.linalg.qr(slope / jnp.maximum(jnp.sqrt(jnp.sum(slope**2, axis=0)), jnp.finfo(slope.dtype).tiny))
+    start = guess
+    for _ in range(_INNER):
+        start, basis = improve(start)
     return _Eliminated(start, basis)
 
 
