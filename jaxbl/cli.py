@@ -55,9 +55,7 @@ def simulate(
     folder = _folder(config, out)
     claim(folder, study, "simulate", overwrite=overwrite)
     trial = run(study, seed=seed, every=every)
-    for line in write_trial_report(trial, folder):
-        typer.echo(line)
-    typer.echo(f"{folder / 'report.html'}")
+    _tell(write_trial_report(trial, folder), folder)
     if not trial.summary["metrics"]["finite"]:
         raise typer.Exit(1)
 
@@ -102,14 +100,9 @@ def sweep(
             )
             return
     folder = _folder(config, out)
-    resume = shlex.join(["jaxbl", "sweep", str(config), "--out", str(folder)])
-    with _resumable(resume), _progress("runs") as progress:
+    with _running("sweep", config, folder) as progress:
         result = run_sweep(study, folder, progress=progress, overwrite=overwrite)
-    for line in write_sweep_report(result, folder):
-        typer.echo(line)
-    if result.cost["lanes"]:
-        typer.echo(_spent(result.cost))
-    typer.echo(f"{folder / 'report.html'}")
+    _tell(write_sweep_report(result, folder), folder, result.cost)
 
 
 @app.command()
@@ -122,14 +115,9 @@ def tune(config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOpti
 
     study = read_config(config)
     folder = _folder(config, out)
-    resume = shlex.join(["jaxbl", "tune", str(config), "--out", str(folder)])
-    with _naming(config, folder), _resumable(resume), _progress("runs") as progress:
+    with _running("tune", config, folder) as progress:
         result = run_tune(study, folder, progress=progress, overwrite=overwrite)
-    for line in write_tune_report(result, folder):
-        typer.echo(line)
-    if result.cost["lanes"]:
-        typer.echo(_spent(result.cost))
-    typer.echo(f"{folder / 'report.html'}")
+    _tell(write_tune_report(result, folder), folder, result.cost)
 
 
 @app.command()
@@ -142,12 +130,9 @@ def verify(config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOp
 
     study = read_config(config)
     folder = _folder(config, out)
-    resume = shlex.join(["jaxbl", "verify", str(config), "--out", str(folder)])
-    with _naming(config, folder), _resumable(resume), _progress("runs") as progress:
+    with _running("verify", config, folder) as progress:
         verdict = run_verify(study, folder, progress=progress, overwrite=overwrite)
-    for line in write_verify_report(verdict, folder):
-        typer.echo(line)
-    typer.echo(f"{folder / 'report.html'}")
+    _tell(write_verify_report(verdict, folder), folder)
 
 
 @app.command()
@@ -170,9 +155,7 @@ def plot(
         if identity(study) != Store.open(folder).manifest["identity"]:
             raise InputError(f"{config}: is not the study in {folder}; only title, notes and figures may differ")
         result = dataclasses.replace(result, config=study)
-    for line in write_sweep_report(result, folder):
-        typer.echo(line)
-    typer.echo(f"{folder / 'report.html'}")
+    _tell(write_sweep_report(result, folder), folder)
 
 
 def _folder(config: Path, out: Path | None) -> Path:
@@ -202,11 +185,14 @@ def _naming(config: Path, folder: Path | None = None) -> Iterator[None]:
 
 
 @contextmanager
-def _resumable(command: str) -> Iterator[None]:
+def _running(command: str, config: Path, folder: Path) -> "Iterator[Progress | None]":
+    """Around a long computation: messages name the config, progress is shown, and an interrupt says how to go on."""
     try:
-        yield
+        with _naming(config, folder), _progress("runs") as progress:
+            yield progress
     except KeyboardInterrupt:
-        typer.echo(f"interrupted; what is finished is kept. Go on with: {command}", err=True)
+        resume = shlex.join(["jaxbl", command, str(config), "--out", str(folder)])
+        typer.echo(f"interrupted; what is finished is kept. Go on with: {resume}", err=True)
         raise typer.Exit(130) from None
 
 
@@ -229,9 +215,14 @@ def _progress(unit: str) -> "Iterator[Progress | None]":
         yield update
 
 
-def _spent(cost: dict[str, float]) -> str:
-    compiling, running = _duration(cost["compile_seconds"]), _duration(cost["run_seconds"])
-    return f"Compiled in {compiling}, ran {cost['lanes']:.0f} lanes in {running}."
+def _tell(lines: list[str], folder: Path, cost: dict[str, float] | None = None) -> None:
+    """Print the headline of a report, what it took to compute, and where the report lies."""
+    for line in lines:
+        typer.echo(line)
+    if cost is not None and cost["lanes"]:
+        compiling, running = _duration(cost["compile_seconds"]), _duration(cost["run_seconds"])
+        typer.echo(f"Compiled in {compiling}, ran {cost['lanes']:.0f} lanes in {running}.")
+    typer.echo(f"{folder / 'report.html'}")
 
 
 def _duration(seconds: float) -> str:
