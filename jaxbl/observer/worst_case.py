@@ -75,14 +75,19 @@ def half_cycle(
         return slope
 
     def step_size(s: _State) -> Values:
-        return _STEP / (lambda_ + jnp.sqrt(2.0 * (alpha + f_plus)) + 2.0 * damping * s.y)
+        # y begins at zero: the root is what the damping will be one step on
+        fastest = jnp.sqrt(2.0 * (alpha + f_plus)) + jnp.sqrt(2.0 * damping * jnp.abs(s.x2)) + 2.0 * damping * s.y
+        return _STEP / (lambda_ + fastest)
 
     def gone(s: _State) -> Values:
         """At the origin: nothing is left, or it is being neared along a ray, which no trajectory crosses."""
         c = 2.0 * (alpha - homeward * f_plus)
         turning = s.x2 * (s.x2 - lambda_ * s.y) + c * s.y**2  # Q(p) y^2 for p = x1' / y
         along = (jnp.abs(turning) < _GONE**2 * (lambda_ * s.y) ** 2) & (s.x2 > 0.0)
-        return (jnp.abs(s.x2) + jnp.sqrt(jnp.abs(c)) * s.y < _GONE * speed) | along
+        # with damping p' = -(p^2 + lambda p + c + 2 damping x2): the roots part as x2 falls, p stays above the lower
+        above = (2.0 * s.x2 >= lambda_ * s.y) & (lambda_**2 >= 4.0 * (c + 2.0 * damping * s.x2))
+        held = (damping > 0.0) & (c > 0.0) & (s.x2 > 0.0) & above
+        return (jnp.abs(s.x2) + jnp.sqrt(jnp.abs(c)) * s.y < _GONE * speed) | along | held
 
     start = _State(zero, speed, zero)
     turn, turned = _march(
