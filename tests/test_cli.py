@@ -151,8 +151,8 @@ BAD = {
     ),
     "nothing to tune for": (
         ["tune", "rest.toml"],
-        "rest.toml: excitation: leaves the motor undisturbed (f⁺ = 0), so that there is nothing to tune for; "
-        "it should move the drive",
+        "rest.toml: motor: nothing acts on it that its observer does not know (f⁺ = 0), so that gains have nothing to meet; "
+        "add a transmission, an effect, or an excitation that moves the drive",
     ),
     "foreign folder, tune": (
         ["tune", "study.toml", "--out", "full"],

@@ -1,10 +1,10 @@
 """Gain conditions of the super-twisting observer, for the error system (34) with bound f_plus.
 
 The error system is x1' = x2 - lambda sqrt|x1| sign x1, x2' = d - alpha sign x1 with any d(t) in [-f_plus, f_plus].
-All functions are elementwise over JAX arrays that broadcast, and differentiable away from their limits. `least_lambda_*`
-return the smallest lambda (rad^0.5/s) that a condition allows for given alpha and f_plus (rad/s^2); where no lambda does
-(alpha <= f_plus) that is `inf`, and `nan` only where an argument is. By homogeneity all of them are sqrt(f_plus) times a
-function of alpha / f_plus.
+All functions are elementwise over JAX arrays that broadcast, and differentiable away from their limits. Their domain is
+lambda >= 0, finite alpha and f_plus >= 0. `least_lambda_*` return the smallest lambda (rad^0.5/s) that a condition allows
+for given alpha and f_plus (rad/s^2); where no lambda does (alpha <= f_plus) that is `inf`, and `nan` only where an argument
+is. By homogeneity all of them are sqrt(f_plus) times a function of alpha / f_plus.
 """
 
 from collections.abc import Callable
@@ -163,7 +163,7 @@ def convergence_time_bound(
     r = least_lambda_davila_fridman(alpha, f_plus) / lambda_
     speed = jnp.abs(velocity_error) + lambda_ * jnp.sqrt(jnp.abs(position_error))
     peak = jnp.sqrt(speed**2 + 2.0 * jnp.abs(alpha - f_plus) * jnp.abs(position_error))
-    holds = (alpha > f_plus) & (r < 1.0)
+    holds = (alpha > f_plus) & (lambda_ > 0.0) & (r < 1.0)
     safe = jnp.where(holds, (alpha - f_plus) * (1.0 - r), 1.0)
     return jnp.where(holds, peak / safe, jnp.inf)
 

@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.study.store import write_atomic
-from jaxbl.study.verify import Verdict, judged_sides
+from jaxbl.study.verify import Verdict, conditions_of, judged_sides
 
 from .maps import Drawn, condition_curves
 from .page import TableOf, html
@@ -49,7 +49,8 @@ def _mark(ax: Axes, verdict: Verdict, dark: bool = False) -> list[Line2D]:
     """Marks at the usual pair and at the study's marks; those beyond the axes stand on the edge. Returns the legend."""
     handles = []
     (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
-    places = [_USUAL, *((mark["name"], mark["alpha_ratio"], mark["lambda_ratio"]) for mark in verdict.summary["marks"])]
+    marks = [mark for mark in verdict.summary["marks"] if mark["alpha_ratio"] is not None]
+    places = [_USUAL, *((mark["name"], mark["alpha_ratio"], mark["lambda_ratio"]) for mark in marks)]
     for i, (name, alpha, lambda_) in enumerate(places):
         x, y = np.clip(alpha, left, right), np.clip(lambda_, low, high)
         look = {"marker": _MARKERS[i % len(_MARKERS)], "ms": 12, "mfc": COLOURS[4] if dark else "white", "mec": "black"}
@@ -74,7 +75,7 @@ def _atlas(verdict: Verdict) -> Drawn:
     shown = np.clip(found.ratio, 1e-6, 1e6)
     ax.pcolormesh(found.alpha, found.lambda_, shown, cmap="PuOr_r", norm=norm, rasterized=True, shading="nearest")
     _axes_of_plane(ax, found.alpha, found.lambda_)
-    handles: list[Any] = condition_curves(ax, list(CONDITIONS), 1.0, (found.alpha[0], found.alpha[-1]))
+    handles: list[Any] = condition_curves(ax, conditions_of(verdict.config), 1.0, (found.alpha[0], found.alpha[-1]))
     step = max(len(found.alpha) // 24, 1)
     look = {"marker": "o", "ms": 5, "mfc": "white", "mec": "black", "ls": ""}
     ax.plot(found.alpha[::step], found.boundary[::step], **look, zorder=5)
@@ -124,7 +125,11 @@ def _levels(verdict: Verdict, side: str) -> Drawn:
         planes[level] = (alpha[good], lambda_[good], frame[f"{side}.converged"].astype(float)[good])
     alphas = np.concatenate([plane[0] for plane in planes.values()])
     lambdas = np.concatenate([plane[1] for plane in planes.values()])
-    bins = [np.geomspace(*np.quantile(values, [0.005, 0.995]), 45) for values in (alphas, lambdas)]
+    if not alphas.size:
+        axes[0].text(0.5, 0.5, "no run has a finite bound f⁺ and lambda > 0", ha="center", transform=axes[0].transAxes)
+        return Drawn(f"levels_{side}", figure, f"Runs of the drive, {side} observer: none to be drawn.")
+    ends = [np.quantile(values, [0.005, 0.995]) for values in (alphas, lambdas)]
+    bins = [np.geomspace(low / 1.01, high * 1.01, 45) for low, high in ends]
     handles: list[Any] = []
     for ax, (level, (alpha, lambda_, converged)) in zip(axes, planes.items(), strict=True):
         runs, _, _ = np.histogram2d(alpha, lambda_, bins)
@@ -134,7 +139,7 @@ def _levels(verdict: Verdict, side: str) -> Drawn:
         with np.errstate(invalid="ignore"):
             ax.pcolormesh(*bins, (share / runs).T, cmap=MAP, vmin=0.0, vmax=1.0, rasterized=True)
         ax.set(xscale="log", yscale="log", xlim=bins[0][[0, -1]], ylim=bins[1][[0, -1]], xlabel=_ALPHA)
-        handles = condition_curves(ax, list(CONDITIONS), 1.0, (max(bins[0][0], 1.0001), bins[0][-1]))
+        handles = condition_curves(ax, conditions_of(verdict.config), 1.0, (max(bins[0][0], 1.0001), bins[0][-1]))
         wrong = verdict.counterexamples
         if len(wrong):
             wrong = wrong[
@@ -176,7 +181,7 @@ def _conservatism(verdict: Verdict) -> Drawn:
             ax.plot(largest, k + shift, ">" if censored else "|", color=colour, ms=6 if censored else 9)
     ax.axvline(1.0, color="black", lw=0.8)
     ax.set(xscale="log", xlabel="λ demanded over the least λ that works")
-    ax.set_yticks(range(len(CONDITIONS)), [condition.title for condition in CONDITIONS.values()])
+    ax.set_yticks(range(len(CONDITIONS)), [condition.title for condition in conditions_of(verdict.config).values()])
     ax.invert_yaxis()
     ax.grid(axis="y", visible=False)
     figure.legend(loc="outside lower center", ncols=3)
@@ -271,6 +276,9 @@ def _mark_lines(verdict: Verdict) -> list[str]:
     lines = []
     for mark in verdict.summary["marks"]:
         rho = mark["peak_ratio"]
+        if mark["alpha_ratio"] is None:
+            lines.append(f"{mark['name']}: the run diverged.")
+            continue
         line = f"{mark['name']}: α / f⁺ = {mark['alpha_ratio']:.3g}, λ / √f⁺ = {mark['lambda_ratio']:.3g}; "
         if rho is None:
             line += "α is below the true f⁺: no condition can hold."

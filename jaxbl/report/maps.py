@@ -5,6 +5,7 @@
 # pyright: reportReturnType=false
 
 import re
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +21,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jaxbl.errors import InputError
-from jaxbl.observer.conditions import CONDITIONS
+from jaxbl.observer.conditions import CONDITIONS, Condition
 from jaxbl.study.config import Config, FigureTable, nearest, numeric_paths
 from jaxbl.study.laws import Law, accuracy_laws, check_selection, fixed_values, selected
 from jaxbl.study.metrics import describe
@@ -368,18 +369,20 @@ def _overlay(ax: Axes, bound: float, spec: FigureTable, xs: np.ndarray, ys: np.n
     """Curves of the gain conditions for one f_plus."""
     alpha_is_x = spec.x.endswith(".alpha")
     alphas = xs if alpha_is_x else ys
-    return condition_curves(ax, list(spec.overlays), bound, (alphas.min(), alphas.max()), alpha_is_x)
+    return condition_curves(
+        ax, {name: CONDITIONS[name] for name in spec.overlays}, bound, (alphas.min(), alphas.max()), alpha_is_x
+    )
 
 
 def condition_curves(
-    ax: Axes, names: list[str], bound: float, alphas: tuple[float, float], alpha_is_x: bool = True
+    ax: Axes, conditions: Mapping[str, Condition], bound: float, alphas: tuple[float, float], alpha_is_x: bool = True
 ) -> list[Line2D]:
     """Draw the least lambda of gain conditions over a range of alpha, for one f_plus. Returns the legend's handles."""
     low, high = max(alphas[0], bound * 1.0001), alphas[1]
     fine = np.geomspace(low, high, 400) if high > bound else np.array([])
     handles = []
-    for name in names:
-        condition, (dashes, colour) = CONDITIONS[name], _CURVES[name]
+    for name, condition in conditions.items():
+        dashes, colour = _CURVES[name]
         with jax.enable_x64(True):
             least = np.asarray(condition.least_lambda(jnp.asarray(fine), jnp.asarray(bound))) if fine.size else fine
         line = (fine, least) if alpha_is_x else (least, fine)

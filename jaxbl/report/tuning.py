@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
+from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.study.metrics import SIDE_METRICS
 from jaxbl.study.store import write_atomic
 from jaxbl.study.tune import Tuning
@@ -23,7 +24,7 @@ from .reports import save_all
 from .style import COLOURS, HATCH, MAP, MISSING, style, with_unit
 
 _MARKS = ("o", "s", "^", "D", "v", "P", "X")
-_CONDITIONS = ["davila_fridman", "seeber_horn", "exact"]
+_CONDITIONS = {name: CONDITIONS[name] for name in ("davila_fridman", "seeber_horn", "exact")}
 
 
 def draw_tuning(tuning: Tuning) -> list[Drawn]:

@@ -373,13 +373,11 @@ class RangeTable(Table):
         return np.geomspace(self.start, self.stop, self.num)
 
 
-class MarkTable(Table):
+class MarkTable(GainPairTable):
     """A pair of gains to be marked in the atlas, run once on the study's drive."""
 
     name: str = Field(description="label")
     side: Literal["motor", "load"] = Field(default="motor", description="observer that has these gains")
-    lambda_: float = Field(alias="lambda", ge=0.0, description="gain lambda", json_schema_extra={"unit": "√rad/s"})
-    alpha: float = Field(ge=0.0, description="gain alpha", json_schema_extra={"unit": "rad/s²"})
 
 
 class VerifyTable(Table):
@@ -392,7 +390,7 @@ class VerifyTable(Table):
     lambda_ratio: RangeTable = Field(
         default_factory=lambda: RangeTable(start=0.002, stop=25.0, num=512), description="lambda / √f_plus of the atlas"
     )
-    damping: list[Annotated[float, Field(gt=0.0)]] = Field(
+    damping: list[Annotated[float, Field(gt=0.0, le=1000.0)]] = Field(
         default=[0.1, 0.3, 1.0],
         description="dampings (friction / inertia × velocity error / f_plus) whose boundaries are simulated",
     )
@@ -570,6 +568,9 @@ class Config(Table):
                 raise wrong("tune.compare[{i}].load has no meaning on a rigid drive; remove it", i=i)
             if not rigid and other.load is None:
                 raise wrong("tune.compare[{i}].load is missing: a two_inertia drive has a load observer", i=i)
+        for i, mark in enumerate(self.verify.marks):
+            if rigid and mark.side == "load":
+                raise wrong("verify.marks[{i}].side: 'load' has no meaning on a rigid drive; it should be 'motor'", i=i)
         for i, effect in enumerate(self.effects):
             place = effect.kind.partition(".")[0]
             if rigid and place in ("load", "transmission"):

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxbl.errors import InputError
 from jaxbl.observer import conditions
 from jaxbl.simulate import Experiment, Reducer, Signals, State
 
@@ -223,3 +224,15 @@ def metric_columns(experiment: Experiment) -> list[str]:
     elif "half_gap" not in experiment.transmission.truth():
         names.remove("dead_zone_error")
     return ["finite", *(f"{side}.{name}" for side in experiment.sides for name in names)]
+
+
+NOTHING = {"float64": 1e-9, "float32": 1e-4}
+"""By precision: a right-hand side error this small against the acceleration is rounding."""
+
+
+def undisturbed(side: str) -> InputError:
+    """What to say where f_plus is zero."""
+    return InputError(
+        f"{side}: nothing acts on it that its observer does not know (f⁺ = 0), so that gains have nothing to meet; "
+        "add a transmission, an effect, or an excitation that moves the drive"
+    )

@@ -14,6 +14,7 @@ from jaxbl.simulate import Experiment, Reducer, Signals, scan
 
 from .config import Config, TuneTable, read_config
 from .engine import precision, prepare
+from .metrics import NOTHING
 
 
 class Scenarios(NamedTuple):
@@ -78,6 +79,7 @@ class _Seen(NamedTuple):
     disturbance: Any
     at_start: Any
     largest_velocity: Any
+    largest_acceleration: Any
 
 
 def _see(experiment: Experiment, totals: dict[str, _Seen], index: Any, signals: Signals) -> dict[str, _Seen]:
@@ -85,17 +87,19 @@ def _see(experiment: Experiment, totals: dict[str, _Seen], index: Any, signals: 
     for side, old in totals.items():
         true = signals.side(side).true
         assert true is not None
-        unknown = jnp.abs(true.acceleration - experiment.drive.acceleration(side, true.velocity, signals.input))
+        known = experiment.drive.acceleration(side, true.velocity, signals.input)
+        unknown = jnp.abs(true.acceleration - known)
         new[side] = _Seen(
             jnp.maximum(old.disturbance, unknown),
             jnp.where(index == 0, unknown, old.at_start),
             jnp.maximum(old.largest_velocity, jnp.abs(true.velocity)),
+            jnp.maximum(old.largest_acceleration, jnp.abs(true.acceleration)),
         )
     return new
 
 
 _PILOT = Reducer(
-    lambda experiment: {side: _Seen(*[jnp.zeros_like(experiment.run.sample_period)] * 3) for side in experiment.sides},
+    lambda experiment: {side: _Seen(*[jnp.zeros_like(experiment.run.sample_period)] * 4) for side in experiment.sides},
     _see,
     lambda experiment, totals, state: {f"{s}.{n}": v for s, seen in totals.items() for n, v in seen._asdict().items()},
 )
@@ -121,6 +125,9 @@ def _seen(scenarios: Scenarios, excitation: Any = None) -> dict[str, dict[str, f
     for side, values in out.items():
         if not all(map(math.isfinite, values.values())):
             raise NoResult(f"{side}: the drive itself diverges in the pilot run, so that there is nothing to observe")
+        for name in ("disturbance", "at_start"):
+            if values[name] <= NOTHING[config.run.precision] * values["largest_acceleration"]:
+                values[name] = 0.0
     return out
 
 

@@ -20,7 +20,7 @@ from jaxbl.errors import InputError
 from .config import Config, read_config
 from .engine import Layout
 
-FORMAT = 1
+FORMAT = 2
 
 
 _COMMANDS = {
@@ -42,6 +42,9 @@ def identity(config: Config, command: str = "sweep") -> str:
     data["sweep"].pop("chunk", None)
     for key in ("title", "notes", "figures", *_COMMANDS[command][2]):
         data.pop(key, None)
+    for key in ("q", "marks"):
+        # judged and drawn anew each time
+        data.get("verify", {}).pop(key, None)
     _name_by_content(data["excitation"], config.excitation)
     if config.tune is not None and "holdout" in data.get("tune", {}):
         _name_by_content(data["tune"]["holdout"], config.tune.holdout)

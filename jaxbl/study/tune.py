@@ -19,10 +19,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from jaxbl.errors import InputError, NoResult
+from jaxbl.errors import NoResult
 
 from .config import TUNE_NAMES, Config, TuneTable, read_config
 from .engine import Progress
+from .metrics import undisturbed
 from .pilot import Scenarios, pilot, scenarios_of
 from .store import claim, make_folder, mark, write_atomic
 from .sweep import sweep
@@ -144,10 +145,7 @@ class Search:
         self.f_plus = {side: float(found["f_plus"]) for side, found in pilot.items()}
         for side, bound in self.f_plus.items():
             if not bound > 0.0:
-                raise InputError(
-                    f"excitation: leaves the {side} undisturbed (f⁺ = 0), so that there is nothing to tune for; "
-                    "it should move the drive"
-                )
+                raise undisturbed(side)
         self.limits = Window(
             (table.alpha_ratio.start, table.alpha_ratio.stop), (table.lambda_ratio.start, table.lambda_ratio.stop)
         )

@@ -150,10 +150,9 @@ class _Summary:
 
     def _about_optimum(self, side: str) -> list[str]:
         search, row, lines = self.search, self.best[side], []
-        cells = search.cells(side)
         gains = (("alpha", "alpha / f⁺", search.limits.alpha), ("lambda", "lambda / √f⁺", search.limits.lambda_))
         for gain, label, (low, high) in gains:
-            ratio, near = row[f"{gain}_ratio"], cells[gain] * (1.0 + 1e-9)
+            ratio, near = row[f"{gain}_ratio"], 1.01
             if gain == "alpha" and row["margin_alpha"] < self.table.margin_alpha * near:
                 lines.append(f"{side}: the optimum lies at margin_alpha = {self.table.margin_alpha:g}.")
                 low = 0.0  # it is the margin that ends the range there

@@ -22,11 +22,12 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.errors import InputError
-from jaxbl.observer.conditions import CONDITIONS, least_lambda_davila_fridman, peak_ratio
+from jaxbl.observer.conditions import CONDITIONS, Condition, least_lambda_davila_fridman, peak_ratio
 from jaxbl.observer.worst_case import half_cycle, least_lambda_simulated
 
 from .config import Config, read_config
 from .engine import Progress
+from .metrics import NOTHING, undisturbed
 from .points import Points
 from .store import claim, mark, plain, write_atomic
 from .sweep import sweep
@@ -123,6 +124,10 @@ def verify(
         report = None if progress is None else partial(_shifted, progress, done, sum(rows.values()))
         place = None if work is None else work / level
         levels[level] = sweep(study, place, progress=report, devices=devices).frame
+        for side in sides:
+            size = levels[level][f"{side}.f_plus_acceleration"].max()
+            if levels[level][f"{side}.f_plus"].max() <= NOTHING[config.run.precision] * size:
+                raise undisturbed(side)
         done += rows[level]
     summaries = [_judge_normalised(config, normalised)]
     found = []
@@ -175,6 +180,15 @@ def judged_sides(config: Config) -> list[str]:
         raise InputError(
             "axes: verify needs axes over both gains of an observer, such as observer.motor.alpha and observer.motor.lambda"
         )
+    if config.sweep.design != "grid" or config.sweep.refine is not None:
+        key = "refine" if config.sweep.refine is not None else "design"
+        raise InputError(f"sweep.{key}: verify seeks the least lambda that works in every column of a whole grid; remove it")
+    for i, axis in enumerate(config.axes):
+        if axis.zip is not None and axis.path in {f"observer.{side}.lambda" for side in sides}:
+            raise InputError(
+                f"axes[{i}].zip: verify seeks the least lambda that works, everything else being equal; "
+                f"{axis.path} should not be zipped"
+            )
     return sides
 
 
@@ -264,14 +278,23 @@ def _kept(path: Path | None, compute: Callable[[], pd.DataFrame]) -> pd.DataFram
     return table
 
 
+def conditions_of(config: Config) -> dict[str, Condition]:
+    """The gain conditions, with the study's q in (32)."""
+    q = config.verify.q
+    if q is None:
+        return CONDITIONS
+    return CONDITIONS | {
+        "davila_fridman": Condition(f"Davila-Fridman (32), q = {q:g}", partial(least_lambda_davila_fridman, q=q))
+    }
+
+
 def demanded_lambda(config: Config, alpha: np.ndarray, f_plus: np.ndarray) -> dict[str, np.ndarray]:
     """Least lambda (rad^0.5/s) that each condition asks for at alpha and f_plus (rad/s^2), with the study's q in (32)."""
-    functions = {name: condition.least_lambda for name, condition in CONDITIONS.items()}
-    if config.verify.q is not None:
-        functions["davila_fridman"] = partial(least_lambda_davila_fridman, q=config.verify.q)
     with jax.enable_x64(True):
         given = jnp.asarray(alpha, float), jnp.asarray(f_plus, float)
-        return {name: np.asarray(jax.jit(function)(*given)) for name, function in functions.items()}
+        return {
+            name: np.asarray(jax.jit(condition.least_lambda)(*given)) for name, condition in conditions_of(config).items()
+        }
 
 
 def _judge_normalised(config: Config, found: Normalised) -> dict[str, Any]:
@@ -284,7 +307,7 @@ def _judge_normalised(config: Config, found: Normalised) -> dict[str, Any]:
         conditions.append(
             {
                 "name": name,
-                "title": CONDITIONS[name].title,
+                "title": conditions_of(config)[name].title,
                 "holds": int(holds.sum()),
                 "counterexamples": int((holds & ~converged).sum()),
                 "fails_but_converged": int((~holds & converged).sum()),
@@ -313,7 +336,7 @@ def _judge(config: Config, level: str, side: str, frame: pd.DataFrame) -> tuple[
     converged = frame[f"{side}.converged"].to_numpy(bool)
     bounds = {"true": f"{side}.f_plus", "claimed": f"{side}.f_plus_acceleration"}
     # the least lambda that worked, everything else being equal
-    others = [key for key in (*(axis.path for axis in config.axes), "seed") if key != path and key in frame]
+    others = [key for key in _keys(config) if key != path and key in frame]
     first = frame[converged].groupby(others, sort=False)[path].idxmin().to_numpy()
     position = frame.index.get_indexer(first)
     smallest = lambda_.min()
@@ -329,7 +352,7 @@ def _judge(config: Config, level: str, side: str, frame: pd.DataFrame) -> tuple[
             strict = np.isfinite(ratios) & (ratios > 1.0)
             entry = {
                 "name": name,
-                "title": CONDITIONS[name].title,
+                "title": conditions_of(config)[name].title,
                 "holds": int(holds.sum()),
                 "counterexamples": int(failed.sum()),
                 "fails_but_converged": int((~holds & converged).sum()),
@@ -418,15 +441,6 @@ def _causes(
     The cause is what mended it (all such, joined by "or"), or "several" if only all together did. "f_plus underestimated":
     that did not mend it either, but showed a bound that alpha does not exceed. Else "unexplained".
     """
-    run = study.resolved()["run"]
-    long, fine = 4.0 * run["duration"], run["sample_period"] / 4.0
-    mended: dict[str, dict[str, Any]] = {"run too short": {"run.duration": long}}
-    mended["period too long"] = {"run.sample_period": fine, "run.substeps": max(-(-run["substeps"] // 4), 1)}
-    if level == "sampled":
-        mended["noise"] = {"encoders.noise": 0.0, "encoders.load_noise": None}
-        mended["quantisation"] = {"encoders.motor_resolution": 0.0, "encoders.load_resolution": 0.0}
-        mended["explicit discretisation"] = {"observer.discretisation": "implicit"}
-    together = {path: value for change in mended.values() for path, value in change.items()}
     kept = rows.iloc[np.unique(np.linspace(0, len(rows) - 1, _MOST_EXPLAINED).astype(int))]
     structural = list(Points(study).groups[0].structural)
     causes = pd.Series("not tried", index=rows.index, dtype=object)
@@ -442,6 +456,10 @@ def _causes(
 
     for number, (_, part) in enumerate(kept.groupby(structural, sort=False) if structural else [((), kept)]):
         name = f"{level}-{side}-{number}"
+        run = study.resolved()["run"]
+        run |= {path.removeprefix("run."): part[path].iloc[0] for path in structural if path.startswith("run.")}
+        mended = _mended(run, level)
+        together = {path: value for change in mended.values() for path, value in change.items()}
         frames = {cause: repeat(part, change, f"{name}-{cause}") for cause, change in mended.items()}
         mends = {cause: frame[f"{side}.converged"].to_numpy(bool) for cause, frame in frames.items() if frame is not None}
         alone = pd.Series(
@@ -456,6 +474,17 @@ def _causes(
             alone[rest.index] = np.where(frame[f"{side}.converged"].to_numpy(bool), "several", low)
         causes[part.index] = alone
     return causes
+
+
+def _mended(run: dict[str, Any], level: str) -> dict[str, dict[str, Any]]:
+    """What can make a run fail, and the keys that mend it."""
+    fine = {"run.sample_period": run["sample_period"] / 4.0, "run.substeps": max(-(-run["substeps"] // 4), 1)}
+    mended: dict[str, dict[str, Any]] = {"run too short": {"run.duration": 4.0 * run["duration"]}, "period too long": fine}
+    if level == "sampled":
+        mended["noise"] = {"encoders.noise": 0.0, "encoders.load_noise": None}
+        mended["quantisation"] = {"encoders.motor_resolution": 0.0, "encoders.load_resolution": 0.0}
+        mended["explicit discretisation"] = {"observer.discretisation": "implicit"}
+    return mended
 
 
 @dataclasses.dataclass(frozen=True)
@@ -495,7 +524,7 @@ def _again(study: Config, rows: pd.DataFrame, fixed: dict[str, Any], change: dic
     points = rows[paths].drop_duplicates(ignore_index=True)
     index = {tuple(row): i for i, row in enumerate(points.itertuples(index=False, name=None))}
     data["axes"] = [{"path": path, "values": points[path].tolist(), "zip": "runs"} for path in paths]
-    data["sweep"] = {"seeds": data["sweep"]["seeds"]}
+    data["sweep"] = {key: data["sweep"][key] for key in ("seeds", "first_seed")}
     numbers = np.array([index[row] for row in rows[paths].itertuples(index=False, name=None)])
     return _Again(read_config(data), numbers, rows["seed"].to_numpy())
 
@@ -513,9 +542,15 @@ def _marks(config: Config, work: Path | None, devices: list[Any] | None) -> list
         if not marks:
             continue
         gains = {"lambda": [given.lambda_ for given in marks], "alpha": [given.alpha for given in marks]}
-        axes = [{"path": f"observer.{side}.{name}", "values": values, "zip": "marks"} for name, values in gains.items()]
+        pairs = list(zip(*gains.values(), strict=True))
+        points = list(dict.fromkeys(pairs))
+        axes = [
+            {"path": f"observer.{side}.{name}", "values": list(values), "zip": "marks"}
+            for name, values in zip(gains, zip(*points, strict=True), strict=True)
+        ]
         place = None if work is None else work / "marks" / side
         frame = sweep(base | {"axes": axes, "sweep": {}}, place, devices=devices, overwrite=True).frame
+        frame = frame.iloc[[points.index(pair) for pair in pairs]]
         error = abs(float(base["observer"][side]["velocity_error"]))
         friction = float(drive.viscous(side)) / float(drive.inertia(side))
         bounds = frame[f"{side}.f_plus"].to_numpy(float)

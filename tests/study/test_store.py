@@ -158,7 +158,7 @@ def test_damaged_manifest(copy, content):
 def test_manifest_of_another_version(copy):
     manifest = json.loads((copy / "manifest.json").read_text()) | {"format": 99}
     (copy / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(InputError, match="has format 99; this version reads 1"):
+    with pytest.raises(InputError, match="has format 99; this version reads 2"):
         load(copy)
 
 
