@@ -264,10 +264,12 @@ def _headline(verdict: Verdict) -> list[str]:
     for level in verdict.summary["levels"][1:]:
         claimed = level["claimed_bound"]
         if claimed["too_small"] is not None and level["level"] == "drive":
+            # where nothing accelerates there is no factor
+            most = claimed["true_over_claimed"]["max"]
             lines.append(
                 f"{level['side']}: twice the largest acceleration, the paper's text for f⁺, is too small in "
-                f"{100.0 * claimed['too_small']:.0f} % of the converged runs, by a factor of up to "
-                f"{claimed['true_over_claimed']['max']:.3g}."
+                f"{100.0 * claimed['too_small']:.0f} % of the converged runs"
+                + ("." if most is None else f", by a factor of up to {most:.3g}.")
             )
     return lines
 

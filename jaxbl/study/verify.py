@@ -9,6 +9,7 @@ true f_plus along its run. "sampled": the study as it stands, with its period, q
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
 # pyright: reportReturnType=false
 
+import copy
 import dataclasses
 import json
 from collections.abc import Callable, Mapping
@@ -370,13 +371,14 @@ def _judge(config: Config, level: str, side: str, frame: pd.DataFrame) -> tuple[
                 extra = {"level": level, "side": side, "condition": name, "bound": bound}
                 counterexamples.append(frame[failed].assign(row=np.flatnonzero(failed), **extra))
     worked = frame[converged]
+    too_small = worked[bounds["true"]] > worked[bounds["claimed"]]
     ratio = (worked[bounds["true"]] / worked[bounds["claimed"]]).replace([np.inf, -np.inf], np.nan).dropna()
     claimed = {
         "definition": "twice the largest acceleration",
-        "converged_runs": len(ratio),
-        "too_small": float((ratio > 1.0).mean()) if len(ratio) else None,
+        "converged_runs": len(worked),
+        "too_small": float(too_small.mean()) if len(worked) else None,
         "true_over_claimed": {"median": ratio.median(), "max": ratio.max()},
-        "by_input": _by_input(config, worked.assign(too_small=ratio > 1.0), bounds),
+        "by_input": _by_input(config, worked.assign(too_small=too_small), bounds),
         "conditions": summaries["claimed"],
     }
     summary = {
@@ -433,6 +435,33 @@ def _explained(found: pd.DataFrame, study: Config, explain: Callable[[pd.DataFra
     )
 
 
+def _mended(run: dict[str, Any], level: str) -> dict[str, dict[str, Any]]:
+    """What can make a run fail, with the keys that mend it; `run` as it stands in those runs."""
+    long, fine = 4.0 * run["duration"], run["sample_period"] / 4.0
+    mended: dict[str, dict[str, Any]] = {"run too short": {"run.duration": long}}
+    mended["period too long"] = {"run.sample_period": fine, "run.substeps": max(-(-run["substeps"] // 4), 1)}
+    if level == "sampled":
+        mended["noise"] = {"encoders.noise": 0.0, "encoders.load_noise": None}
+        mended["quantisation"] = {"encoders.motor_resolution": 0.0, "encoders.load_resolution": 0.0}
+        mended["explicit discretisation"] = {"observer.discretisation": "implicit"}
+    return mended
+
+
+def _with(tables: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """A config's tables with some dotted keys set; None removes one."""
+    data = copy.deepcopy(tables)
+    for path, value in values.items():
+        *names, key = path.split(".")
+        table = data
+        for name in names:
+            table = table.setdefault(name, {})
+        if value is None:
+            table.pop(key, None)
+        else:
+            table[key] = value.item() if isinstance(value, np.generic) else value
+    return data
+
+
 def _causes(
     study: Config, level: str, side: str, rows: pd.DataFrame, *, work: Path | None, devices: list[Any] | None
 ) -> pd.Series:
@@ -445,9 +474,9 @@ def _causes(
     structural = list(Points(study).groups[0].structural)
     causes = pd.Series("not tried", index=rows.index, dtype=object)
 
-    def repeat(part: pd.DataFrame, change: dict[str, Any], name: str) -> pd.DataFrame | None:
+    def repeat(part: pd.DataFrame, fixed: dict[str, Any], change: dict[str, Any], name: str) -> pd.DataFrame | None:
         """The runs with some keys changed; None where that changes nothing."""
-        again = _again(study, part, {path: part[path].iloc[0] for path in structural}, change)
+        again = _again(study, part, fixed, change)
         if again is None:
             return None
         place = None if work is None else work / "causes" / name.replace(" ", "_")
@@ -456,11 +485,10 @@ def _causes(
 
     for number, (_, part) in enumerate(kept.groupby(structural, sort=False) if structural else [((), kept)]):
         name = f"{level}-{side}-{number}"
-        run = study.resolved()["run"]
-        run |= {path.removeprefix("run."): part[path].iloc[0] for path in structural if path.startswith("run.")}
-        mended = _mended(run, level)
+        fixed = {path: part[path].iloc[0] for path in structural}
+        mended = _mended(_with(study.resolved(), fixed)["run"], level)
         together = {path: value for change in mended.values() for path, value in change.items()}
-        frames = {cause: repeat(part, change, f"{name}-{cause}") for cause, change in mended.items()}
+        frames = {cause: repeat(part, fixed, change, f"{name}-{cause}") for cause, change in mended.items()}
         mends = {cause: frame[f"{side}.converged"].to_numpy(bool) for cause, frame in frames.items() if frame is not None}
         alone = pd.Series(
             [" or ".join(cause for cause in mends if mends[cause][i]) for i in range(len(part))],
@@ -468,23 +496,12 @@ def _causes(
             dtype=object,
         )
         rest = part[alone == ""]
-        if len(rest) and (frame := repeat(rest, together, f"{name}-several")) is not None:
+        if len(rest) and (frame := repeat(rest, fixed, together, f"{name}-several")) is not None:
             # an observer that fails can drag its own f_plus down; where it works, alpha turns out to be too small
             low = np.where(frame[f"{side}.margin_alpha"] <= 1.0, "f_plus underestimated", "unexplained")
             alone[rest.index] = np.where(frame[f"{side}.converged"].to_numpy(bool), "several", low)
         causes[part.index] = alone
     return causes
-
-
-def _mended(run: dict[str, Any], level: str) -> dict[str, dict[str, Any]]:
-    """What can make a run fail, and the keys that mend it."""
-    fine = {"run.sample_period": run["sample_period"] / 4.0, "run.substeps": max(-(-run["substeps"] // 4), 1)}
-    mended: dict[str, dict[str, Any]] = {"run too short": {"run.duration": 4.0 * run["duration"]}, "period too long": fine}
-    if level == "sampled":
-        mended["noise"] = {"encoders.noise": 0.0, "encoders.load_noise": None}
-        mended["quantisation"] = {"encoders.motor_resolution": 0.0, "encoders.load_resolution": 0.0}
-        mended["explicit discretisation"] = {"observer.discretisation": "implicit"}
-    return mended
 
 
 @dataclasses.dataclass(frozen=True)
@@ -506,19 +523,11 @@ class _Again:
 
 def _again(study: Config, rows: pd.DataFrame, fixed: dict[str, Any], change: dict[str, Any]) -> _Again | None:
     """The runs with some keys changed; None where that changes nothing."""
-    data = study.resolved()
-    for path, value in {**fixed, **change}.items():
-        *tables, key = path.split(".")
-        table = data
-        for name in tables:
-            table = table.setdefault(name, {})
-        if value is None:
-            table.pop(key, None)
-        else:
-            table[key] = value.item() if isinstance(value, np.generic) else value
+    unchanged = _with(study.resolved(), fixed)
+    data = _with(unchanged, change)
     paths = [axis.path for axis in study.axes if axis.path not in fixed and axis.path not in change]
-    dropped = [axis.path for axis in study.axes if axis.path in change]
-    before, after = (read_config({**tables, "axes": []}).resolved() for tables in (study.resolved(), data))
+    dropped = [axis.path for axis in study.axes if axis.path in change and axis.path not in fixed]
+    before, after = (read_config({**tables, "axes": []}).resolved() for tables in (unchanged, data))
     if not dropped and before == after:
         return None
     points = rows[paths].drop_duplicates(ignore_index=True)
