@@ -307,6 +307,7 @@ def replay(
     """
     if state is None:
         state = initial_state(experiment, {side: measured[side][0] for side in experiment.sides})
+    state = State(None, state.observer, state.equivalent_control, state.identifier)
 
     def samples(indices: Int[Array, " samples"]) -> tuple[Array, dict[str, Array]]:
         return torque[indices], {side: measured[side][indices] for side in experiment.sides}

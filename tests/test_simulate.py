@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from jaxbl.drive import Encoders, Initial, Rigid, set_leaves
 from jaxbl.drive.effects import ConstantTorque, CoulombFriction
 from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, Observers
-from jaxbl.simulate import Reducer, scan, unit_noise
+from jaxbl.simulate import Reducer, initial_state, replay, scan, trajectory, unit_noise
 from jaxbl.study.metrics import METRICS
 
 SEED = jnp.asarray(3)
@@ -310,3 +310,27 @@ def test_one_compilation_serves_all_values():
     for noise in (0.0, 1e-4, 1e-3):
         compiled(paper(noise=noise, steps=64, substeps=1))
     assert traces == 1
+
+
+@pytest.mark.parametrize("every", [1, 7])
+def test_a_replayed_record_gives_what_the_observers_gave(every):
+    experiment = paper(noise=1e-4, start=0.1, steps=700)
+    seen = trace(experiment)
+    measured = {side: seen.side(side).measured for side in experiment.sides}
+    run = eqx.filter_jit(lambda *given: replay(*given, record=everything, every=every, state=initial_state(experiment)))
+    _, again = run(experiment, seen.input, measured)
+    for side in experiment.sides:
+        mine, theirs = again.side(side), seen.side(side)
+        np.testing.assert_allclose(mine.velocity_estimate, theirs.velocity_estimate[::every], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(mine.torque_estimate, theirs.torque_estimate[::every], rtol=1e-12, atol=1e-12)
+        assert mine.true is None
+    np.testing.assert_allclose(again.time, seen.time[::every])
+
+
+def test_a_trajectory_is_the_plant_of_the_whole_chain():
+    experiment = paper(steps=300)
+    seen = trace(experiment)
+    states = jax.jit(lambda u: trajectory(experiment, experiment.plant.init(experiment.initial), u))(seen.input)
+    for side in experiment.sides:
+        np.testing.assert_allclose(states.position[side], seen.side(side).true.position, rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(states.velocity[side], seen.side(side).true.velocity, rtol=1e-12, atol=1e-14)

@@ -46,7 +46,9 @@ def spread(fit: Fit) -> Spread:
     normal = jnp.einsum("wtsp,wtsq->pq", fit.jacobian, fit.jacobian)
     size = jnp.sqrt(jnp.diag(normal))
     size = jnp.where(size > 0.0, size, 1.0)
-    scores = jnp.einsum("wtsp,wts->wtp", fit.jacobian / size, fit.residual).reshape(windows * samples, parameters)
+    scores = jnp.einsum("wtsp,wts->wtp", fit.jacobian / size[None, None, None, :], fit.residual).reshape(
+        windows * samples, parameters
+    )
     variance = jnp.sum(fit.residual**2) / freedom
     middle, bandwidth = _long_run(scores)
     middle = middle * fit.residual.size / freedom

@@ -153,11 +153,11 @@ def _smooth(position: Array, smoothness: Array, noise: Array, period: Array) -> 
 
     _, (state, covariance) = jax.lax.scan(sample, (zero, jnp.zeros((3, 3), position.dtype)), forward, reverse=True)
     unit = noise * period ** jnp.array([0.0, -1.0, -2.0])
-    state = state * unit
+    state = state * unit[None, :]
     state = state.at[:, 0].add(position[0])
     return Smoothed(
         state,
-        covariance * jnp.outer(unit, unit),
+        covariance * jnp.outer(unit, unit)[None],
         noise,
         smoothness * noise**2 / period**5,
         forward.innovation / jnp.sqrt(forward.variance),

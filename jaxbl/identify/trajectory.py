@@ -157,7 +157,7 @@ def _eliminate(experiment: Experiment, window: Windows) -> _Eliminated:
     def improve(start: Array) -> tuple[Array, Array]:
         value, slope = derivatives(start)
         size = jnp.sqrt(jnp.sum(slope**2, axis=0))
-        basis, triangle = jnp.linalg.qr(slope / jnp.where(size > 0.0, size, 1.0))
+        basis, triangle = jnp.linalg.qr(slope / jnp.where(size > 0.0, size, 1.0)[None, :])
         # a state without influence stays where it is
         triangle = triangle + _RIDGE * jnp.eye(len(start))
         change = jax.scipy.linalg.solve_triangular(triangle, basis.T @ value)

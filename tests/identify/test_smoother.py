@@ -1,0 +1,108 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxbl.identify.smoother import smooth
+
+PERIOD, NOISE, JERK = 2e-3, 1e-4, 3e3
+F = np.array([[1.0, PERIOD, 0.5 * PERIOD**2], [0.0, 1.0, PERIOD], [0.0, 0.0, 1.0]])
+Q = JERK * np.array(
+    [
+        [PERIOD**5 / 20, PERIOD**4 / 8, PERIOD**3 / 6],
+        [PERIOD**4 / 8, PERIOD**3 / 3, PERIOD**2 / 2],
+        [PERIOD**3 / 6, PERIOD**2 / 2, PERIOD],
+    ]
+)
+
+
+def motion(seed, samples):
+    """A motion under white jerk, and its readings."""
+    random = np.random.default_rng(seed)
+    steps = random.standard_normal((samples, 3)) @ np.linalg.cholesky(Q).T
+    state = np.zeros((samples, 3))
+    for i in range(1, samples):
+        state[i] = F @ state[i - 1] + steps[i]
+    return state, state[:, 0] + NOISE * random.standard_normal(samples)
+
+
+def batch(readings):
+    """The same by one least-squares problem over all states, without a filter."""
+    samples = len(readings)
+    size = np.array([1.0, 1.0 / PERIOD, 1.0 / PERIOD**2]) * NOISE
+    root = np.linalg.inv(np.linalg.cholesky(Q))
+    rows = np.zeros((4 * samples - 3, 3 * samples))
+    right = np.zeros(4 * samples - 3)
+    for i in range(samples):
+        rows[i, 3 * i] = 1.0 / NOISE
+        right[i] = readings[i] / NOISE
+    for i in range(1, samples):
+        at = samples + 3 * (i - 1)
+        rows[at : at + 3, 3 * i : 3 * i + 3] = root
+        rows[at : at + 3, 3 * i - 3 : 3 * i] = -root @ F
+    rows = rows * np.tile(size, samples)
+    triangle = np.linalg.qr(rows, mode="r")
+    solution = np.linalg.lstsq(rows, right, rcond=None)[0].reshape(samples, 3) * size
+    inverse = np.linalg.inv(triangle)
+    covariance = (inverse @ inverse.T).reshape(samples, 3, samples, 3)
+    return solution, np.stack([covariance[i, :, i] * np.outer(size, size) for i in range(samples)])
+
+
+def test_agrees_with_least_squares_over_all_states():
+    _, readings = motion(1, 120)
+    found = smooth(jnp.asarray(readings), PERIOD, noise=NOISE, jerk=JERK)
+    state, covariance = batch(readings)
+    deviation = np.sqrt(np.einsum("tii->ti", covariance))
+    # a hundredth of the backward filter's information counts twice at the first sample
+    assert np.abs((found.state - state) / deviation).max() < 0.02
+    assert np.abs((found.state - state) / deviation)[40:].max() < 1e-4
+    np.testing.assert_allclose(np.sqrt(np.einsum("tii->ti", found.covariance)), deviation, rtol=0.01)
+    np.testing.assert_allclose(np.einsum("tii->ti", found.covariance)[40:], deviation[40:] ** 2, rtol=1e-4)
+    both = np.outer(deviation[60], deviation[60])
+    np.testing.assert_allclose(found.covariance[60] / both, covariance[60] / both, atol=1e-4)
+
+
+def test_finds_noise_and_jerk_and_knows_its_errors():
+    state, readings = motion(2, 6000)
+    found = smooth(jnp.asarray(readings), PERIOD)
+    assert float(found.noise) == pytest.approx(NOISE, rel=0.05)
+    assert float(found.jerk) == pytest.approx(JERK, rel=0.5)
+    for order in range(3):
+        errors = (np.asarray(found.state)[:, order] - state[:, order]) / np.asarray(found.deviation(order))
+        assert 0.85 < np.sqrt(np.mean(errors**2)) < 1.15
+    white = np.asarray(found.innovations)[10:]
+    assert abs(np.mean(white[1:] * white[:-1])) < 0.05
+    assert np.mean(white**2) == pytest.approx(1.0, abs=0.06)
+
+
+@pytest.mark.parametrize("noise", [1e-8, 1e-5])
+def test_covariance_stays_positive_where_readings_are_fine(noise):
+    t = PERIOD * np.arange(2000)
+    found = smooth(jnp.asarray(np.sin(5.0 * t) + noise * np.random.default_rng(0).standard_normal(2000)), PERIOD)
+    assert np.all(
+        np.linalg.eigvalsh(np.asarray(found.covariance) / np.asarray(found.covariance).max(axis=(1, 2), keepdims=True))
+        > -1e-12
+    )
+    assert np.all(np.asarray(found.deviation(2)) > 0.0)
+    errors = np.asarray(found.velocity) - 5.0 * np.cos(5.0 * t)
+    # a sine is smoother than white jerk
+    assert 0.1 < np.sqrt(np.mean((errors / np.asarray(found.deviation(1))) ** 2)) < 1.3
+
+
+def test_units_and_offsets_do_not_matter():
+    _, readings = motion(3, 400)
+    found = smooth(jnp.asarray(readings), PERIOD)
+    other = smooth(jnp.asarray(7.0 + 1e3 * readings), PERIOD)
+    np.testing.assert_allclose(
+        other.velocity, 1e3 * found.velocity, rtol=1e-6, atol=1e-6 * 1e3 * np.abs(found.velocity).max()
+    )
+    np.testing.assert_allclose(other.deviation(1), 1e3 * found.deviation(1), rtol=1e-5)
+
+
+def test_quantised_readings_and_many_channels_at_once():
+    t = PERIOD * np.arange(3000)
+    step = 1e-3
+    readings = step * np.round(np.stack([np.sin(4.0 * t), np.cos(3.0 * t)]) / step)
+    found = jax.vmap(lambda x: smooth(x, PERIOD))(jnp.asarray(readings))
+    np.testing.assert_allclose(found.noise, step / np.sqrt(12.0), rtol=0.2)
+    assert np.sqrt(np.mean((found.state[0, :, 1] - 4.0 * np.cos(4.0 * t)) ** 2)) < 0.02

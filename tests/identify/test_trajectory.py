@@ -1,0 +1,194 @@
+"""Trajectory fits against truth from another integrator, and against one joint least-squares problem by SciPy."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import least_squares
+from small_study import rigid, small
+
+from jaxbl.drive.plant import PlantState
+from jaxbl.errors import InputError
+from jaxbl.identify.intervals import refusals, spread
+from jaxbl.identify.smoother import smooth
+from jaxbl.identify.trajectory import Fit, cut, fit, free_parameters, with_values
+from jaxbl.simulate import trajectory
+from jaxbl.study.config import read_config
+from jaxbl.study.engine import prepare
+
+TRUE = {
+    "drive.motor_inertia": 0.05,
+    "drive.motor_viscous": 0.15,
+    "drive.load_inertia": 7.0,
+    "drive.load_viscous": 16.0,
+    "transmission.stiffness": 60.0,
+    "transmission.half_gap": 0.08,
+}
+RATIO = 5.0
+PERIOD = 2e-3
+
+
+def drive(substeps):
+    law = {"law": "dead_zone", "stiffness": TRUE["transmission.stiffness"], "half_gap": TRUE["transmission.half_gap"]}
+    study = small({"run.sample_period": PERIOD, "run.substeps": substeps, "run.duration": 0.1}, transmission=law)
+    return prepare(read_config(study))
+
+
+def recorded(kind, samples):
+    """Input and true states (positions and velocities of both sides) from SciPy, hard gap, input held over each sample."""
+    t = PERIOD * np.arange(samples)
+    torque = {
+        "multisine": 2.0 * sum(np.sin(2.0 * np.pi * f * t + i) for i, f in enumerate((0.3, 0.7, 1.9, 4.1))),
+        "steps": 6.0 * np.sign(np.sin(2.0 * np.pi * 0.9 * t + 0.1)),
+        "chirp": 5.0 * np.sin(2.0 * np.pi * (0.4 + 0.6 * t) * t + 0.3),
+    }[kind]
+    j_e, f_e, j_s, f_s, k, gap = TRUE.values()
+
+    def slope(_, x, u):
+        z = x[0] - RATIO * x[2]
+        c = k * (z - np.clip(z, -gap, gap))
+        return [x[1], (u - f_e * x[1] - c) / j_e, x[3], (RATIO * c - f_s * x[3]) / j_s]
+
+    states, x = np.zeros((samples, 4)), np.zeros(4)
+    for i in range(samples):
+        states[i] = x
+        x = solve_ivp(slope, (0.0, PERIOD), x, "DOP853", args=(torque[i],), rtol=1e-10, atol=1e-13).y[:, -1]
+    return torque, states
+
+
+def windows_of(torque, readings, noise, samples):
+    found = {side: smooth(values, PERIOD, noise=noise[side]) for side, values in readings.items()}
+    start = PlantState({s: x.position for s, x in found.items()}, {s: x.velocity for s, x in found.items()}, ())
+    return cut(torque, readings, PERIOD, start, noise, samples)
+
+
+def noisy(states, noise, key):
+    keys = jax.random.split(key)
+    return {
+        side: states[:, 2 * i] + noise[side] * jax.random.normal(keys[i], (len(states),)) for i, side in enumerate(noise)
+    }
+
+
+def test_agrees_with_one_least_squares_problem_over_parameters_and_states():
+    """SciPy's own over the parameters and the states of all windows at once, derivatives by JAX."""
+    noise = {"motor": 1e-3, "load": 2e-4}
+    torque, states = recorded("multisine", 400)
+    experiment = drive(2)
+    free = free_parameters(experiment, list(TRUE), 1.0)
+    windows = windows_of(torque, noisy(states, noise, jax.random.key(0)), noise, 100)
+    found = eqx.filter_jit(lambda t: fit(experiment, free, windows, t))(0.1 * jnp.ones(len(free)))
+    assert bool(found.converged)
+
+    @jax.jit
+    def residual(both):
+        at = with_values(experiment, free, both[:6])
+        starts = both[6:].reshape(4, 4)
+
+        def one(x, u, motor, load):
+            start = PlantState({"motor": x[0], "load": x[1]}, {"motor": x[2], "load": x[3]}, ())
+            simulated = trajectory(at, start, u).position
+            return jnp.stack([(motor - simulated["motor"]) / noise["motor"], (load - simulated["load"]) / noise["load"]], -1)
+
+        each = jax.vmap(one)(starts, windows.torque, windows.measured["motor"], windows.measured["load"])
+        return jnp.concatenate([each.ravel(), both[:6] / 3.0])
+
+    guess = windows.start
+    first = np.stack([guess.position["motor"], guess.position["load"], guess.velocity["motor"], guess.velocity["load"]], -1)
+    jacobian = jax.jit(jax.jacfwd(residual))
+    joint = least_squares(
+        residual, np.concatenate([0.1 * np.ones(6), first.ravel()]), jacobian, method="lm", xtol=1e-12, ftol=1e-12
+    )
+    covariance = np.linalg.inv(joint.jac[:-6].T @ joint.jac[:-6])[:6, :6]
+    deviation = np.sqrt(np.diag(covariance))
+    assert np.abs((found.theta - joint.x[:6]) / deviation).max() < 0.02
+    plain = np.linalg.inv(np.einsum("wtsp,wtsq->pq", found.jacobian, found.jacobian))
+    np.testing.assert_allclose(np.sqrt(np.diag(plain)), deviation, rtol=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["multisine", "steps"])
+def test_intervals_cover_the_truth_as_often_as_they_say(kind):
+    """200 noise realisations in one vmapped run; the truth has a hard gap and another integrator."""
+    noise = {"motor": 3e-4, "load": 6e-5}
+    torque, states = recorded(kind, 900)
+    experiment = drive(6)
+    free = free_parameters(experiment, list(TRUE), 1.0)
+
+    def one(key):
+        windows = windows_of(torque, noisy(states, noise, key), noise, 300)
+        found = fit(experiment, free, windows, 0.03 * jax.random.normal(jax.random.fold_in(key, 1), (len(free),)), 25)
+        return found.theta, spread(found).covariance
+
+    theta, covariance = eqx.filter_jit(jax.vmap(one))(jax.random.split(jax.random.key(7), 200))
+    deviation = np.sqrt(np.einsum("rii->ri", covariance))
+    covered = np.mean(np.abs(theta / deviation) < 1.96, axis=0)
+    assert np.all((covered >= 0.92) & (covered <= 0.98)), covered
+    # without bias, within what 200 runs can tell
+    assert np.all(np.abs(np.mean(theta, axis=0)) < 4.0 * np.std(theta, axis=0) / np.sqrt(200.0))
+
+
+def test_scales_that_one_record_cannot_part_are_refused():
+    """Torque gain, inertia and friction scaled alike give the same motion."""
+    effects = [{"kind": "actuator.gain_error", "relative": 0.0}, {"kind": "motor.coulomb_friction", "torque": 0.01}]
+    experiment = prepare(read_config(rigid({"run.sample_period": PERIOD, "run.substeps": 1}, effects=effects)))
+    t = PERIOD * np.arange(1000)
+    torque = 0.1 * np.sin(9.0 * t) + 0.05 * np.sin(31.0 * t)
+    rest = experiment.plant.init(experiment.initial)
+    simulated = trajectory(experiment, rest, jnp.asarray(torque)).position["motor"]
+    readings = {"motor": simulated + 1e-5 * jax.random.normal(jax.random.key(2), (1000,))}
+    paths = ["drive.motor_inertia", "drive.motor_viscous", "effects.motor.coulomb_friction.torque"]
+
+    def fitted(names):
+        free = free_parameters(experiment, names, 0.1)
+        smoothed = smooth(readings["motor"], PERIOD)
+        start = PlantState({"motor": smoothed.position}, {"motor": smoothed.velocity}, ((), ()))
+        found = fit(experiment, free, cut(torque, readings, PERIOD, start, {"motor": 1e-5}, 250), jnp.zeros(len(free)))
+        return free, found
+
+    free, found = fitted(paths)
+    refused, condition = refusals(free, spread(found))
+    assert refused == []
+    assert condition < 1e3
+    np.testing.assert_allclose(found.theta, 0.0, atol=0.05)
+    free, found = fitted([*paths, "effects.actuator.gain_error.relative"])
+    refused, condition = refusals(free, spread(found))
+    assert condition > 1e4
+    (direction,) = refused
+    assert set(direction.direction) == {*paths, "effects.actuator.gain_error.relative"}
+    np.testing.assert_allclose(list(direction.direction.values()), 1.0, rtol=0.05)
+
+
+def test_residual_correlation_widens_intervals():
+    """Residuals of an AR(1) process on a constant regressor: the factor is known, (1 + rho) / (1 - rho) in variance."""
+    rho, samples = 0.8, 20_000
+    draws = np.random.default_rng(4).standard_normal(samples)
+    residual = np.zeros(samples)
+    for i in range(1, samples):
+        residual[i] = rho * residual[i - 1] + draws[i]
+    ones = jnp.ones((10, samples // 10, 1, 1))
+    rest = PlantState({"motor": jnp.zeros(10)}, {"motor": jnp.zeros(10)}, ())
+    found = spread(
+        Fit(jnp.zeros(1), rest, jnp.asarray(residual).reshape(10, -1, 1), ones, jnp.zeros(()), jnp.zeros(()), jnp.ones(()))
+    )
+    np.testing.assert_allclose(found.inflation, np.sqrt((1.0 + rho) / (1.0 - rho)), rtol=0.1)
+    white = spread(
+        Fit(jnp.zeros(1), rest, jnp.asarray(draws).reshape(10, -1, 1), ones, jnp.zeros(()), jnp.zeros(()), jnp.ones(()))
+    )
+    np.testing.assert_allclose(white.inflation, 1.0, rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("paths", "message"),
+    [
+        (["drive.motor_mass"], r"'drive\.motor_mass' is no number of the plant; fitted can be: drive\.motor_inertia, "),
+        (["observer.motor.alpha"], r"'observer\.motor\.alpha' is no number of the plant"),
+        (["drive.motor_inertia"] * 2, "'drive.motor_inertia' is named twice"),
+        (["transmission.half_gap"], "'transmission.half_gap' must stay positive, and its nominal value is 0; give one"),
+    ],
+)
+def test_what_cannot_be_fitted(paths, message):
+    law = {"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.0}
+    with pytest.raises(InputError, match=message):
+        free_parameters(read_config(small(transmission=law)).build(), paths, 1.0)
