@@ -1,0 +1,7 @@
+"""Measured logs: reading them into SI units, and what they are good for."""
+
+from .reader import Findings as Findings
+from .reader import Record as Record
+from .reader import read_log_table as read_log_table
+from .reader import read_record as read_record
+from .table import LogTable as LogTable
