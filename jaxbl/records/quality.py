@@ -258,7 +258,7 @@ class Gearing:
 
 def _direction(velocity: Array) -> Array:
     """+1 or -1 where it moves, between them where it hardly does."""
-    return velocity / (np.abs(velocity) + 0.02 * np.sqrt(np.mean(velocity**2)) + 1e-300)
+    return velocity / np.hypot(velocity, 0.02 * np.sqrt(np.mean(velocity**2)) + 1e-300)
 
 
 def gearing(times: Array, motor: Array, load: Array, segments: Slices, period: float) -> Gearing | None:
@@ -300,8 +300,11 @@ def gearing(times: Array, motor: Array, load: Array, segments: Slices, period: f
             cut = slice(cut.start, len(smooth) - cut.start)
             place = np.pi * (smooth - lowest) / (highest - lowest)
             repeating = [np.cos(k * place) for k in range(1, HARMONICS + 1)]
-            all_rows.append(np.stack([smooth - lowest, velocity, direction, np.ones_like(smooth), *repeating], axis=1)[cut])
-            targets.append((low_passed(motor[s], cutoff, period))[cut])
+            columns = np.stack([smooth - lowest, velocity, direction, np.ones_like(smooth), *repeating], axis=1)[cut]
+            # on its way from flank to flank it is anywhere in the gap
+            clear = np.abs(columns[:, 1]) > 0.3 * np.sqrt(np.mean(velocity**2))
+            all_rows.append(columns[clear])
+            targets.append(low_passed(motor[s], cutoff, period)[cut][clear])
         target, rows = np.concatenate(targets), np.concatenate(all_rows)
         found, errors = jackknifed(target, rows)
         if not np.isfinite(found).all() or found[0] == 0.0:
@@ -316,6 +319,8 @@ def gearing(times: Array, motor: Array, load: Array, segments: Slices, period: f
     # the ratio is that of the whole motion, whatever repeats within it
     slopes, slope_errors = jackknifed(target, rows[:, :4])
     left = target - rows[:, :4] @ slopes
+    # how the gap is crossed is not modelled: what that was found to be worth, on motions of several frequencies
+    crossing = 0.01 * found[2] / float(np.sqrt(np.mean(rows[:, 1] ** 2)))
     spread = float(np.std(target))
     return Gearing(
         ratio=float(slopes[0]),
@@ -323,7 +328,7 @@ def gearing(times: Array, motor: Array, load: Array, segments: Slices, period: f
         lost_motion=2.0 * float(found[2]) * float(np.sign(found[0])),
         lost_motion_error=2.0 * float(errors[2]),
         skew=skew,
-        skew_error=abs(float(errors[1] / found[0])),
+        skew_error=float(np.hypot(errors[1] / found[0], crossing / found[0])),
         residual=float(np.sqrt(np.mean(left**2))) / spread if spread else np.inf,
     )
 

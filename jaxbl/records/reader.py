@@ -55,6 +55,7 @@ class Record:
         segments: contiguous parts; between them the log has gaps.
         notes: what was done to the log, and what is odd about it, in sentences.
         findings: figures on its quality.
+        intervals: between the raw stamps that were kept, s, shape (raw samples - 1,).
     """
 
     path: Path
@@ -68,6 +69,7 @@ class Record:
     segments: tuple[slice, ...]
     notes: tuple[str, ...]
     findings: Findings
+    intervals: Array
 
 
 def read_log_table(log: LogTable | Mapping[str, Any] | None, name: str = "") -> LogTable:
@@ -178,6 +180,7 @@ class _Reader:
             segments=segments,
             notes=tuple(self.notes),
             findings=Findings(sampling, figures, gearing, dynamics),
+            intervals=np.diff(stamps),
         )
 
     # time stamps

@@ -28,6 +28,7 @@ from jaxbl.errors import InputError
 from jaxbl.observer.equivalent_control import EquivalentControl
 from jaxbl.observer.recursive import Identifier
 from jaxbl.observer.super_twisting import OBSERVERS, AbstractSuperTwisting, Observers
+from jaxbl.records.reader import read_log_table
 from jaxbl.records.table import Key, LogTable, StrictTable, brief, describe, nearest
 from jaxbl.simulate import Experiment, Run
 
@@ -611,6 +612,19 @@ def read_config(source: str | Path | Mapping[str, Any] | Config) -> Config:
     origins: dict[Key, str] = {}
     chain = [] if isinstance(source, Mapping) else [Path(source).resolve()]
     return _validate(_included(data, name, folder, chain, origins), name, origins)
+
+
+def read_log_config(path: Path) -> tuple[LogTable, float | None]:
+    """The `[log]` table of a TOML file and the gear ratio, if it has one: a whole study, or nothing but `[log]`.
+
+    Raises:
+        InputError: unreadable file, bad TOML, unknown key, wrong type or range; one line that names file and key.
+    """
+    data = _included(_load(path), str(path), path.parent, [path.resolve()], {})
+    if set(data) <= {"title", "notes", "log"}:
+        return read_log_table(data.get("log"), str(path)), None
+    config = read_config(path)
+    return config.log, None if config.drive.kind == "rigid" else config.drive.gear_ratio
 
 
 def _load(path: Path) -> dict[str, Any]:
