@@ -83,7 +83,7 @@ def even_grid(stamps: Array) -> tuple[bool, float, float, float]:
     largest = float(np.abs(deviation).max())
     # stamps that were rounded, say to milliseconds, are off by up to half a step
     rounding = resolution(np.diff(stamps))
-    even = largest <= 0.02 * period or (rounding <= period and largest <= 0.55 * rounding)
+    even = largest <= 0.02 * period or largest <= 0.55 * min(rounding, 20.0 * period)
     return even, period, float(middle + period * index[0]), float(np.sqrt(np.mean(deviation**2)))
 
 
@@ -143,7 +143,9 @@ def bandwidth(values: Array, period: float, *, slope: bool) -> float:
     frequency, density = spectrum(values, period)
     # steps of the resolution make noise of their own, and not always up to the end of the band
     floor = max(noise_floor(frequency, density), resolution(values) ** 2 / 6.0 * period)
-    power = np.where(density > 6.0 * floor, density - floor, 0.0) * (frequency**2 if slope else 1.0)
+    # differences of noise leak into the first two frequencies
+    clear = np.where(np.arange(len(density)) < 2, 24.0, 6.0) * floor
+    power = np.where(density > clear, density - floor, 0.0) * (frequency**2 if slope else 1.0)
     if not power.any():
         return 0.0
     total = np.cumsum(power)
@@ -394,11 +396,14 @@ def dynamics(times: Array, torque: Array, position: Array, segments: Slices, per
     target, rows = np.concatenate(targets), np.concatenate(all_rows)
     found, errors = jackknifed(target, rows)
     if not np.isfinite(found).all():
-        return None
+        # terms that are the same but for a factor
+        found, errors = np.zeros(6), np.full(6, np.inf)
     terms = rows[:, :5]
     centred = terms[:, :4] - terms[:, :4].mean(axis=0)
     spread = np.sqrt(np.mean(centred**2, axis=0))
-    inflation = np.append(np.diag(np.linalg.pinv(np.corrcoef(centred.T))), 1.0) if (spread > 0).all() else np.full(5, np.inf)
+    inflation = np.full(5, np.inf)
+    if np.isfinite(errors).all() and (spread > 0.0).all():
+        inflation = np.append(np.diag(np.linalg.inv(np.corrcoef(centred.T))), 1.0)
     left = target - rows @ found
     return Dynamics(
         names=("inertia", "viscous", "coulomb", "spring", "constant"),

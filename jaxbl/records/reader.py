@@ -129,6 +129,7 @@ class _Reader:
         self.columns, self.path, self.table, self.gear_ratio = columns, columns.path, table, gear_ratio
         self.notes: list[str] = []
         self.rows = np.zeros(0, dtype=int)
+        self.median = self.gap = 0.0
 
     def wrong(self, text: str) -> InputError:
         return InputError(f"{self.path}: {text}")
@@ -146,8 +147,9 @@ class _Reader:
         grid = self.gridded(stamps, channels, parts, step, skews, first, regrid)
         gearing = self.gearing(grid, step)
         if any(raw.skew == "estimate" for raw in channels.values()):
-            gearing = self.estimate_skew(gearing, skews, step)
+            skews["theta_s"] = self.estimated_skew(gearing, step)
             grid = self.gridded(stamps, channels, parts, step, skews, first, regrid)
+            gearing = self.gearing(grid, step)
         time, values, segments = grid
         if regrid:
             why = "to the period that [log] resample asks for" if self.table.resample else "from uneven stamps"
@@ -157,7 +159,8 @@ class _Reader:
         for name, skew in skews.items():
             if skew:
                 self.notes.append(f"{name}: moved by its skew of {1e3 * skew:.4g} ms.")
-        self.check_gearing(gearing)
+        if len(positions) == 2:
+            self.check_gearing(gearing)
         side = "theta_e" if "theta_e" in values else "theta_s"
         dynamics = quality.dynamics(time, values["u"], values[side], segments, step) if "u" in values else None
         if dynamics is not None:
@@ -226,6 +229,9 @@ class _Reader:
             self.notes.append(f"{len(self.rows)} of {len(stamps)} rows are read, by [log] where, start and stop.")
         intervals = np.diff(stamps)
         self.median = float(np.median(intervals)) or float(np.mean(intervals))
+        # stamps that were rounded to more than a period come in groups
+        group = 0.0 if np.median(intervals) else float(np.median(intervals[intervals > 0.0]))
+        self.gap = max(quality.GAP * self.median, 2.5 * group)
         if self.median >= 0.5:
             self.notes.append(f"The period is {self.median:g} s: if the stamps are not in s, set [log] t.unit.")
         return stamps[self.rows], start
@@ -247,7 +253,7 @@ class _Reader:
     ) -> tuple[Array, dict[str, _Raw], Slices, Sampling, float, list[float]]:
         """Parts between gaps; without repeated stamps and parts that are too short."""
         count = len(stamps)
-        parts = _parts(stamps, self.median)
+        parts = _parts(stamps, self.gap)
         longest = max(parts, key=_length)
         fits = [quality.even_grid(stamps[p]) for p in parts if _length(p) >= SHORTEST // 2]
         even = bool(fits) and all(fit[0] for fit in fits)
@@ -265,10 +271,10 @@ class _Reader:
                     {n: raw._replace(values=raw.values[~again]) for n, raw in channels.items()},
                 )
                 self.rows = self.rows[~again]
-                parts = _parts(stamps, self.median)
+                parts = _parts(stamps, self.gap)
                 longest = max(parts, key=_length)
         intervals = np.diff(stamps)
-        inside = intervals[intervals <= quality.GAP * self.median]
+        inside = intervals[intervals <= self.gap]
         kept = [p for p in parts if _length(p) >= SHORTEST // 2]
         if sum(map(_length, kept)) < SHORTEST:
             raise self.wrong(
@@ -464,16 +470,17 @@ class _Reader:
             return None
         return quality.gearing(time, values["theta_e"], values["theta_s"], segments, step)
 
-    def estimate_skew(self, gearing: Gearing | None, skews: dict[str, float], step: float) -> Gearing:
+    def estimated_skew(self, gearing: Gearing | None, step: float) -> float:
         if gearing is None:
             raise self.wrong("theta_s.skew = 'estimate': the motion does not tell a skew; give it in s, or leave it out")
+        found = f"{1e3 * gearing.skew:.4g} ± {1e3 * gearing.skew_error:.2g} ms"
         if not gearing.skew_error < 0.5 * step:
             raise self.wrong(
-                f"theta_s.skew = 'estimate': found {1e3 * gearing.skew:.3g} ± {1e3 * gearing.skew_error:.2g} ms, which is "
-                f"not known to half a period of {1e3 * step:.4g} ms; give it in s, or leave it out"
+                f"theta_s.skew = 'estimate': found {found}, which is not known to half a period of {1e3 * step:.4g} ms; "
+                "give it in s, or leave it out"
             )
-        skews["theta_s"] = gearing.skew
-        return gearing
+        self.notes.append(f"The skew of theta_s was estimated against theta_e: {found}.")
+        return gearing.skew
 
     # what may be wrong
 
@@ -545,32 +552,35 @@ class _Reader:
     def check_gearing(self, found: Gearing | None) -> None:
         """Compare the ratio of both motions with the gear ratio that is expected."""
         expected = self.gear_ratio
-        if found is None or expected is None or found.residual > 0.2:
-            if found is not None and found.residual > 0.2:
-                self.notes.append(
-                    f"theta_e and theta_s hardly go together ({100 * found.residual:.0f} % of theta_e is not explained by "
-                    "theta_s): they may not belong to one drive, or the load hardly moves beyond the lost motion."
-                )
+        if found is None or found.residual > 0.2:
+            left = "" if found is None else f" ({100 * found.residual:.0f} % of theta_e is not explained by theta_s)"
+            self.notes.append(
+                f"theta_e and theta_s hardly go together{left}: they may not belong to one drive, or the load hardly moves."
+            )
+            return
+        if expected is None:
             return
         relative = found.ratio / expected
         tolerance = max(0.02, 3.0 * found.residual, 5.0 * found.ratio_error / abs(expected))
         if abs(relative - 1.0) <= tolerance:
             return
+        units = {name: (getattr(self.table, name) or PositionTable()).unit for name in ("theta_e", "theta_s")}
+        degrees = 180.0 / math.pi
+        close = [
+            (-1.0, "the sign of one of them is wrong; set sign = -1 in [log] theta_e or theta_s"),
+            (1.0 / expected**2, "the sides are swapped; exchange the columns in [log] theta_e and theta_s"),
+            (-1.0 / expected**2, "the sides are swapped, and one has the wrong sign; see [log] theta_e and theta_s"),
+            (degrees, "theta_s is not in degrees" if units["theta_s"] == "deg" else "theta_e is in degrees"),
+            (1.0 / degrees, "theta_e is not in degrees" if units["theta_e"] == "deg" else "theta_s is in degrees"),
+            (1.0 / expected, "theta_s is already counted at the motor shaft; set factor = 1 / gear_ratio in [log] theta_s"),
+        ]
+        guess, why = min(close, key=lambda pair: abs(relative / pair[0] - 1.0))
+        if abs(relative / guess - 1.0) > tolerance:
+            why = "gear_ratio, or a unit in [log], is wrong"
+        elif "degrees" in why:
+            why += "; see unit in [log]"
         moves = f"theta_e moves {found.ratio:.4g} for each 1 of theta_s, where gear_ratio is {expected:g}"
-        close = {
-            -1.0: "the sign of one of them is wrong; set sign = -1 in [log] theta_e or theta_s",
-            1.0 / expected**2: "the sides are swapped; exchange the columns in [log] theta_e and theta_s",
-            -1.0 / expected**2: "the sides are swapped, and one has the wrong sign; see [log] theta_e and theta_s",
-            180.0 / math.pi: 'theta_e is in degrees; set unit = "deg" in [log] theta_e',
-            math.pi / 180.0: 'theta_s is in degrees; set unit = "deg" in [log] theta_s',
-            1.0 / expected: "theta_s is already counted at the motor shaft; set factor = 1 / gear_ratio in [log] theta_s",
-            2.0 * math.pi: "theta_e is not in rad, or theta_s in turns; see unit in [log]",
-            0.5 / math.pi: "theta_e is in turns, or theta_s is not in rad; see unit in [log]",
-        }
-        guess = min(close, key=lambda ratio: abs(relative / ratio - 1.0))
-        sure = found.residual < 0.05
-        why = close[guess] if abs(relative / guess - 1.0) <= tolerance else "gear_ratio, or a unit in [log], is wrong"
-        if sure:
+        if found.residual < 0.05:
             raise self.wrong(f"{moves}: {why}")
         self.notes.append(f"{moves}, but they go together only roughly; perhaps {why}.")
 
@@ -650,8 +660,8 @@ def _length(part: slice) -> int:
     return part.stop - part.start
 
 
-def _parts(stamps: Array, period: float) -> list[slice]:
-    ends = np.flatnonzero(np.diff(stamps) > quality.GAP * period) + 1
+def _parts(stamps: Array, gap: float) -> list[slice]:
+    ends = np.flatnonzero(np.diff(stamps) > gap) + 1
     edges = [0, *ends.tolist(), len(stamps)]
     return [slice(a, b) for a, b in itertools.pairwise(edges)]
 

@@ -10,7 +10,8 @@ from pydantic_core import PydanticCustomError
 
 def nearest(word: str, words: Any) -> str:
     """A hint that names the nearest valid word, or all of them where none is near."""
-    close = difflib.get_close_matches(word, list(words), n=1, cutoff=0.6)
+    words = list(words)
+    close = difflib.get_close_matches(word, words, n=1, cutoff=0.6)
     return f"did you mean '{close[0]}'?" if close else f"valid: {', '.join(words)}"
 
 
