@@ -170,8 +170,10 @@ def _of_inertia_and_friction(record: Record, speed: Array, reversals: int) -> li
             return Judgement(name, "weak", f"looks like {unlike} in this motion (variance × {found.inflation[i]:.0f})")
         if found.values[i] < 2.0 * found.errors[i]:
             return Judgement(name, "weak", f"a rough fit finds no positive one ({percent[i]}): other effects hide it")
-        if found.shares[i] < 0.05 or spread[i] > 0.2:
-            return Judgement(name, "weak", f"it takes only {percent[i]}, and is known to {100 * spread[i]:.0f} % of itself")
+        if found.shares[i] < 0.05:
+            return Judgement(name, "weak", f"it takes only {percent[i]}")
+        if spread[i] > 0.2:
+            return Judgement(name, "weak", f"a rough fit finds it to {100 * spread[i]:.0f} % of itself ({percent[i]})")
         return Judgement(name, "yes", f"{yes}: {percent[i]}")
 
     result = [judge("inertia", 0, f"motion up to {width:.3g} Hz", "a spring or gravity")]

@@ -167,16 +167,20 @@ def stays(values: Array, step: float) -> float:
     return share / len(values)
 
 
-def jumps(positions: Array, step: float) -> int:
+def jumps(positions: Array, step: float, stamps: Array | None = None) -> int:
     """Isolated outliers and steps of a position: differences far off those around them.
 
     Args:
-        positions: shape (samples,), evenly spaced.
+        positions: shape (samples,).
         step: resolution, of which motion leaves differences of a few.
+        stamps: times of the positions, s, shape (samples,); left out: evenly spaced.
     """
     from scipy.ndimage import median_filter, percentile_filter
 
     differences = np.diff(positions)
+    if stamps is not None:
+        intervals = np.diff(stamps)
+        differences = differences * (np.median(intervals) / intervals)
     odd = np.abs(differences - median_filter(differences, 7, mode="nearest"))
     # what the motion itself does nearby, an outlier or two left out
     nearby = percentile_filter(differences, 90, 31, mode="nearest") - percentile_filter(differences, 10, 31, mode="nearest")

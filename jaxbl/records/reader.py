@@ -165,7 +165,11 @@ class _Reader:
         dynamics = quality.dynamics(time, values["u"], values[side], segments, step) if "u" in values else None
         if dynamics is not None:
             self.check_torque(dynamics, values["u"], values[side], segments)
-        figures = {name: self.figures(name, raw, parts, stamps) for name, raw in channels.items()}
+        # uneven stamps would pass for noise of what moves between them
+        source = (time, values, segments) if regrid else (stamps, {n: raw.values for n, raw in channels.items()}, parts)
+        figures = {
+            name: self.figures(name, raw, parts, None if sampling.even else stamps, source) for name, raw in channels.items()
+        }
         if gearing is not None:
             figures["theta_s"] = replace(figures["theta_s"], skew=gearing.skew, skew_error=gearing.skew_error)
             self.note_skew(gearing, step)
@@ -284,7 +288,7 @@ class _Reader:
             widest = int(np.argmax(intervals))
             left_out = count - repeated - sum(map(_length, kept))
             self.notes.append(
-                f"{len(parts) - 1} gaps part the log into {len(kept)} segments; the longest is {intervals[widest]:.4g} s, "
+                f"Gaps: {len(parts) - 1}; segments: {len(kept)}; the longest gap is {intervals[widest]:.4g} s, "
                 f"after data row {self.rows[widest] + 1}"
                 + (f"; {left_out} samples between gaps were left out." if left_out else ".")
             )
@@ -511,8 +515,8 @@ class _Reader:
         around = [p for p in periods if p >= span * 0.999 and (np.abs(size[at] - p) <= 3.0 * usual + 1e-9 * p).all()]
         if around and usual < 0.05 * around[0]:
             raise self.wrong(
-                f"column {column!r} ({name}) jumps by about {around[0]:.6g} at {len(at)} rows (data row "
-                f"{self.rows[at[0] + 1] + 1} first) and goes on from there: it wraps around; set wrap = {around[0]:.6g} in "
+                f"column {column!r} ({name}) jumps by about {around[0]:.10g} at {len(at)} rows (data row "
+                f"{self.rows[at[0] + 1] + 1} first) and goes on from there: it wraps around; set wrap = {around[0]:.10g} in "
                 f"[log] {name}"
             )
 
@@ -620,14 +624,33 @@ class _Reader:
                 "of the stamps, or viscous friction of the load winding up the shaft, which look alike."
             )
 
-    def figures(self, name: str, raw: _Raw, parts: Slices, stamps: Array) -> quality.Channel:
-        part = max(parts, key=_length)
-        values = raw.values[part]
-        period = float(stamps[part][-1] - stamps[part][0]) / (len(values) - 1)
+    def figures(
+        self,
+        name: str,
+        raw: _Raw,
+        parts: Slices,
+        stamps: Array | None,
+        source: tuple[Array, dict[str, Array], Slices],
+    ) -> quality.Channel:
+        """Figures on a channel.
+
+        Args:
+            name: of the channel.
+            raw: at the rows.
+            parts: rows between gaps.
+            stamps: of the rows, where they are uneven.
+            source: evenly spaced times, values by channel, and segments, that its spectrum is taken of.
+        """
+        times, by_channel, segments = source
+        part = max(segments, key=_length)
+        values = by_channel[name][part]
+        period = float(times[part][-1] - times[part][0]) / (len(values) - 1)
         every = np.concatenate([raw.values[p] for p in parts])
         step = quality.resolution(every)
         is_position = name.startswith("theta")
-        jumps = sum(quality.jumps(raw.values[p], step) for p in parts) if is_position else 0
+        jumps = 0
+        if is_position:
+            jumps = sum(quality.jumps(raw.values[p], step, None if stamps is None else stamps[p]) for p in parts)
         saturated = raw.saturated or (0.0 if is_position else quality.stays(every, step))
         if jumps:
             self.notes.append(

@@ -165,6 +165,7 @@ def _torque_over_velocity(record: Record) -> Drawn:
     dynamics = record.findings.dynamics
     speed = velocity(record, side)
     torque, label = record.torque.copy(), "torque u"
+    edge = 0
     sure = dynamics is not None and dynamics.values[0] > 4.0 * dynamics.errors[0] and dynamics.shares[0] > 0.05
     if sure:
         assert dynamics is not None
@@ -173,14 +174,17 @@ def _torque_over_velocity(record: Record) -> Drawn:
             torque[s] = quality.low_passed(torque[s], 4.0 * channel.bandwidth, record.sample_period)
             torque[s] -= dynamics.values[0] * np.gradient(speed[s], record.sample_period)
         label = "u less inertia"
+        # the ends of a segment are the filter's
+        edge = round(1.0 / (4.0 * channel.bandwidth * record.sample_period))
     figure = Figure(figsize=(7.0, 3.4), layout="constrained")
     ax = figure.subplots()
-    at = np.concatenate([np.arange(len(record.time))[_shown(record, s)] for s in record.segments])
+    inner = [slice(s.start + edge, s.stop - edge) for s in record.segments if s.stop - s.start > 4 * edge]
+    at = np.concatenate([np.arange(len(record.time))[_shown(record, s)] for s in inner or record.segments])
     ax.plot(speed[at], torque[at], ".", ms=1.6, color=COLOURS[0], alpha=0.5)
     ax.axhline(0.0, color="#888888", lw=0.8)
     ax.axvline(0.0, color="#888888", lw=0.8)
     # a few samples at sharp corners of the motion would set the scale
-    low, high = np.quantile(torque, [0.002, 0.998])
+    low, high = np.quantile(torque[at], [0.002, 0.998])
     margin = 0.15 * (high - low)
     ax.set(xlabel=f"{side} velocity ({channel.unit}/s)", ylabel=f"{label} ({record.findings.channels['u'].unit})",
            ylim=(low - margin, high + margin))  # fmt: skip
