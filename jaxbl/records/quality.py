@@ -42,7 +42,8 @@ class Channel:
         least: smallest value.
         largest: largest value.
         resolution: step between neighbouring values; 0 where there is none to be seen.
-        noise: rms of a white noise with the spectral density found above a third of the sampling rate.
+        noise: rms of a white noise with the spectral density found above a third of the sampling rate; of uneven stamps
+            that of the resampled signal, which is a little less.
         bandwidth: frequency in Hz below which 95 % of the power lies (of a position: of its velocity's), noise left out.
         saturated: share of samples at the saturation level, or in stays at an extreme value.
         jumps: isolated outliers and steps, as of dropped counts.

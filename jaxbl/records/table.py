@@ -208,7 +208,10 @@ _Plain = Annotated[bool | int | float | str, BeforeValidator(_is_plain)]
 
 
 class LogTable(StrictTable):
-    """How a measured log is to be read. Accepted in every study; simulate and sweep do not use it."""
+    """How a measured log is to be read; `theta_e = "x"` is short for `theta_e = { column = "x" }`.
+
+    Accepted in every study; simulate and sweep do not use it.
+    """
 
     hold: Literal["zoh"] = Field(default="zoh", description="input between samples")
     initial_state: Literal["unknown", "rest"] = Field(default="unknown", description="state at the first sample")
