@@ -208,6 +208,8 @@ def low_passed(values: Array, cutoff: float, period: float) -> Array:
 
 
 BLOCKS = 12
+SHORTEST = 64
+"""Samples that a log needs, as does a segment to be filtered and regressed; others need half as many."""
 
 
 def jackknifed(target: Array, regressors: Array) -> tuple[Array, Array]:
@@ -290,7 +292,9 @@ def gearing(times: Array, motor: Array, load: Array, segments: Slices, period: f
     if width == 0.0:
         return None
     cutoff = 4.0 * width
-    usable = [s for s in segments if s.stop - s.start >= 64]
+    usable = [s for s in segments if s.stop - s.start >= SHORTEST]
+    if not usable:
+        return None
     skew, found, errors = 0.0, None, None
     target = np.array([])
     rows = np.zeros((0, 4 + HARMONICS))
@@ -313,6 +317,8 @@ def gearing(times: Array, motor: Array, load: Array, segments: Slices, period: f
             all_rows.append(columns[clear])
             targets.append(low_passed(motor[s], cutoff, period)[cut][clear])
         target, rows = np.concatenate(targets), np.concatenate(all_rows)
+        if len(target) < 3 * rows.shape[1]:
+            return None
         found, errors = jackknifed(target, rows)
         if not np.isfinite(found).all() or found[0] == 0.0:
             return None
@@ -384,7 +390,7 @@ def dynamics(times: Array, torque: Array, position: Array, segments: Slices, per
     cutoff = 3.0 * width
     targets, all_rows = [], []
     for s in segments:
-        if s.stop - s.start < 64:
+        if s.stop - s.start < SHORTEST:
             continue
         smooth = low_passed(position[s], cutoff, period)
         velocity = np.gradient(smooth, period)
@@ -399,6 +405,8 @@ def dynamics(times: Array, torque: Array, position: Array, segments: Slices, per
     if not targets:
         return None
     target, rows = np.concatenate(targets), np.concatenate(all_rows)
+    if np.ptp(target) == 0.0:
+        return None
     found, errors = jackknifed(target, rows)
     if not np.isfinite(found).all():
         # terms that are the same but for a factor

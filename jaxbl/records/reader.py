@@ -14,11 +14,8 @@ from jaxbl.errors import InputError
 
 from . import quality
 from .files import Columns, read_columns
-from .quality import Array, Dynamics, Gearing, Sampling, Slices
+from .quality import SHORTEST, Array, Dynamics, Gearing, Sampling, Slices
 from .table import LogTable, PositionTable, TimeTable, TorqueTable, describe, nearest
-
-SHORTEST = 64
-"""Samples that a log needs, and a part of one between gaps half as many."""
 
 
 @dataclass(frozen=True)
@@ -293,6 +290,11 @@ class _Reader:
                 + (f"; {left_out} samples between gaps were left out." if left_out else ".")
             )
         even_fits = [quality.even_grid(stamps[p]) for p in kept]
+        if even:
+            # rounded stamps may repeat, which no spline takes
+            stamps = stamps.copy()
+            for p, (_, spacing, begin, _) in zip(kept, even_fits, strict=True):
+                stamps[p] = begin + spacing * np.arange(_length(p))
         period = even_fits[int(np.argmax([_length(p) for p in kept]))][1] if even else self.median
         sampling = Sampling(
             samples=count,
@@ -604,16 +606,19 @@ class _Reader:
         if away > 0.2 * travel:
             # potential energy may pay for the motion
             share = max(share, 0.0)
-        if (share < -0.2 and (backwards or not heavy)) or (backwards and share < 0.02):
-            said = (
-                f"the drive gives back {-100 * share:.0f} % of the work"
-                if share < -0.2
-                else "it accelerates against the torque"
+        if backwards and share < 0.02:
+            raise self.wrong(
+                "the torque has the wrong sign: the drive accelerates against it"
+                + (f" and gives {-100 * share:.0f} % of the work back" if share < -0.02 else "")
+                + "; set sign = -1 in [log] u"
             )
-            raise self.wrong(f"the torque has the wrong sign: {said}; set sign = -1 in [log] u")
         if share < -0.1 or backwards:
+            # a driven load does that, too
             self.notes.append(
-                "u looks as if its sign were wrong: see the work that it does, and the acceleration it goes with."
+                f"The drive gives {-100 * share:.0f} % of the work back to its input: "
+                "the load drives it, or the sign of u is wrong."
+                if share < -0.1
+                else "The drive seems to accelerate against u: see its sign, unit and column."
             )
 
     def note_skew(self, found: Gearing, step: float) -> None:

@@ -150,7 +150,8 @@ def _spectra(record: Record) -> Drawn:
             label = f"95 % {what} below {channel.bandwidth:.3g} Hz"
             ax.axvline(channel.bandwidth, color="#555555", lw=1.0, ls=":", label=label)
         ax.set_ylabel(f"{_LABELS[name]}\n({channel.unit}/√Hz)")
-        ax.legend(loc="lower right", ncols=2, bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
+        if channel.noise or channel.bandwidth:
+            ax.legend(loc="lower right", ncols=2, bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
     axes[-1].set_xlabel("frequency (Hz)")
     figure.align_ylabels()
     return Drawn(

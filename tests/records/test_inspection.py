@@ -5,8 +5,11 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from measured import EMPS, GEAR_RATIO, SERVO, XL330, made, real
 
+from jaxbl.errors import InputError
 from jaxbl.records import inspect
 
 
@@ -78,6 +81,45 @@ def test_noise_identifies_nothing(tmp_path):
     frame["theta_e"], frame["theta_s"] = random.standard_normal(4000), random.standard_normal(4000)
     found = answers(tmp_path, frame)
     assert {answer for answer, _ in found.values()} == {"no"}
+
+
+def odd_signal(random, count):
+    """Anything that may stand in a column."""
+    time = np.arange(count) / count
+    return random.choice([
+        random.standard_normal(count), np.cumsum(random.standard_normal(count)), np.sin(40.0 * random.random() * time),
+        time, np.round(time), np.zeros(count), random.integers(-3, 4, count) * 1.0, np.round(20.0 * np.sin(9.0 * time)),
+        np.where(random.random(count) < 0.02, 1e3, 0.0) + np.sin(20.0 * time),
+    ]) * random.choice([1.0, 1e-9, 1e9])  # fmt: skip
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.integers(0, 2**20),
+    st.sampled_from([64, 65, 100, 300]),
+    st.sampled_from([{}, {"resample": 2e-3}, {"theta_s": {"skew": "estimate"}}, {"u": {"skew": 0.007}}]),
+)
+def test_any_log_is_inspected_or_refused_in_one_line(tmp_path_factory, seed, count, log):
+    random = np.random.default_rng(seed)
+    period = 1e-3
+    stamps = [period * np.arange(count), period * np.cumsum(random.uniform(0.5, 1.5, count)),
+              period * np.cumsum(random.integers(0, 3, count)), period * 4.0 * np.floor(np.arange(count) / 4.0),
+              period * np.cumsum(random.exponential(1.0, count) ** 3)][random.integers(5)]  # fmt: skip
+    frame = pd.DataFrame({"t": stamps} | {name: odd_signal(random, count) for name in ("u", "theta_e", "theta_s")})
+    path = tmp_path_factory.mktemp("odd") / "log.parquet"
+    frame.to_parquet(path)
+    found, refusal = None, ""
+    try:
+        found = inspect(path, log, gear_ratio=None if seed % 2 else 7.0)
+    except InputError as error:
+        refusal = str(error)
+    if found is None:
+        assert refusal.startswith(f"{path}: ") and "\n" not in refusal
+        return
+    json.dumps(found.to_dict())
+    for segment in found.record.segments:
+        np.testing.assert_allclose(np.diff(found.record.time[segment]), found.record.sample_period, rtol=1e-5)
+    assert all(np.isfinite(values).all() for values in found.record.positions.values())
 
 
 def test_the_whole_as_plain_data(tmp_path):
