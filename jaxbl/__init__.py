@@ -8,6 +8,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .errors import InputError as InputError
     from .errors import NoResult as NoResult
+    from .records import Inspection as Inspection
+    from .records import LogTable as LogTable
+    from .records import Record as Record
+    from .records import inspect as inspect
+    from .records import read_record as read_record
+    from .report import write_inspection_report as write_inspection_report
     from .report import write_sweep_report as write_sweep_report
     from .report import write_trial_report as write_trial_report
     from .report import write_tune_report as write_tune_report
@@ -30,6 +36,12 @@ if TYPE_CHECKING:
 _WHERE = {
     "InputError": "errors",
     "NoResult": "errors",
+    "Inspection": "records",
+    "LogTable": "records",
+    "Record": "records",
+    "inspect": "records",
+    "read_record": "records",
+    "write_inspection_report": "report",
     "write_sweep_report": "report",
     "write_trial_report": "report",
     "write_tune_report": "report",

@@ -136,6 +136,53 @@ def verify(config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOp
 
 
 @app.command()
+def inspect(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="CSV, Parquet, MATLAB or JSON file", show_default=False)],
+    model: Annotated[
+        Path | None, typer.Option("--model", metavar="TOML", help="study, or a file with nothing but [log]: how to read it")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="folder for the results [default: results/<log name>]")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the inspection of another log")] = False,
+) -> None:
+    """Say what a measured log holds and what it can identify: channels, sampling, noise, figures."""
+    from .records import inspect as inspect_log
+    from .report import write_inspection_report
+    from .study.config import read_log_config
+
+    table, gear_ratio = (None, None) if model is None else read_log_config(model)
+    found = inspect_log(log, table, gear_ratio=gear_ratio)
+    folder = _folder(log, out)
+    _claim_for_log(folder, log, overwrite=overwrite)
+    for line in write_inspection_report(found, folder):
+        typer.echo(line)
+    typer.echo(f"{folder / 'report.html'}")
+
+
+def _claim_for_log(folder: Path, log: Path, *, overwrite: bool) -> None:
+    """Make the folder; leave other results than those of this log alone."""
+    import json
+
+    from .study.store import make_folder
+
+    make_folder(folder)
+    marker = folder / "inspection.json"
+    if not marker.exists():
+        if any(folder.iterdir()):
+            raise InputError(f"{folder}: is not empty and holds no inspection; choose another folder with --out")
+        return
+    try:
+        file = json.loads(marker.read_text(encoding="utf-8"))["file"]
+    except (OSError, ValueError, KeyError, TypeError):
+        file = "an unreadable one"
+    if file != str(log.resolve()) and not overwrite:
+        raise InputError(
+            f"{folder}: holds the inspection of another log ({file}); choose another with --out, or --overwrite"
+        )
+
+
+@app.command()
 def plot(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder of a sweep", show_default=False)],
     config: Annotated[

@@ -13,7 +13,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import tomli_w
-from small_study import ALPHA, LAMBDA, listed, rigid, spaced
+from measured import EMPS, made, real
+from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
 from typer.testing import CliRunner
 
 from jaxbl import cli
@@ -398,6 +399,55 @@ def test_shipped_studies_run_without_a_word_on_stderr(name, command, tmp_path):
             axis["num"] = 2
     done = jaxbl(command, write(tmp_path, study), cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_inspect_says_what_a_log_holds_and_leaves_numbers_figures_and_report(call, tmp_path):
+    made(count=6000, gap=0.1, noise=1e-4).to_csv("axis.csv", index=False)
+    code, lines, _ = call("inspect", "axis.csv")
+    folder = tmp_path / "results" / "axis"
+    assert code == 0
+    assert lines[0] == "axis.csv: 6000 samples, 6 s every 1 ms, even stamps, one segment"
+    assert [line.split()[0] for line in lines[3:6]] == ["theta_e", "theta_s", "u"]
+    assert lines[-1] == "results/axis/report.html" and len(lines) <= 26
+    figures = {f"figures/{name}.png" for name in ("channels", "spectra", "torque_over_velocity", "twist")}
+    assert {"inspection.json", "report.html"} | figures <= set(left(folder))
+    assert json.loads((folder / "inspection.json").read_text())["gear_ratio"] == pytest.approx(20.0, rel=1e-3)
+    # again, and with a gear ratio that it contradicts
+    assert call("inspect", "axis.csv")[:2] == (0, lines)
+    write(tmp_path, small({"drive.gear_ratio": 5.0}), "model.toml")
+    with pytest.raises(InputError, match=r"axis.csv: theta_e moves 20 for each 1 of theta_s, where gear_ratio is 5"):
+        call("inspect", "axis.csv", "--model", "model.toml")
+
+
+def test_inspect_reads_as_the_model_says_and_leaves_other_results_alone(call, tmp_path):
+    made(count=1000).drop(columns="theta_s").rename(columns={"theta_e": "x"}).to_parquet("axis.parquet")
+    (tmp_path / "log.toml").write_text('[log]\ntheta_e = "x"\n')
+    assert call("inspect", "axis.parquet", "--model", "log.toml")[0] == 0
+    (tmp_path / "part.toml").write_text('include = "log.toml"\ntitle = "my axis"\n')
+    assert call("inspect", "axis.parquet", "--model", "part.toml")[0] == 0
+    write(tmp_path, rigid(log={"theta_e": "x"}), "study.toml")
+    assert call("inspect", "axis.parquet", "--model", "study.toml")[0] == 0
+    (tmp_path / "wrong.toml").write_text('[log]\ntheta_e = { colum = "x" }\n')
+    with pytest.raises(InputError, match=r"wrong.toml: log.theta_e: unknown key 'colum'; did you mean 'column'\?"):
+        call("inspect", "axis.parquet", "--model", "wrong.toml")
+    made(count=1000).to_csv("axis.csv", index=False)
+    with pytest.raises(InputError, match=r"results/axis: holds the inspection of another log \(.*axis.parquet\)"):
+        call("inspect", "axis.csv")
+    assert call("inspect", "axis.csv", "--overwrite")[0] == 0
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("mine")
+    with pytest.raises(InputError, match="full: is not empty and holds no inspection; choose another folder with --out"):
+        call("inspect", "axis.csv", "--out", "full")
+    with pytest.raises(InputError, match=r"none\.csv: no such file"):
+        call("inspect", "none.csv")
+    assert not (tmp_path / "results" / "none").exists()
+
+
+def test_inspect_runs_without_a_word_on_stderr(tmp_path):
+    (tmp_path / "log.toml").write_text(tomli_w.dumps({"log": EMPS}))
+    done = jaxbl("inspect", str(real("emps/DATA_EMPS.mat")), "--model", "log.toml", "--out", "out", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "motion up to" in done.stdout
 
 
 def test_a_refined_sweep_from_the_command_line(call, tmp_path):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from jaxbl.records import read_log_table
 from jaxbl.study.config import read_config
 
 ROOT = Path(__file__).parents[1]
@@ -24,6 +25,13 @@ def test_tutorial_configs_are_valid():
     assert len(blocks) == 3
     config = read_config(tomllib.loads("".join(blocks)))
     assert [axis.num for axis in config.axes] == [32, 32]
+
+
+def test_log_examples_are_valid():
+    blocks = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "logs.md").read_text(encoding="utf-8"), re.S)
+    assert len(blocks) >= 5
+    for block in blocks:
+        read_log_table(tomllib.loads(block)["log"])
 
 
 @pytest.mark.parametrize("page", [*sorted(ROOT.glob("docs/*.md")), ROOT / "README.md"], ids=lambda p: p.name)

@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal, Union
 
 import numpy as np
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
+from pydantic import Field, ValidationError, create_model, model_validator
 from pydantic_core import PydanticCustomError
 
 from jaxbl.drive.effects import effect_class, effect_kinds
@@ -28,35 +28,18 @@ from jaxbl.errors import InputError
 from jaxbl.observer.equivalent_control import EquivalentControl
 from jaxbl.observer.recursive import Identifier
 from jaxbl.observer.super_twisting import OBSERVERS, AbstractSuperTwisting, Observers
+from jaxbl.records.reader import read_log_table
+from jaxbl.records.table import Key, LogTable, StrictTable, brief, describe, nearest
 from jaxbl.simulate import Experiment, Run
 
 from .refine import TOLERANCE, is_boolean
 
 
-def nearest(word: str, words: Any) -> str:
-    """A hint that names the nearest valid word, or all of them where none is near."""
-    close = difflib.get_close_matches(word, list(words), n=1, cutoff=0.6)
-    return f"did you mean '{close[0]}'?" if close else f"valid: {', '.join(words)}"
-
-
-class Table(BaseModel):
-    """A table of the config: strict types, finite numbers, no unknown keys."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, validate_default=False)
+class Table(StrictTable):
+    """A table that may build what it describes."""
 
     factory: ClassVar[Callable[..., Any]]
     """What the table builds (generated tables)."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _known_keys(cls, data: Any) -> Any:
-        if isinstance(data, Mapping):
-            keys = [field.alias or name for name, field in cls.model_fields.items()]
-            for key in data:
-                if key not in keys:
-                    hint = nearest(str(key), keys)
-                    raise PydanticCustomError("unknown_key", "unknown key '{key}'; {hint}", {"key": key, "hint": hint})
-        return data
 
     def build(self) -> Any:
         """The module that a generated table stands for."""
@@ -346,13 +329,6 @@ TUNE_NAMES = ("tuned", "usual rule", "config")
 """What a comparison of gains always holds."""
 
 
-class LogTable(Table):
-    """How a measured log is to be read. Accepted in every study; simulate and sweep do not use it."""
-
-    hold: Literal["zoh"] = Field(default="zoh", description="input between samples")
-    initial_state: Literal["unknown", "rest"] = Field(default="unknown", description="state at the first sample")
-
-
 class RangeTable(Table):
     """Values between two ends, evenly spaced on a log scale."""
 
@@ -639,8 +615,17 @@ def read_config(source: str | Path | Mapping[str, Any] | Config) -> Config:
     return _validate(_included(data, name, folder, chain, origins), name, origins)
 
 
-Key = tuple[str | int, ...]
-"""Where a value lies in a config: keys of tables and positions in arrays."""
+def read_log_config(path: Path) -> tuple[LogTable, float | None]:
+    """The `[log]` table of a TOML file and the gear ratio, if it has one: a whole study, or nothing but `[log]`.
+
+    Raises:
+        InputError: unreadable file, bad TOML, unknown key, wrong type or range; one line that names file and key.
+    """
+    data = _included(_load(path), str(path), path.parent, [path.resolve()], {})
+    if set(data) <= {"title", "notes", "log"}:
+        return read_log_table(data.get("log"), str(path)), None
+    config = read_config(path)
+    return config.log, None if config.drive.kind == "rigid" else config.drive.gear_ratio
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -680,7 +665,7 @@ def _included(data: dict[str, Any], name: str, folder: Path, chain: list[Path], 
     files = data.pop("include", [])
     files = [files] if isinstance(files, str) else files
     if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
-        raise InputError(f"{name}: include: should be a file name or an array of them, not {_brief(files)}")
+        raise InputError(f"{name}: include: should be a file name or an array of them, not {brief(files)}")
     merged: dict[str, Any] = {}
     for file in files:
         path = folder / file
@@ -740,8 +725,7 @@ _UNIONS = {("drive",): 1, ("transmission",): 1, ("excitation",): 1, ("effects",)
 
 def _describe(error: ValidationError) -> tuple[Key, str]:
     """The first error: the key that is wrong, and one line that says so."""
-    first = error.errors()[0]
-    location = list(first["loc"])
+    location = list(error.errors()[0]["loc"])
     for union, tag in _UNIONS.items():
         if tuple(location[: len(union)]) == union and len(location) > tag:
             del location[tag]
@@ -749,35 +733,7 @@ def _describe(error: ValidationError) -> tuple[Key, str]:
         del location[4:]  # the member of the union that came last
     if location[:1] == ["figures"] and "where" in location:
         del location[4:]
-    key = ""
-    for part in location:
-        key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)
-    where = f"{key}: " if key else ""
-    kind, context, given = first["type"], first.get("ctx", {}), _brief(first["input"])
-    place = tuple(location)
-    if kind == "missing":
-        return place, f"{where}this key is missing"
-    if kind == "union_tag_invalid":
-        tags = [t.strip(" '") for t in context["expected_tags"].split(",")]
-        name = context["discriminator"].strip("'")
-        return (*place, name), f"{key}.{name}: unknown {name} '{context['tag']}'; {nearest(context['tag'], tags)}"
-    if kind == "union_tag_not_found":
-        return place, f"{where}the key {context['discriminator']} is missing"
-    if kind in ("model_type", "model_attributes_type", "dict_type"):
-        return place, f"{where}should be a table, not {given}"
-    if kind == "list_type":
-        return place, f"{where}should be an array, not {given}"
-    message = first["msg"].removeprefix("Input ")
-    if kind == "unknown_key":
-        return (*place, context["key"]), f"{where}{message}"
-    if kind in ("period", "sweep", "axis", "figure", "range", "consistency"):
-        return place, f"{where}{message}"
-    return place, f"{where}{message}, not {given}"
-
-
-def _brief(given: Any) -> str:
-    text = repr(given)
-    return text if len(text) <= 80 else f"{text[:77]}..."
+    return describe(error, location)
 
 
 def numeric_paths(config: Config) -> dict[str, Parameter]:

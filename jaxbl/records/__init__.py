@@ -1,0 +1,10 @@
+"""Measured logs: reading them into SI units, and what they are good for."""
+
+from .inspection import Inspection as Inspection
+from .inspection import Judgement as Judgement
+from .inspection import inspect as inspect
+from .reader import Findings as Findings
+from .reader import Record as Record
+from .reader import read_log_table as read_log_table
+from .reader import read_record as read_record
+from .table import LogTable as LogTable

@@ -1,0 +1,268 @@
+"""Reading a log file into named columns: text, Parquet, MATLAB (up to 7.2, and 7.3), JSON."""
+
+# pandas' own annotations are wider than what its methods return
+# pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
+
+import csv
+import io
+import json
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from jaxbl.errors import InputError
+
+from .table import nearest
+
+_KINDS = "text (CSV and the like), Parquet, MATLAB (.mat) and JSON can be read"
+
+
+class Columns:
+    """The columns of a log file.
+
+    Attributes:
+        path: the file.
+        columns: name -> values, one-dimensional; numbers in place of names where the file has none.
+    """
+
+    def __init__(self, path: Path, columns: dict[str | int, Any]):
+        self.path = path
+        self.columns = columns
+
+    def name(self, column: str | int, channel: str = "") -> str | int:
+        """The name of a column that is given by name or number.
+
+        Raises:
+            InputError: there is no such column; the nearest is named.
+        """
+        if column in self.columns:
+            return column
+        names = list(self.columns)
+        if isinstance(column, int):
+            if column < len(names):
+                return names[column]
+            count = f"has {len(names)} columns, numbered 0 to {len(names) - 1}" if len(names) != 1 else "has only column 0"
+            raise InputError(f"{self.path}: no column {column}: the file {count}")
+        key = f"; [log] {channel} can name another" if channel else ""
+        if all(isinstance(name, int) for name in names):
+            raise InputError(
+                f"{self.path}: no column '{column}': the file has no header; give the column's number, 0 to {len(names) - 1}"
+                + (f", as [log] {channel}" if channel else "")
+            )
+        raise InputError(f"{self.path}: no column '{column}'; {nearest(column, map(str, names))}{key}")
+
+    def raw(self, column: str | int, channel: str = "") -> np.ndarray:
+        """A column as it stands, shape (rows,)."""
+        return np.asarray(self.columns[self.name(column, channel)])
+
+    def numbers(self, column: str | int, channel: str = "") -> np.ndarray:
+        """A column of finite numbers, shape (rows,).
+
+        Raises:
+            InputError: no such column, or something else in it; the first such row is named, counted from 1.
+        """
+        name = self.name(column, channel)
+        given = self.columns[name]
+        values = np.asarray(pd.to_numeric(pd.Series(given), errors="coerce"), dtype=float)
+        finite = np.isfinite(values)
+        if not finite.all():
+            row = int(np.argmin(finite))
+            cell = np.asarray(given, dtype=object)[row]
+            empty = cell is None or (isinstance(cell, float) and np.isnan(cell))
+            what = "empty or not a number" if empty else repr(cell)
+            raise InputError(f"{self.path}: column {name!r}, data row {row + 1} is {what}; it should be a finite number")
+        return values
+
+
+def read_columns(path: Path) -> Columns:
+    """Read all columns of a log file; the suffix and the first bytes say which kind it is.
+
+    Raises:
+        InputError: the file is missing, empty, or of no known kind.
+    """
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a folder; a log file is needed") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    if not content.strip():
+        raise InputError(f"{path}: is empty; {_KINDS}")
+    suffix = path.suffix.lower()
+    if content.startswith(b"PAR1"):
+        return Columns(path, _parquet(path))
+    if content.startswith(b"\x89HDF"):
+        return Columns(path, _hdf5(path))
+    if suffix == ".mat":
+        return Columns(path, _matlab(path))
+    if b"\0" in content:
+        raise InputError(f"{path}: is not a log of a known kind; {_KINDS}")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")  # a degree sign in a header of an old program
+    if suffix == ".json" or text.lstrip()[0] in "[{":
+        return Columns(path, _json(path, text))
+    return Columns(path, _text(path, text))
+
+
+def _parquet(path: Path) -> dict[str | int, Any]:
+    try:
+        frame = pd.read_parquet(path)
+    except Exception as error:  # pyarrow has many kinds
+        raise InputError(f"{path}: cannot be read as Parquet: {_first_line(error)}") from None
+    return {str(name): frame[name].to_numpy() for name in frame.columns}
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+_NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eEdD][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
+
+
+def _text(path: Path, text: str) -> dict[str | int, Any]:
+    """Comma, semicolon, tab or white space between columns; a header or none; # before remarks."""
+    lines = text.splitlines()
+    skipped = next((i for i, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), None)
+    if skipped is None:
+        raise InputError(f"{path}: holds only remarks; rows of numbers are needed")
+    first = lines[skipped]
+    # a comma between digits may be a decimal one, but not where nothing else separates
+    separator = next((c for c in ";\t," if c in first), r"\s+")
+    cells = _cells(first, separator)
+    header = not any(_NUMBER.fullmatch(cell) for cell in cells)
+    second = next((line for line in lines[skipped + 1 :] if line.strip()), "")
+    if header and len(_cells(second, separator)) == len(cells) + 1 and second.rstrip(" ").endswith(separator):
+        cells = [*cells, ""]  # a separator at the end of the rows
+    sample = "\n".join(lines[skipped + header : skipped + header + 50])
+    decimal = "," if separator != "," and re.search(r"\d,\d", sample) and not re.search(r"\d\.\d", sample) else "."
+    try:
+        with warnings.catch_warnings(action="error", category=pd.errors.ParserWarning):
+            frame = pd.read_csv(
+                io.StringIO(text),
+                sep=separator,
+                header=None,
+                names=_names(path, cells) if header else None,
+                skiprows=skipped + header,
+                comment="#",
+                skipinitialspace=True,
+                decimal=decimal,
+                index_col=False,
+                low_memory=False,
+            )
+    except (ValueError, pd.errors.ParserWarning) as error:
+        if "No columns" in str(error):
+            raise InputError(f"{path}: has a header and no rows; a log needs rows of numbers") from None
+        if isinstance(error, pd.errors.ParserWarning):
+            raise InputError(f"{path}: rows have more columns than the header; they should have {len(cells)}") from None
+        raise InputError(f"{path}: cannot be read as a table: {_first_line(error)}") from None
+    if not len(frame):
+        raise InputError(f"{path}: has a header and no rows; a log needs rows of numbers")
+    return {name if isinstance(name, str) else int(name): frame[name].to_numpy() for name in frame.columns}
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    cells = next(csv.reader([line], delimiter=separator), []) if len(separator) == 1 else line.split()
+    return [cell.strip() for cell in cells]
+
+
+def _names(path: Path, cells: list[str]) -> list[str]:
+    if cells and not cells[-1]:
+        cells = [*cells[:-1], f"column {len(cells) - 1}"]  # a separator at the end of the lines
+    for i, cell in enumerate(cells):
+        if cell in cells[:i]:
+            raise InputError(f"{path}: two columns are called '{cell}'; names should differ")
+    return cells
+
+
+def _json(path: Path, text: str) -> dict[str | int, Any]:
+    """An array of objects, an object that holds one, or an object of arrays."""
+    try:
+        data = json.loads(text)
+    except ValueError as error:
+        raise InputError(f"{path}: is not valid JSON: {error}") from None
+    if isinstance(data, dict):
+        rows = [value for value in data.values() if isinstance(value, list) and value and isinstance(value[0], dict)]
+        if len(rows) == 1:
+            data = rows[0]
+        else:
+            columns = {name: _plain(value) for name, value in data.items() if isinstance(value, list)}
+            if not columns:
+                raise InputError(f"{path}: holds no array of rows or of numbers; a log needs one")
+            return columns  # type: ignore[return-value]
+    if not data or not all(isinstance(row, dict) for row in data):
+        raise InputError(f"{path}: should hold an array of objects, one a row")
+    names = dict.fromkeys(name for row in data for name in row)
+    return {name: _plain([row.get(name) for row in data]) for name in names}
+
+
+def _plain(values: list[Any]) -> np.ndarray:
+    array = np.empty(len(values), dtype=object)
+    array[:] = values
+    return np.asarray(pd.Series(array).infer_objects())
+
+
+def _matlab(path: Path) -> dict[str | int, Any]:
+    """Vectors, columns of matrices, and fields of structures (`name.field`)."""
+    from scipy.io import loadmat
+
+    try:
+        data = loadmat(path, squeeze_me=True, struct_as_record=True)
+    except NotImplementedError:
+        return _hdf5(path)
+    except Exception as error:  # scipy has many kinds
+        raise InputError(f"{path}: cannot be read as a MATLAB file: {_first_line(error)}") from None
+    columns: dict[str | int, Any] = {}
+    for name, value in data.items():
+        if not name.startswith("__"):
+            _add(columns, name, value)
+    return _some(path, columns)
+
+
+def _add(columns: dict[str | int, Any], name: str, value: Any) -> None:
+    value = np.asarray(value)
+    if value.dtype.names:
+        if value.ndim == 0:
+            for field in value.dtype.names:
+                _add(columns, f"{name}.{field}", value[field].item() if value[field].dtype == object else value[field])
+        return
+    if value.dtype.kind not in "biuf":
+        return
+    if value.ndim == 1:
+        columns[name] = value
+    elif value.ndim == 2:
+        # samples run along the longer side
+        for i, column in enumerate(value.T if value.shape[0] >= value.shape[1] else value):
+            columns[f"{name}[{i}]"] = column
+
+
+def _hdf5(path: Path) -> dict[str | int, Any]:
+    """MATLAB 7.3, or any HDF5 file of vectors."""
+    import h5py
+
+    columns: dict[str | int, Any] = {}
+
+    def visit(name: str, item: Any) -> None:
+        named = isinstance(item, h5py.Dataset) and not name.startswith("#")
+        if named and item.attrs.get("MATLAB_class") != b"char" and item.dtype.kind in "biuf":
+            _add(columns, name.replace("/", "."), np.squeeze(item[()]))
+
+    try:
+        with h5py.File(path) as file:
+            file.visititems(visit)
+    except Exception as error:  # h5py has many kinds
+        raise InputError(f"{path}: cannot be read as a MATLAB file: {_first_line(error)}") from None
+    return _some(path, columns)
+
+
+def _some(path: Path, columns: dict[str | int, Any]) -> dict[str | int, Any]:
+    if not columns:
+        raise InputError(f"{path}: holds no vectors of numbers; a log needs them")
+    return columns

@@ -1,0 +1,250 @@
+"""What a measured log can and cannot identify, judged before anything is fitted to it."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import quality
+from .quality import Array
+from .reader import SIDES, Record, read_log_table, read_record
+from .table import LogTable
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Whether a log can identify a quantity.
+
+    Attributes:
+        quantity: of the drive.
+        answer: yes; weak: with large uncertainty, or only together with another quantity; no.
+        why: one sentence.
+    """
+
+    quantity: str
+    answer: Literal["yes", "weak", "no"]
+    why: str
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """A log, and what it is good for.
+
+    Attributes:
+        record: the log as read.
+        log: how it was read.
+        gear_ratio: motor over load motion: the expected one, else that of the log; None with one encoder.
+        reversals: how often the direction of motion changes.
+        judgements: what the log can identify.
+    """
+
+    record: Record
+    log: LogTable
+    gear_ratio: float | None
+    reversals: int
+    judgements: tuple[Judgement, ...]
+
+    @property
+    def twist(self) -> Array | None:
+        """theta_e - gear_ratio theta_s about its median, rad (m), shape (samples,); None with one encoder."""
+        both = self.record.positions
+        if self.gear_ratio is None or len(both) < 2:
+            return None
+        twist = both["motor"] - self.gear_ratio * both["load"]
+        return twist - np.median(twist)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in `inspection.json`."""
+        record, found = self.record, self.record.findings
+        dynamics = found.dynamics
+        return {
+            "file": str(record.path.resolve()),
+            "samples": len(record.time),
+            "sample_period": record.sample_period,
+            "start": record.start,
+            "closed_loop": record.closed_loop,
+            "segments": [[float(record.time[s][0]), float(record.time[s][-1])] for s in record.segments],
+            "sampling": asdict(found.sampling),
+            "channels": {name: asdict(channel) for name, channel in found.channels.items()},
+            "gear_ratio": self.gear_ratio,
+            "gearing": None if found.gearing is None else asdict(found.gearing),
+            "dynamics": None
+            if dynamics is None
+            else {
+                "terms": {
+                    name: {
+                        "value": float(dynamics.values[i]),
+                        "standard_error": float(dynamics.errors[i]),
+                        "inflation": float(dynamics.inflation[i]) if math.isfinite(dynamics.inflation[i]) else None,
+                        "share": float(dynamics.shares[i]),
+                    }
+                    for i, name in enumerate(dynamics.names)
+                },
+                "residual": dynamics.residual,
+            },
+            "reversals": self.reversals,
+            "identifiable": [asdict(judgement) for judgement in self.judgements],
+            "notes": list(record.notes),
+        }
+
+
+def inspect(
+    path: str | Path, log: LogTable | Mapping[str, Any] | None = None, *, gear_ratio: float | None = None
+) -> Inspection:
+    """Read a measured log and judge what it can identify.
+
+    Args:
+        path: CSV or other text, Parquet, MATLAB (.mat up to 7.3), or JSON file.
+        log: the `[log]` table of a study, or its keys; left out: columns t, u, theta_e, theta_s in s, N m, rad, rad.
+        gear_ratio: expected ratio of motor over load motion, which the log is checked against.
+
+    Raises:
+        InputError: the file or a column is missing or unfit, or the log contradicts what is said of it; one line.
+    """
+    table = read_log_table(log)
+    record = read_record(path, table, gear_ratio=gear_ratio)
+    gearing = record.findings.gearing
+    ratio = gear_ratio if gear_ratio is not None else None if gearing is None else gearing.ratio
+    if len(record.positions) < 2:
+        ratio = None
+    speed = velocity(record)
+    reversals = _reversals(record, speed)
+    found = [*_of_inertia_and_friction(record, speed, reversals), *_of_transmission(record, speed, reversals, ratio)]
+    return Inspection(record, table, ratio, reversals, tuple(found))
+
+
+def velocity(record: Record, side: str | None = None) -> Array:
+    """Velocity by differences of the low-passed position, rad/s (m/s), shape (samples,).
+
+    Args:
+        record: the log.
+        side: motor or load; left out: the motor if it has an encoder.
+    """
+    side = side or ("motor" if "motor" in record.positions else "load")
+    width = record.findings.channels[SIDES[side]].bandwidth
+    speed = np.zeros(len(record.time))
+    for s in record.segments:
+        smooth = record.positions[side][s]
+        if width:
+            smooth = quality.low_passed(smooth, 4.0 * width, record.sample_period)
+        speed[s] = np.gradient(smooth, record.sample_period)
+    return speed
+
+
+def _moving(speed: Array) -> NDArray[np.bool_]:
+    return np.abs(speed) > 0.1 * np.sqrt(np.mean(speed**2))
+
+
+def _reversals(record: Record, speed: Array) -> int:
+    count = 0
+    for s in record.segments:
+        signs = np.sign(speed[s][_moving(speed)[s]])
+        count += int(np.count_nonzero(np.diff(signs)))
+    return count
+
+
+def _of_inertia_and_friction(record: Record, speed: Array, reversals: int) -> list[Judgement]:
+    names = ("inertia", "viscous friction", "Coulomb friction", "constant torque")
+    torque, found = record.torque, record.findings.dynamics
+    if torque is None:
+        return [Judgement(name, "no", "no torque was recorded, so that only the kinematics show") for name in names]
+    if np.ptp(torque) == 0.0:
+        why = "the input is constant: free motion tells only ratios to the inertia (or to a known gravity torque)"
+        return [Judgement(name, "weak", why) for name in names]
+    if found is None:
+        return [Judgement(name, "no", "the motion does not stand out of the noise") for name in names]
+    moving = np.abs(speed[_moving(speed)])
+    slow, fast = np.quantile(moving, [0.05, 0.95])
+    both = min((speed[_moving(speed)] > 0).mean(), (speed[_moving(speed)] < 0).mean())
+    channel = "theta_e" if "motor" in record.positions else "theta_s"
+    width = record.findings.channels[channel].bandwidth
+    percent = [f"{100 * share:.0f} % of the torque" for share in found.shares]
+    spread = [abs(error / value) if value else math.inf for value, error in zip(found.values, found.errors, strict=True)]
+
+    def judge(name: str, i: int, yes: str, unlike: str) -> Judgement:
+        if found.inflation[i] > 10.0:
+            return Judgement(name, "weak", f"looks like {unlike} in this motion (variance × {found.inflation[i]:.0f})")
+        if found.values[i] < 2.0 * found.errors[i]:
+            return Judgement(name, "weak", f"a rough fit finds no positive one ({percent[i]}): other effects hide it")
+        if found.shares[i] < 0.05:
+            return Judgement(name, "weak", f"it takes only {percent[i]}")
+        if spread[i] > 0.2:
+            return Judgement(name, "weak", f"a rough fit finds it to {100 * spread[i]:.0f} % of itself ({percent[i]})")
+        return Judgement(name, "yes", f"{yes}: {percent[i]}")
+
+    result = [judge("inertia", 0, f"motion up to {width:.3g} Hz", "a spring or gravity")]
+    if fast < 1.5 * slow:
+        why = f"speeds of {slow:.3g} to {fast:.3g} are too alike to tell viscous from Coulomb friction"
+        return [*result, *(Judgement(name, "weak", why) for name in names[1:3]), _constant(both)]
+    result.append(judge("viscous friction", 1, f"speeds of {slow:.3g} to {fast:.3g}", "Coulomb friction"))
+    if both < 0.05:
+        why = "motion in one direction only: it looks like a constant torque"
+        return [*result, Judgement("Coulomb friction", "weak", why), _constant(both)]
+    return [*result, judge("Coulomb friction", 2, f"{reversals} reversals", "viscous friction"), _constant(both)]
+
+
+def _constant(both: float) -> Judgement:
+    if both < 0.05:
+        return Judgement("constant torque", "weak", "motion in one direction only: it looks like Coulomb friction")
+    return Judgement("constant torque", "yes", f"motion in both directions ({100 * both:.0f} % in the rarer one)")
+
+
+def _of_transmission(record: Record, speed: Array, reversals: int, ratio: float | None) -> list[Judgement]:
+    names = ("gear ratio", "lost motion", "stiffness")
+    gearing, channels = record.findings.gearing, record.findings.channels
+    if len(record.positions) < 2:
+        missing = "load" if "motor" in record.positions else "motor"
+        why = f"there is no {missing} encoder: nothing is known of what lies between"
+        return [Judgement(name, "no", why) for name in names]
+    if gearing is None or ratio is None:
+        return [Judgement(name, "no", "the motion does not stand out of the noise") for name in names]
+    result = [
+        Judgement(
+            "gear ratio",
+            "yes" if gearing.residual < 0.05 else "weak",
+            f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {100 * gearing.residual:.2g} % of theta_e is left over",
+        )
+    ]
+    seen = math.hypot(channels["theta_e"].resolution, ratio * channels["theta_s"].resolution) / math.sqrt(12.0)
+    seen = math.hypot(seen, math.hypot(channels["theta_e"].noise, ratio * channels["theta_s"].noise))
+    lost, error = gearing.lost_motion, gearing.lost_motion_error
+    unit = channels["theta_e"].unit
+    size = f"{lost:.3g} ± {error:.1g} {unit}"
+    if reversals < 2:
+        result.append(Judgement("lost motion", "no", f"{reversals} reversals: both flanks of the gap must be touched"))
+    elif lost > 4.0 * error and lost > seen:
+        result.append(Judgement("lost motion", "yes", f"theta_e shifts by {size} at the {reversals} reversals"))
+    else:
+        result.append(Judgement("lost motion", "weak", f"shift of theta_e at reversals is {size}, noise {seen:.2g} {unit}"))
+    return [*result, _stiffness(record, speed, ratio, seen)]
+
+
+def _stiffness(record: Record, speed: Array, ratio: float, seen: float) -> Judgement:
+    """From twist over torque within one direction of motion."""
+    torque, dynamics = record.transmitted, record.findings.dynamics
+    if torque is None:
+        if record.torque is None or np.ptp(record.torque) == 0.0:
+            return Judgement("stiffness", "no", "no varying torque was recorded")
+        torque = record.torque
+    twist = record.positions["motor"] - ratio * record.positions["load"]
+    width = record.findings.channels["theta_e"].bandwidth
+    if width == 0.0 or dynamics is None:
+        return Judgement("stiffness", "no", "the motion does not stand out of the noise")
+    targets, rows = [], []
+    for s in record.segments:
+        held = quality.low_passed(np.stack([twist[s], torque[s], np.sign(speed[s]), speed[s]], axis=1), 4.0 * width,
+                                  record.sample_period)  # fmt: skip
+        targets.append(held[:, 0])
+        rows.append(np.column_stack([held[:, 1:], np.ones(len(held))]))
+    found, errors = quality.jackknifed(np.concatenate(targets), np.concatenate(rows))
+    reach = abs(float(found[0])) * float(np.std(torque))
+    unit = record.findings.channels["theta_e"].unit
+    if not np.isfinite(found[0]) or found[0] < 5.0 * errors[0] or reach < seen:
+        return Judgement("stiffness", "weak", f"the twist hardly follows the torque (it winds up {reach:.2g} {unit} rms)")
+    return Judgement(
+        "stiffness", "yes", f"the twist follows the torque: {reach:.2g} {unit} rms against a noise of {seen:.2g}"
+    )

@@ -1,0 +1,259 @@
+"""The `[log]` table of a study: which columns a measured log has, and how they become SI units."""
+
+import difflib
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
+
+
+def nearest(word: str, words: Any) -> str:
+    """A hint that names the nearest valid word, or all of them where none is near."""
+    words = list(words)
+    close = difflib.get_close_matches(word, words, n=1, cutoff=0.6)
+    return f"did you mean '{close[0]}'?" if close else f"valid: {', '.join(words)}"
+
+
+class StrictTable(BaseModel):
+    """A table of the config: strict types, finite numbers, no unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, validate_default=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys(cls, data: Any) -> Any:
+        if isinstance(data, Mapping):
+            keys = [field.alias or name for name, field in cls.model_fields.items()]
+            for key in data:
+                if key not in keys:
+                    hint = nearest(str(key), keys)
+                    raise PydanticCustomError("unknown_key", "unknown key '{key}'; {hint}", {"key": key, "hint": hint})
+        return data
+
+
+Key = tuple[str | int, ...]
+"""Where a value lies in a config: keys of tables and positions in arrays."""
+
+
+def describe(error: ValidationError, location: list[str | int] | None = None) -> tuple[Key, str]:
+    """The first error: the key that is wrong, and one line that says so.
+
+    Args:
+        error: what pydantic found.
+        location: the key, where pydantic's own has more in it than keys.
+    """
+    first = error.errors()[0]
+    location = list(first["loc"]) if location is None else location
+    key = ""
+    for part in location:
+        key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)
+    where = f"{key}: " if key else ""
+    kind, context, given = first["type"], first.get("ctx", {}), brief(first["input"])
+    place = tuple(location)
+    if kind == "missing":
+        return place, f"{where}this key is missing"
+    if kind == "union_tag_invalid":
+        tags = [t.strip(" '") for t in context["expected_tags"].split(",")]
+        name = context["discriminator"].strip("'")
+        return (*place, name), f"{key}.{name}: unknown {name} '{context['tag']}'; {nearest(context['tag'], tags)}"
+    if kind == "union_tag_not_found":
+        return place, f"{where}the key {context['discriminator']} is missing"
+    if kind in ("model_type", "model_attributes_type", "dict_type"):
+        return place, f"{where}should be a table, not {given}"
+    if kind == "list_type":
+        return place, f"{where}should be an array, not {given}"
+    message = first["msg"].removeprefix("Input ")
+    if kind == "unknown_key":
+        return (*place, context["key"]), f"{where}{message}"
+    if kind in ("period", "sweep", "axis", "figure", "range", "consistency"):
+        return place, f"{where}{message}"
+    return place, f"{where}{message}, not {given}"
+
+
+def brief(given: Any) -> str:
+    """A value as messages show it."""
+    text = repr(given)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _is_column(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, str | int) or (isinstance(value, int) and value < 0):
+        raise PydanticCustomError("column", "should be a column's name, or its number counted from 0")
+    return value
+
+
+def _is_skew(value: Any) -> Any:
+    if isinstance(value, bool) or not (isinstance(value, int | float) or value == "estimate"):
+        raise PydanticCustomError("skew", "should be a number of seconds or 'estimate'")
+    return value
+
+
+def _is_plain(value: Any) -> Any:
+    if not isinstance(value, bool | int | float | str):
+        raise PydanticCustomError("where", "should be a number, text, true or false")
+    return value
+
+
+def _is_sign(value: Any) -> Any:
+    if isinstance(value, bool) or value not in (1, -1):
+        raise PydanticCustomError("sign", "should be 1 or -1")
+    return int(value)
+
+
+_Column = Annotated[str | int, BeforeValidator(_is_column)]
+_Skew = Annotated[float | Literal["estimate"], BeforeValidator(_is_skew)]
+_Sign = Annotated[int, BeforeValidator(_is_sign)]
+
+_SECONDS: Any = {"unit": "s"}
+
+
+class _ColumnTable(StrictTable):
+    """What all channels have in common; a column's name or number alone stands for a table with nothing else in it."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _column_alone(cls, data: Any) -> Any:
+        if isinstance(data, str) or (isinstance(data, int) and not isinstance(data, bool)):
+            return {"column": data}
+        return data
+
+
+def _consistency(message: str, **context: Any) -> PydanticCustomError:
+    return PydanticCustomError("consistency", message, context)  # type: ignore[arg-type]
+
+
+class TimeTable(_ColumnTable):
+    """The time stamps of a log."""
+
+    column: _Column | None = Field(default=None, description="name of the column, or its number counted from 0; left out: t")
+    unit: Literal["s", "ms", "us", "ns"] = Field(default="s", description="unit of the stamps")
+    period: float | None = Field(
+        default=None, gt=0.0, description="sampling period of a log without stamps", json_schema_extra=_SECONDS
+    )
+
+    @model_validator(mode="after")
+    def _one_source(self) -> "TimeTable":
+        if self.period is not None and self.column is not None:
+            raise _consistency("has both column and period; period is for logs without time stamps")
+        return self
+
+
+class _ChannelTable(_ColumnTable):
+    """What measured channels have in common."""
+
+    column: _Column | None = Field(
+        default=None, description="name of the column, or its number counted from 0; left out: the channel's own name"
+    )
+    sign: _Sign = Field(default=1, description="-1 if the column counts the other way; 1 or -1")
+    offset: float = Field(default=0.0, description="added last, in SI units")
+    signed_bits: int | None = Field(
+        default=None, ge=2, le=63, description="word length of two's complement numbers that were logged as unsigned"
+    )
+
+
+class PositionTable(_ChannelTable):
+    """An encoder's column."""
+
+    unit: Literal["rad", "deg", "turn", "counts", "m", "mm"] = Field(default="rad", description="unit of the column")
+    counts_per_turn: float | None = Field(default=None, gt=0.0, description="counts of one turn; for unit counts")
+    factor: float = Field(default=1.0, gt=0.0, description="units in one number of the column")
+    minus: _Column | None = Field(default=None, description="column to be subtracted, in the same unit")
+    wrap: float | None = Field(
+        default=None, gt=0.0, description="period, in numbers of the column, after which it starts again; undone"
+    )
+    skew: _Skew = Field(
+        default=0.0,
+        description="by how much the stamps are later than the readings, undone; 'estimate' (theta_s only): as found "
+        "against theta_e",
+        json_schema_extra=_SECONDS,
+    )
+
+    @model_validator(mode="after")
+    def _counts(self) -> "PositionTable":
+        if self.unit == "counts" and self.counts_per_turn is None:
+            raise _consistency("unit counts needs counts_per_turn")
+        if self.unit != "counts" and self.counts_per_turn is not None:
+            raise _consistency("counts_per_turn is for unit counts, not for {unit}", unit=self.unit)
+        return self
+
+
+class TorqueTable(_ChannelTable):
+    """A torque's column (force on a linear axis), or that of a voltage, current or duty that stands for it."""
+
+    unit: Literal["N m", "N", "V", "A", "counts"] | None = Field(
+        default=None, description="unit of the column: N m, N, V, A or counts; left out: N m, or N on a linear axis"
+    )
+    factor: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="N m (N on a linear axis) in one number of the column; needed for V, A and counts; else 1",
+    )
+    saturation: float | None = Field(
+        default=None, gt=0.0, description="magnitude, in numbers of the column, at which it saturates"
+    )
+    skew: float = Field(
+        default=0.0, description="by how much the stamps are later than the torque, undone", json_schema_extra=_SECONDS
+    )
+
+    @model_validator(mode="after")
+    def _constant(self) -> "TorqueTable":
+        if self.unit in ("V", "A", "counts") and self.factor is None:
+            raise _consistency("unit {unit} needs factor, the torque in N m (or force in N) of one {unit}", unit=self.unit)
+        return self
+
+
+Channel = Literal["u", "theta_e", "theta_s"]
+_Plain = Annotated[bool | int | float | str, BeforeValidator(_is_plain)]
+
+
+class LogTable(StrictTable):
+    """How a measured log is to be read; `theta_e = "x"` is short for `theta_e = { column = "x" }`.
+
+    Accepted in every study; simulate and sweep do not use it.
+    """
+
+    hold: Literal["zoh"] = Field(default="zoh", description="input between samples")
+    initial_state: Literal["unknown", "rest"] = Field(default="unknown", description="state at the first sample")
+    t: TimeTable | None = Field(default=None, description="time stamps; left out: column t, in s")
+    u: TorqueTable | None = Field(default=None, description="input torque on the motor shaft; left out: column u, in N m")
+    theta_e: PositionTable | None = Field(default=None, description="motor position; left out: column theta_e, in rad")
+    theta_s: PositionTable | None = Field(default=None, description="load position; left out: column theta_s, in rad")
+    transmitted: TorqueTable | None = Field(default=None, description="measured transmitted torque; left out: none")
+    absent: list[Channel] | None = Field(
+        default=None, description="channels that were not recorded, of u, theta_e, theta_s; left out: none"
+    )
+    where: dict[str, _Plain] | None = Field(
+        default=None, description="column -> value: only rows that have it (a switch, a mode); left out: all rows"
+    )
+    start: float | None = Field(
+        default=None, ge=0.0, description="reads from here on, counted from the first stamp", json_schema_extra=_SECONDS
+    )
+    stop: float | None = Field(
+        default=None, gt=0.0, description="reads up to here, counted from the first stamp", json_schema_extra=_SECONDS
+    )
+    resample: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="period to resample to; left out: the log's own, uneven stamps to their median",
+        json_schema_extra=_SECONDS,
+    )
+    closed_loop: bool | None = Field(
+        default=None, description="whether a controller chose u from the positions; left out: not known"
+    )
+
+    @model_validator(mode="after")
+    def _possible(self) -> "LogTable":
+        if self.start is not None and self.stop is not None and self.start >= self.stop:
+            raise _consistency("start {start} should be less than stop {stop}", start=self.start, stop=self.stop)
+        absent = self.absent or []
+        for name in absent:
+            if getattr(self, name) is not None:
+                raise _consistency("{name} is described and said to be absent; remove one of them", name=name)
+        if "theta_e" in absent and "theta_s" in absent:
+            raise _consistency("absent: a log without theta_e and theta_s has no position; one of them is needed")
+        if self.theta_e is not None and self.theta_e.skew == "estimate":
+            raise _consistency("theta_e.skew: 'estimate' is for theta_s, whose skew is found against theta_e")
+        if self.theta_s is not None and self.theta_s.skew == "estimate" and "theta_e" in absent:
+            raise _consistency("theta_s.skew: 'estimate' needs theta_e, which is said to be absent")
+        return self

@@ -1,0 +1,239 @@
+"""Figures, table and report of an inspected log."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import tomli_w
+from matplotlib.figure import Figure
+
+from jaxbl.records import quality
+from jaxbl.records.inspection import Inspection, velocity
+from jaxbl.records.reader import SIDES, Record
+from jaxbl.study.store import plain, write_atomic
+
+from .maps import Drawn
+from .page import TableOf, html
+from .reports import save_all
+from .style import COLOURS, style
+
+_POINTS = 6000
+_LINES = 25
+"""Lines that the terminal gets at most."""
+_LABELS = {"u": "input u", "theta_e": "motor θe", "theta_s": "load θs", "transmitted": "transmitted"}
+_COLOUR = {"u": COLOURS[6], "theta_e": COLOURS[0], "theta_s": COLOURS[1], "transmitted": COLOURS[2]}
+
+
+def write_inspection_report(inspection: Inspection, folder: Path) -> list[str]:
+    """Write `inspection.json`, figures and report into a folder that exists. Returns the lines for the terminal."""
+    record = inspection.record
+    text = json.dumps(plain(inspection.to_dict()), indent=2, ensure_ascii=False)
+    write_atomic(folder / "inspection.json", text)
+    pictures = save_all(draw_inspection(inspection), folder)
+    tables = [
+        TableOf(
+            "What the log can identify",
+            ["quantity", "", "why"],
+            [[j.quantity, j.answer, j.why] for j in inspection.judgements],
+        ),
+        TableOf("Channels", list(_CHANNEL_COLUMNS), [list(row) for row in _channel_rows(record)]),
+    ]
+    table = tomli_w.dumps({"log": inspection.log.model_dump(exclude_none=True)})
+    page = html(record.path.name, [_headline(record)], list(record.notes), pictures, tables, table)
+    write_atomic(folder / "report.html", page)
+    return summary(inspection)
+
+
+def _headline(record: Record) -> str:
+    sampling, count = record.findings.sampling, len(record.segments)
+    span = float(sum(record.time[s][-1] - record.time[s][0] for s in record.segments)) + count * record.sample_period
+    stamps = "even stamps" if sampling.even else f"uneven stamps (jitter {1e3 * sampling.jitter:.2g} ms rms)"
+    parts = "one segment" if count == 1 else f"{count} segments"
+    return f"{len(record.time)} samples, {span:.4g} s every {1e3 * record.sample_period:.5g} ms, {stamps}, {parts}"
+
+
+_CHANNEL_COLUMNS = ("channel", "unit", "least", "largest", "resolution", "noise", "bandwidth", "saturated", "jumps", "skew")
+
+
+def _channel_rows(record: Record) -> Iterator[tuple[str, ...]]:
+    for name, c in record.findings.channels.items():
+        skew = "–" if c.skew is None or c.skew_error is None else f"{1e3 * c.skew:.2g} ± {1e3 * c.skew_error:.1g} ms"
+        yield (
+            name, c.unit, f"{c.least:.4g}", f"{c.largest:.4g}", f"{c.resolution:.3g}" if c.resolution else "–",
+            f"{c.noise:.2g}", f"{c.bandwidth:.3g} Hz" if c.bandwidth else "–",
+            f"{100 * c.saturated:.2g} %" if c.saturated else "–", str(c.jumps) if name.startswith("theta") else "–", skew,
+        )  # fmt: skip
+
+
+def summary(inspection: Inspection) -> list[str]:
+    """The log in at most 25 lines: channels, what can be identified, what was done."""
+    record = inspection.record
+    lines = [f"{record.path.name}: {_headline(record)}", ""]
+    lines += _aligned([_CHANNEL_COLUMNS, *_channel_rows(record)])
+    lines += ["", *_aligned([("identifies", "", ""), *((j.quantity, j.answer, j.why) for j in inspection.judgements)])]
+    room = _LINES - len(lines) - 1
+    notes = list(record.notes)
+    if len(notes) > room:
+        notes = [*notes[: room - 1], f"... and {len(notes) - room + 1} more remarks in the report"]
+    return [*lines, *([""] if notes else []), *notes]
+
+
+def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def draw_inspection(inspection: Inspection) -> list[Drawn]:
+    """All figures of an inspected log."""
+    record = inspection.record
+    with style():
+        drawn = [_channels(record), _spectra(record)]
+        if record.torque is not None and np.ptp(record.torque):
+            drawn.append(_torque_over_velocity(record))
+        if inspection.twist is not None:
+            drawn.append(_twist(inspection))
+        if not record.findings.sampling.even:
+            drawn.append(_intervals(record))
+    return drawn
+
+
+def _values(record: Record) -> dict[str, np.ndarray]:
+    found = {} if record.torque is None else {"u": record.torque}
+    found |= {SIDES[side]: values for side, values in record.positions.items()}
+    return found if record.transmitted is None else found | {"transmitted": record.transmitted}
+
+
+def _shown(record: Record, segment: slice) -> slice:
+    """No more points than a page shows, in proportion to the segment."""
+    return slice(segment.start, segment.stop, max(len(record.time) // _POINTS, 1))
+
+
+def _side(record: Record) -> str:
+    return "motor" if "motor" in record.positions else "load"
+
+
+def _channels(record: Record) -> Drawn:
+    values = _values(record)
+    side = _side(record)
+    unit = record.findings.channels[SIDES[side]].unit
+    rows = [(_LABELS[n], record.findings.channels[n].unit, v, _COLOUR[n]) for n, v in values.items()]
+    rows.append((f"{side} velocity", f"{unit}/s", velocity(record, side), COLOURS[3]))
+    figure = Figure(figsize=(7.0, 1.5 * len(rows) + 0.6), layout="constrained")
+    axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False).ravel()
+    for ax, (label, unit, signal, colour) in zip(axes, rows, strict=True):
+        for segment in record.segments:
+            at = _shown(record, segment)
+            ax.plot(record.time[at], signal[at], color=colour, lw=0.9)
+        ax.set_ylabel(f"{label}\n({unit})")
+    axes[-1].set_xlabel("time (s)")
+    figure.align_ylabels()
+    return Drawn(
+        "channels", figure, f"The channels over time, and the velocity by differences of the low-passed {side} position."
+    )
+
+
+def _spectra(record: Record) -> Drawn:
+    values = {n: v for n, v in _values(record).items() if np.ptp(v)}
+    longest = max(record.segments, key=lambda s: s.stop - s.start)
+    figure = Figure(figsize=(7.0, 2.1 * len(values) + 0.6), layout="constrained")
+    axes = figure.subplots(len(values), 1, sharex=True, squeeze=False).ravel()
+    for ax, (name, signal) in zip(axes, values.items(), strict=True):
+        channel = record.findings.channels[name]
+        frequency, density = quality.spectrum(signal[longest], record.sample_period)
+        ax.loglog(frequency, np.sqrt(density), color=_COLOUR[name], lw=1.0)
+        if channel.noise:
+            floor = channel.noise * np.sqrt(2.0 * record.sample_period)
+            ax.axhline(floor, color="#555555", lw=1.0, ls="--", label=f"noise {channel.noise:.2g} {channel.unit} rms")
+        if channel.bandwidth:
+            what = "of velocity's power" if name.startswith("theta") else "of power"
+            label = f"95 % {what} below {channel.bandwidth:.3g} Hz"
+            ax.axvline(channel.bandwidth, color="#555555", lw=1.0, ls=":", label=label)
+        ax.set_ylabel(f"{_LABELS[name]}\n({channel.unit}/√Hz)")
+        if channel.noise or channel.bandwidth:
+            ax.legend(loc="lower right", ncols=2, bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
+    axes[-1].set_xlabel("frequency (Hz)")
+    figure.align_ylabels()
+    return Drawn(
+        "spectra", figure, "Amplitude spectral densities (Welch), the noise floor, and the bandwidth of each channel."
+    )
+
+
+def _torque_over_velocity(record: Record) -> Drawn:
+    assert record.torque is not None
+    side = _side(record)
+    channel = record.findings.channels[SIDES[side]]
+    dynamics = record.findings.dynamics
+    speed = velocity(record, side)
+    torque, label = record.torque.copy(), "torque u"
+    edge = 0
+    sure = dynamics is not None and dynamics.values[0] > 4.0 * dynamics.errors[0] and dynamics.shares[0] > 0.05
+    if sure:
+        assert dynamics is not None
+        for s in record.segments:
+            # the acceleration holds nothing above this frequency, so the torque shall not either
+            torque[s] = quality.low_passed(torque[s], 4.0 * channel.bandwidth, record.sample_period)
+            torque[s] -= dynamics.values[0] * np.gradient(speed[s], record.sample_period)
+        label = "u less inertia"
+        # the ends of a segment are the filter's
+        edge = round(1.0 / (4.0 * channel.bandwidth * record.sample_period))
+    figure = Figure(figsize=(7.0, 3.4), layout="constrained")
+    ax = figure.subplots()
+    inner = [slice(s.start + edge, s.stop - edge) for s in record.segments if s.stop - s.start > 4 * edge]
+    at = np.concatenate([np.arange(len(record.time))[_shown(record, s)] for s in inner or record.segments])
+    ax.plot(speed[at], torque[at], ".", ms=1.6, color=COLOURS[0], alpha=0.5)
+    ax.axhline(0.0, color="#888888", lw=0.8)
+    ax.axvline(0.0, color="#888888", lw=0.8)
+    # a few samples at sharp corners of the motion would set the scale
+    low, high = np.quantile(torque[at], [0.002, 0.998])
+    margin = 0.15 * (high - low)
+    ax.set(xlabel=f"{side} velocity ({channel.unit}/s)", ylabel=f"{label} ({record.findings.channels['u'].unit})",
+           ylim=(low - margin, high + margin))  # fmt: skip
+    less = (
+        f" The torque that accelerates {dynamics.values[0]:.4g} is taken off: a rough fit, not an identification."
+        if sure and dynamics
+        else ""
+    )
+    return Drawn("torque_over_velocity", figure, f"Torque over velocity: friction, as far as this log shows it.{less}")
+
+
+def _twist(inspection: Inspection) -> Drawn:
+    record, twist = inspection.record, inspection.twist
+    assert twist is not None
+    unit = record.findings.channels["theta_e"].unit
+    torque = record.torque if record.transmitted is None else record.transmitted
+    panels = [(record.positions["load"], f"load position θs ({record.findings.channels['theta_s'].unit})")]
+    if torque is not None and np.ptp(torque):
+        name = "u" if record.transmitted is None else "transmitted"
+        panels.insert(0, (torque, f"{_LABELS[name]} ({record.findings.channels[name].unit})"))
+    figure = Figure(figsize=(7.0, 3.6), layout="constrained")
+    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False).ravel()
+    at = np.concatenate([np.arange(len(record.time))[_shown(record, s)] for s in record.segments])
+    forward = velocity(record, "load")[at] > 0.0
+    for ax, (x, label) in zip(axes, panels, strict=True):
+        for chosen, colour, name in ((forward, COLOURS[0], "forwards"), (~forward, COLOURS[1], "backwards")):
+            ax.plot(x[at][chosen], twist[at][chosen], ".", ms=1.8, color=colour, alpha=0.6, label=name)
+        ax.set_xlabel(label)
+    axes[0].set_ylabel(f"θe − N₀ θs about its median ({unit})")
+    axes[-1].legend(ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, markerscale=5)
+    caption = (
+        f"Twist θe − N₀ θs with N₀ = {inspection.gear_ratio:.5g}, by the direction of motion. Over torque: hysteresis, its "
+        "width is lost motion and friction, its slope compliance. Over position: what repeats with it is eccentricity of "
+        "encoders or gears."
+    )
+    return Drawn("twist", figure, caption)
+
+
+def _intervals(record: Record) -> Drawn:
+    ends, intervals = np.cumsum(record.intervals), 1e3 * record.intervals
+    inside = record.intervals <= quality.GAP * record.findings.sampling.median_period
+    ends, intervals = ends[inside], intervals[inside]
+    figure = Figure(figsize=(7.0, 2.6), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True)
+    left.plot(ends, intervals, ".", ms=2.0, color=COLOURS[0])
+    left.axhline(1e3 * record.findings.sampling.median_period, color=COLOURS[1], lw=1.0, ls="--", label="median")
+    left.set(xlabel="time (s)", ylabel="interval between stamps (ms)")
+    left.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
+    right.hist(intervals, bins=60, orientation="horizontal", color=COLOURS[0])
+    right.set(xlabel="samples (1)")
+    return Drawn("intervals", figure, "Intervals between raw time stamps, before resampling; gaps are left out.")

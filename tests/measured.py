@@ -1,0 +1,90 @@
+"""Measured logs for tests: made ones whose truth is known, and where the real ones lie."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+GEAR_RATIO, INERTIA, VISCOUS, COULOMB = 20.0, 0.01, 0.05, 0.1
+
+
+def play(positions: np.ndarray, width: float) -> np.ndarray:
+    """Positions behind a gap."""
+    behind, place = np.empty_like(positions), positions[0]
+    for i, position in enumerate(positions):
+        place = min(max(place, position - 0.5 * width), position + 0.5 * width)
+        behind[i] = place
+    return behind
+
+
+def made(
+    times: np.ndarray | None = None,
+    *,
+    count: int = 4000,
+    period: float = 1e-3,
+    skew: float = 0.0,
+    gap: float = 0.0,
+    noise: float = 0.0,
+    resolution: float = 0.0,
+    seed: int = 0,
+) -> pd.DataFrame:
+    """A log of a geared drive in multisine motion: t, u, theta_e, theta_s.
+
+    Args:
+        times: stamps, s; left out: even ones.
+        count: of the even ones.
+        period: of the even ones, s; torques are means over it from each stamp on.
+        skew: by how much the load's stamps are late, s.
+        gap: lost motion, rad at the motor.
+        noise: of both encoders, rad rms at the motor.
+        resolution: of both encoders, rad at the motor.
+        seed: of phases and noise.
+    """
+    random = np.random.default_rng(seed)
+    t = period * np.arange(count) if times is None else np.asarray(times)
+    frequency, size = np.array([0.5, 0.83, 1.27, 2.1]), np.array([20.0, 10.0, 8.0, 4.0])
+    phase = random.uniform(0.0, 2.0 * np.pi, 4)
+
+    def motion(times: np.ndarray, derivative: int) -> np.ndarray:
+        rate = 2.0 * np.pi * frequency
+        angle = rate * times[:, None] + phase + 0.5 * np.pi * derivative
+        return (size * rate**derivative * np.sin(angle)).sum(axis=1)
+
+    middle = t + 0.5 * period
+    u = INERTIA * motion(middle, 2) + VISCOUS * motion(middle, 1) + COULOMB * np.tanh(motion(middle, 1) / 0.5)
+    motor = motion(t, 0) + noise * random.standard_normal(len(t))
+    load = play(motion(t - skew, 0), gap) + noise * random.standard_normal(len(t))
+    if resolution:
+        motor, load = (np.round(x / resolution) * resolution for x in (motor, load))
+    return pd.DataFrame({"t": t, "u": u, "theta_e": motor, "theta_s": load / GEAR_RATIO})
+
+
+def real(name: str) -> Path:
+    """A real recording; the test skips where the folder with them is absent."""
+    folder = Path(os.environ.get("JAXBL_DATA", Path(__file__).parents[1] / ".." / "shared" / "data"))
+    if not (folder / name).exists():
+        pytest.skip(f"no recording {name} (the folder with them is named by JAXBL_DATA)")
+    return folder / name
+
+
+EMPS: dict[str, Any] = {
+    "u": {"column": "vir", "unit": "V", "factor": 35.1507},
+    "theta_e": {"column": "qm", "unit": "m"},
+    "closed_loop": True,
+}
+XL330: dict[str, Any] = {
+    "t": "timestamp",
+    # the duty is not known in N m: 1 is full duty
+    "u": {"column": "load", "unit": "counts", "factor": 1.0 / 885.0, "signed_bits": 16, "saturation": 885.0},
+    "theta_e": "position",
+    "closed_loop": True,
+}
+SERVO: dict[str, Any] = {
+    "t": 0,
+    "theta_s": {"column": 1, "unit": "deg", "factor": 220.0 / 4096.0},
+    "theta_e": {"column": 1, "minus": 2, "unit": "deg", "factor": 220.0 / 4096.0},
+    "absent": ["u"],
+}

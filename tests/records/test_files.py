@@ -1,0 +1,165 @@
+"""Columns out of files of every kind."""
+
+import json
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.io import savemat
+
+from jaxbl.errors import InputError
+from jaxbl.records.files import read_columns
+
+T, U = np.arange(5) * 0.1, np.array([1.5, -2.0, 3e-7, 4e12, 0.0])
+
+
+def matlab73(path, **columns):
+    """As MATLAB saves with -v7.3: HDF5 behind a block of text, row vectors turned."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in columns.items():
+            data = file.create_dataset(name, data=np.atleast_2d(values))
+            data.attrs["MATLAB_class"] = np.bytes_("double")
+        title = file.create_dataset("title", data=np.array([[72], [105]], dtype=np.uint16))
+        title.attrs["MATLAB_class"] = np.bytes_("char")
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
+
+
+def text(separator, decimal=".", header=True):
+    def write(path):
+        frame = pd.DataFrame({"t": T, "u": U})
+        frame.to_csv(path, sep=separator, decimal=decimal, header=header, index=False)
+
+    return write
+
+
+WRITERS = {
+    "comma.csv": text(","),
+    "semicolon.csv": text(";"),
+    "german.csv": text(";", ","),
+    "tab.tsv": text("\t"),
+    "german_tab.txt": text("\t", ","),
+    "blank.txt": text(" "),
+    "bare.txt": text(" ", header=False),
+    "bare.csv": text(",", header=False),
+    "remarks.csv": lambda p: p.write_text(
+        "# a remark\n\n" + pd.DataFrame({"t": T, "u": U}).to_csv(index=False).replace("\n0.2", "\n# another\n0.2")
+    ),
+    "trailing.csv": lambda p: p.write_text(
+        "t,u\n" + "".join(f"{t},{u},\n" for t, u in zip(T.tolist(), U.tolist(), strict=True))
+    ),
+    "bom.csv": lambda p: p.write_text(pd.DataFrame({"t": T, "u": U}).to_csv(index=False), encoding="utf-8-sig"),
+    "windows.csv": lambda p: p.write_bytes(
+        b'"t";"u"\r\n' + b"".join(f"{t!r}; {u!r}\r\n".encode() for t, u in zip(T.tolist(), U.tolist(), strict=True))
+    ),
+    "table.parquet": lambda p: pd.DataFrame({"t": T, "u": U}).to_parquet(p),
+    "old.mat": lambda p: savemat(p, {"t": T, "u": U[:, None], "gain": 3.0, "note": "hi"}),
+    "new.mat": lambda p: matlab73(p, t=T, u=U),
+    "rows.json": lambda p: p.write_text(json.dumps(pd.DataFrame({"t": T, "u": U}).to_dict("records"))),
+    "entries.json": lambda p: p.write_text(
+        json.dumps({"mass": 1.0, "entries": pd.DataFrame({"t": T, "u": U}).to_dict("records")})
+    ),
+    "columns.json": lambda p: p.write_text(json.dumps({"mass": 1.0, "t": T.tolist(), "u": U.tolist()})),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_every_kind_of_file_gives_the_same_columns(name, tmp_path):
+    path = tmp_path / name
+    WRITERS[name](path)
+    columns = read_columns(path)
+    keys = (0, 1) if name.startswith("bare") else ("t", "u")
+    assert set(keys) <= set(columns.columns)
+    for key, number, values in zip(keys, (0, 1), (T, U), strict=True):
+        np.testing.assert_array_equal(columns.numbers(key), values)
+        if not name.endswith(".json"):
+            np.testing.assert_array_equal(columns.numbers(number), values)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.lists(st.floats(-1e12, 1e12, width=64), min_size=2, max_size=30),
+    st.sampled_from([",", ";", "\t", " ", " ; "]),
+    st.booleans(),
+)
+def test_numbers_survive_text(tmp_path_factory, values, separator, header):
+    path = tmp_path_factory.mktemp("text") / "log.txt"
+    rows = [separator.join(repr(v) for v in (value, -value)) for value in values]
+    path.write_text("\n".join([separator.join("ab")] * header + rows))
+    columns = read_columns(path)
+    np.testing.assert_array_equal(columns.numbers("a" if header else 0), values)
+    np.testing.assert_array_equal(columns.numbers(1), np.negative(values))
+
+
+def test_structures_and_matrices_of_matlab_have_columns_of_their_own(tmp_path):
+    savemat(tmp_path / "a.mat", {"log": {"t": T, "inner": {"u": U}}, "both": np.stack([T, U], axis=1)})
+    with h5py.File(tmp_path / "b.mat", "w") as file:
+        file["log/t"], file["log/inner/u"] = T[None], U[None]
+        file["both"] = np.stack([T, U])
+    for name in ("a.mat", "b.mat"):
+        columns = read_columns(tmp_path / name)
+        for column, values in {"log.t": T, "log.inner.u": U, "both[0]": T, "both[1]": U}.items():
+            np.testing.assert_array_equal(columns.numbers(column), values)
+
+
+BAD = {
+    "missing": (None, "no such file"),
+    "empty.csv": (b"", "is empty; text .* can be read"),
+    "blank.csv": (b" \n\n", "is empty"),
+    "remarks.csv": (b"# hello\n", "holds only remarks; rows of numbers are needed"),
+    "header.csv": (b"t,u\n", "has a header and no rows"),
+    "twice.csv": (b"t,u,u\n1,2,3\n", "two columns are called 'u'; names should differ"),
+    "wide.csv": (b"t,u\n1,2,3\n", "rows have more columns than the header; they should have 2"),
+    "ragged.csv": (b"t,u\n1,2\n1,2,3\n", "cannot be read as a table: .* line 3"),
+    "photo.png": (b"\x89PNG\0\0\0", "is not a log of a known kind"),
+    "broken.json": (b'{"t": [1, 2', "is not valid JSON"),
+    "scalars.json": (b'{"t": 1}', "holds no array of rows or of numbers"),
+    "list.json": (b"[1, 2]", "should hold an array of objects, one a row"),
+    "broken.parquet": (b"PAR1 no", "cannot be read as Parquet"),
+    "broken.mat": (b"no matlab at all" * 20, "cannot be read as a MATLAB file"),
+    "broken73.mat": (b"\x89HDF\r\n\x1a\n no", "cannot be read as a MATLAB file"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_unreadable_files_are_named_in_one_line(name, tmp_path):
+    content, message = BAD[name]
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as error:
+        read_columns(path)
+    assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
+
+
+def test_a_folder_and_a_file_without_vectors(tmp_path):
+    with pytest.raises(InputError, match="is a folder; a log file is needed"):
+        read_columns(tmp_path)
+    savemat(tmp_path / "a.mat", {"x": 1.0, "name": "hi"})
+    with pytest.raises(InputError, match="holds no vectors of numbers"):
+        read_columns(tmp_path / "a.mat")
+
+
+COLUMNS = {
+    "near": ("t,theta_e\n1,2\n", "thetae", "no column 'thetae'; did you mean 'theta_e'\\?"),
+    "far": ("t,x\n1,2\n", "theta_e", "no column 'theta_e'; valid: t, x"),
+    "number": ("t,x\n1,2\n", 2, "no column 2: the file has 2 columns, numbered 0 to 1"),
+    "only one": ("1\n2\n", 1, "no column 1: the file has only column 0"),
+    "no header": ("1,2\n3,4\n", "u", "no column 'u': the file has no header; give the column's number, 0 to 1"),
+    "text": ("t,u\n1,2\n2,on\n", "u", "column 'u', data row 2 is 'on'; it should be a finite number"),
+    "hole": ("t,u\n1,\n2,3\n", "u", "column 'u', data row 1 is empty or not a number"),
+    "nan": ("t,u\n1,2\n2,nan\n", "u", "column 'u', data row 2 is empty or not a number"),
+    "infinite": ("t,u\n1,2\n2,inf\n", "u", "column 'u', data row 2 is inf"),
+    "truncated": ("t,u\n1,2\n3", "u", "column 'u', data row 2 is empty"),
+}
+
+
+@pytest.mark.parametrize("case", COLUMNS)
+def test_columns_that_are_not_there_or_not_numbers(case, tmp_path):
+    content, column, message = COLUMNS[case]
+    (tmp_path / "log.csv").write_text(content)
+    with pytest.raises(InputError, match=message):
+        read_columns(tmp_path / "log.csv").numbers(column)

@@ -1,0 +1,145 @@
+"""What a log can identify."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from measured import EMPS, GEAR_RATIO, SERVO, XL330, made, real
+
+from jaxbl.errors import InputError
+from jaxbl.records import inspect
+
+
+def answers(tmp_path, frame, log=None, gear_ratio=GEAR_RATIO):
+    frame.to_parquet(tmp_path / "log.parquet")
+    return {j.quantity: (j.answer, j.why) for j in inspect(tmp_path / "log.parquet", log, gear_ratio=gear_ratio).judgements}
+
+
+QUANTITIES = ["inertia", "viscous friction", "Coulomb friction", "constant torque", "gear ratio", "lost motion", "stiffness"]
+
+
+def test_a_rich_log_identifies_all_but_what_it_does_not_show(tmp_path):
+    found = answers(tmp_path, made(count=6000, gap=0.1, noise=1e-4))
+    assert list(found) == QUANTITIES
+    for quantity in QUANTITIES[:2] + QUANTITIES[3:6]:
+        assert found[quantity][0] == "yes", quantity
+    assert "theta_e shifts by 0.0" in found["lost motion"][1] or "theta_e shifts by 0.1" in found["lost motion"][1]
+    # the load follows the motor whatever the torque
+    assert found["stiffness"][0] == "weak"
+
+
+def test_a_compliant_transmission_shows_its_stiffness(tmp_path):
+    frame = made(count=6000, noise=1e-4)
+    frame["theta_s"] -= frame["u"] / 50.0 / GEAR_RATIO
+    assert answers(tmp_path, frame)["stiffness"][0] == "yes"
+    frame["sensor"] = frame["u"]
+    found = answers(tmp_path, frame.drop(columns="u"), {"absent": ["u"], "transmitted": "sensor"})
+    assert found["inertia"] == ("no", "no torque was recorded, so that only the kinematics show")
+
+
+def test_one_encoder_says_nothing_of_the_transmission(tmp_path):
+    for side, other in (("theta_e", "load"), ("theta_s", "motor")):
+        found = answers(tmp_path, made()[["t", "u", side]])
+        for quantity in ("gear ratio", "lost motion", "stiffness"):
+            assert found[quantity] == ("no", f"there is no {other} encoder: nothing is known of what lies between")
+        assert found["inertia"][0] == "yes"
+
+
+def test_free_motion_tells_ratios(tmp_path):
+    found = answers(tmp_path, made().assign(u=0.0))
+    assert found["inertia"][0] == "weak" and "only ratios" in found["inertia"][1]
+    assert found["stiffness"] == ("no", "no varying torque was recorded")
+
+
+def test_one_direction_one_speed_and_one_frequency(tmp_path):
+    t = 1e-3 * np.arange(6000)
+    forwards = 10.0 * t + 0.5 * np.sin(3.0 * t) + 0.2 * np.sin(11.0 * t)
+
+    def log(position):
+        velocity = np.gradient(position, t)
+        u = 0.01 * np.gradient(velocity, t) + 0.05 * velocity + 0.1 * np.sign(velocity)
+        return pd.DataFrame({"t": t, "u": u, "theta_e": position, "theta_s": position / GEAR_RATIO})
+
+    found = answers(tmp_path, log(forwards))
+    assert found["constant torque"] == ("weak", "motion in one direction only: it looks like Coulomb friction")
+    assert found["Coulomb friction"][0] == "weak"
+    assert found["lost motion"] == ("no", "0 reversals: both flanks of the gap must be touched")
+    triangle = 4.0 * np.abs((t / 2.0) % 1.0 - 0.5) + 1e-5 * np.random.default_rng(0).standard_normal(6000)
+    found = answers(tmp_path, log(np.convolve(np.pad(triangle, 25, "edge"), np.ones(51) / 51.0, "valid")))
+    for quantity in ("viscous friction", "Coulomb friction"):
+        assert found[quantity][0] == "weak" and "too alike to tell viscous from Coulomb friction" in found[quantity][1]
+    found = answers(tmp_path, log(np.sin(6.0 * t)))
+    assert found["inertia"][0] == "weak" and "looks like a spring or gravity" in found["inertia"][1]
+
+
+def test_noise_identifies_nothing(tmp_path):
+    random = np.random.default_rng(0)
+    frame = made()
+    frame["theta_e"], frame["theta_s"] = random.standard_normal(4000), random.standard_normal(4000)
+    found = answers(tmp_path, frame)
+    assert {answer for answer, _ in found.values()} == {"no"}
+
+
+def odd_signal(random, count):
+    """Anything that may stand in a column."""
+    time = np.arange(count) / count
+    return random.choice([
+        random.standard_normal(count), np.cumsum(random.standard_normal(count)), np.sin(40.0 * random.random() * time),
+        time, np.round(time), np.zeros(count), random.integers(-3, 4, count) * 1.0, np.round(20.0 * np.sin(9.0 * time)),
+        np.where(random.random(count) < 0.02, 1e3, 0.0) + np.sin(20.0 * time),
+    ]) * random.choice([1.0, 1e-9, 1e9])  # fmt: skip
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.integers(0, 2**20),
+    st.sampled_from([64, 65, 100, 300]),
+    st.sampled_from([{}, {"resample": 2e-3}, {"theta_s": {"skew": "estimate"}}, {"u": {"skew": 0.007}}]),
+)
+def test_any_log_is_inspected_or_refused_in_one_line(tmp_path_factory, seed, count, log):
+    random = np.random.default_rng(seed)
+    period = 1e-3
+    stamps = [period * np.arange(count), period * np.cumsum(random.uniform(0.5, 1.5, count)),
+              period * np.cumsum(random.integers(0, 3, count)), period * 4.0 * np.floor(np.arange(count) / 4.0),
+              period * np.cumsum(random.exponential(1.0, count) ** 3)][random.integers(5)]  # fmt: skip
+    frame = pd.DataFrame({"t": stamps} | {name: odd_signal(random, count) for name in ("u", "theta_e", "theta_s")})
+    path = tmp_path_factory.mktemp("odd") / "log.parquet"
+    frame.to_parquet(path)
+    found, refusal = None, ""
+    try:
+        found = inspect(path, log, gear_ratio=None if seed % 2 else 7.0)
+    except InputError as error:
+        refusal = str(error)
+    if found is None:
+        assert refusal.startswith(f"{path}: ") and "\n" not in refusal
+        return
+    json.dumps(found.to_dict())
+    for segment in found.record.segments:
+        np.testing.assert_allclose(np.diff(found.record.time[segment]), found.record.sample_period, rtol=1e-5)
+    assert all(np.isfinite(values).all() for values in found.record.positions.values())
+
+
+def test_the_whole_as_plain_data(tmp_path):
+    made(count=2000).drop(index=range(800, 900)).to_parquet(tmp_path / "log.parquet")
+    found = inspect(tmp_path / "log.parquet")
+    data = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert data["file"] == str((tmp_path / "log.parquet").resolve())
+    assert data["gear_ratio"] == pytest.approx(GEAR_RATIO, rel=1e-4)
+    assert len(data["segments"]) == 2 and data["sampling"]["gaps"] == 1
+    assert set(data["channels"]) == {"u", "theta_e", "theta_s"}
+    assert data["dynamics"]["terms"]["inertia"]["value"] == pytest.approx(0.01, rel=0.05)
+    assert len(data["identifiable"]) == 7
+    assert found.twist is not None and np.abs(found.twist).max() < 1e-3
+
+
+def test_real_machines(tmp_path):
+    found = {j.quantity: j.answer for j in inspect(real("emps/DATA_EMPS.mat"), EMPS).judgements}
+    assert [found[q] for q in QUANTITIES] == ["yes"] * 4 + ["no"] * 3
+    found = inspect(real("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
+    assert [j.answer for j in found.judgements[:5]] == ["no"] * 4 + ["yes"]
+    assert np.ptp(np.degrees(found.twist)) == pytest.approx(2.9, abs=0.5)
+    free = inspect(real("bam_xl330/2026-01-15_10h28m17.json"), XL330 | {"where": {"torque_enable": False}})
+    assert free.judgements[0].answer == "weak"

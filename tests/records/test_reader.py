@@ -1,0 +1,576 @@
+"""From columns to evenly spaced SI channels, and what is said of logs that are not fit for it."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from measured import COULOMB, EMPS, GEAR_RATIO, INERTIA, SERVO, VISCOUS, XL330, made, real
+from small_study import small
+
+from jaxbl.errors import InputError
+from jaxbl.records import LogTable, read_log_table, read_record
+from jaxbl.study.trial import run
+
+
+def wrote(tmp_path, frame, name="log.parquet"):
+    path = tmp_path / name
+    frame.to_parquet(path) if path.suffix == ".parquet" else frame.to_csv(path, index=False)
+    return path
+
+
+def test_a_log_in_si_units_is_read_as_it_stands(tmp_path):
+    frame = made()
+    record = read_record(wrote(tmp_path, frame), gear_ratio=GEAR_RATIO)
+    np.testing.assert_allclose(record.time, frame["t"], atol=1e-12)
+    np.testing.assert_array_equal(record.torque, frame["u"])
+    np.testing.assert_array_equal(record.positions["motor"], frame["theta_e"])
+    np.testing.assert_array_equal(record.positions["load"], frame["theta_s"])
+    assert record.sample_period == pytest.approx(1e-3, rel=1e-12)
+    assert record.segments == (slice(0, 4000),)
+    assert (record.start, record.closed_loop, record.transmitted, record.notes) == (0.0, None, None, ())
+    assert record.findings.sampling.even
+    # the rough regression finds the drive that made the log
+    found = dict(zip(record.findings.dynamics.names, record.findings.dynamics.values, strict=True))
+    assert found["inertia"] == pytest.approx(INERTIA, rel=0.01)
+    assert found["viscous"] == pytest.approx(VISCOUS, rel=0.02)
+    assert found["coulomb"] == pytest.approx(COULOMB, rel=0.1)
+    assert abs(record.findings.channels["u"].skew) < 1e-4
+
+
+def test_what_simulate_leaves_is_a_log(tmp_path):
+    changes = {"run.duration": 1.0, "encoders.motor_resolution": 1e-4, "encoders.load_resolution": 1e-5}
+    trial = run(small(changes))
+    record = read_record(wrote(tmp_path, trial.trace), trial.config.log, gear_ratio=5.0)
+    np.testing.assert_array_equal(record.torque, trial.trace["u"])
+    assert record.findings.channels["theta_e"].resolution == pytest.approx(1e-4)
+    assert record.findings.channels["theta_s"].resolution == pytest.approx(1e-5)
+
+
+ONE = {"rad": 1.0, "deg": math.pi / 180.0, "turn": 2.0 * math.pi, "m": 1.0, "mm": 1e-3}
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_positions_survive_units_signs_wraps_and_words(tmp_path_factory, data):
+    truth = made(count=400, period=2e-3)
+    unit = data.draw(st.sampled_from([*ONE, "counts"]))
+    sign = data.draw(st.sampled_from([1, -1]))
+    factor = data.draw(st.sampled_from([1.0, 0.5, 3.0]))
+    counts = data.draw(st.sampled_from([4096.0, 20000.0]))
+    log = {"column": "x", "unit": unit, "sign": sign, "factor": factor, "offset": 2.0}
+    one = 2.0 * math.pi / counts if unit == "counts" else ONE[unit]
+    column = (truth["theta_e"].to_numpy() - 2.0) * sign / one / factor
+    step = 0.0
+    if unit == "counts":
+        log["counts_per_turn"] = counts
+        column, step = np.round(column), one * factor
+        if data.draw(st.booleans()):
+            # a counter of 18 bits, and the word logged as unsigned: it wraps around
+            log |= {"wrap": 2.0**18, "signed_bits": 18}
+            column = column % 2.0**18
+        elif data.draw(st.booleans()):
+            log["signed_bits"] = 32
+            column = column % 2.0**32
+    elif data.draw(st.booleans()):
+        wrap = 1.1 * np.abs(np.diff(column)).max() * 2.0
+        log["wrap"] = float(wrap)
+        column = column % wrap
+    if data.draw(st.booleans()):
+        other = np.arange(len(column)) % 7.0
+        column, log = column + other, log | {"minus": "other"}
+        if "signed_bits" in log or "wrap" in log:
+            log.pop("minus")
+            column = column - other
+    truth = truth.assign(x=column, other=np.arange(len(column)) % 7.0)
+    path = wrote(tmp_path_factory.mktemp("units"), truth)
+    absent = ["theta_s"] + (["u"] if unit in ("m", "mm") else [])
+    record = read_record(path, {"theta_e": log, "absent": absent})
+    motion = record.positions["motor"] - truth["theta_e"].to_numpy()
+    # where a wrapped position starts is not known
+    motion -= round(motion[0] / (one * factor * log["wrap"])) * one * factor * log["wrap"] if "wrap" in log else 0.0
+    np.testing.assert_allclose(motion, 0.0, atol=0.5 * step + 1e-6)
+    assert record.findings.channels["theta_e"].unit == ("m" if unit in ("m", "mm") else "rad")
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.sampled_from(["N m", "V", "A", "counts"]), st.floats(0.01, 100.0), st.sampled_from([1, -1]), st.floats(-1.0, 1.0),
+    st.booleans(),
+)  # fmt: skip
+def test_torques_survive_units_signs_and_words(tmp_path_factory, unit, factor, sign, offset, words):
+    truth = made(count=400, period=2e-3)
+    log = {"column": "x", "unit": unit, "factor": factor, "sign": sign, "offset": offset}
+    column = (truth["u"].to_numpy() - offset) * sign / factor
+    step = 0.0
+    if words:
+        log["factor"] = factor = 1e-4
+        column, step = np.round((truth["u"].to_numpy() - offset) * sign / 1e-4) % 2.0**16, 1e-4
+        if np.abs(truth["u"] - offset).max() > 3.2:
+            return
+        log["signed_bits"] = 16
+    path = wrote(tmp_path_factory.mktemp("units"), truth.assign(x=column))
+    record = read_record(path, {"u": log})
+    np.testing.assert_allclose(record.torque, truth["u"], atol=0.5 * step + 1e-9)
+
+
+def test_linear_axes_measure_force(tmp_path):
+    frame = made().drop(columns="theta_s")
+    record = read_record(wrote(tmp_path, frame), {"theta_e": {"unit": "m"}})
+    assert [record.findings.channels[name].unit for name in ("u", "theta_e")] == ["N", "m"]
+    with pytest.raises(
+        InputError, match=r"\[log\] u.unit is N m, but the position is in m; on a linear axis it should be N"
+    ):
+        read_record(wrote(tmp_path, frame), {"theta_e": {"unit": "m"}, "u": {"unit": "N m"}})
+
+
+def test_stamps_in_other_units_and_none_at_all(tmp_path):
+    frame = made()
+    for unit, one in {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}.items():
+        path = wrote(tmp_path, frame.assign(t=(frame["t"] + 7.0) * one))
+        record = read_record(path, {"t": {"column": "t", "unit": unit}})
+        assert record.start == pytest.approx(7.0)
+        np.testing.assert_allclose(record.time, frame["t"], atol=1e-8)
+    record = read_record(wrote(tmp_path, frame.drop(columns="t")), {"t": {"period": 2e-3}})
+    np.testing.assert_allclose(record.time, 2.0 * frame["t"], atol=1e-9)
+
+
+def test_rounded_stamps_are_an_even_grid(tmp_path):
+    frame = made(period=1.25e-3)
+    for step in (1e-3, 5e-3):
+        stamps = np.floor(frame["t"] / step + 1e-9) * step
+        record = read_record(wrote(tmp_path, frame.assign(t=stamps)), gear_ratio=GEAR_RATIO)
+        assert record.findings.sampling.even and record.findings.sampling.repeated == 0
+        assert record.sample_period == pytest.approx(1.25e-3, rel=1e-4)
+        np.testing.assert_array_equal(record.torque, frame["u"])
+
+
+def uneven(seed=1, count=4000):
+    return np.cumsum(1e-3 * np.random.default_rng(seed).uniform(0.7, 1.4, count))
+
+
+def test_uneven_stamps_are_resampled_to_their_median_period(tmp_path):
+    times = uneven()
+    record = read_record(wrote(tmp_path, made(times)), gear_ratio=GEAR_RATIO)
+    truth = made(times[0] + record.time)
+    assert record.sample_period == record.findings.sampling.median_period == pytest.approx(np.median(np.diff(times)))
+    assert not record.findings.sampling.even
+    assert any(note.startswith("Resampled from uneven stamps: every 1.0") for note in record.notes)
+    np.testing.assert_allclose(np.diff(record.time), record.sample_period, rtol=1e-9)
+    np.testing.assert_allclose(record.positions["motor"], truth["theta_e"], atol=1e-8)
+    assert len(record.intervals) == 3999
+
+
+def test_resampling_keeps_the_impulse_of_a_held_torque(tmp_path):
+    times = uneven()
+    frame = made(times)
+    for period in (None, 5e-4, 3.7e-3):
+        record = read_record(wrote(tmp_path, frame), {"resample": period} if period else None)
+        assert record.sample_period == (period or record.findings.sampling.median_period)
+        impulse = np.concatenate([[0.0], np.cumsum(frame["u"].to_numpy()[:-1] * np.diff(times))])
+        ends = record.time + times[0]
+        expected = np.interp(ends, times, impulse)
+        np.testing.assert_allclose(np.cumsum(record.torque)[:-1] * record.sample_period, expected[1:], atol=1e-12)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**16), st.floats(0.05, 0.45))
+def test_resampled_positions_are_accurate_to_the_fourth_order(tmp_path_factory, seed, jitter):
+    folder = tmp_path_factory.mktemp("jitter")
+    errors = []
+    for period in (8e-3, 4e-3):
+        times = period * (np.arange(round(4.0 / period)) + jitter * np.random.default_rng(seed).uniform(-1.0, 1.0))
+        record = read_record(wrote(folder, made(times)), {"resample": period, "absent": ["theta_s"]})
+        inner = slice(20, -20)
+        truth = made(times[0] + record.time)["theta_e"].to_numpy()
+        errors.append(np.abs(record.positions["motor"] - truth)[inner].max())
+    # h⁴ (5/384) of the fourth derivative, about 4 (2π 2.1)⁴, and the others'
+    assert errors[0] < 4e-5
+    assert errors[1] < max(errors[0] / 8.0, 1e-9)
+
+
+def test_repeated_stamps_are_left_out_and_gaps_part_the_log(tmp_path):
+    frame = made(uneven())
+    kept = frame.drop(index=[*range(1000, 1200), *range(2500, 2510)])
+    again = pd.concat([kept.iloc[:500], kept.iloc[[499, 499]], kept.iloc[500:]])
+    record = read_record(wrote(tmp_path, again), gear_ratio=GEAR_RATIO)
+    sampling = record.findings.sampling
+    assert (sampling.repeated, sampling.gaps, len(record.segments)) == (2, 2, 3)
+    assert sampling.longest_interval == pytest.approx(0.21, rel=0.05)
+    assert "2 rows have the stamp of the row before and were left out (data row 501 first)." in record.notes
+    assert any(note.startswith("Gaps: 2; segments: 3; the longest gap is 0.2") for note in record.notes)
+    assert any(note.endswith("s, after data row 1002.") for note in record.notes)
+    for segment in record.segments:
+        np.testing.assert_allclose(np.diff(record.time[segment]), record.sample_period, rtol=1e-9)
+    ends = [segment.stop for segment in record.segments]
+    assert ends == [*(segment.start for segment in record.segments[1:]), len(record.time)]
+    truth = made(frame["t"].iloc[0] + record.time)
+    np.testing.assert_allclose(record.positions["motor"], truth["theta_e"], atol=1e-6)
+
+
+def test_gaps_between_even_stamps_leave_the_samples_alone(tmp_path):
+    frame = made().drop(index=range(1000, 1200))
+    record = read_record(wrote(tmp_path, frame))
+    assert record.segments == (slice(0, 1000), slice(1000, 3800))
+    np.testing.assert_array_equal(record.positions["motor"], frame["theta_e"])
+    np.testing.assert_allclose(record.time, frame["t"], atol=1e-9)
+
+
+def test_rows_are_chosen_by_value_and_by_time(tmp_path):
+    frame = made()
+    on = (frame["t"] > 1.0) & (frame["t"] < 2.0)
+    frame = frame.assign(on=on, mode=np.where(on, "run", "stop"), state=on.astype(int))
+    for where in ({"on": True}, {"mode": "run"}, {"state": 1}, {"on": True, "mode": "run"}):
+        record = read_record(wrote(tmp_path, frame), {"where": where})
+        np.testing.assert_array_equal(record.torque, frame["u"][on])
+    record = read_record(wrote(tmp_path, frame), {"where": {"on": False}, "start": 0.5, "stop": 3.0})
+    assert len(record.segments) == 2
+    np.testing.assert_array_equal(record.torque, frame["u"][~on & (frame["t"] >= 0.5) & (frame["t"] <= 3.0)])
+    assert record.notes[0] == f"{len(record.time)} of 4000 rows are read, by [log] where, start and stop."
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("skew", "quality"),
+    [
+        (3e-4, {"noise": 1e-3}),
+        (2.3e-3, {"gap": 0.2, "resolution": 2.0 * math.pi / 4096}),
+        (-1.2e-3, {"gap": 0.05, "noise": 1e-2}),
+        (0.0, {"gap": 0.1, "noise": 1e-3}),
+    ],
+)
+def test_skew_and_lost_motion_are_found_within_their_uncertainty(tmp_path, skew, quality, seed):
+    frame = made(count=6000, skew=skew, seed=seed, **quality)
+    path = wrote(tmp_path, frame)
+    record = read_record(path, gear_ratio=GEAR_RATIO)
+    found = record.findings.gearing
+    assert abs(found.skew - skew) < 4.0 * found.skew_error
+    assert found.skew_error < 5e-5
+    assert found.lost_motion == pytest.approx(quality.get("gap", 0.0), rel=0.03, abs=2e-3)
+    assert found.ratio == pytest.approx(GEAR_RATIO, rel=1e-3)
+    assert any("late against" in n or "early against" in n for n in record.notes) == bool(skew)
+    # undone on request
+    undone = read_record(path, {"theta_s": {"skew": "estimate"}})
+    assert any(note.startswith("theta_s: moved by its skew") for note in undone.notes)
+    assert abs(undone.findings.gearing.skew) < 4.0 * found.skew_error
+
+
+def test_a_given_skew_is_undone(tmp_path):
+    frame = made(skew=2.5e-3)
+    record = read_record(wrote(tmp_path, frame), {"theta_s": {"skew": 2.5e-3}}, gear_ratio=GEAR_RATIO)
+    np.testing.assert_allclose(GEAR_RATIO * record.positions["load"], record.positions["motor"], atol=1e-6)
+    late = frame.assign(u=np.interp(frame["t"] - 4e-3, frame["t"], frame["u"]))
+    found = read_record(wrote(tmp_path, late)).findings.channels["u"]
+    assert found.skew == pytest.approx(4e-3, abs=4.0 * found.skew_error + 1e-4)
+    record = read_record(wrote(tmp_path, late), {"u": {"skew": 4e-3}})
+    assert abs(record.findings.channels["u"].skew) < 2e-4
+
+
+def test_resolution_noise_saturation_and_jumps(tmp_path):
+    step = 2.0 * math.pi / 4096
+    frame = made(resolution=step, noise=5e-3)
+    limit = 0.6 * frame["u"].abs().max()
+    frame["u"] = frame["u"].clip(-limit, limit)
+    frame.loc[1500, "theta_e"] += 100.0 * step
+    frame.loc[2500:, "theta_e"] -= 150.0 * step
+    record = read_record(wrote(tmp_path, frame))
+    motor, torque = record.findings.channels["theta_e"], record.findings.channels["u"]
+    assert motor.resolution == pytest.approx(step, rel=1e-6)
+    load = record.findings.channels["theta_s"]
+    assert GEAR_RATIO * load.noise == pytest.approx(math.hypot(5e-3, step / math.sqrt(12.0)), rel=0.1)
+    assert motor.jumps == 2
+    assert any(note.startswith("theta_e: 2 jumps") for note in record.notes)
+    assert torque.saturated == pytest.approx((frame["u"].abs() == limit).mean())
+    assert load.jumps == 0
+    declared = read_record(wrote(tmp_path, frame), {"u": {"saturation": float(limit)}})
+    assert declared.findings.channels["u"].saturated == torque.saturated
+    assert motor.bandwidth == pytest.approx(2.1, abs=1.0)
+
+
+def test_uneven_stamps_are_no_noise_and_no_jumps(tmp_path):
+    record = read_record(wrote(tmp_path, made(uneven(), noise=2e-3)))
+    motor = record.findings.channels["theta_e"]
+    # splines between the readings smooth a little
+    assert motor.noise == pytest.approx(2e-3, rel=0.3)
+    assert motor.jumps == 0
+
+
+def test_no_false_alarms(tmp_path):
+    """Clean logs of many kinds are read without a remark."""
+    step = 2.0 * math.pi / 2**14
+    for frame in (made(), made(resolution=step), made(noise=1e-2), made(gap=0.1), made(count=500, period=5e-3)):
+        assert read_record(wrote(tmp_path, frame), gear_ratio=GEAR_RATIO).notes == ()
+    # text with three decimals looks like no encoder
+    assert read_record(wrote(tmp_path, made().round(3), "log.csv"), gear_ratio=GEAR_RATIO).notes == ()
+
+
+def changed(**columns):
+    return lambda frame: frame.assign(**{name: change(frame) for name, change in columns.items()})
+
+
+def with_cell(column, row, value):
+    def change(frame):
+        frame = frame.astype({column: object})
+        frame.loc[row, column] = value
+        return frame
+
+    return change
+
+
+BAD = {
+    "no position": (lambda f: f[["t", "u"]], {}, "no column 'theta_e' or 'theta_s'; columns: t, u; "),
+    "no torque": (
+        lambda f: f.rename(columns={"u": "torque"}),
+        {},
+        r"no column 'u'; valid: t, torque, .*; \[log\] u can name it, absent = \[\"u\"\] says that there is none",
+    ),
+    "misnamed torque": (lambda f: f, {"u": "torqe"}, "no column 'torqe'; valid: t, u, theta_e, theta_s"),
+    "misnamed position": (lambda f: f, {"theta_e": "theta_m"}, r"no column 'theta_m'; did you mean 'theta_[es]'\?"),
+    "misspelt position": (
+        lambda f: f.rename(columns={"theta_s": "Theta_S"}),
+        {},
+        r"no column 'theta_s', but 'Theta_S'; \[log\] theta_s = \"Theta_S\" would read it",
+    ),
+    "no time": (lambda f: f.rename(columns={"t": "time"}), {}, r"no column 't'; .*; \[log\] t.column can name another"),
+    "text": (with_cell("u", 17, "on"), {}, "column 'u', data row 18 is 'on'; it should be a finite number"),
+    "nan": (with_cell("theta_s", 4, np.nan), {}, "column 'theta_s', data row 5 is empty or not a number"),
+    "text in time": (with_cell("t", 0, "start"), {}, "column 't', data row 1 is 'start'"),
+    "back in time": (with_cell("t", 100, 0.05), {}, "column 't', data row 101: time goes back from 0.099 s to 0.05 s"),
+    "no time passes": (changed(t=lambda f: 0.0 * f["t"] + 3.0), {}, "column 't' is 3 s in all rows; stamps should increase"),
+    "short": (lambda f: f.iloc[:63], {}, "has 63 rows; a log needs at least 64"),
+    "short window": (
+        lambda f: f,
+        {"stop": 0.01},
+        r"\[log\] where, start and stop leave 11 of 4000 rows; at least 64 are needed",
+    ),
+    "nowhere": (
+        lambda f: f.assign(mode="run"),
+        {"where": {"mode": "stop"}},
+        r"\[log\] where leaves no row: 'mode' is never 'stop'; values: 'run'",
+    ),
+    "all gaps": (
+        changed(t=lambda f: f["t"] + np.floor(f["t"] / 0.02 + 1e-6)),
+        {},
+        "gaps leave no 64 samples in a row",
+    ),
+    "stuck": (
+        changed(theta_s=lambda f: 0.0 * f["t"] + 0.25),
+        {},
+        r"column 'theta_s' \(theta_s\) is 0.25 in all rows; it should move; absent = \[\"theta_s\"\] leaves it out",
+    ),
+    "at rest": (
+        changed(theta_e=lambda f: 1e-3 * (np.arange(len(f)) % 900 > 600) + 1e-3 * (np.arange(len(f)) % 7 > 5)),
+        {"absent": ["theta_s"]},
+        "theta_e moves by 2 steps of its resolution 0.001 only: nothing excites the drive",
+    ),
+    "wrapped": (
+        changed(theta_e=lambda f: f["theta_e"] % (2.0 * np.pi)),
+        {},
+        r"column 'theta_e' \(theta_e\) jumps by about 6.283185307 at \d+ rows .* wraps around; "
+        r"set wrap = 6.283185307 in \[log\] theta_e",
+    ),
+    "wrapped word": (
+        changed(theta_e=lambda f: np.round(f["theta_e"] * 1e4) % 65536),
+        {"theta_e": {"unit": "counts", "counts_per_turn": 62831.0}},
+        "set wrap = 65536 in",
+    ),
+    "wrong wrap": (
+        lambda f: f,
+        {"theta_e": {"wrap": 6.0}},
+        r"column 'theta_e' ranges over [\d.]+, more than \[log\] theta_e.wrap = 6",
+    ),
+    "unsigned": (
+        changed(u=lambda f: np.round(f["u"] * 1000) % 65536),
+        {"u": {"unit": "counts", "factor": 1e-3}},
+        r"whole numbers up to \d+ and none about 32768: signed words of 16 bits, logged as unsigned; "
+        r"set signed_bits = 16 in \[log\] u",
+    ),
+    "no such word": (lambda f: f, {"u": {"signed_bits": 8}}, r"column 'u', data row 1: .* is no word of 8 bits"),
+    "beyond saturation": (lambda f: f, {"u": {"saturation": 0.1}}, r"exceeds \[log\] u.saturation = 0.1"),
+    "degrees": (
+        changed(theta_e=lambda f: np.round(f["theta_e"] / (2.0 * np.pi) * 8192) * 360.0 / 8192),
+        {},
+        r"column 'theta_e' \(theta_e\) has steps of 0.0439453, a turn of 8192 counts in degrees: it is not in radians; "
+        r"set unit = \"deg\" in \[log\] theta_e",
+    ),
+    "radians": (
+        changed(theta_s=lambda f: np.round(f["theta_s"] / (2.0 * np.pi) * 2**14) * 2.0 * np.pi / 2**14),
+        {"theta_s": {"unit": "deg"}},
+        r"a turn of 16384 counts in radians: it is not in degrees; set unit = \"rad\"",
+    ),
+    "counts": (
+        changed(theta_e=lambda f: np.round(f["theta_e"] * 1000)),
+        {},
+        r"holds whole numbers only: counts, not radians; set unit = \"counts\" and counts_per_turn in \[log\] theta_e",
+    ),
+    "continuous degrees": (
+        changed(theta_e=lambda f: np.degrees(f["theta_e"])),
+        {},
+        r"theta_e moves 1146 for each 1 of theta_s, where gear_ratio is 20: theta_e is in degrees",
+    ),
+    "continuous radians": (lambda f: f, {"theta_s": {"unit": "deg"}}, "theta_s is not in degrees; see unit in"),
+    "load in degrees": (changed(theta_s=lambda f: np.degrees(f["theta_s"])), {}, "theta_s is in degrees"),
+    "wrong sign of a side": (
+        changed(theta_s=lambda f: -f["theta_s"]),
+        {},
+        "the sign of one of them is wrong; set sign = -1",
+    ),
+    "swapped": (
+        lambda f: f,
+        {"theta_e": "theta_s", "theta_s": "theta_e"},
+        r"the sides are swapped; exchange the columns in \[log\] theta_e and theta_s",
+    ),
+    "swapped and turned": (
+        changed(theta_s=lambda f: -f["theta_s"]),
+        {"theta_e": "theta_s", "theta_s": "theta_e"},
+        "the sides are swapped, and one has the wrong sign",
+    ),
+    "at the motor": (changed(theta_s=lambda f: 20.0 * f["theta_s"]), {}, "theta_s is already counted at the motor shaft"),
+    "wrong ratio": (
+        changed(theta_s=lambda f: 2.0 * f["theta_s"]),
+        {},
+        r"theta_e moves 10 for each 1 of theta_s, where gear_ratio is 20: gear_ratio, or a unit in \[log\], is wrong",
+    ),
+    "wrong sign of the torque": (changed(u=lambda f: -f["u"]), {}, "the torque has the wrong sign: .*; set sign = -1 in"),
+    "estimate without motion": (
+        changed(theta_s=lambda f: 0.01 * np.random.default_rng(0).standard_normal(len(f))),
+        {"theta_s": {"skew": "estimate"}},
+        "theta_s.skew = 'estimate': ",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_logs_are_told_in_one_line(case, tmp_path):
+    change, log, message = BAD[case]
+    frame = change(made())
+    text = any(frame[column].dtype == object for column in ("t", "u", "theta_s") if column in frame)
+    path = wrote(tmp_path, frame, "log.csv" if text else "log.parquet")
+    with pytest.raises(InputError, match=message) as error:
+        read_record(path, log, gear_ratio=GEAR_RATIO)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+
+
+def test_columns_of_unequal_length_are_told(tmp_path):
+    (tmp_path / "log.json").write_text(f'{{"t": {list(range(100))}, "u": {[0.0] * 100}, "theta_e": [1.0, 2.0]}}')
+    with pytest.raises(InputError, match="column 'theta_e' has 2 values and the time 100; they should be equally many"):
+        read_record(tmp_path / "log.json")
+
+
+def test_doubts_are_remarks(tmp_path):
+    frame = made()
+    # one encoder of another drive
+    odd = frame.assign(theta_s=made(seed=5)["theta_s"])
+    notes = read_record(wrote(tmp_path, odd), gear_ratio=GEAR_RATIO).notes
+    assert any(note.startswith("theta_e and theta_s hardly go together") for note in notes)
+    notes = read_record(wrote(tmp_path, frame.assign(t=1000.0 * frame["t"])), gear_ratio=GEAR_RATIO).notes
+    assert any("if the stamps are not in s, set [log] t.unit" in note for note in notes)
+    notes = read_record(wrote(tmp_path, frame.assign(t=frame["t"] / 1000.0)), gear_ratio=GEAR_RATIO).notes
+    assert any("rpm: check its unit" in note for note in notes)
+    notes = read_record(wrote(tmp_path, frame.assign(u=0.0)), gear_ratio=GEAR_RATIO).notes
+    assert notes == ("u is 0 throughout: the log shows free motion, and no inertia by itself.",)
+
+
+def test_a_falling_load_gives_its_energy_back(tmp_path):
+    """Braking all the way down is no wrong sign."""
+    t = 1e-3 * np.arange(3000)
+    down = -0.5 * t + 0.02 * np.sin(8.0 * t)
+    frame = pd.DataFrame({"t": t, "u": 1.0 + 0.05 * np.sin(5.0 * t), "theta_e": down})
+    assert read_record(wrote(tmp_path, frame)).torque is not None
+
+
+TABLES = {
+    "unknown key": ({"colum": 1}, r"log: unknown key 'colum'; valid: "),
+    "unknown channel key": ({"theta_e": {"colum": 1}}, r"log.theta_e: unknown key 'colum'; did you mean 'column'\?"),
+    "no column": ({"theta_e": {"column": 1.5}}, "log.theta_e.column: should be a column's name, or its number .*, not 1.5"),
+    "sign": ({"u": {"sign": 2}}, "log.u.sign: should be 1 or -1, not 2"),
+    "no counts": ({"theta_s": {"unit": "counts"}}, "log.theta_s: unit counts needs counts_per_turn"),
+    "counts in rad": (
+        {"theta_s": {"unit": "rad", "counts_per_turn": 2}},
+        "log.theta_s: counts_per_turn is for unit counts, not for rad",
+    ),
+    "no constant": ({"u": {"unit": "A"}}, "log.u: unit A needs factor, the torque in N m .* of one A"),
+    "unknown unit": ({"u": {"unit": "kNm"}}, "log.u.unit: should be 'N m', 'N', 'V', 'A' or 'counts', not 'kNm'"),
+    "two times": ({"t": {"column": "t", "period": 1.0}}, "log.t: has both column and period"),
+    "window": ({"start": 2.0, "stop": 1.0}, "log: start 2.0 should be less than stop 1.0"),
+    "there and not": ({"u": "u", "absent": ["u"]}, "log: u is described and said to be absent; remove one of them"),
+    "no position": ({"absent": ["theta_e", "theta_s"]}, "log: absent: .* one of them is needed"),
+    "skew": ({"theta_s": {"skew": "guess"}}, "log.theta_s.skew: should be a number of seconds or 'estimate', not 'guess'"),
+    "skew of the motor": ({"theta_e": {"skew": "estimate"}}, "log: theta_e.skew: 'estimate' is for theta_s"),
+    "skew against nothing": ({"theta_s": {"skew": "estimate"}, "absent": ["theta_e"]}, "'estimate' needs theta_e"),
+    "where": ({"where": {"mode": [1]}}, r"log.where.mode: should be a number, text, true or false, not \[1\]"),
+    "absent": ({"absent": ["v"]}, r"log.absent\[0\]: should be 'u', 'theta_e' or 'theta_s', not 'v'"),
+}
+
+
+@pytest.mark.parametrize("case", TABLES)
+def test_wrong_tables_name_the_key(case):
+    table, message = TABLES[case]
+    with pytest.raises(InputError, match=message):
+        read_log_table(table)
+    with pytest.raises(InputError, match=message):
+        read_record("never opened", table)
+
+
+def test_a_column_alone_stands_for_its_table_and_the_table_survives_toml():
+    table = read_log_table({"t": 0, "theta_e": "x", "where": {"on": True, "mode": "a"}})
+    assert table.t.column == 0 and table.theta_e.column == "x"
+    assert LogTable.model_validate(table.model_dump(exclude_none=True)) == table
+    assert read_log_table(None) == LogTable()
+
+
+# real machines
+
+
+def test_emps_is_read_as_published():
+    for name in ("DATA_EMPS.mat", "DATA_EMPS_PULSES.mat"):
+        record = read_record(real(f"emps/{name}"), EMPS)
+        assert (len(record.time), record.sample_period) == (24841, pytest.approx(1e-3))
+        assert record.findings.sampling.even and record.closed_loop
+        assert record.notes == ("There is no theta_s (load position) in this log.",)
+        # the published fit: 95.109 kg, 203.5 N s/m, 20.394 N, -3.165 N
+        found = dict(zip(record.findings.dynamics.names, record.findings.dynamics.values, strict=True))
+        assert found["inertia"] == pytest.approx(95.1, rel=0.03)
+        assert found["viscous"] == pytest.approx(203.5, rel=0.1)
+        assert found["coulomb"] == pytest.approx(20.4, rel=0.15)
+        assert abs(record.findings.channels["u"].skew) < 1e-3
+
+
+def test_emps_with_the_wrong_sign_is_refused():
+    with pytest.raises(InputError, match="the torque has the wrong sign"):
+        read_record(real("emps/DATA_EMPS.mat"), EMPS | {"u": EMPS["u"] | {"sign": -1}})
+
+
+def test_xl330_records_are_resampled():
+    files = sorted(real("bam_xl330").glob("*.json"))
+    assert len(files) == 8
+    for file in files:
+        record = read_record(file, XL330)
+        assert not record.findings.sampling.even
+        assert 3.4e-3 < record.sample_period < 5.4e-3
+        assert record.findings.channels["theta_e"].resolution == pytest.approx(2.0 * math.pi / 4096, rel=1e-6)
+        assert record.findings.channels["theta_e"].jumps == 0
+        assert np.abs(record.torque).max() <= 1.0
+        np.testing.assert_allclose(np.diff(record.time), record.sample_period, rtol=1e-6)
+        if record.torque.min() < 0.0:
+            with pytest.raises(InputError, match="set signed_bits = 16"):
+                read_record(file, XL330 | {"u": {"column": "load", "unit": "counts", "factor": 1e-3}})
+    free = read_record(files[1], XL330 | {"where": {"torque_enable": False}})
+    assert len(free.segments) == 1 and not free.torque.any()
+
+
+def test_servoproject_has_two_encoders_and_no_torque():
+    path = real("servoproject_dual_encoder/outputEncoderData.txt")
+    record = read_record(path, SERVO, gear_ratio=1.0)
+    assert (len(record.time), record.torque) == (42000, None)
+    assert record.findings.gearing.ratio == pytest.approx(1.0, abs=0.01)
+    assert abs(record.findings.gearing.skew) < 4.0 * record.findings.gearing.skew_error
+    # counts of 220/4096 degrees, in parts of 32
+    assert record.findings.channels["theta_s"].resolution == pytest.approx(math.radians(220.0 / 4096.0 / 32.0), rel=1e-6)
+    raw = np.loadtxt(path)
+    np.testing.assert_allclose(record.positions["motor"], np.radians((raw[:, 1] - raw[:, 2]) * 220.0 / 4096.0), atol=1e-12)
+    with pytest.raises(InputError, match="the sign of one of them is wrong"):
+        read_record(path, SERVO, gear_ratio=-1.0)

@@ -1,0 +1,89 @@
+"""Figures, table and page of an inspected log."""
+
+import json
+
+import numpy as np
+import pytest
+from measured import GEAR_RATIO, SERVO, made, real
+from test_page import Page
+
+from jaxbl.records import inspect
+from jaxbl.report import write_inspection_report
+from jaxbl.report.inspected import draw_inspection, summary
+from jaxbl.report.style import save
+
+UNEVEN = np.cumsum(1e-3 * np.random.default_rng(1).uniform(0.7, 1.4, 3000))
+BOTH = ["channels", "spectra", "torque_over_velocity", "twist"]
+CASES = {
+    "both encoders": (made(count=6000, gap=0.1, noise=1e-3), {}, BOTH),
+    "uneven, with a gap": (made(UNEVEN).drop(index=range(1000, 1400)), {}, [*BOTH, "intervals"]),
+    "motor alone": (made().drop(columns="theta_s"), {}, BOTH[:3]),
+    "load alone, linear": (made().drop(columns="theta_e"), {"theta_s": {"unit": "m"}}, BOTH[:3]),
+    "free": (made().assign(u=0.0), {}, ["channels", "spectra", "twist"]),
+    "no torque": (made(), {"absent": ["u"]}, ["channels", "spectra", "twist"]),
+    "sensor": (made(), {"transmitted": "u"}, BOTH),
+    "noise": (made().assign(theta_e=np.random.default_rng(0).standard_normal(4000)), {}, BOTH),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_all_figures_are_drawn_with_units(tmp_path, case):
+    frame, log, names = CASES[case]
+    frame.to_parquet(tmp_path / "log.parquet")
+    drawn = draw_inspection(inspect(tmp_path / "log.parquet", log))
+    assert [d.name for d in drawn] == names
+    for d in drawn:
+        assert d.caption.endswith(".")
+        assert save(d.figure, tmp_path / f"{d.name}.png").stat().st_size > 5000
+        assert "(" in d.figure.axes[-1].get_xlabel()
+        assert "(" in d.figure.axes[0].get_ylabel()
+    units = [ax.get_ylabel().split("\n")[-1] for ax in drawn[0].figure.axes]
+    if case == "load alone, linear":
+        assert units == ["(N)", "(m)", "(m/s)"]
+    if case == "both encoders":
+        assert units == ["(N m)", "(rad)", "(rad)", "(rad/s)"]
+
+
+def test_a_gap_is_not_drawn_over(tmp_path):
+    made().drop(index=range(1000, 1400)).to_parquet(tmp_path / "log.parquet")
+    channels = draw_inspection(inspect(tmp_path / "log.parquet"))[0]
+    assert [len(ax.lines) for ax in channels.figure.axes] == [2, 2, 2, 2]
+
+
+def test_the_table_fits_a_terminal_whatever_is_wrong(tmp_path):
+    frame = made(UNEVEN, noise=1e-3).drop(index=range(1000, 1400))
+    limit = 0.5 * frame["u"].max()
+    frame["u"] = frame["u"].clip(-limit, limit)
+    frame.loc[500, "theta_e"] += 3.0
+    frame.loc[700, "theta_s"] += 3.0
+    frame["t"] *= 1000.0
+    frame = frame.assign(sensor=frame["u"])
+    frame.loc[200:202, "t"] = frame.loc[200, "t"]
+    frame.to_parquet(tmp_path / "log.parquet")
+    found = inspect(tmp_path / "log.parquet", {"theta_s": {"skew": 1.0}, "transmitted": "sensor", "stop": 2.9e3})
+    lines = summary(found)
+    assert len(lines) == 25
+    assert lines[-1].startswith("... and ") and lines[-1].endswith(" more remarks in the report")
+    assert all(len(line) < 200 for line in lines)
+
+
+def test_the_report_holds_table_figures_and_how_the_log_was_read(tmp_path):
+    (tmp_path / "out").mkdir()
+    made(gap=0.1).rename(columns={"theta_e": "a<b"}).to_parquet(tmp_path / "log.parquet")
+    found = inspect(tmp_path / "log.parquet", {"theta_e": "a<b"}, gear_ratio=GEAR_RATIO)
+    lines = write_inspection_report(found, tmp_path / "out")
+    assert lines == summary(found)
+    page = (tmp_path / "out" / "report.html").read_text()
+    Page(page)
+    assert page.count("<img") == 4
+    for text in ("What the log can identify", "Coulomb friction", "a&lt;b", "resolution"):
+        assert text in page
+    data = json.loads((tmp_path / "out" / "inspection.json").read_text())
+    assert data["identifiable"][0]["quantity"] == "inertia"
+
+
+def test_a_real_log_with_two_encoders(tmp_path):
+    found = inspect(real("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
+    twist = draw_inspection(found)[-1]
+    assert twist.name == "twist" and len(twist.figure.axes) == 1
+    assert summary(found)[0] == "outputEncoderData.txt: 42000 samples, 126 s every 3 ms, even stamps, one segment"
