@@ -28,6 +28,11 @@ ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML stu
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="DIR", help="folder for the results [default: results/<config name>]")
 ]
+LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="CSV, Parquet, MATLAB or JSON file", show_default=False)]
+LogOutOption = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="folder for the results [default: results/<log name>]")
+]
+LogOverwriteOption = Annotated[bool, typer.Option("--overwrite", help="replace the results of another log")]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="remove the results of another study from the folder")]
 
 
@@ -137,14 +142,12 @@ def verify(config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOp
 
 @app.command()
 def inspect(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="CSV, Parquet, MATLAB or JSON file", show_default=False)],
+    log: LogArgument,
     model: Annotated[
         Path | None, typer.Option("--model", metavar="TOML", help="study, or a file with nothing but [log]: how to read it")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="folder for the results [default: results/<log name>]")
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the inspection of another log")] = False,
+    out: LogOutOption = None,
+    overwrite: LogOverwriteOption = False,
 ) -> None:
     """Say what a measured log holds and what it can identify: channels, sampling, noise, figures."""
     from .records import inspect as inspect_log
@@ -160,6 +163,32 @@ def inspect(
     typer.echo(f"{folder / 'report.html'}")
 
 
+@app.command()
+def identify(
+    log: LogArgument,
+    model: Annotated[
+        Path, typer.Option("--model", metavar="TOML", help="study with nominal numbers, and [log]", show_default=False)
+    ],
+    out: LogOutOption = None,
+    overwrite: LogOverwriteOption = False,
+) -> None:
+    """Find a machine's numbers in its log, with intervals: stiffness, gap, inertias, frictions."""
+    _start_jax()
+    from .report import write_identification_report
+    from .study.config import read_config
+    from .study.identification import identify as identify_log
+
+    study = read_config(model)
+    folder = _folder(log, out)
+    _claim_for_log(folder, log, overwrite=overwrite)
+    with _naming(model, folder):
+        found = identify_log(log, study)
+    _tell(write_identification_report(found, folder), folder)
+
+
+_LOG_MARKERS = ("inspection.json", "identification.json")
+
+
 def _claim_for_log(folder: Path, log: Path, *, overwrite: bool) -> None:
     """Make the folder; leave other results than those of this log alone."""
     import json
@@ -167,19 +196,16 @@ def _claim_for_log(folder: Path, log: Path, *, overwrite: bool) -> None:
     from .study.store import make_folder
 
     make_folder(folder)
-    marker = folder / "inspection.json"
-    if not marker.exists():
-        if any(folder.iterdir()):
-            raise InputError(f"{folder}: is not empty and holds no inspection; choose another folder with --out")
-        return
-    try:
-        file = json.loads(marker.read_text(encoding="utf-8"))["file"]
-    except (OSError, ValueError, KeyError, TypeError):
-        file = "an unreadable one"
-    if file != str(log.resolve()) and not overwrite:
-        raise InputError(
-            f"{folder}: holds the inspection of another log ({file}); choose another with --out, or --overwrite"
-        )
+    markers = [folder / name for name in _LOG_MARKERS if (folder / name).exists()]
+    if not markers and any(folder.iterdir()):
+        raise InputError(f"{folder}: is not empty and holds no results of a log; choose another folder with --out")
+    for marker in markers:
+        try:
+            file = json.loads(marker.read_text(encoding="utf-8"))["file"]
+        except (OSError, ValueError, KeyError, TypeError):
+            file = "an unreadable one"
+        if file != str(log.resolve()) and not overwrite:
+            raise InputError(f"{folder}: holds results of another log ({file}); choose another with --out, or --overwrite")
 
 
 @app.command()

@@ -431,12 +431,12 @@ def test_inspect_reads_as_the_model_says_and_leaves_other_results_alone(call, tm
     with pytest.raises(InputError, match=r"wrong.toml: log.theta_e: unknown key 'colum'; did you mean 'column'\?"):
         call("inspect", "axis.parquet", "--model", "wrong.toml")
     made(count=1000).to_csv("axis.csv", index=False)
-    with pytest.raises(InputError, match=r"results/axis: holds the inspection of another log \(.*axis.parquet\)"):
+    with pytest.raises(InputError, match=r"results/axis: holds results of another log \(.*axis.parquet\)"):
         call("inspect", "axis.csv")
     assert call("inspect", "axis.csv", "--overwrite")[0] == 0
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("mine")
-    with pytest.raises(InputError, match="full: is not empty and holds no inspection; choose another folder with --out"):
+    with pytest.raises(InputError, match="full: is not empty and holds no results of a log; choose another folder with"):
         call("inspect", "axis.csv", "--out", "full")
     with pytest.raises(InputError, match=r"none\.csv: no such file"):
         call("inspect", "none.csv")

@@ -59,7 +59,7 @@ def free_parameters(experiment: Experiment, paths: Sequence[str], torque: float)
     Raises:
         InputError: unknown path, one that no trajectory depends on, or a positive number without a value to start from.
     """
-    known = {path: known for path, known in leaf_paths(experiment).items() if path.split(".")[0] in _PHYSICAL}
+    known = {path: known for path, known in leaf_paths(experiment).items() if path.split(".")[0] in PHYSICAL}
     free = []
     for path in paths:
         if path not in known:
@@ -67,7 +67,7 @@ def free_parameters(experiment: Experiment, paths: Sequence[str], torque: float)
         if path in paths[: len(free)]:
             raise InputError(f"'{path}' is named twice")
         nominal, about = float(get_leaf(experiment, path)), known[path]
-        positive = _is_positive(about)
+        positive = is_positive(about)
         if positive and nominal <= 0.0:
             raise InputError(f"'{path}' must stay positive, and its nominal value is {nominal:g}; give one to start from")
         scale = abs(nominal) or (torque if about.unit == "N m" else 1.0)
@@ -75,10 +75,12 @@ def free_parameters(experiment: Experiment, paths: Sequence[str], torque: float)
     return tuple(free)
 
 
-_PHYSICAL = ("drive", "transmission", "effects")
+PHYSICAL = ("drive", "transmission", "effects")
+"""Tables of the config whose numbers move the plant."""
 
 
-def _is_positive(about: Parameter) -> bool:
+def is_positive(about: Parameter) -> bool:
+    """Whether a number must not become negative."""
     return any(limit is not None and limit >= 0.0 for limit in (about.minimum, about.above))
 
 

@@ -1,6 +1,7 @@
 """Figures and reports."""
 
 from .atlas import write_verify_report as write_verify_report
+from .identified import write_identification_report as write_identification_report
 from .inspected import write_inspection_report as write_inspection_report
 from .maps import draw as draw
 from .reports import write_sweep_report as write_sweep_report

@@ -349,6 +349,25 @@ class RangeTable(Table):
         return np.geomspace(self.start, self.stop, self.num)
 
 
+class IdentifyTable(Table):
+    """What `jaxbl identify` seeks in a log, and how."""
+
+    parameters: list[str] | None = Field(
+        default=None,
+        description="dotted paths of the numbers to find; left out: all of drive, transmission and effects that are not in "
+        "uncertainty.exact and have a value to start from",
+    )
+    window: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="length of the windows that the model runs freely over; left out: chosen by the width of the intervals",
+        json_schema_extra={"unit": "s"},
+    )
+    starts: int = Field(default=8, ge=1, le=1000, description="starts of the fit, the first at the nominal numbers")
+    spread: float = Field(default=2.0, gt=1.0, le=100.0, description="the others lie within this factor of them")
+    seed: int = Field(default=0, ge=0, description="seed of the starts")
+
+
 class MarkTable(GainPairTable):
     """A pair of gains to be marked in the atlas, run once on the study's drive."""
 
@@ -507,6 +526,7 @@ class Config(Table):
     uncertainty: UncertaintyTable = Field(default_factory=UncertaintyTable)
     tune: TuneTable | None = Field(default=None)
     log: LogTable = Field(default_factory=LogTable)
+    identify: IdentifyTable = Field(default_factory=IdentifyTable)
     verify: VerifyTable = Field(default_factory=VerifyTable)
     axes: list[AxisTable] = Field(default=[])
     figures: list[FigureTable] = Field(default=[])

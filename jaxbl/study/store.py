@@ -40,7 +40,7 @@ def identity(config: Config, command: str = "sweep") -> str:
     """
     data = config.resolved()
     data["sweep"].pop("chunk", None)
-    for key in ("title", "notes", "figures", *_COMMANDS[command][2]):
+    for key in ("title", "notes", "figures", "identify", *_COMMANDS[command][2]):
         data.pop(key, None)
     for key in ("q", "marks"):
         # judged and drawn anew each time
