@@ -477,7 +477,7 @@ class _Reader:
         return quality.gearing(time, values["theta_e"], values["theta_s"], segments, step)
 
     def estimated_skew(self, gearing: Gearing | None, step: float) -> float:
-        if gearing is None:
+        if gearing is None or gearing.skew is None or gearing.skew_error is None:
             raise self.wrong("theta_s.skew = 'estimate': the motion does not tell a skew; give it in s, or leave it out")
         found = f"{1e3 * gearing.skew:.4g} ± {1e3 * gearing.skew_error:.2g} ms"
         if not gearing.skew_error < 0.5 * step:
@@ -558,10 +558,11 @@ class _Reader:
     def check_gearing(self, found: Gearing | None) -> None:
         """Compare the ratio of both motions with the gear ratio that is expected."""
         expected = self.gear_ratio
-        if found is None or found.residual > 0.2:
+        if found is None or found.residual >= quality.UNLIKE:
             left = "" if found is None else f" ({100 * found.residual:.0f} % of theta_e is not explained by theta_s)"
             self.notes.append(
-                f"theta_e and theta_s hardly go together{left}: they may not belong to one drive, or the load hardly moves."
+                f"theta_e and theta_s hardly go together{left}: they may not belong to one drive, or the load hardly moves "
+                "beyond the lost motion."
             )
             return
         if expected is None:
@@ -622,6 +623,8 @@ class _Reader:
             )
 
     def note_skew(self, found: Gearing, step: float) -> None:
+        if found.skew is None or found.skew_error is None:
+            return
         if abs(found.skew) > 6.0 * found.skew_error and abs(found.skew) > 0.05 * step:
             which = "late" if found.skew > 0.0 else "early"
             self.notes.append(
