@@ -662,7 +662,8 @@ class _Reader:
         saturated = raw.saturated or (0.0 if is_position else quality.stays(every, step))
         if jumps:
             self.notes.append(
-                f"{name}: {jumps} jump{'s' * (jumps > 1)} that the motion does not explain: dropped counts or disturbed readings."
+                f"{name}: {jumps} jump{'s' * (jumps > 1)} that the motion does not explain: "
+                "dropped counts or disturbed readings."
             )
         if saturated:
             self.notes.append(f"{name} is saturated in {100 * saturated:.2g} % of the samples.")
