@@ -217,9 +217,11 @@ def _of_transmission(record: Record, speed: Array, reversals: int, ratio: float 
     if reversals < 2:
         result.append(Judgement("lost motion", "no", f"{reversals} reversals: both flanks of the gap must be touched"))
     elif lost > 4.0 * error and lost > seen:
-        result.append(Judgement("lost motion", "yes", f"theta_e shifts by {size} at the {reversals} reversals"))
+        result.append(Judgement("lost motion", "yes", f"theta_e shifts by about {size} from flank to flank"))
     else:
-        result.append(Judgement("lost motion", "weak", f"shift of theta_e at reversals is {size}, noise {seen:.2g} {unit}"))
+        result.append(
+            Judgement("lost motion", "weak", f"shift of theta_e from flank to flank is {size}, noise {seen:.2g} {unit}")
+        )
     return [*result, _stiffness(record, speed, ratio, seen)]
 
 

@@ -41,14 +41,14 @@ class Record:
 
     Attributes:
         path: the file.
-        time: s from the first stamp, shape (samples,).
+        time: s from the first sample, shape (samples,).
         sample_period: s.
         torque: input at the motor shaft, held from each sample to the next, N m (N on a linear axis), shape (samples,); None
             if it was not recorded.
         positions: "motor" and "load", as far as they were recorded -> rad (m on a linear axis), shape (samples,).
         transmitted: measured transmitted torque, N m (N), shape (samples,), or None.
         closed_loop: whether a controller chose the input from the positions; None if not known.
-        start: first raw time stamp, s.
+        start: time of the first sample by the stamps of the log, s.
         segments: contiguous parts; between them the log has gaps.
         notes: what was done to the log, and what is odd about it, in sentences.
         findings: figures on its quality.
@@ -126,6 +126,7 @@ class _Reader:
         self.columns, self.path, self.table, self.gear_ratio = columns, columns.path, table, gear_ratio
         self.notes: list[str] = []
         self.rows = np.zeros(0, dtype=int)
+        self.total = 0
         self.median = self.gap = 0.0
 
     def wrong(self, text: str) -> InputError:
@@ -133,7 +134,7 @@ class _Reader:
 
     def record(self) -> Record:
         stamps, start = self.stamps()
-        channels = self.channels(len(self.rows))
+        channels = self.channels()
         stamps, channels, parts, sampling, period, first = self.sampled(stamps, channels)
         positions = {name: raw for name, raw in channels.items() if name.startswith("theta")}
         for name, raw in positions.items():
@@ -180,7 +181,7 @@ class _Reader:
             positions={side: values[name] for side, name in SIDES.items() if name in values},
             transmitted=values.get("transmitted"),
             closed_loop=self.table.closed_loop,
-            start=start,
+            start=start + float(time[0]),
             segments=segments,
             notes=tuple(self.notes),
             findings=Findings(sampling, figures, gearing, dynamics),
@@ -198,6 +199,7 @@ class _Reader:
         else:
             stamps = self.columns.numbers("t" if table.column is None else table.column, "t.column")
             stamps = stamps * {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[table.unit]
+        self.total = len(stamps)
         if len(stamps) < SHORTEST:
             raise self.wrong(f"has {len(stamps)} rows; a log needs at least {SHORTEST}")
         back = np.diff(stamps) < 0.0
@@ -309,7 +311,7 @@ class _Reader:
 
     # channels
 
-    def channels(self, length: int) -> dict[str, _Raw]:
+    def channels(self) -> dict[str, _Raw]:
         """All channels in SI units at the kept rows."""
         found: dict[str, _Raw] = {}
         linear = False
@@ -351,8 +353,7 @@ class _Reader:
     def column(self, name: str, column: str | int, bits: int | None) -> Array:
         """Numbers of a column at all rows, unsigned words made signed."""
         values = self.columns.numbers(column, f"{name}.column")
-        total = len(self.columns.numbers(self.time_name)) if self.timed else len(values)
-        self.same_length(values, total, column)
+        self.same_length(values, self.total, column)
         if bits is not None:
             outside = (values != np.round(values)) | (values < -(2.0 ** (bits - 1))) | (values >= 2.0**bits)
             if outside.any():
@@ -363,10 +364,6 @@ class _Reader:
                 )
             values = np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values)
         return values[self.rows]
-
-    @property
-    def timed(self) -> bool:
-        return self.table.t is None or self.table.t.period is None
 
     def position(self, name: str, table: PositionTable) -> _Raw:
         column = name if table.column is None else table.column
@@ -450,6 +447,9 @@ class _Reader:
                 grid = at + step * np.arange(_length(part), dtype=float)
             else:
                 low = max(float(stamps[part][0]) - skew for skew in skews.values())
+                if not regrid:
+                    # where the channels without skew have their samples
+                    low = at + step * math.ceil((low - at) / step - 1e-6)
                 high = min(float(stamps[part][-1]) - skew for skew in skews.values())
                 count = math.floor((high - low) / step + 1e-6) + 1
                 if count < SHORTEST // 2:
@@ -477,7 +477,7 @@ class _Reader:
         return quality.gearing(time, values["theta_e"], values["theta_s"], segments, step)
 
     def estimated_skew(self, gearing: Gearing | None, step: float) -> float:
-        if gearing is None:
+        if gearing is None or gearing.skew is None or gearing.skew_error is None:
             raise self.wrong("theta_s.skew = 'estimate': the motion does not tell a skew; give it in s, or leave it out")
         found = f"{1e3 * gearing.skew:.4g} ± {1e3 * gearing.skew_error:.2g} ms"
         if not gearing.skew_error < 0.5 * step:
@@ -558,10 +558,11 @@ class _Reader:
     def check_gearing(self, found: Gearing | None) -> None:
         """Compare the ratio of both motions with the gear ratio that is expected."""
         expected = self.gear_ratio
-        if found is None or found.residual > 0.2:
+        if found is None or found.residual >= quality.UNLIKE:
             left = "" if found is None else f" ({100 * found.residual:.0f} % of theta_e is not explained by theta_s)"
             self.notes.append(
-                f"theta_e and theta_s hardly go together{left}: they may not belong to one drive, or the load hardly moves."
+                f"theta_e and theta_s hardly go together{left}: they may not belong to one drive, or the load hardly moves "
+                "beyond the lost motion."
             )
             return
         if expected is None:
@@ -622,6 +623,8 @@ class _Reader:
             )
 
     def note_skew(self, found: Gearing, step: float) -> None:
+        if found.skew is None or found.skew_error is None:
+            return
         if abs(found.skew) > 6.0 * found.skew_error and abs(found.skew) > 0.05 * step:
             which = "late" if found.skew > 0.0 else "early"
             self.notes.append(
@@ -659,7 +662,8 @@ class _Reader:
         saturated = raw.saturated or (0.0 if is_position else quality.stays(every, step))
         if jumps:
             self.notes.append(
-                f"{name}: {jumps} jumps that its motion does not explain: dropped counts or disturbed readings."
+                f"{name}: {jumps} jump{'s' * (jumps > 1)} that the motion does not explain: "
+                "dropped counts or disturbed readings."
             )
         if saturated:
             self.notes.append(f"{name} is saturated in {100 * saturated:.2g} % of the samples.")

@@ -228,6 +228,8 @@ def test_rows_are_chosen_by_value_and_by_time(tmp_path):
     record = read_record(wrote(tmp_path, frame), {"where": {"on": False}, "start": 0.5, "stop": 3.0})
     assert len(record.segments) == 2
     np.testing.assert_array_equal(record.torque, frame["u"][~on & (frame["t"] >= 0.5) & (frame["t"] <= 3.0)])
+    assert record.start == pytest.approx(0.5)
+    assert record.time[0] == 0.0
     assert record.notes[0] == f"{len(record.time)} of 4000 rows are read, by [log] where, start and stop."
 
 
@@ -261,6 +263,11 @@ def test_a_given_skew_is_undone(tmp_path):
     frame = made(skew=2.5e-3)
     record = read_record(wrote(tmp_path, frame), {"theta_s": {"skew": 2.5e-3}}, gear_ratio=GEAR_RATIO)
     np.testing.assert_allclose(GEAR_RATIO * record.positions["load"], record.positions["motor"], atol=1e-6)
+    # an early channel leaves the others their samples
+    record = read_record(wrote(tmp_path, made(skew=-2.5e-3)), {"theta_s": {"skew": -2.5e-3}})
+    assert record.start == pytest.approx(3e-3)
+    np.testing.assert_allclose(record.torque, frame["u"][3:], atol=1e-9)
+    np.testing.assert_allclose(GEAR_RATIO * record.positions["load"], frame["theta_e"][3:], atol=1e-6)
     late = frame.assign(u=np.interp(frame["t"] - 4e-3, frame["t"], frame["u"]))
     found = read_record(wrote(tmp_path, late)).findings.channels["u"]
     assert found.skew == pytest.approx(4e-3, abs=4.0 * found.skew_error + 1e-4)
