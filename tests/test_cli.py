@@ -209,6 +209,8 @@ def test_bad_input_is_one_line_and_exit_2(case, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("arguments", [["sweep"], ["sweep", "study.toml", "--outt", "a"], ["swep", "study.toml"]])
 def test_wrong_usage_exits_2(arguments, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["jaxbl", *arguments])
+    # else click names the module that python -m runs, pytest
+    monkeypatch.setattr(sys.modules["__main__"], "__package__", None)
     with pytest.raises(SystemExit) as end:
         cli.main()
     assert end.value.code == 2
@@ -469,3 +471,27 @@ def test_a_refined_sweep_from_the_command_line(call, tmp_path):
     assert second == [line for line in first if not line.startswith("Compiled")]
     _, drawn, _ = call("plot", "results/study")
     assert drawn == second
+
+
+def test_a_log_is_identified(call, tmp_path):
+    study = rigid(
+        {"run.duration": 0.6, "encoders.noise": 1e-5, "excitation.frequency": 4.0, "run.substeps": 2},
+        effects=[{"kind": "motor.coulomb_friction", "torque": 0.02}],
+        identify={"starts": 1, "window": 0.1},
+    )
+    write(tmp_path, study, "axis.toml")
+    assert call("simulate", "axis.toml", "--out", "made")[0] == 0
+    pd.read_parquet("made/trace.parquet")[["t", "u", "theta_e"]].to_csv("axis.csv", index=False)
+    code, lines, _ = call("identify", "axis.csv", "--model", "axis.toml")
+    assert code == 0
+    assert lines[0].startswith("drive.motor_inertia = 0.0")
+    assert lines[-1] == "results/axis/report.html"
+    found = json.loads((tmp_path / "results/axis/identification.json").read_text())
+    names = ["drive.motor_inertia", "drive.motor_viscous", "effects.motor.coulomb_friction.torque"]
+    assert list(found["parameters"]) == names
+    assert call("simulate", "results/axis/model.toml", "--out", "again")[0] == 0
+    write(tmp_path, study | {"identify": {"parameters": ["drive.mass"]}}, "wrong.toml")
+    with pytest.raises(InputError, match=r"^wrong\.toml: 'drive\.mass' is no number of the plant; fitted can be: "):
+        call("identify", "axis.csv", "--model", "wrong.toml")
+    with pytest.raises(InputError, match="results of another log"):
+        call("identify", "made/trace.parquet", "--model", "axis.toml", "--out", "results/axis")
