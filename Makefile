@@ -8,7 +8,7 @@ demo: .venv/installed
 	$(BIN)/jaxbl sweep sweeps/gain_map.toml
 
 test: .venv/installed-dev
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .

@@ -1,7 +1,12 @@
 """Settings of all tests: float64 unless a test asks otherwise, no silent rank promotion, two CPU devices."""
 
+from pathlib import Path
+
 import jax
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_num_cpu_devices", 2)
+# what one worker or run has compiled serves the others
+jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parents[1] / ".cache" / "jax"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)

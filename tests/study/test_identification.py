@@ -31,7 +31,7 @@ def geared(changes=None, **tables):
         "transmission": LAW,
         "effects": FRICTION,
         "excitation": {"kind": "multisine", "amplitude": 5.0, "frequency": 0.5},
-        "identify": {"starts": 2},
+        "identify": {"starts": 2, "window": 0.5},
         "observer": OBSERVER,
     } | tables
     return small(SETTINGS | (changes or {}), **tables)
@@ -72,7 +72,7 @@ def test_numbers_are_those_of_the_machine_within_their_errors(found):
         residual = found.summary["residual"][side]
         assert residual["noise"] == pytest.approx(noise, rel=0.1)
         assert residual["rms"] == pytest.approx(noise, rel=0.1)
-    assert found.summary["method"]["trajectory"]["window"] == pytest.approx(1.0)
+    assert found.summary["method"]["trajectory"]["window"] == pytest.approx(0.5)
 
 
 def test_recursive_identifier_ends_nearby(found):
