@@ -5,7 +5,7 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -177,12 +177,19 @@ def identify(
     from .report import write_identification_report
     from .study.config import read_config
     from .study.identification import identify as identify_log
+    from .study.identification import record_for
 
     study = read_config(model)
+    record = record_for(study, log)
     folder = _folder(log, out)
     _claim_for_log(folder, log, overwrite=overwrite)
-    with _naming(model, folder):
-        found = identify_log(log, study)
+    try:
+        with _naming(model, folder):
+            found = identify_log(record, study)
+    except InputError:
+        with suppress(OSError):  # not empty: it was there before
+            folder.rmdir()
+        raise
     _tell(write_identification_report(found, folder), folder)
 
 

@@ -492,6 +492,9 @@ def test_a_log_is_identified(call, tmp_path):
     assert call("simulate", "results/axis/model.toml", "--out", "again")[0] == 0
     write(tmp_path, study | {"identify": {"parameters": ["drive.mass"]}}, "wrong.toml")
     with pytest.raises(InputError, match=r"^wrong\.toml: 'drive\.mass' is no number of the plant; fitted can be: "):
-        call("identify", "axis.csv", "--model", "wrong.toml")
+        call("identify", "axis.csv", "--model", "wrong.toml", "--out", "new")
+    with pytest.raises(InputError, match=r"^none\.csv: no such file"):
+        call("identify", "none.csv", "--model", "axis.toml", "--out", "new")
+    assert not (tmp_path / "new").exists()
     with pytest.raises(InputError, match="results of another log"):
         call("identify", "made/trace.parquet", "--model", "axis.toml", "--out", "results/axis")

@@ -77,9 +77,7 @@ def identify(
     """
     config = read_config(model)
     settings = config.identify
-    ratio = config.drive.gear_ratio if config.drive.kind == "two_inertia" else None
-    record = log if isinstance(log, Record) else read_record(log, config.log, gear_ratio=ratio)
-    _check(config, record)
+    record = log if isinstance(log, Record) else record_for(config, log)
     assert record.torque is not None
     with jax.enable_x64(True):
         experiment = _on_record(config, record)
@@ -104,7 +102,14 @@ def identify(
     return Identification(config, with_values(config, values), record, summary, trace)
 
 
-def _check(config: Config, record: Record) -> None:
+def record_for(config: Config, log: str | Path) -> Record:
+    """Read a log as a study says, with the channels that its identification needs.
+
+    Raises:
+        InputError: unfit log.
+    """
+    ratio = config.drive.gear_ratio if config.drive.kind == "two_inertia" else None
+    record = read_record(log, config.log, gear_ratio=ratio)
     sides = ("motor", "load") if config.drive.kind == "two_inertia" else ("motor",)
     for side in sides:
         if side not in record.positions:
@@ -114,6 +119,7 @@ def _check(config: Config, record: Record) -> None:
             )
     if record.torque is None:
         raise InputError(f"{record.path}: no input torque (u), which identification needs")
+    return record
 
 
 def _on_record(config: Config, record: Record) -> Experiment:
