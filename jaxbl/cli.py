@@ -1,13 +1,15 @@
 """The command line: parse, call, print. JAX is imported only once a command has work for it."""
 
 import dataclasses
+import json
 import os
 import shlex
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -165,27 +167,37 @@ def inspect(
 
 @app.command()
 def identify(
-    log: LogArgument,
+    log: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG...", help="CSV, Parquet, MATLAB or JSON files of one machine", show_default=False),
+    ],
     model: Annotated[
         Path, typer.Option("--model", metavar="TOML", help="study with nominal numbers, and [log]", show_default=False)
     ],
+    holdout: Annotated[
+        Path | None, typer.Option("--holdout", metavar="LOG2", help="log of the same machine to try the numbers out on")
+    ] = None,
+    profile: Annotated[
+        bool | None, typer.Option("--profile", help="profile-likelihood intervals as well", show_default=False)
+    ] = None,
     out: LogOutOption = None,
     overwrite: LogOverwriteOption = False,
 ) -> None:
-    """Find a machine's numbers in its log, with intervals: stiffness, gap, inertias, frictions."""
+    """Find a machine's numbers in its logs, with intervals: stiffness, gap, inertias, frictions."""
     _start_jax()
-    from .report import write_identification_report
-    from .study.config import read_config
-    from .study.identification import identify as identify_log
-    from .study.identification import record_for
+    from .report import identification_lines, write_identification_report
+    from .study.identification import read_task, run_task
 
-    study = read_config(model)
-    record = record_for(study, log)
-    folder = _folder(log, out)
-    _claim_for_log(folder, log, overwrite=overwrite)
+    task = read_task(log, model, holdout=holdout, profile=profile)
+    folder = _folder(log[0], out)
+    _claim_for_log(folder, log[0], overwrite=overwrite)
+    finished = _finished(folder / "identification.json", task.identity)
+    if finished is not None:
+        _tell(identification_lines(finished), folder)
+        return
     try:
         with _naming(model, folder):
-            found = identify_log(record, study)
+            found = run_task(task)
     except InputError:
         with suppress(OSError):  # not empty: it was there before
             folder.rmdir()
@@ -193,13 +205,20 @@ def identify(
     _tell(write_identification_report(found, folder), folder)
 
 
+def _finished(file: Path, identity: str) -> dict[str, Any] | None:
+    """What an earlier call found, if it was asked the same."""
+    try:
+        found = json.loads(file.read_text())
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) and found.get("identity") == identity else None
+
+
 _LOG_MARKERS = ("inspection.json", "identification.json")
 
 
 def _claim_for_log(folder: Path, log: Path, *, overwrite: bool) -> None:
     """Make the folder; leave other results than those of this log alone."""
-    import json
-
     from .study.store import make_folder
 
     make_folder(folder)
@@ -265,15 +284,38 @@ def _naming(config: Path, folder: Path | None = None) -> Iterator[None]:
 
 
 @contextmanager
-def _running(command: str, config: Path, folder: Path) -> "Iterator[Progress | None]":
-    """Around a long computation: messages name the config, progress is shown, and an interrupt says how to go on."""
+def _running(command: str, config: Path, folder: Path) -> "Iterator[Progress]":
+    """Around a long computation: messages name the config, progress is shown, and an interrupt says how to go on.
+
+    An interrupt may be lost in foreign code, or come out of it as another error: it is remembered, and heeded at the next
+    progress or error.
+    """
+    interrupted = False
+
+    def interrupt(number: int, frame: object) -> None:
+        nonlocal interrupted
+        interrupted = True
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, interrupt)
     try:
-        with _naming(config, folder), _progress("runs") as progress:
+        with _naming(config, folder), _progress("runs") as shown:
+
+            def progress(done: int, total: int) -> None:
+                if interrupted:
+                    raise KeyboardInterrupt
+                if shown is not None:
+                    shown(done, total)
+
             yield progress
-    except KeyboardInterrupt:
+    except BaseException as error:
+        if not (interrupted or isinstance(error, KeyboardInterrupt)):
+            raise
         resume = shlex.join(["jaxbl", command, str(config), "--out", str(folder)])
         typer.echo(f"interrupted; what is finished is kept. Go on with: {resume}", err=True)
         raise typer.Exit(130) from None
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

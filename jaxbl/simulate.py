@@ -360,7 +360,12 @@ def _scan(
 
 
 def trajectory(
-    experiment: Experiment, start: PlantState, torque: Float[Array, " samples"], time: Scalar = 0.0
+    experiment: Experiment,
+    start: PlantState,
+    torque: Float[Array, " samples"],
+    time: Scalar = 0.0,
+    measured: dict[str, Float[Array, " samples"]] | None = None,
+    gain: dict[str, Float[Array, " 2"]] | None = None,
 ) -> PlantState:
     """The plant alone under a recorded input: its states at the samples, with a leading time axis.
 
@@ -369,13 +374,26 @@ def trajectory(
         start: state at the first sample.
         torque: input in N m, held from each sample to the next.
         time: time of the first sample in s.
+        measured: positions of each side in rad, to predict from: each state is then what follows from the samples before.
+        gain: by which a prediction error corrects position (1) and velocity (1/s) of its side; needs `measured`.
     """
     plant, run = experiment.plant, experiment.run
 
-    def sample(state: PlantState, given: tuple[Array, Array]) -> tuple[PlantState, PlantState]:
-        index, torque = given
-        at = time + index.astype(torque.dtype) * run.sample_period
-        return _move(plant, run, state, torque, at), state
+    def corrected(state: PlantState, readings: dict[str, Array]) -> PlantState:
+        if gain is None:
+            return state
+        errors = {side: readings[side] - state.position[side] for side in readings}
+        return PlantState(
+            {side: state.position[side] + gain[side][0] * error for side, error in errors.items()},
+            {side: state.velocity[side] + gain[side][1] * error for side, error in errors.items()},
+            state.effects,
+        )
 
-    _, states = jax.lax.scan(sample, start, (jnp.arange(len(torque), dtype=jnp.int32), torque))
+    def sample(state: PlantState, given: tuple[Array, Array, dict[str, Array]]) -> tuple[PlantState, PlantState]:
+        index, torque, readings = given
+        at = time + index.astype(torque.dtype) * run.sample_period
+        return _move(plant, run, corrected(state, readings), torque, at), state
+
+    samples = jnp.arange(len(torque), dtype=jnp.int32), torque, measured if measured is not None and gain is not None else {}
+    _, states = jax.lax.scan(sample, start, samples)
     return states

@@ -46,6 +46,10 @@ class AbstractDrive(eqx.Module):
         """Motor angle for one unit of the side's angle."""
         return 1.0
 
+    def place(self, place: str) -> str:
+        """Where effects of a place act."""
+        return place
+
     def acceleration(self, side: str, velocity: Scalar, torque: Scalar) -> Scalar:
         """Nominal acceleration f(x_2, u) without transmitted torque, as the observers (7) know it; rad/s^2.
 
@@ -80,7 +84,7 @@ class TwoInertia(AbstractDrive):
 
 
 class Rigid(AbstractDrive):
-    """One inertia: everything beyond it is disturbance. `motor.*` effects act on it."""
+    """One inertia: everything beyond it is disturbance. `motor.*` effects act on it, and those that only a load has."""
 
     name: ClassVar[str] = "rigid"
     sides: ClassVar[tuple[str, ...]] = ("motor",)
@@ -95,6 +99,9 @@ class Rigid(AbstractDrive):
 
     def torque_gain(self, side):
         return -1.0
+
+    def place(self, place):
+        return "motor" if place == "load" else place
 
 
 DRIVES: dict[str, type[AbstractDrive]] = {drive.name: drive for drive in (TwoInertia, Rigid)}
@@ -181,19 +188,39 @@ class Plant(eqx.Module):
         position = {side: middle[side] + 0.5 * step * velocity[side] for side in self.drive.sides}
         return PlantState(position, velocity, tuple(states))
 
-    def _kick(self, velocity: Sides, position: Sides, seen: Sides, torque: Scalar, time: Scalar, step: Scalar) -> Sides:
-        """Velocities after `step`; `seen` are the velocities at which velocity-dependent effects are evaluated."""
+    def torques(
+        self, position: Sides, velocity: Sides, torque: Scalar, time: Scalar, transmitted: Scalar | None = None
+    ) -> dict[str, tuple[Scalar, Scalar]]:
+        """What acts on each side but for its nominal viscous friction, N m: the sum of all torques, and the level of
+        set-valued dry friction that opposes motion beside it (the Python number 0.0 without any).
+
+        Args:
+            position: rad.
+            velocity: rad/s, at which velocity-dependent effects are evaluated.
+            torque: that acts on the motor, N m.
+            time: s.
+            transmitted: transmitted torque, N m, where it is known; left out, the transmission's.
+        """
         gains: dict[str, Scalar] = {"motor": -1.0}
-        transmitted: Scalar = 0.0
+        through: Scalar = 0.0
         if self.transmission is not None:
-            transmitted, gains["load"] = self.transmitted(position, seen)
-        new = {}
+            through, gains["load"] = self.transmitted(position, velocity)
+        if transmitted is not None:
+            through = transmitted
+        found = {}
         for side in self.drive.sides:
-            total = gains[side] * transmitted + (torque if side == "motor" else 0.0)
+            total = gains[side] * through + (torque if side == "motor" else 0.0)
             level: Scalar = 0.0
             for effect in self._at(side):
-                total = total - effect.resist(Motion(time, position[side], seen[side]))
-                level = level + effect.dry_friction(seen[side])
+                total = total - effect.resist(Motion(time, position[side], velocity[side]))
+                level = level + effect.dry_friction(velocity[side])
+            found[side] = total, level
+        return found
+
+    def _kick(self, velocity: Sides, position: Sides, seen: Sides, torque: Scalar, time: Scalar, step: Scalar) -> Sides:
+        """Velocities after `step`; `seen` are the velocities at which velocity-dependent effects are evaluated."""
+        new = {}
+        for side, (total, level) in self.torques(position, seen, torque, time).items():
             mass = self.inertia(side) / step
             drag = 0.5 * self.drive.viscous(side)
             free = ((mass - drag) * velocity[side] + total) / (mass + drag)
@@ -201,7 +228,7 @@ class Plant(eqx.Module):
         return new
 
     def _at(self, place: str) -> list[AbstractEffect]:
-        return [effect for effect in self.effects if effect.place == place]
+        return [effect for effect in self.effects if self.drive.place(effect.place) == place]
 
 
 def _soften(velocity: Float[Array, ""], stop: Scalar) -> Float[Array, ""]:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbl.drive.parameters import Parameter, get_leaf, leaf_paths, set_leaves
 from jaxbl.errors import InputError
@@ -25,7 +25,7 @@ from jaxbl.simulate import Experiment, PlantState, trajectory
 
 _INNER = 3
 _RIDGE = 1e-10
-_WIDE = 3.0
+WIDE = 3.0
 
 
 class Free(NamedTuple):
@@ -70,7 +70,7 @@ def free_parameters(experiment: Experiment, paths: Sequence[str], torque: float)
         positive = is_positive(about)
         if positive and nominal <= 0.0:
             raise InputError(f"'{path}' must stay positive, and its nominal value is {nominal:g}; give one to start from")
-        scale = abs(nominal) or (torque if about.unit == "N m" else 1.0)
+        scale = abs(nominal) or (torque if about.unit == "N m" else 0.0) or 1.0
         free.append(Free(path, about.unit, nominal, scale, positive))
     return tuple(free)
 
@@ -92,7 +92,9 @@ class Windows(eqx.Module):
         measured: positions of each side in rad, shape (windows, samples).
         time: of each window's first sample, s, shape (windows,).
         start: a guess of the state at each window's first sample, leaves of shape (windows,).
-        noise: standard deviation of each side's readings in rad.
+        noise: standard deviation of each side's readings (of its prediction errors, with a gain), rad.
+        rest: whether a window begins at rest: velocities as guessed, not fitted; shape (windows,).
+        gain: of the predictor (:func:`jaxbl.simulate.trajectory`) of each side, shape (2,); None: free runs, output error.
     """
 
     torque: Float[Array, "windows samples"]
@@ -100,6 +102,24 @@ class Windows(eqx.Module):
     time: Float[Array, " windows"]
     start: PlantState
     noise: dict[str, Float[Array, ""]]
+    rest: Bool[Array, " windows"]
+    gain: dict[str, Float[Array, " 2"]] | None = None
+
+    def only(self, which: np.ndarray) -> "Windows":
+        """Some of the windows."""
+        per_window = self.torque, self.measured, self.time, self.start, self.rest
+        torque, measured, time, start, rest = jax.tree.map(lambda x: x[which], per_window)
+        return Windows(torque, measured, time, start, self.noise, rest, self.gain)
+
+    @staticmethod
+    def join(parts: Sequence["Windows"]) -> "Windows":
+        """Windows of several parts of a record, with the noise and gain of the first."""
+        per_window = [(one.torque, one.measured, one.time, one.start, one.rest) for one in parts]
+        torque, measured, time, start, rest = jax.tree.map(lambda *x: jnp.concatenate(x), *per_window)
+        return Windows(torque, measured, time, start, parts[0].noise, rest, parts[0].gain)
+
+
+_MAPPED = Windows(0, 0, 0, 0, None, 0, None)  # type: ignore[arg-type]
 
 
 class Fit(eqx.Module):
@@ -131,7 +151,7 @@ def with_values(experiment: Experiment, free: Sequence[Free], theta: Float[Array
 
 
 def _residual(experiment: Experiment, start: PlantState, window: Windows) -> Float[Array, "samples sides"]:
-    simulated = trajectory(experiment, start, window.torque, window.time).position
+    simulated = trajectory(experiment, start, window.torque, window.time, window.measured, window.gain).position
     sides = [(window.measured[side] - simulated[side]) / window.noise[side] for side in experiment.sides]
     return jnp.stack(sides, axis=-1)
 
@@ -144,6 +164,9 @@ class _Eliminated(NamedTuple):
 def _eliminate(experiment: Experiment, window: Windows) -> _Eliminated:
     """Initial state of one window by Gauss-Newton, and an orthonormal basis of what it can explain."""
     guess, unravel = ravel_pytree(window.start)
+    free = jax.tree.map(jnp.ones_like, window.start)
+    moving = jax.tree.map(lambda one: jnp.where(window.rest, 0.0, one), free.velocity)
+    known, _ = ravel_pytree(PlantState(free.position, moving, free.effects))
 
     def residual(start: Array) -> Array:
         return _residual(experiment, unravel(start), window)
@@ -158,6 +181,7 @@ def _eliminate(experiment: Experiment, window: Windows) -> _Eliminated:
 
     def improve(start: Array) -> tuple[Array, Array]:
         value, slope = derivatives(start)
+        slope = slope * known[None, :]
         size = jnp.sqrt(jnp.sum(slope**2, axis=0))
         basis, triangle = jnp.linalg.qr(slope / jnp.where(size > 0.0, size, 1.0)[None, :])
         # a state without influence stays where it is
@@ -181,12 +205,23 @@ def _projected(experiment: Experiment, window: Windows) -> tuple[Array, Array]:
     return (flat - basis @ (basis.T @ flat)).reshape(value.shape), start
 
 
+def projected_residual(experiment: Experiment, windows: Windows) -> tuple[Float[Array, "windows samples sides"], PlantState]:
+    """Residuals over the noise without what the windows' initial states could explain, and those states.
+
+    The derivative by the experiment's numbers is Kaufman's.
+    """
+    residual, start = jax.vmap(lambda window: _projected(experiment, window), in_axes=(_MAPPED,))(windows)
+    unravel = ravel_pytree(jax.tree.map(lambda x: x[0], windows.start))[1]
+    return residual, jax.vmap(unravel)(start)
+
+
 def fit(
     experiment: Experiment,
     free: Sequence[Free],
     windows: Windows,
     theta: Float[Array, " parameters"],
     most_steps: int = 100,
+    held: Bool[Array, " parameters"] | None = None,
 ) -> Fit:
     """Fit from one start; `vmap` it over starts, or over records.
 
@@ -198,24 +233,27 @@ def fit(
         windows: the record.
         theta: the start, shape (parameters,); zeros are the nominal values.
         most_steps: of the solver.
+        held: which numbers stay at the start; none if left out.
     """
-    mapped = windows, Windows(0, 0, 0, 0, None)  # type: ignore[arg-type]
 
-    def projected(theta: Array) -> tuple[Array, Array]:
-        at = with_values(experiment, free, theta)
-        return jax.vmap(lambda window: _projected(at, window), in_axes=(mapped[1],))(windows)
+    given = theta
+
+    def projected(theta: Array) -> tuple[Array, PlantState]:
+        return projected_residual(with_values(experiment, free, theta), windows)
 
     def residual(theta: Array, _: None) -> tuple[Array, Array]:
-        return projected(theta)[0], theta / _WIDE
+        if held is not None:
+            theta = jnp.where(held, given, theta)
+        return projected(theta)[0], theta / WIDE
 
     solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
     found = optx.least_squares(residual, solver, theta, max_steps=most_steps, throw=False)
-    value, push, start = jax.linearize(projected, found.value, has_aux=True)
+    best = found.value if held is None else jnp.where(held, given, found.value)
+    value, push, start = jax.linearize(projected, best, has_aux=True)
     jacobian = jnp.moveaxis(jax.vmap(push)(jnp.eye(len(theta))), 0, -1)
-    unravel = ravel_pytree(jax.tree.map(lambda x: x[0], windows.start))[1]
     return Fit(
-        found.value,
-        jax.vmap(unravel)(start),
+        best,
+        start,
         value,
         jacobian,
         0.5 * jnp.sum(value**2),
@@ -231,8 +269,10 @@ def cut(
     start: Any,
     noise: dict[str, float],
     samples: int,
+    first: float = 0.0,
+    rest: bool = False,
 ) -> Windows:
-    """Cut a record into as many windows as fit into it.
+    """Cut part of a record into as many windows as fit into it.
 
     Args:
         torque: input in N m, shape (samples,).
@@ -241,8 +281,13 @@ def cut(
         start: states at all samples (:class:`jaxbl.simulate.PlantState`, leaves of shape (samples,)).
         noise: standard deviation of each side's readings in rad.
         samples: length of a window.
+        first: time of the first sample, s.
+        rest: whether the part begins at rest.
     """
     count = len(torque) // samples
+    standing = np.arange(count) == (0 if rest else -1)
+    start = jax.tree.map(lambda x: jnp.asarray(x)[: count * samples : samples], start)
+    still = jax.tree.map(lambda x: jnp.where(standing, 0.0, x), start.velocity)
 
     def split(values: Any) -> Array:
         return jnp.asarray(values)[: count * samples].reshape(count, samples)
@@ -250,7 +295,8 @@ def cut(
     return Windows(
         torque=split(torque),
         measured={side: split(values) for side, values in measured.items()},
-        time=period * samples * jnp.arange(count),
-        start=jax.tree.map(lambda x: jnp.asarray(x)[: count * samples : samples], start),
+        time=first + period * samples * jnp.arange(count),
+        start=PlantState(start.position, still, start.effects),
         noise={side: jnp.asarray(value, float) for side, value in noise.items()},
+        rest=jnp.asarray(standing),
     )

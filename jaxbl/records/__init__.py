@@ -3,6 +3,7 @@
 from .inspection import Inspection as Inspection
 from .inspection import Judgement as Judgement
 from .inspection import inspect as inspect
+from .join import join as join
 from .reader import Findings as Findings
 from .reader import Record as Record
 from .reader import read_log_table as read_log_table

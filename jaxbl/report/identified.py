@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomli_w
 from matplotlib.figure import Figure
 
 from jaxbl.study.identification import Identification
@@ -28,30 +29,38 @@ def write_identification_report(found: Identification, folder: Path) -> list[str
     draft = folder / "trace.draft"
     found.trace.to_parquet(draft, index=False)
     draft.replace(folder / "trace.parquet")
-    write_atomic(folder / "model.toml", found.model.to_toml())
-    lead, remarks = _headline(found), _remarks(found)
+    model = found.model.resolved()
+    if found.replays:
+        model["excitation"] = {"kind": "recorded", "file": "trace.parquet", "time_column": "t", "torque_column": "u"}
+    text = tomli_w.dumps(model)
+    write_atomic(folder / "model.toml", text)
+    lead, remarks = _headline(found.summary), _remarks(found.summary)
     tables = [_parameter_table(found)]
     if found.summary["method"]["recursive"]:
         tables.append(_recursive_table(found))
     title = found.config.title or f"Identification from {found.record.path.name}"
-    page = html(title, lead, remarks, pictures, tables, found.model.to_toml())
+    page = html(title, lead, remarks, pictures, tables, text)
     write_atomic(folder / "report.html", page)
     # last: it marks the folder as finished
     write_atomic(folder / "identification.json", json.dumps(found.summary, indent=1, ensure_ascii=False))
     return [*lead, *remarks]
 
 
-def _headline(found: Identification) -> list[str]:
+def identification_lines(summary: dict[str, Any]) -> list[str]:
+    """What the terminal says of an `identification.json`."""
+    return [*_headline(summary), *_remarks(summary)]
+
+
+def _headline(summary: dict[str, Any]) -> list[str]:
     lines = []
-    for path, one in found.summary["parameters"].items():
+    for path, one in summary["parameters"].items():
         low, high = one["interval"]
         unit = f" {one['unit']}" if one.get("unit") else ""
         lines.append(f"{path} = {one['value']:.5g} ± {one['standard_error']:.2g}{unit}, 95 %: {low:.5g} to {high:.5g}.")
     return lines
 
 
-def _remarks(found: Identification) -> list[str]:
-    summary = found.summary
+def _remarks(summary: dict[str, Any]) -> list[str]:
     lines = []
     for refusal in summary["refused"]:
         shares = ", ".join(f"{path} {share:+.2f}" for path, share in refusal["direction"].items())

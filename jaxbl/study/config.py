@@ -357,15 +357,27 @@ class IdentifyTable(Table):
         description="dotted paths of the numbers to find; left out: all of drive, transmission and effects that are not in "
         "uncertainty.exact and have a value to start from",
     )
+    method: Literal["output_error", "prediction_error"] = Field(
+        default="output_error",
+        description="output_error: the model runs freely over each window; prediction_error: each reading corrects it, "
+        "which is better where disturbances act that the model does not know",
+    )
     window: float | None = Field(
         default=None,
         gt=0.0,
-        description="length of the windows that the model runs freely over; left out: chosen by the width of the intervals",
+        description="length of the windows that the model runs over; left out: chosen by the width of the intervals",
         json_schema_extra={"unit": "s"},
     )
     starts: int = Field(default=8, ge=1, le=1000, description="starts of the fit, the first at the nominal numbers")
     spread: float = Field(default=2.0, gt=1.0, le=100.0, description="the others lie within this factor of them")
     seed: int = Field(default=0, ge=0, description="seed of the starts")
+    profile: bool = Field(default=False, description="whether to compute profile-likelihood intervals as well")
+    bandwidth: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="of the torques in the equations of motion; left out: a twentieth of the sampling rate",
+        json_schema_extra={"unit": "Hz"},
+    )
 
 
 class MarkTable(GainPairTable):
@@ -568,8 +580,8 @@ class Config(Table):
             if rigid and mark.side == "load":
                 raise wrong("verify.marks[{i}].side: 'load' has no meaning on a rigid drive; it should be 'motor'", i=i)
         for i, effect in enumerate(self.effects):
-            place = effect.kind.partition(".")[0]
-            if rigid and place in ("load", "transmission"):
+            place, _, kind = effect.kind.partition(".")
+            if rigid and (place == "transmission" or (place == "load" and f"motor.{kind}" in effect_kinds())):
                 raise wrong(
                     "effects[{i}]: {kind} has no meaning on a rigid drive; motor.* and actuator.* effects act on it",
                     i=i,
@@ -622,8 +634,40 @@ def read_config(source: str | Path | Mapping[str, Any] | Config) -> Config:
     Raises:
         InputError: unreadable file, bad TOML, unknown key, wrong type or range; one line that names file and key.
     """
+    return source if isinstance(source, Config) else _validate(*_read(source))
+
+
+_UNGIVEN = {"lambda": 1.0, "alpha": 1.0}
+
+
+def read_model(source: str | Path | Mapping[str, Any] | Config) -> tuple[Config, frozenset[str]]:
+    """Read a study that is to be held against a log: `[excitation]` and the observers' gains may be missing.
+
+    Returns:
+        The study, with something harmless in place of what is missing; and what is: `excitation`, `observer.motor`,
+        `observer.load`.
+
+    Raises:
+        InputError: as :func:`read_config`.
+    """
     if isinstance(source, Config):
-        return source
+        return source, frozenset()
+    data, name, origins = _read(source)
+    missing = set()
+    if "excitation" not in data:
+        missing.add("excitation")
+        data["excitation"] = {"kind": "sine", "amplitude": 0.0, "frequency": 1.0}
+    drive, observer = data.get("drive"), data.setdefault("observer", {})
+    rigid = isinstance(drive, dict) and drive.get("kind") == "rigid"
+    for side in ("motor",) if rigid else ("motor", "load"):
+        if isinstance(observer, dict) and side not in observer:
+            missing.add(f"observer.{side}")
+            observer[side] = dict(_UNGIVEN)
+    return _validate(data, name, origins), frozenset(missing)
+
+
+def _read(source: str | Path | Mapping[str, Any]) -> tuple[dict[str, Any], str, dict[Key, str]]:
+    """Data of a study with what it includes, how messages call it, and the file that each key came from."""
     if isinstance(source, Mapping):
         name, data, folder = "config", copy.deepcopy(dict(source)), Path()
     else:
@@ -632,7 +676,7 @@ def read_config(source: str | Path | Mapping[str, Any] | Config) -> Config:
         _localise(data, folder)
     origins: dict[Key, str] = {}
     chain = [] if isinstance(source, Mapping) else [Path(source).resolve()]
-    return _validate(_included(data, name, folder, chain, origins), name, origins)
+    return _included(data, name, folder, chain, origins), name, origins
 
 
 def read_log_config(path: Path) -> tuple[LogTable, float | None]:
@@ -644,7 +688,7 @@ def read_log_config(path: Path) -> tuple[LogTable, float | None]:
     data = _included(_load(path), str(path), path.parent, [path.resolve()], {})
     if set(data) <= {"title", "notes", "log"}:
         return read_log_table(data.get("log"), str(path)), None
-    config = read_config(path)
+    config, _ = read_model(path)
     return config.log, None if config.drive.kind == "rigid" else config.drive.gear_ratio
 
 
@@ -770,7 +814,11 @@ def numeric_paths(config: Config) -> dict[str, Parameter]:
         found |= dict(_paths(effect, f"effects.{label}"))
     found.pop("run.precision", None)
     if config.drive.kind == "rigid":
-        return {path: known for path, known in found.items() if "load" not in path and not path.startswith("identifier.")}
+        return {
+            path: known
+            for path, known in found.items()
+            if path.startswith("effects.") or ("load" not in path and not path.startswith("identifier."))
+        }
     return found
 
 

@@ -1,15 +1,19 @@
 """Parameters of a machine from its log: the function behind `jaxbl identify`.
 
-A trajectory fit with intervals, and beside it the paper's chain: the study's observers run on the recorded positions, and
-the recursive identifier (27)-(28) on their equivalent control.
+A trajectory fit with intervals, and beside it what else a log allows: the equations of motion at smoothed kinematics (and
+the measured transmitted torque, if there is one), and the paper's chain, the study's observers run on the recorded positions
+with the recursive identifier (27)-(28) on their equivalent control.
 """
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false
 
 import dataclasses
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +24,20 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.drive.parameters import get_leaf, leaf_paths, set_leaves
-from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
-from jaxbl.identify.intervals import Refusal, Spread, interval, refusals, spread
-from jaxbl.identify.smoother import Smoothed, smooth
-from jaxbl.identify.trajectory import PHYSICAL, Fit, Free, Windows, cut, fit, free_parameters, is_positive
-from jaxbl.records import Record, read_record
+from jaxbl.identify.gains import Gains, choose_gains
+from jaxbl.identify.intervals import LIMIT, Refusal, Spread, interval, spread
+from jaxbl.identify.profile import Profile, profile
+from jaxbl.identify.regression import Kinematics, errors, from_smoothed, regress, shortest
+from jaxbl.identify.search import Channels, Found, Search, Settings, smoothed_channels, windows_of
+from jaxbl.identify.trajectory import PHYSICAL, Fit, Free, free_parameters, is_positive, projected_residual
+from jaxbl.records import Record, join, read_record
 from jaxbl.simulate import Experiment, Signals, State, replay
 
-from .config import Config, IdentifyTable, read_config, with_values
+from .config import Config, read_model, with_values
 from .engine import prepare
 from .store import plain
 
-_LONG, _SHORT = 500, 50
-"""Samples of the windows that are tried where the study gives none."""
-_MOST_COARSE = 100
-_FEWEST = 20
 _LOG_NAMES = {"motor": "theta_e", "load": "theta_s"}
 
 
@@ -46,10 +48,12 @@ class Identification:
     Attributes:
         config: the study, with its nominal numbers.
         model: the study with the numbers found.
-        record: the log.
+        record: the log, or the logs one after the other.
         summary: as in `identification.json`.
-        trace: one row a sample: `t`, `u`, positions, smoothed velocities and accelerations with standard deviations,
-            residuals of the fit (rad), and what the observers and the recursive identifier make of the record.
+        trace: one row a sample: `t`, `u`, positions, `transmitted` where it was measured, smoothed velocities and
+            accelerations with standard deviations, residuals of the fit (rad), the fitted law's torque at the smoothed
+            positions (`torque`), and what the observers and the recursive identifier make of the record.
+        replays: whether the model's excitation is to be the log's, for want of one in the study.
     """
 
     config: Config
@@ -57,57 +61,142 @@ class Identification:
     record: Record
     summary: dict[str, Any]
     trace: pd.DataFrame
+    replays: bool
 
 
-def identify(
-    log: str | Path | Record,
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """A study, its log, and what is asked of them: everything that decides the result.
+
+    Attributes:
+        config: the study.
+        missing: tables that the study does not have (`excitation`, `observer.motor`, `observer.load`).
+        record: the log.
+        holdout: another log, on which the numbers are tried out; or None.
+    """
+
+    config: Config
+    missing: frozenset[str]
+    record: Record
+    holdout: Record | None
+
+    @property
+    def identity(self) -> str:
+        """Hash of everything that decides the result."""
+        text = json.dumps([self.config.resolved(), sorted(self.missing), version("jaxbl")], sort_keys=True)
+        total = hashlib.sha256(text.encode())
+        for record in (self.record, self.holdout):
+            if record is not None:
+                total.update(str(record.segments).encode())
+                for values in (record.time, record.torque, *record.positions.values(), record.transmitted):
+                    total.update(b"" if values is None else np.ascontiguousarray(values).tobytes())
+        return total.hexdigest()[:16]
+
+
+Logs = str | Path | Record | Sequence[str | Path | Record]
+
+
+def read_task(
+    log: Logs,
     model: str | Path | Mapping[str, Any] | Config,
     *,
     parameters: Sequence[str] | None = None,
+    holdout: Logs | None = None,
+    profile: bool | None = None,
+) -> Task:
+    """Read study and logs; arguments as of :func:`identify`.
+
+    Raises:
+        InputError: unfit log or study.
+    """
+    config, missing = read_model(model)
+    asked = {"parameters": None if parameters is None else list(parameters), "profile": profile}
+    given = {key: value for key, value in asked.items() if value is not None}
+    config = config.model_copy(update={"identify": config.identify.model_copy(update=given)})
+    return Task(config, missing, _read(config, log), None if holdout is None else _read(config, holdout))
+
+
+def identify(
+    log: Logs,
+    model: str | Path | Mapping[str, Any] | Config,
+    *,
+    parameters: Sequence[str] | None = None,
+    holdout: Logs | None = None,
+    profile: bool | None = None,
 ) -> Identification:
     """Identify a machine from its log.
 
     Args:
-        log: the file, read as the study's `[log]` table says, or a record.
-        model: study with nominal numbers: TOML file, mapping or config.
+        log: the file, read as the study's `[log]` table says, or a record; or several of them, of one machine.
+        model: study with nominal numbers: TOML file, mapping or config. `[excitation]` and `[observer]` may be missing: the
+            input is the log's, and gains are chosen on it.
         parameters: dotted paths of the numbers to find, in place of `[identify] parameters`.
+        holdout: another log (or several) of the machine, on which the model found is tried out.
+        profile: whether to compute profile-likelihood intervals, in place of `[identify] profile`.
 
     Raises:
         InputError: unfit log or study, or a number that cannot be fitted.
     """
-    config = read_config(model)
-    settings = config.identify
-    record = log if isinstance(log, Record) else record_for(config, log)
-    assert record.torque is not None
-    with jax.enable_x64(True):
-        experiment = _on_record(config, record)
-        paths = list(parameters or settings.parameters or _default_paths(config, experiment))
-        free = free_parameters(experiment, paths, float(np.std(record.torque)))
-        smoothed = {side: [smooth(record.positions[side][part], record.sample_period) for part in record.segments]
-                    for side in experiment.sides}  # fmt: skip
-        noise = {side: float(np.mean([float(one.noise) for one in parts])) for side, parts in smoothed.items()}
-        search = _Search(experiment, record, smoothed, noise, settings)
-        found = search.run(free)
-        values = {one.path: float(one.value(found.fit.theta[i])) for i, one in enumerate(found.free)}
-        experiment = set_leaves(experiment, {path: jnp.asarray(value) for path, value in values.items()})
-        chain, recursive = _chain(experiment, record)
-        trace = pd.DataFrame(
-            {"t": record.time, "u": record.torque}
-            | {_LOG_NAMES[side]: record.positions[side] for side in experiment.sides}
-            | _smoothed_columns(smoothed)
-            | _residual_columns(found, record, noise, experiment.sides)
-            | chain
-        )
-        summary = _summary(config, record, experiment, found, search, noise, recursive)
-    return Identification(config, with_values(config, values), record, summary, trace)
+    return run_task(read_task(log, model, parameters=parameters, holdout=holdout, profile=profile))
 
 
-def record_for(config: Config, log: str | Path) -> Record:
-    """Read a log as a study says, with the channels that its identification needs.
+def run_task(task: Task) -> Identification:
+    """Do what :func:`read_task` read.
 
     Raises:
-        InputError: unfit log.
+        InputError: a number that cannot be fitted, or a log that the model cannot follow.
     """
+    config, record, settings = task.config, task.record, task.config.identify
+    assert record.torque is not None
+    with jax.enable_x64(True):
+        nominal = _on_record(config, record)
+        paths = list(settings.parameters or _default_paths(config, nominal))
+        free = free_parameters(nominal, paths, float(np.std(record.torque)))
+        channels = smoothed_channels(record, nominal.sides)
+        rest = config.log.initial_state == "rest"
+        how = Settings(settings.method, settings.window, settings.starts, settings.spread, settings.seed, rest)
+        found = Search(nominal, record, channels, how).run(free)
+        values = {one.path: float(one.value(found.fit.theta[i])) for i, one in enumerate(found.free)}
+        fitted = set_leaves(nominal, {path: jnp.asarray(value) for path, value in values.items()})
+        profiles = {}
+        if settings.profile:
+            profiles = profile(nominal, found.free, found.windows, found.fit, found.spread)
+        factor = _decimation(config, record)
+        parts = _kinematics(record, channels, factor)
+        gains, gain_values = _gains(task.missing, fitted, record, channels)
+        chain, recursive = _chain(set_leaves(fitted, _arrays(gain_values)), record)
+        noise = {side: float(one) for side, one in found.windows.noise.items()}
+        trace = pd.DataFrame(
+            {"t": record.time, "u": record.torque}
+            | {_LOG_NAMES[side]: record.positions[side] for side in nominal.sides}
+            | ({} if record.transmitted is None else {"transmitted": record.transmitted})
+            | _smoothed_columns(channels)
+            | _residual_columns(found, record, noise, nominal.sides)
+            | _law_column(fitted, channels)
+            | chain
+        )
+        method: dict[str, Any] = {"recursive": recursive, "trajectory": _trajectory(found, record)}
+        if parts:
+            method["regression"] = _regression(nominal, found.free, parts, factor, record)
+        summary = _summary(task, fitted, found, profiles, noise) | {"method": method}
+        summary["torque"] = errors(fitted, parts, factor) if parts else {}
+        if gains:
+            summary["gains"] = {side: one._asdict() for side, one in gains.items()}
+        if task.holdout is not None:
+            summary["holdout"] = _on_holdout(task, nominal, fitted, found.samples)
+    model = with_values(config, values | gain_values)
+    return Identification(config, model, record, plain(summary), trace, "excitation" in task.missing)
+
+
+def _read(config: Config, logs: Logs) -> Record:
+    """Read logs as a study says, with the channels that its identification needs."""
+    several = [logs] if isinstance(logs, str | Path | Record) else list(logs)
+    if not several:
+        raise InputError("no log: at least one is needed")
+    return join([one if isinstance(one, Record) else _read_one(config, one) for one in several])
+
+
+def _read_one(config: Config, log: str | Path) -> Record:
     ratio = config.drive.gear_ratio if config.drive.kind == "two_inertia" else None
     record = read_record(log, config.log, gear_ratio=ratio)
     sides = ("motor", "load") if config.drive.kind == "two_inertia" else ("motor",)
@@ -118,8 +207,13 @@ def record_for(config: Config, log: str | Path) -> Record:
                 f"the log has {', '.join(record.positions)}"
             )
     if record.torque is None:
-        raise InputError(f"{record.path}: no input torque (u), which identification needs")
+        notes = (*record.notes, "No input torque was recorded: the drive is taken to move freely, without one.")
+        record = dataclasses.replace(record, torque=np.zeros(len(record.time)), notes=notes)
     return record
+
+
+def _arrays(values: Mapping[str, float]) -> dict[str, jax.Array]:
+    return {path: jnp.asarray(value) for path, value in values.items()}
 
 
 def _on_record(config: Config, record: Record) -> Experiment:
@@ -150,142 +244,90 @@ def _default_paths(config: Config, experiment: Experiment) -> list[str]:
     ]
 
 
-@dataclasses.dataclass(frozen=True)
-class _Found:
-    """The fit that was kept."""
-
-    free: tuple[Free, ...]
-    fit: Fit
-    spread: Spread
-    window: int
-    windows: Windows
-    firsts: np.ndarray
-    refused: list[Refusal]
-    held: list[str]
-    condition: float
+def _decimation(config: Config, record: Record) -> int:
+    """Samples that become one where torques are compared."""
+    bandwidth = config.identify.bandwidth
+    if bandwidth is None:
+        return 10
+    return max(round(0.5 / (bandwidth * record.sample_period)), 1)
 
 
-class _Search:
-    """Multi-start on short windows, then fits to the whole record in windows of one or two lengths."""
-
-    def __init__(
-        self,
-        experiment: Experiment,
-        record: Record,
-        smoothed: dict[str, list[Smoothed]],
-        noise: dict[str, float],
-        settings: IdentifyTable,
-    ):
-        self.experiment, self.record, self.smoothed, self.noise, self.settings = (
-            experiment,
-            record,
-            smoothed,
-            noise,
-            settings,
-        )
-        shortest = min(part.stop - part.start for part in record.segments)
-        asked = None if settings.window is None else round(settings.window / record.sample_period)
-        if asked is not None and not _FEWEST <= asked <= shortest:
-            raise InputError(
-                f"identify.window: {settings.window:g} s are {asked} samples; it should be between {_FEWEST} samples "
-                f"({_FEWEST * record.sample_period:g} s) and the log's shortest part ({shortest * record.sample_period:g} s)"
-            )
-        lengths = {_SHORT, _LONG} if asked is None else {asked}
-        self.lengths = sorted({min(length, shortest // 2 if asked is None else shortest) for length in lengths})
-        self.starts: list[dict[str, Any]] = []
-        self._fit = eqx.filter_jit(fit)
-        self._fits = eqx.filter_jit(lambda e, free, w, thetas: jax.vmap(lambda theta: fit(e, free, w, theta, 30))(thetas))
-
-    def windows(self, samples: int) -> tuple[Windows, np.ndarray]:
-        """The record in windows, segment by segment, and the row that each begins with."""
-        record, pieces, firsts = self.record, [], []
-        assert record.torque is not None
-        for i, part in enumerate(record.segments):
-            found = {side: parts[i] for side, parts in self.smoothed.items()}
-            count = part.stop - part.start
-            start = PlantState(
-                {side: one.position for side, one in found.items()},
-                {side: one.velocity for side, one in found.items()},
-                jax.tree.map(
-                    lambda x, count=count: jnp.full(count, x), self.experiment.plant.init(self.experiment.initial).effects
-                ),
-            )
-            measured = {side: record.positions[side][part] for side in found}
-            pieces.append(cut(record.torque[part], measured, record.sample_period, start, self.noise, samples))
-            firsts.append(part.start + samples * np.arange(count // samples))
-        noise = pieces[0].noise
-        joined = jax.tree.map(lambda *x: jnp.concatenate(x), *(dataclasses.replace(p, noise={}) for p in pieces))
-        first = np.concatenate(firsts)
-        time = jnp.asarray(record.time[first] - record.time[0])
-        return dataclasses.replace(joined, noise=noise, time=time), first
-
-    def run(self, free: tuple[Free, ...]) -> _Found:
-        """Fit; directions that the record does not show are taken out one number at a time."""
-        theta = self._coarse(free)
-        everything, refused, held = free, [], []
-        while True:
-            found = self._whole(free, theta)
-            shown, condition = refusals(free, found[1])
-            if not refused:
-                first_condition = condition
-            if not shown or len(free) == 1:
-                break
-            refused = refused or shown
-            worst = max(shown, key=lambda one: one.deviation)
-            out = max(worst.direction, key=lambda path: abs(worst.direction[path]))
-            held.append(out)
-            keep = [i for i, one in enumerate(free) if one.path != out]
-            free, theta = tuple(free[i] for i in keep), theta[jnp.asarray(keep)]
-        assert len(everything) == len(free) + len(held)
-        return _Found(free, *found, refused, held, first_condition)
-
-    def _coarse(self, free: tuple[Free, ...]) -> jax.Array:
-        """Best of several starts, on short windows from all over the record."""
-        windows, _ = self.windows(self.lengths[0])
-        if len(windows.time) > _MOST_COARSE:
-            pick = np.linspace(0, len(windows.time) - 1, _MOST_COARSE).astype(int)
-            noise = windows.noise
-            chosen = jax.tree.map(lambda x: x[pick], dataclasses.replace(windows, noise={}))
-            windows = dataclasses.replace(chosen, noise=noise)
-        random = np.random.default_rng(self.settings.seed)
-        reach = np.log(self.settings.spread)
-        thetas = np.zeros((self.settings.starts, len(free)))
-        thetas[1:] = random.uniform(-reach, reach, thetas[1:].shape)
-        found = self._fits(self.experiment, free, windows, jnp.asarray(thetas))
-        cost = np.where(np.isfinite(np.asarray(found.cost)), np.asarray(found.cost), np.inf)
-        if not np.isfinite(cost).any():
-            raise InputError(
-                f"{self.record.path}: the model diverges from every start; its nominal numbers should be nearer"
-            )
-        best = int(np.argmin(cost))
-        self.starts = [
-            {"cost": float(c), "agrees": bool(c <= cost[best] * 1.01), "theta": t.tolist()}
-            for c, t in zip(cost, np.asarray(found.theta), strict=True)
-        ]
-        return found.theta[best]
-
-    def _whole(self, free: tuple[Free, ...], theta: jax.Array) -> tuple[Fit, Spread, int, Windows, np.ndarray]:
-        """The fit to all of the record; of the windows tried, those with the narrower intervals on the whole.
-
-        Long windows tell more where noise alone disturbs; where the model does not explain everything, errors grow along
-        them, and the intervals, which know correlated residuals, become wider than those of short windows.
-        """
-        best = None
-        for samples in self.lengths:
-            windows, firsts = self.windows(samples)
-            found = self._fit(self.experiment, free, windows, theta)
-            width = spread(found)
-            size = float(jnp.sum(jnp.log(jnp.diag(width.covariance))))
-            if np.isfinite(size) and (best is None or size < best[0]):
-                best = size, (found, width, samples, windows, firsts)
-        if best is None:
-            raise InputError(f"{self.record.path}: the model diverges on this log; its nominal numbers should be nearer")
-        return best[1]
+def _kinematics(record: Record, channels: Channels, factor: int) -> list[Kinematics]:
+    """The parts of a record that are long enough to be decimated."""
+    assert record.torque is not None
+    found = []
+    for i, part in enumerate(record.segments):
+        if part.stop - part.start >= max(2 * shortest(factor), 50):
+            smoothed = {side: parts[i] for side, parts in channels.smoothed.items()}
+            transmitted = None if record.transmitted is None else record.transmitted[part]
+            time = record.time[part] - record.time[0]
+            found.append(from_smoothed(time, record.torque[part], smoothed, transmitted))
+    return found
 
 
-def _smoothed_columns(smoothed: dict[str, list[Smoothed]]) -> dict[str, np.ndarray]:
+def _gains(
+    missing: frozenset[str], fitted: Experiment, record: Record, channels: Channels
+) -> tuple[dict[str, Gains], dict[str, float]]:
+    """Gains of the observers that the study leaves open, by side and by dotted path."""
+    sides = [side for side in fitted.sides if f"observer.{side}" in missing]
+    if not sides:
+        return {}, {}
+    i = int(np.argmax([part.stop - part.start for part in record.segments]))
+    part = record.segments[i]
+    assert record.torque is not None
+    smoothed = {side: parts[i] for side, parts in channels.smoothed.items()}
+    kinematics = from_smoothed(record.time[part] - record.time[part][0], record.torque[part], smoothed)
+    chosen = choose_gains(fitted, kinematics, {side: record.positions[side][part] for side in fitted.sides})
+    values = {}
+    for side in sides:
+        values |= {f"observer.{side}.lambda": chosen[side].lambda_, f"observer.{side}.alpha": chosen[side].alpha}
+    return {side: chosen[side] for side in sides}, values
+
+
+def _law_column(fitted: Experiment, channels: Channels) -> dict[str, np.ndarray]:
+    """Transmitted torque by the fitted law at the smoothed positions, N m."""
+    plant = fitted.plant
+    if plant.transmission is None:
+        return {}
+    pieces = []
+    for parts in zip(*(channels.smoothed[side] for side in fitted.sides), strict=True):
+        moving = dict(zip(fitted.sides, parts, strict=True))
+        position, velocity = ({side: one.state[:, i] for side, one in moving.items()} for i in range(2))
+        pieces.append(jax.vmap(lambda position, velocity: plant.transmitted(position, velocity)[0])(position, velocity))
+    return {"torque": np.concatenate([np.asarray(x) for x in pieces])}
+
+
+def _on_holdout(task: Task, nominal: Experiment, fitted: Experiment, samples: int) -> dict[str, Any]:
+    """How well the numbers found serve another log, beside the nominal ones."""
+    config, record = task.config, task.holdout
+    assert record is not None
+    period = jnp.asarray(record.sample_period)
+    rebased = [eqx.tree_at(lambda e: e.run.sample_period, one, period) for one in (nominal, fitted)]
+    channels = smoothed_channels(record, nominal.sides)
+    longest = max(part.stop - part.start for part in record.segments)
+    windows, _ = windows_of(record, channels, nominal, min(samples, longest), config.log.initial_state == "rest")
+    left = [eqx.filter_jit(projected_residual)(one, windows)[0] for one in rebased]
+    position = {}
+    for i, side in enumerate(nominal.sides):
+        before, after = (channels.noise[side] * float(jnp.sqrt(jnp.mean(one[:, :, i] ** 2))) for one in left)
+        position[side] = {"rms": after, "nominal_rms": before, "noise": channels.noise[side]}
+    factor = _decimation(config, record)
+    parts = _kinematics(record, channels, factor)
+    torque = errors(rebased[1], parts, factor) if parts else {}
+    before = errors(rebased[0], parts, factor) if parts else {}
+    for name, one in torque.items():
+        one["nominal_relative"] = before[name]["relative"]
+    return {
+        "file": str(record.path.resolve()),
+        "window": windows.torque.shape[1] * record.sample_period,
+        "position": position,
+        "torque": torque,
+    }
+
+
+def _smoothed_columns(channels: Channels) -> dict[str, np.ndarray]:
     columns = {}
-    for side, parts in smoothed.items():
+    for side, parts in channels.smoothed.items():
         for order, name in ((1, "velocity"), (2, "acceleration")):
             columns[f"{side}.{name}"] = np.concatenate([np.asarray(one.state[:, order]) for one in parts])
             columns[f"{side}.{name}_deviation"] = np.concatenate([np.asarray(one.deviation(order)) for one in parts])
@@ -293,10 +335,10 @@ def _smoothed_columns(smoothed: dict[str, list[Smoothed]]) -> dict[str, np.ndarr
 
 
 def _residual_columns(
-    found: _Found, record: Record, noise: dict[str, float], sides: tuple[str, ...]
+    found: Found, record: Record, noise: dict[str, float], sides: tuple[str, ...]
 ) -> dict[str, np.ndarray]:
     columns = {}
-    rows = (found.firsts[:, None] + np.arange(found.window)).ravel()
+    rows = (found.firsts[:, None] + np.arange(found.samples)[None, :]).ravel()
     for i, side in enumerate(sides):
         column = np.full(len(record.time), np.nan)
         column[rows] = noise[side] * np.asarray(found.fit.residual[:, :, i]).ravel()
@@ -337,7 +379,7 @@ def _chain(experiment: Experiment, record: Record) -> tuple[dict[str, np.ndarray
     return columns, found
 
 
-def _derived(experiment: Experiment, found: _Found) -> dict[str, Any]:
+def _derived(experiment: Experiment, found: Found) -> dict[str, Any]:
     """What else the law's numbers say (half_gap beside dead_zone), with standard errors by the delta method."""
     if experiment.transmission is None:
         return {}
@@ -359,68 +401,89 @@ def _derived(experiment: Experiment, found: _Found) -> dict[str, Any]:
     return derived
 
 
-def _summary(
-    config: Config,
-    record: Record,
-    experiment: Experiment,
-    found: _Found,
-    search: _Search,
-    noise: dict[str, float],
-    recursive: dict[str, Any],
-) -> dict[str, Any]:
-    theta, width = np.asarray(found.fit.theta), np.asarray(found.spread.covariance)
-    deviation = np.sqrt(np.diag(width))
-    parameters = {}
-    for i, one in enumerate(found.free):
-        low, high = interval(one, theta[i], deviation[i])
-        parameters[one.path] = {
+def _parameters(free: Sequence[Free], fit: Fit, width: Spread) -> dict[str, dict[str, Any]]:
+    """Values with standard errors and 95 % intervals, by path."""
+    theta, deviation = np.asarray(fit.theta), np.sqrt(np.diag(np.asarray(width.covariance)))
+    return {
+        one.path: {
             "value": float(one.value(theta[i])),
             "standard_error": float(one.slope(theta[i])) * deviation[i],
-            "interval": [low, high],
+            "interval": list(interval(one, theta[i], deviation[i])),
             "unit": one.unit,
             "nominal": one.nominal,
         }
-    parameters |= _derived(experiment, found)
-    residual = {
-        side: {
-            "rms": noise[side] * float(jnp.sqrt(jnp.mean(found.fit.residual[:, :, i] ** 2))),
-            "noise": noise[side],
-        }
-        for i, side in enumerate(experiment.sides)
+        for i, one in enumerate(free)
     }
-    agreeing = sum(start["agrees"] for start in search.starts)
-    return plain(
-        {
-            "title": config.title,
-            "file": str(record.path.resolve()),
-            "samples": len(record.time),
-            "sample_period": record.sample_period,
-            "parameters": parameters,
-            "correlation": {
-                "parameters": [one.path for one in found.free],
-                "matrix": width / np.outer(deviation, deviation),
-            },
-            "refused": [
-                {"direction": one.direction, "why": _why(one), "relative_deviation": one.deviation} for one in found.refused
-            ],
-            "held": found.held,
-            "condition": found.condition,
-            "residual": residual,
-            "method": {
-                "recursive": recursive,
-                "trajectory": {
-                    "window": found.window * record.sample_period,
-                    "windows": len(found.firsts),
-                    "converged": found.fit.converged,
-                    "starts": len(search.starts),
-                    "starts_agreeing": agreeing,
-                    "variance_over_noise": found.spread.variance,
-                    "inflation": dict(zip([one.path for one in found.free], found.spread.inflation, strict=True)),
-                },
-            },
-            "notes": list(record.notes),
-        }
-    )
+
+
+def _regression(
+    nominal: Experiment, free: Sequence[Free], parts: Sequence[Kinematics], factor: int, record: Record
+) -> dict[str, Any]:
+    """Least squares on the equations of motion; numbers that they do not show are left out."""
+    found = regress(nominal, free, parts, factor)
+    information = np.einsum("wtsp,wtsq->pq", found.jacobian, found.jacobian)
+    values, vectors = np.linalg.eigh(information)
+    blind = values < 1.0 / LIMIT**2
+    seen = [i for i in range(len(free)) if not np.any(np.abs(vectors[i, blind]) > 0.1)]
+    all_of_it = _parameters(free, found, spread(found))
+    at = {free[i].path: jnp.asarray(all_of_it[free[i].path]["value"]) for i in range(len(free))}
+    return {
+        "parameters": {free[i].path: all_of_it[free[i].path] for i in seen},
+        "measured_transmitted_torque": record.transmitted is not None,
+        "bandwidth": 0.5 / (factor * record.sample_period),
+        "torque": errors(set_leaves(nominal, at), parts, factor),
+        "converged": found.converged,
+    }
+
+
+def _trajectory(found: Found, record: Record) -> dict[str, Any]:
+    agreeing = sum(start["agrees"] for start in found.starts)
+    return {
+        "kind": "prediction_error" if found.smoothness else "output_error",
+        "window": found.samples * record.sample_period,
+        "windows": len(found.firsts),
+        "converged": found.fit.converged,
+        "starts": len(found.starts),
+        "starts_agreeing": agreeing,
+        "variance_over_noise": found.spread.variance,
+        "inflation": dict(zip([one.path for one in found.free], found.spread.inflation, strict=True)),
+        "smoothness": found.smoothness,
+    }
+
+
+def _summary(
+    task: Task, fitted: Experiment, found: Found, profiles: Mapping[str, Profile], noise: Mapping[str, float]
+) -> dict[str, Any]:
+    record, width = task.record, np.asarray(found.spread.covariance)
+    deviation = np.sqrt(np.diag(width))
+    parameters = _parameters(found.free, found.fit, found.spread)
+    for path, one in profiles.items():
+        points = [list(point) for point in zip(one.values.tolist(), one.deviance.tolist(), strict=True)]
+        parameters[path] |= {"profile_interval": list(one.interval), "profile": points}
+    parameters |= _derived(fitted, found)
+    residual = {
+        side: {"rms": noise[side] * float(jnp.sqrt(jnp.mean(found.fit.residual[:, :, i] ** 2))), "noise": noise[side]}
+        for i, side in enumerate(fitted.sides)
+    }
+    return {
+        "title": task.config.title,
+        "identity": task.identity,
+        "file": str(record.path.resolve()),
+        "samples": len(record.time),
+        "sample_period": record.sample_period,
+        "parameters": parameters,
+        "correlation": {
+            "parameters": [one.path for one in found.free],
+            "matrix": width / np.outer(deviation, deviation),
+        },
+        "refused": [
+            {"direction": one.direction, "why": _why(one), "relative_deviation": one.deviation} for one in found.refused
+        ],
+        "held": found.held,
+        "condition": found.condition,
+        "residual": residual,
+        "notes": list(record.notes),
+    }
 
 
 _HELP = {

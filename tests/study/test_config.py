@@ -164,7 +164,7 @@ BAD = {
         "[transmission] has no meaning on a rigid drive; remove it, or use drive.kind = 'two_inertia'",
     ),
     "rigid with load observer": (rigid({"observer.load": {"lambda": 1.0, "alpha": 1.0}}), "observer.load has no meaning"),
-    "rigid with load effect": (rigid(effects=[EFFECTS["load.gravity"]]), "effects[0]: load.gravity has no meaning"),
+    "rigid with load effect": (rigid(effects=[EFFECTS["load.inertia"]]), "effects[0]: load.inertia has no meaning"),
     "no transmission": (small({"transmission": None}), "[transmission] is missing"),
     "no load observer": (small({"observer.load": None}), "observer.load is missing"),
     "exact path": (small({"uncertainty.exact": ["drive.gear_rati"]}), "nearest valid path: 'drive.gear_ratio'"),

@@ -1,0 +1,92 @@
+"""Gains of the observers from a record itself: its disturbance and its noise.
+
+The smoother gives velocity and disturbance without the delay that an observer has. Gains are tried on the record, all at
+once, and those are taken whose velocity comes nearest to the smoothed one, of those that keep a margin to the exact
+convergence condition (:func:`jaxbl.observer.conditions.least_lambda_exact`) for the largest disturbance seen.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbl.drive.parameters import set_leaves
+from jaxbl.observer.conditions import least_lambda_exact
+from jaxbl.simulate import Experiment, Signals, State, replay
+
+from .regression import Kinematics
+
+_ALPHA = np.geomspace(1.1, 6.0, 10)
+_LAMBDA = np.geomspace(1.1, 12.0, 12)
+_MOST = 20_000
+
+
+class Gains(NamedTuple):
+    """Gains chosen for one observer.
+
+    Attributes:
+        lambda_: √(rad/s).
+        alpha: rad/s^2.
+        f_plus: largest disturbance of the record, rad/s^2.
+        velocity_error: rms difference to the smoothed velocity, rad/s.
+    """
+
+    lambda_: float
+    alpha: float
+    f_plus: float
+    velocity_error: float
+
+
+def disturbance(experiment: Experiment, kinematics: Kinematics, side: str) -> Float[Array, " samples"]:
+    """Acceleration of a side that its observer's nominal model does not explain, rad/s^2."""
+    k = kinematics
+    return k.acceleration[side] - experiment.drive.acceleration(side, k.velocity[side], k.torque)
+
+
+def choose_gains(
+    experiment: Experiment, kinematics: Kinematics, measured: dict[str, Float[Array, " samples"]]
+) -> dict[str, Gains]:
+    """Choose the gains of all observers on a part of a record.
+
+    Args:
+        experiment: with array leaves.
+        kinematics: of the part, by the smoother.
+        measured: its positions in rad.
+    """
+    count = min(len(kinematics.time), _MOST)
+    k = jax.tree.map(lambda x: x[:count], kinematics)
+    ends = slice(min(20, count // 10), count - min(20, count // 10))
+    f_plus = {side: float(jnp.max(jnp.abs(disturbance(experiment, k, side)[ends]))) for side in experiment.sides}
+    alpha, factor = (jnp.asarray(x.ravel()) for x in np.meshgrid(_ALPHA, _LAMBDA))
+    tried = {}
+    for side, bound in f_plus.items():
+        bound = max(bound, np.finfo(float).tiny)
+        tried[f"observer.{side}.alpha"] = alpha * bound
+        tried[f"observer.{side}.lambda"] = factor * least_lambda_exact(alpha * bound, jnp.full_like(alpha, bound))
+
+    def velocity(state: State, signals: Signals) -> dict[str, Any]:
+        return {side: signals.side(side).velocity_estimate for side in experiment.sides}
+
+    @eqx.filter_jit
+    def misses(tried: dict[str, Array], readings: dict[str, Array]) -> dict[str, Array]:
+        def one(values: dict[str, Array]) -> dict[str, Array]:
+            _, found = replay(set_leaves(experiment, values), k.torque, readings, record=velocity)
+            settled = slice(count // 4, None)
+            return {
+                side: jnp.sqrt(jnp.mean((found[side][settled] - velocity[settled]) ** 2))
+                for side, velocity in k.velocity.items()
+            }
+
+        return jax.vmap(one)(tried)
+
+    missed = misses(tried, {side: jnp.asarray(measured[side])[:count] for side in experiment.sides})
+    chosen = {}
+    for side in experiment.sides:
+        size = np.asarray(missed[side])
+        best = int(np.argmin(np.where(np.isfinite(size), size, np.inf)))
+        lambda_, alpha_ = (float(tried[f"observer.{side}.{name}"][best]) for name in ("lambda", "alpha"))
+        chosen[side] = Gains(lambda_, alpha_, f_plus[side], float(size[best]))
+    return chosen

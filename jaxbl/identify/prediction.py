@@ -1,0 +1,80 @@
+"""Prediction errors: how strongly a predictor should follow the readings, where disturbances act that no model knows.
+
+Each side's predictor is the drive's own model, corrected by the steady-state Kalman gain of a position whose velocity is
+driven by white noise of density q; what is open is q h^3 / sigma^2 alone. Of all, the gain with the least prediction errors
+is the one of largest likelihood, since their scale is free. The super-twisting correction (8) is no such predictor: it
+brings all noise of a reading into the next prediction, and noise in a prediction biases the numbers fitted to it.
+References: L. Ljung, System Identification (1999), 7.4, 7.5; Y. Bar-Shalom, X.-R. Li, T. Kirubarajan (2001), 6.5.
+"""
+
+import dataclasses
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.linalg import solve_discrete_are
+
+from jaxbl.simulate import Experiment
+
+from .trajectory import Windows, projected_residual
+
+_COARSE = 10.0 ** np.arange(-12.0, 1.0)
+_FINE = 10.0 ** np.arange(-2.0, 2.1, 0.5)
+_MOST_WINDOWS = 40
+
+
+def kalman_gain(smoothness: float, period: float) -> np.ndarray:
+    """Steady-state gain on position (1) and velocity (1/s) for a smoothness q h^3 / sigma^2; shape (2,)."""
+    f = np.array([[1.0, 1.0], [0.0, 1.0]])
+    q = smoothness * np.array([[1.0 / 3.0, 0.5], [0.5, 1.0]])
+    covariance = solve_discrete_are(f.T, np.array([[1.0], [0.0]]), q, np.eye(1))
+    gain = covariance[:, 0] / (covariance[0, 0] + 1.0)
+    return gain * np.array([1.0, 1.0 / period])
+
+
+@eqx.filter_jit
+def _sizes(experiment: Experiment, windows: Windows, gains: dict[str, Float[Array, "n 2"]]) -> Float[Array, "n sides"]:
+    """Rms prediction error of each side in rad, for several gains."""
+    noise = jnp.stack([windows.noise[side] for side in experiment.sides])
+
+    def one(gain: dict[str, Array]) -> Array:
+        residual, _ = projected_residual(experiment, dataclasses.replace(windows, gain=gain))
+        return noise * jnp.sqrt(jnp.mean(residual**2, axis=(0, 1)))
+
+    return jax.vmap(one)(gains)
+
+
+def predictor(experiment: Experiment, windows: Windows) -> tuple[Windows, dict[str, float]]:
+    """The windows with the gain whose prediction errors are least, and their size as noise.
+
+    Args:
+        experiment: with the numbers found so far.
+        windows: the record.
+
+    Returns:
+        The windows, and each side's smoothness q h^3 / sigma^2.
+    """
+    period = float(experiment.run.sample_period)
+    count = len(windows.time)
+    few = windows.only(np.unique(np.linspace(0, count - 1, min(count, _MOST_WINDOWS)).astype(int)))
+    gains_of = partial(_gains, period)
+
+    def best(candidates: list[dict[str, float]]) -> dict[str, float]:
+        sizes = _sizes(experiment, few, {side: gains_of([c[side] for c in candidates]) for side in experiment.sides})
+        total = np.asarray(jnp.sum(jnp.log(sizes), axis=1))
+        return candidates[int(np.argmin(np.where(np.isfinite(total), total, np.inf)))]
+
+    chosen = best([dict.fromkeys(experiment.sides, float(x)) for x in _COARSE])
+    for side in experiment.sides:
+        chosen = best([chosen | {side: float(chosen[side] * x)} for x in _FINE])
+    gain = {side: gains_of([value])[0] for side, value in chosen.items()}
+    windows = dataclasses.replace(windows, gain=gain)
+    size = _sizes(experiment, windows, {side: one[None] for side, one in gain.items()})[0]
+    return dataclasses.replace(windows, noise=dict(zip(experiment.sides, size, strict=True))), chosen
+
+
+def _gains(period: float, smoothness: list[float]) -> Float[Array, "n 2"]:
+    return jnp.asarray(np.stack([kalman_gain(one, period) for one in smoothness]))

@@ -1,0 +1,220 @@
+"""Regression on the equations of motion: torques that are left over at known kinematics, and the numbers that leave least.
+
+What is commonly done with a log (inverse dynamics, ordinary least squares on filtered derivatives), and what a measured
+transmitted torque allows without any observer. Residual and regressors pass one decimation filter.
+References: M. Gautier, Dynamic identification of robots with power model, ICRA (1997); A. Janot, M. Gautier, M. Brunot, Data
+set and reference models of EMPS, Workshop on Nonlinear System Identification Benchmarks (2019).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+from scipy import signal
+
+from jaxbl.drive.plant import PlantState
+from jaxbl.simulate import Experiment
+
+from .smoother import Smoothed
+from .trajectory import WIDE, Fit, Free, with_values
+
+_PASSES = 3
+"""Fits, each with the weights of the residuals of the one before."""
+
+
+class Kinematics(eqx.Module):
+    """Part of a record without gaps, with derivatives.
+
+    Attributes:
+        time: s, shape (samples,).
+        torque: input in N m, its mean over the sampling period around each sample, shape (samples,).
+        position, velocity, acceleration: of each side; rad, rad/s, rad/s^2; shape (samples,).
+        transmitted: measured transmitted torque in N m, shape (samples,), or None.
+    """
+
+    time: Float[Array, " samples"]
+    torque: Float[Array, " samples"]
+    position: dict[str, Float[Array, " samples"]]
+    velocity: dict[str, Float[Array, " samples"]]
+    acceleration: dict[str, Float[Array, " samples"]]
+    transmitted: Float[Array, " samples"] | None = None
+
+
+def from_smoothed(
+    time: np.ndarray, torque: np.ndarray, smoothed: dict[str, Smoothed], transmitted: np.ndarray | None = None
+) -> Kinematics:
+    """Kinematics by the fixed-interval smoother; `torque` is the input held from each sample to the next."""
+    states = {side: one.state for side, one in smoothed.items()}
+    return _kinematics(time, torque, states, transmitted)
+
+
+def differentiated(
+    time: np.ndarray,
+    torque: np.ndarray,
+    positions: dict[str, np.ndarray],
+    cutoff: float,
+    transmitted: np.ndarray | None = None,
+) -> Kinematics:
+    """Kinematics as commonly found: Butterworth low-pass of 4th order forth and back, then central differences.
+
+    Args:
+        time: even, s.
+        torque: input held from each sample to the next, N m.
+        positions: of each side, rad.
+        cutoff: of the low-pass, Hz.
+        transmitted: measured transmitted torque, N m.
+    """
+    period = (time[-1] - time[0]) / (len(time) - 1)
+    sections = signal.butter(4, min(2.0 * cutoff * period, 0.99), output="sos")
+    states = {}
+    for side, position in positions.items():
+        smooth = signal.sosfiltfilt(sections, position)
+        velocity = np.gradient(smooth, period)
+        states[side] = jnp.asarray(np.stack([smooth, velocity, np.gradient(velocity, period)], axis=1))
+    return _kinematics(time, torque, states, transmitted)
+
+
+def _kinematics(
+    time: np.ndarray, torque: np.ndarray, states: dict[str, Array], transmitted: np.ndarray | None
+) -> Kinematics:
+    held = np.asarray(torque, float)
+    before = np.concatenate([held[:1], held[:-1]])
+    position, velocity, acceleration = ({side: state[:, i] for side, state in states.items()} for i in range(3))
+    mean = jnp.asarray(0.5 * (before + held))
+    measured = None if transmitted is None else jnp.asarray(transmitted)
+    return Kinematics(jnp.asarray(time), mean, position, velocity, acceleration, measured)
+
+
+class Balance(NamedTuple):
+    """One equation of the drive along a record.
+
+    Attributes:
+        residual: torque that the equation leaves over, N m, shape (samples,).
+        drive: torque that drives the side (input or transmitted torque; the measured one for the transmission), N m.
+    """
+
+    residual: Float[Array, " samples"]
+    drive: Float[Array, " samples"]
+
+
+def balance(experiment: Experiment, kinematics: Kinematics) -> dict[str, Balance]:
+    """Equations of motion at known kinematics, by name: each side, and `transmission` where its torque was measured.
+
+    A side's residual is the torque that the model has too much there: all torques less inertia times acceleration.
+    """
+    plant, drive, k = experiment.plant, experiment.drive, kinematics
+    torque = _actuated(experiment, k.torque)
+    found = {}
+    if k.transmitted is not None and plant.transmission is not None:
+        through = jax.vmap(lambda position, velocity: plant.transmitted(position, velocity)[0])(k.position, k.velocity)
+        found["transmission"] = Balance(k.transmitted - through, k.transmitted)
+
+    def at(position: dict, velocity: dict, torque: Array, time: Array, transmitted: Array | None) -> dict:
+        return plant.torques(position, velocity, torque, time, transmitted)
+
+    acting = jax.vmap(at)(k.position, k.velocity, torque, k.time, k.transmitted)
+    through = k.transmitted
+    if through is None and plant.transmission is not None:
+        through = jax.vmap(lambda position, velocity: plant.transmitted(position, velocity)[0])(k.position, k.velocity)
+    for side, (total, level) in acting.items():
+        resisting = drive.viscous(side) * k.velocity[side] + level * jnp.sign(k.velocity[side])
+        driving = torque if side == "motor" or through is None else drive.torque_gain(side) * through
+        found[side] = Balance(total - resisting - plant.inertia(side) * k.acceleration[side], driving)
+    return found
+
+
+def _actuated(experiment: Experiment, torque: Float[Array, " samples"]) -> Float[Array, " samples"]:
+    """The torque that acts, of the one that was commanded."""
+    effects, period = experiment.effects, experiment.run.sample_period
+    if not any(effect.place == "actuator" for effect in effects):
+        return torque
+
+    def sample(states: list, torque: Array) -> tuple[list, Array]:
+        new = []
+        for effect, state in zip(effects, states, strict=True):
+            state, torque = effect.actuate(state, torque, period)
+            new.append(state)
+        return new, torque
+
+    start = jax.tree.map(lambda x: jnp.asarray(x, torque.dtype), [effect.init() for effect in effects])
+    return jax.lax.scan(sample, start, torque)[1]
+
+
+def decimate(values: Float[Array, " samples"], factor: int) -> Float[Array, " less"]:
+    """Zero-phase low-pass (Hamming window) and every `factor`-th sample, but for the ends, where the filter does not fit."""
+    if factor == 1:
+        return values
+    taps = jnp.asarray(signal.firwin(20 * factor + 1, 1.0 / factor), values.dtype)
+    return jnp.convolve(values, taps, "valid")[::factor]
+
+
+def errors(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, dict[str, float]]:
+    """How far a model misses the torques, after decimation: rms in N m, and relative to the driving torque's rms."""
+    found: dict[str, list[Balance]] = {}
+    for part in parts:
+        for name, one in eqx.filter_jit(balance)(experiment, part).items():
+            found.setdefault(name, []).append(Balance(decimate(one.residual, factor), decimate(one.drive, factor)))
+    figures = {}
+    for name, pieces in found.items():
+        left, drive = (float(jnp.sqrt(jnp.mean(jnp.concatenate(x) ** 2))) for x in zip(*pieces, strict=True))
+        figures[name] = {"rms": left, "relative": left / drive if drive > 0.0 else float("nan")}
+    return figures
+
+
+def shortest(factor: int) -> int:
+    """Samples that a part must have to be decimated."""
+    return 1 if factor == 1 else 20 * factor + 1
+
+
+def regress(
+    experiment: Experiment,
+    free: Sequence[Free],
+    parts: Sequence[Kinematics],
+    factor: int,
+    theta: Float[Array, " parameters"] | None = None,
+) -> Fit:
+    """Least squares on all equations of motion, each weighted by what it leaves over.
+
+    Args:
+        experiment: with array leaves.
+        free: what is fitted.
+        parts: the record; parts shorter than :func:`shortest` must be left out.
+        factor: of the decimation.
+        theta: the start; left out, the nominal values.
+
+    Returns:
+        A fit whose residuals and derivatives have shape (1, samples, equations, ...), for
+        :func:`jaxbl.identify.intervals.spread`.
+    """
+    names = list(eqx.filter_eval_shape(balance, experiment, parts[0]))
+
+    def left(theta: Array, _: None = None) -> Array:
+        at = with_values(experiment, free, theta)
+        each = [balance(at, part) for part in parts]
+        columns = [jnp.concatenate([decimate(one[name].residual, factor) for one in each]) for name in names]
+        return jnp.stack(columns, axis=-1)
+
+    def weighted(theta: Array, weights: Array) -> tuple[Array, Array]:
+        return left(theta) * weights[None, :], theta / WIDE
+
+    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
+
+    @eqx.filter_jit
+    def solve(theta: Array) -> tuple[Array, Array, Array, Array]:
+        found, steps, ended = theta, jnp.zeros((), int), jnp.asarray(True)
+        for _ in range(_PASSES):
+            weights = 1.0 / jnp.maximum(jnp.sqrt(jnp.mean(left(found) ** 2, axis=0)), jnp.finfo(float).tiny)
+            solution = optx.least_squares(weighted, solver, found, weights, max_steps=200, throw=False)
+            found, steps = solution.value, steps + solution.stats["num_steps"]
+            ended = solution.result == optx.RESULTS.successful
+        return found, weights, steps, ended
+
+    found, weights, steps, ended = solve(jnp.zeros(len(free)) if theta is None else theta)
+    residual = left(found) * weights[None, :]
+    jacobian = jax.jacfwd(left)(found) * weights[None, :, None]
+    return Fit(found, PlantState({}, {}, ()), residual[None], jacobian[None], 0.5 * jnp.sum(residual**2), steps, ended)

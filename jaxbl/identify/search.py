@@ -1,0 +1,246 @@
+"""From a record to numbers: several starts on short windows, the whole record from the best, and what it does not show."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbl.drive.plant import PlantState
+from jaxbl.errors import InputError
+from jaxbl.records import Record
+from jaxbl.simulate import Experiment
+
+from .intervals import Refusal, Spread, refusals, spread
+from .prediction import predictor
+from .smoother import Smoothed, smooth
+from .trajectory import Fit, Free, Windows, cut, fit, with_values
+
+_LONG, _SHORT = 500, 50
+"""Samples of the windows that are tried where no length is asked for."""
+_MOST_COARSE = 100
+_FEWEST = 20
+_PASSES = 2
+"""Choices of the predictor's gain, each followed by a fit."""
+
+
+class Channels(NamedTuple):
+    """A record's positions smoothed, segment by segment, and the noise of their readings in rad."""
+
+    smoothed: dict[str, list[Smoothed]]
+    noise: dict[str, float]
+
+
+def smoothed_channels(record: Record, sides: Sequence[str]) -> Channels:
+    """Smooth the positions of each side."""
+    smoothed = {
+        side: [smooth(jnp.asarray(record.positions[side][part]), record.sample_period) for part in record.segments]
+        for side in sides
+    }
+    noise = {side: float(np.mean([float(one.noise) for one in parts])) for side, parts in smoothed.items()}
+    return Channels(smoothed, noise)
+
+
+def windows_of(
+    record: Record, channels: Channels, experiment: Experiment, samples: int, rest: bool = False
+) -> tuple[Windows, np.ndarray]:
+    """The record in windows, segment by segment, and the row that each begins with.
+
+    Args:
+        record: the log.
+        channels: of the record.
+        experiment: says how effects begin.
+        samples: length of a window; segments that are shorter are left out.
+        rest: whether each segment begins at rest.
+    """
+    assert record.torque is not None
+    effects = experiment.plant.init(experiment.initial).effects
+    pieces, firsts = [], []
+    for i, part in enumerate(record.segments):
+        count = part.stop - part.start
+        if count < samples:
+            continue
+        found = {side: parts[i] for side, parts in channels.smoothed.items()}
+        start = PlantState(
+            {side: one.position for side, one in found.items()},
+            {side: one.velocity for side, one in found.items()},
+            jax.tree.map(lambda x, count=count: jnp.full(count, x), effects),
+        )
+        measured = {side: record.positions[side][part] for side in found}
+        first = float(record.time[part.start] - record.time[0])
+        torque = record.torque[part]
+        pieces.append(cut(torque, measured, record.sample_period, start, channels.noise, samples, first, rest))
+        firsts.append(part.start + samples * np.arange(count // samples))
+    return Windows.join(pieces), np.concatenate(firsts)
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """How numbers are sought: as the study's `[identify]` and `[log]` tables say.
+
+    Attributes:
+        method: output error of free runs, or prediction error.
+        window: length of the windows in s, or None to choose it.
+        starts: number of starts.
+        spread: factor around the nominal numbers within which they lie.
+        seed: of the starts.
+        rest: whether the log begins at rest.
+    """
+
+    method: Literal["output_error", "prediction_error"]
+    window: float | None
+    starts: int
+    spread: float
+    seed: int
+    rest: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """The fit that was kept.
+
+    Attributes:
+        free: numbers that were fitted.
+        fit: from the best start.
+        spread: its covariance.
+        windows: the record as it was fitted.
+        firsts: row that each window begins with.
+        refused: directions that the record does not show.
+        held: numbers that were left at their nominal values therefore.
+        condition: of the information about all numbers asked for.
+        starts: cost and theta of each start, and whether it agrees with the best.
+        smoothness: of each side's predictor; empty for output error.
+    """
+
+    free: tuple[Free, ...]
+    fit: Fit
+    spread: Spread
+    windows: Windows
+    firsts: np.ndarray
+    refused: list[Refusal]
+    held: list[str]
+    condition: float
+    starts: list[dict[str, Any]]
+    smoothness: dict[str, float]
+
+    @property
+    def samples(self) -> int:
+        """Length of a window."""
+        return self.windows.torque.shape[1]
+
+
+class _Whole(NamedTuple):
+    """A fit to all of the record."""
+
+    fit: Fit
+    spread: Spread
+    windows: Windows
+    firsts: np.ndarray
+    smoothness: dict[str, float]
+
+
+class Search:
+    """Search of one record's numbers; compiled functions are kept from fit to fit."""
+
+    def __init__(self, experiment: Experiment, record: Record, channels: Channels, settings: Settings):
+        self.experiment, self.record, self.channels, self.settings = experiment, record, channels, settings
+        shortest = min(part.stop - part.start for part in record.segments)
+        longest = max(part.stop - part.start for part in record.segments)
+        if settings.window is None:
+            short = min(_SHORT, shortest // 2)
+            self.lengths = [short, min(_LONG, max(shortest // 2, short))]
+            if settings.method == "prediction_error":
+                self.lengths = self.lengths[1:]
+        else:
+            asked = round(settings.window / record.sample_period)
+            if not _FEWEST <= asked <= longest:
+                raise InputError(
+                    f"identify.window: {settings.window:g} s are {asked} samples; it should be between {_FEWEST} samples "
+                    f"({_FEWEST * record.sample_period:g} s) and the log's longest part "
+                    f"({longest * record.sample_period:g} s)"
+                )
+            self.lengths = [asked]
+        self._fit = eqx.filter_jit(fit)
+        self._fits = eqx.filter_jit(lambda e, free, w, thetas: jax.vmap(lambda theta: fit(e, free, w, theta, 30))(thetas))
+
+    def run(self, free: tuple[Free, ...]) -> Found:
+        """Fit; of directions that the record does not show, one number at a time is taken out.
+
+        Raises:
+            InputError: the model diverges.
+        """
+        theta, starts = self._coarse(free)
+        refused, held, first_condition = [], [], None
+        while True:
+            found = self._whole(free, theta)
+            shown, condition = refusals(free, found.spread)
+            if first_condition is None:
+                refused, first_condition = shown, condition
+            if not shown or len(free) == 1:
+                break
+            worst = max(shown, key=lambda one: one.deviation)
+            out = max(worst.direction, key=lambda path: abs(worst.direction[path]))
+            held.append(out)
+            keep = [i for i, one in enumerate(free) if one.path != out]
+            free, theta = tuple(free[i] for i in keep), theta[jnp.asarray(keep)]
+        return Found(
+            free,
+            found.fit,
+            found.spread,
+            found.windows,
+            found.firsts,
+            refused,
+            held,
+            first_condition,
+            starts,
+            found.smoothness,
+        )
+
+    def _cut(self, samples: int) -> tuple[Windows, np.ndarray]:
+        return windows_of(self.record, self.channels, self.experiment, samples, self.settings.rest)
+
+    def _coarse(self, free: tuple[Free, ...]) -> tuple[jax.Array, list[dict[str, Any]]]:
+        """Best of several starts, on short windows from all over the record."""
+        windows, _ = self._cut(self.lengths[0])
+        count = len(windows.time)
+        if count > _MOST_COARSE:
+            windows = windows.only(np.linspace(0, count - 1, _MOST_COARSE).astype(int))
+        random = np.random.default_rng(self.settings.seed)
+        reach = np.log(self.settings.spread)
+        thetas = np.zeros((self.settings.starts, len(free)))
+        thetas[1:] = random.uniform(-reach, reach, thetas[1:].shape)
+        found = self._fits(self.experiment, free, windows, jnp.asarray(thetas))
+        cost = np.where(np.isfinite(np.asarray(found.cost)), np.asarray(found.cost), np.inf)
+        if not np.isfinite(cost).any():
+            raise InputError(
+                f"{self.record.path}: the model diverges from every start; its nominal numbers should be nearer"
+            )
+        best = int(np.argmin(cost))
+        starts = [
+            {"cost": float(c), "agrees": bool(c <= cost[best] * 1.01), "theta": t.tolist()}
+            for c, t in zip(cost, np.asarray(found.theta), strict=True)
+        ]
+        return found.theta[best], starts
+
+    def _whole(self, free: tuple[Free, ...], theta: jax.Array) -> _Whole:
+        """Fit to all of the record, in windows of the length that leaves the numbers least open."""
+        best: tuple[float, _Whole] | None = None
+        for samples in self.lengths:
+            windows, firsts = self._cut(samples)
+            smoothness: dict[str, float] = {}
+            if self.settings.method == "prediction_error":
+                for _ in range(_PASSES):
+                    windows, smoothness = predictor(with_values(self.experiment, free, theta), windows)
+                    found = self._fit(self.experiment, free, windows, theta)
+                    theta = found.theta
+            found = self._fit(self.experiment, free, windows, theta)
+            width = spread(found)
+            size = float(jnp.sum(jnp.log(jnp.diag(width.covariance))))
+            if np.isfinite(size) and (best is None or size < best[0]):
+                best = size, _Whole(found, width, windows, firsts, smoothness)
+        if best is None:
+            raise InputError(f"{self.record.path}: the model diverges on this log; its nominal numbers should be nearer")
+        return best[1]
