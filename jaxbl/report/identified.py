@@ -36,12 +36,14 @@ _POINTS = 2400
 """Points of a line; longer signals are drawn by the least and largest of each of as many bins."""
 _CLOUD = 4000
 """Points of a cloud; of more than these the density is drawn."""
+_LINES = 30_000
+"""Points of a limit cycle that is drawn as a line; of a longer one the density is drawn."""
 _CYCLES = 2.5
 """Cycles of motion that are shown in full."""
 _SETTLING = 0.1
 """Share of the record that is left to the observers to converge: shown, but out of rms values and scales."""
 _COLOUR = {"motor": COLOURS[0], "load": COLOURS[1]}
-_MODEL, _MEASURED, _GAP, _FAINT = COLOURS[6], COLOURS[2], "#F3E3A1", "#8C8C8C"
+_MODEL, _MEASURED, _FALLING, _GAP, _FAINT = COLOURS[6], COLOURS[2], COLOURS[3], "#F3E3A1", "#8C8C8C"
 _DENSITY = ListedColormap(mpl.colormaps["Greys"](np.linspace(0.25, 0.75, 64)))
 _CHANNEL = {"motor": "theta_e", "load": "theta_s"}
 _ABOVE: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1, "columnspacing": 1.2}
@@ -133,7 +135,7 @@ class _View:
         count = len(velocity)
         away = velocity[np.abs(velocity) > 0.1 * np.max(np.abs(velocity), initial=0.0)]
         reversals = int(np.count_nonzero(np.diff(np.sign(away))))
-        length = int(_CYCLES * 2.0 * count / reversals) if reversals > 2 else count // 4
+        length = int(_CYCLES * 2.0 * len(away) / reversals) if reversals > 2 else count // 4
         length = max(length, 200, round(20.0 * float(self.experiment.equivalent_control.time_constant) / period))
         if 1.5 * length > count:
             return self.observed
@@ -266,7 +268,8 @@ class _View:
             ax.axvspan(*self.span, color=COLOURS[5], alpha=0.25, lw=0.0)
 
     def rms(self, values: Array) -> float:
-        return float(np.sqrt(np.nanmean(values[self.settled] ** 2)))
+        finite = values[self.settled][np.isfinite(values[self.settled])]
+        return float(np.sqrt(np.mean(finite**2))) if len(finite) else float("nan")
 
 
 def _outline(values: Array, points: int) -> Array:
@@ -478,8 +481,10 @@ def _torque(view: _View) -> Drawn:
 def _cloud(view: _View, ax: Axes, x: Array, y: Array, limits: tuple[tuple[float, float], tuple[float, float]]) -> None:
     """All settled points of a plane: as points, or as their density where they are many."""
     x, y = x[view.settled], y[view.settled]
+    finite = np.isfinite(x) & np.isfinite(y)
+    x, y = x[finite], y[finite]
     if len(x) <= _CLOUD:
-        ax.plot(x, y, ".", ms=1.5, color=_FAINT, zorder=1)
+        ax.plot(x, y, ".", ms=2.0, mew=0.0, color=_FAINT, zorder=1)
         return
     counts, *edges = np.histogram2d(x, y, bins=(280, 190), range=limits)
     shown = np.where(counts > 0.0, counts, np.nan).T
@@ -494,7 +499,7 @@ def _gap(view: _View, ax: Axes) -> None:
         return
     one = view.found.summary["parameters"].get("transmission.half_gap")
     error = f" ± {1.96 * one['standard_error']:.1g}" if one else ""
-    label = f"fitted gap, half width {view.half_gap:.4g}{error} {view.unit['motor']}"
+    label = f"fitted gap: half width {view.half_gap:.4g}{error} {view.unit['motor']}"
     ax.axvspan(-view.half_gap, view.half_gap, color=_GAP, alpha=0.6, lw=0.0, zorder=0, label=label)
     for sign in (-1.0, 1.0):
         ax.axvline(sign * view.half_gap, color=COLOURS[4], lw=1.0, zorder=0.5)
@@ -504,8 +509,7 @@ def _plane_note(view: _View) -> str:
     if view.whole:
         return "The line is all of the record but its first tenth."
     low, high = view.span
-    what = "density of" if view.settled.stop - view.settled.start > _CLOUD else "points of"
-    return f"The line is {low:.4g} to {high:.4g} s, where the motion is largest; grey is the {what} all but the first tenth."
+    return f"The line is {low:.4g} to {high:.4g} s, where the motion is largest; grey is all but the first tenth."
 
 
 def _line(view: _View) -> slice:
@@ -514,10 +518,11 @@ def _line(view: _View) -> slice:
 
 def _mean_over(twist: Array, torque: Array, rows: Array, limits: tuple[float, float]) -> tuple[Array, Array]:
     """Mean torque of some rows in bins of twist; NaN where a bin has too few for it to mean anything."""
-    edges = np.linspace(*limits, 81)
+    bins = int(np.clip(len(rows) // 25, 12, 80))
+    edges = np.linspace(*limits, bins + 1)
     at = np.digitize(twist[rows], edges)
-    count = np.bincount(at, minlength=82)[1:81]
-    total = np.bincount(at, torque[rows], minlength=82)[1:81]
+    count = np.bincount(at, minlength=bins + 2)[1 : bins + 1]
+    total = np.bincount(at, torque[rows], minlength=bins + 2)[1 : bins + 1]
     mean = np.where(count >= 4, total / np.maximum(count, 1), np.nan)
     return 0.5 * (edges[1:] + edges[:-1]), mean
 
@@ -535,12 +540,12 @@ def _hysteresis(view: _View) -> Drawn:
         if across and up:
             _cloud(view, ax, view.twist, torque, (across, up))
             ax.set(xlim=across, ylim=up)
-            for growing, how in ((True, "-"), (False, ":")):
+            for growing, shade in ((True, colour), (False, _FALLING)):
                 rows = np.arange(len(rate))[view.settled]
                 rows = rows[((rate[rows] > 0.0) == growing) & np.isfinite(torque[rows])]
                 ax.plot(
-                    *_mean_over(view.twist, torque, rows, across), color=colour, lw=2.6, ls=how, zorder=3,
-                    label=f"mean while the twist {'grows' if growing else 'falls'}",
+                    *_mean_over(view.twist, torque, rows, across), color=shade, lw=2.4, alpha=0.9, zorder=3,
+                    label=f"mean, twist {'growing' if growing else 'falling'}",
                 )  # fmt: skip
             twist = np.linspace(*across, 400)
             ax.plot(twist, view.law_at(twist), color=_MODEL, lw=1.2, ls="--", zorder=4, label="fitted law")
@@ -563,10 +568,13 @@ def _limit_cycle(view: _View) -> Drawn:
     limits = _limits(twist[view.settled]), _limits(view.rate[view.settled])
     _gap(view, ax)
     if limits[0] and limits[1]:
-        _cloud(view, ax, twist, view.rate, (limits[0], limits[1]))
+        if view.settled.stop - view.settled.start <= _LINES:
+            ax.plot(twist[view.settled], view.rate[view.settled], color=_FAINT, lw=0.6, alpha=0.5, zorder=1)
+        else:
+            _cloud(view, ax, twist, view.rate, (limits[0], limits[1]))
         ax.set(xlim=limits[0], ylim=limits[1])
     rows = _line(view)
-    ax.plot(twist[rows], view.rate[rows], color=COLOURS[1], lw=1.4, zorder=3)
+    ax.plot(twist[rows], view.rate[rows], color=COLOURS[3], lw=1.4, zorder=3)
     ax.axhline(0.0, color=_FAINT, lw=0.8, zorder=0.6)
     ax.set(xlabel=f"twist θe − N₀ θs ({unit})", ylabel=f"twist rate by the smoother ({unit}/s)")
     if view.half_gap:
@@ -626,7 +634,7 @@ def _friction(view: _View) -> Drawn:
     ax.legend(ncols=2, **_ABOVE)
     caption = (
         f"The {what} beyond inertia and viscous friction over velocity, behind the same low-pass: friction as the log "
-        f"shows it, and as fitted. {_plane_note(view)}"
+        f"shows it, and as fitted. Reversals are slanted by the low-pass. {_plane_note(view)}"
     )
     return Drawn("friction", figure, caption)
 
