@@ -43,7 +43,8 @@ _CYCLES = 2.5
 _SETTLING = 0.1
 """Share of the record that is left to the observers to converge: shown, but out of rms values and scales."""
 _COLOUR = {"motor": COLOURS[0], "load": COLOURS[1]}
-_MODEL, _MEASURED, _FALLING, _GAP, _FAINT = COLOURS[6], COLOURS[2], COLOURS[3], "#F3E3A1", "#8C8C8C"
+_MODEL, _MEASURED, _GAP, _FAINT = COLOURS[6], COLOURS[2], "#F3E3A1", "#8C8C8C"
+_GROWING, _FALLING = COLOURS[2], COLOURS[3]
 _DENSITY = ListedColormap(mpl.colormaps["Greys"](np.linspace(0.25, 0.75, 64)))
 _CHANNEL = {"motor": "theta_e", "load": "theta_s"}
 _ABOVE: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1, "columnspacing": 1.2}
@@ -518,7 +519,7 @@ def _line(view: _View) -> slice:
 
 def _mean_over(twist: Array, torque: Array, rows: Array, limits: tuple[float, float]) -> tuple[Array, Array]:
     """Mean torque of some rows in bins of twist; NaN where a bin has too few for it to mean anything."""
-    bins = int(np.clip(len(rows) // 25, 12, 80))
+    bins = int(np.clip(len(rows) // 15, 24, 80))
     edges = np.linspace(*limits, bins + 1)
     at = np.digitize(twist[rows], edges)
     count = np.bincount(at, minlength=bins + 2)[1 : bins + 1]
@@ -540,7 +541,7 @@ def _hysteresis(view: _View) -> Drawn:
         if across and up:
             _cloud(view, ax, view.twist, torque, (across, up))
             ax.set(xlim=across, ylim=up)
-            for growing, shade in ((True, colour), (False, _FALLING)):
+            for growing, shade in ((True, _GROWING), (False, _FALLING)):
                 rows = np.arange(len(rate))[view.settled]
                 rows = rows[((rate[rows] > 0.0) == growing) & np.isfinite(torque[rows])]
                 ax.plot(
@@ -556,7 +557,7 @@ def _hysteresis(view: _View) -> Drawn:
     caption = (
         "Transmitted torque over the measured twist, both behind the same low-pass (which rounds corners), with the fitted "
         "law (cf. Figs. 26 and 27); grey is all of the record but its first tenth. Where the means of the two directions "
-        "part, there is friction, damping or delay that the model lacks."
+        "part, there is friction or damping that the model lacks, or delay: the observer's own is in it."
     )
     return Drawn("hysteresis", figure, caption)
 
