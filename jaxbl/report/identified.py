@@ -266,7 +266,7 @@ class _View:
     def mark(self, ax: Axes) -> None:
         """Shade what is shown in full."""
         if not self.whole:
-            ax.axvspan(*self.span, color=COLOURS[5], alpha=0.25, lw=0.0)
+            ax.axvspan(*self.span, color=COLOURS[5], alpha=0.25, lw=1.5)
 
     def rms(self, values: Array) -> float:
         finite = values[self.settled][np.isfinite(values[self.settled])]
