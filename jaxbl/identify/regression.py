@@ -17,7 +17,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 from scipy import signal
 
-from jaxbl.drive.plant import PlantState
+from jaxbl.drive.plant import Plant, PlantState
 from jaxbl.simulate import Experiment
 
 from .smoother import Smoothed
@@ -111,21 +111,45 @@ def balance(experiment: Experiment, kinematics: Kinematics) -> dict[str, Balance
     torque = _actuated(experiment, k.torque)
     found = {}
     if k.transmitted is not None and plant.transmission is not None:
-        through = jax.vmap(lambda position, velocity: plant.transmitted(position, velocity)[0])(k.position, k.velocity)
-        found["transmission"] = Balance(k.transmitted - through, k.transmitted)
-
-    def at(position: dict, velocity: dict, torque: Array, time: Array, transmitted: Array | None) -> dict:
-        return plant.torques(position, velocity, torque, time, transmitted)
-
-    acting = jax.vmap(at)(k.position, k.velocity, torque, k.time, k.transmitted)
+        found["transmission"] = Balance(k.transmitted - _transmitted(plant, k), k.transmitted)
+    acting = jax.vmap(plant.torques)(k.position, k.velocity, torque, k.time, k.transmitted)
     through = k.transmitted
     if through is None and plant.transmission is not None:
-        through = jax.vmap(lambda position, velocity: plant.transmitted(position, velocity)[0])(k.position, k.velocity)
+        through = _transmitted(plant, k)
     for side, (total, level) in acting.items():
         resisting = drive.viscous(side) * k.velocity[side] + level * jnp.sign(k.velocity[side])
         driving = torque if side == "motor" or through is None else drive.torque_gain(side) * through
         found[side] = Balance(total - resisting - plant.inertia(side) * k.acceleration[side], driving)
     return found
+
+
+def model_torques(
+    experiment: Experiment, kinematics: Kinematics, deviation: dict[str, Float[Array, " samples"]]
+) -> dict[str, Float[Array, " samples"]]:
+    """Torques by a model at known kinematics, N m: `transmission`, and what effects take on each side that has any.
+
+    Args:
+        experiment: the model.
+        kinematics: of a part of a record.
+        deviation: standard deviation of the velocities, rad/s: dry friction goes through zero within it.
+    """
+    plant, k, found = experiment.plant, kinematics, {}
+    if plant.transmission is not None:
+        found["transmission"] = _transmitted(plant, k)
+    none = jnp.zeros_like(k.torque)
+    acting = jax.vmap(plant.torques)(k.position, k.velocity, none, k.time, none)
+    places = {plant.drive.place(effect.place) for effect in plant.effects}
+    for side, (total, level) in acting.items():
+        if side in places or (side == "motor" and "actuator" in places):
+            direction = jnp.clip(k.velocity[side] / jnp.maximum(3.0 * deviation[side], jnp.finfo(float).tiny), -1.0, 1.0)
+            added = (plant.inertia(side) - plant.drive.inertia(side)) * k.acceleration[side]
+            lost = k.torque - _actuated(experiment, k.torque) if side == "motor" else 0.0
+            found[side] = level * direction - total + added + lost
+    return found
+
+
+def _transmitted(plant: Plant, k: Kinematics) -> Float[Array, " samples"]:
+    return jax.vmap(lambda position, velocity: plant.transmitted(position, velocity)[0])(k.position, k.velocity)
 
 
 def _actuated(experiment: Experiment, torque: Float[Array, " samples"]) -> Float[Array, " samples"]:

@@ -28,7 +28,7 @@ from jaxbl.errors import InputError
 from jaxbl.identify.gains import Gains, choose_gains
 from jaxbl.identify.intervals import LIMIT, Refusal, Spread, interval, spread
 from jaxbl.identify.profile import Profile, profile
-from jaxbl.identify.regression import Kinematics, errors, from_smoothed, regress, shortest
+from jaxbl.identify.regression import Kinematics, errors, from_smoothed, model_torques, regress, shortest
 from jaxbl.identify.search import Channels, Found, Search, Settings, smoothed_channels, windows_of
 from jaxbl.identify.trajectory import PHYSICAL, Fit, Free, free_parameters, is_positive, projected_residual
 from jaxbl.records import Record, join, read_record
@@ -51,8 +51,9 @@ class Identification:
         record: the log, or the logs one after the other.
         summary: as in `identification.json`.
         trace: one row a sample: `t`, `u`, positions, `transmitted` where it was measured, smoothed velocities and
-            accelerations with standard deviations, residuals of the fit (rad), the fitted law's torque at the smoothed
-            positions (`torque`), and what the observers and the recursive identifier make of the record.
+            accelerations with standard deviations, residuals of the fit (rad), torques by the fitted model at the smoothed
+            motion (`torque` of the law, `motor.effects`, `load.effects`), and what the observers and the recursive
+            identifier make of the record.
         replays: whether the model's excitation is to be the log's, for want of one in the study.
     """
 
@@ -172,7 +173,7 @@ def run_task(task: Task) -> Identification:
             | ({} if record.transmitted is None else {"transmitted": record.transmitted})
             | _smoothed_columns(channels)
             | _residual_columns(found, record, noise, nominal.sides)
-            | _law_column(fitted, channels)
+            | _model_columns(fitted, record, channels)
             | chain
         )
         method: dict[str, Any] = {"recursive": recursive, "trajectory": _trajectory(found, record)}
@@ -284,17 +285,30 @@ def _gains(
     return {side: chosen[side] for side in sides}, values
 
 
-def _law_column(fitted: Experiment, channels: Channels) -> dict[str, np.ndarray]:
-    """Transmitted torque by the fitted law at the smoothed positions, N m."""
-    plant = fitted.plant
-    if plant.transmission is None:
-        return {}
-    pieces = []
-    for parts in zip(*(channels.smoothed[side] for side in fitted.sides), strict=True):
-        moving = dict(zip(fitted.sides, parts, strict=True))
-        position, velocity = ({side: one.state[:, i] for side, one in moving.items()} for i in range(2))
-        pieces.append(jax.vmap(lambda position, velocity: plant.transmitted(position, velocity)[0])(position, velocity))
-    return {"torque": np.concatenate([np.asarray(x) for x in pieces])}
+def _model_columns(fitted: Experiment, record: Record, channels: Channels) -> dict[str, np.ndarray]:
+    """Torques by the fitted model at the smoothed motion, N m: the law's, and what effects take on each side."""
+    assert record.torque is not None
+    pieces: dict[str, list[np.ndarray]] = {}
+    for i, part in enumerate(record.segments):
+        smoothed = {side: parts[i] for side, parts in channels.smoothed.items()}
+        kinematics = from_smoothed(record.time[part] - record.time[0], record.torque[part], smoothed)
+        found = model_torques(fitted, kinematics, {side: one.deviation(1) for side, one in smoothed.items()})
+        for name, values in found.items():
+            pieces.setdefault("torque" if name == "transmission" else f"{name}.effects", []).append(np.asarray(values))
+    return {name: np.concatenate(values) for name, values in pieces.items()}
+
+
+_LINEAR = (("kg m²", "kg"), ("N m", "N"), ("rad", "m"))
+
+
+def unit_on(record: Record, path: str, unit: str) -> str:
+    """The unit of a number on a log: N and m where its side moves in m."""
+    side = "load" if any(part.startswith("load") for part in path.split(".")) else "motor"
+    channels = record.findings.channels
+    if _LOG_NAMES[side] in channels and channels[_LOG_NAMES[side]].unit == "m":
+        for turning, linear in _LINEAR:
+            unit = unit.replace(turning, linear)
+    return unit
 
 
 def _on_holdout(task: Task, nominal: Experiment, fitted: Experiment, samples: int) -> dict[str, Any]:
@@ -310,7 +324,8 @@ def _on_holdout(task: Task, nominal: Experiment, fitted: Experiment, samples: in
     position = {}
     for i, side in enumerate(nominal.sides):
         before, after = (channels.noise[side] * float(jnp.sqrt(jnp.mean(one[:, :, i] ** 2))) for one in left)
-        position[side] = {"rms": after, "nominal_rms": before, "noise": channels.noise[side]}
+        unit = record.findings.channels[_LOG_NAMES[side]].unit
+        position[side] = {"rms": after, "nominal_rms": before, "noise": channels.noise[side], "unit": unit}
     factor = _decimation(config, record)
     parts = _kinematics(record, channels, factor)
     torque = errors(rebased[1], parts, factor) if parts else {}
@@ -401,7 +416,7 @@ def _derived(experiment: Experiment, found: Found) -> dict[str, Any]:
     return derived
 
 
-def _parameters(free: Sequence[Free], fit: Fit, width: Spread) -> dict[str, dict[str, Any]]:
+def _parameters(record: Record, free: Sequence[Free], fit: Fit, width: Spread) -> dict[str, dict[str, Any]]:
     """Values with standard errors and 95 % intervals, by path."""
     theta, deviation = np.asarray(fit.theta), np.sqrt(np.diag(np.asarray(width.covariance)))
     return {
@@ -409,7 +424,7 @@ def _parameters(free: Sequence[Free], fit: Fit, width: Spread) -> dict[str, dict
             "value": float(one.value(theta[i])),
             "standard_error": float(one.slope(theta[i])) * deviation[i],
             "interval": list(interval(one, theta[i], deviation[i])),
-            "unit": one.unit,
+            "unit": unit_on(record, one.path, one.unit),
             "nominal": one.nominal,
         }
         for i, one in enumerate(free)
@@ -425,7 +440,7 @@ def _regression(
     values, vectors = np.linalg.eigh(information)
     blind = values < 1.0 / LIMIT**2
     seen = [i for i in range(len(free)) if not np.any(np.abs(vectors[i, blind]) > 0.1)]
-    all_of_it = _parameters(free, found, spread(found))
+    all_of_it = _parameters(record, free, found, spread(found))
     at = {free[i].path: jnp.asarray(all_of_it[free[i].path]["value"]) for i in range(len(free))}
     return {
         "parameters": {free[i].path: all_of_it[free[i].path] for i in seen},
@@ -456,13 +471,17 @@ def _summary(
 ) -> dict[str, Any]:
     record, width = task.record, np.asarray(found.spread.covariance)
     deviation = np.sqrt(np.diag(width))
-    parameters = _parameters(found.free, found.fit, found.spread)
+    parameters = _parameters(record, found.free, found.fit, found.spread)
     for path, one in profiles.items():
         points = [list(point) for point in zip(one.values.tolist(), one.deviance.tolist(), strict=True)]
         parameters[path] |= {"profile_interval": list(one.interval), "profile": points}
     parameters |= _derived(fitted, found)
     residual = {
-        side: {"rms": noise[side] * float(jnp.sqrt(jnp.mean(found.fit.residual[:, :, i] ** 2))), "noise": noise[side]}
+        side: {
+            "rms": noise[side] * float(jnp.sqrt(jnp.mean(found.fit.residual[:, :, i] ** 2))),
+            "noise": noise[side],
+            "unit": record.findings.channels[_LOG_NAMES[side]].unit,
+        }
         for i, side in enumerate(fitted.sides)
     }
     return {

@@ -1,0 +1,215 @@
+"""Figures and words of an identification, on made results: every law, gaps in the log, a measured torque, a linear axis."""
+
+import dataclasses
+import functools
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from small_study import rigid, small
+
+from jaxbl.identify.regression import Kinematics, model_torques
+from jaxbl.records import read_record
+from jaxbl.report.identified import draw_identification, write_identification_report
+from jaxbl.report.style import save
+from jaxbl.study.config import read_config
+from jaxbl.study.identification import Identification, unit_on
+from jaxbl.study.trial import run
+
+GEARED = ["intervals", "residuals", "velocities", "torque", "hysteresis", "limit_cycle", "recursive"]
+RIGID = ["intervals", "residuals", "velocities", "resistance", "friction"]
+MOTION = {
+    "excitation": {"kind": "multisine", "amplitude": 5.0, "frequency": 0.5},
+    "observer": {"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}},
+}
+SHORT = {"run.duration": 1.0, "run.sample_period": 2e-3, "run.substeps": 4, "identifier.start": 0.2}
+DEAD_ZONE = {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08}
+
+
+def geared(changes=None, **tables):
+    return small(SHORT | (changes or {}), **({"transmission": DEAD_ZONE} | MOTION | tables))
+
+
+def drawn_of(found):
+    return {one.name: one for one in draw_identification(found)}
+
+
+@functools.cache
+def _trace(study: str):
+    """The trace of a study given as JSON: several tests look at the same one."""
+    return run(json.loads(study)).trace
+
+
+def torques_of(config, trace, sides):
+    columns = (
+        {side: jnp.asarray(trace[f"{side}.{name}"]) for side in sides} for name in ("position", "velocity", "acceleration")
+    )
+    kinematics = Kinematics(jnp.asarray(trace["t"]), jnp.asarray(trace["u"]), *columns)
+    deviation = {side: jnp.asarray(trace[f"{side}.velocity_deviation"]) for side in sides}
+    return model_torques(config.build(), kinematics, deviation)
+
+
+def made(data, folder, *, gap=False, unit="rad", transmitted=False, held=()):
+    """What identify would find with the numbers of the study itself."""
+    config = read_config(data)
+    truth = _trace(json.dumps(data)).copy()
+    sides = [side for side in ("motor", "load") if f"{side}.position" in truth]
+    columns = ["t", "u", "theta_e", "theta_s"][: 2 + len(sides)]
+    frame = truth[columns].drop(index=range(100, 120)) if gap else truth[columns]
+    frame.to_csv(folder / "log.csv", index=False)
+    log = {column: {"column": column, "unit": "m"} for column in columns[2:]} if unit == "m" else None
+    record = read_record(folder / "log.csv", log)
+    trace = truth.loc[frame.index].reset_index(drop=True).rename(columns={"z": "twist"})
+    trace["t"] = record.time
+    for side in sides:
+        trace[f"{side}.velocity_deviation"] = trace[f"{side}.acceleration_deviation"] = 1e-3
+        trace[f"{side}.acceleration"] = np.gradient(trace[f"{side}.velocity"], record.sample_period)
+        trace[f"{side}.residual"] = 1e-4 * np.random.default_rng(0).standard_normal(len(trace))
+    for name, values in torques_of(config, trace, sides).items():
+        trace["torque" if name == "transmission" else f"{name}.effects"] = np.asarray(values)
+    if transmitted:
+        trace["transmitted"] = truth["torque"]
+    names = [name for name in ("stiffness", "dead_zone", "half_gap") if f"motor.{name}" in trace]
+    if gap:
+        # as of the observers, which run on the longest part alone
+        chain = ["twist", *(f"{s}.{n}" for s in sides for n in ("velocity_estimate", "torque_estimate", *names))]
+        longest = max(record.segments, key=lambda one: one.stop - one.start)
+        outside = np.ones(len(trace), bool)
+        outside[longest] = False
+        trace.loc[outside, chain] = np.nan
+    numbers = {"drive.motor_inertia": ("kg m²", 0.05), "drive.motor_viscous": ("N m s/rad", 0.15)}
+    parameters = {
+        path: {"value": value, "standard_error": 1e-3, "interval": [value - 2e-3, value + 2e-3],
+               "unit": unit_on(record, path, kind),
+               "nominal": 1.1 * value} for path, (kind, value) in numbers.items()
+    }  # fmt: skip
+    if "half_gap" in names:
+        parameters["transmission.half_gap"] = {"value": 0.08, "standard_error": 1e-4, "interval": [0.0798, 0.0802]}
+    summary = {
+        "parameters": parameters,
+        "refused": [],
+        "held": list(held),
+        "residual": {side: {"rms": 1e-4, "noise": 1e-4, "unit": unit} for side in sides},
+        "torque": {},
+        "notes": [],
+        "method": {
+            "recursive": {name: {side: float(trace[f"{side}.{name}"].iloc[-1]) for side in sides} for name in names},
+            "trajectory": {"window": 0.5, "windows": 2, "converged": True, "starts": 2, "starts_agreeing": 2},
+        },
+    }
+    return Identification(config, config, record, summary, trace, False)
+
+
+CASES = {
+    "dead zone": (geared(), {}, GEARED),
+    "sigmoid": (geared(transmission={"law": "sigmoid_backlash", "stiffness": 60.0, "dead_zone": 0.02, "slope": 80.0}), {},
+                GEARED),
+    "shaft": (geared(transmission={"law": "linear_shaft", "stiffness": 60.0}), {}, GEARED),
+    "gap": (geared(), {"gap": True, "held": ["drive.load_inertia"]}, GEARED),
+    "measured": (geared({"run.duration": 10.0}), {"transmitted": True}, GEARED),
+    "effects": (geared(effects=[{"kind": "transmission.backlash", "half_gap": 0.01},
+                                {"kind": "transmission.damping", "damping": 0.1},
+                                {"kind": "transmission.eccentricity", "amplitude": 0.01},
+                                {"kind": "motor.inertia", "inertia": 0.01},
+                                {"kind": "actuator.lag", "time_constant": 0.01}]), {}, GEARED),
+    "rigid": (rigid(SHORT | {"identifier.start": None}), {}, RIGID),
+    "linear": (rigid(SHORT | {"identifier.start": None}, effects=[{"kind": "motor.coulomb_friction", "torque": 0.02}]),
+               {"unit": "m"}, RIGID),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_all_figures_are_drawn_with_units(case, tmp_path):
+    data, how, names = CASES[case]
+    found = made(data, tmp_path, **how)
+    drawn = draw_identification(found)
+    assert [one.name for one in drawn] == names
+    for one in drawn:
+        assert one.caption.endswith(".")
+        assert save(one.figure, tmp_path / f"{one.name}.png").stat().st_size > 5000
+        if one.name != "intervals":
+            assert "(" in one.figure.axes[0].get_ylabel(), one.name
+            assert "(" in one.figure.axes[-1].get_xlabel(), one.name
+    shown = {one.name: one.figure for one in drawn}
+    if case == "measured":
+        assert [ax.get_title(loc="left") for ax in shown["hysteresis"].axes] == [
+            "by the motor side",
+            "by the load side",
+            "measured",
+        ]
+        assert "measured" in labels(shown["torque"])
+    if case == "shaft":
+        assert not any("gap" in text for text in labels(shown["limit_cycle"]))
+    if case == "effects":
+        assert any("half width 0.09" in text for text in labels(shown["hysteresis"]))
+    if case == "gap":
+        assert [text.get_text() for text in shown["intervals"].axes[0].texts][-1] == "held: not shown by this log"
+
+
+def labels(figure: Figure) -> list[str]:
+    """Labels of all that is in the legends of the first axes."""
+    return figure.axes[0].get_legend_handles_labels()[1]
+
+
+def test_a_linear_axis_has_newtons_and_metres(tmp_path):
+    found = made(CASES["linear"][0], tmp_path, unit="m")
+    words = "\n".join(write_identification_report(found, tmp_path))
+    assert "drive.motor_inertia = 0.05 ± 0.001 kg," in words
+    assert "drive.motor_viscous = 0.15 ± 0.001 N s/m," in words
+    assert "met to 0.0001 m rms" in words
+    figures = {one.name: one.figure for one in draw_identification(found)}
+    assert figures["velocities"].axes[0].get_ylabel() == "motor velocity (m/s)"
+    assert figures["resistance"].axes[0].get_ylabel() == "resisting force (N)"
+    assert "kg m²" not in (tmp_path / "report.html").read_text()
+
+
+def test_torque_of_a_side_is_less_the_effects_on_it(tmp_path):
+    """Friction of 1 N m on the motor and 5 N m on the load is not mistaken for transmitted torque."""
+    friction = [{"kind": "motor.coulomb_friction", "torque": 1.0}, {"kind": "load.coulomb_friction", "torque": 5.0}]
+    found = made(geared({"run.duration": 2.0}, effects=friction), tmp_path)
+    axes = drawn_of(found)["torque"].figure.axes
+    rms = [float(text.split("rms ")[1].split()[0]) for text in axes[1].get_legend_handles_labels()[1]]
+    assert len(rms) == 2
+    without = dataclasses.replace(found, trace=found.trace.drop(columns=["motor.effects", "load.effects"]))
+    axes = drawn_of(without)["torque"].figure.axes
+    more = [float(text.split("rms ")[1].split()[0]) for text in axes[1].get_legend_handles_labels()[1]]
+    assert min(rms) < 0.6 * min(more)
+
+
+def test_long_log_shows_its_largest_motion_in_full(tmp_path):
+    """Small motion, then large motion in the third quarter."""
+    found = made(geared({"run.duration": 10.0}), tmp_path)
+    trace = found.trace.copy()
+    size = np.where((trace["t"] > 6.0) & (trace["t"] < 8.0), 1.0, 0.1)
+    trace["motor.velocity"] *= size
+    above, below = drawn_of(dataclasses.replace(found, trace=trace))["velocities"].figure.axes[::2]
+    low, high = above.get_xlim()
+    assert 5.9 < low < high < 8.1
+    assert below.get_xlim() == pytest.approx((0.0, 10.0), abs=0.01)
+
+
+def test_outline_keeps_the_extremes_and_the_order():
+    from jaxbl.report.identified import _outline
+
+    values = np.random.default_rng(0).standard_normal(100_003)
+    values[7] = 50.0
+    values[99_999] = -60.0
+    values[2000:9000] = np.nan
+    at = _outline(values, 2400)
+    assert len(at) < 2500
+    assert np.all(np.diff(at) >= 0)
+    assert np.nanmax(values[at]) == 50.0 and np.nanmin(values[at]) == -60.0
+    assert np.isnan(values[at]).any()
+
+
+def test_observers_that_diverged_leave_figures(tmp_path):
+    found = made(geared(), tmp_path)
+    trace = found.trace.copy()
+    for name in ("motor.velocity_estimate", "motor.torque_estimate", "motor.stiffness", "motor.half_gap"):
+        trace[name] = np.nan
+    drawn = draw_identification(dataclasses.replace(found, trace=trace))
+    assert [one.name for one in drawn] == GEARED
+    for one in drawn:
+        save(one.figure, tmp_path / f"{one.name}.png")
