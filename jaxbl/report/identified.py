@@ -125,7 +125,13 @@ def _remarks(summary: dict[str, Any]) -> list[str]:
 
 
 def _shares(torque: dict[str, Any]) -> str:
-    return ", ".join(f"{100.0 * one['relative']:.2g} % ({name})" for name, one in torque.items())
+    return ", ".join(f"{_share(one)} ({name})" for name, one in torque.items())
+
+
+def _share(one: dict[str, Any], which: str = "") -> str:
+    """A torque error as a share of the driving torque, or by itself where nothing drives."""
+    relative = one[f"{which}relative"]
+    return f"{one[f'{which}rms']:.2g} {one['unit']} rms" if relative is None else f"{100.0 * relative:.2g} %"
 
 
 def _on_holdout(holdout: dict[str, Any]) -> list[str]:
@@ -136,7 +142,7 @@ def _on_holdout(holdout: dict[str, Any]) -> list[str]:
         for side, one in holdout["position"].items()
     ]
     if holdout["torque"]:
-        before = ", ".join(f"{100.0 * one['nominal_relative']:.2g} %" for one in holdout["torque"].values())
+        before = ", ".join(_share(one, "nominal_") for one in holdout["torque"].values())
         lines.append(f"On {name} torques are off by {_shares(holdout['torque'])}; by the nominal numbers by {before}.")
     return lines
 

@@ -25,12 +25,12 @@ import pandas as pd
 
 from jaxbl.drive.parameters import get_leaf, leaf_paths, set_leaves
 from jaxbl.errors import InputError
-from jaxbl.identify.gains import Gains, choose_gains
-from jaxbl.identify.intervals import LIMIT, Refusal, Spread, interval, spread
-from jaxbl.identify.profile import Profile, profile
-from jaxbl.identify.regression import Kinematics, errors, from_smoothed, model_torques, regress, shortest
-from jaxbl.identify.search import Channels, Found, Search, Settings, smoothed_channels, windows_of
-from jaxbl.identify.trajectory import PHYSICAL, Fit, Free, free_parameters, is_positive, projected_residual
+from jaxbl.identification.gains import Gains, choose_gains
+from jaxbl.identification.intervals import LIMIT, Refusal, Spread, interval, spread
+from jaxbl.identification.profile import Profile, profile
+from jaxbl.identification.regression import Kinematics, errors, from_smoothed, model_torques, regress, shortest
+from jaxbl.identification.search import Channels, Found, Search, Settings, smoothed_channels, windows_of
+from jaxbl.identification.trajectory import PHYSICAL, Fit, Free, free_parameters, is_positive, projected_residual
 from jaxbl.records import Record, join, read_record
 from jaxbl.simulate import Experiment, Signals, State, replay
 
@@ -180,7 +180,7 @@ def run_task(task: Task) -> Identification:
         if parts:
             method["regression"] = _regression(nominal, found.free, parts, factor, record)
         summary = _summary(task, fitted, found, profiles, noise) | {"method": method}
-        summary["torque"] = errors(fitted, parts, factor) if parts else {}
+        summary["torque"] = _torque_errors(record, fitted, parts, factor)
         if gains:
             summary["gains"] = {side: one._asdict() for side, one in gains.items()}
         if task.holdout is not None:
@@ -266,6 +266,13 @@ def _kinematics(record: Record, channels: Channels, factor: int) -> list[Kinemat
     return found
 
 
+def _torque_errors(
+    record: Record, experiment: Experiment, parts: Sequence[Kinematics], factor: int
+) -> dict[str, dict[str, Any]]:
+    found = errors(experiment, parts, factor) if parts else {}
+    return {name: one | {"unit": unit_on(record, name, "N m")} for name, one in found.items()}
+
+
 def _gains(
     missing: frozenset[str], fitted: Experiment, record: Record, channels: Channels
 ) -> tuple[dict[str, Gains], dict[str, float]]:
@@ -328,10 +335,9 @@ def _on_holdout(task: Task, nominal: Experiment, fitted: Experiment, samples: in
         position[side] = {"rms": after, "nominal_rms": before, "noise": channels.noise[side], "unit": unit}
     factor = _decimation(config, record)
     parts = _kinematics(record, channels, factor)
-    torque = errors(rebased[1], parts, factor) if parts else {}
-    before = errors(rebased[0], parts, factor) if parts else {}
+    before, torque = (_torque_errors(record, one, parts, factor) for one in rebased)
     for name, one in torque.items():
-        one["nominal_relative"] = before[name]["relative"]
+        one["nominal_rms"], one["nominal_relative"] = before[name]["rms"], before[name]["relative"]
     return {
         "file": str(record.path.resolve()),
         "window": windows.torque.shape[1] * record.sample_period,
@@ -446,7 +452,7 @@ def _regression(
         "parameters": {free[i].path: all_of_it[free[i].path] for i in seen},
         "measured_transmitted_torque": record.transmitted is not None,
         "bandwidth": 0.5 / (factor * record.sample_period),
-        "torque": errors(set_leaves(nominal, at), parts, factor),
+        "torque": _torque_errors(record, set_leaves(nominal, at), parts, factor),
         "converged": found.converged,
     }
 

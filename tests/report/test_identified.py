@@ -10,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 from small_study import rigid, small
 
-from jaxbl.identify.regression import Kinematics, model_torques
+from jaxbl.identification.regression import Kinematics, model_torques
 from jaxbl.records import read_record
 from jaxbl.report.identified import draw_identification, write_identification_report
 from jaxbl.report.style import save

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbl.identify.smoother import smooth
+from jaxbl.identification.smoother import smooth
 
 PERIOD, NOISE, JERK = 2e-3, 1e-4, 3e3
 F = np.array([[1.0, PERIOD, 0.5 * PERIOD**2], [0.0, 1.0, PERIOD], [0.0, 0.0, 1.0]])

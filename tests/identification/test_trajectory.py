@@ -11,9 +11,9 @@ from small_study import rigid, small
 
 from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
-from jaxbl.identify.intervals import refusals, spread
-from jaxbl.identify.smoother import smooth
-from jaxbl.identify.trajectory import Fit, cut, fit, free_parameters, with_values
+from jaxbl.identification.intervals import refusals, spread
+from jaxbl.identification.smoother import smooth
+from jaxbl.identification.trajectory import Fit, cut, fit, free_parameters, with_values
 from jaxbl.simulate import trajectory
 from jaxbl.study.config import read_config
 from jaxbl.study.engine import prepare

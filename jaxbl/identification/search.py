@@ -142,6 +142,12 @@ class _Whole(NamedTuple):
     smoothness: dict[str, float]
 
 
+def _nearest_turn(free: Sequence[Free], theta: jax.Array) -> jax.Array:
+    """Theta with phases within half a turn of their nominal values."""
+    turns = np.array([2.0 * np.pi / one.scale if one.path.endswith(".phase") else np.inf for one in free])
+    return theta - jnp.where(np.isfinite(turns), turns * jnp.round(theta / turns), 0.0)
+
+
 class Search:
     """Search of one record's numbers; compiled functions are kept from fit to fit."""
 
@@ -223,7 +229,7 @@ class Search:
             {"cost": float(c), "agrees": bool(c <= cost[best] * 1.01), "theta": t.tolist()}
             for c, t in zip(cost, np.asarray(found.theta), strict=True)
         ]
-        return found.theta[best], starts
+        return _nearest_turn(free, found.theta[best]), starts
 
     def _whole(self, free: tuple[Free, ...], theta: jax.Array) -> _Whole:
         """Fit to all of the record, in windows of the length that leaves the numbers least open."""

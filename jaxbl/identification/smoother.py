@@ -178,7 +178,10 @@ def smooth(
     position = jnp.asarray(position, float)
     if noise is None:
         # third differences of white noise have variance 20 sigma^2; smooth motion adds little to their median
-        guess = jnp.median(jnp.abs(jnp.diff(position, n=3))) / 0.6745 / jnp.sqrt(20.0)
+        third = jnp.diff(position, n=3)
+        median = jnp.median(jnp.abs(third)) / 0.6745
+        # more than half of a counter's readings may stand still
+        guess = jnp.where(median > 0.0, median, jnp.sqrt(jnp.mean(third**2))) / jnp.sqrt(20.0)
         unit = jnp.maximum(guess, 1e-9 * jnp.ptp(position) + jnp.finfo(position.dtype).tiny)
     else:
         unit = jnp.asarray(noise, float)

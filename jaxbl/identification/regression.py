@@ -213,7 +213,7 @@ def regress(
 
     Returns:
         A fit whose residuals and derivatives have shape (1, samples, equations, ...), for
-        :func:`jaxbl.identify.intervals.spread`.
+        :func:`jaxbl.identification.intervals.spread`.
     """
     names = list(eqx.filter_eval_shape(balance, experiment, parts[0]))
 

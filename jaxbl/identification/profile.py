@@ -46,7 +46,7 @@ def profile(
     """Profile every fitted number.
 
     The likelihood counts residuals as many times as they are independent: its curvature is that of the covariance of
-    :func:`jaxbl.identify.intervals.spread`.
+    :func:`jaxbl.identification.intervals.spread`.
 
     Args:
         experiment: nominal.
