@@ -24,10 +24,10 @@ BELOW = {
     "drive": {"errors"},
     "observer": {"drive", "errors"},
     "simulate": {"observer", "drive", "errors"},
-    "identify": {"simulate", "observer", "drive", "records", "errors"},
+    "identification": {"simulate", "observer", "drive", "records", "errors"},
 }
-BELOW["study"] = {*BELOW["identify"], "identify"}
-BELOW["discrepancy"] = {*BELOW["identify"], "identify"}
+BELOW["study"] = {*BELOW["identification"], "identification"}
+BELOW["discrepancy"] = {*BELOW["identification"], "identification"}
 BELOW["report"] = {*BELOW["study"], "study", "discrepancy"}
 BELOW["cli"] = {*BELOW["report"], "report"}
 
@@ -87,3 +87,10 @@ def test_every_study_is_valid_with_its_axes_and_figures(file):
     assert config.title
     assert len(Points(config)) >= 1
     check_figures(config, config.figures, metric_columns(config.build()))
+
+
+def test_public_functions_stay_functions_once_their_packages_are_imported():
+    for name in dir(jaxbl):
+        getattr(jaxbl, name)
+    importlib.import_module("jaxbl.study.identification")
+    assert all(callable(getattr(jaxbl, name)) for name in ("identify", "inspect", "run", "sweep", "verify", "tune"))
