@@ -1,0 +1,90 @@
+"""The predictor's gain against an iterated Kalman filter, and prediction errors where a disturbance acts."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_study import rigid
+
+from jaxbl.drive.plant import PlantState
+from jaxbl.identification.intervals import spread
+from jaxbl.identification.prediction import kalman_gain, predictor
+from jaxbl.identification.smoother import smooth
+from jaxbl.identification.trajectory import cut, fit, free_parameters, with_values
+from jaxbl.study.config import read_config
+from jaxbl.study.engine import prepare
+
+PERIOD, SAMPLES = 2e-3, 3000
+
+
+@pytest.mark.parametrize("smoothness", [1e-10, 1e-4, 1.0, 100.0])
+def test_gain_is_that_of_a_filter_that_has_run_long(smoothness):
+    f = np.array([[1.0, 1.0], [0.0, 1.0]])
+    q = smoothness * np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])
+    p = np.eye(2)
+    for _ in range(20_000):
+        gain = p[:, 0] / (p[0, 0] + 1.0)
+        p = f @ (p - np.outer(gain, p[0])) @ f.T + q
+    np.testing.assert_allclose(kalman_gain(smoothness, 0.1), gain * [1.0, 10.0], rtol=1e-6)
+
+
+def disturbed(force, seed=0):
+    """A mass with viscous friction under a multisine and white random force (N²s), by exact discretisation."""
+    random = np.random.default_rng(seed)
+    mass, friction = 0.05, 0.15
+    t = PERIOD * np.arange(SAMPLES)
+    torque = 0.2 * sum(np.sin(2.0 * np.pi * f * t + i) for i, f in enumerate((0.3, 0.9, 2.7)))
+    decay = np.exp(-friction / mass * PERIOD)
+    moved = mass / friction * (1.0 - decay)
+    # of the state by white force, to the order of the period that matters
+    noise = np.linalg.cholesky(force / mass**2 * np.array([[PERIOD**3 / 3, PERIOD**2 / 2], [PERIOD**2 / 2, PERIOD]]))
+    x, states = np.zeros(2), np.zeros((SAMPLES, 2))
+    for i in range(SAMPLES):
+        states[i] = x
+        x = np.array([
+            x[0] + moved * x[1] + torque[i] / friction * (PERIOD - moved),
+            decay * x[1] + torque[i] / friction * (1.0 - decay),
+        ]) + noise @ random.standard_normal(2)  # fmt: skip
+    return torque, states, {"motor": states[:, 0] + 1e-4 * random.standard_normal(SAMPLES)}
+
+
+def experiment_and_free():
+    experiment = prepare(read_config(rigid({"run.sample_period": PERIOD, "run.substeps": 1})))
+    return experiment, free_parameters(experiment, ["drive.motor_inertia", "drive.motor_viscous"], 1.0)
+
+
+def windows_of(torque, readings, samples):
+    smoothed = smooth(jnp.asarray(readings["motor"]), PERIOD)
+    start = PlantState({"motor": smoothed.position}, {"motor": smoothed.velocity}, ())
+    return cut(torque, readings, PERIOD, start, {"motor": 1e-4}, samples)
+
+
+def test_with_a_disturbance_prediction_errors_tell_more_than_free_runs():
+    experiment, free = experiment_and_free()
+    fitted = jax.jit(lambda windows: fit(experiment, free, windows, jnp.zeros(2)))
+    errors, widths = {"free": [], "predicted": []}, {"free": [], "predicted": []}
+    force = 1e-4
+    for seed in range(8):
+        torque, _, readings = disturbed(force, seed)
+        windows = windows_of(torque, readings, 500)
+        predicted, smoothness = predictor(experiment, windows)
+        np.testing.assert_allclose(smoothness["motor"], force / 0.05**2 * PERIOD**3 / 1e-8, rtol=9.0)
+        for name, one in (("free", windows), ("predicted", predicted)):
+            found = fitted(one)
+            errors[name].append(found.theta)
+            widths[name].append(np.sqrt(np.diag(spread(found).covariance)))
+    size = {name: np.sqrt(np.mean(np.square(values), axis=0)) for name, values in errors.items()}
+    assert np.all(size["predicted"] < 0.7 * size["free"]), size
+    # errors are about as large as they say
+    np.testing.assert_allclose(size["predicted"], np.mean(widths["predicted"], axis=0), rtol=0.7)
+
+
+def test_without_a_disturbance_the_predictor_runs_freely():
+    experiment, free = experiment_and_free()
+    torque, _, readings = disturbed(1e-14)
+    windows = windows_of(torque, readings, 500)
+    predicted, smoothness = predictor(experiment, windows)
+    assert smoothness["motor"] < 1e-9
+    assert float(predicted.noise["motor"]) == pytest.approx(1e-4, rel=0.05)
+    found = fit(with_values(experiment, free, jnp.zeros(2)), free, predicted, jnp.zeros(2))
+    np.testing.assert_allclose(found.theta, 0.0, atol=0.005)

@@ -1,0 +1,78 @@
+"""Profile-likelihood intervals: those of the covariance where the fit is quadratic, and the right ones where it is not."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from small_study import rigid
+
+from jaxbl.drive.plant import PlantState
+from jaxbl.identification.intervals import interval, spread
+from jaxbl.identification.profile import profile
+from jaxbl.identification.trajectory import cut, fit, free_parameters
+from jaxbl.study.config import read_config
+from jaxbl.study.engine import prepare
+
+PERIOD, SAMPLES, NOISE = 2e-3, 400, 1e-3
+
+
+def record(seed=0, size=0.2, drag=0.15):
+    """A mass with viscous friction, exact discretisation, from a known start."""
+    mass = 0.05
+    t = PERIOD * np.arange(SAMPLES)
+    torque = size * np.sin(2.0 * np.pi * 2.0 * t)
+    decay = np.exp(-drag / mass * PERIOD)
+    moved = mass / drag * (1.0 - decay)
+    x, positions = np.zeros(2), np.zeros(SAMPLES)
+    for i in range(SAMPLES):
+        positions[i] = x[0]
+        x = np.array([x[0] + moved * x[1] + torque[i] / drag * (PERIOD - moved),
+                      decay * x[1] + torque[i] / drag * (1.0 - decay)])  # fmt: skip
+    readings = {"motor": positions + NOISE * np.random.default_rng(seed).standard_normal(SAMPLES)}
+    rest = PlantState({"motor": jnp.zeros(SAMPLES)}, {"motor": jnp.zeros(SAMPLES)}, ())
+    return cut(torque, readings, PERIOD, rest, {"motor": NOISE}, SAMPLES)
+
+
+def fitted(paths, windows):
+    experiment = prepare(read_config(rigid({"run.sample_period": PERIOD, "run.substeps": 1})))
+    free = free_parameters(experiment, paths, 1.0)
+    found = eqx.filter_jit(fit)(experiment, free, windows, jnp.zeros(len(free)))
+    return experiment, free, found
+
+
+def test_where_the_fit_is_quadratic_both_intervals_agree():
+    windows = record(size=2.0)
+    experiment, free, found = fitted(["drive.motor_inertia", "drive.motor_viscous"], windows)
+    width = spread(found)
+    profiles = profile(experiment, free, windows, found, width)
+    for i, one in enumerate(free):
+        theta, deviation = float(found.theta[i]), float(jnp.sqrt(width.covariance[i, i]))
+        low, high = interval(one, theta, deviation)
+        np.testing.assert_allclose(profiles[one.path].interval, (low, high), atol=0.05 * (high - low), rtol=0.0)
+        assert np.all(np.diff(profiles[one.path].values) >= 0.0)
+        assert profiles[one.path].deviance.min() == 0.0
+
+
+def test_where_it_is_not_the_profile_follows_the_likelihood():
+    """Weak excitation: the friction is hardly seen. The reference is a root of the cost with all else fitted anew."""
+    windows = record(size=0.003, seed=3)
+    paths = ["drive.motor_inertia", "drive.motor_viscous"]
+    experiment, free, found = fitted(paths, windows)
+    width = spread(found)
+    ends = profile(experiment, free, windows, found, width)["drive.motor_viscous"].interval
+    scale = float(width.variance) * float(width.inflation[1]) ** 2
+    again = eqx.filter_jit(lambda theta: fit(experiment, free, windows, theta, 60, jnp.array([False, True])).cost)
+
+    def excess(value):
+        theta = jnp.array([float(found.theta[0]), np.log(value / 0.15)])
+        return 2.0 * (float(again(theta)) - float(found.cost)) / scale - 3.841
+
+    best = 0.15 * np.exp(float(found.theta[1]))
+    assert ends[1] == pytest.approx(brentq(excess, best, 20.0 * best, xtol=1e-6), rel=0.03)
+    low = brentq(excess, best * np.exp(-2.99), best, xtol=1e-6) if excess(best * np.exp(-2.99)) > 0.0 else 0.0
+    assert ends[0] == pytest.approx(low, rel=0.03)
+    # far from symmetric: here the covariance's interval is another one
+    theta, deviation = float(found.theta[1]), float(jnp.sqrt(width.covariance[1, 1]))
+    wald = interval(free[1], theta, deviation)
+    assert abs(wald[1] / ends[1] - 1.0) > 0.05
