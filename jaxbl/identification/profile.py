@@ -63,13 +63,20 @@ def profile(
     worth = float(width.variance) * np.asarray(width.inflation) ** 2
 
     @eqx.filter_jit
-    def costs(windows: Windows, thetas: jax.Array, which: jax.Array) -> tuple[jax.Array, jax.Array]:
-        def one(given: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-            theta, i = given
+    def some(windows: Windows, thetas: jax.Array, which: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def one(theta: jax.Array, i: jax.Array) -> tuple[jax.Array, jax.Array]:
             found = fit(experiment, free, windows, theta, _MOST_STEPS, jnp.arange(count) == i)
             return found.cost, found.theta
 
-        return jax.lax.map(one, (thetas, which), batch_size=_AT_ONCE)
+        return jax.vmap(one)(thetas, which)
+
+    def costs(thetas: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Cost and theta of fits with one number held each; a few at a time, which bounds memory."""
+        cost, found = np.empty(len(which)), np.empty_like(thetas)
+        for first in range(0, len(which), _AT_ONCE):
+            batch = np.arange(first, first + _AT_ONCE) % len(which)
+            cost[batch], found[batch] = some(windows, jnp.asarray(thetas[batch]), jnp.asarray(which[batch]))
+        return cost, found
 
     which = np.repeat(np.arange(count), 2)
     sign = np.tile([-1.0, 1.0], count)
@@ -79,7 +86,7 @@ def profile(
     for _ in range(_PASSES):
         steps = np.minimum(steps, _FURTHEST)
         thetas = centre[None, :] + (sign * steps)[:, None] * others
-        cost, found = (np.asarray(x) for x in costs(windows, jnp.asarray(thetas), jnp.asarray(which)))
+        cost, found = costs(thetas, which)
         deviance = 2.0 * (cost - float(best.cost)) / worth[which]
         for i, one in enumerate(deviance):
             tried[i].append((float(steps[i]), float(one)))
