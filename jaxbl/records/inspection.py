@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import quality
+from .gearing import Gearing, seen
 from .quality import Array
 from .reader import SIDES, Record, read_log_table, read_record
 from .table import LogTable
@@ -209,20 +210,22 @@ def _of_transmission(record: Record, speed: Array, reversals: int, ratio: float 
             f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {100 * gearing.residual:.2g} % of theta_e is left over",
         )
     ]
-    seen = math.hypot(channels["theta_e"].resolution, ratio * channels["theta_s"].resolution) / math.sqrt(12.0)
-    seen = math.hypot(seen, math.hypot(channels["theta_e"].noise, ratio * channels["theta_s"].noise))
-    lost, error = gearing.lost_motion, gearing.lost_motion_error
-    unit = channels["theta_e"].unit
-    size = f"{lost:.3g} ± {error:.1g} {unit}"
+    noise = seen(ratio, channels["theta_e"], channels["theta_s"])
+    result.append(_lost_motion(gearing, reversals, noise, channels["theta_e"].unit))
+    return [*result, _stiffness(record, speed, ratio, noise)]
+
+
+def _lost_motion(gearing: Gearing, reversals: int, noise: float, unit: str) -> Judgement:
+    size = gearing.lost_motion_text(unit)
+    if gearing.flank == "load":
+        return Judgement("lost motion", "yes", f"theta_e shifts by {size} as the load changes sides")
     if reversals < 2:
-        result.append(Judgement("lost motion", "no", f"{reversals} reversals: both flanks of the gap must be touched"))
-    elif lost > 4.0 * error and lost > seen:
-        result.append(Judgement("lost motion", "yes", f"theta_e shifts by about {size} from flank to flank"))
-    else:
-        result.append(
-            Judgement("lost motion", "weak", f"shift of theta_e from flank to flank is {size}, noise {seen:.2g} {unit}")
-        )
-    return [*result, _stiffness(record, speed, ratio, seen)]
+        return Judgement("lost motion", "no", f"{reversals} reversals: both flanks of the gap must be touched")
+    if gearing.wide:
+        return Judgement("lost motion", "weak", f"shift of {size} with the wind-up, which looks alike in this motion")
+    if gearing.stands_out(noise):
+        return Judgement("lost motion", "yes", f"theta_e shifts by {size} from flank to flank")
+    return Judgement("lost motion", "weak", f"shift of theta_e from flank to flank is {size}, noise {noise:.2g} {unit}")
 
 
 def _stiffness(record: Record, speed: Array, ratio: float, seen: float) -> Judgement:
