@@ -64,15 +64,23 @@ class Gearing:
     def lost_motion_text(self, unit: str) -> str:
         """Value, error and interval; in degrees as well."""
         low, high = self.lost_motion_interval
-        text = f"{self.lost_motion:.3g} ± {self.lost_motion_error:.1g} {unit} (95 %: {low:.3g} to {high:.3g} {unit}"
+        digits = _decimals(self.lost_motion_error)
+        text = f"{self.lost_motion:.{digits}f} ± {self.lost_motion_error:.{digits}f} {unit}"
+        text += f" (95 %: {low:.{digits}f} to {high:.{digits}f}"
         if unit == "rad":
-            degrees = 180.0 / np.pi
-            text += f"; {degrees * self.lost_motion:.3g} ± {degrees * self.lost_motion_error:.2g}°"
+            value, error = np.degrees(self.lost_motion), np.degrees(self.lost_motion_error)
+            digits = _decimals(error)
+            text += f"; {value:.{digits}f} ± {error:.{digits}f}°"
         return f"{text})"
 
     def stands_out(self, noise: float) -> bool:
         """Whether the lost motion is more than its error and the noise (:func:`seen`)."""
         return self.lost_motion > max(4.0 * self.lost_motion_error, noise)
+
+
+def _decimals(error: float) -> int:
+    """Decimals that show two digits of an error."""
+    return int(np.clip(1 - np.floor(np.log10(error)), 0, 9)) if 0.0 < error < np.inf else 6
 
 
 def gearing(
@@ -248,7 +256,7 @@ def _lost_motion(
         for part in np.split(np.arange(len(clear)), ends):
             clear[part] = ~_widened(~clear[part], guard)
         few = np.flatnonzero(clear)[:: max(int(clear.sum()) // 20_000, 1)]
-        if len(few) < 3 * terms.shape[1]:
+        if len(few) < 3 * terms.shape[1] or clear.sum() < 0.1 * len(clear):
             continue
         chosen = np.column_stack([np.sign(flank[few]), terms[few]])
         chosen /= np.abs(chosen).max(axis=0) + 1e-300
@@ -331,7 +339,7 @@ def _gear_fit(
         # on its way from flank to flank it is anywhere in the gap
         clear = np.abs(np.concatenate([m[part[3]] for m, part in zip(mixed, parts, strict=True)])) > 0.3
         few = np.flatnonzero(clear)[:: max(len(position) // 20_000, 1)]
-        if len(few) < 3 * rows.shape[1]:
+        if len(few) < 3 * rows.shape[1] or clear.sum() < 0.25 * len(clear):
             continue
         rows[:, 2] = flank
         scaled = rows[few] / (np.abs(rows[few]).max(axis=0) + 1e-300)

@@ -263,7 +263,7 @@ def by_load(times: Array, twist: Array, position: Array, velocity: Array, turn: 
             return None
         variance += (len(finite) - 1) / len(finite) * float(np.sum((finite - finite.mean()) ** 2))
     error = math.sqrt(variance)
-    if abs(value) < 5.0 * error:
+    if abs(value) < 8.0 * error:
         return None
     turned = np.flatnonzero(np.diff(state))
     at = tuple(float(0.5 * (cells.time[i] + cells.time[i + 1])) for i in turned)
