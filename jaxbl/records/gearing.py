@@ -23,7 +23,7 @@ class Gearing:
 
     Attributes:
         ratio: motor over load motion.
-        ratio_error: standard error.
+        ratio_error: standard error; beside a twist as large as the motion it takes that share of the ratio.
         lost_motion: shift of theta_e against theta_s from flank to flank of the gap, at the motor; rad or m.
         lost_motion_error: standard error.
         skew: by how much the stamps of theta_s are later than its readings, s, against those of theta_e; None where it
@@ -37,6 +37,7 @@ class Gearing:
         lost_motion_range: what a tenth of the places falls below, and a tenth exceeds, where the load changes sides.
         twist: range of theta_e - ratio theta_s, with the ratio that is expected, if one is; at the motor.
         twist_residual: rms of the twist that lost motion and wind-up leave over the rms of theta_e about its mean.
+        least_twist: range of the twist with the ratio that was found.
         motion: range of theta_e.
     """
 
@@ -54,12 +55,13 @@ class Gearing:
     lost_motion_range: tuple[float, float]
     twist: float
     twist_residual: float
+    least_twist: float
     motion: float
 
     @property
     def wide(self) -> bool:
-        """Whether the twist is of the size of the motion, so that the load hardly follows the motor."""
-        return self.twist > WIDE * self.motion
+        """Whether the twist is of the size of the motion whatever the ratio, so that the load hardly follows the motor."""
+        return min(self.twist, self.least_twist) > WIDE * self.motion
 
     def lost_motion_text(self, unit: str) -> str:
         """Value, error and interval; in degrees as well."""
@@ -138,17 +140,20 @@ def gearing(
     left = target - rows[:, :4] @ slopes
     spread = float(np.std(target))
     residual = float(np.sqrt(np.mean(left**2))) / spread if spread else np.inf
-    # encoders do not wait for long; and at one speed only, a delay looks like lost motion
-    known = known and residual < UNLIKE and abs(skew) < 10.0 * period and bool(np.isfinite(errors[1]))
+    # encoders do not wait for long; and at one speed, to and fro, a delay looks like lost motion
+    alike = abs(float(rows[:, 1] @ rows[:, 2])) / float(np.linalg.norm(rows[:, 1]) * np.linalg.norm(rows[:, 2]) + 1e-300)
+    known = known and residual < UNLIKE and abs(skew) < 10.0 * period and alike < 0.97
     # what is not clearly there is better not undone
     undone = skew if known and abs(skew) > 4.0 * errors[1] / abs(found[0]) else 0.0
     ratio = float(slopes[0]) if expected is None else expected
     aligned = [_aligned(times[s], load[s], undone) for s in usable]
     motor_there = np.concatenate([motor[s] for s in usable])
-    twist, motion = float(np.ptp(motor_there - ratio * np.concatenate(aligned))), float(np.ptp(motor_there))
+    load_there, motion = np.concatenate(aligned), float(np.ptp(motor_there))
+    twist, least = (float(np.ptp(motor_there - r * load_there)) for r in (ratio, float(slopes[0])))
+    wide = min(twist, least) > WIDE * motion
     # a load that sticks and slips, or a coarse encoder, shows its direction no sooner than the motor does
     slow = min(width, _width(motor[longest], period) or width)
-    lost = _lost_motion(times, motor, aligned, usable, period, 4.0 * slow, ratio, turn, wide=twist > WIDE * motion)
+    lost = _lost_motion(times, motor, aligned, usable, period, 4.0 * slow, ratio, turn, wide=wide)
     if lost is None:
         value, error = 2.0 * float(found[2]) * float(np.sign(found[0])), 2.0 * float(errors[2])
         lost = LostMotion.unsure(value, error)
@@ -156,10 +161,10 @@ def gearing(
     speed = float(np.sqrt(np.mean(rows[:, 1] ** 2)))
     skew_error = float(np.hypot(errors[1], 0.005 * lost.value / speed) / abs(found[0]))
     # beside a gap as large as the motion nothing is told of delays
-    known = known and twist < WIDE * motion
+    known = known and not wide
     return Gearing(
         ratio=float(slopes[0]),
-        ratio_error=float(slope_errors[0]),
+        ratio_error=float(np.hypot(slope_errors[0], slopes[0] * least / motion if wide else 0.0)),
         lost_motion=lost.value,
         lost_motion_error=lost.error,
         skew=skew if known else None,
@@ -172,6 +177,7 @@ def gearing(
         lost_motion_range=(lost.least, lost.largest),
         twist=twist,
         twist_residual=lost.residual / spread if spread else np.inf,
+        least_twist=least,
         motion=motion,
     )
 
@@ -253,6 +259,8 @@ def _lost_motion(
     for angle in _MIXTURES:
         flank = np.cos(angle) * velocity / sizes[0] + np.sin(angle) * acceleration / sizes[1]
         clear = np.abs(flank) > 0.3
+        if clear.sum() < 0.25 * len(clear):
+            continue
         for part in np.split(np.arange(len(clear)), ends):
             clear[part] = ~_widened(~clear[part], guard)
         few = np.flatnonzero(clear)[:: max(int(clear.sum()) // 20_000, 1)]

@@ -203,11 +203,15 @@ def _of_transmission(record: Record, speed: Array, reversals: int, ratio: float 
         return [Judgement(name, "no", why) for name in names]
     if gearing is None or ratio is None:
         return [Judgement(name, "no", "the motion does not stand out of the noise") for name in names]
+    share = min(gearing.twist, gearing.least_twist) / gearing.motion
+    left = f"{100 * gearing.residual:.2g} % of theta_e is left over"
+    if gearing.wide:
+        left = f"gap and wind-up take {100 * share:.0f} % of the range of theta_e"
     result = [
         Judgement(
             "gear ratio",
-            "yes" if gearing.residual < 0.05 else "weak",
-            f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {100 * gearing.residual:.2g} % of theta_e is left over",
+            "yes" if gearing.residual < 0.05 and not gearing.wide else "weak",
+            f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {left}",
         )
     ]
     noise = seen(ratio, channels["theta_e"], channels["theta_s"])

@@ -83,10 +83,16 @@ def by_motion(
     found, errors = quality.jackknifed(twist[clear], terms)
     if not np.isfinite(found).all():
         return None
+    value = float(found[0])
+    rest = twist[clear] - terms @ found
+    left = float(np.sqrt(np.mean(rest**2)))
+    # a drift leaves each stretch on one flank at a level of its own
+    stretch = np.concatenate([[0], np.cumsum(np.diff(signs) != 0)])
+    levels = np.bincount(stretch, rest) / np.bincount(stretch)
+    between = 2.0 * float(np.sqrt(np.mean(levels**2) / max(len(levels) - 2, 1)))
     # corners of the motion are rounded by the filter: what that may leave, where nothing else does
-    value, error = float(found[0]), math.hypot(float(errors[0]), 1e-4 * float(found[0]), beside)
-    left = float(np.sqrt(np.mean((twist[clear] - terms @ found) ** 2)))
-    interval = _interval(value, error, quality.BLOCKS - 1)
+    error = math.hypot(max(float(errors[0]), between), 1e-4 * value, beside)
+    interval = _interval(value, error, min(quality.BLOCKS, len(levels)) - 1)
     return LostMotion(value, error, interval, "motion", changes, (), value, value, left)
 
 
@@ -250,7 +256,7 @@ def by_load(times: Array, twist: Array, position: Array, velocity: Array, turn: 
     left = _left(cells, state, value)
     residual = float(np.std(left))
     # two levels stand apart; a drift does not
-    if abs(value) < 4.0 * residual or not _better_than_drift(cells, left):
+    if abs(value) < 6.0 * residual or not _better_than_drift(cells, left):
         return None
     passes = np.unique(cells.passing)
     groups = np.array_split(np.arange(BINS), quality.BLOCKS)

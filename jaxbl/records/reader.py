@@ -565,6 +565,9 @@ class _Reader:
     def check_gearing(self, found: Gearing | None) -> None:
         """Compare the ratio of both motions with the gear ratio that is expected."""
         expected = self.gear_ratio
+        if found is not None and expected is not None and found.wide and found.residual < UNLIKE:
+            self.check_wide_gearing(found, expected)
+            return
         if found is None or found.residual >= UNLIKE:
             left = "" if found is None else f" ({100 * found.residual:.0f} % of theta_e is not explained by theta_s)"
             self.notes.append(
@@ -597,6 +600,28 @@ class _Reader:
         if found.residual < 0.05:
             raise self.wrong(f"{moves}: {why}")
         self.notes.append(f"{moves}, but they go together only roughly; perhaps {why}.")
+
+    def check_wide_gearing(self, found: Gearing, expected: float) -> None:
+        """The same where the twist is as large as the motion, so that the log fits many ratios."""
+        unit = "m" if self.turn is None else "rad"
+        ranges = (
+            f"theta_e - {expected:g} theta_s ranges over {found.twist:.3g} {unit}, theta_e over {found.motion:.3g} {unit}"
+        )
+        # a load that a motor moves through a gap moves no farther than the motor
+        if found.twist > max(3.0 * found.least_twist, 1.5 * found.motion):
+            raise self.wrong(
+                f"{ranges}: gear_ratio, or a unit in [log], is wrong (with {found.ratio:.3g} in place of {expected:g} it "
+                f"would be {found.least_twist:.3g} {unit})"
+            )
+        against = " They mostly move against each other: perhaps the sign of one of them is wrong."
+        self.notes.append(
+            f"{ranges}: with a gap or wind-up of that size the log hardly checks gear_ratio."
+            + (
+                " They move against each other most of the time: perhaps the sign of one of them is wrong."
+                if against
+                else ""
+            )
+        )
 
     def check_torque(self, found: Dynamics, torque: Array, position: Array, segments: Slices) -> None:
         """A passive drive takes energy from its input; inertia and friction are positive."""
