@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -96,16 +96,7 @@ class Inspection:
 def inspect(
     path: str | Path, log: LogTable | Mapping[str, Any] | None = None, *, gear_ratio: float | None = None
 ) -> Inspection:
-    """Read a measured log and judge what it can identify.
-
-    Args:
-        path: CSV or other text, Parquet, MATLAB (.mat up to 7.3), or JSON file.
-        log: the `[log]` table of a study, or its keys; left out: columns t, u, theta_e, theta_s in s, N m, rad, rad.
-        gear_ratio: expected ratio of motor over load motion, which the log is checked against.
-
-    Raises:
-        InputError: the file or a column is missing or unfit, or the log contradicts what is said of it; one line.
-    """
+    """Read a measured log and judge what it can identify; arguments and errors are those of :func:`read_record`."""
     table = read_log_table(log)
     record = read_record(path, table, gear_ratio=gear_ratio)
     gearing = record.findings.gearing
@@ -114,7 +105,10 @@ def inspect(
         ratio = None
     speed = velocity(record)
     reversals = _reversals(record, speed)
-    found = [*_of_inertia_and_friction(record, speed, reversals), *_of_transmission(record, speed, reversals, ratio)]
+    rigid = _of_inertia_and_friction(record, speed, reversals)
+    if gearing is not None and gearing.wide:
+        rigid = [_beside_a_gap(judgement) for judgement in rigid]
+    found = [*rigid, *_of_transmission(record, speed, reversals, ratio)]
     return Inspection(record, table, ratio, reversals, tuple(found))
 
 
@@ -186,6 +180,14 @@ def _of_inertia_and_friction(record: Record, speed: Array, reversals: int) -> li
         why = "motion in one direction only: it looks like a constant torque"
         return [*result, Judgement("Coulomb friction", "weak", why), _constant(both)]
     return [*result, judge("Coulomb friction", 2, f"{reversals} reversals", "viscous friction"), _constant(both)]
+
+
+def _beside_a_gap(judgement: Judgement) -> Judgement:
+    """Of a motor that moves as far as the gap lets it, a fit of one rigid body says little."""
+    if judgement.answer == "no" or judgement.quantity == "constant torque":
+        return judgement
+    why = f"{judgement.why}; in a fit of a rigid drive, while here the load follows the motor loosely"
+    return replace(judgement, answer="weak", why=why)
 
 
 def _constant(both: float) -> Judgement:

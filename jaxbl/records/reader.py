@@ -616,11 +616,7 @@ class _Reader:
         against = " They mostly move against each other: perhaps the sign of one of them is wrong."
         self.notes.append(
             f"{ranges}: with a gap or wind-up of that size the log hardly checks gear_ratio."
-            + (
-                " They move against each other most of the time: perhaps the sign of one of them is wrong."
-                if against
-                else ""
-            )
+            + (against if found.ratio * expected < 0.0 else "")
         )
 
     def check_torque(self, found: Dynamics, torque: Array, position: Array, segments: Slices) -> None:
