@@ -33,7 +33,7 @@ class Gearing:
         lost_motion_interval: 95 %.
         flank: what tells the flank: the direction of motion, or a load that changes sides.
         flank_changes: on which the lost motion rests.
-        flank_times: of these, s, where the load made them.
+        flank_times: of these, s from the first sample, where the load made them.
         lost_motion_range: what a tenth of the places falls below, and a tenth exceeds, where the load changes sides.
         twist: range of theta_e - ratio theta_s, with the ratio that is expected, if one is; at the motor.
         twist_residual: rms of the twist that lost motion and wind-up leave over the rms of theta_e about its mean.

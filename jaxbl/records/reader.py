@@ -170,9 +170,10 @@ class _Reader:
             name: self.figures(name, raw, parts, None if sampling.even else stamps, source) for name, raw in channels.items()
         }
         if geared is not None:
+            geared = replace(geared, flank_times=tuple(t - float(time[0]) for t in geared.flank_times))
             figures["theta_s"] = replace(figures["theta_s"], skew=geared.skew, skew_error=geared.skew_error)
             self.note_skew(geared, step)
-            self.note_lost_motion(geared, seen(geared.ratio, figures["theta_e"], figures["theta_s"]), float(time[0]))
+            self.note_lost_motion(geared, seen(geared.ratio, figures["theta_e"], figures["theta_s"]))
         if dynamics is not None and dynamics.residual < 0.1 and dynamics.shares[0] > 0.3:
             figures["u"] = replace(figures["u"], skew=dynamics.skew, skew_error=dynamics.skew_error)
         return Record(
@@ -660,11 +661,11 @@ class _Reader:
                 "of the stamps, or viscous friction of the load winding up the shaft, which look alike."
             )
 
-    def note_lost_motion(self, found: Gearing, noise: float, start: float) -> None:
+    def note_lost_motion(self, found: Gearing, noise: float) -> None:
         unit = "m" if self.turn is None else "rad"
         text = found.lost_motion_text(unit)
         if found.flank == "load":
-            few, times = len(found.flank_times) == 1, [f"{t - start:.3g}" for t in found.flank_times[:6]]
+            few, times = len(found.flank_times) == 1, [f"{t:.3g}" for t in found.flank_times[:6]]
             more = ", ..." if len(found.flank_times) > 6 else ""
             low, high = found.lost_motion_range
             self.notes.append(
