@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import quality
+from .gearing import Gearing, seen
 from .quality import Array
 from .reader import SIDES, Record, read_log_table, read_record
 from .table import LogTable
@@ -95,16 +96,7 @@ class Inspection:
 def inspect(
     path: str | Path, log: LogTable | Mapping[str, Any] | None = None, *, gear_ratio: float | None = None
 ) -> Inspection:
-    """Read a measured log and judge what it can identify.
-
-    Args:
-        path: CSV or other text, Parquet, MATLAB (.mat up to 7.3), or JSON file.
-        log: the `[log]` table of a study, or its keys; left out: columns t, u, theta_e, theta_s in s, N m, rad, rad.
-        gear_ratio: expected ratio of motor over load motion, which the log is checked against.
-
-    Raises:
-        InputError: the file or a column is missing or unfit, or the log contradicts what is said of it; one line.
-    """
+    """Read a measured log and judge what it can identify; arguments and errors are those of :func:`read_record`."""
     table = read_log_table(log)
     record = read_record(path, table, gear_ratio=gear_ratio)
     gearing = record.findings.gearing
@@ -113,7 +105,10 @@ def inspect(
         ratio = None
     speed = velocity(record)
     reversals = _reversals(record, speed)
-    found = [*_of_inertia_and_friction(record, speed, reversals), *_of_transmission(record, speed, reversals, ratio)]
+    rigid = _of_inertia_and_friction(record, speed, reversals)
+    if gearing is not None and gearing.wide:
+        rigid = [_beside_a_gap(judgement) for judgement in rigid]
+    found = [*rigid, *_of_transmission(record, speed, reversals, ratio)]
     return Inspection(record, table, ratio, reversals, tuple(found))
 
 
@@ -187,6 +182,14 @@ def _of_inertia_and_friction(record: Record, speed: Array, reversals: int) -> li
     return [*result, judge("Coulomb friction", 2, f"{reversals} reversals", "viscous friction"), _constant(both)]
 
 
+def _beside_a_gap(judgement: Judgement) -> Judgement:
+    """Of a motor that moves as far as the gap lets it, a fit of one rigid body says little."""
+    if judgement.answer == "no" or judgement.quantity == "constant torque":
+        return judgement
+    why = f"{judgement.why}; in a fit of a rigid drive, while here the load follows the motor loosely"
+    return replace(judgement, answer="weak", why=why)
+
+
 def _constant(both: float) -> Judgement:
     if both < 0.05:
         return Judgement("constant torque", "weak", "motion in one direction only: it looks like Coulomb friction")
@@ -202,27 +205,33 @@ def _of_transmission(record: Record, speed: Array, reversals: int, ratio: float 
         return [Judgement(name, "no", why) for name in names]
     if gearing is None or ratio is None:
         return [Judgement(name, "no", "the motion does not stand out of the noise") for name in names]
+    share = min(gearing.twist, gearing.least_twist) / gearing.motion
+    left = f"{100 * gearing.residual:.2g} % of theta_e is left over"
+    if gearing.wide:
+        left = f"gap and wind-up take {100 * share:.0f} % of the range of theta_e"
     result = [
         Judgement(
             "gear ratio",
-            "yes" if gearing.residual < 0.05 else "weak",
-            f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {100 * gearing.residual:.2g} % of theta_e is left over",
+            "yes" if gearing.residual < 0.05 and not gearing.wide else "weak",
+            f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {left}",
         )
     ]
-    seen = math.hypot(channels["theta_e"].resolution, ratio * channels["theta_s"].resolution) / math.sqrt(12.0)
-    seen = math.hypot(seen, math.hypot(channels["theta_e"].noise, ratio * channels["theta_s"].noise))
-    lost, error = gearing.lost_motion, gearing.lost_motion_error
-    unit = channels["theta_e"].unit
-    size = f"{lost:.3g} ± {error:.1g} {unit}"
+    noise = seen(ratio, channels["theta_e"], channels["theta_s"])
+    result.append(_lost_motion(gearing, reversals, noise, channels["theta_e"].unit))
+    return [*result, _stiffness(record, speed, ratio, noise)]
+
+
+def _lost_motion(gearing: Gearing, reversals: int, noise: float, unit: str) -> Judgement:
+    size = gearing.lost_motion_text(unit)
+    if gearing.flank == "load":
+        return Judgement("lost motion", "yes", f"theta_e shifts by {size} as the load changes sides")
     if reversals < 2:
-        result.append(Judgement("lost motion", "no", f"{reversals} reversals: both flanks of the gap must be touched"))
-    elif lost > 4.0 * error and lost > seen:
-        result.append(Judgement("lost motion", "yes", f"theta_e shifts by about {size} from flank to flank"))
-    else:
-        result.append(
-            Judgement("lost motion", "weak", f"shift of theta_e from flank to flank is {size}, noise {seen:.2g} {unit}")
-        )
-    return [*result, _stiffness(record, speed, ratio, seen)]
+        return Judgement("lost motion", "no", f"{reversals} reversals: both flanks of the gap must be touched")
+    if gearing.wide:
+        return Judgement("lost motion", "weak", f"shift of {size} with the wind-up, which looks alike in this motion")
+    if gearing.stands_out(noise):
+        return Judgement("lost motion", "yes", f"theta_e shifts by {size} from flank to flank")
+    return Judgement("lost motion", "weak", f"shift of theta_e from flank to flank is {size}, noise {noise:.2g} {unit}")
 
 
 def _stiffness(record: Record, speed: Array, ratio: float, seen: float) -> Judgement:

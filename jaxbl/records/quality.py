@@ -238,161 +238,6 @@ def jackknifed(target: Array, regressors: Array) -> tuple[Array, Array]:
     return best / scale, error / scale
 
 
-HARMONICS = 8
-"""Terms of the series over position that takes out what repeats with it."""
-
-
-UNLIKE = 0.2
-"""Share of the motor's motion that the load's leaves unexplained, beyond which they are not said to go together."""
-
-
-@dataclass(frozen=True)
-class Gearing:
-    """Motor position as a function of the load's: theta_e = ratio theta_s + constant + half the lost motion by flank.
-
-    Attributes:
-        ratio: motor over load motion.
-        ratio_error: standard error.
-        lost_motion: shift of theta_e against theta_s from flank to flank of the gap, at the motor; rad or m.
-        lost_motion_error: standard error.
-        skew: by how much the stamps of theta_s are later than its readings, s, against those of theta_e; None where it
-            cannot be told.
-        skew_error: standard error.
-        residual: rms of what is left, at the motor, over the rms of theta_e about its mean.
-    """
-
-    ratio: float
-    ratio_error: float
-    lost_motion: float
-    lost_motion_error: float
-    skew: float | None
-    skew_error: float | None
-    residual: float
-
-
-def _direction(velocity: Array) -> Array:
-    """+1 or -1 where it moves, between them where it hardly does."""
-    return velocity / np.hypot(velocity, 0.02 * np.sqrt(np.mean(velocity**2)) + 1e-300)
-
-
-def gearing(times: Array, motor: Array, load: Array, segments: Slices, period: float) -> Gearing | None:
-    """Regress motor on load position, its velocity, acceleration and flank; None where the motion does not tell.
-
-    A delay of the load's stamps adds to theta_e what is proportional to the velocity, lost motion what has the sign of the
-    transmitted torque; so they part wherever the speed varies. That sign is taken as the sign of a mixture of velocity
-    (friction) and acceleration (inertia) of the load, the one that explains most. Viscous friction at the load winds up the
-    shaft in proportion to velocity too, and cannot be told from a delay. Errors of the encoders and the gear that repeat
-    with position (eccentricity) are taken out of both by a cosine series over the range of theta_s.
-
-    Args:
-        times: shape (samples,), s.
-        motor: theta_e, shape (samples,).
-        load: theta_s, shape (samples,).
-        segments: contiguous parts.
-        period: s.
-    """
-    longest = max(segments, key=lambda s: s.stop - s.start)
-    width = bandwidth(load[longest], period, slope=True)
-    usable = [s for s in segments if s.stop - s.start >= SHORTEST]
-    if width == 0.0 or not usable:
-        return None
-    skew, known = 0.0, True
-    fit = None
-    for _ in range(5):
-        fit = _gear_fit(times, motor, load, usable, period, 4.0 * width, skew)
-        if fit is None:
-            return None
-        _, _, found, _ = fit
-        step = float(found[1] / found[0])
-        if not known or abs(step) < 1e-3 * period:
-            break
-        skew += step
-        # a quarter of the fastest period: no delay of an encoder, but a load that moves on its own
-        if abs(skew) > 0.25 / width:
-            skew, known = 0.0, False
-    assert fit is not None
-    target, rows, found, errors = fit
-    # the ratio is that of the whole motion, whatever repeats within it
-    slopes, slope_errors = jackknifed(target, rows[:, :4])
-    if not np.isfinite(slopes).all():
-        return None
-    left = target - rows[:, :4] @ slopes
-    # how the gap is crossed is not modelled: what that was found to be worth, on motions of several frequencies
-    crossing = 0.01 * found[2] / float(np.sqrt(np.mean(rows[:, 1] ** 2)))
-    spread = float(np.std(target))
-    residual = float(np.sqrt(np.mean(left**2))) / spread if spread else np.inf
-    known = known and residual < UNLIKE
-    return Gearing(
-        ratio=float(slopes[0]),
-        ratio_error=float(slope_errors[0]),
-        lost_motion=2.0 * float(found[2]) * float(np.sign(found[0])),
-        lost_motion_error=2.0 * float(errors[2]),
-        skew=skew if known else None,
-        skew_error=float(np.hypot(errors[1], crossing) / abs(found[0])) if known else None,
-        residual=residual,
-    )
-
-
-_MIXTURES = np.radians([0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0])
-"""From velocity alone to acceleration alone, each over its rms."""
-
-
-def _gear_fit(
-    times: Array, motor: Array, load: Array, segments: Slices, period: float, cutoff: float, skew: float
-) -> tuple[Array, Array, Array, Array] | None:
-    """One regression of :func:`gearing` at a given skew.
-
-    Returns:
-        Motor positions, shape (rows,); terms (position, velocity, flank, 1, acceleration, series), shape
-        (rows, 5 + HARMONICS); coefficients and standard errors, shape (5 + HARMONICS,).
-    """
-    from scipy.interpolate import CubicSpline
-
-    targets, parts = [], []
-    lowest, highest = float(load.min()), float(load.max())
-    for s in segments:
-        inside = np.clip(times[s] + skew, times[s][0], times[s][-1])
-        smooth = low_passed(CubicSpline(times[s], load[s])(inside), cutoff, period)
-        velocity = np.gradient(smooth, times[s])
-        edge = min(round(1.0 / (cutoff * period)), len(smooth) // 8) + 2
-        cut = slice(edge, len(smooth) - edge)
-        parts.append((smooth, velocity, np.gradient(velocity, times[s]), cut))
-        targets.append(low_passed(motor[s], cutoff, period)[cut])
-    target = np.concatenate(targets)
-    sizes = [np.sqrt(np.mean(np.concatenate([part[i][part[3]] for part in parts]) ** 2)) + 1e-300 for i in (1, 2)]
-    position, velocity, acceleration = (np.concatenate([part[i][part[3]] for part in parts]) for i in range(3))
-    place = np.pi * (position - lowest) / (highest - lowest)
-    series = [np.cos(k * place) for k in range(1, HARMONICS + 1)]
-    rows = np.stack(
-        [position - lowest, velocity, np.zeros_like(position), np.ones_like(position), acceleration, *series], axis=1
-    )
-    best = None
-    for angle in _MIXTURES:
-        mixed = [np.cos(angle) * part[1] / sizes[0] + np.sin(angle) * part[2] / sizes[1] for part in parts]
-        flank = np.concatenate(
-            [low_passed(_direction(m), cutoff, period)[part[3]] for m, part in zip(mixed, parts, strict=True)]
-        )
-        # on its way from flank to flank it is anywhere in the gap
-        clear = np.abs(np.concatenate([m[part[3]] for m, part in zip(mixed, parts, strict=True)])) > 0.3
-        few = np.flatnonzero(clear)[:: max(len(position) // 20_000, 1)]
-        if len(few) < 3 * rows.shape[1]:
-            continue
-        rows[:, 2] = flank
-        scaled = rows[few] / (np.abs(rows[few]).max(axis=0) + 1e-300)
-        best_fit = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ target[few], rcond=1e-12)[0]
-        size = float(np.mean((target[few] - scaled @ best_fit) ** 2))
-        if best is None or size < best[0]:
-            best = (size, flank, clear)
-    if best is None:
-        return None
-    rows[:, 2] = best[1]
-    rows, target = rows[best[2]], target[best[2]]
-    found, errors = jackknifed(target, rows)
-    if not np.isfinite(found).all() or found[0] == 0.0:
-        return None
-    return target, rows, found, errors
-
-
 @dataclass(frozen=True)
 class Dynamics:
     """A rough rigid-drive regression of the torque, to judge a log by; no identification.
@@ -420,6 +265,11 @@ class Dynamics:
     residual: float
 
 
+def direction_of(velocity: Array) -> Array:
+    """+1 or -1 where it moves, between them where it hardly does."""
+    return velocity / np.hypot(velocity, 0.02 * np.sqrt(np.mean(velocity**2)) + 1e-300)
+
+
 def dynamics(times: Array, torque: Array, position: Array, segments: Slices, period: float) -> Dynamics | None:
     """Regress torque on the motion of one encoder; None where there is too little motion.
 
@@ -442,7 +292,7 @@ def dynamics(times: Array, torque: Array, position: Array, segments: Slices, per
         smooth = low_passed(position[s], cutoff, period)
         velocity = np.gradient(smooth, period)
         acceleration = np.gradient(velocity, period)
-        direction = low_passed(_direction(velocity), cutoff, period)
+        direction = low_passed(direction_of(velocity), cutoff, period)
         held = low_passed(torque[s], cutoff, period)
         edge = min(round(1.0 / (cutoff * period)), len(smooth) // 8) + 2
         cut = slice(edge, len(smooth) - edge)

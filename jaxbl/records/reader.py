@@ -14,7 +14,8 @@ from jaxbl.errors import InputError
 
 from . import quality
 from .files import Columns, read_columns
-from .quality import SHORTEST, Array, Dynamics, Gearing, Sampling, Slices
+from .gearing import UNLIKE, Gearing, gearing, seen
+from .quality import SHORTEST, Array, Dynamics, Sampling, Slices
 from .table import LogTable, PositionTable, TimeTable, TorqueTable, describe, nearest
 
 
@@ -143,11 +144,11 @@ class _Reader:
         regrid = not sampling.even or not math.isclose(step, period, rel_tol=1e-9)
         skews = {name: raw.skew if isinstance(raw.skew, float) else 0.0 for name, raw in channels.items()}
         grid = self.gridded(stamps, channels, parts, step, skews, first, regrid)
-        gearing = self.gearing(grid, step)
+        geared = self.gearing_of(grid, step)
         if any(raw.skew == "estimate" for raw in channels.values()):
-            skews["theta_s"] = self.estimated_skew(gearing, step)
+            skews["theta_s"] = self.estimated_skew(geared, step)
             grid = self.gridded(stamps, channels, parts, step, skews, first, regrid)
-            gearing = self.gearing(grid, step)
+            geared = self.gearing_of(grid, step)
         time, values, segments = grid
         if regrid:
             why = "to the period that [log] resample asks for" if self.table.resample else "from uneven stamps"
@@ -158,7 +159,7 @@ class _Reader:
             if skew:
                 self.notes.append(f"{name}: moved by its skew of {1e3 * skew:.4g} ms.")
         if len(positions) == 2:
-            self.check_gearing(gearing)
+            self.check_gearing(geared)
         side = "theta_e" if "theta_e" in values else "theta_s"
         dynamics = quality.dynamics(time, values["u"], values[side], segments, step) if "u" in values else None
         if dynamics is not None:
@@ -168,9 +169,11 @@ class _Reader:
         figures = {
             name: self.figures(name, raw, parts, None if sampling.even else stamps, source) for name, raw in channels.items()
         }
-        if gearing is not None:
-            figures["theta_s"] = replace(figures["theta_s"], skew=gearing.skew, skew_error=gearing.skew_error)
-            self.note_skew(gearing, step)
+        if geared is not None:
+            geared = replace(geared, flank_times=tuple(t - float(time[0]) for t in geared.flank_times))
+            figures["theta_s"] = replace(figures["theta_s"], skew=geared.skew, skew_error=geared.skew_error)
+            self.note_skew(geared, step)
+            self.note_lost_motion(geared, seen(geared.ratio, figures["theta_e"], figures["theta_s"]))
         if dynamics is not None and dynamics.residual < 0.1 and dynamics.shares[0] > 0.3:
             figures["u"] = replace(figures["u"], skew=dynamics.skew, skew_error=dynamics.skew_error)
         return Record(
@@ -184,7 +187,7 @@ class _Reader:
             start=start + float(time[0]),
             segments=segments,
             notes=tuple(self.notes),
-            findings=Findings(sampling, figures, gearing, dynamics),
+            findings=Findings(sampling, figures, geared, dynamics),
             intervals=np.diff(stamps),
         )
 
@@ -470,11 +473,16 @@ class _Reader:
             begin += len(grid)
         return np.concatenate(times), {name: np.concatenate(v) for name, v in values.items()}, tuple(segments)
 
-    def gearing(self, grid: tuple[Array, dict[str, Array], tuple[slice, ...]], step: float) -> Gearing | None:
+    @property
+    def turn(self) -> float | None:
+        """Of the load, in SI units."""
+        return None if (self.table.theta_s or PositionTable()).unit in ("m", "mm") else 2.0 * math.pi
+
+    def gearing_of(self, grid: tuple[Array, dict[str, Array], tuple[slice, ...]], step: float) -> Gearing | None:
         time, values, segments = grid
         if not {"theta_e", "theta_s"} <= set(values):
             return None
-        return quality.gearing(time, values["theta_e"], values["theta_s"], segments, step)
+        return gearing(time, values["theta_e"], values["theta_s"], segments, step, expected=self.gear_ratio, turn=self.turn)
 
     def estimated_skew(self, gearing: Gearing | None, step: float) -> float:
         if gearing is None or gearing.skew is None or gearing.skew_error is None:
@@ -558,7 +566,10 @@ class _Reader:
     def check_gearing(self, found: Gearing | None) -> None:
         """Compare the ratio of both motions with the gear ratio that is expected."""
         expected = self.gear_ratio
-        if found is None or found.residual >= quality.UNLIKE:
+        if found is not None and expected is not None and found.wide and found.residual < UNLIKE:
+            self.check_wide_gearing(found, expected)
+            return
+        if found is None or found.residual >= UNLIKE:
             left = "" if found is None else f" ({100 * found.residual:.0f} % of theta_e is not explained by theta_s)"
             self.notes.append(
                 f"theta_e and theta_s hardly go together{left}: they may not belong to one drive, or the load hardly moves "
@@ -590,6 +601,24 @@ class _Reader:
         if found.residual < 0.05:
             raise self.wrong(f"{moves}: {why}")
         self.notes.append(f"{moves}, but they go together only roughly; perhaps {why}.")
+
+    def check_wide_gearing(self, found: Gearing, expected: float) -> None:
+        """The same where the twist is as large as the motion, so that the log fits many ratios."""
+        unit = "m" if self.turn is None else "rad"
+        ranges = (
+            f"theta_e - {expected:g} theta_s ranges over {found.twist:.3g} {unit}, theta_e over {found.motion:.3g} {unit}"
+        )
+        # a load that a motor moves through a gap moves no farther than the motor
+        if found.twist > max(3.0 * found.least_twist, 1.5 * found.motion):
+            raise self.wrong(
+                f"{ranges}: gear_ratio, or a unit in [log], is wrong (with {found.ratio:.3g} in place of {expected:g} it "
+                f"would be {found.least_twist:.3g} {unit})"
+            )
+        against = " They mostly move against each other: perhaps the sign of one of them is wrong."
+        self.notes.append(
+            f"{ranges}: with a gap or wind-up of that size the log hardly checks gear_ratio."
+            + (against if found.ratio * expected < 0.0 else "")
+        )
 
     def check_torque(self, found: Dynamics, torque: Array, position: Array, segments: Slices) -> None:
         """A passive drive takes energy from its input; inertia and friction are positive."""
@@ -631,6 +660,22 @@ class _Reader:
                 f"theta_s is {1e3 * abs(found.skew):.3g} ± {1e3 * found.skew_error:.2g} ms {which} against theta_e: a skew "
                 "of the stamps, or viscous friction of the load winding up the shaft, which look alike."
             )
+
+    def note_lost_motion(self, found: Gearing, noise: float) -> None:
+        unit = "m" if self.turn is None else "rad"
+        text = found.lost_motion_text(unit)
+        if found.flank == "load":
+            few, times = len(found.flank_times) == 1, [f"{t:.3g}" for t in found.flank_times[:6]]
+            more = ", ..." if len(found.flank_times) > 6 else ""
+            low, high = found.lost_motion_range
+            self.notes.append(
+                f"Lost motion at the motor: {text}, as the load changes sides at {', '.join(times)}{more} s "
+                f"while places and directions repeat; {low:.2g} to {high:.2g} {unit} by place."
+                + (" With one change, a slipped coupling or lost counts look alike." if few else "")
+            )
+        elif found.stands_out(noise) and not found.wide:
+            changes = f"{found.flank_changes} changes of the flank"
+            self.notes.append(f"Lost motion at the motor: {text}, from {changes} by the direction of motion.")
 
     def figures(
         self,

@@ -209,15 +209,23 @@ def _twist(inspection: Inspection) -> Drawn:
     figure = Figure(figsize=(7.0, 3.6), layout="constrained")
     axes = figure.subplots(1, len(panels), sharey=True, squeeze=False).ravel()
     at = np.concatenate([np.arange(len(record.time))[_shown(record, s)] for s in record.segments])
-    forward = velocity(record, "load")[at] > 0.0
+    gearing = record.findings.gearing
+    by_load = gearing is not None and gearing.flank == "load"
+    if by_load:
+        assert gearing is not None
+        sides = np.searchsorted(gearing.flank_times, record.time[at]) % 2 == 0
+        names = ("load on its first side", "on the other")
+    else:
+        sides, names = velocity(record, "load")[at] > 0.0, ("forwards", "backwards")
     for ax, (x, label) in zip(axes, panels, strict=True):
-        for chosen, colour, name in ((forward, COLOURS[0], "forwards"), (~forward, COLOURS[1], "backwards")):
+        for chosen, colour, name in ((sides, COLOURS[0], names[0]), (~sides, COLOURS[1], names[1])):
             ax.plot(x[at][chosen], twist[at][chosen], ".", ms=1.8, color=colour, alpha=0.6, label=name)
         ax.set_xlabel(label)
     axes[0].set_ylabel(f"θe − N₀ θs about its median ({unit})")
     axes[-1].legend(ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, markerscale=5)
+    told = "the side that the load pulls to" if by_load else "the direction of motion"
     caption = (
-        f"Twist θe − N₀ θs with N₀ = {inspection.gear_ratio:.5g}, by the direction of motion. Over torque: hysteresis, its "
+        f"Twist θe − N₀ θs with N₀ = {inspection.gear_ratio:.5g}, by {told}. Over torque: hysteresis, its "
         "width is lost motion and friction, its slope compliance. Over position: what repeats with it is eccentricity of "
         "encoders or gears."
     )
@@ -232,7 +240,7 @@ def _intervals(record: Record) -> Drawn:
     left, right = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True)
     left.plot(ends, intervals, ".", ms=2.0, color=COLOURS[0])
     left.axhline(1e3 * record.findings.sampling.median_period, color=COLOURS[1], lw=1.0, ls="--", label="median")
-    left.set(xlabel="time (s)", ylabel="interval between stamps (ms)")
+    left.set(xlabel="time (s)", ylabel="interval\n(ms)")
     left.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
     right.hist(intervals, bins=60, orientation="horizontal", color=COLOURS[0])
     right.set(xlabel="samples (1)")

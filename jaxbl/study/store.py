@@ -31,6 +31,8 @@ _COMMANDS = {
     "tune": ("tune/manifest.json", ("gains.toml", "tuning.json", "tune"), ("axes", "verify")),
 }
 _COMMON = ("figures", "report.html")
+LOG_MARKERS = ("inspection.json", "identification.json")
+"""What `inspect` and `identify` leave, which says whose log the folder is for."""
 
 
 def identity(config: Config, command: str = "sweep") -> str:
@@ -91,6 +93,9 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
     if all(same) and (found or not any(folder.iterdir())):
         return
     if not found:
+        log = next((_log_of(folder / name) for name in LOG_MARKERS if (folder / name).exists()), None)
+        if log is not None:
+            raise InputError(f"{folder}: holds the results of a log ({log}); choose another folder with --out")
         raise InputError(f"{folder}: is not empty and holds no study; choose another folder with --out")
     if not overwrite:
         title = next((data["title"] for data in found.values() if data.get("title")), "untitled")
@@ -102,6 +107,14 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
             _remove(folder / name)
     for name in _COMMON:
         _remove(folder / name)
+
+
+def _log_of(marker: Path) -> str:
+    """Name of the log that results are of, quoted."""
+    try:
+        return f"'{Path(_read_json(marker)['file']).name}'"
+    except (InputError, KeyError, TypeError):
+        return f"see {marker.name}"
 
 
 def _remove(path: Path) -> None:

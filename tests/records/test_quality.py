@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxbl.records import quality
+from jaxbl.records.gearing import gearing
 
 RANDOM = np.random.default_rng(3)
 
@@ -109,4 +110,4 @@ def test_motion_of_one_frequency_leaves_inertia_and_spring_alike():
         assert found.inflation[0] > 1e3 and found.inflation[3] > 1e3
     assert quality.dynamics(time, np.zeros(8000), position, whole, 1e-3) is None
     assert quality.dynamics(time, position, RANDOM.standard_normal(8000), whole, 1e-3) is None
-    assert quality.gearing(time, position, RANDOM.standard_normal(8000), whole, 1e-3) is None
+    assert gearing(time, position, RANDOM.standard_normal(8000), whole, 1e-3) is None

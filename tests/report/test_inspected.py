@@ -86,4 +86,6 @@ def test_a_real_log_with_two_encoders(tmp_path):
     found = inspect(real("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
     twist = draw_inspection(found)[-1]
     assert twist.name == "twist" and len(twist.figure.axes) == 1
+    labels = [text.get_text() for text in twist.figure.axes[0].get_legend().get_texts()]
+    assert labels == ["load on its first side", "on the other"]
     assert summary(found)[0] == "outputEncoderData.txt: 42000 samples, 126 s every 3 ms, even stamps, one segment"

@@ -1,0 +1,294 @@
+"""Lost motion from two encoders: how far the motor shifts against the load from flank to flank of the gap."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import quality
+from .quality import Array
+
+Flank = Literal["motion", "load"]
+
+
+@dataclass(frozen=True)
+class LostMotion:
+    """Shift of theta_e - ratio theta_s between the flanks of the gap, at the motor.
+
+    Attributes:
+        value: rad or m.
+        error: standard error, which holds for residuals that are correlated in time and over position.
+        interval: 95 %.
+        flank: what tells the flank: the direction of motion (with the load's inertia), or a load that changes sides at some
+            times, on top of what repeats with position and direction.
+        changes: changes of the flank that it rests on.
+        at: times of these changes where the load made them, s.
+        least: shift at the tenth of all places with the least, where the load changed sides; else the value.
+        largest: the same of the largest.
+        residual: rms of the twist that is left.
+    """
+
+    value: float
+    error: float
+    interval: tuple[float, float]
+    flank: Flank
+    changes: int
+    at: tuple[float, ...]
+    least: float
+    largest: float
+    residual: float
+
+    @classmethod
+    def unsure(cls, value: float, error: float) -> "LostMotion":
+        """From a rough regression, where no flank is touched for long."""
+        return cls(value, error, _interval(value, error, quality.BLOCKS - 1), "motion", 0, (), value, value, math.inf)
+
+    def between(self, other: "LostMotion") -> "LostMotion":
+        """Anywhere between two that rest on different assumptions."""
+        value, error = 0.5 * (self.value + other.value), 0.5 * abs(self.value - other.value)
+        error = math.hypot(error, max(self.error, other.error))
+        return replace(self, value=value, error=error, interval=_interval(value, error, quality.BLOCKS - 1),
+                       least=value, largest=value)  # fmt: skip
+
+
+def _interval(value: float, error: float, freedom: int) -> tuple[float, float]:
+    from scipy.special import stdtrit
+
+    reach = float(stdtrit(max(freedom, 1), 0.975)) * error
+    return value - reach, value + reach
+
+
+# by the direction of motion
+
+
+def by_motion(
+    twist: Array, rows: Array, flank: Array, clear: NDArray[np.bool_], *, beside: float = 0.0
+) -> LostMotion | None:
+    """From the twist on both flanks, wherever one of them is surely touched.
+
+    Args:
+        twist: theta_e - ratio theta_s, shape (samples,).
+        rows: what else the twist depends on, shape (samples, terms).
+        flank: its sign is that of the torque, shape (samples,).
+        clear: where the gap is not being crossed, shape (samples,).
+        beside: standard error of other causes.
+    """
+    signs = np.sign(flank[clear])
+    changes = int(np.count_nonzero(np.diff(signs)))
+    if changes < 2 or len(signs) < quality.SHORTEST:
+        return None
+    terms = np.column_stack([0.5 * signs, rows[clear]])
+    found, errors = quality.jackknifed(twist[clear], terms)
+    if not np.isfinite(found).all():
+        return None
+    value = float(found[0])
+    rest = twist[clear] - terms @ found
+    left = float(np.sqrt(np.mean(rest**2)))
+    # a drift leaves each stretch on one flank at a level of its own
+    stretch = np.concatenate([[0], np.cumsum(np.diff(signs) != 0)])
+    levels = np.bincount(stretch, rest) / np.bincount(stretch)
+    between = 2.0 * float(np.sqrt(np.mean(levels**2) / max(len(levels) - 2, 1)))
+    # corners of the motion are rounded by the filter: what that may leave, where nothing else does
+    error = math.hypot(max(float(errors[0]), between), 1e-4 * value, beside)
+    interval = _interval(value, error, min(quality.BLOCKS, len(levels)) - 1)
+    return LostMotion(value, error, interval, "motion", changes, (), value, value, left)
+
+
+# by the side that the load pulls to
+
+
+BINS = 60
+"""Places over the range, or the turn, of the load."""
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Mean twist wherever a pass over the range crosses a place, in the order of time."""
+
+    twist: Array
+    time: Array
+    place: NDArray[np.intp]
+    passing: NDArray[np.intp]
+    group: NDArray[np.intp]  # of the same place and direction
+
+
+def _cells(times: Array, twist: Array, position: Array, velocity: Array, turn: float | None) -> _Cells | None:
+    moving = np.abs(velocity) > 0.25 * np.sqrt(np.mean(velocity**2))
+    low, high = float(position.min()), float(position.max())
+    if high == low:
+        return None
+    around = turn is not None and high - low > 1.5 * turn
+    span = turn if around and turn is not None else (high - low) * (1.0 + 1e-9)
+    turns = np.floor((position - low) / span) if around else np.zeros(len(position))
+    place = np.clip(((position - low) / span - turns) * BINS, 0, BINS - 1).astype(int)
+    forwards = velocity > 0.0
+    at = np.flatnonzero(moving)
+    if len(at) < quality.SHORTEST:
+        return None
+    # a long rest may hide a change of the load
+    rests = np.diff(times[at]) > 0.02 * (times[at[-1]] - times[at[0]])
+    passing = np.concatenate([[0], np.cumsum((np.diff(forwards[at]) != 0) | (np.diff(turns[at]) != 0) | rests)])
+    key = passing * BINS + place[at]
+    _, first, inverse, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
+    enough = count >= max(3, 0.1 * np.median(count))
+    mean = np.bincount(inverse, twist[at]) / count
+    when = np.bincount(inverse, times[at]) / count
+    order = np.argsort(when)
+    order = order[enough[order]]
+    first = first[order]
+    return _Cells(mean[order], when[order], place[at][first], passing[first], 2 * place[at][first] + forwards[at][first])
+
+
+def _shift(cells: _Cells, late: NDArray[np.bool_], kept: NDArray[np.bool_]) -> tuple[float, Array]:
+    """Biweight location of the shifts of the places that were crossed in both states, and these shifts.
+
+    Where the load hardly pulls, the gap is not crossed in full: such places fall short, and count less.
+    """
+    size = 2 * BINS
+    sums, counts = [], []
+    for state in (~late & kept, late & kept):
+        counts.append(np.bincount(cells.group[state], minlength=size))
+        sums.append(np.bincount(cells.group[state], cells.twist[state], minlength=size))
+    both = (counts[0] > 0) & (counts[1] > 0)
+    if both.sum() < 4:
+        return math.nan, np.zeros(0)
+    shifts = sums[1][both] / counts[1][both] - sums[0][both] / counts[0][both]
+    weights = 1.0 / (1.0 / counts[0][both] + 1.0 / counts[1][both])
+    # start at the shortest half: what falls short lies to one side, and would draw a median and widen its scale; 3.44 is the
+    # usual constant of an MM-estimate (85 % of the efficiency of a mean)
+    ordered, half = np.sort(shifts), len(shifts) // 2
+    widths = ordered[half:] - ordered[: len(shifts) - half]
+    start = int(np.argmin(widths))
+    found = float(ordered[start : start + half + 1].mean())
+    # of a normal distribution half lies within 0.674 standard deviations
+    scale = float(widths[start]) / 1.349 + 1e-300
+    for _ in range(30):
+        size = weights * np.clip(1.0 - ((shifts - found) / (3.44 * scale)) ** 2, 0.0, None) ** 2
+        found = float(size @ shifts / size.sum())
+    return found, shifts
+
+
+def _left(cells: _Cells, late: NDArray[np.bool_], shift: float) -> Array:
+    """Twist less that of its place, direction and state."""
+    rest = cells.twist - shift * late
+    counts = np.maximum(np.bincount(cells.group), 1)
+    return rest - (np.bincount(cells.group, rest) / counts)[cells.group]
+
+
+def _states(cells: _Cells) -> NDArray[np.bool_] | None:
+    """Which of two states each cell is in: the assignment that leaves least, with few changes."""
+    count = len(cells.twist)
+    groups = np.bincount(cells.group)
+    plain = _left(cells, np.zeros(count, dtype=bool), 0.0)
+    # one change: the step, less its mean in each place and direction, that goes along best
+    best, late = 0.0, None
+    for change in range(2, count - 1, max(count // 400, 1)):
+        step = (np.arange(count) >= change).astype(float)
+        step -= (np.bincount(cells.group, step) / np.maximum(groups, 1))[cells.group]
+        size = float(step @ step)
+        gain = float(step @ plain) ** 2 / size if size > 1e-9 else 0.0
+        if gain > best:
+            best, late = gain, np.arange(count) >= change
+    starts = [] if late is None else [late]
+    smooth = np.array([np.median(plain[max(i - 4, 0) : i + 5]) for i in range(count)])
+    starts.append(smooth > 0.5 * (smooth.min() + smooth.max()))
+    chosen = None
+    for state in starts:
+        for _ in range(12):
+            shift, _ = _shift(cells, state, np.ones(count, dtype=bool))
+            if not math.isfinite(shift) or shift == 0.0:
+                break
+            left = _left(cells, state, shift)
+            again = _viterbi(left + shift * state, shift, float(np.var(left)))
+            if (again == state).all():
+                break
+            state = again
+        else:
+            shift, _ = _shift(cells, state, np.ones(count, dtype=bool))
+        if not math.isfinite(shift):
+            continue
+        size = float(np.sum(_left(cells, state, shift) ** 2))
+        if chosen is None or size < chosen[0]:
+            chosen = (size, state)
+    return None if chosen is None else chosen[1]
+
+
+def _viterbi(values: Array, shift: float, variance: float) -> NDArray[np.bool_]:
+    """The sequence of levels 0 and shift that fits best, each change at the price of 20 log-likelihoods."""
+    price = 40.0 * max(variance, 1e-12 * shift**2)
+    cost = np.stack([values**2, (values - shift) ** 2], axis=1)
+    came = np.zeros((len(values), 2), dtype=bool)
+    total = cost[0]
+    for i in range(1, len(values)):
+        change = total[::-1] + price
+        came[i] = change < total
+        total = np.minimum(total, change) + cost[i]
+    state = np.zeros(len(values), dtype=bool)
+    now = int(np.argmin(total))
+    for i in range(len(values) - 1, -1, -1):
+        state[i] = bool(now)
+        now = 1 - now if came[i][now] else now
+    return state
+
+
+def by_load(times: Array, twist: Array, position: Array, velocity: Array, turn: float | None) -> LostMotion | None:
+    """From what changes between passes over the same places in the same direction; None where nothing clearly does.
+
+    Args:
+        times: shape (samples,), s.
+        twist: theta_e - ratio theta_s, shape (samples,).
+        position: of the load, shape (samples,).
+        velocity: of the load, shape (samples,).
+        turn: of the load, after which gear and encoders repeat; None on a linear axis.
+    """
+    cells = _cells(times, twist, position, velocity, turn)
+    if cells is None or len(cells.twist) < 24:
+        return None
+    state = _states(cells)
+    if state is None or state.all() or not state.any():
+        return None
+    every = np.ones(len(state), dtype=bool)
+    value, shifts = _shift(cells, state, every)
+    if not math.isfinite(value):
+        return None
+    left = _left(cells, state, value)
+    residual = float(np.std(left))
+    # two levels stand apart; a drift does not
+    if abs(value) < 6.0 * residual or not _better_than_drift(cells, left):
+        return None
+    passes = np.unique(cells.passing)
+    groups = np.array_split(np.arange(BINS), quality.BLOCKS)
+    without_passes = [_shift(cells, state, cells.passing != p)[0] for p in passes]
+    without_places = [_shift(cells, state, ~np.isin(cells.place, g))[0] for g in groups if np.isin(cells.place, g).any()]
+    variance = 0.0
+    for without in (without_passes, without_places):
+        finite = np.array([w for w in without if math.isfinite(w)])
+        if len(finite) < max(3, len(without) - 1):
+            return None
+        variance += (len(finite) - 1) / len(finite) * float(np.sum((finite - finite.mean()) ** 2))
+    error = math.sqrt(variance)
+    if abs(value) < 8.0 * error:
+        return None
+    turned = np.flatnonzero(np.diff(state))
+    at = tuple(float(0.5 * (cells.time[i] + cells.time[i + 1])) for i in turned)
+    if len(turned) > len(passes):
+        return None
+    sign = math.copysign(1.0, value)
+    least, largest = np.quantile(sign * shifts, [0.1, 0.9])
+    freedom = min(len(passes), quality.BLOCKS) - 1
+    size = abs(value)
+    return LostMotion(
+        size, error, _interval(size, error, freedom), "load", len(at), at, float(least), float(largest), residual
+    )
+
+
+def _better_than_drift(cells: _Cells, left: Array) -> bool:
+    """Whether two states leave much less than a steady drift over time does."""
+    zero = np.zeros(len(left), dtype=bool)
+    plain = _left(cells, zero, 0.0)
+    counts = np.maximum(np.bincount(cells.group), 1)
+    time = cells.time - (np.bincount(cells.group, cells.time) / counts)[cells.group]
+    slope = float(time @ plain) / max(float(time @ time), 1e-300)
+    return float(np.sum(left**2)) < 0.5 * float(np.sum((plain - slope * time) ** 2))

@@ -1,0 +1,78 @@
+"""Motor against load position where the gap is as large as the motion."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from measured import GEAR_RATIO, made
+
+from jaxbl.errors import InputError
+from jaxbl.records import inspect
+
+
+@pytest.fixture(scope="module")
+def wide():
+    """Table 1 of the paper under a slow sine: the twist ranges as far as the motor moves."""
+    period, count = 1e-3, 20_000
+    position, speed, load, load_speed = 0.0, 0.0, 0.0, 0.0
+    rows = []
+    for i in range(count):
+        u = 0.08 * np.sin(2.0 * np.pi * 0.16 * period * i)
+        rows.append((period * i, u, position, load))
+        z = position - 5.0 * load
+        torque = z - 4.0 * 0.02 * np.tanh(10.0 * z)
+        speed += period * (u - 0.15 * speed - torque) / 0.05
+        load_speed += period * (5.0 * torque - 16.0 * load_speed) / 7.0
+        position += period * speed
+        load += period * load_speed
+    frame = pd.DataFrame(rows, columns=["t", "u", "theta_e", "theta_s"])
+    random = np.random.default_rng(0)
+    for name, noise in (("theta_e", 1e-4), ("theta_s", 2e-5)):
+        frame[name] += noise * random.standard_normal(count)
+    return frame
+
+
+def looked_at(tmp_path, frame, gear_ratio, log=None):
+    frame.to_parquet(tmp_path / "log.parquet")
+    return inspect(tmp_path / "log.parquet", log, gear_ratio=gear_ratio)
+
+
+def test_a_gap_as_large_as_the_motion_is_no_wrong_ratio_and_no_skew(tmp_path, wide):
+    found = looked_at(tmp_path, wide, 5.0)
+    gearing = found.record.findings.gearing
+    assert gearing.wide and gearing.skew is None
+    assert abs(gearing.ratio - 5.0) < 2.0 * gearing.ratio_error
+    assert len(found.record.notes) == 1
+    assert found.record.notes[0].startswith("theta_e - 5 theta_s ranges over 0.3")
+    assert found.record.notes[0].endswith("with a gap or wind-up of that size the log hardly checks gear_ratio.")
+    # asymptotically 4 j0 either way, if nothing is known of the wind-up
+    assert gearing.lost_motion_interval[0] < 0.14 and gearing.lost_motion_interval[1] > 0.16
+    answers = {j.quantity: j for j in found.judgements}
+    assert answers["gear ratio"].answer == answers["lost motion"].answer == "weak"
+    assert "gap and wind-up take" in answers["gear ratio"].why
+    # the gap passes for friction in a rigid drive
+    for quantity in ("inertia", "viscous friction", "Coulomb friction"):
+        assert answers[quantity].answer == "weak" and "loosely" in answers[quantity].why
+    assert looked_at(tmp_path, wide, None).record.notes == ()
+
+
+def test_what_cannot_be_is_refused_even_then(tmp_path, wide):
+    with pytest.raises(InputError, match=r"theta_e - 50 theta_s ranges over 1.9\d rad, .*: gear_ratio, or a unit") as error:
+        looked_at(tmp_path, wide, 50.0)
+    assert "\n" not in str(error.value)
+    with pytest.raises(InputError, match="gear_ratio, or a unit in"):
+        looked_at(tmp_path, wide, 5.0, {"theta_s": {"column": "theta_s", "unit": "turn"}})
+    notes = looked_at(tmp_path, wide, -5.0).record.notes
+    assert any("perhaps the sign of one of them is wrong" in note for note in notes)
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.5])
+@pytest.mark.parametrize("factor", [0.1, 10.0, -1.0])
+def test_a_wrong_ratio_is_refused(tmp_path, gap, factor):
+    with pytest.raises(InputError, match=r"theta_e moves -?(20|19\.9)"):
+        looked_at(tmp_path, made(gap=gap, noise=1e-3), factor * GEAR_RATIO)
+
+
+def test_a_gap_of_a_good_part_of_the_motion_leaves_the_ratio(tmp_path):
+    for gap in (5.0, 20.0, 40.0):
+        found = looked_at(tmp_path, made(gap=gap, noise=1e-3, count=8000), GEAR_RATIO)
+        assert not any("moves" in note or "against" in note for note in found.record.notes), found.record.notes
