@@ -642,7 +642,8 @@ class _Reader:
                 + (f" and gives {-100 * share:.0f} % of the work back" if share < -0.02 else "")
                 + "; set sign = -1 in [log] u"
             )
-        if share < -0.1 or backwards:
+        # a wrong sign would take the energy out that went in
+        if share < -0.1 or (backwards and share < 0.1):
             # a driven load does that, too
             self.notes.append(
                 f"The drive gives {-100 * share:.0f} % of the work back to its input: "
