@@ -14,7 +14,7 @@ from jaxbl.errors import InputError
 from jaxbl.identification.intervals import refusals, spread
 from jaxbl.identification.smoother import smooth
 from jaxbl.identification.trajectory import Fit, cut, fit, free_parameters, with_values
-from jaxbl.simulate import trajectory
+from jaxbl.simulate import replay, trajectory
 from jaxbl.study.config import read_config
 from jaxbl.study.engine import prepare
 
@@ -30,15 +30,15 @@ RATIO = 5.0
 PERIOD = 2e-3
 
 
-def drive(substeps):
+def drive(substeps, period=PERIOD, **changes):
     law = {"law": "dead_zone", "stiffness": TRUE["transmission.stiffness"], "half_gap": TRUE["transmission.half_gap"]}
-    study = small({"run.sample_period": PERIOD, "run.substeps": substeps, "run.duration": 0.1}, transmission=law)
-    return prepare(read_config(study))
+    settings = {"run.sample_period": period, "run.substeps": substeps, "run.duration": 0.1}
+    return prepare(read_config(small(settings, transmission=law, **changes)))
 
 
-def recorded(kind, samples):
+def recorded(kind, samples, period=PERIOD):
     """Input and true states (positions and velocities of both sides) from SciPy, hard gap, input held over each sample."""
-    t = PERIOD * np.arange(samples)
+    t = period * np.arange(samples)
     torque = {
         "multisine": 2.0 * sum(np.sin(2.0 * np.pi * f * t + i) for i, f in enumerate((0.3, 0.7, 1.9, 4.1))),
         "steps": 6.0 * np.sign(np.sin(2.0 * np.pi * 0.9 * t + 0.1)),
@@ -54,14 +54,14 @@ def recorded(kind, samples):
     states, x = np.zeros((samples, 4)), np.zeros(4)
     for i in range(samples):
         states[i] = x
-        x = solve_ivp(slope, (0.0, PERIOD), x, "DOP853", args=(torque[i],), rtol=1e-10, atol=1e-13).y[:, -1]
+        x = solve_ivp(slope, (0.0, period), x, "DOP853", args=(torque[i],), rtol=1e-10, atol=1e-13).y[:, -1]
     return torque, states
 
 
-def windows_of(torque, readings, noise, samples):
-    found = {side: smooth(values, PERIOD, noise=noise[side]) for side, values in readings.items()}
+def windows_of(torque, readings, noise, samples, period=PERIOD):
+    found = {side: smooth(values, period, noise=noise[side]) for side, values in readings.items()}
     start = PlantState({s: x.position for s, x in found.items()}, {s: x.velocity for s, x in found.items()}, ())
-    return cut(torque, readings, PERIOD, start, noise, samples)
+    return cut(torque, readings, period, start, noise, samples)
 
 
 def noisy(states, noise, key):
@@ -108,7 +108,7 @@ def test_agrees_with_one_least_squares_problem_over_parameters_and_states():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["multisine", "steps"])
+@pytest.mark.parametrize("kind", ["multisine", "steps", "chirp"])
 def test_intervals_cover_the_truth_as_often_as_they_say(kind):
     """200 noise realisations in one vmapped run; the truth has a hard gap and another integrator."""
     noise = {"motor": 3e-4, "load": 6e-5}
@@ -127,6 +127,42 @@ def test_intervals_cover_the_truth_as_often_as_they_say(kind):
     assert np.all((covered >= 0.92) & (covered <= 0.98)), covered
     # without bias, within what 200 runs can tell
     assert np.all(np.abs(np.mean(theta, axis=0)) < 4.0 * np.std(theta, axis=0) / np.sqrt(200.0))
+
+
+@pytest.mark.slow
+def test_the_gap_at_1_khz_by_the_fit_and_by_the_chain_of_the_paper():
+    """Noise of 1e-4 rad: half gap (4 j_0) within 0.5 % by the fit every time; 40 realisations each, hard gap by SciPy."""
+    noise, period = {"motor": 1e-4, "load": 2e-5}, 1e-3
+    torque, states = recorded("multisine", 4000, period)
+    gains = {"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}}
+    tables = {"observer": gains, "equivalent_control": {"time_constant": 0.01}, "identifier": {"start": 0.5}}
+    experiment = drive(3, period, **tables)
+    free = free_parameters(experiment, list(TRUE), 1.0)
+
+    def by_fit(key):
+        return fit(
+            experiment, free, windows_of(torque, noisy(states, noise, key), noise, 500, period), jnp.zeros(6), 20
+        ).theta
+
+    def by_chain(key):
+        def last(state, signals):
+            return experiment.identifier.estimate(state.identifier, experiment.transmission)
+
+        return replay(experiment, jnp.asarray(torque), noisy(states, noise, key), record=last, every=len(torque) - 1)[1]
+
+    keys = jax.random.split(jax.random.key(11), 40)
+    fitted = jnp.exp(eqx.filter_jit(jax.vmap(by_fit))(keys)) - 1.0
+    assert np.abs(fitted[:, 5]).max() < 0.005, fitted[:, 5]
+    chain = jax.tree.map(lambda x: x[:, -1], eqx.filter_jit(jax.vmap(by_chain))(keys))
+    size = {
+        side: {name: float(jnp.sqrt(jnp.mean((chain[side][name] / true - 1.0) ** 2))) for name, true in
+               (("stiffness", 60.0), ("half_gap", 0.08))} for side in chain
+    }  # fmt: skip
+    rms = np.sqrt(np.mean(fitted**2, axis=0))
+    for side in size:
+        # the chain is biased by what its low-pass and discretisation leave; the fit is not
+        assert 3.0 * rms[4] < size[side]["stiffness"] < 0.05, (size, rms)
+        assert 3.0 * rms[5] < size[side]["half_gap"] < 0.05, (size, rms)
 
 
 def test_scales_that_one_record_cannot_part_are_refused():
