@@ -489,6 +489,9 @@ def test_a_log_is_identified(call, tmp_path):
     found = json.loads((tmp_path / "results/axis/identification.json").read_text())
     names = ["drive.motor_inertia", "drive.motor_viscous", "effects.motor.coulomb_friction.torque"]
     assert list(found["parameters"]) == names
+    finished = (tmp_path / "results/axis/identification.json").stat().st_mtime_ns
+    assert call("identify", "axis.csv", "--model", "axis.toml") == (code, lines, [])
+    assert (tmp_path / "results/axis/identification.json").stat().st_mtime_ns == finished
     assert call("simulate", "results/axis/model.toml", "--out", "again")[0] == 0
     write(tmp_path, study | {"identify": {"parameters": ["drive.mass"]}}, "wrong.toml")
     with pytest.raises(InputError, match=r"^wrong\.toml: 'drive\.mass' is no number of the plant; fitted can be: "):
