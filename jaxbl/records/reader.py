@@ -159,7 +159,7 @@ class _Reader:
             if skew:
                 self.notes.append(f"{name}: moved by its skew of {1e3 * skew:.4g} ms.")
         if len(positions) == 2:
-            self.check_gearing(geared)
+            self.check_gearing(geared, *(values[name] for name in SIDES.values()))
         side = "theta_e" if "theta_e" in values else "theta_s"
         dynamics = quality.dynamics(time, values["u"], values[side], segments, step) if "u" in values else None
         if dynamics is not None:
@@ -563,13 +563,16 @@ class _Reader:
                 f"counts_per_turn in [log] {name}"
             )
 
-    def check_gearing(self, found: Gearing | None) -> None:
+    def check_gearing(self, found: Gearing | None, motor: Array, load: Array) -> None:
         """Compare the ratio of both motions with the gear ratio that is expected."""
         expected = self.gear_ratio
         if found is not None and expected is not None and found.wide and found.residual < UNLIKE:
+            self.check_scale(motor, load, expected)
             self.check_wide_gearing(found, expected)
             return
         if found is None or found.residual >= UNLIKE:
+            if expected is not None:
+                self.check_scale(motor, load, expected)
             left = "" if found is None else f" ({100 * found.residual:.0f} % of theta_e is not explained by theta_s)"
             self.notes.append(
                 f"theta_e and theta_s hardly go together{left}: they may not belong to one drive, or the load hardly moves "
@@ -582,25 +585,44 @@ class _Reader:
         tolerance = max(0.02, 3.0 * found.residual, 5.0 * found.ratio_error / abs(expected))
         if abs(relative - 1.0) <= tolerance:
             return
-        units = {name: (getattr(self.table, name) or PositionTable()).unit for name in ("theta_e", "theta_s")}
-        degrees = 180.0 / math.pi
-        close = [
-            (-1.0, "the sign of one of them is wrong; set sign = -1 in [log] theta_e or theta_s"),
-            (1.0 / expected**2, "the sides are swapped; exchange the columns in [log] theta_e and theta_s"),
-            (-1.0 / expected**2, "the sides are swapped, and one has the wrong sign; see [log] theta_e and theta_s"),
-            (degrees, "theta_s is not in degrees" if units["theta_s"] == "deg" else "theta_e is in degrees"),
-            (1.0 / degrees, "theta_e is not in degrees" if units["theta_e"] == "deg" else "theta_s is in degrees"),
-            (1.0 / expected, "theta_s is already counted at the motor shaft; set factor = 1 / gear_ratio in [log] theta_s"),
-        ]
+        close = self.slips(expected)
         guess, why = min(close, key=lambda pair: abs(relative / pair[0] - 1.0))
         if abs(relative / guess - 1.0) > tolerance:
             why = "gear_ratio, or a unit in [log], is wrong"
-        elif "degrees" in why:
-            why += "; see unit in [log]"
         moves = f"theta_e moves {found.ratio:.4g} for each 1 of theta_s, where gear_ratio is {expected:g}"
         if found.residual < 0.05:
             raise self.wrong(f"{moves}: {why}")
         self.notes.append(f"{moves}, but they go together only roughly; perhaps {why}.")
+
+    def slips(self, expected: float) -> list[tuple[float, str]]:
+        """Usual slips: the factor that each puts on the ratio of both motions, and what is wrong then."""
+        units = {name: (getattr(self.table, name) or PositionTable()).unit for name in ("theta_e", "theta_s")}
+        degrees, see = 180.0 / math.pi, "; see unit in [log]"
+        return [
+            (-1.0, "the sign of one of them is wrong; set sign = -1 in [log] theta_e or theta_s"),
+            (1.0 / expected**2, "the sides are swapped; exchange the columns in [log] theta_e and theta_s"),
+            (-1.0 / expected**2, "the sides are swapped, and one has the wrong sign; see [log] theta_e and theta_s"),
+            (degrees, ("theta_s is not in degrees" if units["theta_s"] == "deg" else "theta_e is in degrees") + see),
+            (1.0 / degrees, ("theta_e is not in degrees" if units["theta_e"] == "deg" else "theta_s is in degrees") + see),
+            (1.0 / expected, "theta_s is already counted at the motor shaft; set factor = 1 / gear_ratio in [log] theta_s"),
+        ]
+
+    def check_scale(self, motor: Array, load: Array, expected: float) -> None:
+        """Whether both move so differently that a slip of units or sides explains it better than any gap."""
+
+        def apart(ratio: float) -> float:
+            """Size of the twist relative to the motion: far below 1 where they go together."""
+            moved = max(float(np.std(motor)), abs(ratio) * float(np.std(load)))
+            return float(np.std(motor - ratio * load)) / moved if moved else 0.0
+
+        if apart(expected) < 0.8:
+            return
+        # load and motor may well move against each other, beyond a resonance or in a gap
+        slips = [(apart(expected * factor), why) for factor, why in self.slips(expected) if factor > 0.0]
+        least, why = min(slips)
+        if least < 0.7:
+            size = float(np.std(motor)) / (abs(expected) * float(np.std(load)))
+            raise self.wrong(f"theta_e moves {size:.3g} times as far as gear_ratio {expected:g} times theta_s: {why}")
 
     def check_wide_gearing(self, found: Gearing, expected: float) -> None:
         """The same where the twist is as large as the motion, so that the log fits many ratios."""

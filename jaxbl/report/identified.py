@@ -88,6 +88,9 @@ def _headline(summary: dict[str, Any]) -> list[str]:
     lines = []
     for path, one in summary["parameters"].items():
         low, high = one["interval"]
+        if None in (one["value"], one["standard_error"], low, high):
+            lines.append(f"{path}: this log leaves it open.")
+            continue
         unit = f" {one['unit']}" if one.get("unit") else ""
         lines.append(f"{path} = {one['value']:.5g} ± {one['standard_error']:.2g}{unit}, 95 %: {low:.5g} to {high:.5g}.")
     return lines
@@ -338,7 +341,11 @@ def _with_error(value: float, error: float, unit: str) -> str:
 
 
 def _intervals(found: Identification) -> Drawn:
-    fitted = {path: one for path, one in found.summary["parameters"].items() if one.get("nominal") is not None}
+    fitted = {
+        path: one
+        for path, one in found.summary["parameters"].items()
+        if one.get("nominal") is not None and None not in (one["value"], *one["interval"])
+    }
     held = [path for path in found.summary["held"] if path not in fitted]
     names = [*fitted, *held]
     figure = Figure(figsize=(9.0, 1.1 + 0.4 * len(names)), layout="constrained")

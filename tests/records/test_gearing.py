@@ -6,7 +6,7 @@ import pytest
 from measured import GEAR_RATIO, made
 
 from jaxbl.errors import InputError
-from jaxbl.records import inspect
+from jaxbl.records import inspect, read_record
 
 
 @pytest.fixture(scope="module")
@@ -76,3 +76,24 @@ def test_a_gap_of_a_good_part_of_the_motion_leaves_the_ratio(tmp_path):
     for gap in (5.0, 20.0, 40.0):
         found = looked_at(tmp_path, made(gap=gap, noise=1e-3, count=8000), GEAR_RATIO)
         assert not any("moves" in note or "against" in note for note in found.record.notes), found.record.notes
+
+
+SLIPS = {
+    "swapped": (lambda e, s: (s, e), r"theta_e moves 0\.0\d+ times as far .*: the sides are swapped"),
+    "motor in degrees": (
+        lambda e, s: (np.degrees(e), s),
+        r"theta_e moves .*: theta_e is in degrees; see unit",
+    ),
+    "load in degrees": (lambda e, s: (e, np.degrees(s)), r"theta_e moves .*: theta_s is in degrees; see unit"),
+    "at the motor": (lambda e, s: (e, 20.0 * s), r"theta_s is already counted at the motor shaft"),
+}
+
+
+@pytest.mark.parametrize("slip", SLIPS)
+def test_slips_are_named_where_the_gap_is_as_large_as_the_motion(tmp_path, slip):
+    change, message = SLIPS[slip]
+    log = made(gap=15.0, noise=1e-3)
+    log["theta_e"], log["theta_s"] = change(log["theta_e"], log["theta_s"])
+    log.to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(InputError, match=message):
+        read_record(tmp_path / "log.csv", gear_ratio=20.0)
