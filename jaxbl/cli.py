@@ -196,8 +196,8 @@ def identify(
         _tell(identification_lines(finished), folder)
         return
     try:
-        with _naming(model, folder):
-            found = run_task(task)
+        with _naming(model, folder), _progress("steps") as progress:
+            found = run_task(task, progress)
     except InputError:
         with suppress(OSError):  # not empty: it was there before
             folder.rmdir()

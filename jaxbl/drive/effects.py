@@ -283,9 +283,10 @@ class Lag(ActuatorEffect):
 
     def actuate(self, state, torque, step):
         (lagged,) = state
-        new = torque + (lagged - torque) * jnp.exp(-step / self.time_constant)
-        # the mean over the step, to second order
-        return (new,), 0.5 * (lagged + new)
+        steps = step / self.time_constant
+        new = torque + (lagged - torque) * jnp.exp(-steps)
+        # the mean over the step keeps the impulse
+        return (new,), torque + (lagged - torque) * -jnp.expm1(-steps) / steps
 
 
 def _both(cls: type[SideEffect]) -> dict[str, Callable[..., AbstractEffect]]:

@@ -35,7 +35,7 @@ from jaxbl.records import Record, join, read_record
 from jaxbl.simulate import Experiment, Signals, State, replay
 
 from .config import Config, read_model, with_values
-from .engine import prepare
+from .engine import Progress, prepare
 from .store import plain
 
 _LOG_NAMES = {"motor": "theta_e", "load": "theta_s"}
@@ -141,31 +141,49 @@ def identify(
     return run_task(read_task(log, model, parameters=parameters, holdout=holdout, profile=profile))
 
 
-def run_task(task: Task) -> Identification:
+_STAGES = 6
+
+
+def run_task(task: Task, progress: Progress | None = None) -> Identification:
     """Do what :func:`read_task` read.
+
+    Args:
+        task: what to do.
+        progress: called with finished and total stages after each.
 
     Raises:
         InputError: a number that cannot be fitted, or a log that the model cannot follow.
     """
     config, record, settings = task.config, task.record, task.config.identify
     assert record.torque is not None
+    stages = iter(range(1, _STAGES + 1))
+
+    def done() -> None:
+        stage = next(stages)
+        if progress is not None:
+            progress(stage, _STAGES)
+
     with jax.enable_x64(True):
         nominal = _on_record(config, record)
         paths = list(settings.parameters or _default_paths(config, nominal))
         free = free_parameters(nominal, paths, float(np.std(record.torque)))
         channels = smoothed_channels(record, nominal.sides)
+        done()
         rest = config.log.initial_state == "rest"
         how = Settings(settings.method, settings.window, settings.starts, settings.spread, settings.seed, rest)
         found = Search(nominal, record, channels, how).run(free)
+        done()
         values = {one.path: float(one.value(found.fit.theta[i])) for i, one in enumerate(found.free)}
         fitted = set_leaves(nominal, {path: jnp.asarray(value) for path, value in values.items()})
         profiles = {}
         if settings.profile:
             profiles = profile(nominal, found.free, found.windows, found.fit, found.spread)
+        done()
         factor = _decimation(config, record)
         parts = _kinematics(record, channels, factor)
         gains, gain_values = _gains(task.missing, fitted, record, channels)
         chain, recursive = _chain(set_leaves(fitted, _arrays(gain_values)), record)
+        done()
         noise = {side: float(one) for side, one in found.windows.noise.items()}
         trace = pd.DataFrame(
             {"t": record.time, "u": record.torque}
@@ -179,12 +197,14 @@ def run_task(task: Task) -> Identification:
         method: dict[str, Any] = {"recursive": recursive, "trajectory": _trajectory(found, record)}
         if parts:
             method["regression"] = _regression(nominal, found.free, parts, factor, record)
+        done()
         summary = _summary(task, fitted, found, profiles, noise) | {"method": method}
         summary["torque"] = _torque_errors(record, fitted, parts, factor)
         if gains:
             summary["gains"] = {side: one._asdict() for side, one in gains.items()}
         if task.holdout is not None:
             summary["holdout"] = _on_holdout(task, nominal, fitted, found.samples)
+        done()
     model = with_values(config, values | gain_values)
     return Identification(config, model, record, plain(summary), trace, "excitation" in task.missing)
 
