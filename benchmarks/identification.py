@@ -268,9 +268,9 @@ def emps_table():
 def table(options):
     frame = simulated(options)
     lines = [
-        f"{options.duration:g} s at {1.0 / PERIOD:g} Hz, {options.seeds} noise seeds; encoder noise {NOISE['motor']:g} rad on the",
-        f"motor, {NOISE['load']:g} on the load. Relative errors in %, rms over seeds; in brackets the half-width of the 95 %",
-        "interval.",
+        f"{options.duration:g} s at {1.0 / PERIOD:g} Hz, {options.seeds} noise seeds; encoder noise {NOISE['motor']:g} rad",
+        f"(motor), {NOISE['load']:g} rad (load). Relative errors in %, rms over seeds; in brackets the half-width of the",
+        "95 % interval.",
         "",
         *simulated_table(frame),
         "",
