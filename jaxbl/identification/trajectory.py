@@ -31,6 +31,7 @@ _RIDGE = 1e-10
 _ENOUGH = 2e-3
 """A fit has ended where a step takes less than this off the sum of squares, in units of the residuals' variance."""
 _MOST_REJECTED = 12
+_GAINED = 1.0
 WIDE = 3.0
 
 
@@ -247,14 +248,18 @@ def projected_residual(
     return residual, jax.vmap(unravel)(start)
 
 
+class _Solved(NamedTuple):
+    theta: Array
+    guess: Any
+    residual: Any
+    steps: Array
+    converged: Array
+
+
 def _solve(
     residual: Callable[[Array, Any], tuple[Any, Any]], solver: Any, theta: Array, guess: Any, most_steps: int
-) -> tuple[Array, Any, Array, Array]:
-    """Least squares, step by step: what comes with the best residual so far is the second argument of the next.
-
-    Returns:
-        theta, what came with it, the number of steps, and whether the solver met its tolerance.
-    """
+) -> _Solved:
+    """Least squares, step by step: what comes with the best residual so far is the second argument of the next."""
     shapes = jax.eval_shape(residual, theta, guess)
     first, static = eqx.partition(solver.init(residual, theta, guess, {}, *shapes, frozenset()), eqx.is_array)
     size = sum(one.size for one in jax.tree.leaves(shapes[0]))
@@ -280,7 +285,7 @@ def _solve(
 
     start = theta, guess, first, jnp.asarray(False)
     theta, guess, state, ended = jax.lax.while_loop(going, step, start)
-    return theta, guess, state.num_steps, ended & jnp.isfinite(cost_of(state))
+    return _Solved(theta, guess, state.f_info.residual, state.num_steps, ended & jnp.isfinite(cost_of(state)))
 
 
 def fit(
@@ -290,6 +295,7 @@ def fit(
     theta: Float[Array, " parameters"],
     most_steps: int = 100,
     held: Bool[Array, " parameters"] | None = None,
+    rounds: int = 3,
 ) -> Fit:
     """Fit from one start; `vmap` it over starts, or over records.
 
@@ -300,12 +306,11 @@ def fit(
         free: what is fitted.
         windows: the record.
         theta: the start, shape (parameters,); zeros are the nominal values.
-        most_steps: of the solver.
+        most_steps: of the solver, each time.
         held: which numbers stay at the start; none if left out.
+        rounds: how often at most the solver is started again, where initial states sought anew are better ones.
     """
 
-    # better guesses of the initial states than a smoother's, which knows no model
-    guess = projected_residual(with_values(experiment, free, theta), windows)[1]
     given = theta
 
     def projected(theta: Array, guess: PlantState) -> tuple[Array, PlantState]:
@@ -335,8 +340,26 @@ def fit(
         return (value, theta / WIDE), start
 
     solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-4)
-    found, guess, steps, converged = _solve(residual, solver, theta, guess, most_steps)
-    best = found if held is None else jnp.where(held, given, found)
+
+    def anew(theta: Array) -> tuple[Array, PlantState]:
+        """Initial states that do not depend on those found before, and what is left over then in each window."""
+        value, start = projected_residual(with_values(experiment, free, theta), windows)
+        return jnp.sum(value**2, axis=(1, 2)), start
+
+    def again(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        theta, guess, round, steps, _, _ = carry
+        found = _solve(residual, solver, theta, guess, most_steps)
+        theta = found.theta if held is None else jnp.where(held, given, found.theta)
+        # a window's initial state may be the best of its neighbourhood only
+        other, start = anew(theta)
+        known = jnp.sum(found.residual[0] ** 2, axis=(1, 2))
+        gained = jnp.any(known - other > _GAINED * jnp.sum(known) / found.residual[0].size)
+        guess = jax.tree.map(lambda new, old: jnp.where(other < known, new, old), start, found.guess)
+        return theta, guess, round + 1, steps + found.steps, found.converged, gained
+
+    zero = jnp.zeros((), int)
+    first = theta, anew(theta)[1], zero, zero, jnp.asarray(False), jnp.asarray(True)
+    best, guess, _, steps, converged, _ = jax.lax.while_loop(lambda carry: carry[-1] & (carry[2] < rounds), again, first)
     value, start, jacobian = with_slope(best, guess)
     return Fit(
         best,
