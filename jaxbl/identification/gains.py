@@ -46,6 +46,26 @@ def disturbance(experiment: Experiment, kinematics: Kinematics, side: str) -> Fl
     return k.acceleration[side] - experiment.drive.acceleration(side, k.velocity[side], k.torque)
 
 
+@eqx.filter_jit
+def _misses(
+    experiment: Experiment, kinematics: Kinematics, tried: dict[str, Array], readings: dict[str, Array]
+) -> dict[str, Array]:
+    """Rms difference of each observer's velocity to the smoothed one, for several gains."""
+
+    def velocity(state: State, signals: Signals) -> dict[str, Any]:
+        return {side: signals.side(side).velocity_estimate for side in experiment.sides}
+
+    def one(values: dict[str, Array]) -> dict[str, Array]:
+        _, found = replay(set_leaves(experiment, values), kinematics.torque, readings, record=velocity)
+        settled = slice(len(kinematics.time) // 4, None)
+        return {
+            side: jnp.sqrt(jnp.mean((found[side][settled] - smooth[settled]) ** 2))
+            for side, smooth in kinematics.velocity.items()
+        }
+
+    return jax.vmap(one)(tried)
+
+
 def choose_gains(
     experiment: Experiment, kinematics: Kinematics, measured: dict[str, Float[Array, " samples"]]
 ) -> dict[str, Gains]:
@@ -67,22 +87,8 @@ def choose_gains(
         tried[f"observer.{side}.alpha"] = alpha * bound
         tried[f"observer.{side}.lambda"] = factor * least_lambda_exact(alpha * bound, jnp.full_like(alpha, bound))
 
-    def velocity(state: State, signals: Signals) -> dict[str, Any]:
-        return {side: signals.side(side).velocity_estimate for side in experiment.sides}
-
-    @eqx.filter_jit
-    def misses(tried: dict[str, Array], readings: dict[str, Array]) -> dict[str, Array]:
-        def one(values: dict[str, Array]) -> dict[str, Array]:
-            _, found = replay(set_leaves(experiment, values), k.torque, readings, record=velocity)
-            settled = slice(count // 4, None)
-            return {
-                side: jnp.sqrt(jnp.mean((found[side][settled] - velocity[settled]) ** 2))
-                for side, velocity in k.velocity.items()
-            }
-
-        return jax.vmap(one)(tried)
-
-    missed = misses(tried, {side: jnp.asarray(measured[side])[:count] for side in experiment.sides})
+    readings = {side: jnp.asarray(measured[side])[:count] for side in experiment.sides}
+    missed = _misses(experiment, k, tried, readings)
     chosen = {}
     for side in experiment.sides:
         size = np.asarray(missed[side])

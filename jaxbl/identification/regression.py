@@ -215,6 +215,16 @@ def regress(
         A fit whose residuals and derivatives have shape (1, samples, equations, ...), for
         :func:`jaxbl.identification.intervals.spread`.
     """
+    start = jnp.zeros(len(free)) if theta is None else theta
+    found, residual, jacobian, steps, ended = _regress(experiment, tuple(free), list(parts), factor, start)
+    return Fit(found, PlantState({}, {}, ()), residual[None], jacobian[None], 0.5 * jnp.sum(residual**2), steps, ended)
+
+
+@eqx.filter_jit
+def _regress(
+    experiment: Experiment, free: tuple[Free, ...], parts: list[Kinematics], factor: int, theta: Float[Array, " parameters"]
+) -> tuple[Array, Array, Array, Array, Array]:
+    """theta, residuals, their derivatives, steps, and whether the solver ended as it should."""
     names = list(eqx.filter_eval_shape(balance, experiment, parts[0]))
 
     def left(theta: Array, _: None = None) -> Array:
@@ -227,18 +237,10 @@ def regress(
         return left(theta) * weights[None, :], theta / WIDE
 
     solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
-
-    @eqx.filter_jit
-    def solve(theta: Array) -> tuple[Array, Array, Array, Array]:
-        found, steps, ended = theta, jnp.zeros((), int), jnp.asarray(True)
-        for _ in range(_PASSES):
-            weights = 1.0 / jnp.maximum(jnp.sqrt(jnp.mean(left(found) ** 2, axis=0)), jnp.finfo(float).tiny)
-            solution = optx.least_squares(weighted, solver, found, weights, max_steps=200, throw=False)
-            found, steps = solution.value, steps + solution.stats["num_steps"]
-            ended = solution.result == optx.RESULTS.successful
-        return found, weights, steps, ended
-
-    found, weights, steps, ended = solve(jnp.zeros(len(free)) if theta is None else theta)
-    residual = left(found) * weights[None, :]
-    jacobian = jax.jacfwd(left)(found) * weights[None, :, None]
-    return Fit(found, PlantState({}, {}, ()), residual[None], jacobian[None], 0.5 * jnp.sum(residual**2), steps, ended)
+    weights, steps, ended = jnp.ones(len(names)), jnp.zeros((), int), jnp.asarray(True)
+    for _ in range(_PASSES):
+        weights = 1.0 / jnp.maximum(jnp.sqrt(jnp.mean(left(theta) ** 2, axis=0)), jnp.finfo(float).tiny)
+        solution = optx.least_squares(weighted, solver, theta, weights, max_steps=200, throw=False)
+        theta, steps = solution.value, steps + solution.stats["num_steps"]
+        ended = solution.result == optx.RESULTS.successful
+    return theta, left(theta) * weights[None, :], jax.jacfwd(left)(theta) * weights[None, :, None], steps, ended

@@ -148,8 +148,16 @@ def _nearest_turn(free: Sequence[Free], theta: jax.Array) -> jax.Array:
     return theta - jnp.where(np.isfinite(turns), turns * jnp.round(theta / turns), 0.0)
 
 
+_fit = eqx.filter_jit(fit)
+
+
+@eqx.filter_jit
+def _fits(experiment: Experiment, free: tuple[Free, ...], windows: Windows, thetas: jax.Array) -> Fit:
+    return jax.vmap(lambda theta: fit(experiment, free, windows, theta, 30, rounds=1))(thetas)
+
+
 class Search:
-    """Search of one record's numbers; compiled functions are kept from fit to fit."""
+    """Search of one record's numbers."""
 
     def __init__(self, experiment: Experiment, record: Record, channels: Channels, settings: Settings):
         self.experiment, self.record, self.channels, self.settings = experiment, record, channels, settings
@@ -169,8 +177,6 @@ class Search:
                     f"({longest * record.sample_period:g} s)"
                 )
             self.lengths = [asked]
-        self._fit = eqx.filter_jit(fit)
-        self._fits = eqx.filter_jit(lambda e, free, w, thetas: jax.vmap(lambda theta: fit(e, free, w, theta, 30))(thetas))
 
     def run(self, free: tuple[Free, ...]) -> Found:
         """Fit; of directions that the record does not show, one number at a time is taken out.
@@ -218,7 +224,7 @@ class Search:
         reach = np.log(self.settings.spread)
         thetas = np.zeros((self.settings.starts, len(free)))
         thetas[1:] = random.uniform(-reach, reach, thetas[1:].shape)
-        found = self._fits(self.experiment, free, windows, jnp.asarray(thetas))
+        found = _fits(self.experiment, free, windows, jnp.asarray(thetas))
         cost = np.where(np.isfinite(np.asarray(found.cost)), np.asarray(found.cost), np.inf)
         if not np.isfinite(cost).any():
             raise InputError(
@@ -240,9 +246,9 @@ class Search:
             if self.settings.method == "prediction_error":
                 for _ in range(_PASSES):
                     windows, smoothness = predictor(with_values(self.experiment, free, theta), windows)
-                    found = self._fit(self.experiment, free, windows, theta)
+                    found = _fit(self.experiment, free, windows, theta)
                     theta = found.theta
-            found = self._fit(self.experiment, free, windows, theta)
+            found = _fit(self.experiment, free, windows, theta)
             width = spread(found)
             size = float(jnp.sum(jnp.log(jnp.diag(width.covariance))))
             if np.isfinite(size) and (best is None or size < best[0]):

@@ -12,7 +12,6 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -387,10 +386,8 @@ def _residual_columns(
     return columns
 
 
-def _chain(experiment: Experiment, record: Record) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The paper's chain on the record's longest part: columns over time (NaN elsewhere), and what it finds at the end."""
-    names: list[str] = []
-
+@eqx.filter_jit
+def _replayed(experiment: Experiment, torque: jax.Array, measured: dict[str, jax.Array]) -> dict[str, jax.Array]:
     def keep(state: State, signals: Signals) -> dict[str, Any]:
         row: dict[str, Any] = {}
         if signals.twist is not None:
@@ -402,15 +399,21 @@ def _chain(experiment: Experiment, record: Record) -> tuple[dict[str, np.ndarray
             assert experiment.identifier is not None and experiment.transmission is not None
             path = experiment.identifier.estimate(state.identifier, experiment.transmission)
             row |= {f"{side}.{name}": value for side, values in path.items() for name, value in values.items()}
-        names[:] = row
         return row
 
+    return replay(experiment, torque, measured, record=keep)[1]
+
+
+def _chain(experiment: Experiment, record: Record) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The paper's chain on the record's longest part: columns over time (NaN elsewhere), and what it finds at the end."""
     part = max(record.segments, key=lambda one: one.stop - one.start)
     assert record.torque is not None
     given = jnp.asarray(record.torque[part]), {side: jnp.asarray(record.positions[side][part]) for side in experiment.sides}
-    _, kept = eqx.filter_jit(partial(replay, record=keep))(experiment, *given)
+    kept = _replayed(experiment, *given)
+    estimates = ("velocity_estimate", "torque_estimate")
+    leading = ["twist", *(f"{side}.{name}" for side in experiment.sides for name in estimates)]
     columns = {}
-    for name in names:
+    for name in [*(name for name in leading if name in kept), *(name for name in kept if name not in leading)]:
         columns[name] = np.full(len(record.time), np.nan)
         columns[name][part] = np.asarray(kept[name])
     found: dict[str, Any] = {}
