@@ -25,6 +25,8 @@ _MOST_COARSE = 100
 _FEWEST = 20
 _PASSES = 2
 """Choices of the predictor's gain, each followed by a fit."""
+NOISE_ALONE = 1.1
+"""Residuals over the noise, rms, up to which a model counts as explaining a record."""
 
 
 class Channels(NamedTuple):
@@ -113,6 +115,7 @@ class Found:
         condition: of the information about all numbers asked for.
         starts: cost and theta of each start, and whether it agrees with the best.
         smoothness: of each side's predictor; empty for output error.
+        between: by how much theta differs between the window lengths that were tried; None if there was one.
     """
 
     free: tuple[Free, ...]
@@ -125,6 +128,7 @@ class Found:
     condition: float
     starts: list[dict[str, Any]]
     smoothness: dict[str, float]
+    between: np.ndarray | None
 
     @property
     def samples(self) -> int:
@@ -140,6 +144,7 @@ class _Whole(NamedTuple):
     windows: Windows
     firsts: np.ndarray
     smoothness: dict[str, float]
+    between: np.ndarray | None = None
 
 
 def _nearest_turn(free: Sequence[Free], theta: jax.Array) -> jax.Array:
@@ -209,6 +214,7 @@ class Search:
             first_condition,
             starts,
             found.smoothness,
+            found.between,
         )
 
     def _cut(self, samples: int) -> tuple[Windows, np.ndarray]:
@@ -239,7 +245,7 @@ class Search:
 
     def _whole(self, free: tuple[Free, ...], theta: jax.Array) -> _Whole:
         """Fit to all of the record, in windows of the length that leaves the numbers least open."""
-        best: tuple[float, _Whole] | None = None
+        tried: list[tuple[float, _Whole]] = []
         for samples in self.lengths:
             windows, firsts = self._cut(samples)
             smoothness: dict[str, float] = {}
@@ -251,8 +257,23 @@ class Search:
             found = _fit(self.experiment, free, windows, theta)
             width = spread(found)
             size = float(jnp.sum(jnp.log(jnp.diag(width.covariance))))
-            if np.isfinite(size) and (best is None or size < best[0]):
-                best = size, _Whole(found, width, windows, firsts, smoothness)
-        if best is None:
+            if np.isfinite(size):
+                tried.append((size, _Whole(found, width, windows, firsts, smoothness)))
+        if not tried:
             raise InputError(f"{self.record.path}: the model diverges on this log; its nominal numbers should be nearer")
-        return best[1]
+        best, *others = [one for _, one in sorted(tried, key=lambda pair: pair[0])]
+        return _between(best, others[0]) if others else best
+
+
+def _between(best: _Whole, other: _Whole) -> _Whole:
+    """Count what another window length would have said, where the model leaves more than noise.
+
+    Then each length finds other numbers, by more than noise does: free runs weigh what is missing by its duration.
+    """
+    change = np.asarray(other.fit.theta - best.fit.theta)
+    width = best.spread
+    if float(width.variance) > NOISE_ALONE**2:
+        wide = width.covariance + jnp.asarray(np.outer(change, change))
+        more = jnp.sqrt(jnp.diag(wide) / jnp.diag(width.covariance))
+        width = width._replace(covariance=wide, inflation=width.inflation * more)
+    return best._replace(spread=width, between=change)

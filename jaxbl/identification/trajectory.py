@@ -265,7 +265,7 @@ def _solve(
     size = sum(one.size for one in jax.tree.leaves(shapes[0]))
 
     def cost_of(state: Any) -> Array:
-        return sum(jnp.sum(one**2) for one in jax.tree.leaves(state.f_info.residual))
+        return jnp.asarray(sum(jnp.sum(one**2) for one in jax.tree.leaves(state.f_info.residual)))
 
     def going(carry: Any) -> Array:
         _, _, state, ended = carry

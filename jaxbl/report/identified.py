@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 
 from jaxbl.drive.effects import AbstractEffect
 from jaxbl.drive.plant import Plant
+from jaxbl.identification.search import NOISE_ALONE
 from jaxbl.simulate import Experiment
 from jaxbl.study.identification import Identification, unit_on
 from jaxbl.study.store import write_atomic
@@ -105,7 +106,7 @@ def _remarks(summary: dict[str, Any]) -> list[str]:
         lines.append(f"Held at the nominal value, on which the others depend: {', '.join(summary['held'])}.")
     for side, residual in summary["residual"].items():
         ratio = residual["rms"] / residual["noise"]
-        told = "the model leaves nothing but noise" if ratio < 1.1 else "the model does not explain all of it"
+        told = "the model leaves nothing but noise" if ratio < NOISE_ALONE else "the model does not explain all of it"
         size = f"{residual['rms']:.2g} {residual['unit']} rms"
         lines.append(f"{side}: positions are met to {size}, {ratio:.3g} times the noise; {told}.")
     fit = summary["method"]["trajectory"]

@@ -492,6 +492,9 @@ def _trajectory(found: Found, record: Record) -> dict[str, Any]:
         "variance_over_noise": found.spread.variance,
         "inflation": dict(zip([one.path for one in found.free], found.spread.inflation, strict=True)),
         "smoothness": found.smoothness,
+        "between_windows": {}
+        if found.between is None
+        else dict(zip([one.path for one in found.free], found.between, strict=True)),
     }
 
 

@@ -262,8 +262,7 @@ def test_emps_agrees_with_what_was_published():
     assert set(parameters) == set(published)
     for path, value in published.items():
         low, high = parameters[path]["interval"]
-        # an estimate too, whose standard error is about as large (jaxbl.identification.regression gives the same values)
-        assert abs(value - 0.5 * (low + high)) < np.sqrt(2.0) * 0.5 * (high - low), (path, low, high)
+        assert low <= value <= high, (path, low, high)
         assert high - low < 0.25 * abs(value)
     torque = found["torque"]["motor"]
     assert torque["relative"] < 0.042
@@ -293,7 +292,7 @@ def test_xl330_pendulum_swings_freely():
         "effects.motor.coulomb_friction.torque",
     }
     low, high = parameters["effects.motor.coulomb_friction.torque"]["interval"]
-    assert 0.0 < low < high < 0.01
+    assert 0.0 < low < high < 0.02
     assert any("taken to move freely" in note for note in found.summary["notes"])
     # of the inertia m l² = 0.0049 kg m², a mass point: gravity pulls less, as the servo's own inertia adds to it
     assert 0.3 < parameters["effects.load.gravity.torque"]["value"] < 0.49 * 0.1 * 9.81
