@@ -393,9 +393,9 @@ def timed(options):
         for call in range(options.calls):
             record = twelve_log(seconds, 10 * int(seconds) + call)
             with stages() as parts:
-                start = time.perf_counter()
+                start, processor = time.perf_counter(), time.process_time()
                 found = whole.identify(record, study)
-                took = time.perf_counter() - start
+                took, processor = time.perf_counter() - start, time.process_time() - processor
             values = found.summary["parameters"]
             worst = max(
                 abs(values[path]["value"] - true) / values[path]["standard_error"]
@@ -403,14 +403,17 @@ def timed(options):
                 if path in values
             )
             how = found.summary["method"]["trajectory"]
-            rows.append({"log (s)": seconds, "call": call + 1, "s": took, **parts.seconds})
+            rows.append({"log (s)": seconds, "call": call + 1, "s": took, "processor": processor, **parts.seconds})
             print(
                 rows[-1],
                 f"free {len(values)} worst {worst:.1f} deviations, window {how['window']}, "
                 f"{how['starts_agreeing']} of {how['starts']} starts agree",
                 flush=True,
             )
-    print(pd.DataFrame(rows).to_markdown(index=False) if False else pd.DataFrame(rows).round(2).to_string())
+    names = list(rows[0])
+    print(f"| {' | '.join(names)} |\n|{' ---: |' * len(names)}")
+    for row in rows:
+        print(f"| {' | '.join(f'{row[name]:.4g}' for name in names)} |")
 
 
 def main():

@@ -22,6 +22,7 @@ from .trajectory import Fit, Free, Windows, cut, fit, with_values
 _LONG, _SHORT = 500, 50
 """Samples of the windows that are tried where no length is asked for."""
 _MOST_COARSE = 100
+_AT_ONCE = 2
 _FEWEST = 20
 _PASSES = 2
 """Choices of the predictor's gain, each followed by a fit."""
@@ -153,7 +154,8 @@ _fit = eqx.filter_jit(fit)
 
 @eqx.filter_jit
 def _fits(experiment: Experiment, free: tuple[Free, ...], windows: Windows, thetas: jax.Array) -> Fit:
-    return jax.vmap(lambda theta: fit(experiment, free, windows, theta, 30, rounds=1))(thetas)
+    # few at a time: those of a batch run as long as the slowest of them
+    return jax.lax.map(lambda theta: fit(experiment, free, windows, theta, 30, rounds=1), thetas, batch_size=_AT_ONCE)
 
 
 class Search:

@@ -250,22 +250,39 @@ def projected_residual(
 
 class _Solved(NamedTuple):
     theta: Array
-    guess: Any
-    residual: Any
+    guess: PlantState
+    left: Array
     steps: Array
     converged: Array
 
 
 def _solve(
-    residual: Callable[[Array, Any], tuple[Any, Any]], solver: Any, theta: Array, guess: Any, most_steps: int
+    residual: Callable[[Array, PlantState], tuple[Array, tuple[PlantState, Array]]],
+    solver: Any,
+    theta: Array,
+    guess: PlantState,
+    most_steps: int,
+    count: int,
 ) -> _Solved:
-    """Least squares, step by step: what comes with the best residual so far is the second argument of the next."""
-    shapes = jax.eval_shape(residual, theta, guess)
-    first, static = eqx.partition(solver.init(residual, theta, guess, {}, *shapes, frozenset()), eqx.is_array)
-    size = sum(one.size for one in jax.tree.leaves(shapes[0]))
+    """Least squares, step by step: the initial states of the best so far are the guess of the next.
+
+    Args:
+        residual: function of theta and guess; beside residuals it gives the states and each window's sum of squares.
+        solver: of optimistix.
+        theta: the start.
+        guess: of the initial states there.
+        most_steps: of the solver.
+        count: of the residuals that the sum of squares is of.
+    """
+
+    def function(theta: Array, guess: PlantState) -> tuple[Array, tuple[PlantState, Array]]:
+        return residual(theta, guess)
+
+    shapes = jax.eval_shape(function, theta, guess)
+    first, static = eqx.partition(solver.init(function, theta, guess, {}, *shapes, frozenset()), eqx.is_array)
 
     def cost_of(state: Any) -> Array:
-        return sum(jnp.sum(one**2) for one in jax.tree.leaves(state.f_info.residual))
+        return jnp.sum(state.f_info.residual**2)
 
     def going(carry: Any) -> Array:
         _, _, state, ended = carry
@@ -274,18 +291,18 @@ def _solve(
     def step(carry: Any) -> Any:
         theta, guess, old, _ = carry
         old = eqx.combine(old, static)
-        theta, new, _ = solver.step(residual, theta, guess, {}, old, frozenset())
-        met, result = solver.terminate(residual, theta, new.aux, {}, new, frozenset())
+        theta, new, _ = solver.step(function, theta, guess, {}, old, frozenset())
+        met, result = solver.terminate(function, theta, new.aux[0], {}, new, frozenset())
         accepted, cost = new.num_steps_since_acceptance == 0, cost_of(new)
         # a change of this size is small beside what residuals of this size leave open, on any record
-        small = accepted & ~old.first_step & (cost_of(old) - cost < _ENOUGH * cost / size)
+        small = accepted & ~old.first_step & (cost_of(old) - cost < _ENOUGH * cost / count)
         lost = new.num_steps_since_acceptance >= _MOST_REJECTED
         ended = met | small | lost | (result != optx.RESULTS.successful)
-        return theta, new.aux, eqx.filter(new, eqx.is_array), ended
+        return theta, new.aux[0], eqx.filter(new, eqx.is_array), ended
 
     start = theta, guess, first, jnp.asarray(False)
     theta, guess, state, ended = jax.lax.while_loop(going, step, start)
-    return _Solved(theta, guess, state.f_info.residual, state.num_steps, ended & jnp.isfinite(cost_of(state)))
+    return _Solved(theta, guess, state.aux[1], state.num_steps, ended & jnp.isfinite(cost_of(state)))
 
 
 def fit(
@@ -325,19 +342,32 @@ def fit(
         slope, (value, start) = jax.jacfwd(twice, has_aux=True)(theta)
         return value, start, slope
 
-    # all columns of the derivative in one run: nothing to be kept along the trajectories
-    known = jax.custom_jvp(projected)
+    def reduced(theta: Array, guess: PlantState) -> tuple[Array, Array, tuple[PlantState, Array]]:
+        """As many residuals as numbers, and one, with the same cost, gradient and normal matrix as all of them."""
+        theta = theta if held is None else jnp.where(held, given, theta)
+        value, start, slope = with_slope(theta, guess)
+        moving = jnp.ones(len(theta)) if held is None else jnp.where(held, 0.0, 1.0)
+        every = jnp.concatenate([value.ravel(), theta / WIDE])
+        slopes = jnp.concatenate([slope.reshape(-1, len(theta)), jnp.eye(len(theta)) / WIDE]) * moving[None, :]
+        size = jnp.sqrt(jnp.sum(slopes**2, axis=0))
+        size = jnp.where(size > 0.0, size, 1.0)
+        unit = slopes / size[None, :]
+        root = jnp.linalg.cholesky(unit.T @ unit + jnp.diag(1.0 - moving))
+        seen = jax.scipy.linalg.solve_triangular(root, unit.T @ every, lower=True)
+        rest = jnp.sqrt(jnp.maximum(jnp.sum(every**2) - jnp.sum(seen**2), 0.0))
+        derivative = jnp.concatenate([root.T * size[None, :], jnp.zeros((1, len(theta)))])
+        return jnp.concatenate([seen, rest[None]]), derivative, (start, jnp.sum(value**2, axis=(1, 2)))
 
-    @known.defjvp
+    # all columns of the derivative in one run, nothing kept along the trajectories, and no decomposition of tall matrices
+    @jax.custom_jvp
+    def residual(theta: Array, guess: PlantState) -> tuple[Array, tuple[PlantState, Array]]:
+        value, _, beside = reduced(theta, guess)
+        return value, beside
+
+    @residual.defjvp
     def _(primals: Any, tangents: Any) -> Any:
-        value, start, slope = with_slope(*primals)
-        return (value, start), (slope @ tangents[0], jax.tree.map(jnp.zeros_like, start))
-
-    def residual(theta: Array, guess: PlantState) -> tuple[tuple[Array, Array], PlantState]:
-        if held is not None:
-            theta = jnp.where(held, given, theta)
-        value, start = known(theta, guess)
-        return (value, theta / WIDE), start
+        value, derivative, beside = reduced(*primals)
+        return (value, beside), (derivative @ tangents[0], jax.tree.map(jnp.zeros_like, beside))
 
     solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-4)
 
@@ -348,13 +378,12 @@ def fit(
 
     def again(carry: tuple[Any, ...]) -> tuple[Any, ...]:
         theta, guess, round, steps, _, _ = carry
-        found = _solve(residual, solver, theta, guess, most_steps)
+        found = _solve(residual, solver, theta, guess, most_steps, windows.torque.size * len(windows.measured))
         theta = found.theta if held is None else jnp.where(held, given, found.theta)
         # a window's initial state may be the best of its neighbourhood only
         other, start = anew(theta)
-        known = jnp.sum(found.residual[0] ** 2, axis=(1, 2))
-        gained = jnp.any(known - other > _GAINED * jnp.sum(known) / found.residual[0].size)
-        guess = jax.tree.map(lambda new, old: jnp.where(other < known, new, old), start, found.guess)
+        gained = jnp.any(found.left - other > _GAINED * jnp.mean(found.left) / windows.torque.shape[1])
+        guess = jax.tree.map(lambda new, old: jnp.where(other < found.left, new, old), start, found.guess)
         return theta, guess, round + 1, steps + found.steps, found.converged, gained
 
     zero = jnp.zeros((), int)
