@@ -13,6 +13,7 @@ they go.
 
 import argparse
 import os
+import resource
 import tempfile
 import time
 from collections import defaultdict
@@ -403,7 +404,9 @@ def timed(options):
                 if path in values
             )
             how = found.summary["method"]["trajectory"]
-            rows.append({"log (s)": seconds, "call": call + 1, "s": took, "processor": processor, **parts.seconds})
+            memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+            row = {"log (s)": seconds, "call": call + 1, "s": took, "processor (s)": processor}
+            rows.append(row | dict(parts.seconds) | {"peak memory (GiB)": memory})
             print(
                 rows[-1],
                 f"free {len(values)} worst {worst:.1f} deviations, window {how['window']}, "

@@ -380,6 +380,8 @@ def fit(
         theta, guess, round, steps, _, _ = carry
         found = _solve(residual, solver, theta, guess, most_steps, windows.torque.size * len(windows.measured))
         theta = found.theta if held is None else jnp.where(held, given, found.theta)
+        if rounds == 1:
+            return theta, found.guess, round + 1, steps + found.steps, found.converged, jnp.asarray(False)
         # a window's initial state may be the best of its neighbourhood only
         other, start = anew(theta)
         gained = jnp.any(found.left - other > _GAINED * jnp.mean(found.left) / windows.torque.shape[1])
