@@ -27,14 +27,15 @@ import numpy as np
 DEFAULT_STEPS = 2
 """Integrator steps a sample where no event falls in it."""
 
-_ROWS = """motor_inertia motor_viscous load_inertia load_viscous ratio stiffness dead_zone slope gap half_gap cubic damping
+_NAMES = """motor_inertia motor_viscous load_inertia load_viscous ratio stiffness dead_zone slope gap half_gap cubic damping
 ecc_amplitude ecc_harmonic ecc_phase
 motor_dry motor_coulomb motor_extra motor_stribeck motor_drag motor_constant motor_gravity motor_periodic motor_hysteresis
 load_dry load_coulomb load_extra load_stribeck load_drag load_constant load_gravity load_periodic load_hysteresis
 motor_drift load_drift drift_time motor_dent load_dent dent_position dent_width gravity_phase
 periodic_rate periodic_phase cog_amplitude cog_harmonic cog_phase hysteresis_length
 motor_random load_random gain limit lag_rate
-loop kp kd filter motor_noise motor_resolution torque_limit period steps""".split()
+loop kp kd filter motor_noise motor_resolution torque_limit period steps"""
+_ROWS = _NAMES.split()
 P = SimpleNamespace(**{name: i for i, name in enumerate(_ROWS)})
 """Row of each number in the parameters of a lane."""
 
@@ -52,10 +53,12 @@ class Machine:
     Attributes:
         drive: the `[drive]` table.
         transmission: the `[transmission]` table; None on a rigid drive.
-        effects: `[[effects]]`; beside the package's kinds: `unknown.drifting_friction` (side, torque, share, time: dry friction
-            that runs from torque (1 + share) to torque (1 - share) over `time` s), `unknown.hysteresis` (side, torque, length:
-            Bouc-Wen, n = 2), `unknown.dent` (side, torque, position, width: dry friction in a bell around one position),
-            `unknown.random_torque` (side, torque: rms of the band-limited torque that :class:`Run` holds).
+        effects: `[[effects]]`; beside the package's kinds
+            `unknown.drifting_friction` (side, torque, share, time): dry friction that runs from torque (1 + share) to
+            torque (1 - share) over `time` s;
+            `unknown.hysteresis` (side, torque, length): Bouc-Wen, n = 2;
+            `unknown.dent` (side, torque, position, width): dry friction in a bell around one position;
+            `unknown.random_torque` (side, torque): rms of the band-limited torque that :class:`Run` holds.
     """
 
     drive: Mapping[str, Any]
