@@ -109,7 +109,8 @@ class Case:
         kind: one of `KINDS`.
         truth: `verdict` (as in diagnosis.json), `effects` (name -> parameters; empty, or the unknown effect), `sizes`
             (name -> share of the driving torque's rms), `level` asked for (the largest of a pair), `seen` (change of what
-            the encoders read over their noise).
+            the encoders read over their noise), `growth` (change of the motor position for one of 1 rad/s in the initial
+            speed, s; thousands mean that a free run cannot be foretold).
         conditions: plant, excitation, holdout (its excitation), loop, period, duration, initial_state, uncertainty, ...
         log, holdout: of the same machine, under two excitations.
         model: nominal study for the package, as plain data (no excitation, no observer).
@@ -386,13 +387,19 @@ def _carry_out(seed: int, plans: list[_Plan]) -> list[Case | None]:
         full.append(replace(plan.machine, effects=(*plan.machine.effects, *_ordered(effects))))
         sizes.append(found)
     runs = [replace(run, machine=machine) for plan, machine in zip(plans, full, strict=True) for run in plan.runs]
+    nudges = [_NUDGE * rms(trace.states[1]) for trace in plain]
     traces = simulate(runs)
+    nudged = simulate([_nudged(runs[2 * i], nudge) for i, nudge in enumerate(nudges)])
     result: list[Case | None] = []
     for i, plan in enumerate(plans):
         pair, made = (runs[2 * i], runs[2 * i + 1]), (traces[2 * i], traces[2 * i + 1])
         seen = _seen(pair[0], plain[i], made[0])
         fit = all(_fit(trace, plain[i], plan.machine) for trace in made) and (not plan.hidden or seen >= _LEAST_SEEN)
-        result.append(_case(seed, plan, sizes[i], seen, pair, made) if fit else None)
+        if not fit:
+            result.append(None)
+            continue
+        growth = rms(nudged[i].states[0] - made[0].states[0]) / nudges[i]
+        result.append(_case(seed, plan, sizes[i], {"seen": seen, "growth": growth}, pair, made))
     return result
 
 
@@ -402,6 +409,14 @@ _ORDER = ("actuator.gain_error", "actuator.saturation", "actuator.lag")
 def _ordered(effects: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Actuator effects in the order in which the simulator applies them."""
     return sorted(effects, key=lambda effect: _ORDER.index(effect["kind"]) if effect["kind"] in _ORDER else -1)
+
+
+_NUDGE = 1e-6
+
+
+def _nudged(run: Run, nudge: float) -> Run:
+    theta_e, w_e, theta_s, w_s = run.initial
+    return replace(run, initial=(theta_e, w_e + nudge, theta_s, w_s))
 
 
 def _seen(run: Run, plain: Trace, made: Trace) -> float:
@@ -425,7 +440,12 @@ def _fit(trace: Trace, plain: Trace, machine: Machine) -> bool:
 
 
 def _case(
-    seed: int, plan: _Plan, sizes: dict[str, float], seen: float, runs: tuple[Run, Run], traces: tuple[Trace, Trace]
+    seed: int,
+    plan: _Plan,
+    sizes: dict[str, float],
+    more: dict[str, float],
+    runs: tuple[Run, Run],
+    traces: tuple[Trace, Trace],
 ) -> Case:
     machine = runs[0].machine
     hidden = {str(effect["kind"]): {k: v for k, v in effect.items() if k != "kind"} for effect in
@@ -447,7 +467,7 @@ def _case(
         "effects": hidden,
         "sizes": sizes,
         "level": max((level for _, level in plan.hidden), default=0.0),
-        "seen": seen,
+        **more,
     }
     logs = [Log(trace.t, trace.u, trace.theta_e, trace.theta_s) for trace in traces]
     return Case(

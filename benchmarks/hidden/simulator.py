@@ -9,8 +9,8 @@ Equations (SI units, sides `motor` and `load`, u held between samples):
 Integrator: classical Runge-Kutta of fourth order between events. In between, each side sticks or slips in one direction and
 the gap is open or closed at one flank, so the right side is smooth; a step that crosses an event (a velocity through zero,
 break-away, contact made or lost) is taken back and shortened by the secant rule until it ends on it, and then the mode
-changes. Stick is exact: a side that sticks has velocity zero. Checked against SciPy in tests/benchmarks, and against half
-the step by :func:`simulate` on request.
+changes. Stick is exact: a side that sticks has velocity zero. Fourth order through events. Checked against SciPy in
+tests/benchmarks.
 
 The same source runs in two engines: compiled lane by lane where numba is installed, and vectorised NumPy where it is not.
 """
@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
-DEFAULT_STEPS = 2
-"""Integrator steps a sample where no event falls in it."""
+STEP = 2.5e-4
+"""Longest integrator step, s; a sample has at least two. Half of it changes the cases by less than their noise."""
 
 _NAMES = """motor_inertia motor_viscous load_inertia load_viscous ratio stiffness dead_zone slope gap half_gap cubic damping
 ecc_amplitude ecc_harmonic ecc_phase
@@ -42,8 +42,8 @@ P = SimpleNamespace(**{name: i for i, name in enumerate(_ROWS)})
 ANGLE_TOLERANCE, SPEED_TOLERANCE, TORQUE_TOLERANCE = 1e-11, 1e-10, 1e-9
 """How near an event a step must end: rad, rad/s, and share of the friction level."""
 
-LARGEST = 60
-"""Attempts in a sample after which a step is taken as it is: a guard against chatter."""
+SPARE = 60
+"""Attempts in a sample beyond its steps, after which one is taken as it is: a guard against chatter."""
 
 
 @dataclass(frozen=True)
@@ -129,13 +129,13 @@ class Trace:
     states: np.ndarray = field(repr=False)
 
 
-def pack(run: Run, steps: int = DEFAULT_STEPS) -> np.ndarray:
+def pack(run: Run, step: float = STEP) -> np.ndarray:
     """Numbers of a lane, in the order of `P`."""
     machine, values = run.machine, dict.fromkeys(_ROWS, 0.0)
     drive, law = machine.drive, machine.transmission or {}
     values |= {"load_inertia": 1.0, "ratio": machine.ratio, "limit": math.inf, "dent_width": 1.0, "hysteresis_length": 1.0}
     values |= {"gain": 1.0, "drift_time": 1.0, "kp": run.kp, "kd": run.kd, "filter": run.filter, "period": run.period}
-    values["steps"] = float(steps)
+    values["steps"] = float(max(2, math.ceil(run.period / step - 1e-9)))
     values |= {"torque_limit": run.torque_limit, "motor_noise": run.motor_noise, "motor_resolution": run.motor_resolution}
     values["loop"] = float(run.reference is not None)
     for key in ("motor_inertia", "motor_viscous", "load_inertia", "load_viscous"):
@@ -341,7 +341,7 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
             over = new[i] < -1.0
             crossed = crossed | over
             cut = pick(over, np.minimum(cut, (before + 0.5) / (before - pick(over, new[i], -2.0))), cut)
-        taken = np.logical_not(crossed & (h > 1e-10) & (tries < LARGEST))
+        taken = np.logical_not(crossed & (h > 1e-10) & (tries < p[STEPS] + SPARE))
         contact, d_e, d_s = modes
         c = pick(taken & (new[0] <= 0.0), pick(contact != 0.0, 0.0, np.sign(new[7])), contact)
         event_e, event_s = taken & (new[1] <= 0.0), taken & (new[2] <= 0.0)
@@ -496,22 +496,22 @@ def engine() -> tuple[Any, str]:
     return _ENGINE[0], _ENGINE[1]
 
 
-def simulate(runs: Sequence[Run], steps: int = DEFAULT_STEPS, batch: int = 256) -> list[Trace]:
+def simulate(runs: Sequence[Run], step: float = STEP, batch: int = 256) -> list[Trace]:
     """Run experiments.
 
     Args:
         runs: they may differ in everything.
-        steps: integrator steps a sample where no event falls in it.
+        step: longest integrator step, s.
         batch: how many advance together.
     """
     traces = []
     for first in range(0, len(runs), batch):
-        traces.extend(_batch(runs[first : first + batch], steps))
+        traces.extend(_batch(runs[first : first + batch], step))
     return traces
 
 
-def _batch(runs: Sequence[Run], steps: int) -> list[Trace]:
-    parameters = np.array([pack(run, steps) for run in runs])
+def _batch(runs: Sequence[Run], step: float) -> list[Trace]:
+    parameters = np.array([pack(run, step) for run in runs])
     lengths = np.array([len(run.torque) for run in runs])
     lanes, most = len(runs), int(lengths.max())
     torque, reference, rate, unit = (np.zeros((lanes, most)) for _ in range(4))
