@@ -15,6 +15,7 @@ import importlib
 import json
 import tempfile
 import time
+import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -34,16 +35,20 @@ def package(logs: Sequence[Log], model: Mapping[str, Any], holdout: Log) -> Mapp
             log.write(path)
         diagnose = jaxbl.diagnose  # type: ignore[attr-defined]
         found = diagnose(paths if len(paths) > 1 else paths[0], model, holdout=Path(folder) / "holdout.csv")
-    return found if isinstance(found, Mapping) else found.summary
+    if isinstance(found, Mapping):
+        return found
+    return {**found.summary, "model": found.model.resolved()}
 
 
 def left(found: Sequence[Case], folder: Path) -> list[Outcome]:
-    """Outcomes of a finished batch: FOLDER/NAME/diagnosis.json for each case."""
+    """Outcomes of a finished batch: FOLDER/NAME/diagnosis.json, and model.toml beside it, for each case."""
     outcomes = []
     for case in found:
         path = folder / case.name / "diagnosis.json"
         known = path.exists()
         diagnosis = json.loads(path.read_text(encoding="utf-8")) if known else {}
+        if known and (path.parent / "model.toml").exists():
+            diagnosis["model"] = tomllib.loads((path.parent / "model.toml").read_text(encoding="utf-8"))
         outcomes.append(outcome(case, diagnosis, error="" if known else f"{path}: no such file"))
     return outcomes
 

@@ -155,36 +155,35 @@ class _Plan:
     uncertainty: float
 
 
-def cases(seed: int, count: int, kind: str = "single") -> list[Case]:
+def cases(seed: int, count: int, kind: str = "single", duration: float | None = None) -> list[Case]:
     """Draw cases.
 
     Args:
         seed: the same seed, count and kind give the same cases.
         count: number of cases; effects, sizes and plants come equally often.
         kind: one of `KINDS`, or `all`: half of the cases single, the rest of all other kinds alike.
+        duration: of all logs in place of what is drawn, s: for quick trials.
     """
-    if kind == "all":
-        others = [share for share in KINDS if share != "single"]
-        each = count // (2 * len(others))
-        counts = {"single": count - each * len(others)} | dict.fromkeys(others, each)
-        return [case for part, n in counts.items() for case in cases(seed, n, part)]
-    if kind not in KINDS:
+    if kind not in (*KINDS, "all"):
         raise ValueError(f"unknown kind {kind!r}; one of {', '.join((*KINDS, 'all'))}")
+    counts = {kind: count}
+    if kind == "all":
+        each = count // (2 * (len(KINDS) - 1))
+        counts = dict.fromkeys(KINDS, each) | {"single": count - each * (len(KINDS) - 1)}
+    wanted = [(part, i, *target) for part, n in counts.items() for i, target in enumerate(_targets(seed, n, part))]
     found: dict[int, Case] = {}
-    wanted = dict(enumerate(_targets(seed, count, kind)))
     for draw_number in range(_MOST_DRAWS):
-        missing = [i for i in wanted if i not in found]
+        missing = [i for i in range(len(wanted)) if i not in found]
         if not missing:
             break
-        plans = [_plan(seed, i, draw_number, kind, *wanted[i]) for i in missing]
-        for plan, case in zip(plans, _carry_out(seed, plans), strict=True):
+        plans = [_plan(seed, draw_number, *wanted[i], duration) for i in missing]
+        for i, case in zip(missing, _carry_out(seed, plans), strict=True):
             if case is not None:
-                found[plan.index] = case
-    else:
-        left = [wanted[i] for i in wanted if i not in found]
-        if left:
-            raise RuntimeError(f"no fit case in {_MOST_DRAWS} draws for {left}")
-    return [found[i] for i in sorted(found)]
+                found[i] = case
+    left = [wanted[i] for i in range(len(wanted)) if i not in found]
+    if left:
+        raise RuntimeError(f"no fit case in {_MOST_DRAWS} draws for {left}")
+    return [found[i] for i in range(len(wanted))]
 
 
 def _targets(seed: int, count: int, kind: str) -> list[tuple[str, tuple[tuple[str, float], ...]]]:
@@ -216,11 +215,21 @@ def _targets(seed: int, count: int, kind: str) -> list[tuple[str, tuple[tuple[st
     return targets[:count]
 
 
-def _plan(seed: int, index: int, draw_number: int, kind: str, plant: str, hidden: tuple[tuple[str, float], ...]) -> _Plan:
+def _plan(
+    seed: int,
+    draw_number: int,
+    kind: str,
+    index: int,
+    plant: str,
+    hidden: tuple[tuple[str, float], ...],
+    duration: float | None,
+) -> _Plan:
     rng = np.random.default_rng([seed, KINDS.index(kind), 2, index, draw_number])
     names = [name for name, _ in hidden]
     given = _PLANTS[plant]
     conditions, uncertainty = _conditions(kind, plant, rng)
+    if duration is not None:
+        conditions["duration"] = duration
     # machines of a kind are not all alike
     drive = {
         key: value * float(np.exp(rng.normal(0.0, 0.15))) if key not in ("kind", "gear_ratio") else value
@@ -304,7 +313,9 @@ def _runs(
     resolution = 2.0 * math.pi / conditions["counts"] if conditions["counts"] else 0.0
     runs = []
     for number, which in enumerate(("excitation", "holdout")):
-        duration = conditions["duration"] if number == 0 else max(5.0, 0.5 * conditions["duration"])
+        duration = conditions["duration"]
+        if number == 1 and duration >= 3.0:
+            duration = max(5.0, 0.5 * duration)
         n = round(duration / period)
         wave = _wave(conditions[which], n, period, frequency * float(rng.uniform(0.8, 1.25)), rng)
         turn = float(rng.uniform(-0.5, 0.5))

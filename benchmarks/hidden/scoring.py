@@ -9,7 +9,8 @@ What counts as right:
 
 Gap of a case: the mean over channels of 1 - e(after) / e(before), where e² = rmse² - floor² on held-out data, nought where
 that is negative; only channels with e(before) of at least the floor. Worse: some channel's rmse after is more than 5 % above
-the larger of before and floor. Ratio to the oracle: the median over channels of rmse after over the oracle's. Calibration:
+the larger of before and floor. Ratio to the oracle: the median over channels of rmse after over the oracle's. That is by
+the tool's own account; by the bench's, where the extended model is given, see hidden/proof.py. Calibration:
 every finding of an `explained` verdict is a bet that pays where the effect was really hidden.
 """
 
@@ -28,9 +29,10 @@ import numpy as np
 
 from .cases import Case, Log
 from .effects import EFFECTS, UNKNOWN
+from .proof import proof
 
 Diagnose = Callable[[list[Log], dict[str, Any], Log], Mapping[str, Any]]
-"""diagnose(logs, model, holdout) -> what stands in diagnosis.json."""
+"""diagnose(logs, model, holdout) -> what stands in diagnosis.json; `model`, the extended study, lets the bench prove it."""
 
 VERDICTS = ("explained", "no_discrepancy", "unknown_effect")
 CONFIDENT = 0.9
@@ -48,6 +50,8 @@ TARGETS = {
     "gap_reduction": (0.99, True),
     "oracle_ratio": (1.5, False),
     "worse": (0.0, False),
+    "proved": (0.99, True),
+    "proved_worse": (0.0, False),
     "calibration_error": (0.05, False),
 }
 """What must hold, and whether more is better."""
@@ -59,7 +63,8 @@ class Outcome:
 
     Attributes:
         findings: effect, confidence and alternatives of each, as they were ordered.
-        reduction, worse, ratio: of the held-out gap; None where it was not given.
+        reduction, worse, ratio: of the held-out gap by its own account; None where it was not given.
+        proved, proved_worse: reduction of the gap by the bench's account, and whether there is more of it.
         error: why there is no diagnosis.
     """
 
@@ -75,6 +80,8 @@ class Outcome:
     reduction: float | None = None
     worse: bool | None = None
     ratio: float | None = None
+    proved: float | None = None
+    proved_worse: bool | None = None
     seconds: float = 0.0
     error: str = ""
 
@@ -165,6 +172,8 @@ def outcome(
         seconds=seconds,
         error=error,
     )
+    if diagnosis.get("model"):
+        result.proved, result.proved_worse = proof(case, diagnosis["model"])
     gap = diagnosis.get("gap")
     if gap:
         _gap(result, gap["holdout_rmse_before"], gap["holdout_rmse_after"], gap.get("noise_floor") or {}, oracle)
@@ -274,6 +283,8 @@ def scores(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "confidently_wrong": rate(by["unknown"], lambda one: bool(one.named) and one.findings[0][1] >= CONFIDENT),
         "gap_reduction": number([one.reduction for one in known if one.reduction is not None]),
         "oracle_ratio": number([one.ratio for one in known if one.ratio is not None]),
+        "proved": number([one.proved for one in known if one.proved is not None]),
+        "proved_worse": rate([one for one in outcomes if one.proved_worse is not None], lambda one: bool(one.proved_worse)),
         "worse": rate([one for one in outcomes if one.worse is not None], lambda one: bool(one.worse)),
         "calibration_error": None if error is None else {"value": error, "count": sum(int(row["count"]) for row in curve)},
         "failed": rate(list(outcomes), lambda one: one.verdict == "failed"),
@@ -299,6 +310,8 @@ _TITLES = {
     "confidently_wrong": f"- explains them at confidence {CONFIDENT:g} or more",
     "gap_reduction": "gap reduction on held-out data, median",
     "worse": "- made worse",
+    "proved": "- the same by the bench's simulator, median",
+    "proved_worse": "- made worse by the bench's simulator",
     "oracle_ratio": "- ratio to the oracle, median",
     "calibration_error": "expected calibration error",
     "failed": "no diagnosis",

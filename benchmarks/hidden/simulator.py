@@ -34,7 +34,7 @@ load_dry load_coulomb load_extra load_stribeck load_drag load_constant load_grav
 motor_drift load_drift drift_time motor_dent load_dent dent_position dent_width gravity_phase
 periodic_rate periodic_phase cog_amplitude cog_harmonic cog_phase hysteresis_length
 motor_random load_random gain limit lag_rate
-loop kp kd filter motor_noise motor_resolution torque_limit period steps"""
+loop kp kd filter motor_noise motor_resolution torque_limit period steps origin"""
 _ROWS = _NAMES.split()
 P = SimpleNamespace(**{name: i for i, name in enumerate(_ROWS)})
 """Row of each number in the parameters of a lane."""
@@ -87,6 +87,8 @@ class Run:
         kp, kd, filter: gains of the loop, N m/rad and N m s/rad, and the share 0..1 of a new difference in its velocity.
         torque_limit: of the loop, N m.
         initial: θ_e, ω_e, θ_s, ω_s.
+        acting: torque that the actuator makes when the run begins, N m (for `actuator.lag`).
+        origin: time at which the run begins, s.
         motor_noise, load_noise: rms of the encoders, rad; resolutions in rad, 0 for none.
         torque_noise: rms of noise in the recorded torque, N m.
         disturbance: unit-rms torque at the samples, for `unknown.random_torque`; linear in between.
@@ -102,6 +104,8 @@ class Run:
     filter: float = 1.0
     torque_limit: float = math.inf
     initial: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    acting: float = 0.0
+    origin: float = 0.0
     motor_noise: float = 0.0
     load_noise: float = 0.0
     motor_resolution: float = 0.0
@@ -137,6 +141,7 @@ def pack(run: Run, step: float = STEP) -> np.ndarray:
     values |= {"gain": 1.0, "drift_time": 1.0, "kp": run.kp, "kd": run.kd, "filter": run.filter, "period": run.period}
     values["steps"] = float(max(2, math.ceil(run.period / step - 1e-9)))
     values |= {"torque_limit": run.torque_limit, "motor_noise": run.motor_noise, "motor_resolution": run.motor_resolution}
+    values["origin"] = run.origin
     values["loop"] = float(run.reference is not None)
     for key in ("motor_inertia", "motor_viscous", "load_inertia", "load_viscous"):
         values[key] = drive.get(key, values[key])
@@ -407,8 +412,7 @@ def _compiled() -> Any:
     attempt, begin, first, control, acting, held = (
         engine.attempt, engine.begin, engine.first, engine.control, engine.acting, engine.held,
     )  # fmt: skip
-    period = P.period
-    steps = P.steps
+    period, steps, origin = P.period, P.steps, P.origin
 
     @numba.njit(parallel=True)
     def run(parameters, lengths, initial, torque, reference, rate, unit, noise, command, readings, states):
@@ -416,9 +420,9 @@ def _compiled() -> Any:
             p = parameters[lane]
             y = (initial[lane, 0], initial[lane, 1], initial[lane, 2], initial[lane, 3], 0.0)
             modes = first(p, y)
-            previous, velocity, lagged = initial[lane, 0], initial[lane, 1], 0.0
+            previous, velocity, lagged = initial[lane, 0], initial[lane, 1], initial[lane, 4]
             for k in range(lengths[lane]):
-                start = k * p[period]
+                start = p[origin] + k * p[period]
                 previous, velocity, u = control(
                     p, y[0], unit[lane, k], previous, velocity, torque[lane, k], reference[lane, k], rate[lane, k]
                 )
@@ -444,16 +448,16 @@ def _vectorised() -> Any:
     def run(parameters, lengths, initial, torque, reference, rate, unit, noise, command, readings, states):
         order = np.argsort(-lengths, kind="stable")
         p = np.ascontiguousarray(parameters[order].T)
-        y = (*initial[order].T, np.zeros(len(order)))
+        y = (*initial[order, :4].T, np.zeros(len(order)))
         modes = engine.first(p, y)
-        previous, velocity, lagged = y[0], y[1], np.zeros(len(order))
+        previous, velocity, lagged = y[0], y[1], initial[order, 4]
         for k in range(int(lengths.max())):
             live = int((lengths > k).sum())
             if live < p.shape[1]:
                 order, p, lagged = order[:live], np.ascontiguousarray(p[:, :live]), lagged[:live]
                 previous, velocity = previous[:live], velocity[:live]
                 y, modes = tuple(part[:live] for part in y), tuple(part[:live] for part in modes)
-            start = k * p[P.period]
+            start = p[P.origin] + k * p[P.period]
             previous, velocity, u = engine.control(
                 p, y[0], unit[order, k], previous, velocity, torque[order, k], reference[order, k], rate[order, k]
             )
@@ -528,7 +532,7 @@ def _batch(runs: Sequence[Run], step: float) -> list[Trace]:
             reference[i, :n], rate[i, :n] = run.reference
         if run.disturbance is not None:
             noise[i, : n + 1] = run.disturbance[: n + 1]
-    initial = np.array([run.initial for run in runs], float)
+    initial = np.array([(*run.initial, run.acting) for run in runs], float)
     with np.errstate(all="ignore"):
         engine()[0](parameters, lengths, initial, torque, reference, rate, unit, noise, command, readings, states)
     traces = []
