@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from hidden.cases import KINDS, Case, Log, cases, save
-from hidden.scoring import Diagnose, Outcome, markdown, outcome, run, write
+from hidden.scoring import Diagnose, Outcome, markdown, outcome, prove, run, write
 from hidden.simulator import engine
 
 
@@ -42,14 +42,16 @@ def package(logs: Sequence[Log], model: Mapping[str, Any], holdout: Log) -> Mapp
 
 def left(found: Sequence[Case], folder: Path) -> list[Outcome]:
     """Outcomes of a finished batch: FOLDER/NAME/diagnosis.json, and model.toml beside it, for each case."""
-    outcomes = []
+    outcomes, models = [], []
     for case in found:
         path = folder / case.name / "diagnosis.json"
         known = path.exists()
         diagnosis = json.loads(path.read_text(encoding="utf-8")) if known else {}
         if known and (path.parent / "model.toml").exists():
             diagnosis["model"] = tomllib.loads((path.parent / "model.toml").read_text(encoding="utf-8"))
+        models.append(diagnosis.get("model"))
         outcomes.append(outcome(case, diagnosis, error="" if known else f"{path}: no such file"))
+    prove(found, outcomes, models)
     return outcomes
 
 

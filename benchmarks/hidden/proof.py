@@ -6,14 +6,13 @@ drift of free-running positions; what is left is what the model has wrong.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from .cases import Case
-from .effects import rms
-from .simulator import Machine, Run, simulate
+from .simulator import Machine, Run, pack, simulate
 
 WINDOW = 0.5
 """Length of the windows, s."""
@@ -21,61 +20,78 @@ _SMALL = 0.1
 """Errors below this share of the encoder's noise are no errors."""
 
 
-def foretold(case: Case, *models: Mapping[str, Any]) -> list[dict[str, float]]:
-    """Rms error in rad of each model's positions over the windows, by channel.
+def foretold(asked: Sequence[tuple[Case, Mapping[str, Any]]]) -> list[dict[str, float] | None]:
+    """Rms error in rad of models' positions over the windows, by channel.
 
     Args:
-        case: whose hold-out run is foretold.
-        models: studies, of which `drive`, `transmission` and `effects` are used.
+        asked: cases, and the study whose `drive`, `transmission` and `effects` are to foretell each one's hold-out run.
 
-    Raises:
-        ValueError: a model has an effect that the bench does not know.
+    Returns:
+        For each; None where the bench cannot run the model.
     """
-    run, truth = case.runs[1], case.traces[1]
-    length = min(round(WINDOW / run.period), len(truth.t))
-    starts = range(0, len(truth.t) - length + 1, length)
-    runs = []
-    for model in models:
-        machine = Machine(model["drive"], model.get("transmission"), model.get("effects", ()))
-        acting = _acting(machine, truth.command, run.period)
-        runs += [
-            Run(
-                machine,
-                run.period,
-                truth.command[k : k + length],
-                initial=tuple(truth.states[:, k]),
-                acting=acting[k],
-                origin=float(truth.t[k]),
-            )
-            for k in starts
-        ]
-    traces = simulate(runs)
-    found = []
-    for i in range(len(models)):
-        own = traces[i * len(starts) : (i + 1) * len(starts)]
-        errors = np.stack([trace.states - truth.states[:, k : k + length] for k, trace in zip(starts, own, strict=True)])
+    runs: list[Run] = []
+    ranges = []
+    for case, model in asked:
+        first = len(runs)
+        try:
+            windows = _windows(case, model)
+            for run in windows:
+                pack(run)
+        except (KeyError, TypeError, ValueError):
+            windows = []
+        runs += windows
+        ranges.append(range(first, len(runs)))
+    traces = simulate(runs, batch=2048)
+    found: list[dict[str, float] | None] = []
+    for (case, _), own in zip(asked, ranges, strict=True):
+        states, squares = case.traces[1].states, []
+        for i in own:
+            k, length = round(runs[i].origin / runs[i].period), len(runs[i].torque)
+            squares.append(np.mean((traces[i].states - states[:, k : k + length]) ** 2, axis=1))
+        errors = np.sqrt(np.mean(squares, axis=0)) if squares else np.zeros(0)
         channels = {"theta_e": 0} if case.runs[1].machine.rigid else {"theta_e": 0, "theta_s": 2}
-        found.append({name: rms(errors[:, row]) for name, row in channels.items()})
+        found.append({name: float(errors[row]) for name, row in channels.items()} if squares else None)
     return found
 
 
-def proof(case: Case, model: Mapping[str, Any]) -> tuple[float | None, bool | None]:
-    """Reduction of the gap from the nominal to the extended model, mean over channels, and whether it grew in one.
+def _windows(case: Case, model: Mapping[str, Any]) -> list[Run]:
+    run, truth = case.runs[1], case.traces[1]
+    machine = Machine(model["drive"], model.get("transmission"), model.get("effects", ()))
+    acting = _acting(machine, truth.command, run.period)
+    length = min(round(WINDOW / run.period), len(truth.t))
+    return [
+        Run(
+            machine,
+            run.period,
+            truth.command[k : k + length],
+            initial=tuple(truth.states[:, k]),
+            acting=acting[k],
+            origin=float(truth.t[k]),
+        )
+        for k in range(0, len(truth.t) - length + 1, length)
+    ]
+
+
+def proofs(asked: Sequence[tuple[Case, Mapping[str, Any]]]) -> list[tuple[float | None, bool | None]]:
+    """Reduction of the gap from the nominal to an extended model, mean over channels, and whether it grew in one.
 
     Without a gap before there is no reduction; without a model that the bench can run there is neither.
     """
-    try:
-        before, after = foretold(case, case.model, model)
-    except (KeyError, TypeError, ValueError):
-        return None, None
-    noise = {"theta_e": case.runs[1].motor_noise, "theta_s": case.runs[1].load_noise}
-    reductions, worse = [], False
-    for channel, old in before.items():
-        small, new = _SMALL * noise[channel], after[channel]
-        worse = worse or not new <= 1.05 * max(old, small)
-        if old > small:
-            reductions.append(1.0 - new / old if math.isfinite(new) else -math.inf)
-    return (float(np.mean(reductions)) if reductions else None), worse
+    pairs = foretold([*((case, case.model) for case, _ in asked), *asked])
+    found: list[tuple[float | None, bool | None]] = []
+    for (case, _), before, after in zip(asked, pairs[: len(asked)], pairs[len(asked) :], strict=True):
+        if before is None or after is None:
+            found.append((None, None))
+            continue
+        noise = {"theta_e": case.runs[1].motor_noise, "theta_s": case.runs[1].load_noise}
+        reductions, worse = [], False
+        for channel, old in before.items():
+            small, new = _SMALL * noise[channel], after[channel]
+            worse = worse or not new <= 1.05 * max(old, small)  # nan is worse
+            if old > small:
+                reductions.append(1.0 - new / old if math.isfinite(new) else -math.inf)
+        found.append((float(np.mean(reductions)) if reductions else None, worse))
+    return found
 
 
 def _acting(machine: Machine, command: np.ndarray, period: float) -> np.ndarray:

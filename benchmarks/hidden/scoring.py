@@ -29,7 +29,7 @@ import numpy as np
 
 from .cases import Case, Log
 from .effects import EFFECTS, UNKNOWN
-from .proof import proof
+from .proof import proofs
 
 Diagnose = Callable[[list[Log], dict[str, Any], Log], Mapping[str, Any]]
 """diagnose(logs, model, holdout) -> what stands in diagnosis.json; `model`, the extended study, lets the bench prove it."""
@@ -126,7 +126,7 @@ def run(
         diagnose: what is put to the test.
         oracle: held-out rmse by channel of the true effect, fitted.
     """
-    outcomes = []
+    outcomes, models = [], []
     for i, case in enumerate(found):
         start = time.perf_counter()
         try:
@@ -136,9 +136,19 @@ def run(
             traceback.print_exc()
             diagnosis, error, best = {}, f"{type(failure).__name__}: {failure}", None
         outcomes.append(outcome(case, diagnosis, best, time.perf_counter() - start, error))
+        models.append(diagnosis.get("model"))
         if sys.stderr.isatty():
             print(f"\r{i + 1} of {len(found)}", end="\n" if i + 1 == len(found) else "", file=sys.stderr)
+    prove(found, outcomes, models)
     return outcomes
+
+
+def prove(found: Sequence[Case], outcomes: Sequence[Outcome], models: Sequence[Mapping[str, Any] | None]) -> None:
+    """Add the bench's own account of the gap to outcomes, where there is an extended model."""
+    given = [i for i, model in enumerate(models) if model]
+    results = proofs([(found[i], models[i] or {}) for i in given])
+    for i, (reduction, worse) in zip(given, results, strict=True):
+        outcomes[i].proved, outcomes[i].proved_worse = reduction, worse
 
 
 def outcome(
@@ -172,8 +182,6 @@ def outcome(
         seconds=seconds,
         error=error,
     )
-    if diagnosis.get("model"):
-        result.proved, result.proved_worse = proof(case, diagnosis["model"])
     gap = diagnosis.get("gap")
     if gap:
         _gap(result, gap["holdout_rmse_before"], gap["holdout_rmse_after"], gap.get("noise_floor") or {}, oracle)
