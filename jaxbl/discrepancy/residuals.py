@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 from scipy.signal import lfilter
 
 from jaxbl.identification.regression import Kinematics, actuated
@@ -115,6 +115,11 @@ def low_passed(
     return steady + smooth(position, period, noise=smoothed.noise, jerk=smoothed.jerk).acceleration  # type: ignore[arg-type]
 
 
+def _mean_around(values: Float[Array, " samples"]) -> Float[Array, " samples"]:
+    """Mean over the sampling period on either side of each sample, weighted by a triangle, to fourth order."""
+    return values.at[1:-1].add(jnp.diff(values, n=2) / 12.0)
+
+
 def _torque(
     experiment: Experiment, side: str, position: dict, velocity: dict, torque: Array, time: Array, transmitted: Array | None
 ) -> tuple[Array, Array]:
@@ -136,6 +141,9 @@ def _side(
     holding = jnp.clip(total - inertia * part.acceleration[side], -level, level)
     moving = jnp.abs(velocity) > _HELD * smoothed[side].deviation(1)
     modelled = total - jnp.where(moving, level * jnp.sign(velocity), holding)
+    # the input is a mean around the sample already; of the rest, the mean that the position's second differences see
+    driving = torque if side == "motor" else jnp.zeros_like(torque)
+    modelled = driving + _mean_around(modelled - driving)
     period = (part.time[-1] - part.time[0]) / (len(part.time) - 1)
     missing = inertia * part.acceleration[side] - low_passed(modelled, smoothed[side], period)
 
@@ -308,3 +316,43 @@ def _beyond_nominal(experiment: Experiment, side: str, part: Kinematics) -> Arra
     added = (experiment.plant.inertia(side) - drive.inertia(side)) * part.acceleration[side]
     nominal = drive.inertia(side) * drive.acceleration(side, velocity, part.torque)
     return total - level * jnp.sign(velocity) - added - nominal
+
+
+def narrowed(residual: Residual, cutoff: float) -> tuple[Residual, np.ndarray]:
+    """A residual behind a further zero-phase low-pass (Gaussian), without ends, no more samples than needed; their indices.
+
+    Noise of accelerations grows with the square of the frequency: what is slow shows better without what is fast.
+
+    Args:
+        residual: of a part.
+        cutoff: frequency at which half of the power passes, Hz.
+    """
+    width = np.sqrt(np.log(2.0)) / (2.0 * np.pi * cutoff * residual.period)
+    stride = max(int(width), 1)
+    # at the ends smoother and filter find but one side
+    cut = min(int(3.0 * width + 0.5 / (residual.bandwidth * residual.period)), len(residual.time) // 4)
+    at = np.arange(cut, len(residual.time) - cut, stride)
+    reach = len(residual.correlation) + int(8.0 * width)
+    size = 2 ** int(np.ceil(np.log2(2 * reach)))
+    spectrum = noise_spectrum(residual.correlation, size)
+    frequency = np.linspace(0.0, np.pi, size // 2 + 1)
+    passed = np.fft.irfft(spectrum * np.exp(-((frequency * width) ** 2)))
+    share = max(passed[0], np.finfo(float).tiny)
+    low = dataclasses.replace(
+        residual,
+        time=residual.time[at],
+        torque=gaussian_filter1d(residual.torque, width)[at],
+        deviation=np.sqrt(share * gaussian_filter1d(residual.deviation**2, width)[at]),
+        correlation=passed[:reach:stride] / share,
+        bandwidth=min(cutoff, residual.bandwidth),
+    )
+    return low, at
+
+
+def noise_spectrum(correlation: np.ndarray, size: int) -> np.ndarray:
+    """Spectral density over the variance, from 0 to half the sampling rate, of noise with a correlation from lag 0 on."""
+    both = np.zeros(size)
+    lags = min(len(correlation), size // 2)
+    both[:lags] = correlation[:lags]
+    both[size - lags + 1 :] = correlation[lags - 1 : 0 : -1]
+    return np.maximum(np.fft.rfft(both).real, 0.0)
