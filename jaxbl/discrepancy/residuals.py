@@ -25,8 +25,8 @@ from jaxbl.simulate import Experiment
 
 _HELD = 3.0
 """Standard deviations of the velocity within which a side may be held by its dry friction."""
-_REACH = 12.0
-"""Length of the noise's correlation, over 1 / w_c."""
+_REACH = 60.0
+"""Length of the noise's correlation, over 1 / w_c: what is slow is a small rest of what is fast, and needs all of it."""
 _LARGEST = 2**18
 _WINDOW = 5.0
 """Time constants of the low-pass beyond which an observer's residual is not its noise."""
@@ -136,23 +136,31 @@ def _side(
     torque = actuated(experiment, part.torque)
     given = part.position, part.velocity, torque, part.time, part.transmitted
     total, level = jax.vmap(lambda *at: _torque(experiment, side, *at))(*given)
-    inertia, velocity = experiment.plant.inertia(side), part.velocity[side]
-    # what is not shown to move may be held: friction is then what is missing, as far as it goes
-    holding = jnp.clip(total - inertia * part.acceleration[side], -level, level)
-    moving = jnp.abs(velocity) > _HELD * smoothed[side].deviation(1)
-    modelled = total - jnp.where(moving, level * jnp.sign(velocity), holding)
+    inertia, velocity, acceleration = experiment.plant.inertia(side), part.velocity[side], part.acceleration[side]
+    period = (part.time[-1] - part.time[0]) / (len(part.time) - 1)
+    # the share of the time around a sample in forward motion less that in backward motion, seen as the rest is
+    step = jnp.maximum(jnp.abs(acceleration) * period, jnp.finfo(float).tiny)
+    passage = jnp.clip(velocity / step, -1.0, 1.0)
+    direction = passage * (2.0 - jnp.abs(passage))
+    # what is not shown to move for a while may be held: friction is then what is missing, as far as it goes
+    corner = (smoothed[side].jerk / smoothed[side].noise ** 2 / period) ** (1.0 / 6.0)
+    still = _HELD * smoothed[side].deviation(1)
+    held = (jnp.abs(velocity) < still) & (jnp.abs(acceleration) < corner * still)
+    friction = jnp.where(held, jnp.clip(total - inertia * acceleration, -level, level), level * direction)
     # the input is a mean around the sample already; of the rest, the mean that the position's second differences see
     driving = torque if side == "motor" else jnp.zeros_like(torque)
-    modelled = driving + _mean_around(modelled - driving)
-    period = (part.time[-1] - part.time[0]) / (len(part.time) - 1)
-    missing = inertia * part.acceleration[side] - low_passed(modelled, smoothed[side], period)
+    modelled = driving + _mean_around(total - driving) - friction
+    missing = inertia * acceleration - low_passed(modelled, smoothed[side], period)
 
     def of(position: dict, velocity: dict, *rest: Array) -> Array:
         total, level = _torque(experiment, side, position, velocity, *rest)
         return total - level * jnp.sign(velocity[side])
 
-    slopes = jax.vmap(jax.jacfwd(of, argnums=(0, 1)))(*given)
-    return missing, *slopes
+    by_position, by_velocity = jax.vmap(jax.jacfwd(of, argnums=(0, 1)))(*given)
+    # when a reversal is, the velocity's noise leaves open
+    turning = jnp.where(held, 0.0, 2.0 * level * (1.0 - jnp.abs(passage)) / step)
+    by_velocity[side] = by_velocity[side] - turning
+    return missing, by_position, by_velocity
 
 
 @eqx.filter_jit
@@ -254,6 +262,10 @@ class _Noise:
             near = self.variance[name] / inside[:, None]
             zero = np.zeros(len(self.time))
             by_position, by_velocity = self.slopes.get(name, (zero, zero))
+            if inertia is not None:
+                # noise lasts about as long as the low-pass does
+                width = 1.0 / self.responses[side].corner
+                by_position, by_velocity = (gaussian_filter1d(slope, width) for slope in (by_position, by_velocity))
             for order, slope in enumerate((by_position, by_velocity)):
                 passed = _mean(np.abs(low_pass * gain[order]) ** 2)
                 share = passed / _mean(np.abs(gain[order]) ** 2)

@@ -11,9 +11,11 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 
+from jaxbl.identification import regression
 from jaxbl.identification.regression import Kinematics
 from jaxbl.identification.smoother import Smoothed
 from jaxbl.simulate import Experiment
@@ -32,7 +34,9 @@ _SAMPLES = 5
 _LEVEL_UNKNOWN = 0.05
 """Relative uncertainty of the noise's deviation."""
 SIGNIFICANT = 4.5
-"""Standard deviations beyond which a region counts: about one false region in a thousand residuals."""
+"""Standard deviations beyond which a region counts: several hundred regions are looked at."""
+RESOLUTION = 5e-4
+"""Share of the driving torque below which sampling alone may be what is missing."""
 _CLEAR = 10.0
 """Power over the noise's from which on no narrower low-pass is tried."""
 _PEAKS, _NARROW, _AROUND = 5, 10.0, 20
@@ -215,8 +219,8 @@ def coordinates_of(
         idle = np.abs(torque) < 0.02 * np.sqrt(np.mean(torque**2))
         loaded = np.where(idle, 1, np.where(torque > 0.0, 2, 0))
         found["load sign"] = Values(loaded, classes=("negative load", "no load", "positive load"))
-    found["speed"] = Values(velocity, f"{length}/s", symbol=omega)
     found["|speed|"] = Values(np.abs(velocity), f"{length}/s", symbol=f"|{omega}|")
+    found["speed"] = Values(velocity, f"{length}/s", symbol=omega)
     for one in part.position:
         position = np.asarray(part.position[one])
         if turns[one] and np.ptp(position) > 1.2 * 2.0 * np.pi and one in (side, "load"):
@@ -235,7 +239,11 @@ def coordinates_of(
     unit = "N m" if turns["motor"] else "N"
     if side == "motor":
         found["input"] = Values(np.asarray(part.torque), unit, symbol="u")
-    found["acceleration"] = Values(np.asarray(part.acceleration[side]), f"{length}/s²", symbol="a")
+    acceleration = np.asarray(part.acceleration[side])
+    if residual.name in experiment.sides:
+        # by the model: the measured one's noise is the residual's, and would be found there
+        acceleration = acceleration - residual.torque / float(experiment.plant.inertia(side))
+    found["acceleration"] = Values(acceleration, f"{length}/s²", symbol="a")
     found["time"] = Values(np.asarray(part.time), "s", symbol="t")
     return found
 
@@ -320,7 +328,7 @@ def _total_z(joined: _Joined) -> float:
     return float(_excess_z(power, noise, joined.variance(masks, 2))[0])
 
 
-def locate(residuals: Sequence[Residual], coordinates: Sequence[Mapping[str, Values]]) -> Localised:
+def locate(residuals: Sequence[Residual], coordinates: Sequence[Mapping[str, Values]], *, floor: float = 0.0) -> Localised:
     """Where the missing torque of one equation lives.
 
     Of several low-passes the one is taken behind which the power stands out most from the noise.
@@ -328,6 +336,7 @@ def locate(residuals: Sequence[Residual], coordinates: Sequence[Mapping[str, Val
     Args:
         residuals: of each part of the record.
         coordinates: of each, the more telling of equals first (:func:`coordinates_of`).
+        floor: torque below which nothing is said to be missing, N m.
     """
     widest = max(one.bandwidth for one in residuals)
     shortest = min(one.time[-1] - one.time[0] for one in residuals)
@@ -354,18 +363,22 @@ def locate(residuals: Sequence[Residual], coordinates: Sequence[Mapping[str, Val
         for name in names
     }
     power, noise = float(np.sum(joined.torque**2)), float(np.sum(joined.deviation**2))
-    excess = max(power - noise, np.finfo(float).tiny)
+    excess = max(power - noise, _LEVEL_UNKNOWN * noise)
     found = {name: _over(name, one, joined, excess) for name, one in values.items()}
     longest = int(np.argmax([len(one.time) for one in residuals]))
     motion = coordinates[longest]["speed"].values if "speed" in names else None
     bands, peaks = _spectrum(residuals[longest], motion, joined.parts[longest])
-    largest = max(
-        (max(abs(one.mean_z), one.excess_z) for coordinate in found.values() for one in coordinate.regions), default=0.0
+    missing = float(np.sqrt(max(power - noise, 0.0) / joined.count))
+    beyond = (z > SIGNIFICANT and missing > floor) or any(
+        (abs(region.mean_z) > SIGNIFICANT and abs(region.mean) > floor)
+        or (region.excess_z > SIGNIFICANT and region.excess > floor**2)
+        for one in found.values()
+        for region in one.regions
     )
+    beyond = beyond or any(one.excess_z > SIGNIFICANT and one.amplitude > floor for one in peaks)
     return Localised(
         residuals[0].name, joined.parts[0].bandwidth, float(np.sqrt(power / joined.count)),
-        float(np.sqrt(noise / joined.count)), float(np.sqrt(max(power - noise, 0.0) / joined.count)), z,
-        bool(max(z, largest, *(one.excess_z for one in peaks), 0.0) > SIGNIFICANT), found, bands, peaks,
+        float(np.sqrt(noise / joined.count)), missing, z, bool(beyond), found, bands, peaks,
     )  # fmt: skip
 
 
@@ -485,7 +498,7 @@ def _spectrum(one: Residual, speed: Array | None, low: Residual) -> tuple[tuple[
     frequency, power, floor = frequency[seen], power[seen], np.maximum(floor[seen], 1e-12 * np.max(floor))
     beyond = power - floor
     total = float(np.sum(low.torque**2) - np.sum(low.deviation**2)) / len(low.time) * count
-    total = max(total, np.finfo(float).tiny)
+    total = max(total, _LEVEL_UNKNOWN * float(np.sum(one.deviation**2)))
     edges = one.bandwidth * 2.0 ** np.arange(-9.0, 2.0)
     edges = np.concatenate([[0.0], edges[edges > 4.0 * resolution]])
     bands = []
@@ -584,12 +597,28 @@ def describe(found: Localised, unit: str = "N m") -> str:
         values = _values(telling, unit)
         place = _PLACE.get(telling.name, f"a function of {telling.name}")
         clauses.append(f"{place}{values}; {_percent(telling.explained)} of the residual power goes with it")
+    if not clauses and found.excess_z < SIGNIFICANT:
+        return f"{side}, {_faint(found, unit)}"
     if not clauses:
         hint = ""
         if telling is not None and best > 0.1:
             hint = f" (most: {_percent(best)}, {_PLACE.get(telling.name, telling.name)})"
         clauses.append(f"nowhere in particular: neither speed nor position, load or time explains half of it{hint}")
     return f"{side}, {'; '.join(clauses)} ({size})"
+
+
+def _faint(found: Localised, unit: str) -> str:
+    """The region that stands out most where the whole does not."""
+    each = [(one, region) for one in found.coordinates.values() for region in one.regions]
+    one, region = max(each, key=lambda pair: max(abs(pair[1].mean_z), pair[1].excess_z))
+    z = max(abs(region.mean_z), region.excess_z)
+    if found.peaks and found.peaks[0].excess_z > z:
+        peak = found.peaks[0]
+        return f"faint: a narrow peak of {peak.amplitude:.2g} {unit} at {peak.frequency:.4g} Hz"
+    place = region.label or f"where {region.low:.3g} < {one.symbol or one.name} < {region.high:.3g} {one.unit}".rstrip()
+    if abs(region.mean_z) >= region.excess_z:
+        return f"faint: {region.mean:+.2g} ± {region.mean_error:.1g} {unit} on average {place}"
+    return f"faint: {np.sqrt(max(region.excess, 0.0)):.2g} {unit} rms beyond noise {place}"
 
 
 def _percent(share: float) -> str:
@@ -658,12 +687,14 @@ def where(
 ) -> dict[str, Localised]:
     """Where each equation's missing torque lives, by equation (:func:`jaxbl.discrepancy.residuals.residual_torques`)."""
     found = {}
+    balance = eqx.filter_jit(regression.balance)
     for name, pieces in residuals.items():
         coordinates = [
             coordinates_of(experiment, part, channels, one, rotating=rotating)
             for part, channels, one in zip(parts, smoothed, pieces, strict=True)
         ]
-        found[name] = locate(pieces, coordinates)
+        driving = np.concatenate([np.asarray(balance(experiment, part)[name].drive) for part in parts])
+        found[name] = locate(pieces, coordinates, floor=RESOLUTION * float(np.sqrt(np.mean(driving**2))))
     return found
 
 
