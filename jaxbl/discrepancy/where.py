@@ -549,7 +549,7 @@ def spectrum_of(residual: Residual) -> tuple[Array, Array, Array]:
     once = np.full(len(frequency), 2.0)
     once[0] = 1.0
     power = once * np.abs(np.fft.rfft(residual.torque * window)) ** 2 / count
-    size = 2 ** int(np.ceil(np.log2(2 * len(residual.correlation))))
+    size = 2 ** int(np.ceil(np.log2(max(2 * len(residual.correlation), count))))
     density = noise_spectrum(residual.correlation, size)
     grid = np.linspace(0.0, 0.5 / residual.period, len(density))
     floor = once * np.mean(residual.deviation**2) * np.interp(frequency, grid, density)

@@ -60,9 +60,9 @@ def _over_time(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, 
             ax.plot(time, torque, color=_COLOUR[name], lw=0.9, label="missing" if i == 0 else None, zorder=2)
             ax.fill_between(time, -band, band, color=_BAND, alpha=0.75, lw=0.0, zorder=3, label=None if i else "± 2 noise")
         ax.axhline(0.0, color=_FAINT, lw=0.8, zorder=1)
-        ax.set_ylabel(with_unit(f"{name}:\nmissing torque", unit))
-        ax.set_title(describe(one, unit), loc="left", fontsize=9, wrap=True)
-        ax.legend(ncols=2, loc="upper right")
+        ax.set_ylabel(with_unit(f"{name}:\nmissing {_what(unit)}", unit))
+        ax.set_title(f"{describe(one, unit)}\n", loc="left", fontsize=9)
+        ax.legend(ncols=2, **_ABOVE)
     axes[-1].set_xlabel("time (s)")
     caption = (
         "Torque that the model lacks (inertia times acceleration less all modelled torques, positive forward), behind the "
@@ -70,6 +70,10 @@ def _over_time(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, 
         "is noise."
     )
     return Drawn("residual_torque", figure, caption)
+
+
+def _what(unit: str) -> str:
+    return "force" if unit == "N" else "torque"
 
 
 def _outline(time: np.ndarray, torque: np.ndarray, band: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -115,10 +119,11 @@ def _over_coordinates(
             f"explains {100.0 * one.explained:.0f} %", loc="left", fontsize=10,
             fontweight="bold" if one is best and one.explained > 0.0 else "normal",
         )  # fmt: skip
-    axes[0].set_ylabel(with_unit(f"{found.name}: missing torque", unit))
+    axes[0].set_ylabel(with_unit(f"{found.name}: missing {_what(unit)}", unit))
     limit = 1.15 * max(float(np.quantile(np.abs(torque), 0.998)), 2.5 * noise)
     axes[0].set_ylim(-limit, limit)
-    axes[-1].legend(loc="upper right")
+    handles = axes[0].get_legend_handles_labels()
+    figure.legend(*handles, ncols=2, loc="outside lower right")
     caption = (
         f"{describe(found, unit)[:1].upper()}{describe(found, unit)[1:]}. Dots are samples, black marks the means of bins "
         "with twice their standard errors; hollow where a mean is not told from zero. Above: share of the power beyond the "
