@@ -270,7 +270,9 @@ class _Noise:
                 passed = _mean(np.abs(low_pass * gain[order]) ** 2)
                 share = passed / _mean(np.abs(gain[order]) ** 2)
                 variance = variance + slope**2 * share * self.variance[name][order]
-                spectrum = spectrum + np.mean(slope**2) * np.abs(low_pass * gain[order]) ** 2
+                # a slope that comes and goes spreads the noise over all frequencies
+                shape = low_pass**2 * passed / _mean(low_pass**2)
+                spectrum = spectrum + np.mean(slope) ** 2 * np.abs(low_pass * gain[order]) ** 2 + np.var(slope) * shape
             if name == side and inertia is not None:
                 own, cross = inertia**2 * np.abs(gain[2]) ** 2, -2.0 * inertia * (low_pass * gain[0] * gain[2].conj()).real
                 variance = variance + near[2] * _mean(own) + np.sqrt(near[0] * near[2]) * by_position * _mean(cross)
@@ -347,8 +349,9 @@ def narrowed(residual: Residual, cutoff: float) -> tuple[Residual, np.ndarray]:
     reach = len(residual.correlation) + int(8.0 * width)
     size = 2 ** int(np.ceil(np.log2(2 * reach)))
     spectrum = noise_spectrum(residual.correlation, size)
-    frequency = np.linspace(0.0, np.pi, size // 2 + 1)
-    passed = np.fft.irfft(spectrum * np.exp(-((frequency * width) ** 2)))
+    impulse = np.zeros(size)
+    impulse[size // 2] = 1.0
+    passed = np.fft.irfft(spectrum * np.abs(np.fft.rfft(gaussian_filter1d(impulse, width))) ** 2)
     share = max(passed[0], np.finfo(float).tiny)
     low = dataclasses.replace(
         residual,

@@ -9,6 +9,7 @@ finding. How much of the power a function of one coordinate explains is counted 
 import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -303,6 +304,12 @@ class _Joined:
             begun += number
         self.blocks = begun
 
+    @cached_property
+    def z(self) -> float:
+        """Significance of all power beyond the noise's."""
+        power, noise = np.array([np.sum(self.torque**2)]), np.array([np.sum(self.deviation**2)])
+        return float(_excess_z(power, noise, self.variance(np.ones((1, self.count)), 2))[0])
+
     def variance(self, masks: Array, power: int) -> Array:
         """Variance by noise of sums of residuals (1), or of their squares (2), over each of some sets of samples."""
         weights = self.deviation**power
@@ -317,15 +324,9 @@ class _Joined:
 
 def _excess_z(power: Array, noise: Array, variance: Array) -> Array:
     """Significance of sums of squares beyond the noise's, whose variance is given (Wilson and Hilferty)."""
-    noise = np.maximum(noise, np.finfo(float).tiny)
+    noise = np.where(noise > 0.0, noise, 1.0)
     small = (variance / noise**2 + (2.0 * _LEVEL_UNKNOWN) ** 2) / 9.0
     return (np.cbrt(power / noise) - (1.0 - small)) / np.sqrt(small)
-
-
-def _total_z(joined: _Joined) -> float:
-    masks = np.ones((1, joined.count))
-    power, noise = np.array([np.sum(joined.torque**2)]), np.array([np.sum(joined.deviation**2)])
-    return float(_excess_z(power, noise, joined.variance(masks, 2))[0])
 
 
 def locate(residuals: Sequence[Residual], coordinates: Sequence[Mapping[str, Values]], *, floor: float = 0.0) -> Localised:
@@ -347,7 +348,7 @@ def locate(residuals: Sequence[Residual], coordinates: Sequence[Mapping[str, Val
             break
         pairs = [narrowed(one, cutoff) for one in residuals]
         joined = _Joined([low for low, _ in pairs])
-        z = _total_z(joined)
+        z = joined.z
         # a wider one shows more: a narrower one must be worth it
         if best is None or z > 1.15 * max(best[0], SIGNIFICANT):
             best = z, joined, [at for _, at in pairs]
@@ -462,6 +463,9 @@ def _folds(joined: _Joined, name: str, count: int) -> Array:
 
 
 def _explained(name: str, one: Values, joined: _Joined, excess: float, even: bool) -> float:
+    if joined.z < SIGNIFICANT:
+        # nothing to be shared out
+        return 0.0
     best = 0.0
     counts = [len(one.classes)] if one.classes else [n for n in _COUNTS if n <= max(joined.effective / 10.0, 2.0)]
     if name == "time":
@@ -482,12 +486,7 @@ def _explained(name: str, one: Values, joined: _Joined, excess: float, even: boo
         predicted = ((np.sum(sums, axis=0) - sums) / np.maximum(others, 1))[fold, index]
         gained = np.sum(joined.torque**2) - np.sum((joined.torque - predicted) ** 2)
         best = max(best, float(gained))
-    return min(best / excess, 1.0) if _beyond(joined) else 0.0
-
-
-def _beyond(joined: _Joined) -> bool:
-    """Whether there is enough beyond the noise to be shared out."""
-    return float(np.sum(joined.torque**2)) > 1.1 * float(np.sum(joined.deviation**2))
+    return min(best / excess, 1.0)
 
 
 def _spectrum(one: Residual, speed: Array | None, low: Residual) -> tuple[tuple[Band, ...], tuple[Peak, ...]]:

@@ -115,7 +115,7 @@ def test_observers_say_the_same():
     (other,) = residual_torques(experiment, [part], [smoothed])["motor"]
     late, moving = slice(1000, None), np.abs(trace["motor.velocity"].to_numpy()[1000:]) > 0.5
     assert rms((one.torque[late] - missing[late])[moving]) < 0.02
-    assert np.corrcoef(one.torque[late], other.torque[late])[0, 1] > 0.9
+    assert np.corrcoef(one.torque[late], other.torque[late])[0, 1] > 0.85
     complete = prepare(read_config(quiet))
     left = observed_residual(complete, "motor", part, jnp.asarray(trace["motor.equivalent_control"]))
     assert rms(left.torque[late]) < 0.2 * rms(one.torque[late])
