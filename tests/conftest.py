@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import jax
+from hypothesis import settings
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -10,3 +11,7 @@ jax.config.update("jax_num_cpu_devices", 2)
 # what one worker or run has compiled serves the others
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parents[1] / ".cache" / "jax"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+# a crowded machine is no failure
+settings.register_profile("patient", deadline=None)
+settings.load_profile("patient")

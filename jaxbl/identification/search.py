@@ -158,7 +158,7 @@ _fit = eqx.filter_jit(fit)
 
 @eqx.filter_jit
 def _fits(experiment: Experiment, free: tuple[Free, ...], windows: Windows, thetas: jax.Array) -> Fit:
-    return jax.vmap(lambda theta: fit(experiment, free, windows, theta, 30))(thetas)
+    return jax.vmap(lambda theta: fit(experiment, free, windows, theta, 30, rounds=1))(thetas)
 
 
 class Search:

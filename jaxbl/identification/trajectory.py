@@ -8,7 +8,9 @@ References: G. Golub, V. Pereyra, Separable nonlinear least squares, Inverse Pro
 H. G. Bock, Recent advances in parameter identification techniques for ODE (1983).
 """
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -23,8 +25,13 @@ from jaxbl.drive.parameters import Parameter, get_leaf, leaf_paths, set_leaves
 from jaxbl.errors import InputError
 from jaxbl.simulate import Experiment, PlantState, trajectory
 
-_INNER = 3
+_INNER = 4
+"""Initial states tried at each step of the fit."""
 _RIDGE = 1e-10
+_ENOUGH = 2e-3
+"""A fit has ended where a step takes less than this off the sum of squares, in units of the residuals' variance."""
+_MOST_REJECTED = 12
+_GAINED = 1.0
 WIDE = 3.0
 
 
@@ -161,43 +168,66 @@ class _Eliminated(NamedTuple):
     basis: Array
 
 
-def _eliminate(experiment: Experiment, window: Windows) -> _Eliminated:
-    """Initial state of one window by Gauss-Newton, and an orthonormal basis of what it can explain."""
+class _Inner(NamedTuple):
+    """Search of one window's initial state: the best so far, with residual and slope there, and the next to be tried."""
+
+    start: Array
+    value: Array
+    slope: Array
+    cost: Array
+    damping: Array
+    tried: Array
+
+
+def _eliminate(experiment: Experiment, window: Windows, passes: int, rest: bool) -> _Eliminated:
+    """Initial state of one window by damped Gauss-Newton, and an orthonormal basis of what it can explain.
+
+    The best of all states tried counts: at a hard gap, or where dry friction holds, a full step often makes things worse.
+    With `rest`, standstill is tried as well.
+    """
     guess, unravel = ravel_pytree(window.start)
+    standing = jax.tree.map(jnp.zeros_like, window.start.velocity)
+    still, _ = ravel_pytree(PlantState(window.start.position, standing, window.start.effects))
     free = jax.tree.map(jnp.ones_like, window.start)
     moving = jax.tree.map(lambda one: jnp.where(window.rest, 0.0, one), free.velocity)
     known, _ = ravel_pytree(PlantState(free.position, moving, free.effects))
 
-    def residual(start: Array) -> Array:
-        return _residual(experiment, unravel(start), window)
+    def residual(start: Array) -> tuple[Array, Array]:
+        value = _residual(experiment, unravel(start), window).ravel()
+        return value, value
 
-    def derivatives(start: Array) -> tuple[Array, Array]:
-        def twice(start: Array) -> tuple[Array, Array]:
-            value = residual(start).ravel()
-            return value, value
-
-        slope, value = jax.jacfwd(twice, has_aux=True)(start)
-        return value, slope
-
-    def improve(start: Array) -> tuple[Array, Array]:
-        value, slope = derivatives(start)
+    def attempt(i: Array, best: _Inner) -> _Inner:
+        slope, value = jax.jacfwd(residual, has_aux=True)(best.tried)
         slope = slope * known[None, :]
+        cost = jnp.sum(value**2)
+        better = (cost < best.cost) | ~jnp.isfinite(best.cost)
+        start, value, slope, cost = jax.tree.map(
+            partial(jnp.where, better), (best.tried, value, slope, cost), (best.start, best.value, best.slope, best.cost)
+        )
+        damping = jnp.where(better, jnp.maximum(0.01 * best.damping, _RIDGE), jnp.maximum(30.0 * best.damping, 1e-2))
         size = jnp.sqrt(jnp.sum(slope**2, axis=0))
-        basis, triangle = jnp.linalg.qr(slope / jnp.where(size > 0.0, size, 1.0)[None, :])
         # a state without influence stays where it is
-        triangle = triangle + _RIDGE * jnp.eye(len(start))
-        change = jax.scipy.linalg.solve_triangular(triangle, basis.T @ value)
-        return start - change / jnp.where(size > 0.0, size, jnp.inf), basis
+        size = jnp.where(size > 0.0, size, jnp.inf)
+        unit = slope / size[None, :]
+        change = jnp.linalg.solve(unit.T @ unit + damping * jnp.eye(len(start)), unit.T @ value)
+        tried = start - change / size
+        if rest:
+            # from there nothing leads back: a side that friction holds does not feel a little velocity
+            middle = passes // 2
+            tried, damping = jnp.where(i == middle, still, tried), jnp.where(i == middle, _RIDGE, damping)
+        return _Inner(start, value, slope, cost, damping, tried)
 
-    start = guess
-    for _ in range(_INNER):
-        start, basis = improve(start)
-    return _Eliminated(start, basis)
+    none = jnp.zeros(window.torque.shape[0] * len(experiment.sides))
+    first = _Inner(guess, none, jnp.zeros((len(none), len(guess))), jnp.asarray(jnp.inf), jnp.asarray(_RIDGE), guess)
+    found = jax.lax.fori_loop(0, passes, attempt, first)
+    size = jnp.sqrt(jnp.sum(found.slope**2, axis=0))
+    basis, _ = jnp.linalg.qr(found.slope / jnp.where(size > 0.0, size, 1.0)[None, :])
+    return _Eliminated(found.start, basis)
 
 
-def _projected(experiment: Experiment, window: Windows) -> tuple[Array, Array]:
+def _projected(experiment: Experiment, window: Windows, passes: int, rest: bool) -> tuple[Array, Array]:
     """Residual of one window without what its initial state could explain, and that state."""
-    held = _eliminate(jax.lax.stop_gradient(experiment), window)
+    held = _eliminate(jax.lax.stop_gradient(experiment), window, passes, rest)
     start, basis = jax.lax.stop_gradient((held.start, held.basis))
     _, unravel = ravel_pytree(window.start)
     value = _residual(experiment, unravel(start), window)
@@ -205,14 +235,57 @@ def _projected(experiment: Experiment, window: Windows) -> tuple[Array, Array]:
     return (flat - basis @ (basis.T @ flat)).reshape(value.shape), start
 
 
-def projected_residual(experiment: Experiment, windows: Windows) -> tuple[Float[Array, "windows samples sides"], PlantState]:
+def projected_residual(
+    experiment: Experiment, windows: Windows, passes: int = 12, rest: bool = True
+) -> tuple[Float[Array, "windows samples sides"], PlantState]:
     """Residuals over the noise without what the windows' initial states could explain, and those states.
 
-    The derivative by the experiment's numbers is Kaufman's.
+    The derivative by the experiment's numbers is Kaufman's. Of each window's initial state `passes` values are tried, with
+    `rest` standstill among them.
     """
-    residual, start = jax.vmap(lambda window: _projected(experiment, window), in_axes=(_MAPPED,))(windows)
+    residual, start = jax.vmap(lambda window: _projected(experiment, window, passes, rest), in_axes=(_MAPPED,))(windows)
     unravel = ravel_pytree(jax.tree.map(lambda x: x[0], windows.start))[1]
     return residual, jax.vmap(unravel)(start)
+
+
+class _Solved(NamedTuple):
+    theta: Array
+    guess: Any
+    residual: Any
+    steps: Array
+    converged: Array
+
+
+def _solve(
+    residual: Callable[[Array, Any], tuple[Any, Any]], solver: Any, theta: Array, guess: Any, most_steps: int
+) -> _Solved:
+    """Least squares, step by step: what comes with the best residual so far is the second argument of the next."""
+    shapes = jax.eval_shape(residual, theta, guess)
+    first, static = eqx.partition(solver.init(residual, theta, guess, {}, *shapes, frozenset()), eqx.is_array)
+    size = sum(one.size for one in jax.tree.leaves(shapes[0]))
+
+    def cost_of(state: Any) -> Array:
+        return jnp.asarray(sum(jnp.sum(one**2) for one in jax.tree.leaves(state.f_info.residual)))
+
+    def going(carry: Any) -> Array:
+        _, _, state, ended = carry
+        return (state.num_steps < most_steps) & ~ended
+
+    def step(carry: Any) -> Any:
+        theta, guess, old, _ = carry
+        old = eqx.combine(old, static)
+        theta, new, _ = solver.step(residual, theta, guess, {}, old, frozenset())
+        met, result = solver.terminate(residual, theta, new.aux, {}, new, frozenset())
+        accepted, cost = new.num_steps_since_acceptance == 0, cost_of(new)
+        # a change of this size is small beside what residuals of this size leave open, on any record
+        small = accepted & ~old.first_step & (cost_of(old) - cost < _ENOUGH * cost / size)
+        lost = new.num_steps_since_acceptance >= _MOST_REJECTED
+        ended = met | small | lost | (result != optx.RESULTS.successful)
+        return theta, new.aux, eqx.filter(new, eqx.is_array), ended
+
+    start = theta, guess, first, jnp.asarray(False)
+    theta, guess, state, ended = jax.lax.while_loop(going, step, start)
+    return _Solved(theta, guess, state.f_info.residual, state.num_steps, ended & jnp.isfinite(cost_of(state)))
 
 
 def fit(
@@ -222,6 +295,7 @@ def fit(
     theta: Float[Array, " parameters"],
     most_steps: int = 100,
     held: Bool[Array, " parameters"] | None = None,
+    rounds: int = 3,
 ) -> Fit:
     """Fit from one start; `vmap` it over starts, or over records.
 
@@ -232,33 +306,69 @@ def fit(
         free: what is fitted.
         windows: the record.
         theta: the start, shape (parameters,); zeros are the nominal values.
-        most_steps: of the solver.
+        most_steps: of the solver, each time.
         held: which numbers stay at the start; none if left out.
+        rounds: how often at most the solver is started again, where initial states sought anew are better ones.
     """
 
     given = theta
 
-    def projected(theta: Array) -> tuple[Array, PlantState]:
-        return projected_residual(with_values(experiment, free, theta), windows)
+    def projected(theta: Array, guess: PlantState) -> tuple[Array, PlantState]:
+        at = dataclasses.replace(windows, start=guess)
+        return projected_residual(with_values(experiment, free, theta), at, _INNER, False)
 
-    def residual(theta: Array, _: None) -> tuple[Array, Array]:
+    def with_slope(theta: Array, guess: PlantState) -> tuple[Array, PlantState, Array]:
+        def twice(theta: Array) -> tuple[Array, tuple[Array, PlantState]]:
+            value, start = projected(theta, guess)
+            return value, (value, start)
+
+        slope, (value, start) = jax.jacfwd(twice, has_aux=True)(theta)
+        return value, start, slope
+
+    # all columns of the derivative in one run: nothing to be kept along the trajectories
+    known = jax.custom_jvp(projected)
+
+    @known.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        value, start, slope = with_slope(*primals)
+        return (value, start), (slope @ tangents[0], jax.tree.map(jnp.zeros_like, start))
+
+    def residual(theta: Array, guess: PlantState) -> tuple[tuple[Array, Array], PlantState]:
         if held is not None:
             theta = jnp.where(held, given, theta)
-        return projected(theta)[0], theta / WIDE
+        value, start = known(theta, guess)
+        return (value, theta / WIDE), start
 
-    solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
-    found = optx.least_squares(residual, solver, theta, max_steps=most_steps, throw=False)
-    best = found.value if held is None else jnp.where(held, given, found.value)
-    value, push, start = jax.linearize(projected, best, has_aux=True)
-    jacobian = jnp.moveaxis(jax.vmap(push)(jnp.eye(len(theta))), 0, -1)
+    solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-4)
+
+    def anew(theta: Array) -> tuple[Array, PlantState]:
+        """Initial states that do not depend on those found before, and what is left over then in each window."""
+        value, start = projected_residual(with_values(experiment, free, theta), windows)
+        return jnp.sum(value**2, axis=(1, 2)), start
+
+    def again(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        theta, guess, round, steps, _, _ = carry
+        found = _solve(residual, solver, theta, guess, most_steps)
+        theta = found.theta if held is None else jnp.where(held, given, found.theta)
+        # a window's initial state may be the best of its neighbourhood only
+        other, start = anew(theta)
+        known = jnp.sum(found.residual[0] ** 2, axis=(1, 2))
+        gained = jnp.any(known - other > _GAINED * jnp.sum(known) / found.residual[0].size)
+        guess = jax.tree.map(lambda new, old: jnp.where(other < known, new, old), start, found.guess)
+        return theta, guess, round + 1, steps + found.steps, found.converged, gained
+
+    zero = jnp.zeros((), int)
+    first = theta, anew(theta)[1], zero, zero, jnp.asarray(False), jnp.asarray(True)
+    best, guess, _, steps, converged, _ = jax.lax.while_loop(lambda carry: carry[-1] & (carry[2] < rounds), again, first)
+    value, start, jacobian = with_slope(best, guess)
     return Fit(
         best,
         start,
         value,
         jacobian,
         0.5 * jnp.sum(value**2),
-        found.stats["num_steps"],
-        found.result == optx.RESULTS.successful,
+        steps,
+        converged,
     )
 
 
