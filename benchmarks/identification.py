@@ -410,7 +410,7 @@ def timed(options):
                 f"{how['starts_agreeing']} of {how['starts']} starts agree",
                 flush=True,
             )
-    print(pd.DataFrame(rows).to_markdown(index=False) if False else pd.DataFrame(rows).round(2).to_string())
+    print(pd.DataFrame(rows).round(2).to_string(index=False))
 
 
 def main():

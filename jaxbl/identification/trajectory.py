@@ -25,7 +25,7 @@ from jaxbl.drive.parameters import Parameter, get_leaf, leaf_paths, set_leaves
 from jaxbl.errors import InputError
 from jaxbl.simulate import Experiment, PlantState, trajectory
 
-_INNER = 4
+_INNER = 2
 """Initial states tried at each step of the fit."""
 _RIDGE = 1e-10
 _ENOUGH = 2e-3
@@ -225,14 +225,10 @@ def _eliminate(experiment: Experiment, window: Windows, passes: int, rest: bool)
     return _Eliminated(found.start, basis)
 
 
-def _projected(experiment: Experiment, window: Windows, passes: int, rest: bool) -> tuple[Array, Array]:
-    """Residual of one window without what its initial state could explain, and that state."""
-    held = _eliminate(jax.lax.stop_gradient(experiment), window, passes, rest)
-    start, basis = jax.lax.stop_gradient((held.start, held.basis))
-    _, unravel = ravel_pytree(window.start)
-    value = _residual(experiment, unravel(start), window)
-    flat = value.ravel()
-    return (flat - basis @ (basis.T @ flat)).reshape(value.shape), start
+def _without(basis: Array, values: Array) -> Array:
+    """What of values, shape (samples, sides, ...), lies outside of a basis of shape (samples times sides, states)."""
+    flat = values.reshape(basis.shape[0], -1)
+    return (flat - basis @ (basis.T @ flat)).reshape(values.shape)
 
 
 def projected_residual(
@@ -240,32 +236,71 @@ def projected_residual(
 ) -> tuple[Float[Array, "windows samples sides"], PlantState]:
     """Residuals over the noise without what the windows' initial states could explain, and those states.
 
-    The derivative by the experiment's numbers is Kaufman's. Of each window's initial state `passes` values are tried, with
-    `rest` standstill among them.
+    Of each window's initial state `passes` values are tried, with `rest` standstill among them.
     """
-    residual, start = jax.vmap(lambda window: _projected(experiment, window, passes, rest), in_axes=(_MAPPED,))(windows)
-    unravel = ravel_pytree(jax.tree.map(lambda x: x[0], windows.start))[1]
-    return residual, jax.vmap(unravel)(start)
+
+    def one(window: Windows) -> tuple[Array, PlantState]:
+        found = _eliminate(experiment, window, passes, rest)
+        start = ravel_pytree(window.start)[1](found.start)
+        return _without(found.basis, _residual(experiment, start, window)), start
+
+    return jax.vmap(one, in_axes=(_MAPPED,))(windows)
+
+
+def _sloped(
+    experiment: Experiment, free: Sequence[Free], windows: Windows, theta: Float[Array, " parameters"]
+) -> tuple[Array, PlantState, Array]:
+    """Projected residuals, initial states, and Kaufman's derivative of the residuals by theta."""
+
+    def one(window: Windows) -> tuple[Array, PlantState, Array]:
+        found = _eliminate(with_values(experiment, free, theta), window, _INNER, False)
+        start = ravel_pytree(window.start)[1](found.start)
+
+        def residual(theta: Array) -> tuple[Array, Array]:
+            value = _residual(with_values(experiment, free, theta), start, window)
+            return value, value
+
+        slope, value = jax.jacfwd(residual, has_aux=True)(theta)
+        return _without(found.basis, value), start, _without(found.basis, slope)
+
+    return jax.vmap(one, in_axes=(_MAPPED,))(windows)
 
 
 class _Solved(NamedTuple):
     theta: Array
-    guess: Any
-    residual: Any
+    guess: PlantState
+    left: Array
     steps: Array
     converged: Array
 
 
 def _solve(
-    residual: Callable[[Array, Any], tuple[Any, Any]], solver: Any, theta: Array, guess: Any, most_steps: int
+    residual: Callable[[Array, PlantState], tuple[Array, tuple[PlantState, Array]]],
+    solver: Any,
+    theta: Array,
+    guess: PlantState,
+    most_steps: int,
+    count: int,
 ) -> _Solved:
-    """Least squares, step by step: what comes with the best residual so far is the second argument of the next."""
-    shapes = jax.eval_shape(residual, theta, guess)
-    first, static = eqx.partition(solver.init(residual, theta, guess, {}, *shapes, frozenset()), eqx.is_array)
-    size = sum(one.size for one in jax.tree.leaves(shapes[0]))
+    """Least squares, step by step: the initial states of the best so far are the guess of the next.
+
+    Args:
+        residual: function of theta and guess; beside residuals it gives the states and each window's sum of squares.
+        solver: of optimistix.
+        theta: the start.
+        guess: of the initial states there.
+        most_steps: of the solver.
+        count: of the residuals that the sum of squares is of.
+    """
+
+    def function(theta: Array, guess: PlantState) -> tuple[Array, tuple[PlantState, Array]]:
+        return residual(theta, guess)
+
+    shapes = jax.eval_shape(function, theta, guess)
+    first, static = eqx.partition(solver.init(function, theta, guess, {}, *shapes, frozenset()), eqx.is_array)
 
     def cost_of(state: Any) -> Array:
-        return jnp.asarray(sum(jnp.sum(one**2) for one in jax.tree.leaves(state.f_info.residual)))
+        return jnp.sum(state.f_info.residual**2)
 
     def going(carry: Any) -> Array:
         _, _, state, ended = carry
@@ -274,18 +309,18 @@ def _solve(
     def step(carry: Any) -> Any:
         theta, guess, old, _ = carry
         old = eqx.combine(old, static)
-        theta, new, _ = solver.step(residual, theta, guess, {}, old, frozenset())
-        met, result = solver.terminate(residual, theta, new.aux, {}, new, frozenset())
+        theta, new, _ = solver.step(function, theta, guess, {}, old, frozenset())
+        met, result = solver.terminate(function, theta, new.aux[0], {}, new, frozenset())
         accepted, cost = new.num_steps_since_acceptance == 0, cost_of(new)
         # a change of this size is small beside what residuals of this size leave open, on any record
-        small = accepted & ~old.first_step & (cost_of(old) - cost < _ENOUGH * cost / size)
+        small = accepted & ~old.first_step & (cost_of(old) - cost < _ENOUGH * cost / count)
         lost = new.num_steps_since_acceptance >= _MOST_REJECTED
         ended = met | small | lost | (result != optx.RESULTS.successful)
-        return theta, new.aux, eqx.filter(new, eqx.is_array), ended
+        return theta, new.aux[0], eqx.filter(new, eqx.is_array), ended
 
     start = theta, guess, first, jnp.asarray(False)
     theta, guess, state, ended = jax.lax.while_loop(going, step, start)
-    return _Solved(theta, guess, state.f_info.residual, state.num_steps, ended & jnp.isfinite(cost_of(state)))
+    return _Solved(theta, guess, state.aux[1], state.num_steps, ended & jnp.isfinite(cost_of(state)))
 
 
 def fit(
@@ -312,34 +347,37 @@ def fit(
     """
 
     given = theta
+    moving = jnp.ones(len(theta)) if held is None else jnp.where(held, 0.0, 1.0)
 
-    def projected(theta: Array, guess: PlantState) -> tuple[Array, PlantState]:
-        at = dataclasses.replace(windows, start=guess)
-        return projected_residual(with_values(experiment, free, theta), at, _INNER, False)
+    def reduced(theta: Array, guess: PlantState) -> tuple[Array, Array, tuple[PlantState, Array]]:
+        """As many residuals as numbers, and one, with the same cost, gradient and normal matrix as all of them."""
+        theta = jnp.where(moving > 0.0, theta, given)
+        value, start, slope = _sloped(experiment, free, dataclasses.replace(windows, start=guess), theta)
+        slope = slope * moving
+        each = jnp.sum(value**2, axis=(1, 2))
+        total = jnp.sum(each) + jnp.sum((theta / WIDE) ** 2)
+        normal = jnp.einsum("wtsp,wtsq->pq", slope, slope) + jnp.diag(moving / WIDE**2)
+        towards = jnp.einsum("wtsp,wts->p", slope, value) + moving * theta / WIDE**2
+        size = jnp.sqrt(jnp.diag(normal)) + (1.0 - moving)
+        root = jnp.linalg.cholesky(normal / jnp.outer(size, size) + jnp.diag(1.0 - moving))
+        seen = jax.scipy.linalg.solve_triangular(root, towards / size, lower=True)
+        rest = jnp.sqrt(jnp.maximum(total - jnp.sum(seen**2), 0.0))
+        derivative = jnp.concatenate([root.T * (size * moving)[None, :], jnp.zeros((1, len(theta)))])
+        return jnp.concatenate([seen, rest[None]]), derivative, (start, each)
 
-    def with_slope(theta: Array, guess: PlantState) -> tuple[Array, PlantState, Array]:
-        def twice(theta: Array) -> tuple[Array, tuple[Array, PlantState]]:
-            value, start = projected(theta, guess)
-            return value, (value, start)
+    # all columns of the derivative in one run, nothing kept along the trajectories, and no decomposition of tall matrices
+    @jax.custom_jvp
+    def residual(theta: Array, guess: PlantState) -> tuple[Array, tuple[PlantState, Array]]:
+        value, _, beside = reduced(theta, guess)
+        return value, beside
 
-        slope, (value, start) = jax.jacfwd(twice, has_aux=True)(theta)
-        return value, start, slope
-
-    # all columns of the derivative in one run: nothing to be kept along the trajectories
-    known = jax.custom_jvp(projected)
-
-    @known.defjvp
+    @residual.defjvp
     def _(primals: Any, tangents: Any) -> Any:
-        value, start, slope = with_slope(*primals)
-        return (value, start), (slope @ tangents[0], jax.tree.map(jnp.zeros_like, start))
-
-    def residual(theta: Array, guess: PlantState) -> tuple[tuple[Array, Array], PlantState]:
-        if held is not None:
-            theta = jnp.where(held, given, theta)
-        value, start = known(theta, guess)
-        return (value, theta / WIDE), start
+        value, derivative, beside = reduced(*primals)
+        return (value, beside), (derivative @ tangents[0], jax.tree.map(jnp.zeros_like, beside))
 
     solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-4)
+    count = windows.torque.size * len(windows.measured)
 
     def anew(theta: Array) -> tuple[Array, PlantState]:
         """Initial states that do not depend on those found before, and what is left over then in each window."""
@@ -348,28 +386,21 @@ def fit(
 
     def again(carry: tuple[Any, ...]) -> tuple[Any, ...]:
         theta, guess, round, steps, _, _ = carry
-        found = _solve(residual, solver, theta, guess, most_steps)
-        theta = found.theta if held is None else jnp.where(held, given, found.theta)
+        found = _solve(residual, solver, theta, guess, most_steps, count)
+        theta = jnp.where(moving > 0.0, found.theta, given)
+        if rounds == 1:
+            return theta, found.guess, round + 1, steps + found.steps, found.converged, jnp.asarray(False)
         # a window's initial state may be the best of its neighbourhood only
         other, start = anew(theta)
-        known = jnp.sum(found.residual[0] ** 2, axis=(1, 2))
-        gained = jnp.any(known - other > _GAINED * jnp.sum(known) / found.residual[0].size)
-        guess = jax.tree.map(lambda new, old: jnp.where(other < known, new, old), start, found.guess)
+        gained = jnp.any(found.left - other > _GAINED * jnp.sum(found.left) / count)
+        guess = jax.tree.map(lambda new, old: jnp.where(other < found.left, new, old), start, found.guess)
         return theta, guess, round + 1, steps + found.steps, found.converged, gained
 
     zero = jnp.zeros((), int)
     first = theta, anew(theta)[1], zero, zero, jnp.asarray(False), jnp.asarray(True)
     best, guess, _, steps, converged, _ = jax.lax.while_loop(lambda carry: carry[-1] & (carry[2] < rounds), again, first)
-    value, start, jacobian = with_slope(best, guess)
-    return Fit(
-        best,
-        start,
-        value,
-        jacobian,
-        0.5 * jnp.sum(value**2),
-        steps,
-        converged,
-    )
+    value, start, jacobian = _sloped(experiment, free, dataclasses.replace(windows, start=guess), best)
+    return Fit(best, start, value, jacobian, 0.5 * jnp.sum(value**2), steps, converged)
 
 
 def cut(
