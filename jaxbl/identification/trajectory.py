@@ -353,11 +353,10 @@ def fit(
         """As many residuals as numbers, and one, with the same cost, gradient and normal matrix as all of them."""
         theta = jnp.where(moving > 0.0, theta, given)
         value, start, slope = _sloped(experiment, free, dataclasses.replace(windows, start=guess), theta)
-        slope = slope * moving
         each = jnp.sum(value**2, axis=(1, 2))
         total = jnp.sum(each) + jnp.sum((theta / WIDE) ** 2)
-        normal = jnp.einsum("wtsp,wtsq->pq", slope, slope) + jnp.diag(moving / WIDE**2)
-        towards = jnp.einsum("wtsp,wts->p", slope, value) + moving * theta / WIDE**2
+        normal = jnp.outer(moving, moving) * jnp.einsum("wtsp,wtsq->pq", slope, slope) + jnp.diag(moving / WIDE**2)
+        towards = moving * (jnp.einsum("wtsp,wts->p", slope, value) + theta / WIDE**2)
         size = jnp.sqrt(jnp.diag(normal)) + (1.0 - moving)
         root = jnp.linalg.cholesky(normal / jnp.outer(size, size) + jnp.diag(1.0 - moving))
         seen = jax.scipy.linalg.solve_triangular(root, towards / size, lower=True)
