@@ -6,7 +6,7 @@ cycles with the largest motion in full, and the whole of it in outline.
 
 import dataclasses
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -309,12 +309,15 @@ def _outline(values: Array, points: int) -> Array:
     return np.minimum(at.T.ravel(), len(values) - 1)
 
 
-def _limits(*values: Array, share: float = 0.001, room: float = 0.12) -> tuple[float, float] | None:
-    """Ends of an axis that a few outliers do not set."""
+def _limits(
+    *values: Array, share: float = 0.001, room: float = 0.12, shown: Sequence[float] = ()
+) -> tuple[float, float] | None:
+    """Ends of an axis that a few outliers do not set; what is to be shown lies inside in any case."""
     finite = np.concatenate([one[np.isfinite(one)] for one in values])
     if not len(finite):
         return None
     low, high = np.quantile(finite, [share, 1.0 - share])
+    low, high = min((low, *shown)), max((high, *shown))
     margin = room * (high - low) or 1e-12 + 0.1 * abs(high)
     return float(low - margin), float(high + margin)
 
@@ -666,7 +669,7 @@ def _path(view: _View) -> Drawn:
     axes = figure.subplots(len(names), 1, sharex=True, squeeze=False).ravel()
     late = slice((view.observed.start + view.observed.stop) // 2, view.observed.stop)
     for ax, name in zip(axes, names, strict=True):
-        ends = []
+        ends, lines = [], []
         for side in SIDES:
             values = view[f"{side}.{name}"]
             view.draw(ax, values, view.observed, color=_COLOUR[side], label=f"recursive, {side} side")
@@ -676,7 +679,8 @@ def _path(view: _View) -> Drawn:
             ax.axhspan(*fitted["interval"], color=_MODEL, alpha=0.15, lw=0.0)
             ax.axhline(fitted["value"], color=_MODEL, lw=1.0, ls="--", label="trajectory fit, 95 %")
             ends.append(np.array(fitted["interval"]))
-        if limits := _limits(*ends, share=0.02, room=0.25):
+            lines.append(fitted["value"])
+        if limits := _limits(*ends, share=0.02, room=0.25, shown=lines):
             ax.set_ylim(*limits)
         path = f"transmission.{name}"
         ax.set_ylabel(
@@ -689,7 +693,7 @@ def _path(view: _View) -> Drawn:
     axes[-1].set_xlabel("time (s)")
     caption = (
         "The paper's recursive identification (27)-(28) by the equivalent control of both sides, beside the trajectory fit "
-        "with its interval. The scale is that of the second half."
+        "with its interval. The scale is that of the second half, and holds the fitted line."
     )
     return Drawn("recursive", figure, caption)
 
