@@ -353,7 +353,7 @@ def fit(
         """As many residuals as numbers, and one, with the same cost, gradient and normal matrix as all of them."""
         theta = jnp.where(moving > 0.0, theta, given)
         value, start, slope = _sloped(experiment, free, dataclasses.replace(windows, start=guess), theta)
-        slope = slope * moving
+        slope = slope * moving[None, None, None, :]
         each = jnp.sum(value**2, axis=(1, 2))
         total = jnp.sum(each) + jnp.sum((theta / WIDE) ** 2)
         normal = jnp.einsum("wtsp,wtsq->pq", slope, slope) + jnp.diag(moving / WIDE**2)
