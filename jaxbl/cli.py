@@ -107,7 +107,7 @@ def sweep(
             )
             return
     folder = _folder(config, out)
-    with _running("sweep", config, folder) as progress:
+    with _running(["sweep", str(config)], config, folder) as progress:
         result = run_sweep(study, folder, progress=progress, overwrite=overwrite)
     _tell(write_sweep_report(result, folder), folder, result.cost)
 
@@ -122,7 +122,7 @@ def tune(config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOpti
 
     study = read_config(config)
     folder = _folder(config, out)
-    with _running("tune", config, folder) as progress:
+    with _running(["tune", str(config)], config, folder) as progress:
         result = run_tune(study, folder, progress=progress, overwrite=overwrite)
     _tell(write_tune_report(result, folder), folder, result.cost)
 
@@ -137,7 +137,7 @@ def verify(config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOp
 
     study = read_config(config)
     folder = _folder(config, out)
-    with _running("verify", config, folder) as progress:
+    with _running(["verify", str(config)], config, folder) as progress:
         verdict = run_verify(study, folder, progress=progress, overwrite=overwrite)
     _tell(write_verify_report(verdict, folder), folder)
 
@@ -195,14 +195,17 @@ def identify(
     if finished is not None:
         _tell(identification_lines(finished), folder)
         return
+    again = ["identify", *map(str, log), "--model", str(model)]
+    again += ["--holdout", str(holdout)] if holdout is not None else []
+    again += ["--profile"] * bool(profile) + ["--overwrite"] * overwrite
     try:
-        with _naming(model, folder), _progress("steps") as progress:
-            found = run_task(task, progress)
-    except InputError:
+        with _running(again, model, folder, unit="steps", kept=False) as progress:
+            lines = write_identification_report(run_task(task, progress), folder)
+    except BaseException:
         with suppress(OSError):  # not empty: it was there before
             folder.rmdir()
         raise
-    _tell(write_identification_report(found, folder), folder)
+    _tell(lines, folder)
 
 
 def _finished(file: Path, identity: str) -> dict[str, Any] | None:
@@ -284,11 +287,11 @@ def _naming(config: Path, folder: Path | None = None) -> Iterator[None]:
 
 
 @contextmanager
-def _running(command: str, config: Path, folder: Path) -> "Iterator[Progress]":
+def _running(words: list[str], config: Path, folder: Path, *, unit: str = "runs", kept: bool = True) -> "Iterator[Progress]":
     """Around a long computation: messages name the config, progress is shown, and an interrupt says how to go on.
 
-    An interrupt may be lost in foreign code, or come out of it as another error: it is remembered, and heeded at the next
-    progress or error.
+    `words` are the command's, without the folder; `kept` says whether what is finished stays in it. An interrupt may be
+    lost in foreign code, or come out of it as another error: it is remembered, and heeded at the next progress or error.
     """
     interrupted = False
 
@@ -299,7 +302,7 @@ def _running(command: str, config: Path, folder: Path) -> "Iterator[Progress]":
 
     before = signal.signal(signal.SIGINT, interrupt)
     try:
-        with _naming(config, folder), _progress("runs") as shown:
+        with _naming(config, folder), _progress(unit) as shown:
 
             def progress(done: int, total: int) -> None:
                 if interrupted:
@@ -311,8 +314,9 @@ def _running(command: str, config: Path, folder: Path) -> "Iterator[Progress]":
     except BaseException as error:
         if not (interrupted or isinstance(error, KeyboardInterrupt)):
             raise
-        resume = shlex.join(["jaxbl", command, str(config), "--out", str(folder)])
-        typer.echo(f"interrupted; what is finished is kept. Go on with: {resume}", err=True)
+        resume = shlex.join(["jaxbl", *words, "--out", str(folder)])
+        told = "what is finished is kept. Go on with" if kept else "nothing was written. Start again with"
+        typer.echo(f"interrupted; {told}: {resume}", err=True)
         raise typer.Exit(130) from None
     finally:
         signal.signal(signal.SIGINT, before)

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import time
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 import tomli_w
@@ -501,3 +503,57 @@ def test_a_log_is_identified(call, tmp_path):
     assert not (tmp_path / "new").exists()
     with pytest.raises(InputError, match="results of another log"):
         call("identify", "made/trace.parquet", "--model", "axis.toml", "--out", "results/axis")
+
+
+IDENTIFY = ["identify", "an axis.csv", "--model", "axis.toml"]
+
+
+@pytest.fixture
+def axis(tmp_path):
+    """A log and its study."""
+    write(tmp_path, rigid({"run.duration": 0.6}, identify={"starts": 1, "window": 0.1}), "axis.toml")
+    time = np.arange(600) * 1e-3
+    log = pd.DataFrame(
+        {"t": time, "u": np.cos(20.0 * time), "theta_e": -0.05 * np.cos(20.0 * time) + 1e-5 * np.cos(1e6 * time)}
+    )
+    log.to_csv(tmp_path / "an axis.csv", index=False)
+
+
+@pytest.mark.parametrize("place", ["jaxbl.study.identification.run_task", "jaxbl.report.identified.html"])
+def test_an_interrupted_identification_writes_nothing_and_says_how_to_start_again(place, axis, call, tmp_path, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    told = "interrupted; nothing was written. Start again with: jaxbl identify 'an axis.csv' --model axis.toml"
+    with monkeypatch.context() as patched:
+        patched.setattr(place, interrupt)
+        assert call(*IDENTIFY, "--out", "out") == (130, [], [f"{told} --out out"])
+        assert not (tmp_path / "out").exists()
+        more = ["--holdout", "an axis.csv", "--profile"]
+        assert call(*IDENTIFY, *more) == (130, [], [f"{told} {shlex.join(more)} --out 'results/an axis'"])
+    if place.endswith("html"):
+        # what another call has found stays as it is
+        assert call(*IDENTIFY, "--out", "out")[0] == 0
+        before = {name: (tmp_path / "out" / name).read_bytes() for name in left(tmp_path / "out")}
+        write(tmp_path, rigid({"run.duration": 0.6}, identify={"starts": 1, "window": 0.15}), "axis.toml")
+        monkeypatch.setattr(place, interrupt)
+        assert call(*IDENTIFY, "--out", "out") == (130, [], [f"{told} --out out"])
+        assert {name: (tmp_path / "out" / name).read_bytes() for name in left(tmp_path / "out")} == before
+
+
+def test_an_interrupt_while_numbers_are_sought(axis, tmp_path):
+    """SIGINT from outside, as soon as the folder is there."""
+    command = [sys.executable, "-m", "jaxbl.cli", *IDENTIFY]
+    folder = tmp_path / "results" / "an axis"
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        for _ in range(3600):
+            if folder.exists() or process.poll() is not None:
+                break
+            time.sleep(0.05)
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=180)
+    assert process.returncode == 130
+    again = "jaxbl identify 'an axis.csv' --model axis.toml --out 'results/an axis'"
+    assert errors == f"interrupted; nothing was written. Start again with: {again}\n"
+    assert not folder.exists()

@@ -6,9 +6,10 @@ cycles with the largest motion in full, and the whole of it in outline.
 
 import dataclasses
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import jax
@@ -25,7 +26,6 @@ from jaxbl.drive.plant import Plant
 from jaxbl.identification.search import NOISE_ALONE
 from jaxbl.simulate import Experiment
 from jaxbl.study.identification import Identification, unit_on
-from jaxbl.study.store import write_atomic
 
 from .maps import SIDES, Drawn
 from .page import TableOf, html
@@ -55,17 +55,27 @@ _ABOVE: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespa
 def write_identification_report(found: Identification, folder: Path) -> list[str]:
     """Write `identification.json`, `model.toml`, `trace.parquet`, figures and report into a folder that exists.
 
-    Returns the lines for the terminal.
+    They are put there together when all are drawn. Returns the lines for the terminal.
     """
+    with TemporaryDirectory(dir=folder, prefix=".draft.") as draft:
+        lines = _write(found, Path(draft))
+        # last: it marks the folder as finished
+        for file in sorted(Path(draft).rglob("*"), key=lambda one: one.name == "identification.json"):
+            if file.is_file():
+                place = folder / file.relative_to(draft)
+                place.parent.mkdir(exist_ok=True)
+                file.replace(place)
+    return lines
+
+
+def _write(found: Identification, folder: Path) -> list[str]:
     pictures = save_all(draw_identification(found), folder)
-    draft = folder / "trace.draft"
-    found.trace.to_parquet(draft, index=False)
-    draft.replace(folder / "trace.parquet")
+    found.trace.to_parquet(folder / "trace.parquet", index=False)
     model = found.model.resolved()
     if found.replays:
         model["excitation"] = {"kind": "recorded", "file": "trace.parquet", "time_column": "t", "torque_column": "u"}
     text = tomli_w.dumps(model)
-    write_atomic(folder / "model.toml", text)
+    (folder / "model.toml").write_text(text, encoding="utf-8")
     lead, remarks = _headline(found.summary), _remarks(found.summary)
     tables = [_parameter_table(found.summary)]
     if "regression" in found.summary["method"]:
@@ -73,10 +83,9 @@ def write_identification_report(found: Identification, folder: Path) -> list[str
     if found.summary["method"]["recursive"]:
         tables.append(_recursive_table(found))
     title = found.config.title or f"Identification from {found.record.path.name}"
-    page = html(title, lead, remarks, pictures, tables, text)
-    write_atomic(folder / "report.html", page)
-    # last: it marks the folder as finished
-    write_atomic(folder / "identification.json", json.dumps(found.summary, indent=1, ensure_ascii=False))
+    (folder / "report.html").write_text(html(title, lead, remarks, pictures, tables, text), encoding="utf-8")
+    content = json.dumps(found.summary, indent=1, ensure_ascii=False)
+    (folder / "identification.json").write_text(content, encoding="utf-8")
     return [*lead, *remarks]
 
 
@@ -309,12 +318,15 @@ def _outline(values: Array, points: int) -> Array:
     return np.minimum(at.T.ravel(), len(values) - 1)
 
 
-def _limits(*values: Array, share: float = 0.001, room: float = 0.12) -> tuple[float, float] | None:
-    """Ends of an axis that a few outliers do not set."""
+def _limits(
+    *values: Array, share: float = 0.001, room: float = 0.12, shown: Sequence[float] = ()
+) -> tuple[float, float] | None:
+    """Ends of an axis that a few outliers do not set; what is to be shown lies inside in any case."""
     finite = np.concatenate([one[np.isfinite(one)] for one in values])
     if not len(finite):
         return None
     low, high = np.quantile(finite, [share, 1.0 - share])
+    low, high = min((low, *shown)), max((high, *shown))
     margin = room * (high - low) or 1e-12 + 0.1 * abs(high)
     return float(low - margin), float(high + margin)
 
@@ -666,7 +678,7 @@ def _path(view: _View) -> Drawn:
     axes = figure.subplots(len(names), 1, sharex=True, squeeze=False).ravel()
     late = slice((view.observed.start + view.observed.stop) // 2, view.observed.stop)
     for ax, name in zip(axes, names, strict=True):
-        ends = []
+        ends, lines = [], []
         for side in SIDES:
             values = view[f"{side}.{name}"]
             view.draw(ax, values, view.observed, color=_COLOUR[side], label=f"recursive, {side} side")
@@ -676,7 +688,8 @@ def _path(view: _View) -> Drawn:
             ax.axhspan(*fitted["interval"], color=_MODEL, alpha=0.15, lw=0.0)
             ax.axhline(fitted["value"], color=_MODEL, lw=1.0, ls="--", label="trajectory fit, 95 %")
             ends.append(np.array(fitted["interval"]))
-        if limits := _limits(*ends, share=0.02, room=0.25):
+            lines.append(fitted["value"])
+        if limits := _limits(*ends, share=0.02, room=0.25, shown=lines):
             ax.set_ylim(*limits)
         path = f"transmission.{name}"
         ax.set_ylabel(
@@ -685,11 +698,12 @@ def _path(view: _View) -> Drawn:
         if name == "dead_zone":
             right = ax.secondary_yaxis("right", functions=(lambda j: 4.0 * j, lambda gap: gap / 4.0))
             right.set_ylabel(f"half gap 4 j₀ ({view.unit['motor']})")
-    axes[0].legend(ncols=3, **_ABOVE)
+    labelled = {label: line for ax in axes for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    axes[0].legend(labelled.values(), labelled.keys(), ncols=3, **_ABOVE)
     axes[-1].set_xlabel("time (s)")
     caption = (
         "The paper's recursive identification (27)-(28) by the equivalent control of both sides, beside the trajectory fit "
-        "with its interval. The scale is that of the second half."
+        "with its interval. The scale is that of the second half, and holds the fitted line."
     )
     return Drawn("recursive", figure, caption)
 

@@ -213,3 +213,16 @@ def test_observers_that_diverged_leave_figures(tmp_path):
     assert [one.name for one in drawn] == GEARED
     for one in drawn:
         save(one.figure, tmp_path / f"{one.name}.png")
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 1.1])
+def test_the_fitted_line_is_shown_wherever_the_recursive_numbers_end(factor, tmp_path):
+    found = made(geared(), tmp_path)
+    trace = found.trace.copy()
+    for side in ("motor", "load"):
+        trace[f"{side}.half_gap"] = factor * 0.08 + 1e-6 * np.sin(np.arange(len(trace)))
+    figure = drawn_of(dataclasses.replace(found, trace=trace))["recursive"].figure
+    low, high = figure.axes[1].get_ylim()
+    margin = 0.1 * (high - low)
+    assert low + margin < 0.08 < high - margin
+    save(figure, tmp_path / "recursive.png")
