@@ -151,7 +151,7 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
             side: experiment.encoders.measure(side, state.plant.position[side], sample.noise[side], drive.ratio(side))
             for side in drive.sides
         }
-        moved = _move(plant, experiment.run, state.plant, torque_in, sample.time)
+        moved = move(plant, experiment.run, state.plant, torque_in, sample.time)
     else:
         assert sample.input is not None
         torque_in, measured, moved = sample.input, sample.measured, None
@@ -203,7 +203,7 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
     return State(moved, observers, filtered, identifier), signals
 
 
-def _move(plant: Plant, run: Run, state: PlantState, torque: Scalar, time: Number) -> PlantState:
+def move(plant: Plant, run: Run, state: PlantState, torque: Scalar, time: Number) -> PlantState:
     """The plant from one sample to the next, in `substeps` steps under a held input."""
     small = run.sample_period / run.substeps
 
@@ -392,7 +392,7 @@ def trajectory(
     def sample(state: PlantState, given: tuple[Array, Array, dict[str, Array]]) -> tuple[PlantState, PlantState]:
         index, torque, readings = given
         at = time + index.astype(torque.dtype) * run.sample_period
-        return _move(plant, run, corrected(state, readings), torque, at), state
+        return move(plant, run, corrected(state, readings), torque, at), state
 
     samples = jnp.arange(len(torque), dtype=jnp.int32), torque, measured if measured is not None and gain is not None else {}
     _, states = jax.lax.scan(sample, start, samples)

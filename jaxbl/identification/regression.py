@@ -108,7 +108,7 @@ def balance(experiment: Experiment, kinematics: Kinematics) -> dict[str, Balance
     A side's residual is the torque that the model has too much there: all torques less inertia times acceleration.
     """
     plant, drive, k = experiment.plant, experiment.drive, kinematics
-    torque = _actuated(experiment, k.torque)
+    torque = actuated(experiment, k.torque)
     found = {}
     if k.transmitted is not None and plant.transmission is not None:
         found["transmission"] = Balance(k.transmitted - _transmitted(plant, k), k.transmitted)
@@ -143,7 +143,7 @@ def model_torques(
         if side in places or (side == "motor" and "actuator" in places):
             direction = jnp.clip(k.velocity[side] / jnp.maximum(3.0 * deviation[side], jnp.finfo(float).tiny), -1.0, 1.0)
             added = (plant.inertia(side) - plant.drive.inertia(side)) * k.acceleration[side]
-            lost = k.torque - _actuated(experiment, k.torque) if side == "motor" else 0.0
+            lost = k.torque - actuated(experiment, k.torque) if side == "motor" else 0.0
             found[side] = level * direction - total + added + lost
     return found
 
@@ -152,7 +152,7 @@ def _transmitted(plant: Plant, k: Kinematics) -> Float[Array, " samples"]:
     return jax.vmap(lambda position, velocity: plant.transmitted(position, velocity)[0])(k.position, k.velocity)
 
 
-def _actuated(experiment: Experiment, torque: Float[Array, " samples"]) -> Float[Array, " samples"]:
+def actuated(experiment: Experiment, torque: Float[Array, " samples"]) -> Float[Array, " samples"]:
     """The torque that acts, of the one that was commanded."""
     effects, period = experiment.effects, experiment.run.sample_period
     if not any(effect.place == "actuator" for effect in effects):

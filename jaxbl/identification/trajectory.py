@@ -77,7 +77,8 @@ def free_parameters(experiment: Experiment, paths: Sequence[str], torque: float)
         positive = is_positive(about)
         if positive and nominal <= 0.0:
             raise InputError(f"'{path}' must stay positive, and its nominal value is {nominal:g}; give one to start from")
-        scale = abs(nominal) or (torque if about.unit == "N m" else 0.0) or 1.0
+        # an angle has no relative size
+        scale = 1.0 if path.endswith(".phase") else abs(nominal) or (torque if about.unit == "N m" else 0.0) or 1.0
         free.append(Free(path, about.unit, nominal, scale, positive))
     return tuple(free)
 

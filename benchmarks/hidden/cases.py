@@ -1,0 +1,545 @@
+"""Cases of the bench: machine, conditions, hidden effects, logs; all from a seed.
+
+Three plants. `paper`: the drive of the paper (J_e 0.05, f_e 0.15, J_s 7, f_s 16, N 5) with a stiffness of 60 N m/rad and a
+half gap of 0.08 rad, which the paper leaves open and with which the load really follows; as a hard dead zone or as law (3),
+and without gap where the gap is what is hidden. `servo`: a geared axis with a resonance at 29 Hz. `direct`: one inertia and
+one encoder. The machines of a kind scatter by 15 %.
+
+Conditions of `single`, `pairs`, `none`, `unknown`: 10-20 s, 1 kHz or 500 Hz, three in ten in closed loop, nominal numbers
+off by 1-3 %, a quarter with 1 % noise on the torque channel. `hard` are single effects with at least three of: closed loop,
+3 s, coarse encoders, numbers off by 4-6 %, 1-3 % noise on the torque channel. Three in ten machines have another effect that
+the nominal model knows.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .effects import EFFECTS, LEVELS, UNKNOWN, Motion, draw, exclusive, on_rigid, rms
+from .simulator import Machine, Run, Trace, simulate
+
+KINDS = ("single", "pairs", "none", "unknown", "hard")
+EXCITATIONS = ("sine", "multisine", "chirp", "steps")
+
+_PLANTS: dict[str, dict[str, Any]] = {
+    "paper": {
+        "drive": {
+            "kind": "two_inertia",
+            "motor_inertia": 0.05,
+            "motor_viscous": 0.15,
+            "load_inertia": 7.0,
+            "load_viscous": 16.0,
+            "gear_ratio": 5.0,
+        },
+        "stiffness": 60.0,
+        "half_gap": 0.08,
+        "dead_zone": 0.02,
+        "slope": 20.0,
+        "torque": (2.5, 5.0),
+        "frequency": (0.2, 0.6),
+        "bandwidth": (4.0, 8.0),
+        "gap": 1.0,
+    },
+    "servo": {
+        "drive": {
+            "kind": "two_inertia",
+            "motor_inertia": 4e-4,
+            "motor_viscous": 2e-3,
+            "load_inertia": 0.06,
+            "load_viscous": 0.25,
+            "gear_ratio": 10.0,
+        },
+        "stiffness": 8.0,
+        "half_gap": 0.02,
+        "dead_zone": 0.005,
+        "slope": 60.0,
+        "torque": (0.25, 0.5),
+        "frequency": (0.4, 1.2),
+        "bandwidth": (20.0, 35.0),
+        "gap": 0.3,
+    },
+    "direct": {
+        "drive": {"kind": "rigid", "motor_inertia": 0.02, "motor_viscous": 0.03},
+        "torque": (0.3, 0.8),
+        "frequency": (0.3, 1.2),
+        "bandwidth": (15.0, 40.0),
+        "gap": 0.0,
+    },
+}
+"""Tables, rms torque (N m), frequency of excitation (Hz), bandwidth of the loop (rad/s), share of machines with a gap."""
+PLANTS = tuple(_PLANTS)
+
+_LEAST_MOTION, _LEAST_SEEN = 0.25, 4.0
+"""A case is drawn again where the hidden effect leaves less than this share of the motion (the drive sticks), or changes
+what the encoders read by less than this many times their noise."""
+_MOST_DRAWS = 40
+
+
+@dataclass(frozen=True)
+class Log:
+    """A measured log: s, N m, rad, rad; `theta_s` is None on a rigid drive."""
+
+    t: np.ndarray
+    u: np.ndarray
+    theta_e: np.ndarray
+    theta_s: np.ndarray | None
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """The channels by the names of the package's log files."""
+        named = {"t": self.t, "u": self.u, "theta_e": self.theta_e, "theta_s": self.theta_s}
+        return {name: values for name, values in named.items() if values is not None}
+
+    def write(self, path: Path) -> None:
+        """As CSV, with all digits that the encoders have."""
+        columns = self.columns()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savetxt(path, np.column_stack(list(columns.values())), "%.10g", ",", header=",".join(columns), comments="")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One machine with something hidden in it.
+
+    Attributes:
+        name: kind, seed and number.
+        kind: one of `KINDS`.
+        truth: `verdict` (as in diagnosis.json), `effects` (name -> parameters; empty, or the unknown effect), `sizes`
+            (name -> share of the driving torque's rms), `level` asked for (the largest of a pair), `seen` (change of what
+            the encoders read over their noise), `growth` (change of the motor position for one of 1 rad/s in the initial
+            speed, s; thousands mean that a free run cannot be foretold).
+        conditions: plant, excitation, holdout (its excitation), loop, period, duration, initial_state, uncertainty, ...
+        log, holdout: of the same machine, under two excitations.
+        model: nominal study for the package, as plain data (no excitation, no observer).
+        oracle: the same with the true numbers and the hidden effects (of `unknown`, what the package can say).
+        runs, traces: how the logs were made, and the truth behind them.
+    """
+
+    name: str
+    kind: str
+    truth: dict[str, Any]
+    conditions: dict[str, Any]
+    log: Log
+    holdout: Log
+    model: dict[str, Any]
+    oracle: dict[str, Any]
+    runs: tuple[Run, Run] = field(repr=False)
+    traces: tuple[Trace, Trace] = field(repr=False)
+
+    @property
+    def hidden(self) -> frozenset[str]:
+        """Names of the hidden effects that the package knows."""
+        return frozenset(self.truth["effects"]) if self.truth["verdict"] == "explained" else frozenset()
+
+    @property
+    def weak(self) -> bool:
+        return self.truth["level"] == LEVELS[0]
+
+
+@dataclass
+class _Plan:
+    """A case before its effects have a size."""
+
+    index: int
+    kind: str
+    plant: str
+    hidden: tuple[tuple[str, float], ...]
+    rng: np.random.Generator
+    seed: int
+    machine: Machine
+    conditions: dict[str, Any]
+    runs: tuple[Run, Run]
+    uncertainty: float
+
+
+def cases(seed: int, count: int, kind: str = "single", duration: float | None = None) -> list[Case]:
+    """Draw cases.
+
+    Args:
+        seed: the same seed, count and kind give the same cases.
+        count: number of cases; effects, sizes and plants come equally often.
+        kind: one of `KINDS`, or `all`: half of the cases single, the rest of all other kinds alike.
+        duration: of all logs in place of what is drawn, s: for quick trials.
+    """
+    if kind not in (*KINDS, "all"):
+        raise ValueError(f"unknown kind {kind!r}; one of {', '.join((*KINDS, 'all'))}")
+    counts = {kind: count}
+    if kind == "all":
+        each = count // (2 * (len(KINDS) - 1))
+        counts = dict.fromkeys(KINDS, each) | {"single": count - each * (len(KINDS) - 1)}
+    wanted = [(part, i, *target) for part, n in counts.items() for i, target in enumerate(_targets(seed, n, part))]
+    found: dict[int, Case] = {}
+    for draw_number in range(_MOST_DRAWS):
+        missing = [i for i in range(len(wanted)) if i not in found]
+        if not missing:
+            break
+        plans = [_plan(seed, draw_number, *wanted[i], duration) for i in missing]
+        for i, case in zip(missing, _carry_out(seed, plans), strict=True):
+            if case is not None:
+                found[i] = case
+    left = [wanted[i] for i in range(len(wanted)) if i not in found]
+    if left:
+        raise RuntimeError(f"no fit case in {_MOST_DRAWS} draws for {left}")
+    return [found[i] for i in range(len(wanted))]
+
+
+def _targets(seed: int, count: int, kind: str) -> list[tuple[str, tuple[tuple[str, float], ...]]]:
+    """Plant and hidden effects of each case, in equal shares."""
+    rng = np.random.default_rng([seed, KINDS.index(kind), 1])
+
+    def plants(effects: Iterable[str]) -> list[str]:
+        return [plant for plant in PLANTS if plant != "direct" or all(on_rigid(effect) for effect in effects)]
+
+    if kind == "none":
+        return [(PLANTS[i % len(PLANTS)], ()) for i in range(count)]
+    if kind == "unknown":
+        hidden = [(((effect, level),), PLANTS) for effect in UNKNOWN for level in LEVELS[1:]]
+    elif kind == "pairs":
+        hidden = []
+        for i, one in enumerate(EFFECTS):
+            for other in EFFECTS[i + 1 :]:
+                if not exclusive(one, other) and not one.split(".")[0] == other.split(".")[0] == "actuator":
+                    levels = [(LEVELS[1], LEVELS[1]), (LEVELS[1], LEVELS[2]), (LEVELS[2], LEVELS[1])][rng.integers(3)]
+                    hidden.append((((one, levels[0]), (other, levels[1])), plants((one, other))))
+    else:
+        hidden = [(((effect, level),), plants([effect])) for effect in EFFECTS for level in LEVELS]
+    targets: list[tuple[str, tuple[tuple[str, float], ...]]] = []
+    while len(targets) < count:
+        for i in rng.permutation(len(hidden)):
+            effects, possible = hidden[i]
+            weights = [1.0 + (plant == "direct") for plant in possible]  # which has a place for fewer of them
+            targets.append((str(rng.choice(possible, p=np.array(weights) / sum(weights))), effects))
+    return targets[:count]
+
+
+def _plan(
+    seed: int,
+    draw_number: int,
+    kind: str,
+    index: int,
+    plant: str,
+    hidden: tuple[tuple[str, float], ...],
+    duration: float | None,
+) -> _Plan:
+    rng = np.random.default_rng([seed, KINDS.index(kind), 2, index, draw_number])
+    names = [name for name, _ in hidden]
+    given = _PLANTS[plant]
+    conditions, uncertainty = _conditions(kind, plant, rng)
+    if duration is not None:
+        conditions["duration"] = duration
+    # machines of a kind are not all alike
+    drive = {
+        key: value * float(np.exp(rng.normal(0.0, 0.15))) if key not in ("kind", "gear_ratio") else value
+        for key, value in given["drive"].items()
+    }
+    machine = Machine(drive, None if plant == "direct" else _law(given, names, rng))
+    machine = replace(machine, effects=_known(machine, names, given, rng))
+    runs = _runs(machine, given, conditions, rng)
+    return _Plan(index, kind, plant, hidden, rng, seed, machine, conditions, runs, uncertainty)
+
+
+def _conditions(kind: str, plant: str, rng: np.random.Generator) -> tuple[dict[str, Any], float]:
+    """What is measured and how, and the relative uncertainty of the nominal numbers."""
+    hard = set(rng.permutation(5)[: rng.integers(3, 6)].tolist()) if kind == "hard" else set()
+    easy_loop = kind != "hard" and rng.random() < 0.3
+    coarse = 2 in hard
+    torque_noise = float(rng.uniform(0.01, 0.03)) if 4 in hard else 0.01 if kind != "hard" and rng.random() < 0.25 else 0.0
+    uncertainty = round(float(rng.uniform(0.04, 0.06) if 3 in hard else rng.uniform(0.01, 0.03)), 3)
+    quantised = rng.random() < (0.7 if coarse else 0.4)
+    one, two = rng.permutation(EXCITATIONS)[:2]
+    conditions = {
+        "plant": plant,
+        "excitation": str(one),
+        "holdout": str(two),
+        "loop": "closed" if easy_loop or 0 in hard else "open",
+        "period": float(rng.choice([1e-3, 2e-3])),
+        "duration": 3.0 if 1 in hard else float(rng.integers(10, 21)),
+        "initial_state": "rest" if rng.random() < 0.35 else "unknown",
+        "uncertainty": uncertainty,
+        "noise": float(np.exp(rng.uniform(*np.log([1e-4, 3e-4] if coarse else [1e-5, 1e-4])))),
+        "counts": int(2 ** rng.integers(12, 15) if coarse else 2 ** rng.integers(16, 21)) if quantised else 0,
+        "torque_noise": torque_noise,
+    }
+    return conditions, uncertainty
+
+
+def _law(given: Mapping[str, Any], names: Sequence[str], rng: np.random.Generator) -> dict[str, Any]:
+    stiffness = given["stiffness"] * float(np.exp(rng.normal(0.0, 0.15)))
+    gap, smooth = rng.random() < given["gap"], rng.random() < 0.25
+    if not gap or "transmission.backlash" in names:
+        return {"law": "linear_shaft", "stiffness": stiffness}
+    scale = float(np.exp(rng.normal(0.0, 0.15)))
+    if smooth:
+        return {
+            "law": "sigmoid_backlash",
+            "stiffness": stiffness,
+            "dead_zone": given["dead_zone"] * scale,
+            "slope": given["slope"],
+        }
+    return {"law": "dead_zone", "stiffness": stiffness, "half_gap": given["half_gap"] * scale}
+
+
+def _known(
+    machine: Machine, names: Sequence[str], given: Mapping[str, Any], rng: np.random.Generator
+) -> tuple[dict[str, Any], ...]:
+    """Another effect, which the nominal model has too."""
+    rigid = machine.rigid
+    possible = ["motor.coulomb_friction", "load.gravity"] + ([] if rigid else ["load.coulomb_friction"])
+    possible = [kind for kind in possible if not any(exclusive(name, kind) for name in names)]
+    chosen, wanted = str(rng.choice(possible)), rng.random() < 0.3
+    torque = float(rng.uniform(0.05, 0.12)) * float(np.mean(given["torque"]))
+    torque *= machine.ratio if chosen.startswith("load.") else 1.0
+    if "unknown.drifting_friction" in names or not wanted:
+        return ()
+    return ({"kind": chosen, "torque": torque} | ({"phase": 0.0} if chosen == "load.gravity" else {}),)
+
+
+def _runs(
+    machine: Machine, given: Mapping[str, Any], conditions: dict[str, Any], rng: np.random.Generator
+) -> tuple[Run, Run]:
+    drive, ratio, period = machine.drive, machine.ratio, conditions["period"]
+    inertia = drive["motor_inertia"] + drive.get("load_inertia", 0.0) / ratio**2
+    viscous = drive["motor_viscous"] + drive.get("load_viscous", 0.0) / ratio**2
+    torque = float(rng.uniform(*given["torque"]))
+    frequency = float(rng.uniform(*given["frequency"]))
+    bandwidth = float(rng.uniform(*given["bandwidth"]))
+    if conditions["duration"] < 5.0:
+        frequency *= 2.0
+    half_gap = (machine.transmission or {}).get("half_gap", 0.0)
+    speed = torque / math.hypot(viscous, inertia * 2.0 * math.pi * frequency)
+    resolution = 2.0 * math.pi / conditions["counts"] if conditions["counts"] else 0.0
+    runs = []
+    for number, which in enumerate(("excitation", "holdout")):
+        duration = conditions["duration"]
+        if number == 1 and duration >= 3.0:
+            duration = max(5.0, 0.5 * duration)
+        n = round(duration / period)
+        wave = _wave(conditions[which], n, period, frequency * float(rng.uniform(0.8, 1.25)), rng)
+        turn = float(rng.uniform(-0.5, 0.5))
+        start = (ratio * turn + half_gap * float(rng.uniform(-0.8, 0.8)), 0.0, turn, 0.0)
+        if conditions["initial_state"] == "unknown":
+            first = 0.6 * speed * float(rng.uniform(-1.0, 1.0))
+            start = (start[0], first, start[2], first / ratio * float(rng.uniform(0.95, 1.05)))
+        shared = {
+            "initial": start,
+            "motor_noise": conditions["noise"],
+            "load_noise": conditions["noise"] / ratio,
+            "motor_resolution": resolution,
+            "load_resolution": resolution / ratio,
+            "torque_noise": conditions["torque_noise"] * torque,
+            "disturbance": _band_limited(n + 1, period, 3.0 * frequency, rng),
+            "seed": int(rng.integers(2**31)),
+        }
+        if conditions["loop"] == "open":
+            runs.append(Run(machine, period, torque * wave / rms(wave), **shared))
+            continue
+        reference = _smooth(wave, period, 4.0 * frequency) if conditions[which] == "steps" else wave
+        rate = np.gradient(reference, period)
+        needed = rms(inertia * np.gradient(rate, period) + viscous * rate)
+        reference, rate = torque / needed * reference, torque / needed * rate
+        kp, kd = inertia * bandwidth**2, max(1.6 * inertia * bandwidth - viscous, 0.1 * inertia * bandwidth)
+        loop = {"kp": kp, "kd": kd, "filter": min(1.0, 10.0 * bandwidth * period), "torque_limit": 6.0 * torque}
+        reference = np.stack([reference - reference[0] + start[0], rate])
+        runs.append(Run(machine, period, np.zeros(n), reference=reference, **loop, **shared))
+    return runs[0], runs[1]
+
+
+def _wave(kind: str, n: int, period: float, frequency: float, rng: np.random.Generator) -> np.ndarray:
+    """An excitation of unit size: torque in open loop, position in closed loop."""
+    t = np.arange(n) * period
+    if kind == "sine":
+        return np.sin(2.0 * math.pi * frequency * t + rng.uniform(-math.pi, math.pi))
+    if kind == "multisine":
+        k = np.arange(1, 11)
+        phases = rng.uniform(-math.pi, math.pi, len(k))
+        return np.sum(
+            np.sin(2.0 * math.pi * 0.3 * frequency * k[:, None] * t + phases[:, None]) / np.sqrt(k)[:, None], axis=0
+        )
+    if kind == "chirp":
+        low, high, length = frequency / 3.0, 4.0 * frequency, n * period
+        return np.sin(2.0 * math.pi * (low + 0.5 * (high - low) * t / length) * t)
+    hold = max(1, round(float(rng.uniform(0.25, 0.6)) / frequency / period))
+    levels = rng.uniform(0.3, 1.0, n // hold + 1) * rng.choice([-1.0, 1.0], n // hold + 1)
+    return np.repeat(levels, hold)[:n]
+
+
+def _smooth(wave: np.ndarray, period: float, frequency: float) -> np.ndarray:
+    """Third-order low-pass: steps that a drive can follow."""
+    from scipy.signal import lfilter
+
+    keep = math.exp(-2.0 * math.pi * frequency * period)
+    for _ in range(3):
+        wave = lfilter([1.0 - keep], [1.0, -keep], wave)
+    return wave
+
+
+def _band_limited(n: int, period: float, frequency: float, rng: np.random.Generator) -> np.ndarray:
+    """Noise of unit rms below a frequency."""
+    spectrum = np.fft.rfft(rng.standard_normal(n)) * (np.fft.rfftfreq(n, period) < max(frequency, 2.0 / (n * period)))
+    spectrum[0] = 0.0
+    noise = np.fft.irfft(spectrum, n)
+    return noise / rms(noise)
+
+
+def _carry_out(seed: int, plans: list[_Plan]) -> list[Case | None]:
+    """Size the effects along runs without them, run the machines, and leave out what is not fit for a case."""
+    plain = simulate([plan.runs[0] for plan in plans])
+    full, sizes = [], []
+    for plan, trace in zip(plans, plain, strict=True):
+        motion = Motion.of(plan.machine, trace)
+        effects, found = [], {}
+        fine = bool(np.isfinite(trace.states).all()) and rms(trace.states[1]) > 0.0
+        for name, level in plan.hidden if fine else ():
+            drawn, found[name] = draw(name, level, motion, plan.uncertainty, plan.rng)
+            effects.extend(drawn)
+        full.append(replace(plan.machine, effects=(*plan.machine.effects, *_ordered(effects))))
+        sizes.append(found)
+    runs = [replace(run, machine=machine) for plan, machine in zip(plans, full, strict=True) for run in plan.runs]
+    nudges = [_NUDGE * rms(trace.states[1]) for trace in plain]
+    traces = simulate(runs)
+    nudged = simulate([_nudged(runs[2 * i], nudge) for i, nudge in enumerate(nudges)])
+    result: list[Case | None] = []
+    for i, plan in enumerate(plans):
+        pair, made = (runs[2 * i], runs[2 * i + 1]), (traces[2 * i], traces[2 * i + 1])
+        seen = _seen(pair[0], plain[i], made[0])
+        fit = all(_fit(trace, plain[i], plan.machine) for trace in made) and (not plan.hidden or seen >= _LEAST_SEEN)
+        if not fit:
+            result.append(None)
+            continue
+        growth = rms(nudged[i].states[0] - made[0].states[0]) / nudges[i]
+        result.append(_case(seed, plan, sizes[i], {"seen": seen, "growth": growth}, pair, made))
+    return result
+
+
+_ORDER = ("actuator.gain_error", "actuator.saturation", "actuator.lag")
+
+
+def _ordered(effects: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Actuator effects in the order in which the simulator applies them."""
+    return sorted(effects, key=lambda effect: _ORDER.index(effect["kind"]) if effect["kind"] in _ORDER else -1)
+
+
+_NUDGE = 1e-6
+
+
+def _nudged(run: Run, nudge: float) -> Run:
+    theta_e, w_e, theta_s, w_s = run.initial
+    return replace(run, initial=(theta_e, w_e + nudge, theta_s, w_s))
+
+
+def _seen(run: Run, plain: Trace, made: Trace) -> float:
+    """Change of what the encoders read, over their noise; the larger of both sides."""
+    noises = [math.hypot(noise, count / math.sqrt(12.0)) for noise, count in
+              ((run.motor_noise, run.motor_resolution), (run.load_noise, run.load_resolution))]  # fmt: skip
+    change = made.states - plain.states
+    seen = [rms(change[0]) / noises[0]]
+    if not run.machine.rigid:
+        seen.append(rms(change[2]) / noises[1])
+    return float(max(seen))
+
+
+def _fit(trace: Trace, plain: Trace, machine: Machine) -> bool:
+    """Whether a drive moves, and stays within bounds."""
+    if not np.isfinite(trace.states).all():
+        return False
+    moving = rms(trace.states[1]) / rms(plain.states[1])
+    bounded = np.max(np.abs(trace.states[2 if not machine.rigid else 0])) < 500.0
+    return bool(_LEAST_MOTION < moving < 10.0 and bounded)
+
+
+def _case(
+    seed: int,
+    plan: _Plan,
+    sizes: dict[str, float],
+    more: dict[str, float],
+    runs: tuple[Run, Run],
+    traces: tuple[Trace, Trace],
+) -> Case:
+    machine = runs[0].machine
+    hidden = {str(effect["kind"]): {k: v for k, v in effect.items() if k != "kind"} for effect in
+              machine.effects[len(plan.machine.effects) :]}  # fmt: skip
+    known = list(plan.machine.effects)
+    drift = hidden.get("unknown.drifting_friction")
+    if drift is not None:  # its mean is known
+        known.append({"kind": f"{drift['side']}.coulomb_friction", "torque": drift["torque"]})
+    verdict = {"none": "no_discrepancy", "unknown": "unknown_effect"}.get(plan.kind, "explained")
+    true = Machine(machine.drive, machine.transmission, (*known, *_ordered(_explained(machine, hidden))))
+    nominal = Machine(
+        _off(machine.drive, plan.uncertainty, plan.rng),
+        None if machine.transmission is None else _off(machine.transmission, plan.uncertainty, plan.rng),
+        [_off(effect, plan.uncertainty, plan.rng) for effect in known],
+    )
+    name = f"{plan.kind}-{seed}-{plan.index:03d}"
+    truth = {
+        "verdict": verdict,
+        "effects": hidden,
+        "sizes": sizes,
+        "level": max((level for _, level in plan.hidden), default=0.0),
+        **more,
+    }
+    logs = [Log(trace.t, trace.u, trace.theta_e, trace.theta_s) for trace in traces]
+    return Case(
+        name,
+        plan.kind,
+        truth,
+        plan.conditions,
+        logs[0],
+        logs[1],
+        _study(name, nominal, plan.conditions, runs[0]),
+        _study(f"{name} as it is", true, plan.conditions, runs[0]),
+        runs,
+        traces,
+    )
+
+
+def _explained(machine: Machine, hidden: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    return [{"kind": kind, **values} for kind, values in hidden.items() if not kind.startswith("unknown.")]
+
+
+def _off(table: Mapping[str, Any], uncertainty: float, rng: np.random.Generator) -> dict[str, Any]:
+    """A table as someone knows it who knows its numbers so well, to four digits."""
+    found = {}
+    for key, value in table.items():
+        if isinstance(value, str) or key == "gear_ratio":
+            found[key] = value
+        else:
+            error = float(np.clip(rng.standard_normal(), -2.0, 2.0))
+            found[key] = float(f"{value * (1.0 + uncertainty * error):.4g}")
+    return found
+
+
+def _study(title: str, machine: Machine, conditions: Mapping[str, Any], run: Run) -> dict[str, Any]:
+    """A study in the package's words: everything but excitation and observer."""
+    study: dict[str, Any] = {"title": title, "drive": dict(machine.drive)}
+    if machine.transmission is not None:
+        study["transmission"] = dict(machine.transmission)
+    study["effects"] = [dict(effect) for effect in machine.effects]
+    encoders = {"noise": run.motor_noise, "motor_resolution": run.motor_resolution}
+    if not machine.rigid:
+        encoders |= {"load_noise": run.load_noise, "load_resolution": run.load_resolution}
+    study["encoders"] = encoders
+    study["run"] = {"sample_period": conditions["period"], "duration": conditions["duration"]}
+    study["uncertainty"] = {
+        "relative": conditions["uncertainty"],
+        "exact": [] if machine.rigid else ["drive.gear_ratio"],
+    }
+    study["log"] = {"hold": "zoh", "initial_state": conditions["initial_state"]}
+    return study
+
+
+def save(found: Sequence[Case], folder: Path) -> None:
+    """Write cases as files: NAME.csv and NAME.toml side by side, hold-out logs in `holdout/`, the truth in truth.json."""
+    import json
+
+    import tomli_w
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for case in found:
+        case.log.write(folder / f"{case.name}.csv")
+        case.holdout.write(folder / "holdout" / f"{case.name}.csv")
+        (folder / f"{case.name}.toml").write_text(tomli_w.dumps(case.model), encoding="utf-8")
+    truths = {case.name: {"truth": case.truth, "conditions": case.conditions, "oracle": case.oracle} for case in found}
+    (folder / "truth.json").write_text(json.dumps(truths, indent=1), encoding="utf-8")

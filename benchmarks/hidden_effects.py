@@ -1,0 +1,96 @@
+"""The bench of hidden effects: machines with something in them that the model does not have. Is it found, named, proved?
+
+The truth comes from a simulator of its own (hidden/simulator.py: nothing of the package in it, another integrator, located
+events), cases from a seed (hidden/cases.py, sizes in hidden/effects.py), figures from hidden/scoring.py. With numba (the
+extra `bench`) 100 cases take a quarter of a CPU minute to draw; without it, in NumPy, some seven.
+
+    python benchmarks/hidden_effects.py --seed 1 --count 66 --kind single          # all effects at 3, 10 and 30 %
+    python benchmarks/hidden_effects.py --seed 1 --count 200 --kind all --out results/hidden
+    python benchmarks/hidden_effects.py --seed 1 --count 200 --kind all --save results/cases    # logs and models as files
+    python benchmarks/hidden_effects.py --seed 1 --count 200 --kind all --results results/diagnosed   # what a batch left
+"""
+
+import argparse
+import importlib
+import json
+import tempfile
+import time
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hidden.cases import KINDS, Case, Log, cases, save
+from hidden.scoring import Diagnose, Outcome, markdown, outcome, prove, run, write
+from hidden.simulator import engine
+
+
+def package(logs: Sequence[Log], model: Mapping[str, Any], holdout: Log) -> Mapping[str, Any]:
+    """`jaxbl.diagnose` on logs as files, as people have them."""
+    import jaxbl
+
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [Path(folder) / f"log{i}.csv" for i in range(len(logs))]
+        for log, path in zip([*logs, holdout], [*paths, Path(folder) / "holdout.csv"], strict=True):
+            log.write(path)
+        diagnose = jaxbl.diagnose  # type: ignore[attr-defined]
+        found = diagnose(paths if len(paths) > 1 else paths[0], model, holdout=Path(folder) / "holdout.csv")
+    if isinstance(found, Mapping):
+        return found
+    return {**found.summary, "model": found.model.resolved()}
+
+
+def left(found: Sequence[Case], folder: Path) -> list[Outcome]:
+    """Outcomes of a finished batch: FOLDER/NAME/diagnosis.json, and model.toml beside it, for each case."""
+    outcomes, models = [], []
+    for case in found:
+        path = folder / case.name / "diagnosis.json"
+        known = path.exists()
+        diagnosis = json.loads(path.read_text(encoding="utf-8")) if known else {}
+        if known and (path.parent / "model.toml").exists():
+            diagnosis["model"] = tomllib.loads((path.parent / "model.toml").read_text(encoding="utf-8"))
+        models.append(diagnosis.get("model"))
+        outcomes.append(outcome(case, diagnosis, error="" if known else f"{path}: no such file"))
+    prove(found, outcomes, models)
+    return outcomes
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, required=True, help="of the cases; take one that development has not seen")
+    parser.add_argument("--count", type=int, default=66, help="number of cases")
+    parser.add_argument("--kind", choices=(*KINDS, "all"), default="single")
+    parser.add_argument(
+        "--save", type=Path, metavar="FOLDER", help="write logs, models and truth there, and diagnose nothing"
+    )
+    parser.add_argument("--results", type=Path, metavar="FOLDER", help="score the diagnosis.json files of a batch")
+    parser.add_argument(
+        "--diagnose", metavar="MODULE:FUNCTION", help="diagnose(logs, model, holdout); left out: the package's"
+    )
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="leave scores.md, JSON files and figures there")
+    asked = parser.parse_args()
+
+    start = time.perf_counter()
+    found = cases(asked.seed, asked.count, asked.kind)
+    print(f"{len(found)} cases of seed {asked.seed} in {time.perf_counter() - start:.0f} s ({engine()[1]})")
+    if asked.save is not None:
+        save(found, asked.save)
+        print(f"written to {asked.save}")
+        return
+    if asked.results is not None:
+        outcomes = left(found, asked.results)
+    else:
+        diagnose: Diagnose = package
+        if asked.diagnose:
+            module, _, function = asked.diagnose.partition(":")
+            diagnose = getattr(importlib.import_module(module), function)
+        outcomes = run(found, diagnose)
+    heading = f"Seed {asked.seed}, {len(found)} cases, {asked.kind}"
+    print(markdown(outcomes, heading))
+    if asked.out is not None:
+        for path in write(outcomes, asked.out, heading):
+            print(path)
+
+
+if __name__ == "__main__":
+    main()

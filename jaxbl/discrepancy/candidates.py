@@ -1,0 +1,284 @@
+"""Torques that effects would add along a measured motion, for every effect that a model may lack.
+
+An effect whose torque is proportional to a number gives one column for it. Of numbers that are not linear (frequencies,
+harmonics, Stribeck speed, limits, gaps, time constants) several values are tried, each a variant of the candidate. Where
+the only number is of that kind, the effect at a trial value is taken as it is, and its slope gives the column.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbl.drive.effects import AbstractEffect, Motion, effect_class, effect_kinds
+from jaxbl.drive.parameters import as_arrays, parameters
+from jaxbl.simulate import Experiment
+
+from .part import Part
+
+Array = np.ndarray
+Numbers = dict[str, float]
+
+
+class Candidate(Protocol):
+    """Torques that may be missing: some columns, and what is there without any of them."""
+
+    @property
+    def name(self) -> str:
+        """Of the effect."""
+        ...
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        ...
+
+    @property
+    def offset(self) -> bool:
+        """Whether something is there at coefficients of 0."""
+        ...
+
+    @property
+    def numbers(self) -> Callable[[Sequence[float]], Numbers | None]:
+        """The effect's numbers from the columns' coefficients; None where they are not allowed."""
+        ...
+
+    def torques(self, signals: "Signals") -> tuple[Array, Array | None]:
+        """Columns in N m, shape (samples, sides + 1, width), and what is there at coefficients of 0, or None for nothing."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """A candidate at given values of its numbers that are not linear.
+
+    Attributes:
+        name: of the effect, e.g. `load.coulomb_friction`.
+        unit: for each column an effect and its size: the column is its torque over that size.
+        trial: in place of these, the effect at a trial value, and at values a little below and above.
+        numbers: the effect's numbers from the columns' coefficients; None where they are not allowed.
+        about: what was tried, for messages.
+    """
+
+    name: str
+    unit: tuple[tuple[AbstractEffect, float], ...]
+    trial: tuple[AbstractEffect, AbstractEffect, AbstractEffect] | None
+    numbers: Callable[[Sequence[float]], Numbers | None]
+    about: Numbers
+
+    @property
+    def width(self) -> int:
+        return len(self.unit) if self.trial is None else 1
+
+    @property
+    def offset(self) -> bool:
+        return self.trial is not None
+
+    def torques(self, signals: "Signals") -> tuple[Array, Array | None]:
+        """As :meth:`Candidate.torques`."""
+        if self.trial is None:
+            return np.stack([signals.of(effect) / size for effect, size in self.unit], axis=2), None
+        below, at, above = (signals.of(effect) for effect in self.trial)
+        return ((above - below) / (2.0 * _STEP))[:, :, None], at
+
+
+class Grids(NamedTuple):
+    """Values tried, and the size of things.
+
+    Attributes:
+        torque: largest input, N m.
+        period: s.
+        twist: rms of the twist z, rad; largest twist.
+        speed: rms, of each side, rad/s.
+        frequencies: of a periodic disturbance, Hz.
+        motor_harmonics, load_harmonics: of a turn.
+    """
+
+    torque: float
+    period: float
+    twist: tuple[float, float]
+    speed: dict[str, float]
+    frequencies: tuple[float, ...] = ()
+    motor_harmonics: tuple[float, ...] = ()
+    load_harmonics: tuple[float, ...] = ()
+
+
+SHARE = 0.3
+"""Prior size of an effect: share of the driving torque's rms."""
+_STRIBECK = 0.05, 0.1, 0.2, 0.3, 0.45, 0.7, 1.0
+_LIMITS = 0.98, 0.95, 0.92, 0.88, 0.84, 0.8, 0.75, 0.7, 0.65, 0.6, 0.55, 0.5, 0.45, 0.4, 0.35, 0.3
+_LAGS = 0.3, 0.6, 1.2, 2.4, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0
+_GAPS = 0.01, 0.02, 0.04, 0.08, 0.12, 0.18, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.92
+_STEP = 0.02
+_SPACING = 0.3
+"""Prior standard deviation of the logarithm of a number about its trial value."""
+
+
+def rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def variants_of(experiment: Experiment, grids: Grids) -> list[Variant]:
+    """All effects that the model lacks and its drive can have, variant by variant."""
+    sides, known = experiment.sides, {effect.name for effect in experiment.effects}
+    found: list[Variant] = []
+    for side in sides:
+        for kind, leaf in _LINEAR:
+            found.append(_single(f"{side}.{kind}", leaf))
+        for share in _STRIBECK:
+            found.append(_stribeck(side, share * grids.speed[side]))
+    found.append(_wave("load.gravity", "torque", {}, -1.0))
+    for frequency in grids.frequencies:
+        found.append(_wave("load.periodic_disturbance", "amplitude", {"frequency": frequency}))
+    for harmonic in grids.motor_harmonics:
+        found.append(_wave("motor.cogging", "amplitude", {"harmonic": harmonic}))
+    if experiment.transmission is not None:
+        for harmonic in grids.load_harmonics:
+            found.append(_wave("transmission.eccentricity", "amplitude", {"harmonic": harmonic}, size=0.02 * grids.twist[0]))
+        found.append(_single("transmission.damping", "damping"))
+        found.append(_single("transmission.hardening", "cubic_stiffness"))
+        if "half_gap" not in experiment.transmission.truth():
+            found += [_trial("transmission.backlash", "half_gap", share * grids.twist[1]) for share in _GAPS]
+    found.append(_single("actuator.gain_error", "relative"))
+    found += [_trial("actuator.saturation", "limit", share * grids.torque) for share in _LIMITS]
+    found += [_trial("actuator.lag", "time_constant", samples * grids.period) for samples in _LAGS]
+    return [one for one in found if one.name not in known]
+
+
+_LINEAR = (
+    ("coulomb_friction", "torque"),
+    ("viscous_friction", "viscous"),
+    ("quadratic_drag", "drag"),
+    ("constant_torque", "torque"),
+    ("inertia", "inertia"),
+)
+
+
+def _effect(name: str, numbers: Numbers) -> AbstractEffect:
+    return as_arrays(effect_kinds()[name](**numbers), float)
+
+
+def _single(name: str, leaf: str) -> Variant:
+    (about,) = (about for field, about in parameters(effect_class(name)) if field.name == leaf)
+
+    def numbers(values: Sequence[float]) -> Numbers | None:
+        (value,) = values
+        return None if about.minimum is not None and value <= about.minimum else {leaf: value}
+
+    return Variant(name, ((_effect(name, {leaf: 1.0}), 1.0),), None, numbers, {})
+
+
+def _stribeck(side: str, speed: float) -> Variant:
+    name = f"{side}.stribeck_friction"
+    sliding = _effect(name, {"torque": 1.0, "breakaway_torque": 1.0, "stribeck_velocity": speed})
+    excess = _effect(name, {"torque": 0.0, "breakaway_torque": 1.0, "stribeck_velocity": speed})
+
+    def numbers(values: Sequence[float]) -> Numbers | None:
+        low, more = values
+        if low < 0.0 or more <= 0.0:
+            return None
+        return {"torque": low, "breakaway_torque": low + more, "stribeck_velocity": speed}
+
+    return Variant(name, ((sliding, 1.0), (excess, 1.0)), None, numbers, {"stribeck_velocity": speed})
+
+
+def _wave(name: str, leaf: str, known: Numbers, turn: float = 1.0, size: float = 1.0) -> Variant:
+    """A sinusoid of unknown phase: two of them, a quarter of a period apart."""
+    pair = tuple((_effect(name, known | {leaf: size, "phase": phase}), size) for phase in (0.0, 0.5 * turn * math.pi))
+
+    def numbers(values: Sequence[float]) -> Numbers:
+        sine, cosine = values
+        return {leaf: math.hypot(sine, cosine), "phase": turn * math.atan2(cosine, sine)} | known
+
+    return Variant(name, pair, None, numbers, known)
+
+
+def _trial(name: str, leaf: str, value: float) -> Variant:
+    effects = tuple(_effect(name, {leaf: value * math.exp(step)}) for step in (-_STEP, 0.0, _STEP))
+
+    def numbers(values: Sequence[float]) -> Numbers | None:
+        (change,) = values
+        return {leaf: value * math.exp(change)} if abs(change) < 4.0 * _SPACING else None
+
+    return Variant(name, (), effects, numbers, {leaf: value})  # type: ignore[arg-type]
+
+
+class Signals:
+    """Torques of effects along one part of a record."""
+
+    def __init__(self, experiment: Experiment, part: Part):
+        self.experiment, self.part = experiment, part
+        self.sides = experiment.sides
+        self.count = len(part.time)
+        self.real = np.asarray(part.weight) > 0.0
+        plant = experiment.plant
+        motion = part.position, part.velocity
+        self.torque = np.asarray(part.torque)
+        acting = plant.torques(*motion, _actuated(experiment, part.torque), part.time)
+        # what must be held where a side stands still
+        self.needed = {}
+        for side in self.sides:
+            total, _ = acting[side]
+            rest = total - experiment.drive.viscous(side) * part.velocity[side]
+            rest = rest - plant.inertia(side) * part.acceleration[side]
+            self.needed[side] = np.asarray(jnp.broadcast_to(rest, (self.count,)))
+        self.direction = {side: self._direction(side) for side in self.sides}
+        self.drive = rms(self.torque[self.real])
+
+    def _direction(self, side: str) -> Array:
+        velocity, deviation = np.asarray(self.part.velocity[side]), np.asarray(self.part.deviation[side])
+        period = float(self.part.time[1] - self.part.time[0])
+        # the share of the time around a sample in forward motion less that in backward motion
+        step = np.maximum(np.abs(np.asarray(self.part.acceleration[side])) * period, np.finfo(float).tiny)
+        passage = np.clip(velocity / np.maximum(step, deviation), -1.0, 1.0)
+        moving = passage * (2.0 - np.abs(passage))
+        held = (np.asarray(self.part.held[side]) > 0.0) & self.real
+        if not held.any():
+            return moving
+        # a side that is held takes what it needs, up to the level
+        level = max(float(np.quantile(np.abs(self.needed[side][held]), 0.95)), np.finfo(float).tiny)
+        return np.where(held, np.clip(self.needed[side] / level, -1.0, 1.0), moving)
+
+    def over(self, side: str) -> float:
+        """Torque on a side for 1 N m at the motor."""
+        return float(self.experiment.drive.ratio(side))
+
+    def of(self, effect: AbstractEffect, within: bool = False) -> Array:
+        """Torque that an effect adds, shape (samples, sides + 1); `within`: to a model that has it already."""
+        effect = as_arrays(effect, float)
+        found = np.zeros((self.count, len(self.sides) + 1))
+        place = self.experiment.drive.place(effect.place)
+        if place == "actuator":
+            found[:, -1] = np.asarray(
+                _actuate_over(effect, self.part.torque, self.experiment.run.sample_period) - self.part.torque
+            )
+        elif place == "transmission":
+            others = tuple(one for one in self.experiment.effects if not (within and one.name == effect.name))
+            both = (eqx.tree_at(lambda e: e.effects, self.experiment, some) for some in (others, (*others, effect)))
+            before, after = (one.plant.transmitted(self.part.position, self.part.velocity) for one in both)
+            found[:, 0] = np.asarray(before[0] - after[0])
+            found[:, 1] = np.asarray(after[1] * after[0] - before[1] * before[0])
+        else:
+            motion = Motion(self.part.time, self.part.position[place], self.part.velocity[place])
+            torque = effect.resist(motion) + effect.dry_friction(motion.velocity) * self.direction[place]
+            torque = torque + effect.added_inertia() * self.part.modelled[place]
+            found[:, self.sides.index(place)] = -np.asarray(torque)
+        return found * self.real[:, None]
+
+
+def _actuated(experiment: Experiment, torque: jax.Array) -> jax.Array:
+    for effect in experiment.effects:
+        if effect.place == "actuator":
+            torque = _actuate_over(effect, torque, experiment.run.sample_period)
+    return torque
+
+
+@eqx.filter_jit
+def _actuate_over(effect: AbstractEffect, torque: jax.Array, period: Any) -> jax.Array:
+    start = jax.tree.map(lambda x: jnp.asarray(x, torque.dtype) * 0.0 + torque[0], effect.init())
+    return jax.lax.scan(lambda state, u: effect.actuate(state, u, period), start, torque)[1]

@@ -1,0 +1,340 @@
+"""Which effects a model lacks on a record: screened on the linearised model, decided on models that have them.
+
+A round: all candidates are screened on the prediction errors of the model so far; of the best, each is put into the
+model, its numbers and the model's own refitted (Gauss-Newton through the simulated step, the prior on the nominal numbers
+kept), and their evidences compared. What wins stays, and the next round begins, until nothing pays for its columns. Then
+what is left is asked whether it is noise: any function of time, position or velocity that pays says that something else
+is missing.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbl.drive.effects import effect_kinds
+from jaxbl.drive.parameters import as_arrays
+from jaxbl.identification.smoother import Smoothed
+from jaxbl.identification.trajectory import Free, free_parameters
+from jaxbl.records import Record
+from jaxbl.simulate import Experiment
+
+from .candidates import SHARE, Candidate, Numbers, variants_of
+from .evidence import Scorer, Set, search
+from .linear import Linear
+from .remainder import functions_of
+
+Array = np.ndarray
+Names = tuple[str, ...]
+
+Verdict = Literal["explained", "no_discrepancy", "unknown_effect"]
+
+ODDS = -3.0
+"""Log prior odds of each effect to be missing."""
+_FINALISTS = 5
+_BEHIND = 0.5
+"""Share of the best gain in evidence that a finalist must reach (or be within :data:`_NEAR`)."""
+_NEAR = 25.0
+_STEPS = 8
+_SETTLED = 2e-3
+_LEAST_CHANCE = 0.01
+_SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
+_MOST = 4
+FLOOR = 0.004
+"""Nats a prediction error that structure in the noise (quantisation, above all) may be worth: 0.8 % of its variance."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A set of effects in the model, all numbers refitted.
+
+    Attributes:
+        names: of the effects.
+        experiment: with the effects and all numbers.
+        numbers: of the effects.
+        theta: the nominal model's own numbers.
+        log_evidence: nats; only differences between models under one gain count.
+        misfit: sum of squared prediction errors over their variance.
+        linear: the model along the record.
+    """
+
+    names: Names
+    experiment: Experiment
+    numbers: dict[str, Numbers]
+    theta: Array
+    log_evidence: float
+    misfit: float
+    linear: Linear
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """An effect that is missing.
+
+    Attributes:
+        effect: its name.
+        confidence: probability that it is this one.
+        numbers: of the effect.
+        alternatives: other effects that the record does not rule out in its place, and their probabilities.
+    """
+
+    effect: str
+    confidence: float
+    numbers: Numbers
+    alternatives: tuple[tuple[str, float], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Explanation:
+    """What a record says that a model lacks.
+
+    Attributes:
+        verdict: as in `diagnosis.json`.
+        findings: in the order in which they were found.
+        model: the nominal model with the findings, all numbers refitted.
+        nominal: the nominal model, its own numbers refitted.
+        wrong: the best model with a wrong effect in place of the last finding, or None.
+        rest: what is left over: evidence (nats) and share of the driving torque of the best function of time, position or
+            velocity, by name.
+    """
+
+    verdict: Verdict
+    findings: tuple[Finding, ...]
+    model: Model
+    nominal: Model
+    wrong: Model | None
+    rest: dict[str, tuple[float, float]]
+
+
+class _Finalist(NamedTuple):
+    """A candidate that did well on the linearised model: its numbers, and the change of the model's own beside them."""
+
+    name: str
+    numbers: Numbers
+    own: Array
+    gain: float
+
+
+class Explainer:
+    """A record, a nominal model, and the models tried."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        free: Sequence[Free],
+        prior: Sequence[float],
+        record: Record,
+        smoothed: Mapping[str, Sequence[Smoothed]],
+    ):
+        self.nominal, self.free, self.prior = experiment, tuple(free), np.asarray(prior)
+        self.record, self.smoothed = record, smoothed
+        self.floor = FLOOR * len(record.time) * len(experiment.sides)
+
+    def linear(self, experiment: Experiment, names: Names, theta: Array) -> Linear:
+        paths = _paths(experiment, names)
+        torque = float(np.std(self.record.torque))  # type: ignore[arg-type]
+        own = (*self.free, *free_parameters(experiment, paths, torque))
+        prior = np.concatenate([self.prior, [_width(path) for path in paths]])
+        centre = np.concatenate([-theta, np.zeros(len(paths))])
+        at = jnp.asarray(np.concatenate([theta, np.zeros(len(paths))]))
+        return Linear(experiment, own, at, prior, centre, self.record, self.smoothed)
+
+    def refit(
+        self, names: Names, numbers: Mapping[str, Numbers], theta: Array, smoothness: Sequence[float], deviation: Array
+    ) -> Model:
+        """Put effects into the model and refit everything."""
+        count = len(self.free)
+        values = {name: dict(numbers[name]) for name in names}
+        linear = None
+        for step in range(_STEPS):
+            experiment = _with_effects(self.nominal, values)
+            linear = self.linear(experiment, names, theta)
+            columns = linear.columns((), smoothness, deviation)
+            scale = columns.scale.copy()
+            paths = _paths(experiment, names)
+            sizes = linear.sizes(names)
+            for i, path in enumerate(paths):
+                amplitude = path.rsplit(".", 1)[1] in _AMPLITUDES
+                if amplitude:
+                    name = path.removeprefix("effects.").rsplit(".", 1)[0]
+                    scale[1 + count + i] = sizes[name]
+            if not np.isfinite(columns.products).all() or not np.isfinite(scale[1:]).all():
+                return Model(names, experiment, values, theta, -np.inf, np.inf, linear)
+            found = Scorer(dataclasses.replace(columns, scale=scale), ())(())
+            assert found is not None
+            change = np.clip(found.own, -1.0, 1.0)
+            done = step > 0 and np.max(np.abs(change), initial=0.0) < _SETTLED
+            if done or step == _STEPS - 1:
+                break
+            theta = theta + change[:count]
+            for path, one, by in zip(paths, linear.free[count:], change[count:], strict=True):
+                name, leaf = path.removeprefix("effects.").rsplit(".", 1)
+                values[name][leaf] = float(one.value(by))
+        assert linear is not None
+        evidence = found.log_evidence + len(names) * ODDS - sum(linear.choices(name) for name in names)
+        return Model(names, experiment, values, theta, evidence, found.misfit, linear)
+
+    def run(self) -> Explanation:
+        """Find what is missing."""
+        theta = np.zeros(len(self.free))
+        linear = self.linear(self.nominal, (), theta)
+        smoothness, deviation = linear.choose(())
+        nominal = current = self.refit((), {}, theta, smoothness, deviation)
+        findings: list[Finding] = []
+        wrong: Model | None = None
+        while len(findings) < _MOST:
+            smoothness, tried = self._round(current, smoothness)
+            if not tried or tried[0][0] <= 0.0:
+                break
+            chances = _softmax(np.array([gain for gain, _ in tried]))
+            (_, current), *others = tried
+            alternatives = tuple(
+                (model.names[-1], float(chance))
+                for (_, model), chance in zip(others, chances[1:], strict=True)
+                if chance > _LEAST_CHANCE
+            )
+            findings.append(Finding(current.names[-1], float(chances[0]), current.numbers[current.names[-1]], alternatives))
+            wrong = others[0][1] if others else None
+        findings = [dataclasses.replace(one, numbers=current.numbers[one.effect]) for one in findings]
+        rest = self.remainder(current, smoothness)
+        verdict: Verdict = "explained" if findings else "no_discrepancy"
+        if any(gain > 0.0 for gain, _ in rest.values()):
+            verdict = "unknown_effect"
+        return Explanation(verdict, tuple(findings), current, nominal, wrong, rest)
+
+    def _round(self, current: Model, smoothness: Sequence[float]) -> tuple[list[float], list[tuple[float, Model]]]:
+        """Models with one effect more, and what each earns (nats), best first."""
+        smoothness, deviation, finalists = self._screen(current, smoothness)
+        if not finalists:
+            return smoothness, []
+        base = self.refit(current.names, current.numbers, current.theta, smoothness, deviation)
+        tried: list[tuple[float, Model]] = []
+        best = finalists[0].gain
+        for one in finalists:
+            # those far behind have their turn where those before have not kept their promise
+            behind = one.gain < max(min(_BEHIND * best, best - _NEAR), 0.0)
+            if behind and any(gain > 0.0 for gain, _ in tried):
+                break
+            numbers = current.numbers | {one.name: one.numbers}
+            model = self.refit((*current.names, one.name), numbers, current.theta + one.own, smoothness, deviation)
+            tried.append((self._gain(base, model), model))
+        return smoothness, sorted(tried, key=lambda pair: -pair[0])
+
+    def remainder(self, model: Model, smoothness: Sequence[float]) -> dict[str, tuple[float, float]]:
+        """What free functions would earn beside a model (nats), and their rms torque over the driving one's, by name."""
+        linear = model.linear
+        smoothness, deviation = linear.choose(())
+        functions = functions_of(linear.signals)
+        columns = linear.columns(functions, smoothness, deviation)
+        found = {}
+        for i, one in enumerate(functions):
+            best = (-np.inf, 0.0)
+            for size in _SIZES:
+                scale = columns.scale.copy()
+                scale[list(columns.places[i])] *= size
+                scorer = Scorer(dataclasses.replace(columns, scale=scale), functions)
+                none, some = scorer(()), scorer((i,))
+                assert none is not None and some is not None
+                best = max(best, (self._gain(none, some), size * SHARE))
+            found[one.name] = best
+        return found
+
+    def _gain(self, base: Model | Set, model: Model | Set) -> float:
+        """What a model's effect earns: evidence, less a floor of what it takes off the misfit."""
+        explained = 0.5 * (base.misfit - model.misfit)
+        gain = model.log_evidence - base.log_evidence
+        return gain - min(max(explained, 0.0), self.floor) if np.isfinite(gain) else -np.inf
+
+    def _screen(self, model: Model, smoothness: Sequence[float]) -> tuple[list[float], Array, list[_Finalist]]:
+        linear = model.linear
+        chosen: Sequence[Candidate] = ()
+        finalists: list[_Finalist] = []
+        for _ in range(2):
+            smoothness, deviation = linear.choose(chosen)
+            variants = variants_of(model.experiment, linear.grids(linear.frequencies(smoothness, deviation)))
+            variants = [one for one in variants if not _same(one.name, model.names)]
+            scorer = Scorer(linear.columns(variants, smoothness, deviation), variants)
+            sets = search(scorer, 1, odds=ODDS)
+            none = scorer(())
+            assert none is not None
+            best: dict[str, tuple[float, Set]] = {}
+            for one in sets:
+                if one.which:
+                    best.setdefault(variants[one.which[0]].name, (self._gain(none, one), one))
+            ordered = sorted(best.items(), key=lambda pair: -pair[1][0])
+            top = ordered[0][1][0] if ordered else 0.0
+            if top <= 0.0:
+                return smoothness, deviation, []
+            finalists = [
+                _Finalist(name, one.numbers[0], one.own[: len(self.free)], gain)
+                for name, (gain, one) in ordered[:_FINALISTS]
+                if gain > 0.0
+            ]
+            chosen = [variants[ordered[0][1][1].which[0]]]
+        smoothness, deviation = linear.choose(chosen)
+        return smoothness, deviation, finalists
+
+
+_DRY = "coulomb_friction", "stribeck_friction"
+
+
+def _same(name: str, others: Iterable[str]) -> bool:
+    """Whether an effect is of a kind with one that is there: of dry friction a side has one law."""
+    place, kind = name.split(".")
+    return kind in _DRY and any(f"{place}.{one}" in others for one in _DRY)
+
+
+def _softmax(values: Array) -> Array:
+    weights = np.exp(values - np.max(values))
+    return weights / weights.sum()
+
+
+_AMPLITUDES = frozenset(
+    ("torque", "breakaway_torque", "viscous", "drag", "inertia", "amplitude", "cubic_stiffness", "damping", "relative")
+)
+_FIXED = frozenset(("harmonic",))
+
+
+def _paths(experiment: Experiment, names: Iterable[str]) -> list[str]:
+    paths = []
+    for name in names:
+        (effect,) = (one for one in experiment.effects if one.name == name)
+        for field in dataclasses.fields(effect):
+            if "parameter" in field.metadata and field.name not in _FIXED:
+                paths.append(f"effects.{name}.{field.name}")
+    return paths
+
+
+def _width(path: str) -> float:
+    return 1.8 if path.endswith(".phase") else 1.0
+
+
+_ORDER = ("actuator.gain_error", "actuator.saturation", "actuator.lag")
+
+
+def _with_effects(experiment: Experiment, values: Mapping[str, Numbers]) -> Experiment:
+    added = [as_arrays(effect_kinds()[name](**numbers), float) for name, numbers in values.items()]
+    effects = sorted((*experiment.effects, *added), key=lambda one: _ORDER.index(one.name) if one.name in _ORDER else -1)
+    return eqx.tree_at(lambda e: e.effects, experiment, tuple(effects))
+
+
+def explain(
+    experiment: Experiment,
+    free: Sequence[Free],
+    prior: Sequence[float],
+    record: Record,
+    smoothed: Mapping[str, Sequence[Smoothed]],
+) -> Explanation:
+    """Which effects a model lacks on a record.
+
+    Args:
+        experiment: the nominal model, with array leaves; its sample period is that of the record.
+        free: its own numbers that are not exactly known.
+        prior: relative standard deviation of each.
+        record: the log.
+        smoothed: its positions, part by part (:func:`jaxbl.identification.search.smoothed_channels`).
+    """
+    return Explainer(experiment, free, prior, record, smoothed).run()

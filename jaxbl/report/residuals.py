@@ -1,0 +1,176 @@
+"""Drawing of residual torques: over time with the noise band, over speed, position and twist, and their spectrum."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxbl.discrepancy.residuals import Residual, narrowed
+from jaxbl.discrepancy.where import SIGNIFICANT, Coordinate, Localised, Values, describe, spectrum_of
+
+from .maps import Drawn
+from .style import COLOURS, style, with_unit
+
+_POINTS, _CLOUD = 2400, 4000
+_COLOUR = {"motor": COLOURS[0], "load": COLOURS[1], "transmission": COLOURS[2]}
+_BAND, _MEAN, _FAINT = "#BDBDBD", COLOURS[6], "#8C8C8C"
+_ABOVE: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1, "columnspacing": 1.2}
+_SHOWN = ("speed", "turn", "load turn", "position", "load position", "twist", "acceleration")
+_PANELS = 3
+_WORTH = 0.1
+"""Share of the power from which on a peak is named."""
+
+
+def draw_residuals(
+    residuals: Mapping[str, Sequence[Residual]],
+    coordinates: Mapping[str, Sequence[Mapping[str, Values]]],
+    found: Mapping[str, Localised],
+    unit: str = "N m",
+) -> list[Drawn]:
+    """All figures of residual torques.
+
+    Args:
+        residuals: by equation, of each part of the record.
+        coordinates: by equation, of each part (:func:`jaxbl.discrepancy.where.coordinates_of`).
+        found: where they live, by equation.
+        unit: of the torques.
+    """
+    with style():
+        drawn = [_over_time(residuals, found, unit)]
+        drawn += [_over_coordinates(residuals[name], coordinates[name], found[name], unit) for name in residuals]
+        drawn.append(_spectra(residuals, found, unit))
+    return drawn
+
+
+def _shown(residual: Residual, found: Localised) -> tuple[Residual, np.ndarray]:
+    """A residual behind the low-pass behind which it was looked at."""
+    return narrowed(residual, found.bandwidth)
+
+
+def _over_time(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, Localised], unit: str) -> Drawn:
+    figure = Figure(figsize=(9.0, 2.3 * len(residuals) + 0.6), layout="constrained")
+    axes = figure.subplots(len(residuals), 1, sharex=True, squeeze=False).ravel()
+    for ax, (name, parts) in zip(axes, residuals.items(), strict=True):
+        one = found[name]
+        for i, part in enumerate(parts):
+            low, _ = _shown(part, one)
+            time, torque, band = _outline(low.time, low.torque, 2.0 * low.deviation)
+            ax.plot(time, torque, color=_COLOUR[name], lw=0.9, label="missing" if i == 0 else None, zorder=2)
+            ax.fill_between(time, -band, band, color=_BAND, alpha=0.75, lw=0.0, zorder=3, label=None if i else "± 2 noise")
+        ax.axhline(0.0, color=_FAINT, lw=0.8, zorder=1)
+        ax.set_ylabel(with_unit(f"{name}:\nmissing {_what(unit)}", unit))
+        ax.set_title(f"{describe(one, unit)}\n", loc="left", fontsize=9)
+        ax.legend(ncols=2, **_ABOVE)
+    axes[-1].set_xlabel("time (s)")
+    caption = (
+        "Torque that the model lacks (inertia times acceleration less all modelled torques, positive forward), behind the "
+        "low-pass behind which it stands out. The grey band is twice the noise's standard deviation: what stays within it "
+        "is noise."
+    )
+    return Drawn("residual_torque", figure, caption)
+
+
+def _what(unit: str) -> str:
+    return "force" if unit == "N" else "torque"
+
+
+def _outline(time: np.ndarray, torque: np.ndarray, band: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fewer points that draw the same line: least and largest of each of many bins."""
+    size = len(time) // (_POINTS // 2)
+    if size < 3:
+        return time, torque, band
+    bins = torque[: len(time) // size * size].reshape(-1, size)
+    at = np.arange(len(bins)) * size + np.sort([np.argmin(bins, axis=1), np.argmax(bins, axis=1)], axis=0)
+    at = at.T.ravel()
+    return time[at], torque[at], band[at]
+
+
+def _panels(found: Localised) -> list[Coordinate]:
+    """The coordinates that are drawn: those that explain most, speed always."""
+    each = [found.coordinates[name] for name in _SHOWN if name in found.coordinates]
+    most = sorted(each, key=lambda one: (one.name != "speed", -one.explained))[:_PANELS]
+    return [one for one in each if one in most]
+
+
+def _over_coordinates(
+    parts: Sequence[Residual], coordinates: Sequence[Mapping[str, Values]], found: Localised, unit: str
+) -> Drawn:
+    shown = _panels(found)
+    figure = Figure(figsize=(3.2 * len(shown) + 0.6, 3.5), layout="constrained")
+    axes = figure.subplots(1, len(shown), sharey=True, squeeze=False).ravel()
+    lows = [_shown(part, found) for part in parts]
+    torque = np.concatenate([low.torque for low, _ in lows])
+    noise = float(np.sqrt(np.mean(np.concatenate([low.deviation for low, _ in lows]) ** 2)))
+    every = max(len(torque) // _CLOUD, 1)
+    best = max(shown, key=lambda one: one.explained)
+    for ax, one in zip(axes, shown, strict=True):
+        values = np.concatenate([part[one.name].values[at] for part, (_, at) in zip(coordinates, lows, strict=True)])
+        ax.axhspan(-2.0 * noise, 2.0 * noise, color=_BAND, alpha=0.6, lw=0.0, zorder=0, label="± 2 noise")
+        ax.plot(
+            values[::every], torque[::every], ".", ms=2.0, mew=0.0, color=_COLOUR[found.name], alpha=0.45, zorder=1,
+            rasterized=True,
+        )  # fmt: skip
+        _means(ax, one)
+        symbol = f" {one.symbol}" if one.symbol else ""
+        ax.set_xlabel(with_unit(f"{one.name}{symbol}", one.unit))
+        ax.set_title(
+            f"explains {100.0 * one.explained:.0f} %", loc="left", fontsize=10,
+            fontweight="bold" if one is best and one.explained > 0.0 else "normal",
+        )  # fmt: skip
+    axes[0].set_ylabel(with_unit(f"{found.name}: missing {_what(unit)}", unit))
+    limit = 1.15 * max(float(np.quantile(np.abs(torque), 0.998)), 2.5 * noise)
+    axes[0].set_ylim(-limit, limit)
+    handles = axes[0].get_legend_handles_labels()
+    figure.legend(*handles, ncols=2, loc="outside lower right")
+    caption = (
+        f"{describe(found, unit)[:1].upper()}{describe(found, unit)[1:]}. Dots are samples, black marks the means of bins "
+        "with twice their standard errors; hollow where a mean is not told from zero. Above: share of the power beyond the "
+        "noise that a function of this coordinate alone explains, on stretches of time that it was not made from."
+    )
+    return Drawn(f"residual_{found.name}", figure, caption)
+
+
+def _means(ax: Axes, one: Coordinate) -> None:
+    x = np.array([0.5 * (region.low + region.high) for region in one.regions])  # pyright: ignore
+    y = np.array([region.mean for region in one.regions])
+    error = np.array([region.mean_error for region in one.regions])
+    sure = np.array([abs(region.mean_z) > 3.0 for region in one.regions])
+    ax.plot(x, y, color=_MEAN, lw=1.0, alpha=0.7, zorder=3)
+    ax.errorbar(x, y, 2.0 * error, fmt="none", ecolor=_MEAN, elinewidth=1.2, zorder=3)
+    ax.plot(x[sure], y[sure], "o", ms=4.0, color=_MEAN, zorder=4, label="bin mean")
+    ax.plot(x[~sure], y[~sure], "o", ms=4.0, mfc="white", mec=_MEAN, mew=0.9, zorder=4)
+
+
+def _spectra(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, Localised], unit: str) -> Drawn:
+    figure = Figure(figsize=(9.0, 2.5 * len(residuals) + 0.6), layout="constrained")
+    axes = figure.subplots(len(residuals), 1, sharex=False, squeeze=False).ravel()
+    for ax, (name, parts) in zip(axes, residuals.items(), strict=True):
+        longest = max(parts, key=lambda part: len(part.time))
+        frequency, power, floor = spectrum_of(longest)
+        seen = (frequency > 0.0) & (frequency <= min(1.5 * longest.bandwidth, frequency[-1]))
+        frequency, power, floor = frequency[seen], power[seen], floor[seen]
+        # of each line: amplitude of a sine with its power
+        size = np.sqrt(2.0 / len(longest.time))
+        ax.loglog(frequency, size * np.sqrt(power), color=_COLOUR[name], lw=0.9, label="missing")
+        ax.loglog(frequency, size * np.sqrt(floor), color=_MEAN, lw=1.2, ls="--", label="noise")
+        ax.set_ylim(0.2 * size * np.sqrt(np.min(floor)), 3.0 * size * np.sqrt(np.max([np.max(power), np.max(floor)])))
+        ax.axvline(found[name].bandwidth, color=_FAINT, lw=0.9, ls=":", label="looked at up to here")
+        for peak in [one for one in found[name].peaks if not one.in_motion and one.excess_z > SIGNIFICANT][:3]:
+            if peak.power_share < _WORTH:
+                continue
+            ax.annotate(
+                f"{peak.frequency:.4g} Hz\n{peak.amplitude:.2g} {unit}", (peak.frequency, peak.amplitude),
+                xytext=(5, 2), textcoords="offset points", fontsize=8, va="center",
+            )  # fmt: skip
+            ax.plot(peak.frequency, peak.amplitude, "v", ms=5, color=_MEAN)
+        ax.set_ylabel(with_unit(f"{name}:\namplitude per line", unit))
+        ax.legend(ncols=3, **_ABOVE)
+    axes[-1].set_xlabel("frequency (Hz)")
+    caption = (
+        "Spectrum of the missing torque and of its noise. The noise of an acceleration grows with the square of the "
+        "frequency, up to the smoother's bandwidth; what stands above the dashed line is missing from the model. Marked: "
+        "narrow peaks that the motion does not have."
+    )
+    return Drawn("residual_spectrum", figure, caption)

@@ -1,0 +1,225 @@
+"""The bench's cases and scores, on short logs and with made-up diagnoses."""
+
+import json
+import tomllib
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hidden.cases import KINDS, _targets, cases, save
+from hidden.effects import APART, EFFECTS, LEVELS, UNKNOWN, on_rigid
+from hidden.proof import foretold, proofs
+from hidden.scoring import calibration, calibration_error, confusion, markdown, outcome, run, scores, write
+from hidden_effects import left
+
+from jaxbl.drive import Initial, Plant, as_arrays
+from jaxbl.drive.effects import effect_kinds
+from jaxbl.records import read_record
+from jaxbl.study.config import read_model
+
+DURATION = 0.6
+GAP = {
+    "holdout_rmse_before": {"theta_e": 1.0},
+    "holdout_rmse_after": {"theta_e": 0.1},
+    "noise_floor": {"theta_e": 0.0},
+}
+
+
+@pytest.fixture(scope="module")
+def found():
+    return cases(4, 32, "all", DURATION)
+
+
+@pytest.fixture(scope="module")
+def oracle(found):
+    """A diagnosis that knows the truth."""
+    truths = {case.name: case for case in found}
+
+    def diagnose(logs, model, holdout):
+        case = truths[model["title"]]
+        findings = [{"effect": name, "confidence": 1.0, "parameters": {}} for name in case.truth["effects"]]
+        findings = findings if case.hidden else []
+        return {"verdict": case.truth["verdict"], "findings": findings, "gap": GAP, "model": case.oracle}
+
+    return diagnose
+
+
+def test_all_effects_of_the_package_are_hidden_at_all_sizes():
+    assert set(EFFECTS) == set(effect_kinds())
+    targets = _targets(0, 66, "single")
+    assert {(effect, level) for _, ((effect, level),) in targets} == {(e, s) for e in EFFECTS for s in LEVELS}
+    assert all(on_rigid(effect) for plant, hidden in _targets(1, 200, "pairs") for effect, _ in hidden if plant == "direct")
+    assert {effect for _, ((effect, _),) in _targets(0, 8, "unknown")} == set(UNKNOWN)
+
+
+def test_same_seed_same_cases():
+    one, other, third = cases(9, 1, "hard", 0.2)[0], cases(9, 1, "hard", 0.2)[0], cases(10, 1, "hard", 0.2)[0]
+    np.testing.assert_array_equal(one.log.theta_e, other.log.theta_e)
+    assert one.truth == other.truth
+    assert one.model == other.model != third.model
+
+
+def test_kinds_come_in_their_shares_and_logs_are_whole(found):
+    assert [sum(case.kind == kind for case in found) for kind in KINDS] == [16, 4, 4, 4, 4]
+    for case in found:
+        for log in (case.log, case.holdout):
+            columns = log.columns()
+            assert ("theta_s" in columns) == (case.conditions["plant"] != "direct")
+            assert all(np.isfinite(values).all() and len(values) == len(log.t) for values in columns.values())
+        assert case.conditions["excitation"] != case.conditions["holdout"]
+
+
+def test_sizes_are_as_asked_or_say_so(found):
+    for case in found:
+        for (name, size), level in zip(case.truth["sizes"].items(), [case.truth["level"]], strict=False):
+            if case.kind in ("single", "hard") and name.split(".")[1] not in (
+                "inertia",
+                "viscous_friction",
+                "gain_error",
+                "damping",
+            ):
+                assert size == pytest.approx(level, rel=0.01)
+
+
+def test_nominal_numbers_are_off_as_the_model_says_and_nominal_effects_stand_apart(found):
+    for case in found:
+        relative = case.model["uncertainty"]["relative"]
+        assert 0.01 <= relative <= 0.06
+        for table in ("drive", "transmission"):
+            for key, true in case.oracle.get(table, {}).items():
+                if isinstance(true, float) and key != "gear_ratio":
+                    assert abs(case.model[table][key] / true - 1.0) <= 2.0 * relative + 1e-3
+        for name, parameters in case.truth["effects"].items():
+            side, kind = name.split(".")
+            if kind == "inertia":
+                assert abs(parameters["inertia"]) >= 0.99 * APART * relative * case.oracle["drive"][f"{side}_inertia"]
+
+
+def test_models_are_studies_of_the_package_and_the_true_one_makes_the_truth(found):
+    checked = 0
+    for case in found:
+        read_model(case.model)
+        config, _ = read_model(case.oracle)
+        if case.kind != "single" or case.truth["growth"] > 1.0 or checked == 4:
+            continue
+        law = None if config.transmission is None else config.transmission.build()
+        plant = Plant(config.drive.build(), law, tuple(effect.build() for effect in config.effects))
+        own = _package(plant, case.runs[0].initial, case.traces[0].command, case.conditions["period"])
+        truth = case.traces[0].states[0]
+        assert np.abs(own - truth).max() < 2e-3 * np.ptp(truth), case.name
+        checked += 1
+    assert checked == 4
+
+
+def _package(plant, initial, torques, period, substeps=20):
+    """Motor position by the package's own plant."""
+    plant, state = as_arrays((plant, Initial(*(initial[i] for i in range(4)))), jnp.float64)
+
+    @eqx.filter_jit
+    def positions(plant, state, torques):
+        step = period / substeps
+
+        def over(carry, torque):
+            state, start = carry
+            after = jax.lax.fori_loop(
+                0, substeps, lambda i, s: plant.advance(s, torque, start + i * step, jnp.asarray(step)), state
+            )
+            return (after, start + period), state.position["motor"]
+
+        return jax.lax.scan(over, (plant.init(state), jnp.asarray(0.0)), torques)[1]
+
+    return np.asarray(positions(plant, state, jnp.asarray(torques)))
+
+
+def test_an_oracle_gets_full_marks(found, oracle):
+    outcomes = run(found, oracle, oracle=lambda case: {"theta_e": 0.1})
+    figures = scores(outcomes)
+    for key in ("single", "hard", "pairs", "abstentions"):
+        assert figures[key]["value"] == 1.0
+    for key in (
+        "false_alarms",
+        "pairs_spurious",
+        "confidently_wrong",
+        "worse",
+        "proved_worse",
+        "calibration_error",
+        "failed",
+    ):
+        assert figures[key]["value"] == 0.0
+    assert figures["gap_reduction"]["value"] == pytest.approx(0.9)
+    assert figures["oracle_ratio"]["value"] == pytest.approx(1.0)
+    assert figures["proved"]["value"] == pytest.approx(1.0)
+    rows, columns, counts = confusion(outcomes)
+    assert all(counts[i, columns.index(row)] for i, row in enumerate(rows) if not row.startswith("unknown."))
+
+
+def test_who_never_sees_anything_raises_no_alarm_and_finds_nothing(found):
+    outcomes = run(found, lambda logs, model, holdout: {"verdict": "no_discrepancy", "findings": [], "model": model})
+    figures = scores(outcomes)
+    assert figures["false_alarms"]["value"] == figures["confidently_wrong"]["value"] == 0.0
+    assert figures["single"]["value"] == figures["pairs"]["value"] == figures["abstentions"]["value"] == 0.0
+    assert figures["unknown_missed"]["value"] == 1.0
+    assert figures["calibration_error"] is None
+    assert figures["proved"]["value"] == 0.0
+    assert "**not met**" in markdown(outcomes)
+
+
+def test_a_wrong_answer_is_counted_where_it_belongs(found):
+    pair = next(case for case in found if case.kind == "pairs")
+    wrong = next(name for name in EFFECTS if name not in pair.hidden)
+    findings = [{"effect": name, "confidence": 0.8} for name in (*pair.hidden, wrong)]
+    gap = {"holdout_rmse_before": {"theta_e": 1.0}, "holdout_rmse_after": {"theta_e": 1.1}, "noise_floor": {"theta_e": 0.1}}
+    told = outcome(pair, {"verdict": "explained", "findings": findings, "gap": gap})
+    assert told.right and told.spurious == [wrong] and told.worse
+    assert told.reduction < 0.0
+    curve = calibration([told])
+    assert curve == [{"confidence": pytest.approx(0.8), "right": pytest.approx(2 / 3), "count": 3}]
+    assert calibration_error(curve) == pytest.approx(0.8 - 2 / 3)
+    unknown = next(case for case in found if case.kind == "unknown")
+    told = outcome(unknown, {"verdict": "explained", "findings": [{"effect": wrong, "confidence": 0.95}]})
+    assert scores([told])["confidently_wrong"]["value"] == 1.0
+    with pytest.raises(ValueError, match="verdict 'maybe'"):
+        outcome(unknown, {"verdict": "maybe"})
+
+
+def test_a_diagnosis_that_fails_is_an_outcome(found, capsys):
+    def fails(logs, model, holdout):
+        raise RuntimeError("no")
+
+    outcomes = run(found[:2], fails)
+    assert scores(outcomes)["failed"]["value"] == 1.0
+    assert "RuntimeError: no" in markdown(outcomes)
+
+
+def test_the_proof_parts_true_from_nominal_model(found):
+    case = next(case for case in found if case.kind == "single")
+    nominal, true = foretold([(case, case.model), (case, case.oracle)])
+    assert true["theta_e"] < 1e-6 * nominal["theta_e"]
+    worse = {**case.model, "effects": [{"kind": "motor.constant_torque", "torque": 100.0}]}
+    foreign = {**case.model, "effects": [{"kind": "motor.of_another_package"}]}
+    results = proofs([(case, case.oracle), (case, worse), (case, foreign)])
+    assert results[0] == (pytest.approx(1.0), False)
+    assert results[1][1]
+    assert results[2] == (None, None)
+
+
+def test_files_are_read_by_the_package_and_scored_from_a_batch(found, oracle, tmp_path):
+    some = found[:3]
+    save(some, tmp_path / "logs")
+    for case in some:
+        model = tomllib.loads((tmp_path / "logs" / f"{case.name}.toml").read_text())
+        assert model == case.model
+        record = read_record(tmp_path / "logs" / f"{case.name}.csv")
+        np.testing.assert_allclose(record.torque, case.log.u, rtol=1e-8, atol=1e-12)
+        folder = tmp_path / "found" / case.name
+        folder.mkdir(parents=True)
+        (folder / "diagnosis.json").write_text(json.dumps(oracle(None, case.model, None)))
+    truth = json.loads((tmp_path / "logs" / "truth.json").read_text())
+    assert set(truth) == {case.name for case in some}
+    outcomes = left(found[:4], tmp_path / "found")
+    assert [one.right for one in outcomes] == [True, True, True, False]
+    made = write(outcomes, tmp_path / "out", "A seed")
+    assert {path.name for path in made} == {"confusion.png", "calibration.png", "sizes.png", "gap.png"}
+    assert (tmp_path / "out" / "scores.md").read_text().startswith("## A seed")

@@ -1,0 +1,44 @@
+"""Figures of residual torques: drawn for every equation, with the sentence, whatever is found."""
+
+import numpy as np
+import pytest
+
+from jaxbl.discrepancy.residuals import Residual
+from jaxbl.discrepancy.where import Values, describe, locate
+from jaxbl.report.residuals import draw_residuals
+from jaxbl.report.style import save
+
+
+def made(name, torque, time):
+    noise = 0.05 * np.random.default_rng(0).standard_normal(len(time))
+    count = len(time)
+    residual = Residual(name, time, torque + noise, np.full(count, 0.05), np.ones(1), 100.0)
+    values = {
+        "direction": Values((np.cos(time) > 0.0).astype(int), classes=("backward", "forward")),
+        "speed": Values(3.0 * np.cos(time), "rad/s", symbol="ω"),
+        "position": Values(3.0 * np.sin(time), "rad", symbol="θe"),
+        "time": Values(time, "s", symbol="t"),
+    }
+    return residual, values
+
+
+@pytest.mark.parametrize("unit", ["N m", "N"])
+def test_every_equation_is_drawn_with_what_was_found(tmp_path, unit):
+    time = 5e-3 * np.arange(8000)
+    torque = {"motor": -0.1 * np.sign(np.cos(time)) + 0.1 * np.sin(2.0 * np.pi * 11.0 * time), "load": np.zeros(8000)}
+    pairs = {name: made(name, one, time) for name, one in torque.items()}
+    residuals = {name: [residual] for name, (residual, _) in pairs.items()}
+    coordinates = {name: [values] for name, (_, values) in pairs.items()}
+    found = {name: locate(residuals[name], coordinates[name]) for name in pairs}
+    drawn = {one.name: one for one in draw_residuals(residuals, coordinates, found, unit)}
+    assert list(drawn) == ["residual_torque", "residual_motor", "residual_load", "residual_spectrum"]
+    above, below = drawn["residual_torque"].figure.axes
+    assert describe(found["motor"], unit) in above.get_title("left")
+    assert "nothing beyond noise" in below.get_title("left")
+    assert above.get_ylabel().endswith(f"({unit})")
+    assert drawn["residual_motor"].figure.axes[0].get_xlabel() == "speed ω (rad/s)"
+    marks = [text.get_text() for text in drawn["residual_spectrum"].figure.axes[0].texts]
+    assert any(text.startswith("11 Hz") for text in marks)
+    for one in drawn.values():
+        assert save(one.figure, tmp_path / f"{one.name}.png").stat().st_size > 10_000
+        assert one.caption.endswith(".")
