@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from .candidates import Candidate, Numbers
 
@@ -88,12 +89,12 @@ class Scorer:
         towards = towards - precision * centre
         total = total + float(precision @ centre**2)
         size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-        unit = matrix / np.outer(size, size)
-        values, vectors = np.linalg.eigh(unit)
-        values = np.maximum(values, 1e-13)
-        inside = vectors.T @ (towards / size)
-        coefficients = -(vectors @ (inside / values)) / size
-        cost = total - float(inside @ (inside / values))
+        # columns may be all but alike
+        unit = matrix / np.outer(size, size) + 1e-12 * np.eye(len(size))
+        root = np.linalg.cholesky(unit)
+        inside = solve_triangular(root, towards / size, lower=True)
+        coefficients = -solve_triangular(root, inside, lower=True, trans=1) / size
+        cost = total - float(inside @ inside)
         amount = np.isfinite(c.scale[chosen])
         numbers, place = [], len(self.base)
         for i in which:
@@ -103,7 +104,7 @@ class Scorer:
                 return None
             numbers.append(found)
             place += width
-        spread = float(np.sum(np.log(values))) + 2.0 * float(np.sum(np.log(size)))
+        spread = 2.0 * float(np.sum(np.log(np.diag(root)))) + 2.0 * float(np.sum(np.log(size)))
         prior = 2.0 * float(np.sum(np.log(c.scale[chosen][amount])))
         evidence = -0.5 * (cost + spread + prior)
         misfit = cost - float(precision @ (coefficients - centre) ** 2)

@@ -22,7 +22,7 @@ from jaxbl.identification.trajectory import Free, free_parameters
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
-from .candidates import SHARE, Candidate, Numbers, variants_of
+from .candidates import SHARE, Numbers, variants_of
 from .evidence import Scorer, Set, search
 from .linear import Linear
 from .remainder import functions_of
@@ -32,15 +32,17 @@ Names = tuple[str, ...]
 
 Verdict = Literal["explained", "no_discrepancy", "unknown_effect"]
 
-ODDS = -3.0
+ODDS = -2.0
 """Log prior odds of each effect to be missing."""
 _FINALISTS = 5
 _BEHIND = 0.5
 """Share of the best gain in evidence that a finalist must reach (or be within :data:`_NEAR`)."""
 _NEAR = 25.0
-_STEPS = 8
+_STEPS = 15
 _SETTLED = 2e-3
 _LEAST_CHANCE = 0.01
+_CLEAR = 10.0
+"""Nats that a free function must earn to tell that something else is missing."""
 _SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
 _MOST = 4
 FLOOR = 0.004
@@ -118,6 +120,17 @@ class _Finalist(NamedTuple):
     gain: float
 
 
+class _Point(NamedTuple):
+    """A model at some numbers: sum of squares with the prior's, and the linear step from there."""
+
+    experiment: Experiment
+    linear: Linear
+    values: dict[str, Numbers]
+    theta: Array
+    found: Set
+    cost: float
+
+
 class Explainer:
     """A record, a nominal model, and the models tried."""
 
@@ -146,36 +159,60 @@ class Explainer:
         self, names: Names, numbers: Mapping[str, Numbers], theta: Array, smoothness: Sequence[float], deviation: Array
     ) -> Model:
         """Put effects into the model and refit everything."""
-        count = len(self.free)
         values = {name: dict(numbers[name]) for name in names}
-        linear = None
-        for step in range(_STEPS):
-            experiment = _with_effects(self.nominal, values)
-            linear = self.linear(experiment, names, theta)
-            columns = linear.columns((), smoothness, deviation)
-            scale = columns.scale.copy()
-            paths = _paths(experiment, names)
-            sizes = linear.sizes(names)
-            for i, path in enumerate(paths):
-                amplitude = path.rsplit(".", 1)[1] in _AMPLITUDES
-                if amplitude:
-                    name = path.removeprefix("effects.").rsplit(".", 1)[0]
-                    scale[1 + count + i] = sizes[name]
-            if not np.isfinite(columns.products).all() or not np.isfinite(scale[1:]).all():
-                return Model(names, experiment, values, theta, -np.inf, np.inf, linear)
-            found = Scorer(dataclasses.replace(columns, scale=scale), ())(())
-            assert found is not None
-            change = np.clip(found.own, -1.0, 1.0)
-            done = step > 0 and np.max(np.abs(change), initial=0.0) < _SETTLED
-            if done or step == _STEPS - 1:
+        best: _Point | None = None
+        change = np.zeros(0)
+        for _ in range(_STEPS):
+            point = self._point(names, values, theta, smoothness, deviation)
+            if best is None or point.cost < best.cost:
+                if not np.isfinite(point.cost):
+                    break
+                best, change = point, np.clip(point.found.own, -1.0, 1.0)
+            else:
+                change = 0.25 * change
+            if np.max(np.abs(change), initial=0.0) < _SETTLED:
                 break
-            theta = theta + change[:count]
-            for path, one, by in zip(paths, linear.free[count:], change[count:], strict=True):
-                name, leaf = path.removeprefix("effects.").rsplit(".", 1)
-                values[name][leaf] = float(one.value(by))
-        assert linear is not None
+            theta, values = self._moved(best, change)
+        if best is None:
+            return Model(names, point.experiment, values, theta, -np.inf, np.inf, point.linear)
+        experiment, linear, found, values, theta = best.experiment, best.linear, best.found, best.values, best.theta
+        if any(one.get("breakaway_torque", np.inf) <= one.get("torque", 0.0) for one in values.values()):
+            # then it is Coulomb's
+            return Model(names, experiment, values, theta, -np.inf, np.inf, linear)
         evidence = found.log_evidence + len(names) * ODDS - sum(linear.choices(name) for name in names)
         return Model(names, experiment, values, theta, evidence, found.misfit, linear)
+
+    def _point(
+        self,
+        names: Names,
+        values: dict[str, Numbers],
+        theta: Array,
+        smoothness: Sequence[float],
+        deviation: Array,
+    ) -> _Point:
+        """Cost at some numbers, and where the linear step leads."""
+        experiment = _with_effects(self.nominal, values)
+        linear = self.linear(experiment, names, theta)
+        columns = linear.columns((), smoothness, deviation)
+        scale, sizes = columns.scale.copy(), linear.sizes(names)
+        for i, path in enumerate(_paths(experiment, names), 1 + len(self.free)):
+            name, leaf = path.removeprefix("effects.").rsplit(".", 1)
+            if leaf in _AMPLITUDES:
+                scale[i] = sizes[name]
+        if not np.isfinite(columns.products).all() or not np.isfinite(scale[1:]).all():
+            return _Point(experiment, linear, values, theta, Set((), -np.inf, np.inf, (), np.zeros(0)), np.inf)
+        found = Scorer(dataclasses.replace(columns, scale=scale), ())(())
+        assert found is not None
+        cost = float(columns.products[0, 0] + np.sum((theta / self.prior) ** 2))
+        return _Point(experiment, linear, values, theta, found, cost)
+
+    def _moved(self, point: _Point, change: Array) -> tuple[Array, dict[str, Numbers]]:
+        count = len(self.free)
+        values = {name: dict(numbers) for name, numbers in point.values.items()}
+        for one, by in zip(point.linear.free[count:], change[count:], strict=True):
+            name, leaf = one.path.removeprefix("effects.").rsplit(".", 1)
+            values[name][leaf] = float(one.value(by))
+        return point.theta + change[:count], values
 
     def run(self) -> Explanation:
         """Find what is missing."""
@@ -186,7 +223,7 @@ class Explainer:
         findings: list[Finding] = []
         wrong: Model | None = None
         while len(findings) < _MOST:
-            smoothness, tried = self._round(current, smoothness)
+            smoothness, tried = self._round(current)
             if not tried or tried[0][0] <= 0.0:
                 break
             chances = _softmax(np.array([gain for gain, _ in tried]))
@@ -196,18 +233,34 @@ class Explainer:
                 for (_, model), chance in zip(others, chances[1:], strict=True)
                 if chance > _LEAST_CHANCE
             )
+            current, gone = self._pruned(current, smoothness)
+            findings = [one for one in findings if one.effect not in gone]
             findings.append(Finding(current.names[-1], float(chances[0]), current.numbers[current.names[-1]], alternatives))
             wrong = others[0][1] if others else None
         findings = [dataclasses.replace(one, numbers=current.numbers[one.effect]) for one in findings]
         rest = self.remainder(current, smoothness)
         verdict: Verdict = "explained" if findings else "no_discrepancy"
-        if any(gain > 0.0 for gain, _ in rest.values()):
+        if any(gain > _CLEAR for gain, _ in rest.values()):
             verdict = "unknown_effect"
         return Explanation(verdict, tuple(findings), current, nominal, wrong, rest)
 
-    def _round(self, current: Model, smoothness: Sequence[float]) -> tuple[list[float], list[tuple[float, Model]]]:
+    def _pruned(self, model: Model, smoothness: Sequence[float]) -> tuple[Model, set[str]]:
+        """A model without the earlier effects that a later one has made needless, and their names."""
+        gone: set[str] = set()
+        for name in model.names[:-1]:
+            deviation = model.linear.deviation(smoothness)
+            names = tuple(one for one in model.names if one != name)
+            full = self.refit(model.names, model.numbers, model.theta, smoothness, deviation)
+            less = self.refit(names, model.numbers, model.theta, smoothness, deviation)
+            if self._gain(less, full) <= 0.0:
+                model, gone = less, gone | {name}
+        return model, gone
+
+    def _round(self, current: Model) -> tuple[list[float], list[tuple[float, Model]]]:
         """Models with one effect more, and what each earns (nats), best first."""
-        smoothness, deviation, finalists = self._screen(current, smoothness)
+        smoothness, deviation = current.linear.choose(())
+        current = self.refit(current.names, current.numbers, current.theta, smoothness, deviation)
+        smoothness, deviation, finalists = self._screen(current)
         if not finalists:
             return smoothness, []
         base = self.refit(current.names, current.numbers, current.theta, smoothness, deviation)
@@ -248,14 +301,14 @@ class Explainer:
         gain = model.log_evidence - base.log_evidence
         return gain - min(max(explained, 0.0), self.floor) if np.isfinite(gain) else -np.inf
 
-    def _screen(self, model: Model, smoothness: Sequence[float]) -> tuple[list[float], Array, list[_Finalist]]:
+    def _screen(self, model: Model) -> tuple[list[float], Array, list[_Finalist]]:
+        """Candidates that do well on the linearised model, and the predictor to judge them by: with the best of them in."""
         linear = model.linear
-        chosen: Sequence[Candidate] = ()
+        smoothness, deviation = linear.choose(())
+        variants = variants_of(model.experiment, linear.grids(linear.frequencies(smoothness, deviation)))
+        variants = [one for one in variants if not _same(one.name, model.names)]
         finalists: list[_Finalist] = []
         for _ in range(2):
-            smoothness, deviation = linear.choose(chosen)
-            variants = variants_of(model.experiment, linear.grids(linear.frequencies(smoothness, deviation)))
-            variants = [one for one in variants if not _same(one.name, model.names)]
             scorer = Scorer(linear.columns(variants, smoothness, deviation), variants)
             sets = search(scorer, 1, odds=ODDS)
             none = scorer(())
@@ -273,8 +326,9 @@ class Explainer:
                 for name, (gain, one) in ordered[:_FINALISTS]
                 if gain > 0.0
             ]
-            chosen = [variants[ordered[0][1][1].which[0]]]
-        smoothness, deviation = linear.choose(chosen)
+            smoothness, deviation = linear.choose([variants[ordered[0][1][1].which[0]]])
+            few = {name for name, _ in ordered[: 2 * _FINALISTS]}
+            variants = [one for one in variants if one.name in few]
         return smoothness, deviation, finalists
 
 

@@ -88,6 +88,8 @@ def _part(
     held = {side: padded(_held(smoothed[side], experiment, states[side][:count])) for side in sides}
     read = jnp.stack([padded(readings[side]) - states[side][:, 0] for side in sides], axis=1)
     weight = jnp.asarray((np.arange(size) < count).astype(float))
+    # as arrays, so that one compiled program serves all numbers
+    free = tuple(one._replace(nominal=jnp.asarray(one.nominal), scale=jnp.asarray(one.scale)) for one in free)
     return _derivatives(experiment, free, theta, padded(time), padded(torque), read, states, deviation, held, weight)
 
 
@@ -228,6 +230,8 @@ def _gradient(part: Part, gain: Array, left: Array) -> Array:
 _SMOOTHNESS = 10.0 ** np.arange(-11.0, 1.0)
 _LEAST = 1e-11
 _FINE = 10.0 ** np.array([-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0])
+OFF = 0.5
+"""Prior size of the error of an inertia or a viscous friction, relative."""
 _FREQUENCIES, _COARSE, _HARMONICS = 8, 16, 40
 
 
@@ -318,6 +322,14 @@ class Linear:
                 )
         return smoothness, deviation
 
+    def deviation(self, smoothness: Sequence[float]) -> np.ndarray:
+        """Rms of the prediction errors, rad, by side, with a given predictor."""
+        none = np.zeros((1, len(self.sides) + 1, 0))
+        errors = []
+        for part, signals in zip(self.parts, self.signals, strict=True):
+            errors.append(np.asarray(_errors(part, self.gain(smoothness), jnp.asarray(np.repeat(none, signals.count, 0)))))
+        return np.sqrt(self._squares(errors) / self.count)
+
     def _squares(self, errors: list[np.ndarray]) -> np.ndarray:
         """Sums of squared prediction errors by side, after least squares on all columns."""
         sides, own, width = len(self.sides), len(self.free), errors[0].shape[2] - 1 - self.states
@@ -387,13 +399,20 @@ class Linear:
             every = np.concatenate([np.zeros((signals.count, len(self.sides) + 1, 0)), *pieces], axis=2)
             power += self._power(every, signals)
             errors = np.asarray(_errors(part, gain, jnp.asarray(every))) / deviation[None, :, None]
-            rest = _without(errors.reshape(-1, errors.shape[2]), self.states)
-            total += rest.T @ rest
+            for one, place in zip(variants, places, strict=True):
+                # the error of a number that is free acts as that number does, dry friction or not
+                if (i := self.same(one.name)) is not None:
+                    errors[:, :, place[0]] = errors[:, :, 1 + i] / float(self.free[i].slope(self.theta[i]))
+            flat = errors.reshape(-1, errors.shape[2])
+            inside = _basis(flat[:, -self.states :]).T @ flat[:, : -self.states]
+            total += flat[:, : -self.states].T @ flat[:, : -self.states] - inside.T @ inside
         size = SHARE * self.drive / np.sqrt(np.maximum(power / self.count, 1e-300))
         scale = np.concatenate([[np.inf], self.prior, size])
         for one, place in zip(variants, places, strict=True):
             if one.offset:
                 scale[list(place)] = 0.3
+            elif (nominal := self.nominal(one.name)) is not None:
+                scale[list(place)] = np.minimum(scale[list(place)], OFF * nominal)
         centre = np.zeros(at)
         centre[1 : 1 + own] = self.centre
         return Columns(total, own, 0, tuple(places), tuple(offsets), scale, centre, self.count * len(self.sides))
@@ -410,16 +429,37 @@ class Linear:
             (effect,) = (one for one in self.experiment.effects if one.name == name)
             power = sum(self._power(signals.of(effect, True)[:, :, None], signals)[0] for signals in self.signals)
             found[name] = SHARE * self.drive / np.sqrt(max(power / self.count, 1e-300))
+            if (nominal := self.nominal(name)) is not None:
+                (value,) = (abs(float(getattr(effect, leaf))) for leaf in ("inertia", "viscous") if hasattr(effect, leaf))
+                found[name] = min(found[name], OFF * nominal / max(value, 1e-300))
         return found
+
+    def same(self, name: str) -> int | None:
+        """Index of the model's own number that an effect is the error of."""
+        side, _, kind = name.partition(".")
+        path = f"drive.{side}_{kind.removesuffix('_friction')}" if kind in ("inertia", "viscous_friction") else ""
+        return next((i for i, one in enumerate(self.free) if one.path == path), None)
+
+    def nominal(self, name: str) -> float | None:
+        """The number of the drive that an effect is the error of, if it is one and is not zero."""
+        side, _, kind = name.partition(".")
+        if kind not in ("inertia", "viscous_friction"):
+            return None
+        drive = self.experiment.drive
+        value = float(drive.inertia(side) if kind == "inertia" else drive.viscous(side))
+        return value if value > 0.0 else None
 
 
 def _flat(columns: np.ndarray, offset: np.ndarray | None) -> np.ndarray:
     return columns if offset is None else np.concatenate([columns, offset[:, :, None]], axis=2)
 
 
+def _basis(values: np.ndarray) -> np.ndarray:
+    size = np.sqrt(np.sum(values**2, axis=0))
+    return np.linalg.qr(values / np.where(size > 0.0, size, 1.0))[0]
+
+
 def _without(values: np.ndarray, states: int) -> np.ndarray:
     """The first columns less what the last, the initial states, explain."""
-    last = values[:, -states:]
-    size = np.sqrt(np.sum(last**2, axis=0))
-    basis, _ = np.linalg.qr(last / np.where(size > 0.0, size, 1.0))
+    basis = _basis(values[:, -states:])
     return values[:, :-states] - basis @ (basis.T @ values[:, :-states])

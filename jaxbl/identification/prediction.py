@@ -8,7 +8,7 @@ References: L. Ljung, System Identification (1999), 7.4, 7.5; Y. Bar-Shalom, X.-
 """
 
 import dataclasses
-from functools import partial
+from functools import cache, partial
 
 import equinox as eqx
 import jax
@@ -26,6 +26,7 @@ _FINE = 10.0 ** np.arange(-2.0, 2.1, 0.5)
 _MOST_WINDOWS = 40
 
 
+@cache
 def kalman_gain(smoothness: float, period: float) -> np.ndarray:
     """Steady-state gain on position (1) and velocity (1/s) for a smoothness q h^3 / sigma^2; shape (2,)."""
     f = np.array([[1.0, 1.0], [0.0, 1.0]])
