@@ -9,10 +9,7 @@ with the recursive identifier (27)-(28) on their equivalent control.
 # pyright: reportArgumentType=false, reportCallIssue=false
 
 import dataclasses
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +30,19 @@ from jaxbl.simulate import Experiment, Signals, State, replay
 
 from .config import Config, read_model, with_values
 from .engine import Progress
-from .logs import LOG_NAMES, Logs, arrays, decimation, default_paths, gains_for, kinematics_of, on_record, read_logs, unit_on
+from .logs import (
+    LOG_NAMES,
+    Logs,
+    arrays,
+    decimation,
+    default_paths,
+    gains_for,
+    identity_of,
+    kinematics_of,
+    on_record,
+    read_logs,
+    unit_on,
+)
 from .store import plain
 
 
@@ -80,14 +89,7 @@ class Task:
     @property
     def identity(self) -> str:
         """Hash of everything that decides the result."""
-        text = json.dumps([self.config.resolved(), sorted(self.missing), version("jaxbl")], sort_keys=True)
-        total = hashlib.sha256(text.encode())
-        for record in (self.record, self.holdout):
-            if record is not None:
-                total.update(str(record.segments).encode())
-                for values in (record.time, record.torque, *record.positions.values(), record.transmitted):
-                    total.update(b"" if values is None else np.ascontiguousarray(values).tobytes())
-        return total.hexdigest()[:16]
+        return identity_of(self.config, self.missing, self.record, self.holdout)
 
 
 def read_task(

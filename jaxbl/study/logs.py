@@ -1,7 +1,10 @@
 """What commands on measured logs share: reading, the study's experiment at a log's period, kinematics, gains, units."""
 
 import dataclasses
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 
 import equinox as eqx
@@ -49,6 +52,18 @@ def _read_one(config: Config, log: str | Path, gear_tolerance: float) -> Record:
         notes = (*record.notes, "No input torque was recorded: the drive is taken to move freely, without one.")
         record = dataclasses.replace(record, torque=np.zeros(len(record.time)), notes=notes)
     return record
+
+
+def identity_of(config: Config, missing: frozenset[str], *records: Record | None) -> str:
+    """Hash of a study and logs: of everything that decides what is found in them."""
+    text = json.dumps([config.resolved(), sorted(missing), version("jaxbl")], sort_keys=True)
+    total = hashlib.sha256(text.encode())
+    for record in records:
+        if record is not None:
+            total.update(str(record.segments).encode())
+            for values in (record.time, record.torque, *record.positions.values(), record.transmitted):
+                total.update(b"" if values is None else np.ascontiguousarray(values).tobytes())
+    return total.hexdigest()[:16]
 
 
 def arrays(values: Mapping[str, float]) -> dict[str, jax.Array]:
