@@ -56,7 +56,7 @@ def _over_time(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, 
         one = found[name]
         for i, part in enumerate(parts):
             low, _ = _shown(part, one)
-            time, torque, band = _outline(low.time, low.torque, 2.0 * low.deviation)
+            time, torque, band = outline(low.time, low.torque, 2.0 * low.deviation)
             ax.plot(time, torque, color=_COLOUR[name], lw=0.9, label="missing" if i == 0 else None, zorder=2)
             ax.fill_between(time, -band, band, color=_BAND, alpha=0.75, lw=0.0, zorder=3, label=None if i else "± 2 noise")
         ax.axhline(0.0, color=_FAINT, lw=0.8, zorder=1)
@@ -76,7 +76,7 @@ def _what(unit: str) -> str:
     return "force" if unit == "N" else "torque"
 
 
-def _outline(time: np.ndarray, torque: np.ndarray, band: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def outline(time: np.ndarray, torque: np.ndarray, band: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fewer points that draw the same line: least and largest of each of many bins."""
     size = len(time) // (_POINTS // 2)
     if size < 3:

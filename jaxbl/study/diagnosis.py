@@ -77,9 +77,11 @@ class Diagnosis:
         summary: as in `diagnosis.json`.
         trace: one row a sample of the log: `t`, `u`, positions, `held_out`, and on each side the torque that the model lacks
             as given (`motor.missing_before`) and with the effects (`motor.missing_after`) with its `motor.noise`, N m.
-        residuals: torques that the model as given lacks, by side, of each part.
+        residuals: torques that the model as given lacks, by side, of each part that was fitted.
         coordinates: along them, by side, of each part.
         located: where they live, by side.
+        pairs: torques that the model lacks as given and with the effects, by side, of each part, and whether it was held
+            out; where that is another log, of that alone.
         replays: whether the model's excitation is to be the log's, for want of one in the study.
     """
 
@@ -92,6 +94,7 @@ class Diagnosis:
     residuals: dict[str, list[Residual]]
     coordinates: dict[str, list[dict[str, Values]]]
     located: dict[str, Localised]
+    pairs: dict[str, list[tuple[Residual, Residual, bool]]]
     replays: bool
 
 
@@ -297,8 +300,15 @@ def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
             summary["rival"] = _rival(config, own, rival)
         done()
     replays = "excitation" in task.missing
+    pairs = {
+        side: [
+            *((one, left, False) for one, left in zip(lacking[side], missing_after[side], strict=True) if not task.separate),
+            *((one, left, True) for one, left in zip(before.torques[side], after.torques[side], strict=True)),
+        ]
+        for side in lacking
+    }
     return Diagnosis(
-        config, model, record, task.holdout, plain(summary), trace, lacking, coordinates, located, replays
+        config, model, record, task.holdout, plain(summary), trace, lacking, coordinates, located, pairs, replays
     )  # fmt: skip
 
 
