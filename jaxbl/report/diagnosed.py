@@ -72,9 +72,9 @@ def verdict_sentence(summary: Mapping[str, Any]) -> str:
         return f"Explained: the model lacks {names}; with {'it' if len(summary['findings']) == 1 else 'them'} noise is left."
     if summary["verdict"] == "no_discrepancy":
         return "No discrepancy: the model leaves nothing but noise."
-    where = "; ".join(one["sentence"] for one in summary["where"].values())
+    where = "; ".join(one["sentence"] for one in summary.get("where_after", summary["where"]).values())
     if names:
-        return f"Unknown effect: {names} is missing, but explains not all of it. The model as given leaves: {where}."
+        return f"Unknown effect: {names} is missing, but does not explain all of it. What is left: {where}."
     return f"Unknown effect: something is missing that is none of the effects known. It lives: {where}."
 
 
@@ -119,7 +119,7 @@ def _value(value: float | None) -> str:
 
 def _remarks(summary: dict[str, Any]) -> list[str]:
     lines = []
-    if summary["verdict"] != "unknown_effect":
+    if summary["verdict"] != "unknown_effect" or summary["findings"]:
         lines += [f"The model as given leaves: {one['sentence']}." for one in summary["where"].values()]
     left = {name: one for name, one in summary["rest"].items() if one["evidence"] is not None and one["evidence"] > 0.0}
     for name, one in sorted(left.items(), key=lambda pair: -pair[1]["evidence"]):
@@ -194,8 +194,8 @@ def _story(summary: Mapping[str, Any]) -> Drawn:
     _chances_panel(right, bars)
     caption = (
         f"{verdict_sentence(summary)} Left: rms error on held-out data over the channel's noise; arrows lead from the model "
-        "as given to the model with the missing effects. Black line: noise, which a perfect model would leave. Controls: the "
-        "best model with another effect, and the added torque in the wrong order of time, which must not help. Right: "
+        "as given to the model with the missing effects. Black line: noise, which a perfect model would leave. Controls: "
+        "the best model with another effect, and the added torque in the wrong order of time, which must not help. Right: "
         "probability of each effect, with what this log does not rule out in its place."
     )
     return Drawn("gap", figure, caption)

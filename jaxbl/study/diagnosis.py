@@ -290,12 +290,17 @@ def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
         gap = proving.gap(fitted, after, rival)
         done()
         missing_after = seen.torques(fitted.experiment)
+        left: dict[str, Localised] = {}
+        if verdict == "unknown_effect":
+            left = where(fitted.experiment, missing_after, seen.parts, seen.smoothed, rotating=_rotating(record, nominal))
         trace = _trace(task, (lacking, missing_after), (before.torques, after.torques))
         done()
         _, gain_values = gains_for(task.missing, fitted.experiment, record, seen.channels)
         model = _model(config, names, fitted.values, gain_values)
         summary = _summary(task, fitted, found, findings, verdict, withdrawn, located)
         summary["gap"] = gap
+        if left:
+            summary["where_after"] = _lives(record, left)
         if rival is not None:
             summary["rival"] = _rival(config, own, rival)
         done()
@@ -572,10 +577,7 @@ def _summary(
     located: Mapping[str, Localised],
 ) -> dict[str, Any]:
     record = task.record
-    torque_unit = {side: unit_on(record, f"{side}.torque", "N m") for side in located}
-    lives = as_json(located)
-    for side, one in located.items():
-        lives[side]["sentence"] = describe(one, torque_unit[side])
+    lives = _lives(record, located)
     values, errors = fitted.values, fitted.errors()
     notes = list(record.notes)
     if task.separate:
@@ -584,7 +586,7 @@ def _summary(
     if task.separate and any(one.effect == "load.periodic_disturbance" for one in findings):
         notes.append("The phase of load.periodic_disturbance is taken to be the same at the start of both logs.")
     if verdict == "no_discrepancy":
-        notes += _least_seen(record, located, torque_unit)
+        notes += _least_seen(record, located)
     own = [one for one in fitted.free if not any(one.path.startswith(f"effects.{name}.") for name in fitted.names)]
     return {
         "title": task.config.title,
@@ -640,9 +642,16 @@ def _finding(
     }
 
 
-def _least_seen(record: Record, located: Mapping[str, Localised], unit: Mapping[str, str]) -> list[str]:
+def _lives(record: Record, located: Mapping[str, Localised]) -> dict[str, Any]:
+    """Where missing torques live, with sentences in the log's units."""
+    told = {name: describe(one, unit_on(record, f"{name}.torque", "N m")) for name, one in located.items()}
+    return {name: one | {"sentence": told[name]} for name, one in as_json(located).items()}
+
+
+def _least_seen(record: Record, located: Mapping[str, Localised]) -> list[str]:
     """What would not have been seen, and whether that is nearly everything."""
     assert record.torque is not None
+    unit = {side: unit_on(record, f"{side}.torque", "N m") for side in located}
     driving = float(np.sqrt(np.mean(np.square(record.torque))))
     lines = []
     for side, one in located.items():

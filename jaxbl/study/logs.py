@@ -1,5 +1,8 @@
 """What commands on measured logs share: reading, the study's experiment at a log's period, kinematics, gains, units."""
 
+# arrays of numpy go where those of jax are asked for
+# pyright: reportArgumentType=false
+
 import dataclasses
 import hashlib
 import json

@@ -71,5 +71,6 @@ def write_next_experiment(folder: Path, summary: Mapping[str, Any], record: Reco
     clear = "" if found.apart > _CLEAR else "; that is little: larger torques, or finer encoders, would be needed"
     return [
         f"To part {pair[0]} from {pair[1]}: {found.kind} of {found.amplitude:.3g} N m, {found.frequency:.3g} Hz, "
-        f"{time[-1] + record.sample_period:.3g} s; their positions differ by {found.apart:.3g} times the noise{clear}: {path}"
+        f"{time[-1] + record.sample_period:.3g} s; their positions differ by {found.apart:.3g} times the noise{clear}: "
+        f"{path}"
     ]
