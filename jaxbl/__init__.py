@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from .records import Record as Record
     from .records import inspect as inspect
     from .records import read_record as read_record
+    from .report import write_diagnosis_report as write_diagnosis_report
     from .report import write_identification_report as write_identification_report
     from .report import write_inspection_report as write_inspection_report
     from .report import write_sweep_report as write_sweep_report
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from .report import write_verify_report as write_verify_report
     from .study.config import Config as Config
     from .study.config import read_config as read_config
+    from .study.diagnosis import Diagnosis as Diagnosis
+    from .study.diagnosis import diagnose as diagnose
     from .study.identification import Identification as Identification
     from .study.identification import identify as identify
     from .study.laws import Law as Law
@@ -44,6 +47,7 @@ _WHERE = {
     "Record": "records",
     "inspect": "records",
     "read_record": "records",
+    "write_diagnosis_report": "report",
     "write_identification_report": "report",
     "write_inspection_report": "report",
     "write_sweep_report": "report",
@@ -52,6 +56,8 @@ _WHERE = {
     "write_verify_report": "report",
     "Config": "study.config",
     "read_config": "study.config",
+    "Diagnosis": "study.diagnosis",
+    "diagnose": "study.diagnosis",
     "Identification": "study.identification",
     "identify": "study.identification",
     "Law": "study.laws",

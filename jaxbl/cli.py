@@ -198,14 +198,135 @@ def identify(
     again = ["identify", *map(str, log), "--model", str(model)]
     again += ["--holdout", str(holdout)] if holdout is not None else []
     again += ["--profile"] * bool(profile) + ["--overwrite"] * overwrite
+    with _leaving_nothing(folder), _running(again, model, folder, unit="steps", kept=False) as progress:
+        lines = write_identification_report(run_task(task, progress), folder)
+    _tell(lines, folder)
+
+
+@app.command()
+def diagnose(
+    log: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[LOG...]", help="CSV, Parquet, MATLAB or JSON files of one machine", show_default=False),
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option("--model", metavar="TOML", help="study with nominal numbers, [uncertainty] and [log]")
+    ] = None,
+    holdout: Annotated[
+        Path | None,
+        typer.Option(
+            "--holdout", metavar="LOG2", help="log of the same machine for the proof [default: the log's last quarter]"
+        ),
+    ] = None,
+    batch: Annotated[
+        Path | None,
+        typer.Option(
+            "--batch", metavar="FOLDER", help="diagnose every log of a folder; NAME.toml beside NAME.csv is its model"
+        ),
+    ] = None,
+    next_experiment: Annotated[
+        Path | None,
+        typer.Option("--next-experiment", metavar="FILE.csv", help="write the input that would part tied effects"),
+    ] = None,
+    out: LogOutOption = None,
+    overwrite: LogOverwriteOption = False,
+) -> None:
+    """Find what a model lacks, name it, add it, and prove on held-out data that the gap shrinks."""
+    if batch is not None:
+        if log or holdout is not None or next_experiment is not None:
+            raise InputError("--batch FOLDER takes no logs, --holdout or --next-experiment; give these one by one")
+        _start_jax()
+        _diagnose_batch(batch, model, out if out is not None else Path("results") / batch.name, overwrite)
+        return
+    if not log:
+        raise InputError("diagnose: no log; give one or several of one machine, or a folder with --batch")
+    if model is None:
+        raise InputError("diagnose: no model; give a study with nominal numbers: --model TOML")
+    _start_jax()
+    from .report import diagnosis_lines, write_diagnosis_report
+    from .study.diagnosis import read_task, run_task
+
+    task = read_task(log, model, holdout=holdout)
+    folder = _folder(log[0], out)
+    _claim_for_log(folder, log[0], overwrite=overwrite)
+    finished = _finished(folder / "diagnosis.json", task.identity)
+    if finished is None:
+        again = ["diagnose", *map(str, log), "--model", str(model)]
+        again += ["--holdout", str(holdout)] if holdout is not None else []
+        again += ["--next-experiment", str(next_experiment)] if next_experiment is not None else []
+        with (
+            _leaving_nothing(folder),
+            _running(again + ["--overwrite"] * overwrite, model, folder, unit="steps", kept=False) as progress,
+        ):
+            found = run_task(task, progress)
+            lines, finished = write_diagnosis_report(found, folder), found.summary
+    else:
+        lines = diagnosis_lines(finished)
+    if next_experiment is not None:
+        from .study.next_experiment import write_next_experiment
+
+        lines += write_next_experiment(folder, finished, task.record, next_experiment)
+    _tell(lines, folder)
+
+
+_LOGS = (".csv", ".parquet", ".mat")
+
+
+def _diagnose_batch(source: Path, model: Path | None, out: Path, overwrite: bool) -> None:
+    """Diagnose all logs of a folder, each into a folder of its own; go on where an earlier call stopped."""
+    from .report.diagnosed import batch_row, write_batch, write_diagnosis_report
+    from .study.diagnosis import read_task, run_task
+    from .study.store import make_folder
+
+    if not source.is_dir():
+        raise InputError(f"{source}: no such folder; --batch needs one with logs ({', '.join(_LOGS)})")
+    logs = sorted(file for file in source.iterdir() if file.suffix.lower() in _LOGS)
+    if not logs:
+        raise InputError(f"{source}: holds no log ({', '.join(_LOGS)})")
+    stems = [file.stem for file in logs]
+    for name in stems:
+        if stems.count(name) > 1:
+            raise InputError(f"{source}: two logs are called {name}; each needs a name of its own for its results")
+    models = {file: own if (own := file.with_suffix(".toml")).exists() else model for file in logs}
+    bare = next((file for file, own in models.items() if own is None), None)
+    if bare is not None:
+        raise InputError(f"{bare}: no model; give --model TOML, or {bare.with_suffix('.toml').name} beside it")
+    make_folder(out)
+    held = {file.stem: file for file in (source / "holdout").glob("*") if file.suffix.lower() in _LOGS}
+    rows = []
+    words = ["diagnose", "--batch", str(source), *(["--model", str(model)] if model else []), *["--overwrite"] * overwrite]
+    with _running(words, model or source, out, unit="logs") as progress:
+        for i, file in enumerate(logs):
+            progress(i, len(logs))
+            folder = out / file.stem
+            try:
+                task = read_task(file, models[file], holdout=held.get(file.stem))  # pyright: ignore[reportArgumentType]
+                _claim_for_log(folder, file, overwrite=overwrite)
+                finished = _finished(folder / "diagnosis.json", task.identity)
+                if finished is None:
+                    with _leaving_nothing(folder):
+                        found = run_task(task)
+                        write_diagnosis_report(found, folder)
+                    finished = found.summary
+                rows.append(batch_row(file, finished))
+            except InputError as error:
+                rows.append(batch_row(file, None, str(error)))
+    for line in write_batch(rows, out):
+        typer.echo(line)
+    typer.echo(f"{out / 'batch.csv'}")
+    if all(row["refused"] for row in rows):
+        raise typer.Exit(2)
+
+
+@contextmanager
+def _leaving_nothing(folder: Path) -> Iterator[None]:
+    """Remove a folder that is still empty when something goes wrong."""
     try:
-        with _running(again, model, folder, unit="steps", kept=False) as progress:
-            lines = write_identification_report(run_task(task, progress), folder)
+        yield
     except BaseException:
         with suppress(OSError):  # not empty: it was there before
             folder.rmdir()
         raise
-    _tell(lines, folder)
 
 
 def _finished(file: Path, identity: str) -> dict[str, Any] | None:
@@ -217,7 +338,7 @@ def _finished(file: Path, identity: str) -> dict[str, Any] | None:
     return found if isinstance(found, dict) and found.get("identity") == identity else None
 
 
-_LOG_MARKERS = ("inspection.json", "identification.json")
+_LOG_MARKERS = ("inspection.json", "identification.json", "diagnosis.json")
 
 
 def _claim_for_log(folder: Path, log: Path, *, overwrite: bool) -> None:

@@ -26,9 +26,9 @@ BELOW = {
     "simulate": {"observer", "drive", "errors"},
     "identification": {"simulate", "observer", "drive", "records", "errors"},
 }
-BELOW["study"] = {*BELOW["identification"], "identification"}
 BELOW["discrepancy"] = {*BELOW["identification"], "identification"}
-BELOW["report"] = {*BELOW["study"], "study", "discrepancy"}
+BELOW["study"] = {*BELOW["discrepancy"], "discrepancy"}
+BELOW["report"] = {*BELOW["study"], "study"}
 BELOW["cli"] = {*BELOW["report"], "report"}
 
 

@@ -9,14 +9,12 @@ import json
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
-import tomli_w
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
@@ -25,11 +23,12 @@ from jaxbl.drive.effects import AbstractEffect
 from jaxbl.drive.plant import Plant
 from jaxbl.identification.search import NOISE_ALONE
 from jaxbl.simulate import Experiment
-from jaxbl.study.identification import Identification, unit_on
+from jaxbl.study.identification import Identification
+from jaxbl.study.logs import unit_on
 
 from .maps import SIDES, Drawn
 from .page import TableOf, html
-from .reports import save_all
+from .reports import drafted, save_all, write_model
 from .style import COLOURS, style, with_unit
 
 Array = np.ndarray
@@ -57,25 +56,13 @@ def write_identification_report(found: Identification, folder: Path) -> list[str
 
     They are put there together when all are drawn. Returns the lines for the terminal.
     """
-    with TemporaryDirectory(dir=folder, prefix=".draft.") as draft:
-        lines = _write(found, Path(draft))
-        # last: it marks the folder as finished
-        for file in sorted(Path(draft).rglob("*"), key=lambda one: one.name == "identification.json"):
-            if file.is_file():
-                place = folder / file.relative_to(draft)
-                place.parent.mkdir(exist_ok=True)
-                file.replace(place)
-    return lines
+    return drafted(folder, "identification.json", lambda draft: _write(found, draft))
 
 
 def _write(found: Identification, folder: Path) -> list[str]:
     pictures = save_all(draw_identification(found), folder)
     found.trace.to_parquet(folder / "trace.parquet", index=False)
-    model = found.model.resolved()
-    if found.replays:
-        model["excitation"] = {"kind": "recorded", "file": "trace.parquet", "time_column": "t", "torque_column": "u"}
-    text = tomli_w.dumps(model)
-    (folder / "model.toml").write_text(text, encoding="utf-8")
+    text = write_model(found.model, folder, replays=found.replays)
     lead, remarks = _headline(found.summary), _remarks(found.summary)
     tables = [_parameter_table(found.summary)]
     if "regression" in found.summary["method"]:

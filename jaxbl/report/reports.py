@@ -6,10 +6,14 @@
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pandas as pd
+import tomli_w
 
+from jaxbl.study.config import Config
 from jaxbl.study.laws import AGREEMENT, END_OF_SWEEP, Law, accuracy_laws
 from jaxbl.study.metrics import SIDE_METRICS
 from jaxbl.study.points import Points
@@ -175,6 +179,28 @@ def _number(value: float | None) -> str:
 def save_all(drawn: list[Drawn], folder: Path) -> list[Picture]:
     """Write figures into the folder's `figures/`; with their captions, for the page."""
     return [Picture(save(d.figure, folder / "figures" / f"{d.name}.png"), d.caption) for d in drawn]
+
+
+def drafted(folder: Path, marker: str, write: Callable[[Path], list[str]]) -> list[str]:
+    """Put files into a folder that exists, together when all are written; `marker` last, which says that it is finished."""
+    with TemporaryDirectory(dir=folder, prefix=".draft.") as draft:
+        lines = write(Path(draft))
+        for file in sorted(Path(draft).rglob("*"), key=lambda one: one.name == marker):
+            if file.is_file():
+                place = folder / file.relative_to(draft)
+                place.parent.mkdir(exist_ok=True)
+                file.replace(place)
+    return lines
+
+
+def write_model(model: Config, folder: Path, *, replays: bool) -> str:
+    """Write `model.toml`; where it `replays`, its excitation is that of `trace.parquet` beside it. Returns the text."""
+    data = model.resolved()
+    if replays:
+        data["excitation"] = {"kind": "recorded", "file": "trace.parquet", "time_column": "t", "torque_column": "u"}
+    text = tomli_w.dumps(data)
+    (folder / "model.toml").write_text(text, encoding="utf-8")
+    return text
 
 
 def _axes_table(result: StudyResult) -> TableOf:

@@ -1,6 +1,7 @@
 """Drawing of residual torques: over time with the noise band, over speed, position and twist, and their spectrum."""
 
 from collections.abc import Mapping, Sequence
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ _BAND, _MEAN, _FAINT = "#BDBDBD", COLOURS[6], "#8C8C8C"
 _ABOVE: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1, "columnspacing": 1.2}
 _SHOWN = ("speed", "turn", "load turn", "position", "load position", "twist", "acceleration")
 _PANELS = 3
+_WIDTH = 118
+"""Characters of a line above a figure."""
 _WORTH = 0.1
 """Share of the power from which on a peak is named."""
 
@@ -56,12 +59,12 @@ def _over_time(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, 
         one = found[name]
         for i, part in enumerate(parts):
             low, _ = _shown(part, one)
-            time, torque, band = _outline(low.time, low.torque, 2.0 * low.deviation)
+            time, torque, band = outline(low.time, low.torque, 2.0 * low.deviation)
             ax.plot(time, torque, color=_COLOUR[name], lw=0.9, label="missing" if i == 0 else None, zorder=2)
             ax.fill_between(time, -band, band, color=_BAND, alpha=0.75, lw=0.0, zorder=3, label=None if i else "± 2 noise")
         ax.axhline(0.0, color=_FAINT, lw=0.8, zorder=1)
         ax.set_ylabel(with_unit(f"{name}:\nmissing {_what(unit)}", unit))
-        ax.set_title(f"{describe(one, unit)}\n", loc="left", fontsize=9)
+        ax.set_title(f"{fill(describe(one, unit), _WIDTH)}\n", loc="left", fontsize=9)
         ax.legend(ncols=2, **_ABOVE)
     axes[-1].set_xlabel("time (s)")
     caption = (
@@ -76,8 +79,8 @@ def _what(unit: str) -> str:
     return "force" if unit == "N" else "torque"
 
 
-def _outline(time: np.ndarray, torque: np.ndarray, band: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fewer points that draw the same line: least and largest of each of many bins."""
+def outline(time: np.ndarray, torque: np.ndarray, band: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fewer points that draw the same line: least and largest of each of many bins; time, torque and its band there."""
     size = len(time) // (_POINTS // 2)
     if size < 3:
         return time, torque, band

@@ -9,10 +9,7 @@ with the recursive identifier (27)-(28) on their equivalent control.
 # pyright: reportArgumentType=false, reportCallIssue=false
 
 import dataclasses
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -22,22 +19,31 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from jaxbl.drive.parameters import get_leaf, leaf_paths, set_leaves
-from jaxbl.errors import InputError
-from jaxbl.identification.gains import Gains, choose_gains
+from jaxbl.drive.parameters import leaf_paths, set_leaves
 from jaxbl.identification.intervals import LIMIT, Refusal, Spread, interval, spread
 from jaxbl.identification.profile import Profile, profile
-from jaxbl.identification.regression import Kinematics, errors, from_smoothed, model_torques, regress, shortest
+from jaxbl.identification.regression import Kinematics, errors, from_smoothed, model_torques, regress
 from jaxbl.identification.search import Channels, Found, Search, Settings, smoothed_channels, windows_of
-from jaxbl.identification.trajectory import PHYSICAL, Fit, Free, free_parameters, is_positive, projected_residual
-from jaxbl.records import Record, join, read_record
+from jaxbl.identification.trajectory import Fit, Free, free_parameters, projected_residual
+from jaxbl.records import Record
 from jaxbl.simulate import Experiment, Signals, State, replay
 
 from .config import Config, read_model, with_values
-from .engine import Progress, prepare
+from .engine import Progress
+from .logs import (
+    LOG_NAMES,
+    Logs,
+    arrays,
+    decimation,
+    default_paths,
+    gains_for,
+    identity_of,
+    kinematics_of,
+    on_record,
+    read_logs,
+    unit_on,
+)
 from .store import plain
-
-_LOG_NAMES = {"motor": "theta_e", "load": "theta_s"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,17 +89,7 @@ class Task:
     @property
     def identity(self) -> str:
         """Hash of everything that decides the result."""
-        text = json.dumps([self.config.resolved(), sorted(self.missing), version("jaxbl")], sort_keys=True)
-        total = hashlib.sha256(text.encode())
-        for record in (self.record, self.holdout):
-            if record is not None:
-                total.update(str(record.segments).encode())
-                for values in (record.time, record.torque, *record.positions.values(), record.transmitted):
-                    total.update(b"" if values is None else np.ascontiguousarray(values).tobytes())
-        return total.hexdigest()[:16]
-
-
-Logs = str | Path | Record | Sequence[str | Path | Record]
+        return identity_of(self.config, self.missing, self.record, self.holdout)
 
 
 def read_task(
@@ -113,7 +109,7 @@ def read_task(
     asked = {"parameters": None if parameters is None else list(parameters), "profile": profile}
     given = {key: value for key, value in asked.items() if value is not None}
     config = config.model_copy(update={"identify": config.identify.model_copy(update=given)})
-    return Task(config, missing, _read(config, log), None if holdout is None else _read(config, holdout))
+    return Task(config, missing, read_logs(config, log), None if holdout is None else read_logs(config, holdout))
 
 
 def identify(
@@ -163,8 +159,8 @@ def run_task(task: Task, progress: Progress | None = None) -> Identification:
             progress(stage, _STAGES)
 
     with jax.enable_x64(True):
-        nominal = _on_record(config, record)
-        paths = list(settings.parameters or _default_paths(config, nominal))
+        nominal = on_record(config, record)
+        paths = list(settings.parameters or default_paths(config, nominal))
         free = free_parameters(nominal, paths, float(np.std(record.torque)))
         channels = smoothed_channels(record, nominal.sides)
         done()
@@ -178,15 +174,15 @@ def run_task(task: Task, progress: Progress | None = None) -> Identification:
         if settings.profile:
             profiles = profile(nominal, found.free, found.windows, found.fit, found.spread)
         done()
-        factor = _decimation(config, record)
-        parts = _kinematics(record, channels, factor)
-        gains, gain_values = _gains(task.missing, fitted, record, channels)
-        chain, recursive = _chain(set_leaves(fitted, _arrays(gain_values)), record)
+        factor = decimation(config, record)
+        parts = kinematics_of(record, channels, factor)
+        gains, gain_values = gains_for(task.missing, fitted, record, channels)
+        chain, recursive = _chain(set_leaves(fitted, arrays(gain_values)), record)
         done()
         noise = {side: float(one) for side, one in found.windows.noise.items()}
         trace = pd.DataFrame(
             {"t": record.time, "u": record.torque}
-            | {_LOG_NAMES[side]: record.positions[side] for side in nominal.sides}
+            | {LOG_NAMES[side]: record.positions[side] for side in nominal.sides}
             | ({} if record.transmitted is None else {"transmitted": record.transmitted})
             | _smoothed_columns(channels)
             | _residual_columns(found, record, noise, nominal.sides)
@@ -208,107 +204,11 @@ def run_task(task: Task, progress: Progress | None = None) -> Identification:
     return Identification(config, model, record, plain(summary), trace, "excitation" in task.missing)
 
 
-def _read(config: Config, logs: Logs) -> Record:
-    """Read logs as a study says, with the channels that its identification needs."""
-    several = [logs] if isinstance(logs, str | Path | Record) else list(logs)
-    if not several:
-        raise InputError("no log: at least one is needed")
-    return join([one if isinstance(one, Record) else _read_one(config, one) for one in several])
-
-
-def _read_one(config: Config, log: str | Path) -> Record:
-    ratio = config.drive.gear_ratio if config.drive.kind == "two_inertia" else None
-    record = read_record(log, config.log, gear_ratio=ratio)
-    sides = ("motor", "load") if config.drive.kind == "two_inertia" else ("motor",)
-    for side in sides:
-        if side not in record.positions:
-            raise InputError(
-                f"{record.path}: no {side} position ({_LOG_NAMES[side]}), which a {config.drive.kind} drive needs; "
-                f"the log has {', '.join(record.positions)}"
-            )
-    if record.torque is None:
-        notes = (*record.notes, "No input torque was recorded: the drive is taken to move freely, without one.")
-        record = dataclasses.replace(record, torque=np.zeros(len(record.time)), notes=notes)
-    return record
-
-
-def _arrays(values: Mapping[str, float]) -> dict[str, jax.Array]:
-    return {path: jnp.asarray(value) for path, value in values.items()}
-
-
-def _on_record(config: Config, record: Record) -> Experiment:
-    """The study's experiment at the record's period, with plant steps no longer than the study's."""
-    step = config.run.sample_period / config.run.substeps
-    substeps = max(int(np.ceil(record.sample_period / step * (1.0 - 1e-9))), 1)
-    experiment = prepare(config.model_copy(update={"run": config.run.model_copy(update={"precision": "float64"})}))
-    return eqx.tree_at(
-        lambda e: e.run,
-        experiment,
-        dataclasses.replace(
-            experiment.run,
-            sample_period=jnp.asarray(record.sample_period),
-            steps=len(record.time),
-            substeps=substeps,
-        ),
-    )
-
-
-def _default_paths(config: Config, experiment: Experiment) -> list[str]:
-    """All numbers of the plant that are not known exactly and have a value to start from."""
-    return [
-        path
-        for path, about in leaf_paths(experiment).items()
-        if path.split(".")[0] in PHYSICAL
-        and path not in config.uncertainty.exact
-        and not (is_positive(about) and float(get_leaf(experiment, path)) <= 0.0)
-    ]
-
-
-def _decimation(config: Config, record: Record) -> int:
-    """Samples that become one where torques are compared."""
-    bandwidth = config.identify.bandwidth
-    if bandwidth is None:
-        return 10
-    return max(round(0.5 / (bandwidth * record.sample_period)), 1)
-
-
-def _kinematics(record: Record, channels: Channels, factor: int) -> list[Kinematics]:
-    """The parts of a record that are long enough to be decimated."""
-    assert record.torque is not None
-    found = []
-    for i, part in enumerate(record.segments):
-        if part.stop - part.start >= max(2 * shortest(factor), 50):
-            smoothed = {side: parts[i] for side, parts in channels.smoothed.items()}
-            transmitted = None if record.transmitted is None else record.transmitted[part]
-            time = record.time[part] - record.time[0]
-            found.append(from_smoothed(time, record.torque[part], smoothed, transmitted))
-    return found
-
-
 def _torque_errors(
     record: Record, experiment: Experiment, parts: Sequence[Kinematics], factor: int
 ) -> dict[str, dict[str, Any]]:
     found = errors(experiment, parts, factor) if parts else {}
     return {name: one | {"unit": unit_on(record, name, "N m")} for name, one in found.items()}
-
-
-def _gains(
-    missing: frozenset[str], fitted: Experiment, record: Record, channels: Channels
-) -> tuple[dict[str, Gains], dict[str, float]]:
-    """Gains of the observers that the study leaves open, by side and by dotted path."""
-    sides = [side for side in fitted.sides if f"observer.{side}" in missing]
-    if not sides:
-        return {}, {}
-    i = int(np.argmax([part.stop - part.start for part in record.segments]))
-    part = record.segments[i]
-    assert record.torque is not None
-    smoothed = {side: parts[i] for side, parts in channels.smoothed.items()}
-    kinematics = from_smoothed(record.time[part] - record.time[part][0], record.torque[part], smoothed)
-    chosen = choose_gains(fitted, kinematics, {side: record.positions[side][part] for side in fitted.sides})
-    values = {}
-    for side in sides:
-        values |= {f"observer.{side}.lambda": chosen[side].lambda_, f"observer.{side}.alpha": chosen[side].alpha}
-    return {side: chosen[side] for side in sides}, values
 
 
 def _model_columns(fitted: Experiment, record: Record, channels: Channels) -> dict[str, np.ndarray]:
@@ -324,19 +224,6 @@ def _model_columns(fitted: Experiment, record: Record, channels: Channels) -> di
     return {name: np.concatenate(values) for name, values in pieces.items()}
 
 
-_LINEAR = (("kg m²", "kg"), ("N m", "N"), ("rad", "m"))
-
-
-def unit_on(record: Record, path: str, unit: str) -> str:
-    """The unit of a number on a log: N and m where its side moves in m."""
-    side = "load" if any(part.startswith("load") for part in path.split(".")) else "motor"
-    channels = record.findings.channels
-    if _LOG_NAMES[side] in channels and channels[_LOG_NAMES[side]].unit == "m":
-        for turning, linear in _LINEAR:
-            unit = unit.replace(turning, linear)
-    return unit
-
-
 def _on_holdout(task: Task, nominal: Experiment, fitted: Experiment, samples: int) -> dict[str, Any]:
     """How well the numbers found serve another log, beside the nominal ones."""
     config, record = task.config, task.holdout
@@ -350,10 +237,10 @@ def _on_holdout(task: Task, nominal: Experiment, fitted: Experiment, samples: in
     position = {}
     for i, side in enumerate(nominal.sides):
         before, after = (channels.noise[side] * float(jnp.sqrt(jnp.mean(one[:, :, i] ** 2))) for one in left)
-        unit = record.findings.channels[_LOG_NAMES[side]].unit
+        unit = record.findings.channels[LOG_NAMES[side]].unit
         position[side] = {"rms": after, "nominal_rms": before, "noise": channels.noise[side], "unit": unit}
-    factor = _decimation(config, record)
-    parts = _kinematics(record, channels, factor)
+    factor = decimation(config, record)
+    parts = kinematics_of(record, channels, factor)
     before, torque = (_torque_errors(record, one, parts, factor) for one in rebased)
     for name, one in torque.items():
         one["nominal_rms"], one["nominal_relative"] = before[name]["rms"], before[name]["relative"]
@@ -512,7 +399,7 @@ def _summary(
         side: {
             "rms": noise[side] * float(jnp.sqrt(jnp.mean(found.fit.residual[:, :, i] ** 2))),
             "noise": noise[side],
-            "unit": record.findings.channels[_LOG_NAMES[side]].unit,
+            "unit": record.findings.channels[LOG_NAMES[side]].unit,
         }
         for i, side in enumerate(fitted.sides)
     }

@@ -31,8 +31,8 @@ _COMMANDS = {
     "tune": ("tune/manifest.json", ("gains.toml", "tuning.json", "tune"), ("axes", "verify")),
 }
 _COMMON = ("figures", "report.html")
-LOG_MARKERS = ("inspection.json", "identification.json")
-"""What `inspect` and `identify` leave, which says whose log the folder is for."""
+LOG_MARKERS = ("inspection.json", "identification.json", "diagnosis.json")
+"""What `inspect`, `identify` and `diagnose` leave, which says whose log the folder is for."""
 
 
 def identity(config: Config, command: str = "sweep") -> str:

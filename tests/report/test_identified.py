@@ -15,7 +15,8 @@ from jaxbl.records import read_record
 from jaxbl.report.identified import draw_identification, write_identification_report
 from jaxbl.report.style import save
 from jaxbl.study.config import read_config
-from jaxbl.study.identification import Identification, unit_on
+from jaxbl.study.identification import Identification
+from jaxbl.study.logs import unit_on
 from jaxbl.study.trial import run
 
 GEARED = ["intervals", "residuals", "velocities", "torque", "hysteresis", "limit_cycle", "recursive"]

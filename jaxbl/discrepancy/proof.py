@@ -1,0 +1,220 @@
+"""How well a model foretells a record that it was not fitted to: positions, speeds and missing torques, and their floors.
+
+Positions by short windows and by one free run, each from the best initial state: what an initial state can explain is no
+error of the model. Torques by the equations of motion at the smoothed motion, behind one low-pass for all models.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbl.drive.effects import SideEffect
+from jaxbl.drive.parameters import Scalar
+from jaxbl.drive.plant import PlantState
+from jaxbl.identification.regression import Kinematics
+from jaxbl.identification.search import Channels, windows_of
+from jaxbl.identification.trajectory import Windows, projected_residual
+from jaxbl.records import Record
+from jaxbl.simulate import Experiment, trajectory
+
+from .residuals import Residual, narrowed, residual_torques
+
+WINDOW = 0.5
+"""s."""
+_BLOCK = 0.5
+"""Length of the blocks that a permuted residual is made of, s."""
+_FORETOLD = 0.02
+"""Share of the motion that the initial speed's uncertainty may grow to where a free run is to say anything."""
+POSITIONS = {"motor": "theta_e", "load": "theta_s"}
+
+
+class Proof(NamedTuple):
+    """Rms errors on a record: by channel (`theta_e`, `theta_s`, `velocity_motor`, ..., `torque_motor`, ...)."""
+
+    errors: dict[str, float]
+    torques: dict[str, list[Residual]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Ground:
+    """A record that models are held against.
+
+    Attributes:
+        record: the log.
+        channels: its positions smoothed.
+        parts: of it, for the equations of motion.
+        bandwidth: of the low-pass that missing torques are looked at behind, Hz, by side.
+        rest: whether each segment begins at rest.
+    """
+
+    record: Record
+    channels: Channels
+    parts: Sequence[Kinematics]
+    bandwidth: Mapping[str, float]
+    rest: bool = False
+
+    @property
+    def smoothed(self) -> list[dict[str, Any]]:
+        """The smoothed positions of each part."""
+        return [{side: pieces[i] for side, pieces in self.channels.smoothed.items()} for i in range(len(self.parts))]
+
+    @property
+    def samples(self) -> int:
+        """Length of a window."""
+        longest = max(part.stop - part.start for part in self.record.segments)
+        return min(max(round(WINDOW / self.record.sample_period), 20), longest)
+
+    def floor(self, torques: Mapping[str, Sequence[Residual]]) -> dict[str, float]:
+        """Noise of each channel: what a perfect model would leave."""
+        found = {POSITIONS[side]: noise for side, noise in self.channels.noise.items()}
+        for side, pieces in self.channels.smoothed.items():
+            found[f"velocity_{side}"] = _rms([np.asarray(one.deviation(1)) for one in pieces])
+        for side, pieces in torques.items():
+            found[f"torque_{side}"] = _rms([narrowed(one, self.bandwidth[side])[0].deviation for one in pieces])
+        return found
+
+    def torque_errors(self, torques: Mapping[str, Sequence[Residual]]) -> dict[str, float]:
+        """Rms missing torque of each side behind the low-pass, N m."""
+        return {
+            f"torque_{side}": _rms([narrowed(one, self.bandwidth[side])[0].torque for one in pieces])
+            for side, pieces in torques.items()
+        }
+
+    def torques(self, experiment: Experiment) -> dict[str, list[Residual]]:
+        """Torques that a model lacks on each side."""
+        found = residual_torques(experiment, self.parts, self.smoothed)
+        return {side: found[side] for side in experiment.sides if side in found}
+
+    def windows(self, experiment: Experiment, samples: int) -> tuple[Windows, np.ndarray]:
+        """The record in windows, and the row that each begins with."""
+        return windows_of(self.record, self.channels, experiment, samples, self.rest)
+
+    def prove(self, experiment: Experiment) -> Proof:
+        """Errors of a model on short windows, and the torques that it lacks."""
+        windows, firsts = self.windows(experiment, self.samples)
+        torques = self.torques(experiment)
+        errors = self._errors(experiment, windows, firsts, 12)
+        return Proof(errors | self.torque_errors(torques), torques)
+
+    def free_run(self, experiment: Experiment) -> tuple[dict[str, float], float]:
+        """Errors of one run over the longest segment, and what a standard deviation of the initial speed would do to it.
+
+        The latter over the motion's; large where a free run cannot be foretold.
+        """
+        longest = max(part.stop - part.start for part in self.record.segments)
+        windows, firsts = self.windows(experiment, longest)
+        errors = self._errors(experiment, windows, firsts, 6)
+        first = np.flatnonzero([part.start == firsts[0] for part in self.record.segments])[0]
+        deviation = {
+            side: float(np.median(np.asarray(pieces[first].deviation(1)))) for side, pieces in self.channels.smoothed.items()
+        }
+        return errors, float(_growth(experiment, windows, deviation))
+
+    def _errors(self, experiment: Experiment, windows: Windows, firsts: np.ndarray, passes: int) -> dict[str, float]:
+        rows = firsts[:, None] + np.arange(windows.torque.shape[1])[None, :]
+        residual, velocity = _foretold(experiment, windows, passes, self.rest)
+        found = {}
+        for i, side in enumerate(experiment.sides):
+            found[POSITIONS[side]] = self.channels.noise[side] * _rms([np.asarray(residual[:, :, i])])
+        for side in experiment.sides:
+            smoothed = np.full(len(self.record.time), np.nan)
+            for part, one in zip(self.record.segments, self.channels.smoothed[side], strict=True):
+                smoothed[part] = np.asarray(one.velocity)
+            found[f"velocity_{side}"] = _rms([np.asarray(velocity[side]) - smoothed[rows]])
+        return found
+
+    def permuted(self, experiment: Experiment, added: Mapping[str, Sequence[np.ndarray]], seed: int = 0) -> Proof:
+        """Errors of a model with a known torque that is the right one in the wrong order: blocks of time, shuffled.
+
+        Args:
+            experiment: the nominal model.
+            added: torque that the extended model adds on each side, of each part, N m.
+            seed: of the order.
+        """
+        time = np.concatenate([np.asarray(part.time) for part in self.parts])
+        at = np.round((time - time[0]) / self.record.sample_period).astype(int)
+        size = max(round(_BLOCK / self.record.sample_period), 1)
+        order = _order(len(time), size, np.random.default_rng(seed))
+        known, torques = [], {}
+        before = self.torques(experiment)
+        for side in experiment.sides:
+            shuffled = np.concatenate(list(added[side]))[order]
+            table = np.zeros(at[-1] + 1)
+            table[at] = shuffled
+            period, first = (jnp.asarray(float(one)) for one in (self.record.sample_period, time[0]))
+            known.append(_KnownTorque(side=side, torque=jnp.asarray(table), first=first, period=period))  # type: ignore[arg-type]
+            ends = np.cumsum([len(one.time) for one in before[side]])[:-1]
+            torques[side] = [
+                dataclasses.replace(one, torque=one.torque - piece)
+                for one, piece in zip(before[side], np.split(shuffled, ends), strict=True)
+            ]
+        model = eqx.tree_at(lambda e: e.effects, experiment, (*known, *experiment.effects))
+        windows, firsts = self.windows(model, self.samples)
+        return Proof(self._errors(model, windows, firsts, 12) | self.torque_errors(torques), torques)
+
+
+def foretold(growth: float) -> bool:
+    """Whether a free run with this growth (:meth:`Ground.free_run`) says anything."""
+    return bool(growth < _FORETOLD)
+
+
+class _KnownTorque(SideEffect):
+    """A torque along time that drives a side."""
+
+    kind: ClassVar[str] = "known_torque"
+    torque: Float[Array, " samples"]
+    first: Scalar
+    period: Scalar
+
+    def resist(self, motion: Any) -> Any:
+        at = jnp.floor((motion.time - self.first) / self.period + 1e-6).astype(jnp.int32)
+        return -self.torque[jnp.clip(at, 0, len(self.torque) - 1)]
+
+
+def _order(count: int, size: int, random: np.random.Generator) -> np.ndarray:
+    """Indices in which blocks have changed places: none stays."""
+    blocks = np.array_split(np.arange(count), max(count // size, 2))
+    places = random.permutation(len(blocks))
+    source = np.empty(len(blocks), int)
+    # a cycle through all of them
+    source[places] = np.roll(places, 1)
+    return np.concatenate([blocks[i] for i in source])[:count]
+
+
+@eqx.filter_jit
+def _foretold(experiment: Experiment, windows: Windows, passes: int, rest: bool) -> tuple[Array, dict[str, Array]]:
+    """Position residuals over the noise, and velocities, from the best initial states."""
+    residual, start = projected_residual(experiment, windows, passes, rest)
+
+    def one(start: PlantState, torque: Array, time: Array) -> dict[str, Array]:
+        return trajectory(experiment, start, torque, time).velocity
+
+    return residual, jax.vmap(one)(start, windows.torque, windows.time)
+
+
+@eqx.filter_jit
+def _growth(experiment: Experiment, windows: Windows, deviation: dict[str, float]) -> Array:
+    """Change of the positions by a standard deviation of the initial speeds, over the motion; the larger of the sides."""
+    start, torque, time = jax.tree.map(lambda x: x[0], (windows.start, windows.torque, windows.time))
+    step = 1e-3
+    moved = {side: value + step * jnp.asarray(deviation[side]) for side, value in start.velocity.items()}
+    runs = [
+        trajectory(experiment, state, torque, time).position
+        for state in (start, PlantState(start.position, moved, start.effects))
+    ]
+    shares = [
+        jnp.sqrt(jnp.mean((runs[1][side] - runs[0][side]) ** 2)) / step / jnp.std(windows.measured[side][0])
+        for side in experiment.sides
+    ]
+    return jnp.max(jnp.stack(shares))
+
+
+def _rms(pieces: Sequence[np.ndarray]) -> float:
+    values = np.concatenate([np.ravel(one) for one in pieces])
+    return float(np.sqrt(np.mean(values**2))) if np.isfinite(values).all() else float("inf")

@@ -1,0 +1,338 @@
+"""What `jaxbl diagnose` leaves to be read: what is missing, how surely, where, and the gap before and after."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxbl.discrepancy.residuals import narrowed
+from jaxbl.study.diagnosis import Diagnosis
+from jaxbl.study.logs import unit_on
+
+from .maps import Drawn
+from .page import TableOf, html
+from .reports import drafted, save_all, write_model
+from .residuals import draw_residuals, outline
+from .style import COLOURS, style, with_unit
+
+_BEFORE, _AFTER, _FLOOR, _FAINT = COLOURS[1], COLOURS[0], COLOURS[6], "#8C8C8C"
+_SHADE, _HELD = "#BDBDBD", COLOURS[4]
+_CHANNELS = {
+    "theta_e": "motor position", "theta_s": "load position", "velocity_motor": "motor speed", "velocity_load": "load speed",
+    "torque_motor": "motor: missing torque", "torque_load": "load: missing torque",
+}  # fmt: skip
+
+
+def write_diagnosis_report(found: Diagnosis, folder: Path) -> list[str]:
+    """Write `diagnosis.json`, `model.toml`, `trace.parquet`, figures and report into a folder that exists.
+
+    They are put there together when all are drawn. Returns the lines for the terminal.
+    """
+    return drafted(folder, "diagnosis.json", lambda draft: _write(found, draft))
+
+
+def _write(found: Diagnosis, folder: Path) -> list[str]:
+    pictures = save_all(draw_diagnosis(found), folder)
+    found.trace.to_parquet(folder / "trace.parquet", index=False)
+    text = write_model(found.model, folder, replays=found.replays)
+    lead, remarks = _headline(found.summary), _remarks(found.summary)
+    tables = [*_finding_tables(found.summary), _gap_table(found.summary["gap"]), _number_table(found.summary)]
+    title = found.config.title or f"Diagnosis of {found.record.path.name}"
+    (folder / "report.html").write_text(html(title, lead, remarks, pictures, tables, text), encoding="utf-8")
+    content = json.dumps(found.summary, indent=1, ensure_ascii=False)
+    (folder / "diagnosis.json").write_text(content, encoding="utf-8")
+    return [*lead, *remarks]
+
+
+def diagnosis_lines(summary: dict[str, Any]) -> list[str]:
+    """What the terminal says of a `diagnosis.json`."""
+    return [*_headline(summary), *_remarks(summary)]
+
+
+def _headline(summary: dict[str, Any]) -> list[str]:
+    lines = [verdict_sentence(summary)]
+    for one in summary["findings"]:
+        numbers = ", ".join(_number(leaf, number) for leaf, number in one["parameters"].items())
+        lines.append(f"{one['effect']} (confidence {_chance(one['confidence'])}): {numbers}.")
+        if one["alternatives"]:
+            others = ", ".join(f"{other['effect']} ({_chance(other['confidence'])})" for other in one["alternatives"])
+            lines.append(f"  This log does not rule out in its place: {others}.")
+    return [*lines, *_gap_lines(summary["gap"])]
+
+
+def verdict_sentence(summary: Mapping[str, Any]) -> str:
+    """The verdict in one sentence."""
+    names = " and ".join(one["effect"] for one in summary["findings"])
+    if summary["verdict"] == "explained":
+        return f"Explained: the model lacks {names}; with {'it' if len(summary['findings']) == 1 else 'them'} noise is left."
+    if summary["verdict"] == "no_discrepancy":
+        return "No discrepancy: the model leaves nothing but noise."
+    where = "; ".join(one["sentence"] for one in summary.get("where_after", summary["where"]).values())
+    if names:
+        return f"Unknown effect: {names} is missing, but does not explain all of it. What is left: {where}."
+    return f"Unknown effect: something is missing that is none of the effects known. It lives: {where}."
+
+
+def _number(leaf: str, one: Mapping[str, Any]) -> str:
+    unit = f" {one['unit']}" if one.get("unit") else ""
+    error = f" ± {one['standard_error']:.2g}" if one["standard_error"] else ""
+    return f"{leaf} = {one['value']:.5g}{error}{unit}"
+
+
+def _chance(value: float) -> str:
+    return "> 0.999" if value > 0.999 else f"{value:.3f}" if value > 0.99 else f"{value:.2f}"
+
+
+def _gap_lines(gap: Mapping[str, Any]) -> list[str]:
+    before, after, floor, units = (gap[key] for key in ("holdout_rmse_before", "holdout_rmse_after", "noise_floor", "units"))
+    if gap["holdout"]["separate"]:
+        place = f"On {Path(gap['holdout']['file']).name}"
+    else:
+        place = f"On the last part of the log ({gap['holdout']['from']:.4g} to {gap['holdout']['to']:.4g} s), held out"
+    told = [
+        f"{name} {_value(before[name])} -> {_value(after[name])} {units[name]} (floor {_value(floor[name])})"
+        for name in before
+        if not name.startswith("velocity")
+    ]
+    lines = [f"{place}, over windows of {gap['holdout']['window']:.2g} s, rms: {'; '.join(told)}."]
+    run = gap["free_run"]
+    if "after" in run:
+        parts = [
+            f"{name} {_value(run['before'][name])} -> {_value(one)} {units[name]}"
+            for name, one in run["after"].items()
+            if not name.startswith("velocity")
+        ]
+        lines.append(f"In one free run: {'; '.join(parts)}.")
+    elif run:
+        lines.append(f"A free run says nothing here: {run['why_not']}.")
+    return lines
+
+
+def _value(value: float | None) -> str:
+    return "diverges" if value is None else f"{value:.3g}"
+
+
+def _remarks(summary: dict[str, Any]) -> list[str]:
+    lines = []
+    if summary["verdict"] != "unknown_effect" or summary["findings"]:
+        lines += [f"The model as given leaves: {one['sentence']}." for one in summary["where"].values()]
+    left = {name: one for name, one in summary["rest"].items() if one["evidence"] is not None and one["evidence"] > 0.0}
+    for name, one in sorted(left.items(), key=lambda pair: -pair[1]["evidence"]):
+        side, _, kind = name.partition(".")
+        lines.append(
+            f"Left over: {_FREE.get(kind, kind)} on the {side} side ({100.0 * one['share']:.2g} % of the driving torque, "
+            f"evidence {one['evidence']:.3g} nats)."
+        )
+    for name, control in summary["gap"]["controls"].items():
+        effect = f" ({control['effect']})" if "effect" in control else ""
+        channel = next(iter(control["rmse"]))
+        what = {"wrong": "the best model with another effect", "permuted": "the missing torque in the wrong order"}[name]
+        lines.append(
+            f"Control: {what}{effect} leaves {_value(control['rmse'][channel])} {summary['gap']['units'][channel]} "
+            f"in {channel}."
+        )
+    return [*lines, *summary["notes"]]
+
+
+_FREE = {
+    "time": "a torque over time", "drift": "a friction that drifts", "position": "a torque over position",
+    "place": "a friction over position", "velocity": "a torque over velocity", "memory": "a friction with a memory",
+}  # fmt: skip
+
+
+def _finding_tables(summary: Mapping[str, Any]) -> list[TableOf]:
+    rows: list[list[object]] = []
+    for one in summary["findings"]:
+        for leaf, number in one["parameters"].items():
+            error = number["standard_error"] or None
+            rows.append([one["effect"], one["confidence"], leaf, number["value"], error, number["unit"]])
+        rows += [[f"or {other['effect']}", other["confidence"], "", "", "", ""] for other in one["alternatives"]]
+    columns = ["effect", "confidence", "number", "value", "standard error", "unit"]
+    return [TableOf("What is missing", columns, rows)] if rows else []
+
+
+def _gap_table(gap: Mapping[str, Any]) -> TableOf:
+    controls = gap["controls"]
+    rows: list[list[object]] = []
+    for name, before in gap["holdout_rmse_before"].items():
+        others = [one["rmse"].get(name) for one in controls.values()]
+        rows.append([_CHANNELS[name], gap["units"][name], before, gap["holdout_rmse_after"][name], gap["noise_floor"][name]])
+        rows[-1] += others
+    return TableOf("Held-out data, rms", ["channel", "unit", "before", "after", "noise", *controls], rows)
+
+
+def _number_table(summary: Mapping[str, Any]) -> TableOf:
+    rows: list[list[object]] = [
+        [path, one["nominal"], one["value"], one["standard_error"], one["unit"]]
+        for path, one in summary["parameters"].items()
+    ]
+    return TableOf("The model's own numbers", ["number", "as given", "fitted", "standard error", "unit"], rows)
+
+
+def draw_diagnosis(found: Diagnosis) -> list[Drawn]:
+    """All figures of a diagnosis."""
+    unit = unit_on(found.record, "motor.torque", "N m")
+    with style():
+        drawn = [_story(found.summary), _over_time(found)]
+    return [*drawn, *draw_residuals(found.residuals, found.coordinates, found.located, unit)]
+
+
+def _story(summary: Mapping[str, Any]) -> Drawn:
+    """Each channel's error over its noise: before, after, floor, controls; and what is missing, how surely."""
+    gap = summary["gap"]
+    names = list(gap["holdout_rmse_before"])
+    bars = _bars(summary)
+    height = max(0.55 * len(names) + 1.9, 0.42 * len(bars) + 1.9)
+    figure = Figure(figsize=(11.0, height), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=[2.3, 1.0])
+    _gap_panel(left, gap, names)
+    _chances_panel(right, bars)
+    caption = (
+        f"{verdict_sentence(summary)} Left: rms error on held-out data over the channel's noise; arrows lead from the model "
+        "as given to the model with the missing effects. Black line: noise, which a perfect model would leave. Controls: "
+        "the best model with another effect, and the added torque in the wrong order of time, which must not help. Right: "
+        "probability of each effect, with what this log does not rule out in its place."
+    )
+    return Drawn("gap", figure, caption)
+
+
+def _gap_panel(ax: Axes, gap: Mapping[str, Any], names: list[str]) -> None:
+    floor = gap["noise_floor"]
+
+    def over(errors: Mapping[str, float | None]) -> np.ndarray:
+        return np.array([np.nan if errors.get(name) is None else errors[name] / floor[name] for name in names], float)  # type: ignore[operator]
+
+    rows = np.arange(len(names))
+    before, after = over(gap["holdout_rmse_before"]), over(gap["holdout_rmse_after"])
+    for row, start, stop in zip(rows, before, after, strict=True):
+        # a hardly changed error needs no arrow
+        if np.isfinite([start, stop]).all() and abs(np.log(start / stop)) > 0.25:
+            ax.annotate("", (stop, row), (start, row), arrowprops={"arrowstyle": "-|>", "color": _FAINT, "lw": 1.2})
+    markers = {"wrong": ("x", "another effect"), "permuted": ("+", "wrong order in time")}
+    every = [before, after]
+    for name, control in gap["controls"].items():
+        marker, label = markers[name]
+        if "effect" in control:
+            label = f"{label} ({control['effect']})"
+        every.append(over(control["rmse"]))
+        ax.plot(every[-1], rows + 0.24, marker, color=_FAINT, ms=7, mew=1.6, ls="none", label=f"control: {label}")
+    ax.plot(before, rows, "D", color=_BEFORE, ms=7, ls="none", label="before", zorder=4)
+    ax.plot(after, rows, "o", color=_AFTER, ms=7, ls="none", label="after", zorder=5)
+    ax.axvline(1.0, color=_FLOOR, lw=1.6, label="noise")
+    ax.set_xscale("log")
+    values = np.concatenate(every)
+    values = values[np.isfinite(values) & (values > 0.0)]
+    ax.set_xlim(0.5 * min(float(values.min(initial=1.0)), 1.0), 2.0 * max(float(values.max(initial=1.0)), 3.0))
+    ax.set_ylim(len(names) - 0.4, -0.6)
+    labels = [
+        f"{_CHANNELS[name]}\n{_value(gap['holdout_rmse_before'][name])} → {_value(gap['holdout_rmse_after'][name])} "
+        f"{gap['units'][name]}"
+        for name in names
+    ]
+    ax.set_yticks(rows, labels, fontsize=9)
+    ax.set_xlabel("rms error on held-out data over noise")
+    handles, texts = ax.get_legend_handles_labels()
+    order = sorted(range(len(texts)), key=lambda i: texts[i].startswith("control"))
+    ax.legend(
+        [handles[i] for i in order], [texts[i] for i in order], ncols=3, loc="lower left", bbox_to_anchor=(-0.02, 1.0),
+        borderaxespad=0.2, columnspacing=1.2,
+    )  # fmt: skip
+
+
+def _bars(summary: Mapping[str, Any]) -> list[tuple[str, float, bool]]:
+    """Effects, their probabilities, and whether they are findings."""
+    bars: list[tuple[str, float, bool]] = []
+    for one in summary["findings"]:
+        bars.append((one["effect"], one["confidence"], True))
+        bars += [(f"or {other['effect']}", other["confidence"], False) for other in one["alternatives"]]
+    return bars
+
+
+def _chances_panel(ax: Axes, bars: list[tuple[str, float, bool]]) -> None:
+    ax.set_xlim(0.0, 1.0)
+    ax.set_xlabel("confidence")
+    if not bars:
+        ax.set_yticks([])
+        ax.text(0.5, 0.5, "no effect named", transform=ax.transAxes, ha="center", va="center", color=_FAINT)
+        return
+    rows = np.arange(len(bars))
+    ax.barh(rows, [chance for _, chance, _ in bars], 0.3, color=[_AFTER if sure else _SHADE for _, _, sure in bars])
+    for row, (name, chance, _) in zip(rows, bars, strict=True):
+        ax.text(0.0, row - 0.22, f" {name}: {_chance(chance)}", ha="left", va="bottom", fontsize=9)
+    ax.set_yticks([])
+    ax.set_ylim(max(len(bars), 3) - 0.4, -0.8)
+    ax.grid(visible=False, axis="y")
+
+
+def _over_time(found: Diagnosis) -> Drawn:
+    """Torque that the model lacks, before and after."""
+    figure = Figure(figsize=(9.0, 2.4 * len(found.pairs) + 0.6), layout="constrained")
+    axes = figure.subplots(len(found.pairs), 1, sharex=True, squeeze=False).ravel()
+    for ax, (side, pieces) in zip(axes, found.pairs.items(), strict=True):
+        unit = unit_on(found.record, f"{side}.torque", "N m")
+        cutoff = found.located[side].bandwidth
+        labelled: set[str] = set()
+        for before, after, held in pieces:
+            low, _ = narrowed(before, cutoff)
+            rest, _ = narrowed(after, cutoff)
+            for one, colour, label in ((low, _BEFORE, "before"), (rest, _AFTER, "after")):
+                time, torque, band = outline(one.time, one.torque, 2.0 * one.deviation)
+                ax.plot(time, torque, color=colour, lw=0.9, label=None if label in labelled else label)
+                labelled.add(label)
+            ax.fill_between(
+                time, -band, band, color=_SHADE, alpha=0.6, lw=0.0, zorder=3,
+                label=None if "noise" in labelled else "± 2 noise",
+            )  # fmt: skip
+            labelled.add("noise")
+            if held and any(not other for _, _, other in pieces):
+                ax.axvspan(
+                    before.time[0], before.time[-1], color=_HELD, alpha=0.18, lw=0.0, zorder=0,
+                    label=None if "held" in labelled else "held out",
+                )  # fmt: skip
+                labelled.add("held")
+        ax.set_ylabel(with_unit(f"{side}:\nmissing {'force' if unit == 'N' else 'torque'}", unit))
+        ax.legend(ncols=4, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, columnspacing=1.2)
+    axes[-1].set_xlabel("time (s)")
+    which = f"Held-out log {found.holdout.path.name}: t" if found.summary["gap"]["holdout"]["separate"] else "T"
+    caption = (
+        f"{which}orque that the model lacks as it was given and with the missing effects, behind the low-pass behind which "
+        "it stands out. A complete model stays within the grey band."
+    )
+    return Drawn("before_after", figure, caption)
+
+
+_SAID = {"explained": "explained", "no_discrepancy": "no discrepancy", "unknown_effect": "unknown effect"}
+
+
+def batch_row(log: Path, summary: Mapping[str, Any] | None, refused: str = "") -> dict[str, Any]:
+    """A row of `batch.csv`: what a log's diagnosis says, or why there is none."""
+    row: dict[str, Any] = {"log": log.name, "verdict": "", "findings": "", "confidence": None, "refused": refused}
+    if summary is None:
+        return row
+    row["verdict"] = summary["verdict"]
+    row["findings"] = "; ".join(one["effect"] for one in summary["findings"])
+    row["confidence"] = min((one["confidence"] for one in summary["findings"]), default=None)
+    for name in summary["gap"]["holdout_rmse_before"]:
+        for key, column in (("holdout_rmse_before", "before"), ("holdout_rmse_after", "after"), ("noise_floor", "floor")):
+            row[f"{name}_{column}"] = summary["gap"][key][name]
+    return row
+
+
+def write_batch(rows: list[dict[str, Any]], folder: Path) -> list[str]:
+    """Write `batch.csv`; returns a table for the terminal."""
+    pd.DataFrame(rows).to_csv(folder / "batch.csv", index=False)
+    width = max(len(row["log"]) for row in rows)
+    lines = []
+    for row in rows:
+        if row["refused"]:
+            lines.append(f"{row['log']:<{width}}  refused         {row['refused']}")
+            continue
+        named = f"{row['findings']} ({_chance(row['confidence'])})" if row["findings"] else ""
+        gap = f"{_value(row['theta_e_before'])} -> {_value(row['theta_e_after'])} ({_value(row['theta_e_floor'])})"
+        lines.append(f"{row['log']:<{width}}  {_SAID[row['verdict']]:<14}  {named}  theta_e {gap}")
+    return lines

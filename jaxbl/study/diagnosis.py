@@ -1,0 +1,665 @@
+"""What a model lacks, from a log: the function behind `jaxbl diagnose`.
+
+Where model and log disagree, which effect is missing, the model with it, and the proof on data that neither the choice nor
+the fit has seen.
+"""
+
+# pandas' own annotations are wider than what its methods return
+# pyright: reportArgumentType=false
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from jaxbl.discrepancy.explain import Explanation, Finding, Model, explain
+from jaxbl.discrepancy.proof import POSITIONS, WINDOW, Ground, Proof, foretold
+from jaxbl.discrepancy.residuals import Residual
+from jaxbl.discrepancy.where import SIGNIFICANT, Localised, Values, as_json, coordinates_of, describe, where
+from jaxbl.drive.effects import effect_class, effect_kinds
+from jaxbl.drive.parameters import parameters, set_leaves
+from jaxbl.errors import InputError
+from jaxbl.identification.intervals import spread
+from jaxbl.identification.prediction import predictor
+from jaxbl.identification.regression import Kinematics, shortest
+from jaxbl.identification.search import Channels, smoothed_channels, windows_of
+from jaxbl.identification.trajectory import WIDE, Fit, Free, Windows, fit, free_parameters
+from jaxbl.records import Record
+from jaxbl.simulate import Experiment
+
+from .config import Config, read_config, read_model, with_values
+from .engine import Progress
+from .logs import (
+    LOG_NAMES,
+    Logs,
+    arrays,
+    decimation,
+    default_paths,
+    gains_for,
+    identity_of,
+    kinematics_of,
+    on_record,
+    read_logs,
+    unit_on,
+)
+from .store import plain
+
+HELD_OUT = 0.25
+"""Share of a log that is held out where there is no other one for it."""
+GEAR_TOLERANCE = 0.15
+"""A missing effect (a soft shaft, a gap) shifts the ratio of both motions by some per cent."""
+_SAMPLES = 500
+"""Of the windows that numbers are fitted on."""
+_WORSE = 1.02
+_DIVERGED = 10.0
+"""Errors on short windows over the motion's range from which on a model counts as diverging."""
+_ALIKE = 3.0
+"""Factor between the inertias that two logs of one machine may show."""
+_HIDDEN = 0.3
+"""Share of the driving torque: where a torque of that size would not have been seen, noise hides everything."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """What a log says that a model lacks.
+
+    Attributes:
+        config: the study, as given.
+        model: the study with the missing effects and all numbers fitted anew; it runs in every other command.
+        record: the part of the log that was fitted.
+        holdout: what was held out: the rest of the log, or another one.
+        summary: as in `diagnosis.json`.
+        trace: one row a sample of the log: `t`, `u`, positions, `held_out`, and on each side the torque that the model lacks
+            as given (`motor.missing_before`) and with the effects (`motor.missing_after`) with its `motor.noise`, N m.
+        residuals: torques that the model as given lacks, by side, of each part that was fitted.
+        coordinates: along them, by side, of each part.
+        located: where they live, by side.
+        pairs: torques that the model lacks as given and with the effects, by side, of each part, and whether it was held
+            out; where that is another log, of that alone.
+        replays: whether the model's excitation is to be the log's, for want of one in the study.
+    """
+
+    config: Config
+    model: Config
+    record: Record
+    holdout: Record
+    summary: dict[str, Any]
+    trace: pd.DataFrame
+    residuals: dict[str, list[Residual]]
+    coordinates: dict[str, list[dict[str, Values]]]
+    located: dict[str, Localised]
+    pairs: dict[str, list[tuple[Residual, Residual, bool]]]
+    replays: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """A study and its log: everything that decides the result.
+
+    Attributes:
+        config: the study.
+        missing: tables that the study does not have (`excitation`, `observer.motor`, `observer.load`).
+        record: the part of the log that may be fitted.
+        holdout: the rest of it, or another log.
+        separate: whether it is another log.
+    """
+
+    config: Config
+    missing: frozenset[str]
+    record: Record
+    holdout: Record
+    separate: bool
+
+    @property
+    def identity(self) -> str:
+        """Hash of everything that decides the result."""
+        return identity_of(self.config, self.missing, self.record, self.holdout)
+
+
+def read_task(log: Logs, model: str | Path | Mapping[str, Any] | Config, *, holdout: Logs | None = None) -> Task:
+    """Read study and logs; arguments as of :func:`diagnose`.
+
+    Raises:
+        InputError: unfit log or study, or a hold-out log of another machine.
+    """
+    config, missing = read_model(model)
+    record = read_logs(config, log, GEAR_TOLERANCE)
+    fewest = max(2 * shortest(decimation(config, record)), 50)
+    if holdout is None:
+        record, other = _split(record, fewest)
+    else:
+        other = read_logs(config, holdout, GEAR_TOLERANCE)
+        _check_machine(record, other)
+    return Task(config, missing, _long(record, fewest), _long(other, fewest), holdout is not None)
+
+
+def diagnose(log: Logs, model: str | Path | Mapping[str, Any] | Config, *, holdout: Logs | None = None) -> Diagnosis:
+    """Find what a model lacks, add it, and prove on held-out data that the gap shrinks.
+
+    Args:
+        log: the file, read as the study's `[log]` table says, or a record; or several of them, of one machine.
+        model: study with nominal numbers: TOML file, mapping or config; `[uncertainty]` says how well they are known.
+            `[excitation]` and `[observer]` may be missing.
+        holdout: another log (or several) of the machine, on which it is proved; left out: the last quarter of the log.
+
+    Raises:
+        InputError: unfit log or study, a hold-out log of another machine, or a model that diverges.
+    """
+    return run_task(read_task(log, model, holdout=holdout))
+
+
+def _long(record: Record, fewest: int) -> Record:
+    """Without parts that are too short for the equations of motion."""
+    parts = tuple(part for part in record.segments if part.stop - part.start >= fewest)
+    if not parts:
+        raise InputError(
+            f"{record.path}: its longest part has {max(part.stop - part.start for part in record.segments)} samples; "
+            f"at least {fewest} are needed"
+        )
+    return dataclasses.replace(record, segments=parts)
+
+
+def _split(record: Record, fewest: int) -> tuple[Record, Record]:
+    """The samples to be fitted, and those held out: the last of the log, at their own times."""
+    total = sum(part.stop - part.start for part in record.segments)
+    left = round((1.0 - HELD_OUT) * total)
+    if HELD_OUT * total < fewest:
+        raise InputError(
+            f"{record.path}: {total} samples are too few to hold a quarter of them out; at least "
+            f"{int(np.ceil(fewest / HELD_OUT))} are needed, or another log: --holdout"
+        )
+    row = record.segments[-1].stop
+    for part in record.segments:
+        if left <= part.stop - part.start:
+            row = part.start + left
+            break
+        left -= part.stop - part.start
+    first = tuple(slice(part.start, min(part.stop, row)) for part in record.segments if part.start < row)
+    last = tuple(slice(max(part.start, row), part.stop) for part in record.segments if part.stop > row)
+    cut = {name: None if (one := getattr(record, name)) is None else one[:row] for name in ("time", "torque", "transmitted")}
+    positions = {side: values[:row] for side, values in record.positions.items()}
+    # times count from the log's first sample in both: a disturbance may be periodic in time
+    return dataclasses.replace(record, **cut, positions=positions, segments=first), dataclasses.replace(
+        record, segments=last
+    )
+
+
+def _check_machine(record: Record, other: Record) -> None:
+    """Refuse a hold-out log of another machine."""
+    if other.path.resolve() == record.path.resolve():
+        raise InputError(f"{other.path}: is the log itself; without --holdout its last quarter is held out")
+    if not np.isclose(record.sample_period, other.sample_period, rtol=1e-2, atol=0.0):
+        raise InputError(
+            f"{other.path}: is sampled every {other.sample_period:.6g} s, {record.path} every {record.sample_period:.6g} s; "
+            f"[log] resample = {record.sample_period:.6g} reads both alike"
+        )
+    for side in record.positions:
+        if side not in other.positions:
+            raise InputError(f"{other.path}: has no {side} position, which {record.path} has; it is of another machine")
+    gears = record.findings.gearing, other.findings.gearing
+    if gears[0] is not None and gears[1] is not None and not (gears[0].wide or gears[1].wide):
+        ratios = gears[0].ratio, gears[1].ratio
+        clear = all(one.residual < 0.1 for one in gears if one is not None)
+        if clear and abs(ratios[1] / ratios[0] - 1.0) > GEAR_TOLERANCE:
+            raise InputError(
+                f"{other.path}: theta_e moves {ratios[1]:.4g} for each 1 of theta_s, on {record.path} {ratios[0]:.4g}; it "
+                "is of another machine, or a sign or unit differs"
+            )
+    inertias = []
+    for one in (record.findings.dynamics, other.findings.dynamics):
+        if one is not None and one.shares[0] > 0.1 and 10.0 * one.errors[0] * one.inflation[0] < abs(one.values[0]):
+            inertias.append(float(one.values[0]))
+    if len(inertias) == 2 and not 1.0 / _ALIKE < inertias[1] / inertias[0] < _ALIKE:
+        raise InputError(
+            f"{other.path}: shows an inertia of {inertias[1]:.3g}, {record.path} of {inertias[0]:.3g} at the motor; it is "
+            "of another machine, or a sign or unit differs"
+        )
+
+
+class _Fitted(NamedTuple):
+    """A model with some effects, all numbers fitted."""
+
+    names: tuple[str, ...]
+    experiment: Experiment
+    free: tuple[Free, ...]
+    theta: np.ndarray
+    deviation: np.ndarray
+
+    @property
+    def values(self) -> dict[str, float]:
+        return {one.path: float(one.value(self.theta[i])) for i, one in enumerate(self.free)}
+
+    def errors(self) -> dict[str, float]:
+        """Standard errors of the values."""
+        return {one.path: float(one.slope(self.theta[i])) * self.deviation[i] for i, one in enumerate(self.free)}
+
+
+_fit = eqx.filter_jit(fit)
+_STAGES = 6
+
+
+def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
+    """Do what :func:`read_task` read.
+
+    Args:
+        task: what to do.
+        progress: called with finished and total stages after each.
+
+    Raises:
+        InputError: a model that diverges.
+    """
+    config, record = task.config, task.record
+    assert record.torque is not None
+    stages = iter(range(1, _STAGES + 1))
+
+    def done() -> None:
+        stage = next(stages)
+        if progress is not None:
+            progress(stage, _STAGES)
+
+    with jax.enable_x64(True):
+        nominal = on_record(config, record)
+        own = free_parameters(nominal, default_paths(config, nominal), float(np.std(record.torque)))
+        prior = np.full(len(own), config.uncertainty.relative)
+        rest = config.log.initial_state == "rest"
+        seen, other = (_ground(config, nominal, one, rest) for one in (record, task.holdout))
+        other = dataclasses.replace(other, rest=rest and task.separate)
+        lacking = seen.torques(nominal)
+        coordinates = _coordinates(nominal, seen, lacking)
+        located = where(nominal, lacking, seen.parts, seen.smoothed, rotating=_rotating(record, nominal))
+        bandwidth = {name: one.bandwidth for name, one in located.items()}
+        seen, other = (dataclasses.replace(one, bandwidth=bandwidth) for one in (seen, other))
+        before = other.prove(nominal)
+        _check_stable(task, before)
+        done()
+        found = explain(nominal, own, prior.tolist(), record, seen.channels.smoothed)
+        done()
+        proving = _Proving(task, nominal, own, prior, seen.channels, other, before)
+        fitted, after, withdrawn = proving.extended(found)
+        done()
+        names = fitted.names
+        findings = [one for one in found.findings if one.effect in names]
+        verdict = found.verdict if findings or not found.findings else _without_findings(found)
+        rival = found.wrong if findings and not withdrawn and found.wrong is not None else None
+        gap = proving.gap(fitted, after, rival)
+        done()
+        missing_after = seen.torques(fitted.experiment)
+        left: dict[str, Localised] = {}
+        if verdict == "unknown_effect":
+            left = where(fitted.experiment, missing_after, seen.parts, seen.smoothed, rotating=_rotating(record, nominal))
+        trace = _trace(task, (lacking, missing_after), (before.torques, after.torques))
+        done()
+        _, gain_values = gains_for(task.missing, fitted.experiment, record, seen.channels)
+        model = _model(config, names, fitted.values, gain_values)
+        summary = _summary(task, fitted, found, findings, verdict, withdrawn, located)
+        summary["gap"] = gap
+        if left:
+            summary["where_after"] = _lives(record, left)
+        if rival is not None:
+            summary["rival"] = _rival(config, own, rival)
+        done()
+    replays = "excitation" in task.missing
+    pairs = {
+        side: [
+            *((one, left, False) for one, left in zip(lacking[side], missing_after[side], strict=True) if not task.separate),
+            *((one, left, True) for one, left in zip(before.torques[side], after.torques[side], strict=True)),
+        ]
+        for side in lacking
+    }
+    return Diagnosis(
+        config, model, record, task.holdout, plain(summary), trace, lacking, coordinates, located, pairs, replays
+    )  # fmt: skip
+
+
+def _ground(config: Config, nominal: Experiment, record: Record, rest: bool) -> Ground:
+    channels = smoothed_channels(record, nominal.sides)
+    parts = kinematics_of(record, channels, decimation(config, record))
+    return Ground(record, channels, parts, {}, rest)
+
+
+def _rotating(record: Record, nominal: Experiment) -> dict[str, bool]:
+    return {side: record.findings.channels[LOG_NAMES[side]].unit != "m" for side in nominal.sides}
+
+
+def _coordinates(
+    nominal: Experiment, ground: Ground, residuals: Mapping[str, Sequence[Residual]]
+) -> dict[str, list[dict[str, Values]]]:
+    rotating = _rotating(ground.record, nominal)
+    each: Sequence[Kinematics] = ground.parts
+    return {
+        side: [
+            coordinates_of(nominal, part, smoothed, one, rotating=rotating)
+            for part, smoothed, one in zip(each, ground.smoothed, pieces, strict=True)
+        ]
+        for side, pieces in residuals.items()
+    }
+
+
+def _check_stable(task: Task, before: Proof) -> None:
+    for side, values in task.holdout.positions.items():
+        error = before.errors.get(POSITIONS[side], 0.0)
+        if not error < _DIVERGED * float(np.ptp(values)):
+            raise InputError(
+                f"{task.holdout.path}: the model diverges under this log's input (its {side} leaves the measured motion by "
+                f"{error:.2g} within {WINDOW:g} s); its numbers, or run.substeps, should be nearer"
+            )
+
+
+def _without_findings(found: Explanation) -> str:
+    return "unknown_effect" if any(gain > 0.0 for gain, _ in found.rest.values()) else "no_discrepancy"
+
+
+class _Proving:
+    """Models fitted on the log, and held against what was held out."""
+
+    def __init__(
+        self,
+        task: Task,
+        nominal: Experiment,
+        own: tuple[Free, ...],
+        prior: np.ndarray,
+        channels: Channels,
+        other: Ground,
+        before: Proof,
+    ):
+        self.task, self.nominal, self.own, self.prior = task, nominal, own, prior
+        self.channels, self.other, self.before = channels, other, before
+        self.floor = other.floor(before.torques)
+
+    def extended(self, found: Explanation) -> tuple[_Fitted, Proof, list[str]]:
+        """The model with what was found, its proof, and the effects that did not earn their place."""
+        names, withdrawn = found.model.names, []
+        while True:
+            base = found.model if names else found.nominal
+            fitted = self.fitted(base, names)
+            after = self.other.prove(self.at(fitted.experiment))
+            if not self.worse(after):
+                return fitted, after, withdrawn
+            if not names:
+                break
+            withdrawn.append(names[-1])
+            names = names[:-1]
+        given = _Fitted((), self.nominal, self.own, np.zeros(len(self.own)), self.prior)
+        return given, self.before, withdrawn
+
+    def worse(self, after: Proof) -> bool:
+        """Whether a model is worse than the one given on what was held out, by more than noise."""
+        return any(
+            not after.errors[name] <= _WORSE * max(self.before.errors[name], self.floor[name])
+            for name in after.errors
+            if not name.startswith("velocity")
+        )
+
+    def at(self, experiment: Experiment) -> Experiment:
+        """A model at the period of what was held out."""
+        period = jnp.asarray(self.other.record.sample_period)
+        return eqx.tree_at(lambda e: e.run.sample_period, experiment, period)
+
+    def fitted(self, base: Model, names: tuple[str, ...]) -> _Fitted:
+        """All numbers by the simulator, from those of the explanation; the better of both."""
+        record = self.task.record
+        experiment, free, theta, width = _start(self.nominal, self.own, self.prior, base, names)
+        windows = self._windows(set_leaves(experiment, _values(free, theta)))
+        given = jnp.asarray(theta), jnp.asarray(width)
+        assert record.torque is not None
+        tried = [
+            _fit(experiment, free, windows, given[0], held=jnp.full(len(free), held), prior=given[1])
+            for held in (True, False)
+        ]
+        best = min(tried, key=lambda one: _cost(one, width))
+        at = np.asarray(best.theta) if np.isfinite(_cost(best, width)) else theta
+        values = arrays({path: float(value) for path, value in _values(free, at).items()})
+        return _Fitted(names, set_leaves(experiment, values), free, at, _deviation(best, width))
+
+    def _windows(self, experiment: Experiment) -> Windows:
+        record = self.task.record
+        rest = self.task.config.log.initial_state == "rest"
+        shortest = min(part.stop - part.start for part in record.segments)
+        windows, _ = windows_of(record, self.channels, experiment, min(_SAMPLES, shortest), rest)
+        return predictor(experiment, windows)[0]
+
+    def gap(self, fitted: _Fitted, after: Proof, rival: Model | None) -> dict[str, Any]:
+        """What is left on held-out data before and after, the floor, and controls."""
+        record, other = self.task.holdout, self.other
+        part = record.segments
+        found: dict[str, Any] = {
+            "holdout": {
+                "file": str(record.path.resolve()),
+                "separate": self.task.separate,
+                "from": float(record.time[part[0].start]),
+                "to": float(record.time[part[-1].stop - 1]),
+                "window": other.samples * record.sample_period,
+                "bandwidth": dict(other.bandwidth),
+            },
+            "units": {name: _unit(record, name) for name in self.floor},
+            "holdout_rmse_before": self.before.errors,
+            "holdout_rmse_after": after.errors,
+            "noise_floor": self.floor,
+            "free_run": {},
+            "controls": {},
+        }
+        runs = {"before": self.nominal, "after": fitted.experiment}
+        for name, one in runs.items():
+            errors, growth = other.free_run(self.at(one))
+            if not foretold(growth):
+                found["free_run"] = {"why_not": "small changes of the initial speed grow to the size of the motion"}
+                break
+            found["free_run"][name] = errors
+        if rival is not None:
+            wrong = set_leaves(rival.experiment, arrays(_values(self.own, rival.theta)))
+            found["controls"]["wrong"] = {"effect": rival.names[-1], "rmse": other.prove(self.at(wrong)).errors}
+        if fitted.names:
+            added = {
+                side: [one.torque - left.torque for one, left in zip(pieces, after.torques[side], strict=True)]
+                for side, pieces in self.before.torques.items()
+            }
+            found["controls"]["permuted"] = {"rmse": other.permuted(self.at(self.nominal), added).errors}
+        return found
+
+
+def _values(free: Sequence[Free], theta: np.ndarray) -> dict[str, Any]:
+    return {one.path: jnp.asarray(one.value(theta[i])) for i, one in enumerate(free)}
+
+
+def _start(
+    nominal: Experiment, own: tuple[Free, ...], prior: np.ndarray, base: Model, names: tuple[str, ...]
+) -> tuple[Experiment, tuple[Free, ...], np.ndarray, np.ndarray]:
+    """A model with some of the effects that another has; its numbers, where they start, and their prior."""
+    known = {f"effects.{one}" for one in base.names if one not in names}
+    kept = tuple(one for one in base.experiment.effects if f"effects.{one.name}" not in known)
+    experiment = eqx.tree_at(lambda e: e.effects, base.experiment, kept)
+    paths = [
+        f"effects.{name}.{field.name}"
+        for name in names
+        for field, _ in parameters(effect_class(name))
+        if field.name not in _COUNTED and not field.metadata.get("static")
+    ]
+    added = free_parameters(experiment, paths, float(nominal.run.sample_period))
+    theta = np.concatenate([np.asarray(base.theta), np.zeros(len(added))])
+    return experiment, (*own, *added), theta, np.concatenate([prior, np.full(len(added), WIDE)])
+
+
+_COUNTED = ("harmonic",)
+"""Whole numbers of a turn."""
+
+
+def _cost(one: Fit, width: np.ndarray) -> float:
+    cost = float(one.cost) + 0.5 * float(np.sum((np.asarray(one.theta) / width) ** 2))
+    return cost if np.isfinite(cost) else float("inf")
+
+
+def _deviation(one: Fit, width: np.ndarray) -> np.ndarray:
+    """Standard deviations of theta: of the fit's sandwich and the prior together."""
+    found = spread(one)
+    information, sandwich = np.asarray(found.information), np.asarray(found.covariance)
+    middle = information @ sandwich @ information
+    prior = np.diag(width**-2.0)
+    inverse = np.linalg.inv(information + prior)
+    return np.sqrt(np.maximum(np.diag(inverse @ (middle + prior) @ inverse), 0.0))
+
+
+_UNITS = {"theta": "rad", "velocity": "rad/s", "torque": "N m"}
+
+
+def _unit(record: Record, name: str) -> str:
+    side = "load" if name in ("theta_s", "velocity_load", "torque_load") else "motor"
+    return unit_on(record, f"{side}.position", _UNITS[name.split("_")[0]])
+
+
+def _model(config: Config, names: Sequence[str], values: Mapping[str, float], gains: Mapping[str, float]) -> Config:
+    """The study with effects more, and with these numbers."""
+    data = config.resolved()
+    numbers: dict[str, dict[str, Any]] = {name: {} for name in names}
+    own = {}
+    for path, value in values.items():
+        name, leaf = path.removeprefix("effects.").rsplit(".", 1)
+        if path.startswith("effects.") and name in numbers:
+            numbers[name][leaf] = value
+        else:
+            own[path] = value
+    return with_values(_with_effects(data, numbers), own | dict(gains))
+
+
+def _with_effects(data: dict[str, Any], numbers: Mapping[str, Mapping[str, Any]]) -> Config:
+    effects = [*data.get("effects", []), *({"kind": name, **one} for name, one in numbers.items())]
+    data["effects"] = sorted(effects, key=lambda one: _ORDER.index(one["kind"]) if one["kind"] in _ORDER else -1)
+    return read_config(data)
+
+
+_ORDER = ("actuator.gain_error", "actuator.saturation", "actuator.lag")
+
+
+def _rival(config: Config, own: Sequence[Free], rival: Model) -> dict[str, Any]:
+    """The best model with another effect, as tables of a study."""
+    values = {path: float(value) for path, value in _values(own, rival.theta).items()}
+    values |= {f"effects.{name}.{leaf}": value for name in rival.names for leaf, value in rival.numbers[name].items()}
+    data = _model(config, rival.names, values, {}).resolved()
+    return {"effect": rival.names[-1]} | {key: data[key] for key in ("drive", "transmission", "effects") if key in data}
+
+
+def _trace(
+    task: Task,
+    fitted: tuple[Mapping[str, list[Residual]], Mapping[str, list[Residual]]],
+    held: tuple[Mapping[str, list[Residual]], Mapping[str, list[Residual]]],
+) -> pd.DataFrame:
+    """One row a sample of the log; of another one that was held out there is nothing."""
+    whole = task.record if task.separate else task.holdout
+    names = {side: LOG_NAMES[side] for side in ("motor", "load") if side in whole.positions}
+    columns: dict[str, Any] = {"t": whole.time, "u": whole.torque}
+    columns |= {name: whole.positions[side] for side, name in names.items()}
+    columns["held_out"] = np.arange(len(whole.time)) >= len(task.record.time)
+    sources = [(task.record, fitted)] + ([] if task.separate else [(task.holdout, held)])
+    for side in fitted[0]:
+        for name, which, attribute in (
+            ("missing_before", 0, "torque"), ("missing_after", 1, "torque"), ("noise", 0, "deviation"),
+        ):  # fmt: skip
+            column = np.full(len(whole.time), np.nan)
+            for record, pair in sources:
+                for part, one in zip(record.segments, pair[which][side], strict=True):
+                    column[part] = getattr(one, attribute)
+            columns[f"{side}.{name}"] = column
+    return pd.DataFrame(columns)
+
+
+def _summary(
+    task: Task,
+    fitted: _Fitted,
+    found: Explanation,
+    findings: Sequence[Finding],
+    verdict: str,
+    withdrawn: Sequence[str],
+    located: Mapping[str, Localised],
+) -> dict[str, Any]:
+    record = task.record
+    lives = _lives(record, located)
+    values, errors = fitted.values, fitted.errors()
+    notes = list(record.notes)
+    if task.separate:
+        notes += [f"{task.holdout.path.name}: {note}" for note in task.holdout.notes]
+    notes += [f"{name} was found, and withdrawn: with it the held-out data are met no better." for name in withdrawn]
+    if task.separate and any(one.effect == "load.periodic_disturbance" for one in findings):
+        notes.append("The phase of load.periodic_disturbance is taken to be the same at the start of both logs.")
+    if verdict == "no_discrepancy":
+        notes += _least_seen(record, located)
+    own = [one for one in fitted.free if not any(one.path.startswith(f"effects.{name}.") for name in fitted.names)]
+    return {
+        "title": task.config.title,
+        "identity": task.identity,
+        "file": str(record.path.resolve()),
+        "samples": len(record.time),
+        "sample_period": record.sample_period,
+        "verdict": verdict,
+        "findings": [_finding(task, one, values, errors, lives, located) for one in findings],
+        "parameters": {
+            one.path: {
+                "value": values[one.path],
+                "standard_error": errors[one.path],
+                "nominal": one.nominal,
+                "unit": unit_on(record, one.path, one.unit),
+            }
+            for one in own
+        },
+        "where": lives,
+        "rest": {name: {"evidence": gain, "share": share} for name, (gain, share) in found.rest.items()},
+        "withdrawn": list(withdrawn),
+        "notes": notes,
+    }
+
+
+def _finding(
+    task: Task,
+    one: Finding,
+    values: Mapping[str, float],
+    errors: Mapping[str, float],
+    lives: Mapping[str, Any],
+    located: Mapping[str, Localised],
+) -> dict[str, Any]:
+    prefix, known = f"effects.{one.effect}", dict.fromkeys(one.numbers)
+    units = {field.name: about.unit for field, about in parameters(effect_class(one.effect))}
+    numbers = {
+        leaf: {
+            "value": values.get(f"{prefix}.{leaf}", one.numbers[leaf]),
+            "standard_error": errors.get(f"{prefix}.{leaf}", 0.0),
+            "unit": unit_on(task.record, f"{one.effect}.{leaf}", units[leaf]),
+        }
+        for leaf in known
+    }
+    place = effect_kinds()[one.effect](**one.numbers).place
+    sides = {"motor": ["motor"], "actuator": ["motor"]}.get(place, ["load"] if place == "load" else list(located))
+    sides = [side for side in sides if side in located] or list(located)
+    return {
+        "effect": one.effect,
+        "confidence": one.confidence,
+        "parameters": numbers,
+        "alternatives": [{"effect": name, "confidence": chance} for name, chance in one.alternatives],
+        "where": {"place": place, "sentences": {side: lives[side]["sentence"] for side in sides}},
+    }
+
+
+def _lives(record: Record, located: Mapping[str, Localised]) -> dict[str, Any]:
+    """Where missing torques live, with sentences in the log's units."""
+    told = {name: describe(one, unit_on(record, f"{name}.torque", "N m")) for name, one in located.items()}
+    return {name: one | {"sentence": told[name]} for name, one in as_json(located).items()}
+
+
+def _least_seen(record: Record, located: Mapping[str, Localised]) -> list[str]:
+    """What would not have been seen, and whether that is nearly everything."""
+    assert record.torque is not None
+    unit = {side: unit_on(record, f"{side}.torque", "N m") for side in located}
+    driving = float(np.sqrt(np.mean(np.square(record.torque))))
+    lines = []
+    for side, one in located.items():
+        least = SIGNIFICANT * one.coordinates["all"].regions[0].mean_error
+        lines.append(f"{side}: a steady torque of less than about {least:.2g} {unit[side]} would not have been seen.")
+        if side == "motor" and least > _HIDDEN * driving:
+            lines.append(
+                f"Noise hides nearly everything: the input is {driving:.2g} {unit[side]} rms. A longer log, larger torques "
+                "or a finer encoder are needed."
+            )
+    return lines

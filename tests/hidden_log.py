@@ -1,0 +1,39 @@
+"""A log from the bench's own simulator, which shares nothing with the package: a direct drive with hidden dry friction."""
+
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+from hidden.cases import Log
+from hidden.simulator import Machine, Run, simulate
+
+DRIVE = {"kind": "rigid", "motor_inertia": 0.02, "motor_viscous": 0.03}
+FRICTION = {"kind": "motor.coulomb_friction", "torque": 0.06}
+
+
+def model(**tables: Any) -> dict[str, Any]:
+    """The study of someone who does not know of the friction, and whose numbers are a little off."""
+    return {
+        "title": "direct drive",
+        "drive": DRIVE | {"motor_inertia": 0.0202, "motor_viscous": 0.0296},
+        "run": {"sample_period": 2e-3, "duration": 4.0},
+        "uncertainty": {"relative": 0.02, "exact": []},
+        "log": {"initial_state": "unknown"},
+    } | tables
+
+
+@cache
+def logged(effects: tuple[str, ...] = ("friction",), seed: int = 1, noise: float = 3e-5, inertia: float = 0.02) -> Log:
+    """4 s of a multisine."""
+    t = 2e-3 * np.arange(2000)
+    phases = np.random.default_rng(seed).uniform(-np.pi, np.pi, 6)
+    k = np.arange(1, 7)
+    torque = 0.3 * np.sum(np.sin(2.0 * np.pi * 0.5 * k[:, None] * t + phases[:, None]), axis=0)
+    machine = Machine(DRIVE | {"motor_inertia": inertia}, None, [FRICTION] if effects else [])
+    (trace,) = simulate([Run(machine, 2e-3, torque, motor_noise=noise, seed=seed)])
+    return Log(trace.t, trace.u, trace.theta_e, None)

@@ -1,0 +1,141 @@
+"""What a diagnosis says: sentences and figures for every verdict."""
+
+import copy
+import dataclasses
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from jaxbl.discrepancy.residuals import Residual
+from jaxbl.report.diagnosed import _over_time, _story, batch_row, diagnosis_lines, write_batch
+from jaxbl.report.style import save
+
+ERRORS = {
+    "theta_e": 0.1,
+    "theta_s": 0.02,
+    "velocity_motor": 1.0,
+    "velocity_load": 0.2,
+    "torque_motor": 0.5,
+    "torque_load": 2.0,
+}
+UNITS = dict(zip(ERRORS, ["rad", "rad", "rad/s", "rad/s", "N m", "N m"], strict=True))
+
+
+def scaled(factor):
+    return {name: factor * value for name, value in ERRORS.items()}
+
+
+SUMMARY = {
+    "verdict": "explained",
+    "findings": [
+        {
+            "effect": "load.coulomb_friction",
+            "confidence": 0.93,
+            "parameters": {"torque": {"value": 0.274, "standard_error": 0.0021, "unit": "N m"}},
+            "alternatives": [{"effect": "load.stribeck_friction", "confidence": 0.07}],
+        }
+    ],
+    "where": {"motor": {"sentence": "motor side: nothing beyond noise"}, "load": {"sentence": "load side, here"}},
+    "rest": {"load.drift": {"evidence": -3.0, "share": 0.001}, "load.time": {"evidence": None, "share": 0.0}},
+    "withdrawn": [],
+    "notes": ["A note."],
+    "gap": {
+        "holdout": {"file": "/logs/other.csv", "separate": True, "from": 0.0, "to": 5.0, "window": 0.5},
+        "units": UNITS,
+        "holdout_rmse_before": ERRORS,
+        "holdout_rmse_after": scaled(0.011),
+        "noise_floor": scaled(0.01),
+        "free_run": {"before": ERRORS, "after": scaled(0.02)},
+        "controls": {
+            "wrong": {"effect": "load.stribeck_friction", "rmse": scaled(0.3)},
+            "permuted": {"rmse": scaled(1.4) | {"theta_e": None}},
+        },
+    },
+}
+
+
+def changed(**keys):
+    return copy.deepcopy(SUMMARY) | keys
+
+
+def test_the_headline_has_verdict_numbers_and_gap():
+    lines = diagnosis_lines(SUMMARY)
+    assert lines[0] == "Explained: the model lacks load.coulomb_friction; with it noise is left."
+    assert lines[1] == "load.coulomb_friction (confidence 0.93): torque = 0.274 ± 0.0021 N m."
+    assert lines[2] == "  This log does not rule out in its place: load.stribeck_friction (0.07)."
+    assert lines[3].startswith("On other.csv, over windows of 0.5 s, rms: theta_e 0.1 -> 0.0011 rad (floor 0.001); theta_s ")
+    assert lines[4].startswith("In one free run: theta_e 0.1 -> 0.002 rad;")
+    assert "Control: the best model with another effect (load.stribeck_friction) leaves 0.03 rad in theta_e." in lines
+    assert "Control: the missing torque in the wrong order leaves diverges rad in theta_e." not in lines
+    assert lines[-1] == "A note."
+
+
+def test_other_verdicts_say_what_is_left():
+    assert diagnosis_lines(changed(verdict="no_discrepancy", findings=[]))[0].startswith("No discrepancy: ")
+    rest = {"load.drift": {"evidence": 30.0, "share": 0.01}}
+    lines = diagnosis_lines(changed(verdict="unknown_effect", findings=[], rest=rest))
+    assert lines[0].startswith(
+        "Unknown effect: something is missing that is none of the effects known. It lives: motor side"
+    )
+    assert any(line.startswith("Left over: a friction that drifts on the load side (1 % of") for line in lines)
+    partly = changed(verdict="unknown_effect", where_after={"load": {"sentence": "load side, there"}})
+    assert diagnosis_lines(partly)[0].endswith("does not explain all of it. What is left: load side, there.")
+    gap = SUMMARY["gap"] | {"free_run": {"why_not": "it is chaotic"}}
+    assert "A free run says nothing here: it is chaotic." in diagnosis_lines(changed(gap=gap))
+
+
+@pytest.mark.parametrize("findings", [SUMMARY["findings"], []], ids=["some", "none"])
+def test_the_story_is_drawn(findings, tmp_path):
+    drawn = _story(changed(findings=findings, verdict="explained" if findings else "no_discrepancy"))
+    left, right = drawn.figure.axes
+    assert left.get_xlabel() == "rms error on held-out data over noise" and left.get_xscale() == "log"
+    assert left.get_yticklabels()[0].get_text() == "motor position\n0.1 → 0.0011 rad"
+    texts = [text.get_text().strip() for text in right.texts]
+    expected = ["load.coulomb_friction: 0.93", "or load.stribeck_friction: 0.07"] if findings else ["no effect named"]
+    assert texts == expected
+    assert save(drawn.figure, tmp_path / "gap.png").stat().st_size > 10_000
+
+
+@dataclasses.dataclass
+class _Part:
+    record: object
+    holdout: object
+    pairs: dict
+    located: dict
+    summary: dict
+
+
+class _Named:
+    def __init__(self, **attributes):
+        self.__dict__.update(attributes)
+
+
+def test_missing_torque_is_drawn_before_and_after(tmp_path):
+    time = 2e-3 * np.arange(2000)
+    noise = 0.02 * np.random.default_rng(0).standard_normal(2000)
+
+    def residual(torque, rows):
+        return Residual("motor", time[rows], torque[rows], np.full(len(time[rows]), 0.02), np.ones(1), 100.0)
+
+    before = 0.3 * np.sign(np.sin(5.0 * time)) + noise
+    parts = [(slice(0, 1500), False), (slice(1500, 2000), True)]
+    pairs = {"motor": [(residual(before, rows), residual(noise, rows), held) for rows, held in parts]}
+    record = _Named(findings=_Named(channels={"theta_e": _Named(unit="rad")}), path=tmp_path / "axis.csv")
+    gap = {"holdout": {"separate": False}}
+    found = _Part(record, record, pairs, {"motor": _Named(bandwidth=30.0)}, {"gap": gap})
+    drawn = _over_time(found)  # type: ignore[arg-type]
+    (ax,) = drawn.figure.axes
+    assert ax.get_ylabel() == "motor:\nmissing torque (N m)"
+    assert ax.get_legend_handles_labels()[1] == ["before", "after", "± 2 noise", "held out"]
+    assert save(drawn.figure, tmp_path / "before_after.png").stat().st_size > 10_000
+
+
+def test_a_batch_is_a_table(tmp_path):
+    rows = [batch_row(tmp_path / "a.csv", SUMMARY), batch_row(tmp_path / "long.csv", None, "long.csv: holds nothing")]
+    lines = write_batch(rows, tmp_path)
+    assert lines[0] == "a.csv     explained       load.coulomb_friction (0.93)  theta_e 0.1 -> 0.0011 (0.001)"
+    assert lines[1] == "long.csv  refused         long.csv: holds nothing"
+    table = pd.read_csv(tmp_path / "batch.csv")
+    assert list(table["log"]) == ["a.csv", "long.csv"]
+    assert table["theta_s_before"][0] == 0.02 and np.isnan(table["theta_s_before"][1])

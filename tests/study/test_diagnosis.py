@@ -1,0 +1,170 @@
+"""From a log to what is missing: the truth comes from a simulator that shares nothing with the package."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from hidden_log import FRICTION, logged, model
+
+import jaxbl.study.diagnosis as under_test
+from jaxbl.errors import InputError
+from jaxbl.records import read_record
+from jaxbl.report import diagnosis_lines, write_diagnosis_report
+from jaxbl.study.config import read_config
+from jaxbl.study.diagnosis import diagnose, read_task, run_task
+from jaxbl.study.next_experiment import next_experiment, tied, write_next_experiment
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("logs")
+    logged().write(folder / "axis.csv")
+    logged(seed=2).write(folder / "other.csv")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(logs):
+    return diagnose(logs / "axis.csv", model())
+
+
+def test_the_missing_effect_is_named_with_its_number(found):
+    summary = found.summary
+    assert summary["verdict"] == "explained"
+    (one,) = summary["findings"]
+    assert one["effect"] == "motor.coulomb_friction" and one["confidence"] > 0.5
+    torque = one["parameters"]["torque"]
+    assert torque["value"] == pytest.approx(FRICTION["torque"], rel=0.02)
+    assert abs(torque["value"] - FRICTION["torque"]) < 5.0 * torque["standard_error"]
+    assert torque["unit"] == "N m"
+    assert one["where"]["place"] == "motor" and "motor side" in one["where"]["sentences"]["motor"]
+    for path, true in (("drive.motor_inertia", 0.02), ("drive.motor_viscous", 0.03)):
+        assert summary["parameters"][path]["value"] == pytest.approx(true, rel=0.02)
+
+
+def test_the_gap_shrinks_to_the_noise_on_what_was_held_out(found):
+    gap = found.summary["gap"]
+    assert gap["holdout"]["separate"] is False and gap["holdout"]["from"] == pytest.approx(3.0)
+    before, after, floor = (gap[key] for key in ("holdout_rmse_before", "holdout_rmse_after", "noise_floor"))
+    assert set(before) == set(after) == set(floor) == {"theta_e", "velocity_motor", "torque_motor"}
+    assert before["theta_e"] > 20.0 * floor["theta_e"]
+    assert after["theta_e"] < 1.5 * floor["theta_e"]
+    assert after["torque_motor"] < 0.5 * before["torque_motor"]
+    assert gap["controls"]["permuted"]["rmse"]["theta_e"] > 0.5 * before["theta_e"]
+    assert gap["free_run"]["after"]["theta_e"] < 0.1 * gap["free_run"]["before"]["theta_e"]
+
+
+def test_what_is_held_out_keeps_its_times_and_is_not_fitted(logs, found):
+    whole = read_record(logs / "axis.csv")
+    task = read_task(logs / "axis.csv", model())
+    assert len(task.record.time) == 1500 and task.record.segments == (slice(0, 1500),)
+    assert task.holdout.segments == (slice(1500, 2000),)
+    np.testing.assert_array_equal(task.holdout.time, whole.time)
+    parts = dataclasses.replace(whole, segments=(slice(0, 700), slice(800, 1200), slice(1300, 2000)))
+    first, last = under_test._split(parts, 50)
+    assert first.segments == (slice(0, 700), slice(800, 1200), slice(1300, 1550))
+    assert last.segments == (slice(1550, 2000),) and len(first.time) == 1550
+    trace = found.trace
+    assert trace["held_out"].sum() == 500 and trace["motor.missing_before"].notna().all()
+    assert trace["motor.missing_after"].std() < trace["motor.missing_before"].std()
+
+
+def test_the_extended_model_runs_and_the_report_says_what_was_found(found, tmp_path):
+    lines = write_diagnosis_report(found, tmp_path)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"diagnosis.json", "model.toml", "trace.parquet", "figures", "report.html"}
+    assert lines[0].startswith("Explained: the model lacks motor.coulomb_friction;")
+    assert any(line.startswith("motor.coulomb_friction (confidence") and "± " in line for line in lines)
+    again = read_config(tmp_path / "model.toml")
+    assert [one.kind for one in again.effects] == ["motor.coulomb_friction"]
+    summary = json.loads((tmp_path / "diagnosis.json").read_text())
+    assert summary == found.summary and diagnosis_lines(summary) == lines
+    assert again.effects[0].torque == summary["findings"][0]["parameters"]["torque"]["value"]
+
+
+def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
+    """The explanation is told to have found a number that is far off, and the fit to leave it."""
+    real, fit = under_test.explain, under_test._fit
+
+    def wrong(*arguments):
+        one = real(*arguments)
+        model = dataclasses.replace(one.model, experiment=spoilt(one.model.experiment))
+        return dataclasses.replace(one, model=model)
+
+    def spoilt(experiment):
+        import equinox as eqx
+
+        return eqx.tree_at(lambda e: e.effects[0].torque, experiment, experiment.effects[0].torque * 4.0)
+
+    def lazy(experiment, free, windows, theta, **how):
+        return fit(experiment, free, windows, theta, **(how | {"held": np.ones(len(theta), bool)}))
+
+    monkeypatch.setattr(under_test, "explain", wrong)
+    monkeypatch.setattr(under_test, "_fit", lazy)
+    task = read_task(logs / "axis.csv", model(), holdout=logs / "other.csv")
+    stages = []
+    found = run_task(task, lambda *at: stages.append(at))
+    assert stages == [(i, 6) for i in range(1, 7)]
+    summary = found.summary
+    assert summary["withdrawn"] == ["motor.coulomb_friction"] and summary["findings"] == []
+    assert summary["verdict"] in ("no_discrepancy", "unknown_effect")
+    assert any("was found, and withdrawn" in note for note in summary["notes"])
+    gap = summary["gap"]
+    assert gap["holdout"]["separate"] is True
+    for name in ("theta_e", "torque_motor"):
+        assert gap["holdout_rmse_after"][name] <= 1.02 * gap["holdout_rmse_before"][name]
+    assert found.model.effects == []
+
+
+def test_a_tie_has_an_experiment(logs, found, tmp_path):
+    record = read_record(logs / "axis.csv")
+    assert tied({"findings": []}) is None
+    told = write_next_experiment(tmp_path, {"findings": []}, record, tmp_path / "next.csv")
+    assert told[0].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
+    other = [{"kind": "motor.quadratic_drag", "drag": 0.004}]
+    rival = {"effect": "motor.quadratic_drag", "drive": model()["drive"], "effects": other}
+    finding = {"effect": "motor.coulomb_friction", "alternatives": [{"effect": "motor.quadratic_drag", "confidence": 0.3}]}
+    summary = {"findings": [finding], "rival": rival}
+    best = next_experiment(summary, found.model, record)
+    assert best is not None and best.apart > 10.0
+    assert np.max(np.abs(best.torque)) <= np.max(np.abs(record.torque)) + 1e-12
+    write_diagnosis_report(found, tmp_path)
+    (line,) = write_next_experiment(tmp_path, summary, record, tmp_path / "new" / "next.csv")
+    assert line.startswith(f"To part motor.coulomb_friction from motor.quadratic_drag: {best.kind} of ")
+    columns = np.genfromtxt(tmp_path / "new" / "next.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(columns["u"], best.torque, atol=1e-8)
+
+
+def refused(logs, *arguments, **keywords):
+    with pytest.raises(InputError) as error:
+        read_task(*arguments, **keywords)
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+def test_a_holdout_of_another_machine_is_refused(logs, tmp_path):
+    axis = logs / "axis.csv"
+    assert "is the log itself" in refused(logs, axis, model(), holdout=axis)
+    log = logged(seed=2)
+    coarse = tmp_path / "coarse.csv"
+    dataclasses.replace(log, t=log.t * 2.0).write(coarse)
+    assert "is sampled every 0.004 s" in refused(logs, axis, model(), holdout=coarse)
+    logged(seed=2, inertia=0.1).write(tmp_path / "heavy.csv")
+    assert "shows an inertia of 0.1" in refused(logs, axis, model(), holdout=tmp_path / "heavy.csv")
+    dataclasses.replace(log, theta_e=-log.theta_e).write(tmp_path / "sign.csv")
+    assert "sign" in refused(logs, axis, model(), holdout=tmp_path / "sign.csv")
+
+
+def test_a_log_that_is_too_short_is_refused(logs, tmp_path):
+    log = logged()
+    short = dataclasses.replace(log, **{name: getattr(log, name)[:150] for name in ("t", "u", "theta_e")})
+    short.write(tmp_path / "short.csv")
+    assert "too few to hold a quarter of them out" in refused(logs, tmp_path / "short.csv", model())
+
+
+def test_a_model_that_diverges_is_refused(logs):
+    unstable = model(effects=[{"kind": "motor.viscous_friction", "viscous": -2.0}])
+    with pytest.raises(InputError, match=r"axis\.csv: the model diverges under this log's input"):
+        diagnose(logs / "axis.csv", unstable)
