@@ -120,6 +120,7 @@ _SPACING = 0.3
 
 
 def rms(values: Array) -> float:
+    """Root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 

@@ -41,7 +41,7 @@ _NEAR = 25.0
 _STEPS = 15
 _SETTLED = 2e-3
 _LEAST_CHANCE = 0.01
-_CLEAR = 10.0
+CLEAR = 10.0
 """Nats that a free function must earn to tell that something else is missing."""
 _SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
 _MOST = 4
@@ -240,7 +240,7 @@ class Explainer:
         findings = [dataclasses.replace(one, numbers=current.numbers[one.effect]) for one in findings]
         rest = self.remainder(current, smoothness)
         verdict: Verdict = "explained" if findings else "no_discrepancy"
-        if any(gain > _CLEAR for gain, _ in rest.values()):
+        if any(gain > CLEAR for gain, _ in rest.values()):
             verdict = "unknown_effect"
         return Explanation(verdict, tuple(findings), current, nominal, wrong, rest)
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from jaxbl.discrepancy.explain import Explanation, Finding, Model, explain
+from jaxbl.discrepancy.explain import CLEAR, Explanation, Finding, Model, explain
 from jaxbl.discrepancy.proof import POSITIONS, WINDOW, Ground, Proof, foretold
 from jaxbl.discrepancy.residuals import Residual
 from jaxbl.discrepancy.where import SIGNIFICANT, Localised, Values, as_json, coordinates_of, describe, where
@@ -352,7 +352,7 @@ def _check_stable(task: Task, before: Proof) -> None:
 
 
 def _without_findings(found: Explanation) -> str:
-    return "unknown_effect" if any(gain > 0.0 for gain, _ in found.rest.values()) else "no_discrepancy"
+    return "unknown_effect" if any(gain > CLEAR for gain, _ in found.rest.values()) else "no_discrepancy"
 
 
 class _Proving:

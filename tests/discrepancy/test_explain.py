@@ -7,7 +7,8 @@ from hidden.cases import cases
 from jaxbl.discrepancy.explain import explain
 from jaxbl.identification.search import smoothed_channels
 from jaxbl.identification.trajectory import free_parameters
-from jaxbl.study.identification import _default_paths, _on_record, read_task
+from jaxbl.study.identification import read_task
+from jaxbl.study.logs import default_paths, on_record
 
 SEED, DURATION = 21, 6.0
 _SIZES = {"torque", "drag", "inertia", "viscous", "relative", "amplitude", "damping", "half_gap", "limit", "time_constant"}
@@ -17,8 +18,8 @@ def explained(case, tmp_path):
     log = tmp_path / "log.csv"
     case.log.write(log)
     task = read_task(log, case.model)
-    nominal = _on_record(task.config, task.record)
-    free = free_parameters(nominal, _default_paths(task.config, nominal), float(np.std(task.record.torque)))
+    nominal = on_record(task.config, task.record)
+    free = free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
     prior = [task.config.uncertainty.relative] * len(free)
     smoothed = smoothed_channels(task.record, nominal.sides).smoothed
     return explain(nominal, free, prior, task.record, smoothed)
