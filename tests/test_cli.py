@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -557,3 +558,134 @@ def test_an_interrupt_while_numbers_are_sought(axis, tmp_path):
     again = "jaxbl identify 'an axis.csv' --model axis.toml --out 'results/an axis'"
     assert errors == f"interrupted; nothing was written. Start again with: {again}\n"
     assert not folder.exists()
+
+
+GAP = {"theta_e": 0.1, "torque_motor": 1.0}
+DIAGNOSED = {
+    "verdict": "explained",
+    "findings": [
+        {
+            "effect": "motor.coulomb_friction",
+            "confidence": 0.97,
+            "parameters": {"torque": {"value": 0.05, "standard_error": 0.001, "unit": "N m"}},
+            "alternatives": [],
+        }
+    ],
+    "where": {"motor": {"sentence": "motor side, somewhere"}},
+    "rest": {},
+    "withdrawn": [],
+    "notes": [],
+    "gap": {
+        "holdout": {"file": "axis.csv", "separate": False, "from": 0.4, "to": 0.6, "window": 0.1},
+        "units": {"theta_e": "rad", "torque_motor": "N m"},
+        "holdout_rmse_before": GAP,
+        "holdout_rmse_after": {"theta_e": 0.001, "torque_motor": 0.01},
+        "noise_floor": {"theta_e": 0.001, "torque_motor": 0.01},
+        "free_run": {},
+        "controls": {},
+    },
+}
+
+
+class _Found:
+    def __init__(self, task):
+        self.summary = DIAGNOSED | {"identity": task.identity, "file": str(task.record.path.resolve())}
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Diagnoses without the computation; returns the tasks that were run."""
+    tasks = []
+
+    def run_task(task, progress=None):
+        tasks.append(task)
+        return _Found(task)
+
+    def report(found, folder):
+        from jaxbl.report import diagnosis_lines
+
+        (folder / "diagnosis.json").write_text(json.dumps(found.summary))
+        return diagnosis_lines(found.summary)
+
+    monkeypatch.setattr("jaxbl.study.diagnosis.run_task", run_task)
+    monkeypatch.setattr("jaxbl.report.write_diagnosis_report", report)
+    monkeypatch.setattr("jaxbl.report.diagnosed.write_diagnosis_report", report)
+    return tasks
+
+
+DIAGNOSE = ["diagnose", "an axis.csv", "--model", "axis.toml"]
+
+
+def test_a_log_is_diagnosed_once(axis, quick, call, tmp_path):
+    code, lines, _ = call(*DIAGNOSE, "--next-experiment", "next.csv")
+    assert code == 0
+    assert lines[0] == "Explained: the model lacks motor.coulomb_friction; with it noise is left."
+    assert lines[1] == "motor.coulomb_friction (confidence 0.97): torque = 0.05 ± 0.001 N m."
+    assert lines[2].startswith(
+        "On the last part of the log (0.4 to 0.6 s), held out, over windows of 0.1 s, rms: theta_e 0.1 ->"
+    )
+    assert lines[-2].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
+    assert lines[-1] == "results/an axis/report.html"
+    assert call(*DIAGNOSE) == (0, [*lines[:-2], lines[-1]], [])
+    assert len(quick) == 1
+    shutil.copy("an axis.csv", "other.csv")
+    with pytest.raises(InputError, match="results of another log"):
+        call("diagnose", "other.csv", "--model", "axis.toml", "--out", "results/an axis")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["diagnose", "--model", "axis.toml"], "no log; give one or several"),
+        (["diagnose", "an axis.csv"], "no model; give a study"),
+        ([*DIAGNOSE, "--holdout", "none.csv", "--out", "new"], r"none\.csv: no such file"),
+        ([*DIAGNOSE, "--holdout", "an axis.csv", "--out", "new"], "is the log itself"),
+        ([*DIAGNOSE, "--batch", "."], "takes no logs"),
+        (["diagnose", "--batch", "none"], "none: no such folder"),
+        (["diagnose", "--batch", "empty"], "empty: holds no log"),
+        (["diagnose", "--batch", "."], r"an axis\.csv: no model; give --model TOML, or an axis\.toml beside it"),
+    ],
+)
+def test_what_cannot_be_diagnosed_is_told(arguments, message, axis, quick, call, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=message) as error:
+        call(*arguments)
+    assert "\n" not in str(error.value)
+    assert not quick and not (tmp_path / "new").exists()
+
+
+def test_an_interrupted_diagnosis_writes_nothing_and_says_how_to_start_again(axis, call, tmp_path, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("jaxbl.study.diagnosis.run_task", interrupt)
+    told = "interrupted; nothing was written. Start again with: jaxbl diagnose 'an axis.csv' --model axis.toml --out out"
+    assert call(*DIAGNOSE, "--out", "out") == (130, [], [told])
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_of_logs_is_diagnosed_and_goes_on_where_it_stopped(axis, quick, call, tmp_path):
+    (tmp_path / "logs").mkdir()
+    for name in ("a.csv", "b.csv"):
+        shutil.copy("an axis.csv", tmp_path / "logs" / name)
+    (tmp_path / "logs" / "broken.csv").write_text("t,u\n0,1\n")
+    code, lines, _ = call("diagnose", "--batch", "logs", "--model", "axis.toml", "--out", "out")
+    assert code == 0
+    assert [line.split()[:2] for line in lines[:3]] == [
+        ["a.csv", "explained"],
+        ["b.csv", "explained"],
+        ["broken.csv", "refused"],
+    ]
+    assert lines[-1] == "out/batch.csv"
+    table = pd.read_csv("out/batch.csv")
+    assert list(table["log"]) == ["a.csv", "b.csv", "broken.csv"] and "broken.csv" in table["refused"][2]
+    assert not (tmp_path / "out" / "broken").exists()
+    (tmp_path / "out" / "b" / "diagnosis.json").unlink()
+    assert call("diagnose", "--batch", "logs", "--model", "axis.toml", "--out", "out") == (0, lines, [])
+    assert len(quick) == 3
+    # a model of its own, and a hold-out log
+    shutil.copy("axis.toml", tmp_path / "logs" / "a.toml")
+    (tmp_path / "logs" / "b.csv").unlink()
+    (tmp_path / "logs" / "broken.csv").rename(tmp_path / "logs" / "a2.csv")
+    (tmp_path / "logs" / "a.csv").write_text("t,u\n0,1\n")
+    assert call("diagnose", "--batch", "logs", "--model", "axis.toml", "--out", "again")[0] == 2

@@ -95,6 +95,15 @@ class Ground:
         """The record in windows, and the row that each begins with."""
         return windows_of(self.record, self.channels, experiment, samples, self.rest)
 
+    def strays(self, experiment: Experiment) -> dict[str, float]:
+        """How far a model leaves each side's motion on short windows from the smoothed states, at most, over its range."""
+        windows, _ = self.windows(experiment, self.samples)
+        apart = _strays(experiment, windows)
+        ranges = {
+            side: max(float(np.ptp(self.record.positions[side][part])) for part in self.record.segments) for side in apart
+        }
+        return {side: float(np.nan_to_num(float(one), nan=np.inf)) / ranges[side] for side, one in apart.items()}
+
     def prove(self, experiment: Experiment) -> Proof:
         """Errors of a model on short windows, and the torques that it lacks."""
         windows, firsts = self.windows(experiment, self.samples)
@@ -196,6 +205,15 @@ def _foretold(experiment: Experiment, windows: Windows, passes: int, rest: bool)
         return trajectory(experiment, start, torque, time).velocity
 
     return residual, jax.vmap(one)(start, windows.torque, windows.time)
+
+
+@eqx.filter_jit
+def _strays(experiment: Experiment, windows: Windows) -> dict[str, Array]:
+    def one(start: PlantState, torque: Array, time: Array) -> dict[str, Array]:
+        return trajectory(experiment, start, torque, time).position
+
+    simulated = jax.vmap(one)(windows.start, windows.torque, windows.time)
+    return {side: jnp.max(jnp.abs(simulated[side] - windows.measured[side])) for side in experiment.sides}
 
 
 @eqx.filter_jit

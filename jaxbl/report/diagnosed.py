@@ -132,10 +132,9 @@ def _remarks(summary: dict[str, Any]) -> list[str]:
         effect = f" ({control['effect']})" if "effect" in control else ""
         channel = next(iter(control["rmse"]))
         what = {"wrong": "the best model with another effect", "permuted": "the missing torque in the wrong order"}[name]
-        lines.append(
-            f"Control: {what}{effect} leaves {_value(control['rmse'][channel])} {summary['gap']['units'][channel]} "
-            f"in {channel}."
-        )
+        left = control["rmse"][channel]
+        told = "diverges" if left is None else f"leaves {_value(left)} {summary['gap']['units'][channel]} in {channel}"
+        lines.append(f"Control: {what}{effect} {told}.")
     return [*lines, *summary["notes"]]
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.discrepancy.explain import CLEAR, Explanation, Finding, Model, explain
-from jaxbl.discrepancy.proof import POSITIONS, WINDOW, Ground, Proof, foretold
+from jaxbl.discrepancy.proof import WINDOW, Ground, Proof, foretold
 from jaxbl.discrepancy.residuals import Residual
 from jaxbl.discrepancy.where import SIGNIFICANT, Localised, Values, as_json, coordinates_of, describe, where
 from jaxbl.drive.effects import effect_class, effect_kinds
@@ -27,7 +27,7 @@ from jaxbl.drive.parameters import parameters, set_leaves
 from jaxbl.errors import InputError
 from jaxbl.identification.intervals import spread
 from jaxbl.identification.prediction import predictor
-from jaxbl.identification.regression import Kinematics, shortest
+from jaxbl.identification.regression import Kinematics
 from jaxbl.identification.search import Channels, smoothed_channels, windows_of
 from jaxbl.identification.trajectory import WIDE, Fit, Free, Windows, fit, free_parameters
 from jaxbl.records import Record
@@ -39,7 +39,6 @@ from .logs import (
     LOG_NAMES,
     Logs,
     arrays,
-    decimation,
     default_paths,
     gains_for,
     identity_of,
@@ -54,6 +53,8 @@ HELD_OUT = 0.25
 """Share of a log that is held out where there is no other one for it."""
 GEAR_TOLERANCE = 0.15
 """A missing effect (a soft shaft, a gap) shifts the ratio of both motions by some per cent."""
+_FEWEST = 100
+"""Samples of a part of a log, and of what is held out."""
 _SAMPLES = 500
 """Of the windows that numbers are fitted on."""
 _WORSE = 1.02
@@ -130,13 +131,12 @@ def read_task(log: Logs, model: str | Path | Mapping[str, Any] | Config, *, hold
     """
     config, missing = read_model(model)
     record = read_logs(config, log, GEAR_TOLERANCE)
-    fewest = max(2 * shortest(decimation(config, record)), 50)
     if holdout is None:
-        record, other = _split(record, fewest)
+        record, other = _split(record)
     else:
         other = read_logs(config, holdout, GEAR_TOLERANCE)
         _check_machine(record, other)
-    return Task(config, missing, _long(record, fewest), _long(other, fewest), holdout is not None)
+    return Task(config, missing, _long(record), _long(other), holdout is not None)
 
 
 def diagnose(log: Logs, model: str | Path | Mapping[str, Any] | Config, *, holdout: Logs | None = None) -> Diagnosis:
@@ -154,25 +154,25 @@ def diagnose(log: Logs, model: str | Path | Mapping[str, Any] | Config, *, holdo
     return run_task(read_task(log, model, holdout=holdout))
 
 
-def _long(record: Record, fewest: int) -> Record:
+def _long(record: Record) -> Record:
     """Without parts that are too short for the equations of motion."""
-    parts = tuple(part for part in record.segments if part.stop - part.start >= fewest)
+    parts = tuple(part for part in record.segments if part.stop - part.start >= _FEWEST)
     if not parts:
         raise InputError(
             f"{record.path}: its longest part has {max(part.stop - part.start for part in record.segments)} samples; "
-            f"at least {fewest} are needed"
+            f"at least {_FEWEST} are needed"
         )
     return dataclasses.replace(record, segments=parts)
 
 
-def _split(record: Record, fewest: int) -> tuple[Record, Record]:
+def _split(record: Record) -> tuple[Record, Record]:
     """The samples to be fitted, and those held out: the last of the log, at their own times."""
     total = sum(part.stop - part.start for part in record.segments)
     left = round((1.0 - HELD_OUT) * total)
-    if HELD_OUT * total < fewest:
+    if HELD_OUT * total < _FEWEST:
         raise InputError(
             f"{record.path}: {total} samples are too few to hold a quarter of them out; at least "
-            f"{int(np.ceil(fewest / HELD_OUT))} are needed, or another log: --holdout"
+            f"{int(np.ceil(_FEWEST / HELD_OUT))} are needed, or another log: --holdout"
         )
     row = record.segments[-1].stop
     for part in record.segments:
@@ -268,15 +268,15 @@ def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
         own = free_parameters(nominal, default_paths(config, nominal), float(np.std(record.torque)))
         prior = np.full(len(own), config.uncertainty.relative)
         rest = config.log.initial_state == "rest"
-        seen, other = (_ground(config, nominal, one, rest) for one in (record, task.holdout))
+        seen, other = (_ground(nominal, one, rest) for one in (record, task.holdout))
         other = dataclasses.replace(other, rest=rest and task.separate)
+        _check_stable(task, nominal, seen)
         lacking = seen.torques(nominal)
         coordinates = _coordinates(nominal, seen, lacking)
         located = where(nominal, lacking, seen.parts, seen.smoothed, rotating=_rotating(record, nominal))
         bandwidth = {name: one.bandwidth for name, one in located.items()}
         seen, other = (dataclasses.replace(one, bandwidth=bandwidth) for one in (seen, other))
-        before = other.prove(nominal)
-        _check_stable(task, before)
+        before = other.prove(_at(nominal, task.holdout))
         done()
         found = explain(nominal, own, prior.tolist(), record, seen.channels.smoothed)
         done()
@@ -317,9 +317,10 @@ def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
     )  # fmt: skip
 
 
-def _ground(config: Config, nominal: Experiment, record: Record, rest: bool) -> Ground:
+def _ground(nominal: Experiment, record: Record, rest: bool) -> Ground:
     channels = smoothed_channels(record, nominal.sides)
-    parts = kinematics_of(record, channels, decimation(config, record))
+    # nothing is decimated here
+    parts = kinematics_of(record, channels, 1)
     return Ground(record, channels, parts, {}, rest)
 
 
@@ -341,18 +342,21 @@ def _coordinates(
     }
 
 
-def _check_stable(task: Task, before: Proof) -> None:
-    for side, values in task.holdout.positions.items():
-        error = before.errors.get(POSITIONS[side], 0.0)
-        if not error < _DIVERGED * float(np.ptp(values)):
+def _check_stable(task: Task, nominal: Experiment, ground: Ground) -> None:
+    for side, apart in ground.strays(nominal).items():
+        if not apart < _DIVERGED:
             raise InputError(
-                f"{task.holdout.path}: the model diverges under this log's input (its {side} leaves the measured motion by "
-                f"{error:.2g} within {WINDOW:g} s); its numbers, or run.substeps, should be nearer"
+                f"{task.record.path}: the model diverges under this log's input: within {WINDOW:g} s its {side} leaves the "
+                f"measured motion by {apart:.2g} times the whole of it; a number of it, or its sign, is wrong"
             )
 
 
 def _without_findings(found: Explanation) -> str:
     return "unknown_effect" if any(gain > CLEAR for gain, _ in found.rest.values()) else "no_discrepancy"
+
+
+def _at(experiment: Experiment, record: Record) -> Experiment:
+    return eqx.tree_at(lambda e: e.run.sample_period, experiment, jnp.asarray(record.sample_period))
 
 
 class _Proving:
@@ -398,8 +402,7 @@ class _Proving:
 
     def at(self, experiment: Experiment) -> Experiment:
         """A model at the period of what was held out."""
-        period = jnp.asarray(self.other.record.sample_period)
-        return eqx.tree_at(lambda e: e.run.sample_period, experiment, period)
+        return _at(experiment, self.other.record)
 
     def fitted(self, base: Model, names: tuple[str, ...]) -> _Fitted:
         """All numbers by the simulator, from those of the explanation; the better of both."""

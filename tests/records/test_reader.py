@@ -582,3 +582,15 @@ def test_servoproject_has_two_encoders_and_no_torque():
     np.testing.assert_allclose(record.positions["motor"], np.radians((raw[:, 1] - raw[:, 2]) * 220.0 / 4096.0), atol=1e-12)
     with pytest.raises(InputError, match="the sign of one of them is wrong"):
         read_record(path, SERVO, gear_ratio=-1.0)
+
+
+@pytest.mark.parametrize("off", [1.1, 0.92])
+def test_a_gear_ratio_that_is_a_little_off_is_noted_where_that_is_allowed(tmp_path, off):
+    path = wrote(tmp_path, made())
+    with pytest.raises(InputError, match="theta_e moves 20 for each 1 of theta_s"):
+        read_record(path, gear_ratio=off * GEAR_RATIO)
+    notes = read_record(path, gear_ratio=off * GEAR_RATIO, gear_tolerance=0.15).notes
+    assert any(note.startswith("theta_e moves 20 for each 1 of theta_s") and "a little wrong" in note for note in notes)
+    for gross in (1.3, -1.0, 1.0 / GEAR_RATIO**2):
+        with pytest.raises(InputError, match=r"for each 1 of theta_s|times theta_s"):
+            read_record(path, gear_ratio=gross * GEAR_RATIO, gear_tolerance=0.15)

@@ -67,7 +67,7 @@ def test_the_headline_has_verdict_numbers_and_gap():
     assert lines[3].startswith("On other.csv, over windows of 0.5 s, rms: theta_e 0.1 -> 0.0011 rad (floor 0.001); theta_s ")
     assert lines[4].startswith("In one free run: theta_e 0.1 -> 0.002 rad;")
     assert "Control: the best model with another effect (load.stribeck_friction) leaves 0.03 rad in theta_e." in lines
-    assert "Control: the missing torque in the wrong order leaves diverges rad in theta_e." not in lines
+    assert "Control: the missing torque in the wrong order diverges." in lines
     assert lines[-1] == "A note."
 
 

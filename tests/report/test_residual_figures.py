@@ -33,7 +33,7 @@ def test_every_equation_is_drawn_with_what_was_found(tmp_path, unit):
     drawn = {one.name: one for one in draw_residuals(residuals, coordinates, found, unit)}
     assert list(drawn) == ["residual_torque", "residual_motor", "residual_load", "residual_spectrum"]
     above, below = drawn["residual_torque"].figure.axes
-    assert describe(found["motor"], unit) in above.get_title("left")
+    assert describe(found["motor"], unit) == " ".join(above.get_title("left").split())
     assert "nothing beyond noise" in below.get_title("left")
     assert above.get_ylabel().endswith(f"({unit})")
     assert drawn["residual_motor"].figure.axes[0].get_xlabel() == "speed ω (rad/s)"

@@ -62,7 +62,7 @@ def test_what_is_held_out_keeps_its_times_and_is_not_fitted(logs, found):
     assert task.holdout.segments == (slice(1500, 2000),)
     np.testing.assert_array_equal(task.holdout.time, whole.time)
     parts = dataclasses.replace(whole, segments=(slice(0, 700), slice(800, 1200), slice(1300, 2000)))
-    first, last = under_test._split(parts, 50)
+    first, last = under_test._split(parts)
     assert first.segments == (slice(0, 700), slice(800, 1200), slice(1300, 1550))
     assert last.segments == (slice(1550, 2000),) and len(first.time) == 1550
     trace = found.trace
