@@ -584,7 +584,7 @@ def _summary(
     values, errors = fitted.values, fitted.errors()
     notes = list(record.notes)
     if task.separate:
-        notes += [f"{task.holdout.path.name}: {note}" for note in task.holdout.notes]
+        notes += [f"{task.holdout.path.name}: {note}" for note in task.holdout.notes if note not in record.notes]
     notes += [f"{name} was found, and withdrawn: with it the held-out data are met no better." for name in withdrawn]
     if task.separate and any(one.effect == "load.periodic_disturbance" for one in findings):
         notes.append("The phase of load.periodic_disturbance is taken to be the same at the start of both logs.")
