@@ -115,7 +115,7 @@ _LIMITS = 0.98, 0.95, 0.92, 0.88, 0.84, 0.8, 0.75, 0.7, 0.65, 0.6, 0.55, 0.5, 0.
 _LAGS = 0.3, 0.6, 1.2, 2.4, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0
 _GAPS = 0.01, 0.02, 0.04, 0.08, 0.12, 0.18, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.92
 _STEP = 0.02
-_SPACING = 0.3
+SPACING = 0.3
 """Prior standard deviation of the logarithm of a number about its trial value."""
 
 
@@ -204,7 +204,7 @@ def _trial(name: str, leaf: str, value: float) -> Variant:
 
     def numbers(values: Sequence[float]) -> Numbers | None:
         (change,) = values
-        return {leaf: value * math.exp(change)} if abs(change) < 4.0 * _SPACING else None
+        return {leaf: value * math.exp(change)} if abs(change) < 4.0 * SPACING else None
 
     return Variant(name, (), effects, numbers, {leaf: value})  # type: ignore[arg-type]
 
@@ -229,7 +229,6 @@ class Signals:
             rest = rest - plant.inertia(side) * part.acceleration[side]
             self.needed[side] = np.asarray(jnp.broadcast_to(rest, (self.count,)))
         self.direction = {side: self._direction(side) for side in self.sides}
-        self.drive = rms(self.torque[self.real])
 
     def _direction(self, side: str) -> Array:
         velocity, deviation = np.asarray(self.part.velocity[side]), np.asarray(self.part.deviation[side])

@@ -22,24 +22,21 @@ class Columns:
     """Everything that prediction errors are linear in, as products.
 
     Attributes:
-        products: of all columns with one another, over the errors' variance; shape (columns, columns). Order: constant, own
-            numbers, initial states, then each variant's columns and offset.
+        products: of all columns with one another, over the errors' variance, initial states eliminated; shape
+            (columns, columns). Order: constant, own numbers, then each variant's columns and offset.
         own: number of the model's own numbers.
-        states: number of initial states.
         places: columns of each variant.
         offsets: column of each variant's offset, or -1.
-        scale: prior standard deviation of each column's coefficient; infinite for initial states.
-        samples: prediction errors counted.
+        scale: prior standard deviation of each column's coefficient.
+        centre: prior mean of each.
     """
 
     products: Array
     own: int
-    states: int
     places: tuple[tuple[int, ...], ...]
     offsets: tuple[int, ...]
     scale: Array
     centre: Array
-    samples: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,10 +61,9 @@ class Set:
 class Scorer:
     """Evidence of sets, computed once each."""
 
-    def __init__(self, columns: Columns, variants: Sequence[Candidate], temper: float = 1.0):
-        self.columns, self.variants, self.temper = columns, variants, temper
-        c = columns
-        self.base = np.arange(1, 1 + c.own + c.states)
+    def __init__(self, columns: Columns, variants: Sequence[Candidate]):
+        self.columns, self.variants = columns, variants
+        self.base = np.arange(1, 1 + columns.own)
         self.known: dict[tuple[int, ...], Set | None] = {}
 
     def __call__(self, which: tuple[int, ...]) -> Set | None:
@@ -80,9 +76,9 @@ class Scorer:
         c = self.columns
         chosen = np.concatenate([self.base, *(np.asarray(c.places[i]) for i in which)]).astype(int)
         fixed = np.array([0, *(c.offsets[i] for i in which if c.offsets[i] >= 0)])
-        inner = c.products[np.ix_(chosen, chosen)] / self.temper
-        towards = c.products[np.ix_(chosen, fixed)].sum(axis=1) / self.temper
-        total = c.products[np.ix_(fixed, fixed)].sum() / self.temper
+        inner = c.products[np.ix_(chosen, chosen)]
+        towards = c.products[np.ix_(chosen, fixed)].sum(axis=1)
+        total = c.products[np.ix_(fixed, fixed)].sum()
         precision = 1.0 / c.scale[chosen] ** 2
         centre = c.centre[chosen]
         matrix = inner + np.diag(precision)
@@ -95,7 +91,6 @@ class Scorer:
         inside = solve_triangular(root, towards / size, lower=True)
         coefficients = -solve_triangular(root, inside, lower=True, trans=1) / size
         cost = total - float(inside @ inside)
-        amount = np.isfinite(c.scale[chosen])
         numbers, place = [], len(self.base)
         for i in which:
             width = len(c.places[i])
@@ -105,47 +100,7 @@ class Scorer:
             numbers.append(found)
             place += width
         spread = 2.0 * float(np.sum(np.log(np.diag(root)))) + 2.0 * float(np.sum(np.log(size)))
-        prior = 2.0 * float(np.sum(np.log(c.scale[chosen][amount])))
+        prior = 2.0 * float(np.sum(np.log(c.scale[chosen])))
         evidence = -0.5 * (cost + spread + prior)
         misfit = cost - float(precision @ (coefficients - centre) ** 2)
         return Set(which, evidence, misfit, tuple(numbers), coefficients[: c.own])
-
-
-def search(scorer: Scorer, most: int, beam: int = 6, odds: float = -3.0) -> list[Set]:
-    """Sets of up to `most` candidates with the largest posteriors, best first; the empty set among them.
-
-    Args:
-        scorer: of sets.
-        most: candidates in a set, of different names.
-        beam: sets of each size that are extended.
-        odds: log prior odds of each effect to be there.
-    """
-    variants = scorer.variants
-    counts: dict[str, int] = {}
-    for one in variants:
-        counts[one.name] = counts.get(one.name, 0) + 1
-
-    def posterior(one: Set) -> float:
-        return one.log_evidence + sum(odds - np.log(counts[variants[i].name]) for i in one.which)
-
-    first = scorer(())
-    assert first is not None
-    found: dict[tuple[int, ...], Set] = {(): first}
-    level = [first]
-    for size in range(1, most + 1):
-        new: dict[tuple[int, ...], Set] = {}
-        for one in level:
-            taken = {variants[i].name for i in one.which}
-            for i, variant in enumerate(variants):
-                if variant.name in taken:
-                    continue
-                extended = scorer((*one.which, i))
-                if extended is not None:
-                    new[extended.which] = extended
-        found |= new
-        # the best variant of each combination of names
-        best: dict[tuple[str, ...], Set] = {}
-        for one in sorted(new.values(), key=posterior, reverse=True):
-            best.setdefault(tuple(sorted(variants[i].name for i in one.which)), one)
-        level = list(best.values())[: beam if size > 1 else 2 * beam]
-    return sorted(found.values(), key=posterior, reverse=True)

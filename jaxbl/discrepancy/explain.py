@@ -23,7 +23,7 @@ from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
 from .candidates import SHARE, Numbers, variants_of
-from .evidence import Scorer, Set, search
+from .evidence import Scorer, Set
 from .linear import Linear
 from .remainder import functions_of
 
@@ -99,8 +99,8 @@ class Explanation:
         model: the nominal model with the findings, all numbers refitted.
         nominal: the nominal model, its own numbers refitted.
         wrong: the best model with a wrong effect in place of the last finding, or None.
-        rest: what is left over: evidence (nats) and share of the driving torque of the best function of time, position or
-            velocity, by name.
+        rest: what is left over: evidence (nats) of each function of time, position or velocity, and the share of the driving
+            torque, of those tried, that its size has most likely.
     """
 
     verdict: Verdict
@@ -238,7 +238,7 @@ class Explainer:
             findings.append(Finding(current.names[-1], float(chances[0]), current.numbers[current.names[-1]], alternatives))
             wrong = others[0][1] if others else None
         findings = [dataclasses.replace(one, numbers=current.numbers[one.effect]) for one in findings]
-        rest = self.remainder(current, smoothness)
+        rest = self.remainder(current)
         verdict: Verdict = "explained" if findings else "no_discrepancy"
         if any(gain > CLEAR for gain, _ in rest.values()):
             verdict = "unknown_effect"
@@ -276,8 +276,8 @@ class Explainer:
             tried.append((self._gain(base, model), model))
         return smoothness, sorted(tried, key=lambda pair: -pair[0])
 
-    def remainder(self, model: Model, smoothness: Sequence[float]) -> dict[str, tuple[float, float]]:
-        """What free functions would earn beside a model (nats), and their rms torque over the driving one's, by name."""
+    def remainder(self, model: Model) -> dict[str, tuple[float, float]]:
+        """What free functions would earn beside a model (nats), and their size over the driving torque, by name."""
         linear = model.linear
         smoothness, deviation = linear.choose(())
         functions = functions_of(linear.signals)
@@ -310,13 +310,12 @@ class Explainer:
         finalists: list[_Finalist] = []
         for _ in range(2):
             scorer = Scorer(linear.columns(variants, smoothness, deviation), variants)
-            sets = search(scorer, 1, odds=ODDS)
             none = scorer(())
             assert none is not None
+            allowed = [one for i in range(len(variants)) if (one := scorer((i,))) is not None]
             best: dict[str, tuple[float, Set]] = {}
-            for one in sets:
-                if one.which:
-                    best.setdefault(variants[one.which[0]].name, (self._gain(none, one), one))
+            for one in sorted(allowed, key=lambda one: -one.log_evidence):
+                best.setdefault(variants[one.which[0]].name, (self._gain(none, one), one))
             ordered = sorted(best.items(), key=lambda pair: -pair[1][0])
             top = ordered[0][1][0] if ordered else 0.0
             if top <= 0.0:
@@ -366,12 +365,14 @@ def _width(path: str) -> float:
     return 1.8 if path.endswith(".phase") else 1.0
 
 
-_ORDER = ("actuator.gain_error", "actuator.saturation", "actuator.lag")
+ACTUATOR_ORDER = ("actuator.gain_error", "actuator.saturation", "actuator.lag")
 
 
 def _with_effects(experiment: Experiment, values: Mapping[str, Numbers]) -> Experiment:
     added = [as_arrays(effect_kinds()[name](**numbers), float) for name, numbers in values.items()]
-    effects = sorted((*experiment.effects, *added), key=lambda one: _ORDER.index(one.name) if one.name in _ORDER else -1)
+    effects = sorted(
+        (*experiment.effects, *added), key=lambda one: ACTUATOR_ORDER.index(one.name) if one.name in ACTUATOR_ORDER else -1
+    )
     return eqx.tree_at(lambda e: e.effects, experiment, tuple(effects))
 
 

@@ -30,7 +30,7 @@ from jaxbl.identification.trajectory import Free, with_values
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment, move
 
-from .candidates import SHARE, Candidate, Grids, Signals, rms
+from .candidates import SHARE, SPACING, Candidate, Grids, Signals, rms
 from .evidence import Columns
 from .part import Part
 
@@ -131,7 +131,6 @@ def _derivatives(
     vectors = jax.vmap(pack)(motion)
 
     def step(vector: Array, theta: Array, force: Array, torque: Array, time: Array) -> Array:
-        # torques on the sides stand before the effects: the order of those that turn the input must not change
         added = tuple(ConstantTorque(side=side, torque=-force[i]) for i, side in enumerate(sides))  # type: ignore[arg-type]
         model = with_values(experiment, free, theta)
         model = eqx.tree_at(lambda e: e.effects, model, (*model.effects, *added))
@@ -410,12 +409,12 @@ class Linear:
         scale = np.concatenate([[np.inf], self.prior, size])
         for one, place in zip(variants, places, strict=True):
             if one.offset:
-                scale[list(place)] = 0.3
+                scale[list(place)] = SPACING
             elif (nominal := self.nominal(one.name)) is not None:
                 scale[list(place)] = np.minimum(scale[list(place)], OFF * nominal)
         centre = np.zeros(at)
         centre[1 : 1 + own] = self.centre
-        return Columns(total, own, 0, tuple(places), tuple(offsets), scale, centre, self.count * len(self.sides))
+        return Columns(total, own, tuple(places), tuple(offsets), scale, centre)
 
     def _power(self, torques: np.ndarray, signals: Signals) -> np.ndarray:
         """Sums of squares of torques, referred to the motor."""

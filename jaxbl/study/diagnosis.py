@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from jaxbl.discrepancy.explain import CLEAR, Explanation, Finding, Model, explain
+from jaxbl.discrepancy.explain import ACTUATOR_ORDER, CLEAR, Explanation, Finding, Model, explain
 from jaxbl.discrepancy.proof import WINDOW, Ground, Proof, foretold
 from jaxbl.discrepancy.residuals import Residual
 from jaxbl.discrepancy.where import SIGNIFICANT, Localised, Values, as_json, coordinates_of, describe, where
@@ -531,11 +531,10 @@ def _model(config: Config, names: Sequence[str], values: Mapping[str, float], ga
 
 def _with_effects(data: dict[str, Any], numbers: Mapping[str, Mapping[str, Any]]) -> Config:
     effects = [*data.get("effects", []), *({"kind": name, **one} for name, one in numbers.items())]
-    data["effects"] = sorted(effects, key=lambda one: _ORDER.index(one["kind"]) if one["kind"] in _ORDER else -1)
+    data["effects"] = sorted(
+        effects, key=lambda one: ACTUATOR_ORDER.index(one["kind"]) if one["kind"] in ACTUATOR_ORDER else -1
+    )
     return read_config(data)
-
-
-_ORDER = ("actuator.gain_error", "actuator.saturation", "actuator.lag")
 
 
 def _rival(config: Config, own: Sequence[Free], rival: Model) -> dict[str, Any]:
