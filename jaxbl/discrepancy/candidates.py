@@ -7,7 +7,7 @@ the only number is of that kind, the effect at a trial value is taken as it is, 
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
@@ -48,8 +48,14 @@ class Candidate(Protocol):
         """The effect's numbers from the columns' coefficients; None where they are not allowed."""
         ...
 
-    def torques(self, signals: "Signals") -> tuple[Array, Array | None]:
-        """Columns in N m, shape (samples, sides + 1, width), and what is there at coefficients of 0, or None for nothing."""
+    @property
+    def effects(self) -> tuple[AbstractEffect, ...]:
+        """Effects whose torques :meth:`columns` needs."""
+        ...
+
+    def columns(self, signals: "Signals", torques: Sequence[Array]) -> Array:
+        """Columns in N m, shape (samples, sides + 1, width), and behind them what is there at coefficients of 0, if
+        anything is."""
         ...
 
 
@@ -79,12 +85,17 @@ class Variant:
     def offset(self) -> bool:
         return self.trial is not None
 
-    def torques(self, signals: "Signals") -> tuple[Array, Array | None]:
-        """As :meth:`Candidate.torques`."""
+    @property
+    def effects(self) -> tuple[AbstractEffect, ...]:
+        """As of :class:`Candidate`."""
+        return tuple(effect for effect, _ in self.unit) if self.trial is None else self.trial
+
+    def columns(self, signals: "Signals", torques: Sequence[Array]) -> Array:
+        """As :meth:`Candidate.columns`."""
         if self.trial is None:
-            return np.stack([signals.of(effect) / size for effect, size in self.unit], axis=2), None
-        below, at, above = (signals.of(effect) for effect in self.trial)
-        return ((above - below) / (2.0 * _STEP))[:, :, None], at
+            return np.stack([torque / size for torque, (_, size) in zip(torques, self.unit, strict=True)], axis=2)
+        below, at, above = torques
+        return np.stack([(above - below) / (2.0 * _STEP), at], axis=2)
 
 
 class Grids(NamedTuple):
@@ -124,9 +135,9 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def variants_of(experiment: Experiment, grids: Grids) -> list[Variant]:
-    """All effects that the model lacks and its drive can have, variant by variant."""
-    sides, known = experiment.sides, {effect.name for effect in experiment.effects}
+def variants_of(experiment: Experiment, lacking: Collection[str], grids: Grids) -> list[Variant]:
+    """Effects that a model lacks, variant by variant."""
+    sides = experiment.sides
     found: list[Variant] = []
     for side in sides:
         for kind, leaf in _LINEAR:
@@ -148,7 +159,7 @@ def variants_of(experiment: Experiment, grids: Grids) -> list[Variant]:
     found.append(_single("actuator.gain_error", "relative"))
     found += [_trial("actuator.saturation", "limit", share * grids.torque) for share in _LIMITS]
     found += [_trial("actuator.lag", "time_constant", samples * grids.period) for samples in _LAGS]
-    return [one for one in found if one.name not in known]
+    return [one for one in found if one.name in lacking]
 
 
 _LINEAR = (
@@ -217,17 +228,9 @@ class Signals:
         self.sides = experiment.sides
         self.count = len(part.time)
         self.real = np.asarray(part.weight) > 0.0
-        plant = experiment.plant
-        motion = part.position, part.velocity
         self.torque = np.asarray(part.torque)
-        acting = plant.torques(*motion, _actuated(experiment, part.torque), part.time)
         # what must be held where a side stands still
-        self.needed = {}
-        for side in self.sides:
-            total, _ = acting[side]
-            rest = total - experiment.drive.viscous(side) * part.velocity[side]
-            rest = rest - plant.inertia(side) * part.acceleration[side]
-            self.needed[side] = np.asarray(jnp.broadcast_to(rest, (self.count,)))
+        self.needed = {side: np.asarray(values) for side, values in _needed(experiment, part).items()}
         self.direction = {side: self._direction(side) for side in self.sides}
 
     def _direction(self, side: str) -> Array:
@@ -248,37 +251,87 @@ class Signals:
         """Torque on a side for 1 N m at the motor."""
         return float(self.experiment.drive.ratio(side))
 
-    def of(self, effect: AbstractEffect, within: bool = False) -> Array:
-        """Torque that an effect adds, shape (samples, sides + 1); `within`: to a model that has it already."""
-        effect = as_arrays(effect, float)
-        found = np.zeros((self.count, len(self.sides) + 1))
-        place = self.experiment.drive.place(effect.place)
-        if place == "actuator":
-            found[:, -1] = np.asarray(
-                _actuate_over(effect, self.part.torque, self.experiment.run.sample_period) - self.part.torque
-            )
-        elif place == "transmission":
-            others = tuple(one for one in self.experiment.effects if not (within and one.name == effect.name))
-            both = (eqx.tree_at(lambda e: e.effects, self.experiment, some) for some in (others, (*others, effect)))
-            before, after = (one.plant.transmitted(self.part.position, self.part.velocity) for one in both)
-            found[:, 0] = np.asarray(before[0] - after[0])
-            found[:, 1] = np.asarray(after[1] * after[0] - before[1] * before[0])
-        else:
-            motion = Motion(self.part.time, self.part.position[place], self.part.velocity[place])
-            torque = effect.resist(motion) + effect.dry_friction(motion.velocity) * self.direction[place]
-            torque = torque + effect.added_inertia() * self.part.modelled[place]
-            found[:, self.sides.index(place)] = -np.asarray(torque)
-        return found * self.real[:, None]
+    def of(self, effects: Sequence[AbstractEffect]) -> list[Array]:
+        """Torque that each effect adds, shape (samples, sides + 1); on top of what a model without it has."""
+        found: list[Array] = [np.zeros(0)] * len(effects)
+        for name in dict.fromkeys(effect.name for effect in effects):
+            which = [i for i, effect in enumerate(effects) if effect.name == name]
+            place = self.experiment.drive.place(effects[which[0]].place)
+            direction = jnp.asarray(self.direction.get(place, self.torque))
+            for first in range(0, len(which), _AT_ONCE):
+                some = which[first : first + _AT_ONCE]
+                # as many at once each time, so that one compiled program serves
+                spare = [effects[some[-1]]] * (_AT_ONCE - len(some))
+                stack = jax.tree.map(lambda *x: jnp.stack(x), *(as_arrays(effects[i], float) for i in some), *spare)
+                torques = np.asarray(_torques(self.experiment, stack, self.part, direction))
+                for i, torque in zip(some, torques, strict=False):
+                    found[i] = torque
+        return found
 
 
-def _actuated(experiment: Experiment, torque: jax.Array) -> jax.Array:
-    for effect in experiment.effects:
-        if effect.place == "actuator":
-            torque = _actuate_over(effect, torque, experiment.run.sample_period)
-    return torque
+_AT_ONCE = 6
+
+
+def forces_of(candidates: Sequence[Candidate], signals: Signals) -> Array:
+    """Columns of candidates, one after the other, N m; shape (samples, sides + 1, columns)."""
+    torques = iter(signals.of([effect for one in candidates for effect in one.effects]))
+    columns = [one.columns(signals, [next(torques) for _ in one.effects]) for one in candidates]
+    return np.concatenate([np.zeros((signals.count, len(signals.sides) + 1, 0)), *columns], axis=2)
 
 
 @eqx.filter_jit
-def _actuate_over(effect: AbstractEffect, torque: jax.Array, period: Any) -> jax.Array:
-    start = jax.tree.map(lambda x: jnp.asarray(x, torque.dtype) * 0.0 + torque[0], effect.init())
-    return jax.lax.scan(lambda state, u: effect.actuate(state, u, period), start, torque)[1]
+def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direction: jax.Array) -> jax.Array:
+    """Torques of effects of one name, leaves of shape (effects,); shape (effects, samples, sides + 1)."""
+    drive, sides = experiment.drive, experiment.sides
+
+    def one(effect: AbstractEffect) -> jax.Array:
+        found = jnp.zeros((len(part.time), len(sides) + 1))
+        place = drive.place(effect.place)
+        if place == "actuator":
+            alone = eqx.tree_at(lambda e: e.effects, experiment, (effect,))
+            found = found.at[:, -1].set(actuated(alone, part.torque)[1] - part.torque)
+        elif place == "transmission":
+            others = tuple(one for one in experiment.effects if one.name != effect.name)
+            both = (eqx.tree_at(lambda e: e.effects, experiment, some) for some in (others, (*others, effect)))
+            before, after = (one.plant.transmitted(part.position, part.velocity) for one in both)
+            found = found.at[:, 0].set(before[0] - after[0])
+            found = found.at[:, 1].set(after[1] * after[0] - before[1] * before[0])
+        else:
+            motion = Motion(part.time, part.position[place], part.velocity[place])
+            torque = effect.resist(motion) + effect.dry_friction(motion.velocity) * direction
+            torque = torque + effect.added_inertia() * part.modelled[place]
+            found = found.at[:, sides.index(place)].set(-torque)
+        return found * part.weight[:, None]
+
+    return jax.vmap(one)(effects)
+
+
+@eqx.filter_jit
+def _needed(experiment: Experiment, part: Part) -> dict[str, jax.Array]:
+    """Torque on each side that its motion does not take up, dry friction left out, N m."""
+    plant = experiment.plant
+    acting = plant.torques(part.position, part.velocity, actuated(experiment, part.torque)[1], part.time)
+    found = {}
+    for side in experiment.sides:
+        rest = acting[side][0] - experiment.drive.viscous(side) * part.velocity[side]
+        found[side] = jnp.broadcast_to(rest - plant.inertia(side) * part.acceleration[side], part.time.shape)
+    return found
+
+
+def actuated(experiment: Experiment, torque: jax.Array) -> tuple[tuple[Any, ...], jax.Array]:
+    """The effects' own states along an input, from one that has lasted, and the torque that acts; N m."""
+    period = experiment.run.sample_period
+
+    def sample(states: list, torque: jax.Array) -> tuple[list, tuple[list, jax.Array]]:
+        new, acting = [], torque
+        for effect, state in zip(experiment.effects, states, strict=True):
+            state, acting = effect.actuate(state, acting, period)
+            new.append(state)
+        return new, (states, acting)
+
+    start = [
+        jax.tree.map(lambda x: jnp.asarray(x, torque.dtype) * 0.0 + torque[0], effect.init())
+        for effect in experiment.effects
+    ]
+    states, acting = jax.lax.scan(sample, start, torque)[1]
+    return tuple(states), acting

@@ -85,9 +85,7 @@ class Scorer:
         towards = towards - precision * centre
         total = total + float(precision @ centre**2)
         size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-        # columns may be all but alike
-        unit = matrix / np.outer(size, size) + 1e-12 * np.eye(len(size))
-        root = np.linalg.cholesky(unit)
+        root = _root(matrix / np.outer(size, size))
         inside = solve_triangular(root, towards / size, lower=True)
         coefficients = -solve_triangular(root, inside, lower=True, trans=1) / size
         cost = total - float(inside @ inside)
@@ -104,3 +102,13 @@ class Scorer:
         evidence = -0.5 * (cost + spread + prior)
         misfit = cost - float(precision @ (coefficients - centre) ** 2)
         return Set(which, evidence, misfit, tuple(numbers), coefficients[: c.own])
+
+
+def _root(unit: Array) -> Array:
+    """Cholesky factor of a matrix with ones on its diagonal, whose columns may be all but alike."""
+    for ridge in (1e-12, 1e-11, 1e-10, 1e-9):
+        try:
+            return np.linalg.cholesky(unit + ridge * np.eye(len(unit)))
+        except np.linalg.LinAlgError:
+            continue
+    return np.linalg.cholesky(unit + 1e-8 * np.eye(len(unit)))

@@ -11,18 +11,18 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.drive.effects import effect_kinds
-from jaxbl.drive.parameters import as_arrays
+from jaxbl.drive.effects import effect_class
+from jaxbl.drive.parameters import parameters, set_leaves
 from jaxbl.identification.smoother import Smoothed
 from jaxbl.identification.trajectory import Free, free_parameters
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
 from .candidates import SHARE, Numbers, variants_of
+from .complete import candidates, complete
 from .evidence import Scorer, Set
 from .linear import Linear
 from .remainder import functions_of
@@ -142,17 +142,18 @@ class Explainer:
         record: Record,
         smoothed: Mapping[str, Sequence[Smoothed]],
     ):
-        self.nominal, self.free, self.prior = experiment, tuple(free), np.asarray(prior)
+        self.nominal, self.free, self.prior = complete(experiment), tuple(free), np.asarray(prior)
+        self.lacking = candidates(experiment)
         self.record, self.smoothed = record, smoothed
         self.floor = FLOOR * len(record.time) * len(experiment.sides)
 
     def linear(self, experiment: Experiment, names: Names, theta: Array) -> Linear:
-        paths = _paths(experiment, names)
+        paths = paths_of(names)
         torque = float(np.std(self.record.torque))  # type: ignore[arg-type]
         own = (*self.free, *free_parameters(experiment, paths, torque))
         prior = np.concatenate([self.prior, [_width(path) for path in paths]])
         centre = np.concatenate([-theta, np.zeros(len(paths))])
-        at = jnp.asarray(np.concatenate([theta, np.zeros(len(paths))]))
+        at = np.concatenate([theta, np.zeros(len(paths))])
         return Linear(experiment, own, at, prior, centre, self.record, self.smoothed)
 
     def refit(
@@ -191,11 +192,11 @@ class Explainer:
         deviation: Array,
     ) -> _Point:
         """Cost at some numbers, and where the linear step leads."""
-        experiment = _with_effects(self.nominal, values)
+        experiment = with_effects(self.nominal, values)
         linear = self.linear(experiment, names, theta)
         columns = linear.columns((), smoothness, deviation)
         scale, sizes = columns.scale.copy(), linear.sizes(names)
-        for i, path in enumerate(_paths(experiment, names), 1 + len(self.free)):
+        for i, path in enumerate(paths_of(names), 1 + len(self.free)):
             name, leaf = path.removeprefix("effects.").rsplit(".", 1)
             if leaf in _AMPLITUDES:
                 scale[i] = sizes[name]
@@ -305,8 +306,8 @@ class Explainer:
         """Candidates that do well on the linearised model, and the predictor to judge them by: with the best of them in."""
         linear = model.linear
         smoothness, deviation = linear.choose(())
-        variants = variants_of(model.experiment, linear.grids(linear.frequencies(smoothness, deviation)))
-        variants = [one for one in variants if not _same(one.name, model.names)]
+        lacking = [name for name in self.lacking if name not in model.names and not _same(name, model.names)]
+        variants = variants_of(model.experiment, lacking, linear.grids(linear.frequencies(smoothness, deviation)))
         finalists: list[_Finalist] = []
         for _ in range(2):
             scorer = Scorer(linear.columns(variants, smoothness, deviation), variants)
@@ -349,31 +350,33 @@ _AMPLITUDES = frozenset(
     ("torque", "breakaway_torque", "viscous", "drag", "inertia", "amplitude", "cubic_stiffness", "damping", "relative")
 )
 _FIXED = frozenset(("harmonic",))
+"""Whole numbers of a turn."""
 
 
-def _paths(experiment: Experiment, names: Iterable[str]) -> list[str]:
-    paths = []
-    for name in names:
-        (effect,) = (one for one in experiment.effects if one.name == name)
-        for field in dataclasses.fields(effect):
-            if "parameter" in field.metadata and field.name not in _FIXED:
-                paths.append(f"effects.{name}.{field.name}")
-    return paths
+def paths_of(names: Iterable[str]) -> list[str]:
+    """Dotted paths of the free numbers of effects."""
+    return [
+        f"effects.{name}.{field.name}"
+        for name in names
+        for field, _ in parameters(effect_class(name))
+        if field.name not in _FIXED and not field.metadata.get("static")
+    ]
 
 
 def _width(path: str) -> float:
     return 1.8 if path.endswith(".phase") else 1.0
 
 
-ACTUATOR_ORDER = ("actuator.gain_error", "actuator.saturation", "actuator.lag")
-
-
-def _with_effects(experiment: Experiment, values: Mapping[str, Numbers]) -> Experiment:
-    added = [as_arrays(effect_kinds()[name](**numbers), float) for name, numbers in values.items()]
-    effects = sorted(
-        (*experiment.effects, *added), key=lambda one: ACTUATOR_ORDER.index(one.name) if one.name in ACTUATOR_ORDER else -1
+def with_effects(experiment: Experiment, values: Mapping[str, Numbers]) -> Experiment:
+    """A model with all effects, some of them with these numbers."""
+    return set_leaves(
+        experiment,
+        {
+            f"effects.{name}.{leaf}": jnp.asarray(value, float)
+            for name, numbers in values.items()
+            for leaf, value in numbers.items()
+        },
     )
-    return eqx.tree_at(lambda e: e.effects, experiment, tuple(effects))
 
 
 def explain(
@@ -386,7 +389,8 @@ def explain(
     """Which effects a model lacks on a record.
 
     Args:
-        experiment: the nominal model, with array leaves; its sample period is that of the record.
+        experiment: the nominal model, with array leaves; its sample period is that of the record. Models of the explanation
+            have all effects, those that are not found at neutral numbers (:mod:`.complete`).
         free: its own numbers that are not exactly known.
         prior: relative standard deviation of each.
         record: the log.

@@ -23,6 +23,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxbl.drive.effects import ConstantTorque
+from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
 from jaxbl.identification.prediction import kalman_gain
 from jaxbl.identification.smoother import Smoothed
@@ -30,46 +31,47 @@ from jaxbl.identification.trajectory import Free, with_values
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment, move
 
-from .candidates import SHARE, SPACING, Candidate, Grids, Signals, rms
+from .candidates import SHARE, SPACING, Candidate, Grids, Signals, actuated, forces_of, rms
+from .complete import Chosen, bucket
 from .evidence import Columns
 from .part import Part
 
-_PAD = 1024
-"""Samples are padded to a multiple, so that records of about one length share their compiled programs."""
-
-
+SAMPLES, _BLOCK = 1024, 128
+"""Least padded length of a part, so that records of about one length share their compiled programs; a block of it."""
 _HELD = 3.0
 
 
 def linearise(
     experiment: Experiment,
     free: Sequence[Free],
-    theta: Float[Array, " numbers"],
+    theta: Float[np.ndarray, " numbers"],
     record: Record,
     smoothed: Mapping[str, Sequence[Smoothed]],
 ) -> list[Part]:
     """The model along each part of a record.
 
     Args:
-        experiment: the model, with array leaves; its sample period is that of the record.
+        experiment: the model with all effects (:func:`.complete.complete`); its sample period is that of the record.
         free: its own numbers.
         theta: their values.
         record: the log.
         smoothed: its positions, part by part.
     """
     assert record.torque is not None
+    chosen = Chosen.of(experiment, free)
     parts = []
     for i, rows in enumerate(record.segments):
         one = {side: smoothed[side][i] for side in experiment.sides}
         time = record.time[rows] - record.time[0]
         readings = {side: record.positions[side][rows] for side in experiment.sides}
-        parts.append(_part(experiment, tuple(free), theta, time, record.torque[rows], readings, one))
+        found = _part(experiment, chosen, chosen.padded(theta, 0.0), time, record.torque[rows], readings, one)
+        parts.append(eqx.tree_at(lambda part: part.own, found, found.own[:, :, : len(free)]))
     return parts
 
 
 def _part(
     experiment: Experiment,
-    free: tuple[Free, ...],
+    chosen: Chosen,
     theta: Array,
     time: np.ndarray,
     torque: np.ndarray,
@@ -77,34 +79,33 @@ def _part(
     smoothed: dict[str, Smoothed],
 ) -> Part:
     count = len(time)
-    size = -(-count // _PAD) * _PAD
+    size = bucket(count, SAMPLES)
 
-    def padded(values: np.ndarray) -> Array:
-        return jnp.asarray(np.concatenate([values, np.repeat(values[-1:], size - count, axis=0)]))
+    def padded(values: np.ndarray) -> np.ndarray:
+        return np.concatenate([values, np.repeat(values[-1:], size - count, axis=0)])
 
     sides = experiment.sides
-    states = {side: padded(np.asarray(smoothed[side].state)) for side in sides}
+    own = {side: np.asarray(smoothed[side].state) for side in sides}
+    states = {side: padded(own[side]) for side in sides}
     deviation = {side: padded(np.asarray(smoothed[side].deviation(1))) for side in sides}
-    held = {side: padded(_held(smoothed[side], experiment, states[side][:count])) for side in sides}
-    read = jnp.stack([padded(readings[side]) - states[side][:, 0] for side in sides], axis=1)
-    weight = jnp.asarray((np.arange(size) < count).astype(float))
-    # as arrays, so that one compiled program serves all numbers
-    free = tuple(one._replace(nominal=jnp.asarray(one.nominal), scale=jnp.asarray(one.scale)) for one in free)
-    return _derivatives(experiment, free, theta, padded(time), padded(torque), read, states, deviation, held, weight)
+    held = {side: padded(_held(smoothed[side], experiment, own[side])) for side in sides}
+    read = np.stack([padded(readings[side]) - states[side][:, 0] for side in sides], axis=1)
+    weight = (np.arange(size) < count).astype(float)
+    given = padded(time), padded(torque), read, states, deviation, held, weight
+    return _derivatives(experiment, chosen, theta, *jax.tree.map(jnp.asarray, given))
 
 
-def _held(smoothed: Smoothed, experiment: Experiment, state: Array) -> np.ndarray:
+def _held(smoothed: Smoothed, experiment: Experiment, state: np.ndarray) -> np.ndarray:
     period = float(experiment.run.sample_period)
     corner = float((smoothed.jerk / smoothed.noise**2 / period) ** (1.0 / 6.0))
     still = _HELD * np.asarray(smoothed.deviation(1))
-    velocity, acceleration = np.asarray(state[:, 1]), np.asarray(state[:, 2])
-    return ((np.abs(velocity) < still) & (np.abs(acceleration) < corner * still)).astype(float)
+    return ((np.abs(state[:, 1]) < still) & (np.abs(state[:, 2]) < corner * still)).astype(float)
 
 
 @eqx.filter_jit
 def _derivatives(
     experiment: Experiment,
-    free: tuple[Free, ...],
+    chosen: Chosen,
     theta: Array,
     time: Array,
     torque: Array,
@@ -115,8 +116,8 @@ def _derivatives(
     weight: Array,
 ) -> Part:
     sides = experiment.sides
-    at = with_values(experiment, free, theta)
-    effects = actuator_states(at, torque)
+    at = chosen.put(experiment, theta)
+    effects, _ = actuated(at, torque)
     motion = PlantState({side: states[side][:, 0] for side in sides}, {side: states[side][:, 1] for side in sides}, effects)
     _, unravel = ravel_pytree(jax.tree.map(lambda x: x[0], motion.effects))
 
@@ -128,57 +129,45 @@ def _derivatives(
         position, velocity = (dict(zip(sides, vector[i * len(sides) :], strict=False)) for i in range(2))
         return PlantState(position, velocity, unravel(vector[2 * len(sides) :]))
 
-    vectors = jax.vmap(pack)(motion)
+    none = jnp.zeros(len(sides) + 1)
 
-    def step(vector: Array, theta: Array, force: Array, torque: Array, time: Array) -> Array:
+    def step(model: Experiment, vector: Array, force: Array, torque: Array, time: Array) -> Array:
         added = tuple(ConstantTorque(side=side, torque=-force[i]) for i, side in enumerate(sides))  # type: ignore[arg-type]
-        model = with_values(experiment, free, theta)
         model = eqx.tree_at(lambda e: e.effects, model, (*model.effects, *added))
         state = unpack(vector)
         extended = PlantState(state.position, state.velocity, (*state.effects, *(() for _ in sides)))
         new = move(model.plant, model.run, extended, torque + force[len(sides)], time)
         return pack(PlantState(new.position, new.velocity, new.effects[: len(state.effects)]))
 
-    none = jnp.zeros(len(sides) + 1)
+    def one(vector: Array, torque: Array, time: Array) -> tuple[Array, Array, Array]:
+        def moved(given: Array) -> tuple[Array, Array]:
+            new = step(at, given[:count], given[count:], torque, time)
+            return new, new
 
-    def one(vector: Array, torque: Array, time: Array) -> tuple[Array, Array, Array, Array]:
-        def of(vector: Array, theta: Array, force: Array) -> tuple[Array, Array]:
-            value = step(vector, theta, force, torque, time)
-            return value, value
+        def numbered(theta: Array) -> Array:
+            return step(chosen.put(experiment, theta), vector, none, torque, time)
 
-        (a, f, b), value = jax.jacfwd(of, argnums=(0, 1, 2), has_aux=True)(vector, theta, none)
-        return a, f, b, value
+        slope, new = jax.jacfwd(moved, has_aux=True)(jnp.concatenate([vector, none]))
+        return slope, jax.jacfwd(numbered)(theta), new
 
-    a, f, b, value = jax.vmap(one)(vectors, torque, time)
+    # block by block, what is computed stays in the cache
+    vectors = jax.vmap(pack)(motion)
+    count = vectors.shape[1]
+    blocks = jax.tree.map(lambda x: x.reshape(-1, 2 * _BLOCK, *x.shape[1:]), (vectors, torque, time))
+    found = jax.lax.map(lambda given: jax.vmap(one)(*given), blocks)
+    slope, f, value = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
     period = experiment.run.sample_period
     modelled = {side: (value[:, len(sides) + i] - vectors[:, len(sides) + i]) / period for i, side in enumerate(sides)}
     defect = value - jnp.concatenate([vectors[1:], value[-1:]])
     # nothing happens from the last reading on
     going = jnp.concatenate([weight[1:], jnp.zeros(1)])
     defect = jnp.where(going[:, None] > 0.0, defect, 0.0)
+    a, b = slope[:, :, :count], slope[:, :, count:]
     return Part(
         time, torque, readings,
         motion.position, motion.velocity, {side: states[side][:, 2] for side in sides}, modelled, deviation, held,
         a, b, f, defect, weight,
     )  # fmt: skip
-
-
-def actuator_states(experiment: Experiment, torque: Float[Array, " samples"]) -> tuple:
-    """The effects' own states along an input, from one that has lasted."""
-    period = experiment.run.sample_period
-
-    def sample(states: list, torque: Array) -> tuple[list, list]:
-        new, acting = [], torque
-        for effect, state in zip(experiment.effects, states, strict=True):
-            state, acting = effect.actuate(state, acting, period)
-            new.append(state)
-        return new, states
-
-    start = [
-        jax.tree.map(lambda x: jnp.asarray(x, torque.dtype) * 0.0 + torque[0], effect.init())
-        for effect in experiment.effects
-    ]
-    return tuple(jax.lax.scan(sample, start, torque)[1])
 
 
 def gain_matrix(gain: Array, states: int) -> Array:
@@ -188,27 +177,56 @@ def gain_matrix(gain: Array, states: int) -> Array:
     return gains.at[sides + jnp.arange(sides), jnp.arange(sides)].set(gain[:, 1])
 
 
-def _recursion(part: Part, gain: Array, forces: Array) -> Array:
-    """Prediction errors, rad; columns: constant, own numbers, forces, initial states; shape (samples, sides, columns)."""
-    states = part.defect.shape[1]
-    sides, numbers, columns = part.readings.shape[1], part.own.shape[2], forces.shape[2]
-    width = 1 + numbers + columns + states
-    start = jnp.zeros((states, width)).at[:, 1 + numbers + columns :].set(jnp.eye(states))
-    gains = gain_matrix(gain, states)
+def _known(part: Part, forces: Array) -> Array:
+    """What drives the state's change at each sample; columns: constant, own numbers, forces, initial states."""
+    samples, states = part.defect.shape
+    none = jnp.zeros((samples, states, states))
+    return jnp.concatenate([part.defect[:, :, None], part.own, part.force @ forces, none], axis=2)
+
+
+def _recursion(a: Array, gains: Array, change: Array, given: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    """Prediction errors along some samples, rad; shape (samples, sides, columns)."""
+    sides = gains.shape[1]
 
     def sample(change: Array, given: tuple[Array, ...]) -> tuple[Array, Array]:
-        a, b, own, defect, reading, force, weight = given
+        a, known, reading, weight = given
         error = -change[:sides].at[:, 0].add(-reading)
-        corrected = change + gains @ error
-        known = jnp.concatenate([defect[:, None], own, b @ force, jnp.zeros((states, states))], axis=1)
-        return a @ corrected + known, error * weight
+        return a @ (change + gains @ error) + known, error * weight
 
-    given = part.step, part.force, part.own, part.defect, part.readings, forces, part.weight
-    return jax.lax.scan(sample, start, given)[1]
+    return jax.lax.scan(sample, change, (a, *given))
 
 
-_errors = jax.jit(_recursion)
-_errors_over = jax.jit(jax.vmap(_recursion, in_axes=(None, 0, None)))
+def _start(states: int, width: int) -> Array:
+    return jnp.zeros((states, width)).at[:, width - states :].set(jnp.eye(states))
+
+
+@jax.jit
+def _errors(part: Part, gain: Array, forces: Array) -> Array:
+    """Prediction errors, rad, by side; columns as of :func:`_known`; shape (samples, sides, columns)."""
+    known = _known(part, forces)
+    states, width = known.shape[1:]
+    return _recursion(part.step, gain_matrix(gain, states), _start(states, width), (known, part.readings, part.weight))[1]
+
+
+@jax.jit
+def _grams(part: Part, gains: Array, forces: Array) -> Array:
+    """Products of the columns of the prediction errors with one another, rad^2, for several gains, by side;
+    shape (gains, sides, columns, columns)."""
+    states, sides = part.defect.shape[1], part.readings.shape[1]
+    width = 1 + part.own.shape[2] + forces.shape[2] + states
+    matrices = jax.vmap(lambda gain: gain_matrix(gain, states))(gains)
+
+    def block(carry: tuple[Array, Array], given: tuple[Part, Array]) -> tuple[tuple[Array, Array], None]:
+        change, total = carry
+        one, forces = given
+        along = _known(one, forces), one.readings, one.weight
+        change, errors = jax.vmap(lambda gain, change: _recursion(one.step, gain, change, along))(matrices, change)
+        return (change, total + jnp.einsum("gtsc,gtsd->gscd", errors, errors)), None
+
+    count = len(part.time) // _BLOCK
+    blocks = jax.tree.map(lambda x: x.reshape(count, _BLOCK, *x.shape[1:]), (part, forces))
+    start = jnp.broadcast_to(_start(states, width), (len(gains), states, width))
+    return jax.lax.scan(block, (start, jnp.zeros((len(gains), sides, width, width))), blocks)[0][1]
 
 
 @jax.jit
@@ -226,12 +244,55 @@ def _gradient(part: Part, gain: Array, left: Array) -> Array:
     return jax.lax.scan(sample, jnp.zeros(states), given, reverse=True)[1]
 
 
-_SMOOTHNESS = 10.0 ** np.arange(-11.0, 1.0)
+_COARSE_SMOOTHNESS = 10.0 ** np.arange(-11.0, 1.0)
+_FINE_SMOOTHNESS = 10.0 ** np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
+_AT_ONCE = 6
 _LEAST = 1e-11
-_FINE = 10.0 ** np.array([-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0])
 OFF = 0.5
 """Prior size of the error of an inertia or a viscous friction, relative."""
 _FREQUENCIES, _COARSE, _HARMONICS = 8, 16, 40
+_COLUMNS = 16
+"""Least padded number of candidate columns."""
+
+
+class Predictor:
+    """Prediction errors under one gain: sums of squares, and the coefficients that leave the least.
+
+    Attributes:
+        smoothness: of each side.
+        given: sum of squared errors of each side as the model stands, rad^2, shape (sides,).
+        squares: the least that changes of all numbers leave; as `given`.
+        coefficients: of all columns, part by part; 1 first.
+    """
+
+    def __init__(self, linear: "Linear", smoothness: list[float], grams: list[np.ndarray]):
+        self.smoothness, self.count = smoothness, linear.count
+        self.given = np.sum([one[:, 0, 0] for one in grams], axis=0)
+        sides, own, states, count = len(linear.sides), len(linear.free), linear.states, linear.count
+        width = grams[0].shape[1] - 1 - states
+        weight = np.ones(sides)
+        precision, centre = np.zeros(width), np.zeros(width)
+        centre[:own] = linear.centre
+        for turn in range(2):
+            weighted = [np.einsum("s,scd->cd", weight, one) for one in grams]
+            total = np.sum([_eliminated(one, states) for one in weighted], axis=0)
+            variance = 1.0 if turn else max(total[0, 0] / (count * sides), 1e-300)
+            precision[:own] = variance / linear.prior**2
+            matrix = total[1:, 1:] + np.diag(precision)
+            size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+            towards = (total[1:, 0] - precision * centre) / size
+            found = -np.linalg.lstsq(matrix / np.outer(size, size), towards, rcond=1e-12)[0] / size
+            free = np.concatenate([[1.0], found])
+            self.coefficients = [np.concatenate([free, -_response(one, states) @ free]) for one in weighted]
+            self.squares = np.sum(
+                [np.einsum("c,scd,d->s", at, one, at) for at, one in zip(self.coefficients, grams, strict=True)], axis=0
+            )
+            weight = 1.0 / np.maximum(self.squares / count, 1e-300)
+
+    def cost(self, theta: np.ndarray, width: np.ndarray) -> float:
+        """Minus twice the log-likelihood, with the prior's, that a step from theta promises."""
+        moved = theta + self.coefficients[0][1 : 1 + len(theta)]
+        return float(self.count * np.sum(np.log(self.squares)) + np.sum((moved / width) ** 2))
 
 
 class Linear:
@@ -241,7 +302,7 @@ class Linear:
         self,
         experiment: Experiment,
         free: Sequence[Free],
-        theta: Float[Array, " numbers"],
+        theta: Float[np.ndarray, " numbers"],
         prior: np.ndarray,
         centre: np.ndarray,
         record: Record,
@@ -249,14 +310,14 @@ class Linear:
     ):
         """Args as of :func:`linearise`; `prior` and `centre` are of the change of each number from theta."""
         self.free, self.theta, self.prior, self.centre = tuple(free), np.asarray(theta), prior, centre
-        self.experiment = with_values(experiment, free, theta)
+        self.experiment = with_values(experiment, free, jnp.asarray(self.theta))
         self.period, self.sides = record.sample_period, experiment.sides
-        self.parts = linearise(experiment, free, theta, record, smoothed)
+        self.parts = linearise(experiment, free, self.theta, record, smoothed)
         self.signals = [Signals(self.experiment, part) for part in self.parts]
         self.count = sum(int(np.asarray(one.weight).sum()) for one in self.parts)
         self.states = self.parts[0].defect.shape[1]
         self.drive = rms(np.concatenate([one.torque[one.real] for one in self.signals]))
-        self.left: list[np.ndarray] = []
+        self._last: tuple[Predictor, list[np.ndarray]] | None = None
 
     def grids(self, frequencies: Sequence[float]) -> Grids:
         """Values to be tried of numbers that are not linear."""
@@ -291,84 +352,87 @@ class Linear:
             return float(np.log(max(len(grids.load_harmonics), 1)))
         return 0.0
 
+    @staticmethod
+    def gain_of(smoothness: Sequence[float], period: float) -> Array:
+        """Steady-state gains of both sides, shape (sides, 2)."""
+        return jnp.asarray(np.stack([kalman_gain(q, period) for q in smoothness]))
+
     def gain(self, smoothness: Sequence[float]) -> Array:
-        return jnp.asarray(np.stack([kalman_gain(q, self.period) for q in smoothness]))
+        return self.gain_of(smoothness, self.period)
+
+    def predictor(self, smoothness: Sequence[float]) -> Predictor:
+        """Prediction errors under a given gain."""
+        (found,) = self._predictors([list(smoothness)], [self._forces((), signals) for signals in self.signals])
+        return found
+
+    def errors(self, smoothness: Sequence[float]) -> list[np.ndarray]:
+        """Prediction errors under a given gain, part by part, rad; shape (samples, sides, columns)."""
+        gain = self.gain(smoothness)
+        return [
+            np.asarray(_errors(part, gain, self._forces((), signals)))
+            for part, signals in zip(self.parts, self.signals, strict=True)
+        ]
 
     def choose(self, variants: Sequence[Candidate]) -> tuple[list[float], np.ndarray]:
         """The predictor with the least errors, some candidates taken in: smoothness of each side, and errors' rms, rad."""
-        forces = []
-        for signals in self.signals:
-            pieces = [_flat(*one.torques(signals)) for one in variants]
-            forces.append(np.concatenate([np.zeros((signals.count, len(self.sides) + 1, 0)), *pieces], axis=2))
+        forces = [self._forces(variants, signals) for signals in self.signals]
 
-        def tried(options: list[list[float]]) -> tuple[list[float], np.ndarray]:
-            gains = jnp.stack([self.gain(one) for one in options])
-            every = [
-                np.asarray(_errors_over(part, gains, jnp.asarray(force)))
-                for part, force in zip(self.parts, forces, strict=True)
-            ]
-            squares = np.stack([self._squares([one[i] for one in every]) for i in range(len(options))])
-            value = np.sum(np.log(squares), axis=1)
-            best = int(np.argmin(np.where(np.isfinite(value), value, np.inf)))
-            self._squares([one[best] for one in every])
-            return options[best], np.sqrt(squares[best] / self.count)
+        def best(options: list[list[float]]) -> Predictor:
+            found = []
+            for i in range(0, len(options), _AT_ONCE):
+                some = options[i : i + _AT_ONCE]
+                found += self._predictors(some, forces)
+            costs = [float(np.sum(np.log(one.squares))) if (one.squares > 0.0).all() else np.inf for one in found]
+            return found[int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))]
 
-        smoothness, deviation = tried([[float(q)] * len(self.sides) for q in _SMOOTHNESS])
+        chosen = best([[float(q)] * len(self.sides) for q in _COARSE_SMOOTHNESS])
         if len(self.sides) > 1:
             for i in range(len(self.sides)):
-                smoothness, deviation = tried(
-                    [[max(float(q * f), _LEAST) if j == i else q for j, q in enumerate(smoothness)] for f in _FINE]
-                )
-        return smoothness, deviation
+                now = chosen.smoothness
+                options = [[max(float(q * f), _LEAST) if j == i else q for j, q in enumerate(now)] for f in _FINE_SMOOTHNESS]
+                other = best(options)
+                if np.sum(np.log(other.squares)) < np.sum(np.log(chosen.squares)):
+                    chosen = other
+        self._last = chosen, forces
+        return chosen.smoothness, np.sqrt(chosen.squares / self.count)
+
+    def _predictors(self, options: list[list[float]], forces: list[np.ndarray]) -> list[Predictor]:
+        gains = jnp.stack([self.gain(one) for one in options])
+        grams = [np.asarray(_grams(part, gains, force)) for part, force in zip(self.parts, forces, strict=True)]
+        return [Predictor(self, one, [gram[i] for gram in grams]) for i, one in enumerate(options)]
+
+    def _forces(self, variants: Sequence[Candidate], signals: Signals) -> np.ndarray:
+        """Torques of candidates, padded with columns of zeros; shape (samples, sides + 1, columns)."""
+        forces = forces_of(variants, signals)
+        width = forces.shape[2]
+        spare = bucket(width, _COLUMNS, 2) - width if width else 0
+        return np.concatenate([forces, np.zeros((*forces.shape[:2], spare))], axis=2)
 
     def deviation(self, smoothness: Sequence[float]) -> np.ndarray:
         """Rms of the prediction errors, rad, by side, with a given predictor."""
-        none = np.zeros((1, len(self.sides) + 1, 0))
-        errors = []
-        for part, signals in zip(self.parts, self.signals, strict=True):
-            errors.append(np.asarray(_errors(part, self.gain(smoothness), jnp.asarray(np.repeat(none, signals.count, 0)))))
-        return np.sqrt(self._squares(errors) / self.count)
-
-    def _squares(self, errors: list[np.ndarray]) -> np.ndarray:
-        """Sums of squared prediction errors by side, after least squares on all columns."""
-        sides, own, width = len(self.sides), len(self.free), errors[0].shape[2] - 1 - self.states
-        weight, squares = np.ones(sides), np.zeros(sides)
-        for turn in range(2):
-            total = np.zeros((width + 1, width + 1))
-            pieces = []
-            for one in errors:
-                rest = _without((one * weight[None, :, None]).reshape(-1, one.shape[2]), self.states)
-                total += rest.T @ rest
-                pieces.append(rest)
-            variance = 1.0 if turn else max(total[0, 0] / (self.count * sides), 1e-300)
-            precision, centre = np.zeros(width), np.zeros(width)
-            precision[:own], centre[:own] = variance / self.prior**2, self.centre
-            matrix = total[1:, 1:] + np.diag(precision)
-            size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-            towards = (total[1:, 0] - precision * centre) / size
-            found = -np.linalg.lstsq(matrix / np.outer(size, size), towards, rcond=1e-12)[0] / size
-            self.left = [(rest[:, 0] + rest[:, 1:] @ found).reshape(-1, sides) / weight[None, :] for rest in pieces]
-            squares = np.sum([np.sum(one**2, axis=0) for one in self.left], axis=0)
-            weight = 1.0 / np.sqrt(np.maximum(squares / self.count, 1e-300))
-        return squares
+        return np.sqrt(self.predictor(smoothness).squares / self.count)
 
     def frequencies(self, smoothness: Sequence[float], deviation: np.ndarray) -> list[float]:
         """Frequencies (Hz) at which a disturbance of the load explains most, by the gradient of the errors' squares.
 
         Of the longest part, at what the last call of :meth:`choose` left over.
         """
+        assert self._last is not None
         i = int(np.argmax([float(one.weight.sum()) for one in self.parts]))
         part, side = self.parts[i], self.sides.index(self.experiment.drive.place("load"))
+        predictor, forces = self._last
+        errors = _errors(part, self.gain(predictor.smoothness), forces[i])
+        left = np.asarray(errors) @ predictor.coefficients[i]
         time, real = np.asarray(part.time), int(np.asarray(part.weight).sum())
         span, top = real * self.period, min(0.25 / self.period, 50.0)
         few = np.geomspace(1.0 / span, top, _COARSE)
         phase = 2.0 * np.pi * few[None, :] * time[:, None]
-        forces = np.zeros((len(time), len(self.sides) + 1, 2 * _COARSE))
-        forces[:, side] = np.concatenate([np.sin(phase), np.cos(phase)], axis=1)
+        waves = np.zeros((len(time), len(self.sides) + 1, 2 * _COARSE))
+        waves[:, side] = np.concatenate([np.sin(phase), np.cos(phase)], axis=1)
         gain = self.gain(smoothness)
-        responses = np.asarray(_errors(part, gain, jnp.asarray(forces)))[:, :, 1 + len(self.free) : -self.states]
+        responses = np.asarray(_errors(part, gain, waves))[:, :, 1 + len(self.free) : -self.states]
         power = np.sum((responses / deviation[None, :, None]) ** 2, axis=(0, 1)).reshape(2, -1).mean(axis=0)
-        slope = np.asarray(_gradient(part, gain, jnp.asarray(self.left[i] / deviation[None, :] ** 2)))[:real, side]
+        slope = np.asarray(_gradient(part, gain, jnp.asarray(left / deviation[None, :] ** 2)))[:real, side]
         size = 4 * 2 ** int(np.ceil(np.log2(real)))
         frequency = np.fft.rfftfreq(size, self.period)
         inside = (frequency >= 0.5 / span) & (frequency <= top)
@@ -394,17 +458,18 @@ class Linear:
             at += one.offset
         total, power = np.zeros((at, at)), np.zeros(at - 1 - own)
         for part, signals in zip(self.parts, self.signals, strict=True):
-            pieces = [_flat(*one.torques(signals)) for one in variants]
-            every = np.concatenate([np.zeros((signals.count, len(self.sides) + 1, 0)), *pieces], axis=2)
-            power += self._power(every, signals)
-            errors = np.asarray(_errors(part, gain, jnp.asarray(every))) / deviation[None, :, None]
+            forces = self._forces(variants, signals)
+            power += self._power(forces[:, :, : at - 1 - own], signals)
+            gram = np.einsum("s,scd->cd", deviation**-2.0, np.asarray(_grams(part, gain[None], forces))[0])
+            every = np.concatenate([np.arange(at), np.arange(len(gram) - self.states, len(gram))])
+            gram = gram[np.ix_(every, every)]
             for one, place in zip(variants, places, strict=True):
                 # the error of a number that is free acts as that number does, dry friction or not
                 if (i := self.same(one.name)) is not None:
-                    errors[:, :, place[0]] = errors[:, :, 1 + i] / float(self.free[i].slope(self.theta[i]))
-            flat = errors.reshape(-1, errors.shape[2])
-            inside = _basis(flat[:, -self.states :]).T @ flat[:, : -self.states]
-            total += flat[:, : -self.states].T @ flat[:, : -self.states] - inside.T @ inside
+                    slope = float(self.free[i].slope(self.theta[i]))
+                    gram[place[0]] = gram[1 + i] / slope
+                    gram[:, place[0]] = gram[:, 1 + i] / slope
+            total += _eliminated(gram, self.states)
         size = SHARE * self.drive / np.sqrt(np.maximum(power / self.count, 1e-300))
         scale = np.concatenate([[np.inf], self.prior, size])
         for one, place in zip(variants, places, strict=True):
@@ -419,14 +484,14 @@ class Linear:
     def _power(self, torques: np.ndarray, signals: Signals) -> np.ndarray:
         """Sums of squares of torques, referred to the motor."""
         over = np.array([*(signals.over(side) for side in self.sides), 1.0])
-        return np.sum((torques / over[None, :, None]) ** 2, axis=(0, 1))
+        return np.einsum("tsc,tsc,s->c", torques, torques, over**-2.0)
 
     def sizes(self, names: Sequence[str]) -> dict[str, float]:
         """Prior relative standard deviation of the amplitudes of effects that the model has."""
         found = {}
         for name in names:
-            (effect,) = (one for one in self.experiment.effects if one.name == name)
-            power = sum(self._power(signals.of(effect, True)[:, :, None], signals)[0] for signals in self.signals)
+            effect = get_leaf(self.experiment, f"effects.{name}")
+            power = sum(self._power(signals.of([effect])[0][:, :, None], signals)[0] for signals in self.signals)
             found[name] = SHARE * self.drive / np.sqrt(max(power / self.count, 1e-300))
             if (nominal := self.nominal(name)) is not None:
                 (value,) = (abs(float(getattr(effect, leaf))) for leaf in ("inertia", "viscous") if hasattr(effect, leaf))
@@ -449,16 +514,21 @@ class Linear:
         return value if value > 0.0 else None
 
 
-def _flat(columns: np.ndarray, offset: np.ndarray | None) -> np.ndarray:
-    return columns if offset is None else np.concatenate([columns, offset[:, :, None]], axis=2)
+def _scaled(gram: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse of the products of the last columns, the initial states, which may be all but alike; and their size."""
+    inner = gram[-states:, -states:]
+    size = np.sqrt(np.maximum(np.diag(inner), 0.0))
+    # the state of an effect that does nothing
+    size = np.where(size > 1e-20 * np.max(size), size, np.inf)
+    return np.linalg.pinv(inner / np.outer(size, size), rcond=1e-12, hermitian=True), size
 
 
-def _basis(values: np.ndarray) -> np.ndarray:
-    size = np.sqrt(np.sum(values**2, axis=0))
-    return np.linalg.qr(values / np.where(size > 0.0, size, 1.0))[0]
+def _response(gram: np.ndarray, states: int) -> np.ndarray:
+    """What the initial states take off the other columns."""
+    inverse, size = _scaled(gram, states)
+    return (inverse @ (gram[-states:, :-states] / size[:, None])) / size[:, None]
 
 
-def _without(values: np.ndarray, states: int) -> np.ndarray:
-    """The first columns less what the last, the initial states, explain."""
-    basis = _basis(values[:, -states:])
-    return values[:, :-states] - basis @ (basis.T @ values[:, :-states])
+def _eliminated(gram: np.ndarray, states: int) -> np.ndarray:
+    """Products of columns without what the last of them, the initial states, explain."""
+    return gram[:-states, :-states] - gram[:-states, -states:] @ _response(gram, states)

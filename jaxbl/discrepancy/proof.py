@@ -23,6 +23,7 @@ from jaxbl.identification.trajectory import Windows, projected_residual
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment, trajectory
 
+from .complete import bucket
 from .residuals import Residual, narrowed, residual_torques
 
 WINDOW = 0.5
@@ -92,8 +93,9 @@ class Ground:
         return {side: found[side] for side in experiment.sides if side in found}
 
     def windows(self, experiment: Experiment, samples: int) -> tuple[Windows, np.ndarray]:
-        """The record in windows, and the row that each begins with."""
-        return windows_of(self.record, self.channels, experiment, samples, self.rest)
+        """The record in windows, some of them only to fill up, and the row that each of the others begins with."""
+        windows, firsts = windows_of(self.record, self.channels, experiment, samples, self.rest)
+        return windows.padded(bucket(len(firsts), 1)), firsts
 
     def strays(self, experiment: Experiment) -> dict[str, float]:
         """How far a model leaves each side's motion on short windows from the smoothed states, at most, over its range."""
@@ -106,18 +108,35 @@ class Ground:
 
     def prove(self, experiment: Experiment) -> Proof:
         """Errors of a model on short windows, and the torques that it lacks."""
-        windows, firsts = self.windows(experiment, self.samples)
+        driven = self._driven(experiment, {})
+        windows, firsts = self.windows(driven, self.samples)
         torques = self.torques(experiment)
-        errors = self._errors(experiment, windows, firsts, 12)
+        errors = self._errors(driven, windows, firsts, 12)
         return Proof(errors | self.torque_errors(torques), torques)
+
+    def _driven(self, experiment: Experiment, tables: Mapping[str, np.ndarray]) -> Experiment:
+        """A model with known torques on its sides, sample by sample; none where there is no table."""
+        period, first = (jnp.asarray(float(one)) for one in (self.record.sample_period, self.parts[0].time[0]))
+        count = round(float(self.parts[-1].time[-1] - self.parts[0].time[0]) / self.record.sample_period) + 1
+        known = []
+        for side in experiment.sides:
+            table = np.zeros(bucket(count, 256))
+            given = tables.get(side, np.zeros(0))
+            table[: len(given)] = given
+            known.append(_KnownTorque(side=side, torque=jnp.asarray(table), first=first, period=period))  # type: ignore[arg-type]
+        return eqx.tree_at(lambda e: e.effects, experiment, (*known, *experiment.effects))
 
     def free_run(self, experiment: Experiment) -> tuple[dict[str, float], float]:
         """Errors of one run over the longest segment, and what a standard deviation of the initial speed would do to it.
 
-        The latter over the motion's; large where a free run cannot be foretold.
+        The latter over the motion's; large where a free run cannot be foretold. Up to a ninth at the end may be left out, so
+        that compiled programs serve records of several lengths.
         """
-        longest = max(part.stop - part.start for part in self.record.segments)
-        windows, firsts = self.windows(experiment, longest)
+        lengths = [part.stop - part.start for part in self.record.segments]
+        longest = max(lengths)
+        spare = max(longest.bit_length() - 4, 0)
+        windows, firsts = windows_of(self.record, self.channels, experiment, longest >> spare << spare, self.rest)
+        windows, firsts = windows.only(np.arange(1)).padded(1), firsts[:1]
         errors = self._errors(experiment, windows, firsts, 6)
         first = np.flatnonzero([part.start == firsts[0] for part in self.record.segments])[0]
         deviation = {
@@ -127,15 +146,17 @@ class Ground:
 
     def _errors(self, experiment: Experiment, windows: Windows, firsts: np.ndarray, passes: int) -> dict[str, float]:
         rows = firsts[:, None] + np.arange(windows.torque.shape[1])[None, :]
-        residual, velocity = _foretold(experiment, windows, passes, self.rest)
+        residual, velocity = jax.tree.map(
+            lambda x: np.asarray(x)[: len(firsts)], _foretold(experiment, windows, passes, self.rest)
+        )
         found = {}
         for i, side in enumerate(experiment.sides):
-            found[POSITIONS[side]] = self.channels.noise[side] * _rms([np.asarray(residual[:, :, i])])
+            found[POSITIONS[side]] = self.channels.noise[side] * _rms([residual[:, :, i]])
         for side in experiment.sides:
             smoothed = np.full(len(self.record.time), np.nan)
             for part, one in zip(self.record.segments, self.channels.smoothed[side], strict=True):
                 smoothed[part] = np.asarray(one.velocity)
-            found[f"velocity_{side}"] = _rms([np.asarray(velocity[side]) - smoothed[rows]])
+            found[f"velocity_{side}"] = _rms([velocity[side] - smoothed[rows]])
         return found
 
     def permuted(self, experiment: Experiment, added: Mapping[str, Sequence[np.ndarray]], seed: int = 0) -> Proof:
@@ -150,20 +171,18 @@ class Ground:
         at = np.round((time - time[0]) / self.record.sample_period).astype(int)
         size = max(round(_BLOCK / self.record.sample_period), 1)
         order = _order(len(time), size, np.random.default_rng(seed))
-        known, torques = [], {}
+        tables, torques = {}, {}
         before = self.torques(experiment)
         for side in experiment.sides:
             shuffled = np.concatenate(list(added[side]))[order]
-            table = np.zeros(at[-1] + 1)
-            table[at] = shuffled
-            period, first = (jnp.asarray(float(one)) for one in (self.record.sample_period, time[0]))
-            known.append(_KnownTorque(side=side, torque=jnp.asarray(table), first=first, period=period))  # type: ignore[arg-type]
+            tables[side] = np.zeros(at[-1] + 1)
+            tables[side][at] = shuffled
             ends = np.cumsum([len(one.time) for one in before[side]])[:-1]
             torques[side] = [
                 dataclasses.replace(one, torque=one.torque - piece)
                 for one, piece in zip(before[side], np.split(shuffled, ends), strict=True)
             ]
-        model = eqx.tree_at(lambda e: e.effects, experiment, (*known, *experiment.effects))
+        model = self._driven(experiment, tables)
         windows, firsts = self.windows(model, self.samples)
         return Proof(self._errors(model, windows, firsts, 12) | self.torque_errors(torques), torques)
 

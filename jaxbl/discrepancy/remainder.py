@@ -7,7 +7,11 @@ them is an effect with a name; if one pays after all effects with names have had
 import dataclasses
 from collections.abc import Sequence
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+
+from jaxbl.drive.effects import AbstractEffect
 
 from .candidates import Numbers, Signals
 
@@ -44,8 +48,12 @@ class Function:
     def numbers(self, values: Sequence[float]) -> Numbers:
         return {}
 
-    def torques(self, signals: Signals) -> tuple[Array, None]:
-        """Columns, shape (samples, sides + 1, width)."""
+    @property
+    def effects(self) -> tuple[AbstractEffect, ...]:
+        return ()
+
+    def columns(self, signals: Signals, torques: Sequence[Array]) -> Array:
+        """As :meth:`.candidates.Candidate.columns`; N m."""
         part, side = signals.part, self.side
         position, velocity = np.asarray(part.position[side]), np.asarray(part.velocity[side])
         direction = signals.direction[side]
@@ -64,7 +72,7 @@ class Function:
                 columns = _stops(position, np.array(_LENGTHS) * np.std(position[signals.real]))
         found = np.zeros((signals.count, len(signals.sides) + 1, self.width))
         found[:, signals.sides.index(side)] = -columns * signals.real[:, None]
-        return found, None
+        return found
 
 
 def functions_of(signals: Sequence[Signals]) -> list[Function]:
@@ -95,10 +103,14 @@ def _hats(values: Array, span: tuple[float, float], count: int) -> Array:
 
 def _stops(position: Array, lengths: Array) -> Array:
     """Elastoplastic elements of several lengths, between -1 and 1, shape (samples, lengths)."""
-    found = np.zeros((len(position), len(lengths)))
-    now = np.zeros(len(lengths))
     steps = np.diff(position, prepend=position[0])[:, None] / np.maximum(lengths, 1e-300)[None, :]
-    for k, step in enumerate(steps):
-        now = np.clip(now + step, -1.0, 1.0)
-        found[k] = now
-    return found
+    return np.asarray(_stopped(jnp.asarray(steps)))
+
+
+@jax.jit
+def _stopped(steps: jax.Array) -> jax.Array:
+    def sample(now: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
+        now = jnp.clip(now + step, -1.0, 1.0)
+        return now, now
+
+    return jax.lax.scan(sample, jnp.zeros(steps.shape[1]), steps)[1]

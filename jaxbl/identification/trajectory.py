@@ -28,6 +28,8 @@ from jaxbl.simulate import Experiment, PlantState, trajectory
 _INNER = 2
 """Initial states tried at each step of the fit."""
 _RIDGE = 1e-10
+_INFLUENCE = 1e-20
+"""Of a state, over that of the one with the most: what is below is none (an effect that does nothing)."""
 _ENOUGH = 2e-3
 """A fit has ended where a step takes less than this off the sum of squares, in units of the residuals' variance."""
 _MOST_REJECTED = 12
@@ -103,6 +105,7 @@ class Windows(eqx.Module):
         noise: standard deviation of each side's readings (of its prediction errors, with a gain), rad.
         rest: whether a window begins at rest: velocities as guessed, not fitted; shape (windows,).
         gain: of the predictor (:func:`jaxbl.simulate.trajectory`) of each side, shape (2,); None: free runs, output error.
+        weight: of each window's residuals, shape (windows,); 0 where a window only fills up; None: 1.
     """
 
     torque: Float[Array, "windows samples"]
@@ -112,12 +115,20 @@ class Windows(eqx.Module):
     noise: dict[str, Float[Array, ""]]
     rest: Bool[Array, " windows"]
     gain: dict[str, Float[Array, " 2"]] | None = None
+    weight: Float[Array, " windows"] | None = None
 
     def only(self, which: np.ndarray) -> "Windows":
         """Some of the windows."""
         per_window = self.torque, self.measured, self.time, self.start, self.rest
         torque, measured, time, start, rest = jax.tree.map(lambda x: x[which], per_window)
-        return Windows(torque, measured, time, start, self.noise, rest, self.gain)
+        weight = None if self.weight is None else self.weight[which]
+        return Windows(torque, measured, time, start, self.noise, rest, self.gain, weight)
+
+    def padded(self, count: int) -> "Windows":
+        """With windows of no weight at the end, so that compiled programs serve records of several lengths."""
+        own = len(self.time)
+        which = np.minimum(np.arange(count), own - 1)
+        return dataclasses.replace(self.only(which), weight=jnp.asarray((np.arange(count) < own).astype(float)))
 
     @staticmethod
     def join(parts: Sequence["Windows"]) -> "Windows":
@@ -127,7 +138,7 @@ class Windows(eqx.Module):
         return Windows(torque, measured, time, start, parts[0].noise, rest, parts[0].gain)
 
 
-_MAPPED = Windows(0, 0, 0, 0, None, 0, None)  # type: ignore[arg-type]
+_MAPPED = Windows(0, 0, 0, 0, None, 0, None, 0)  # type: ignore[arg-type]
 
 
 class Fit(eqx.Module):
@@ -161,7 +172,7 @@ def with_values(experiment: Experiment, free: Sequence[Free], theta: Float[Array
 def _residual(experiment: Experiment, start: PlantState, window: Windows) -> Float[Array, "samples sides"]:
     simulated = trajectory(experiment, start, window.torque, window.time, window.measured, window.gain).position
     sides = [(window.measured[side] - simulated[side]) / window.noise[side] for side in experiment.sides]
-    return jnp.stack(sides, axis=-1)
+    return jnp.stack(sides, axis=-1) * (1.0 if window.weight is None else window.weight)
 
 
 class _Eliminated(NamedTuple):
@@ -208,7 +219,7 @@ def _eliminate(experiment: Experiment, window: Windows, passes: int, rest: bool)
         damping = jnp.where(better, jnp.maximum(0.01 * best.damping, _RIDGE), jnp.maximum(30.0 * best.damping, 1e-2))
         size = jnp.sqrt(jnp.sum(slope**2, axis=0))
         # a state without influence stays where it is
-        size = jnp.where(size > 0.0, size, jnp.inf)
+        size = jnp.where(size > _INFLUENCE * jnp.max(size), size, jnp.inf)
         unit = slope / size[None, :]
         change = jnp.linalg.solve(unit.T @ unit + damping * jnp.eye(len(start)), unit.T @ value)
         tried = start - change / size
@@ -222,7 +233,7 @@ def _eliminate(experiment: Experiment, window: Windows, passes: int, rest: bool)
     first = _Inner(guess, none, jnp.zeros((len(none), len(guess))), jnp.asarray(jnp.inf), jnp.asarray(_RIDGE), guess)
     found = jax.lax.fori_loop(0, passes, attempt, first)
     size = jnp.sqrt(jnp.sum(found.slope**2, axis=0))
-    basis, _ = jnp.linalg.qr(found.slope / jnp.where(size > 0.0, size, 1.0)[None, :])
+    basis, _ = jnp.linalg.qr(found.slope / jnp.where(size > _INFLUENCE * jnp.max(size), size, jnp.inf)[None, :])
     return _Eliminated(found.start, basis)
 
 

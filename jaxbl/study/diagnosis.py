@@ -18,18 +18,18 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from jaxbl.discrepancy.explain import ACTUATOR_ORDER, CLEAR, Explanation, Finding, Model, explain
+from jaxbl.discrepancy.complete import ACTUATOR_ORDER, complete, neutral
+from jaxbl.discrepancy.explain import CLEAR, Explanation, Finding, Model, explain, paths_of, with_effects
 from jaxbl.discrepancy.proof import WINDOW, Ground, Proof, foretold
+from jaxbl.discrepancy.refine import refined
 from jaxbl.discrepancy.residuals import Residual
 from jaxbl.discrepancy.where import SIGNIFICANT, Localised, Values, as_json, coordinates_of, describe, where
 from jaxbl.drive.effects import effect_class, effect_kinds
 from jaxbl.drive.parameters import parameters, set_leaves
 from jaxbl.errors import InputError
-from jaxbl.identification.intervals import spread
-from jaxbl.identification.prediction import predictor
 from jaxbl.identification.regression import Kinematics
-from jaxbl.identification.search import Channels, smoothed_channels, windows_of
-from jaxbl.identification.trajectory import WIDE, Fit, Free, Windows, fit, free_parameters
+from jaxbl.identification.search import Channels, smoothed_channels
+from jaxbl.identification.trajectory import WIDE, Free, free_parameters
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
@@ -240,7 +240,6 @@ class _Fitted(NamedTuple):
         return {one.path: float(one.slope(self.theta[i])) * self.deviation[i] for i, one in enumerate(self.free)}
 
 
-_fit = eqx.filter_jit(fit)
 _STAGES = 6
 
 
@@ -264,8 +263,10 @@ def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
             progress(stage, _STAGES)
 
     with jax.enable_x64(True):
-        nominal = on_record(config, record)
-        own = free_parameters(nominal, default_paths(config, nominal), float(np.std(record.torque)))
+        # one structure for all models, so that they share their compiled programs
+        bare = on_record(config, record)
+        nominal = complete(bare)
+        own = free_parameters(bare, default_paths(config, bare), float(np.std(record.torque)))
         prior = np.full(len(own), config.uncertainty.relative)
         rest = config.log.initial_state == "rest"
         seen, other = (_ground(nominal, one, rest) for one in (record, task.holdout))
@@ -278,7 +279,7 @@ def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
         seen, other = (dataclasses.replace(one, bandwidth=bandwidth) for one in (seen, other))
         before = other.prove(_at(nominal, task.holdout))
         done()
-        found = explain(nominal, own, prior.tolist(), record, seen.channels.smoothed)
+        found = explain(bare, own, prior.tolist(), record, seen.channels.smoothed)
         done()
         proving = _Proving(task, nominal, own, prior, seen.channels, other, before)
         fitted, after, withdrawn = proving.extended(found)
@@ -406,26 +407,9 @@ class _Proving:
 
     def fitted(self, base: Model, names: tuple[str, ...]) -> _Fitted:
         """All numbers by the simulator, from those of the explanation; the better of both."""
-        record = self.task.record
         experiment, free, theta, width = _start(self.nominal, self.own, self.prior, base, names)
-        windows = self._windows(set_leaves(experiment, _values(free, theta)))
-        given = jnp.asarray(theta), jnp.asarray(width)
-        assert record.torque is not None
-        tried = [
-            _fit(experiment, free, windows, given[0], held=jnp.full(len(free), held), prior=given[1])
-            for held in (True, False)
-        ]
-        best = min(tried, key=lambda one: _cost(one, width))
-        at = np.asarray(best.theta) if np.isfinite(_cost(best, width)) else theta
-        values = arrays({path: float(value) for path, value in _values(free, at).items()})
-        return _Fitted(names, set_leaves(experiment, values), free, at, _deviation(best, width))
-
-    def _windows(self, experiment: Experiment) -> Windows:
-        record = self.task.record
-        rest = self.task.config.log.initial_state == "rest"
-        shortest = min(part.stop - part.start for part in record.segments)
-        windows, _ = windows_of(record, self.channels, experiment, min(_SAMPLES, shortest), rest)
-        return predictor(experiment, windows)[0]
+        found = refined(experiment, free, theta, width, self.task.record, self.channels.smoothed)
+        return _Fitted(names, found.experiment, free, found.theta, found.deviation)
 
     def gap(self, fitted: _Fitted, after: Proof, rival: Model | None) -> dict[str, Any]:
         """What is left on held-out data before and after, the floor, and controls."""
@@ -474,37 +458,10 @@ def _start(
     nominal: Experiment, own: tuple[Free, ...], prior: np.ndarray, base: Model, names: tuple[str, ...]
 ) -> tuple[Experiment, tuple[Free, ...], np.ndarray, np.ndarray]:
     """A model with some of the effects that another has; its numbers, where they start, and their prior."""
-    known = {f"effects.{one}" for one in base.names if one not in names}
-    kept = tuple(one for one in base.experiment.effects if f"effects.{one.name}" not in known)
-    experiment = eqx.tree_at(lambda e: e.effects, base.experiment, kept)
-    paths = [
-        f"effects.{name}.{field.name}"
-        for name in names
-        for field, _ in parameters(effect_class(name))
-        if field.name not in _COUNTED and not field.metadata.get("static")
-    ]
-    added = free_parameters(experiment, paths, float(nominal.run.sample_period))
+    experiment = with_effects(base.experiment, {one: neutral(one) for one in base.names if one not in names})
+    added = free_parameters(experiment, paths_of(names), float(nominal.run.sample_period))
     theta = np.concatenate([np.asarray(base.theta), np.zeros(len(added))])
     return experiment, (*own, *added), theta, np.concatenate([prior, np.full(len(added), WIDE)])
-
-
-_COUNTED = ("harmonic",)
-"""Whole numbers of a turn."""
-
-
-def _cost(one: Fit, width: np.ndarray) -> float:
-    cost = float(one.cost) + 0.5 * float(np.sum((np.asarray(one.theta) / width) ** 2))
-    return cost if np.isfinite(cost) else float("inf")
-
-
-def _deviation(one: Fit, width: np.ndarray) -> np.ndarray:
-    """Standard deviations of theta: of the fit's sandwich and the prior together."""
-    found = spread(one)
-    information, sandwich = np.asarray(found.information), np.asarray(found.covariance)
-    middle = information @ sandwich @ information
-    prior = np.diag(width**-2.0)
-    inverse = np.linalg.inv(information + prior)
-    return np.sqrt(np.maximum(np.diag(inverse @ (middle + prior) @ inverse), 0.0))
 
 
 _UNITS = {"theta": "rad", "velocity": "rad/s", "torque": "N m"}

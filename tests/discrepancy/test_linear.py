@@ -9,7 +9,7 @@ import pytest
 from small_study import rigid, small
 
 from jaxbl.discrepancy import linear as module
-from jaxbl.discrepancy.candidates import Grids, variants_of
+from jaxbl.discrepancy.candidates import Grids, forces_of, variants_of
 from jaxbl.discrepancy.linear import Linear
 from jaxbl.drive.effects import effect_kinds
 from jaxbl.drive.parameters import as_arrays
@@ -48,7 +48,7 @@ def linear(tmp_path, sides, change=lambda e: e, theta=0.0, disturbed=0.0):
     for side, (one,) in smoothed.items():
         wave = disturbed * np.cumsum(rng.standard_normal((len(record.time), 3)), axis=0)
         smoothed[side] = [one._replace(state=one.state + wave * np.array([1e-7, 1e-6, 1e-5]))]
-    at = jnp.full(len(free), theta)
+    at = np.full(len(free), theta)
     prior, centre = np.full(len(free), 0.02), np.zeros(len(free))
     return Linear(change(experiment), free, at, prior, centre, record, smoothed)
 
@@ -59,7 +59,10 @@ def errors(model, forces=None):
     width = 0 if forces is None else forces.shape[2]
     none = np.zeros((signals.count, len(model.sides) + 1, width)) if forces is None else forces
     found = np.asarray(module._errors(model.parts[0], model.gain([1e-6] * len(model.sides)), jnp.asarray(none)))
-    return module._without(found.reshape(-1, found.shape[2]), model.states)
+    flat = found.reshape(-1, found.shape[2])
+    basis = np.linalg.qr(flat[:, -model.states :])[0]
+    rest = flat[:, : -model.states]
+    return rest - basis @ (basis.T @ rest)
 
 
 def size(values):
@@ -106,7 +109,7 @@ def test_a_candidates_torque_does_what_the_effect_does(tmp_path, name):
         return eqx.tree_at(lambda e: e.effects, experiment, (*experiment.effects, effect))
 
     base = linear(tmp_path, 2)
-    torque = base.signals[0].of(effect)[:, :, None]
+    torque = base.signals[0].of([effect])[0][:, :, None]
     columns = errors(base, torque)
     expected = errors(linear(tmp_path, 2, with_effect))[:, 0] - columns[:, 0]
     found = columns[:, -1]
@@ -121,11 +124,20 @@ def test_numbers_of_waves_are_those_of_the_effect(tmp_path):
     values = (0.3e-3, -0.4e-3)
     waves = ("load.gravity", "load.periodic_disturbance", "motor.cogging", "transmission.eccentricity")
     seen = set()
-    for one in variants_of(base.experiment, grids):
+    for one in variants_of(base.experiment, waves, grids):
         if one.name in waves:
-            columns, _ = one.torques(base.signals[0])
+            columns = forces_of([one], base.signals[0])
             effect = as_arrays(effect_kinds()[one.name](**one.numbers(values)), float)
-            expected = base.signals[0].of(effect)
+            (expected,) = base.signals[0].of([effect])
             assert size(columns @ np.array(values) - expected) < 0.02 * size(expected)
             seen.add(one.name)
     assert seen == set(waves)
+
+
+@pytest.mark.parametrize("sides", [1, 2])
+def test_products_are_those_of_the_errors(tmp_path, sides):
+    """Summed block by block, initial states eliminated, against a decomposition of all errors at once."""
+    model = linear(tmp_path, sides)
+    found = model.columns((), [1e-6] * sides, np.ones(sides)).products
+    every = errors(model)
+    assert found == pytest.approx(every.T @ every, rel=1e-6, abs=1e-9 * np.max(found))

@@ -1,0 +1,79 @@
+"""A model with all effects at neutral numbers moves as the model without them does."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_study import rigid, small
+
+from jaxbl.discrepancy.complete import Chosen, bucket, candidates, complete, neutral, numbers_of
+from jaxbl.drive.effects import effect_kinds
+from jaxbl.drive.parameters import as_arrays, get_leaf, parameters
+from jaxbl.identification.trajectory import free_parameters, with_values
+from jaxbl.simulate import trajectory
+from jaxbl.study.config import read_config
+from jaxbl.study.engine import prepare
+
+KNOWN = [{"kind": "motor.coulomb_friction", "torque": 0.05}]
+
+
+def model(sides, law="backlash"):
+    data = small() if sides == 2 else rigid()
+    return as_arrays(prepare(read_config({**data, "effects": KNOWN})), float)
+
+
+@pytest.mark.parametrize("sides", [1, 2])
+def test_neutral_effects_do_nothing(sides):
+    bare = model(sides)
+    every = complete(bare)
+    torque = jnp.asarray(np.random.default_rng(1).normal(0.0, 2.0, 300))
+    runs = []
+    for one in (bare, every):
+        start = one.plant.init(one.initial)
+        runs.append(eqx.filter_jit(trajectory)(one, start, torque))
+    for side in bare.sides:
+        assert np.ptp(runs[0].position[side]) > 0.0
+        for name in ("position", "velocity"):
+            found, expected = (np.asarray(getattr(one, name)[side]) for one in (runs[1], runs[0]))
+            assert found == pytest.approx(expected, rel=1e-12, abs=1e-14)
+
+
+@pytest.mark.parametrize("sides", [1, 2])
+def test_all_effects_are_there_once(sides):
+    bare = model(sides)
+    lacking = candidates(bare)
+    names = [one.name for one in complete(bare).effects]
+    assert len(set(names)) == len(names)
+    assert set(names) == {*lacking, "motor.coulomb_friction"}
+    if sides == 2:
+        assert set(names) == set(effect_kinds())
+    # a second time there is nothing to add
+    assert candidates(complete(bare)) == []
+
+
+@pytest.mark.parametrize("name", effect_kinds())
+def test_every_effect_has_neutral_numbers(name):
+    effect = effect_kinds()[name](**neutral(name))
+    assert {field.name for field, _ in parameters(effect)} == set(neutral(name))
+
+
+def test_chosen_numbers_are_set_as_named_ones_are():
+    every = complete(model(2))
+    free = free_parameters(
+        every, ["drive.motor_inertia", "effects.load.constant_torque.torque", "transmission.stiffness"], 1.0
+    )
+    theta = np.array([0.1, -0.3, 0.2])
+    chosen = Chosen.of(every, free)
+    found = chosen.put(every, chosen.padded(theta, 7.0))
+    expected = with_values(every, free, jnp.asarray(theta))
+    for path in numbers_of(every):
+        assert float(get_leaf(found, path)) == pytest.approx(float(get_leaf(expected, path)), rel=1e-15)
+
+
+def test_buckets_are_few_and_large_enough():
+    sizes = [bucket(count, 1024) for count in range(1, 100_000, 77)]
+    assert all(size >= count for size, count in zip(sizes, range(1, 100_000, 77), strict=True))
+    assert all(size <= max(1.26 * count, 1024) for size, count in zip(sizes, range(1, 100_000, 77), strict=True))
+    assert len(set(sizes)) < 32
+    assert all(size % 256 == 0 for size in sizes)
+    assert [bucket(count, 1) for count in (1, 2, 3, 5, 9, 17)] == [1, 2, 3, 5, 10, 20]
