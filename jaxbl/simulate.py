@@ -78,13 +78,15 @@ class State(eqx.Module):
 class Sample(NamedTuple):
     """What a step is given: time, and either unit noise (simulation) or input and measured positions (a record).
 
-    With unit noise, an `input` (N m) takes the place of the excitation's.
+    With unit noise, an `input` (N m) takes the place of the excitation's. `known` (rad/s^2) are accelerations that the
+    observers are told of besides their nominal equations, by side.
     """
 
     time: Number
     noise: dict[str, Number] | None = None
     input: Number | None = None
     measured: dict[str, Number] | None = None
+    known: dict[str, Number] | None = None
 
 
 class TrueSide(NamedTuple):
@@ -160,7 +162,8 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
     for side in drive.sides:
 
         def nominal(velocity: Number, side: str = side) -> Number:
-            return drive.acceleration(side, velocity, torque_in)
+            expected = drive.acceleration(side, velocity, torque_in)
+            return expected if sample.known is None else expected + sample.known[side]
 
         observer = getattr(experiment.observer, side)
         observers[side], estimates[side] = observer.step(state.observer[side], measured[side], nominal, period)
@@ -290,6 +293,7 @@ def replay(
     record: Callable[[State, Signals], Any] | None = None,
     every: int = 1,
     state: State | None = None,
+    known: dict[str, Float[Array, " samples"]] | None = None,
 ) -> tuple[dict[str, Array], Any]:
     """Run observers, filter and identifier on a record in place of the plant.
 
@@ -301,6 +305,8 @@ def replay(
         record: what to keep of every `every`-th sample; None keeps nothing.
         every: decimation of what is kept.
         state: where to begin; left out, at the first position and standstill.
+        known: accelerations of each side that the observers are told of besides their nominal equations, held from each
+            sample to the next, rad/s^2; the equivalent control is then what is missing beyond these, too.
 
     Returns:
         As :func:`scan`.
@@ -309,11 +315,12 @@ def replay(
         state = initial_state(experiment, {side: measured[side][0] for side in experiment.sides})
     state = State(None, state.observer, state.equivalent_control, state.identifier)
 
-    def samples(indices: Int[Array, " samples"]) -> tuple[Array, dict[str, Array]]:
-        return torque[indices], {side: measured[side][indices] for side in experiment.sides}
+    def samples(indices: Int[Array, " samples"]) -> tuple[Any, ...]:
+        told = None if known is None else {side: known[side][indices] for side in experiment.sides}
+        return torque[indices], {side: measured[side][indices] for side in experiment.sides}, told
 
-    def sample(time: Number, torque: Number, measured: dict[str, Number]) -> Sample:
-        return Sample(time, None, torque, measured)
+    def sample(time: Number, torque: Number, measured: dict[str, Number], told: dict[str, Number] | None) -> Sample:
+        return Sample(time, None, torque, measured, told)
 
     return _scan(experiment, state, len(torque), samples, sample, reducers, record, every)
 

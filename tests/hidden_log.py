@@ -14,6 +14,12 @@ from hidden.simulator import Machine, Run, simulate
 
 DRIVE = {"kind": "rigid", "motor_inertia": 0.02, "motor_viscous": 0.03}
 FRICTION = {"kind": "motor.coulomb_friction", "torque": 0.06}
+GEARED = {
+    "kind": "two_inertia", "motor_inertia": 0.05, "motor_viscous": 0.15, "load_inertia": 7.0, "load_viscous": 16.0,
+    "gear_ratio": 5.0,
+}  # fmt: skip
+GAP = {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08}
+FRICTIONS = [{"kind": "motor.coulomb_friction", "torque": 0.1}, {"kind": "load.coulomb_friction", "torque": 6.0}]
 
 
 def model(**tables: Any) -> dict[str, Any]:
@@ -37,3 +43,13 @@ def logged(effects: tuple[str, ...] = ("friction",), seed: int = 1, noise: float
     machine = Machine(DRIVE | {"motor_inertia": inertia}, None, [FRICTION] if effects else [])
     (trace,) = simulate([Run(machine, 2e-3, torque, motor_noise=noise, seed=seed)])
     return Log(trace.t, trace.u, trace.theta_e, None)
+
+
+@cache
+def geared() -> tuple[Log, dict[str, np.ndarray]]:
+    """4 s of a drive with a gap and hidden frictions, a small part of what is transmitted; and its true speeds, rad/s."""
+    t = 2e-3 * np.arange(2000)
+    torque = 5.0 * (np.sin(2.0 * np.pi * 0.5 * t) + np.sin(2.0 * np.pi * 1.3 * t + 1.0))
+    machine = Machine(GEARED, GAP, FRICTIONS)
+    (trace,) = simulate([Run(machine, 2e-3, torque, motor_noise=1e-5, load_noise=2e-6, seed=1)])
+    return Log(trace.t, trace.u, trace.theta_e, trace.theta_s), {"motor": trace.states[1], "load": trace.states[3]}

@@ -327,6 +327,19 @@ def test_a_replayed_record_gives_what_the_observers_gave(every):
     np.testing.assert_allclose(again.time, seen.time[::every])
 
 
+def test_what_observers_are_told_is_not_in_their_equivalent_control():
+    experiment = paper(noise=0.0, steps=2000)
+    seen = trace(experiment)
+    measured = {side: seen.side(side).measured for side in experiment.sides}
+    # of the true acceleration, its mean over each sampling period
+    known = {side: seen.side(side).true.perturbation for side in experiment.sides}
+    run = eqx.filter_jit(lambda *given: replay(*given, record=everything, state=initial_state(experiment), known=known))
+    _, told = run(experiment, seen.input, measured)
+    for side in experiment.sides:
+        plain = seen.side(side).equivalent_control[500:]
+        assert np.std(told.side(side).equivalent_control[500:]) < 0.02 * np.std(plain)
+
+
 def test_a_trajectory_is_the_plant_of_the_whole_chain():
     experiment = paper(steps=300)
     seen = trace(experiment)

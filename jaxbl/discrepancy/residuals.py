@@ -10,14 +10,14 @@ Sign: the torque that is missing from the model, J a less all modelled torques; 
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.ndimage import gaussian_filter1d, uniform_filter1d
-from scipy.signal import lfilter
+from scipy.ndimage import gaussian_filter1d
 
 from jaxbl.identification.regression import Kinematics, actuated
 from jaxbl.identification.smoother import Smoothed, smooth
@@ -28,8 +28,6 @@ _HELD = 3.0
 _REACH = 60.0
 """Length of the noise's correlation, over 1 / w_c: what is slow is a small rest of what is fast, and needs all of it."""
 _LARGEST = 2**18
-_WINDOW = 5.0
-"""Time constants of the low-pass beyond which an observer's residual is not its noise."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,11 +126,27 @@ def _torque(
     return total - experiment.drive.viscous(side) * velocity[side], jnp.asarray(level, torque.dtype)
 
 
-@eqx.filter_jit
-def _side(
-    experiment: Experiment, side: str, part: Kinematics, smoothed: dict[str, Smoothed]
-) -> tuple[Array, dict[str, Array], dict[str, Array]]:
-    """Missing torque, and the derivatives of the modelled torque by the positions and velocities, along a part."""
+class _Acting(NamedTuple):
+    """Modelled torques on a side along a part, N m.
+
+    Attributes:
+        total: all but dry friction.
+        friction: dry friction, where it is shown.
+        level: the most that friction can be.
+        held: where friction may hold the side.
+        passage: velocity over its change within a sampling period, within -1 and 1.
+        step: that change, rad/s.
+    """
+
+    total: Array
+    friction: Array
+    level: Array
+    held: Array
+    passage: Array
+    step: Array
+
+
+def _acting(experiment: Experiment, side: str, part: Kinematics, smoothed: Smoothed) -> _Acting:
     torque = actuated(experiment, part.torque)
     given = part.position, part.velocity, torque, part.time, part.transmitted
     total, level = jax.vmap(lambda *at: _torque(experiment, side, *at))(*given)
@@ -143,14 +157,42 @@ def _side(
     passage = jnp.clip(velocity / step, -1.0, 1.0)
     direction = passage * (2.0 - jnp.abs(passage))
     # what is not shown to move for a while may be held: friction is then what is missing, as far as it goes
-    corner = (smoothed[side].jerk / smoothed[side].noise ** 2 / period) ** (1.0 / 6.0)
-    still = _HELD * smoothed[side].deviation(1)
+    corner = (smoothed.jerk / smoothed.noise**2 / period) ** (1.0 / 6.0)
+    still = _HELD * smoothed.deviation(1)
     held = (jnp.abs(velocity) < still) & (jnp.abs(acceleration) < corner * still)
     friction = jnp.where(held, jnp.clip(total - inertia * acceleration, -level, level), level * direction)
+    return _Acting(total, friction, level, held, passage, step)
+
+
+@eqx.filter_jit
+def beyond_nominal(
+    experiment: Experiment, side: str, part: Kinematics, smoothed: Smoothed
+) -> tuple[Float[Array, " samples"], Float[Array, " samples"]]:
+    """Modelled torque on a side less that of its nominal equation, in which the inertia is the nominal one, N m.
+
+    What transmission and effects add to J dv/dt = (input) - B v, the right-hand side that an observer (7)-(8) knows; and,
+    on its own, the dry friction that is to be taken off it.
+    """
+    drive, velocity = experiment.drive, part.velocity[side]
+    acting = _acting(experiment, side, part, smoothed)
+    added = (experiment.plant.inertia(side) - drive.inertia(side)) * part.acceleration[side]
+    nominal = drive.inertia(side) * drive.acceleration(side, velocity, part.torque)
+    return acting.total - added - nominal, acting.friction
+
+
+@eqx.filter_jit
+def _side(
+    experiment: Experiment, side: str, part: Kinematics, smoothed: dict[str, Smoothed]
+) -> tuple[Array, dict[str, Array], dict[str, Array]]:
+    """Missing torque, and the derivatives of the modelled torque by the positions and velocities, along a part."""
+    torque = actuated(experiment, part.torque)
+    given = part.position, part.velocity, torque, part.time, part.transmitted
+    acting = _acting(experiment, side, part, smoothed[side])
+    period = (part.time[-1] - part.time[0]) / (len(part.time) - 1)
     # the input is a mean around the sample already; of the rest, the mean that the position's second differences see
     driving = torque if side == "motor" else jnp.zeros_like(torque)
-    modelled = driving + _mean_around(total - driving) - friction
-    missing = inertia * acceleration - low_passed(modelled, smoothed[side], period)
+    modelled = driving + _mean_around(acting.total - driving) - acting.friction
+    missing = experiment.plant.inertia(side) * part.acceleration[side] - low_passed(modelled, smoothed[side], period)
 
     def of(position: dict, velocity: dict, *rest: Array) -> Array:
         total, level = _torque(experiment, side, position, velocity, *rest)
@@ -158,7 +200,7 @@ def _side(
 
     by_position, by_velocity = jax.vmap(jax.jacfwd(of, argnums=(0, 1)))(*given)
     # when a reversal is, the velocity's noise leaves open
-    turning = jnp.where(held, 0.0, 2.0 * level * (1.0 - jnp.abs(passage)) / step)
+    turning = jnp.where(acting.held, 0.0, 2.0 * acting.level * (1.0 - jnp.abs(acting.passage)) / acting.step)
     by_velocity[side] = by_velocity[side] - turning
     return missing, by_position, by_velocity
 
@@ -285,51 +327,6 @@ class _Noise:
             side, self.time, np.asarray(missing), np.sqrt(np.maximum(variance, tiny)),
             correlation / max(correlation[0], tiny), corner / (2.0 * np.pi * self.period),
         )  # fmt: skip
-
-
-def observed_residual(
-    experiment: Experiment, side: str, part: Kinematics, equivalent_control: Float[Array, " samples"]
-) -> Residual:
-    """The same by an observer: J z_2 less what transmission and effects of the model explain, behind the same low-pass.
-
-    The equivalent control is the acceleration beyond the side's nominal equation (the paper's perturbation
-    identification), first-order low-passed. Its noise is taken from what is faster than some time constants: median size
-    and correlation, one for all of the part. The observer's convergence at the beginning is in the residual: leave it out.
-
-    Args:
-        experiment: the model, with array leaves; its sample period is that of the record.
-        side: of the observer.
-        part: of the record.
-        equivalent_control: filtered, along the part, rad/s^2.
-    """
-    modelled = np.asarray(_beyond_nominal(experiment, side, part))
-    constant, period = float(experiment.equivalent_control.time_constant), float(experiment.run.sample_period)
-    share = -np.expm1(-period / constant) if constant > 0.0 else 1.0
-    passed, _ = lfilter([share], [1.0, share - 1.0], modelled, zi=[(1.0 - share) * modelled[0]])
-    torque = float(experiment.drive.inertia(side)) * np.asarray(equivalent_control) - passed
-    window = max(2 * round(0.5 * _WINDOW / share) + 1, 5)
-    fast = (torque - uniform_filter1d(torque, window))[window:-window]
-    deviation = max(float(np.median(np.abs(fast))) / 0.6745, np.finfo(float).tiny)
-    # jumps of the missing torque do not count
-    fast = np.clip(fast, -4.0 * deviation, 4.0 * deviation)
-    spectrum = np.abs(np.fft.rfft(fast, 2 * len(fast))) ** 2
-    correlation = np.fft.irfft(spectrum)[: min(2 * window, len(fast))]
-    return Residual(
-        side, np.asarray(part.time), torque, np.full(len(torque), deviation), correlation / correlation[0],
-        min(1.0 / (2.0 * np.pi * constant), 0.5 / period) if constant > 0.0 else 0.5 / period,
-    )  # fmt: skip
-
-
-@eqx.filter_jit
-def _beyond_nominal(experiment: Experiment, side: str, part: Kinematics) -> Array:
-    """Modelled torque less the nominal equation's, in which the inertia is the nominal one."""
-    drive, velocity = experiment.drive, part.velocity[side]
-    acting = actuated(experiment, part.torque)
-    given = part.position, part.velocity, acting, part.time, part.transmitted
-    total, level = jax.vmap(lambda *at: _torque(experiment, side, *at))(*given)
-    added = (experiment.plant.inertia(side) - drive.inertia(side)) * part.acceleration[side]
-    nominal = drive.inertia(side) * drive.acceleration(side, velocity, part.torque)
-    return total - level * jnp.sign(velocity) - added - nominal
 
 
 def narrowed(residual: Residual, cutoff: float) -> tuple[Residual, np.ndarray]:

@@ -121,6 +121,9 @@ def _remarks(summary: dict[str, Any]) -> list[str]:
     lines = []
     if summary["verdict"] != "unknown_effect" or summary["findings"]:
         lines += [f"The model as given leaves: {one['sentence']}." for one in summary["where"].values()]
+    witnesses = [told for name, one in summary["where"].items() if (told := _witness(name, one, summary["gap"]["units"]))]
+    if witnesses:
+        lines.append(f"By the observers' equivalent control: {'; '.join(witnesses)}.")
     left = {name: one for name, one in summary["rest"].items() if one["evidence"] is not None and one["evidence"] > 0.0}
     for name, one in sorted(left.items(), key=lambda pair: -pair[1]["evidence"]):
         side, _, kind = name.partition(".")
@@ -138,6 +141,22 @@ def _remarks(summary: dict[str, Any]) -> list[str]:
     return [*lines, *summary["notes"]]
 
 
+def _witness(side: str, where: Mapping[str, Any], units: Mapping[str, str]) -> str:
+    """What the observer of a side says; nothing where there is none or it does not converge."""
+    one = where.get("observed")
+    if not one or not one["converged"]:
+        return ""
+    unit = units[f"torque_{side}"]
+    if one["rms"] < _BEYOND * one["noise"]:
+        return f"{side} side, nothing beyond its noise ({_value(one['noise'])} {unit} rms)"
+    return (
+        f"{side} side, {_value(one['rms'])} {unit} rms (its noise {_value(one['noise'])}), correlation "
+        f"{one['correlation']:.2f} with the smoother's"
+    )
+
+
+_BEYOND = 1.5
+"""Times its noise that an observer's residual must be to be more than that."""
 _FREE = {
     "time": "a torque over time", "drift": "a friction that drifts", "position": "a torque over position",
     "place": "a friction over position", "velocity": "a torque over velocity", "memory": "a friction with a memory",
@@ -178,7 +197,7 @@ def draw_diagnosis(found: Diagnosis) -> list[Drawn]:
     unit = unit_on(found.record, "motor.torque", "N m")
     with style():
         drawn = [_story(found.summary), _over_time(found)]
-    return [*drawn, *draw_residuals(found.residuals, found.coordinates, found.located, unit)]
+    return [*drawn, *draw_residuals(found.residuals, found.coordinates, found.located, unit, found.observed)]
 
 
 def _story(summary: Mapping[str, Any]) -> Drawn:

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jaxbl.discrepancy.observed import Observed
 from jaxbl.discrepancy.residuals import Residual, narrowed
 from jaxbl.discrepancy.where import SIGNIFICANT, Coordinate, Localised, Values, describe, spectrum_of
 
@@ -31,6 +32,7 @@ def draw_residuals(
     coordinates: Mapping[str, Sequence[Mapping[str, Values]]],
     found: Mapping[str, Localised],
     unit: str = "N m",
+    observed: Mapping[str, Sequence[Observed]] | None = None,
 ) -> list[Drawn]:
     """All figures of residual torques.
 
@@ -39,9 +41,10 @@ def draw_residuals(
         coordinates: by equation, of each part (:func:`jaxbl.discrepancy.where.coordinates_of`).
         found: where they live, by equation.
         unit: of the torques.
+        observed: the same torques by the observers, of each part; those of an observer that does not converge are not drawn.
     """
     with style():
-        drawn = [_over_time(residuals, found, unit)]
+        drawn = [_over_time(residuals, found, unit, observed or {})]
         drawn += [_over_coordinates(residuals[name], coordinates[name], found[name], unit) for name in residuals]
         drawn.append(_spectra(residuals, found, unit))
     return drawn
@@ -52,7 +55,12 @@ def _shown(residual: Residual, found: Localised) -> tuple[Residual, np.ndarray]:
     return narrowed(residual, found.bandwidth)
 
 
-def _over_time(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, Localised], unit: str) -> Drawn:
+def _over_time(
+    residuals: Mapping[str, Sequence[Residual]],
+    found: Mapping[str, Localised],
+    unit: str,
+    observed: Mapping[str, Sequence[Observed]],
+) -> Drawn:
     figure = Figure(figsize=(9.0, 2.3 * len(residuals) + 0.6), layout="constrained")
     axes = figure.subplots(len(residuals), 1, sharex=True, squeeze=False).ravel()
     for ax, (name, parts) in zip(axes, residuals.items(), strict=True):
@@ -62,16 +70,29 @@ def _over_time(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, 
             time, torque, band = outline(low.time, low.torque, 2.0 * low.deviation)
             ax.plot(time, torque, color=_COLOUR[name], lw=0.9, label="missing" if i == 0 else None, zorder=2)
             ax.fill_between(time, -band, band, color=_BAND, alpha=0.75, lw=0.0, zorder=3, label=None if i else "± 2 noise")
+        witnesses = observed.get(name, ())
+        if all(part.converged for part in witnesses):
+            for i, part in enumerate(witnesses):
+                low, _ = _shown(part.residual, one)
+                time, torque, _ = outline(low.time, low.torque, low.deviation)
+                label = None if i else f"by its observer (noise {low.deviation[0]:.2g} {unit})"
+                ax.plot(time, torque, color=_MEAN, lw=0.5, label=label, zorder=4)
         ax.axhline(0.0, color=_FAINT, lw=0.8, zorder=1)
         ax.set_ylabel(with_unit(f"{name}:\nmissing {_what(unit)}", unit))
         ax.set_title(f"{fill(describe(one, unit), _WIDTH)}\n", loc="left", fontsize=9)
-        ax.legend(ncols=2, **_ABOVE)
+        ax.legend(ncols=3, **_ABOVE)
     axes[-1].set_xlabel("time (s)")
     caption = (
         "Torque that the model lacks (inertia times acceleration less all modelled torques, positive forward), behind the "
         "low-pass behind which it stands out. The grey band is twice the noise's standard deviation: what stays within it "
         "is noise."
     )
+    if observed:
+        caption += (
+            " Thin dark line: the same by the side's super-twisting observer, whose equivalent control stands for what the "
+            "model lacks once it is told of all that the model has, late by the time constant of its low-pass: a second "
+            "witness with noise of its own, on which nothing depends."
+        )
     return Drawn("residual_torque", figure, caption)
 
 

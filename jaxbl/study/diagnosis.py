@@ -20,6 +20,7 @@ import pandas as pd
 
 from jaxbl.discrepancy.complete import ACTUATOR_ORDER, complete, neutral
 from jaxbl.discrepancy.explain import CLEAR, Explanation, Finding, Model, explain, paths_of, with_effects
+from jaxbl.discrepancy.observed import Observed, compared, observed_torques
 from jaxbl.discrepancy.proof import WINDOW, Ground, Proof, foretold
 from jaxbl.discrepancy.refine import refined
 from jaxbl.discrepancy.residuals import Residual
@@ -77,8 +78,11 @@ class Diagnosis:
         holdout: what was held out: the rest of the log, or another one.
         summary: as in `diagnosis.json`.
         trace: one row a sample of the log: `t`, `u`, positions, `held_out`, and on each side the torque that the model lacks
-            as given (`motor.missing_before`) and with the effects (`motor.missing_after`) with its `motor.noise`, N m.
+            as given (`motor.missing_before`) and with the effects (`motor.missing_after`) with its `motor.noise`, N m; and
+            what the model as given lacks by the observers (`motor.observed_before`, `motor.observed_noise`), N m, empty
+            while they converge.
         residuals: torques that the model as given lacks, by side, of each part that was fitted.
+        observed: the same by the observers' equivalent control.
         coordinates: along them, by side, of each part.
         located: where they live, by side.
         pairs: torques that the model lacks as given and with the effects, by side, of each part, and whether it was held
@@ -93,6 +97,7 @@ class Diagnosis:
     summary: dict[str, Any]
     trace: pd.DataFrame
     residuals: dict[str, list[Residual]]
+    observed: dict[str, list[Observed]]
     coordinates: dict[str, list[dict[str, Values]]]
     located: dict[str, Localised]
     pairs: dict[str, list[tuple[Residual, Residual, bool]]]
@@ -297,8 +302,11 @@ def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
         trace = _trace(task, (lacking, missing_after), (before.torques, after.torques))
         done()
         _, gain_values = gains_for(task.missing, fitted.experiment, record, seen.channels)
+        witness = _Witness(task, set_leaves(bare, arrays(gain_values)), seen, other)
+        trace = trace.assign(**witness.columns(len(trace)))
         model = _model(config, names, fitted.values, gain_values)
         summary = _summary(task, fitted, found, findings, verdict, withdrawn, located)
+        witness.tell(summary, lacking)
         summary["gap"] = gap
         if left:
             summary["where_after"] = _lives(record, left)
@@ -314,7 +322,8 @@ def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
         for side in lacking
     }
     return Diagnosis(
-        config, model, record, task.holdout, plain(summary), trace, lacking, coordinates, located, pairs, replays
+        config, model, record, task.holdout, plain(summary), trace, lacking, witness.observed, coordinates, located, pairs,
+        replays,
     )  # fmt: skip
 
 
@@ -358,6 +367,43 @@ def _without_findings(found: Explanation) -> str:
 
 def _at(experiment: Experiment, record: Record) -> Experiment:
     return eqx.tree_at(lambda e: e.run.sample_period, experiment, jnp.asarray(record.sample_period))
+
+
+class _Witness:
+    """What the observers say of the torques that the model as given lacks; nothing is decided by it."""
+
+    def __init__(self, task: Task, nominal: Experiment, seen: Ground, other: Ground):
+        self.task, self.nominal, self.seen = task, nominal, seen
+        self.observed = observed_torques(nominal, seen.record, seen.parts, seen.smoothed)
+        self.held = {}
+        if not task.separate:
+            self.held = observed_torques(_at(nominal, other.record), other.record, other.parts, other.smoothed)
+
+    def columns(self, samples: int) -> dict[str, np.ndarray]:
+        """Of the trace."""
+        found = {}
+        for side in self.observed:
+            torque, noise = np.full((2, samples), np.nan)
+            for record, pieces in ((self.task.record, self.observed), (self.task.holdout, self.held)):
+                for part, one in zip(record.segments if pieces else (), pieces.get(side, ()), strict=True):
+                    torque[part.start + one.skipped : part.stop] = one.residual.torque
+                    noise[part.start + one.skipped : part.stop] = one.residual.deviation
+            found |= {f"{side}.observed_before": torque, f"{side}.observed_noise": noise}
+        return found
+
+    def tell(self, summary: dict[str, Any], lacking: Mapping[str, list[Residual]]) -> None:
+        """Add what the observers say to where the torques live, and a note where they say nothing."""
+        for side, pieces in self.observed.items():
+            about = compared(self.nominal, pieces, lacking[side], self.seen.bandwidth[side])
+            gains = getattr(self.nominal.observer, side)
+            about["gains"] = {"lambda": float(gains.lambda_), "alpha": float(gains.alpha)}
+            about["time_constant"] = float(self.nominal.equivalent_control.time_constant)
+            summary["where"][side]["observed"] = about
+            if not about["converged"]:
+                summary["notes"].append(
+                    f"The {side}'s observer does not converge on this log (alpha = {float(gains.alpha):.3g}): its "
+                    "equivalent control says nothing of the missing torque. The verdict does not use it."
+                )
 
 
 class _Proving:

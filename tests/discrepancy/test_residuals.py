@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_study import rigid, small
 
-from jaxbl.discrepancy.residuals import Residual, low_passed, narrowed, noise_spectrum, observed_residual, residual_torques
+from jaxbl.discrepancy.residuals import Residual, low_passed, narrowed, noise_spectrum, residual_torques
 from jaxbl.identification.regression import balance, from_smoothed
 from jaxbl.identification.smoother import smooth
 from jaxbl.study.config import read_config
@@ -103,22 +103,6 @@ def test_noise_of_the_input_is_counted():
     assert scores(residual_torques(experiment, [part], [smoothed], torque_noise=0.3)["motor"][0]) == pytest.approx(
         1.0, abs=0.1
     )
-
-
-def test_observers_say_the_same():
-    """The equivalent control of the paper's chain, with the same noise that its own jumps tell."""
-    quiet = study(1, [FRICTION]) | {"encoders": {"noise": 1e-6}, "equivalent_control": {"time_constant": 0.02}}
-    trace, part, smoothed = record(quiet)
-    experiment = prepare(read_config(quiet | {"effects": []}))
-    one = observed_residual(experiment, "motor", part, jnp.asarray(trace["motor.equivalent_control"]))
-    missing = -0.1 * np.sign(trace["motor.velocity"].to_numpy())
-    (other,) = residual_torques(experiment, [part], [smoothed])["motor"]
-    late, moving = slice(1000, None), np.abs(trace["motor.velocity"].to_numpy()[1000:]) > 0.5
-    assert rms((one.torque[late] - missing[late])[moving]) < 0.02
-    assert np.corrcoef(one.torque[late], other.torque[late])[0, 1] > 0.85
-    complete = prepare(read_config(quiet))
-    left = observed_residual(complete, "motor", part, jnp.asarray(trace["motor.equivalent_control"]))
-    assert rms(left.torque[late]) < 0.2 * rms(one.torque[late])
 
 
 def test_narrowing_keeps_the_noise_level_and_what_is_slow():

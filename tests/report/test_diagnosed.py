@@ -71,6 +71,24 @@ def test_the_headline_has_verdict_numbers_and_gap():
     assert lines[-1] == "A note."
 
 
+def test_the_second_witness_is_heard_where_it_says_anything():
+    assert not any("observers" in line for line in diagnosis_lines(SUMMARY))
+    seen = {"converged": True, "rms": 2.1, "noise": 0.2, "correlation": 0.987}
+    nothing = {"converged": True, "rms": 0.021, "noise": 0.02, "correlation": 0.3}
+    silent = {"converged": False, "rms": None, "noise": None, "correlation": None}
+
+    def told(**witnesses):
+        where = {side: SUMMARY["where"][side] | {"observed": one} for side, one in witnesses.items()}
+        return [line for line in diagnosis_lines(changed(where=where)) if "observers" in line]
+
+    assert told(motor=nothing, load=seen) == [
+        "By the observers' equivalent control: motor side, nothing beyond its noise (0.02 N m rms); load side, 2.1 N m rms "
+        "(its noise 0.2), correlation 0.99 with the smoother's."
+    ]
+    assert told(motor=silent, load=seen)[0].startswith("By the observers' equivalent control: load side, 2.1 N m rms")
+    assert told(motor=silent) == []
+
+
 def test_other_verdicts_say_what_is_left():
     assert diagnosis_lines(changed(verdict="no_discrepancy", findings=[]))[0].startswith("No discrepancy: ")
     rest = {"load.drift": {"evidence": 30.0, "share": 0.01}}

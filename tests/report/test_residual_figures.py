@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from jaxbl.discrepancy.observed import Observed
 from jaxbl.discrepancy.residuals import Residual
 from jaxbl.discrepancy.where import Values, describe, locate
 from jaxbl.report.residuals import draw_residuals
@@ -20,6 +21,21 @@ def made(name, torque, time):
         "time": Values(time, "s", symbol="t"),
     }
     return residual, values
+
+
+def test_observers_that_converge_are_drawn_thin(tmp_path):
+    time = 5e-3 * np.arange(4000)
+    torque = {name: -0.1 * np.sign(np.cos(time)) for name in ("motor", "load")}
+    pairs = {name: made(name, one, time) for name, one in torque.items()}
+    residuals, coordinates = ({name: [pair[i]] for name, pair in pairs.items()} for i in range(2))
+    found = {name: locate(residuals[name], coordinates[name]) for name in pairs}
+    observed = {name: [Observed(pair[0], 0, 0.5 * (name == "load"))] for name, pair in pairs.items()}
+    drawn = draw_residuals(residuals, coordinates, found, observed=observed)[0]
+    above, below = (ax.get_legend_handles_labels()[1] for ax in drawn.figure.axes)
+    assert above[:2] == below == ["missing", "± 2 noise"] and len(above) == 3
+    assert above[2].startswith("by its observer (noise 0.0") and "super-twisting" in drawn.caption
+    assert drawn.figure.axes[0].lines[1].get_linewidth() < drawn.figure.axes[0].lines[0].get_linewidth()
+    assert save(drawn.figure, tmp_path / "over_time.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize("unit", ["N m", "N"])

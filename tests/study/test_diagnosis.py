@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import jax
 import numpy as np
 import pytest
 from hidden_log import FRICTION, logged, model
@@ -68,6 +69,40 @@ def test_what_is_held_out_keeps_its_times_and_is_not_fitted(logs, found):
     trace = found.trace
     assert trace["held_out"].sum() == 500 and trace["motor.missing_before"].notna().all()
     assert trace["motor.missing_after"].std() < trace["motor.missing_before"].std()
+
+
+def test_the_observers_are_a_second_witness(found):
+    about = found.summary["where"]["motor"]["observed"]
+    assert about["converged"] is True and about["correlation"] > 0.95
+    assert about["rms"] == pytest.approx(about["smoother_rms"], rel=0.05) and about["rms"] > 5.0 * about["noise"]
+    assert set(about["gains"]) == {"lambda", "alpha"} and about["time_constant"] == 0.01 and about["bandwidth"] < 16.0
+    trace, (one,) = found.trace, found.observed["motor"]
+    known = trace["motor.observed_before"].notna()
+    # the beginnings of both parts are left out
+    assert not known[: one.skipped].any() and known[one.skipped : 1500].all()
+    assert not known[1500 : 1500 + one.skipped].any() and known[1500 + one.skipped :].all()
+    assert (trace["motor.observed_noise"].notna() == known).all()
+    np.testing.assert_array_equal(trace["motor.observed_before"][one.skipped : 1500], one.residual.torque)
+    assert trace["motor.observed_before"][known].std() == pytest.approx(trace["motor.missing_before"].std(), rel=0.1)
+    assert not any("observer" in note for note in found.summary["notes"])
+
+
+def test_an_observer_that_does_not_converge_is_noted(logs):
+    task = read_task(logs / "axis.csv", model(observer={"motor": {"lambda": 2.0, "alpha": 1.0}}))
+    assert "observer.motor" not in task.missing
+    with jax.enable_x64(True):
+        nominal = under_test.on_record(task.config, task.record)
+        seen, other = (
+            dataclasses.replace(under_test._ground(nominal, one, False), bandwidth={"motor": 30.0})
+            for one in (task.record, task.holdout)
+        )
+        witness = under_test._Witness(task, nominal, seen, other)
+        summary = {"where": {"motor": {}}, "notes": []}
+        witness.tell(summary, seen.torques(nominal))
+    assert summary["where"]["motor"]["observed"]["converged"] is False
+    assert summary["where"]["motor"]["observed"]["rms"] is None
+    (note,) = summary["notes"]
+    assert note.startswith("The motor's observer does not converge on this log (alpha = 1)")
 
 
 def test_the_extended_model_runs_and_the_report_says_what_was_found(found, tmp_path):

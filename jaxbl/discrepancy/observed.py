@@ -1,0 +1,197 @@
+"""The torques that a model lacks as the observers see them: a second witness beside the smoother's residual.
+
+The paper's perturbation identification: once a super-twisting observer (7)-(8) has converged, its equivalent control (15)
+is the perturbation, all that the right-hand side it knows leaves out. Here that right-hand side is told of all that the
+model has, transmission and effects at the smoothed motion, besides its nominal equation: J z_2 is then what the model lacks.
+Were it not told, the whole transmitted torque would go through the observer, whose lag on it would be taken for missing.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import lfilter
+from scipy.signal.windows import parzen
+
+from jaxbl.identification.regression import Kinematics
+from jaxbl.identification.smoother import Smoothed
+from jaxbl.observer.super_twisting import ObserverState
+from jaxbl.records import Record
+from jaxbl.simulate import Experiment, Signals, State, initial_state, replay
+
+from .residuals import Residual, beyond_nominal, narrowed
+
+_DRAWS = 6
+"""Runs over the smoothed motion with other noise, which tell the observers' own."""
+_SETTLING = 10.0
+"""Time constants of the equivalent control's low-pass that are left out at the beginning of a part."""
+_FEWEST = 20
+_STUCK = 0.9
+"""Share of alpha: a mean control beyond is a switching term that does not switch."""
+_OFTEN = 0.1
+_MEMORY = 60.0
+"""Time constants over which the observers' noise is correlated: what is slow is a small rest of what is fast."""
+
+
+class Observed(NamedTuple):
+    """What the observer of a side sees along a part of a record.
+
+    Attributes:
+        residual: torque that the model lacks behind the equivalent control's low-pass (causal: late by its time constant),
+            without the beginning, while the observer converges; its noise is one level for all of the part.
+        skipped: samples of the part that are left out at its beginning.
+        stuck: share of the time in which the switching term does not switch: alpha is less than what is missing, over J.
+    """
+
+    residual: Residual
+    skipped: int
+    stuck: float
+
+    @property
+    def converged(self) -> bool:
+        """Whether the equivalent control says anything: it does not where the observer is not on its sliding surface."""
+        return bool(np.isfinite(self.residual.torque).all()) and self.stuck < _OFTEN
+
+
+def observed_torques(
+    experiment: Experiment, record: Record, parts: Sequence[Kinematics], smoothed: Sequence[Mapping[str, Smoothed]]
+) -> dict[str, list[Observed]]:
+    """Torques that a model lacks on each side by its observers' equivalent control, N m.
+
+    The observers begin each part at the smoothed position and velocity. Their own noise is found by runs of the same
+    observers over the smoothed motion with independent white noise of the readings' size: they are not linear, and their
+    noise depends on the motion. What differs between these runs is noise.
+
+    Args:
+        experiment: the model, with array leaves and the observers' gains; its sample period is that of the record.
+        record: the log.
+        parts: of it, one for each segment (:func:`jaxbl.identification.regression.from_smoothed`).
+        smoothed: positions of each part, by side.
+    """
+    assert record.torque is not None
+    found: dict[str, list[Observed]] = {side: [] for side in experiment.sides}
+    bare = eqx.tree_at(lambda e: e.identifier, experiment, None, is_leaf=lambda x: x is None)
+    for i, (rows, part, channels) in enumerate(zip(record.segments, parts, smoothed, strict=True)):
+        random = np.random.default_rng(i)
+        known, readings = {}, {}
+        for side in experiment.sides:
+            known[side] = _held(*beyond_nominal(experiment, side, part, channels[side])) / experiment.drive.inertia(side)
+            drawn = float(channels[side].noise) * random.standard_normal((_DRAWS, len(part.time)))
+            measured = np.asarray(record.positions[side])[rows]
+            readings[side] = jnp.asarray(np.concatenate([measured[None], np.asarray(part.position[side]) + drawn]))
+        controls = _controls(bare, jnp.asarray(record.torque[rows]), readings, known, part)
+        for side in experiment.sides:
+            found[side].append(_observed(experiment, side, part, np.asarray(controls[side])))
+    return found
+
+
+def _held(smooth: Float[Array, " samples"], friction: Float[Array, " samples"]) -> Float[Array, " samples"]:
+    """Torque to be held from each sample to the next, so that the implicit observer's position moves as under the true one.
+
+    Held from sample k on, p_k moves the observer's positions by second differences of h^2 (p_{k-1} + p_k) / (2 J), where
+    the true torque moves them by that of its mean around sample k, weighted by a triangle: tau + h^2 tau'' / 12. With the
+    mean of two samples for p_k the former is tau + h^2 tau'' / 4, hence the sixth that is taken off; not of friction,
+    which jumps. The explicit observer's own lag of half a period remains.
+    """
+    torque = smooth.at[1:-1].add(-jnp.diff(smooth, n=2) / 6.0) - friction
+    return jnp.append(0.5 * (torque[:-1] + torque[1:]), torque[-1])
+
+
+@eqx.filter_jit
+def _controls(
+    experiment: Experiment, torque: Array, readings: dict[str, Array], known: dict[str, Array], part: Kinematics
+) -> dict[str, Float[Array, "runs samples"]]:
+    """Filtered equivalent control of each side, rad/s^2, for several readings of one motion."""
+
+    def keep(state: State, signals: Signals) -> dict[str, Any]:
+        return {side: signals.side(side).equivalent_control for side in experiment.sides}
+
+    def one(measured: dict[str, Array]) -> dict[str, Array]:
+        begin = initial_state(experiment, {side: values[0] for side, values in measured.items()})
+        at = {side: ObserverState(part.position[side][0], part.velocity[side][0]) for side in experiment.sides}
+        state = State(None, at, begin.equivalent_control, begin.identifier)
+        return replay(experiment, torque, measured, record=keep, state=state, known=known)[1]
+
+    return jax.vmap(one)(readings)
+
+
+def _share(experiment: Experiment) -> float:
+    """Of the difference that the equivalent control's low-pass takes in at each sample."""
+    constant, period = float(experiment.equivalent_control.time_constant), float(experiment.run.sample_period)
+    return -math.expm1(-period / constant) if constant > 0.0 else 1.0
+
+
+def _observed(experiment: Experiment, side: str, part: Kinematics, controls: np.ndarray) -> Observed:
+    share, period = _share(experiment), float(experiment.run.sample_period)
+    constant = float(experiment.equivalent_control.time_constant)
+    skipped = min(max(math.ceil(_SETTLING / share), _FEWEST), len(part.time) // 4)
+    torque = float(experiment.drive.inertia(side)) * controls[:, skipped:]
+    if not np.isfinite(torque).all():
+        torque = np.full_like(torque, np.nan)
+    # the mean takes its share of each
+    noise = np.sqrt(_DRAWS / (_DRAWS - 1.0)) * (torque[1:] - np.mean(torque[1:], axis=0))
+    count = noise.shape[1]
+    lags = min(max(math.ceil(_MEMORY / share), 10 * _FEWEST), count)
+    size = 2 ** math.ceil(math.log2(2 * count))
+    products = np.fft.irfft(np.mean(np.abs(np.fft.rfft(noise, size)) ** 2, axis=0))[:lags] / count
+    least = np.finfo(float).tiny
+    deviation = float(np.sqrt(np.maximum(np.mean(noise**2), least)))
+    # a window that keeps the spectrum positive, and what is fast out of what is slow
+    correlation = products / np.maximum(products[0], least) * parzen(2 * lags - 1)[lags - 1 :]
+    residual = Residual(
+        side, np.asarray(part.time)[skipped:], torque[0], np.full(count, deviation), correlation,
+        min(1.0 / (2.0 * np.pi * constant), 0.5 / period) if constant > 0.0 else 0.5 / period,
+    )  # fmt: skip
+    width = max(math.ceil(5.0 / share), _FEWEST)
+    mean = np.abs(uniform_filter1d(controls[0, skipped:], width))
+    stuck = float(np.mean(mean > _STUCK * float(getattr(experiment.observer, side).alpha)))
+    return Observed(residual, skipped, stuck)
+
+
+def compared(
+    experiment: Experiment, observed: Sequence[Observed], residuals: Sequence[Residual], cutoff: float
+) -> dict[str, Any]:
+    """The observers' residual of a side beside the smoother's, both behind both low-passes: the observers' and a common one.
+
+    Args:
+        experiment: whose observers these are.
+        observed: of each part.
+        residuals: the smoother's, of each part.
+        cutoff: of the common low-pass, Hz.
+
+    Returns:
+        `converged`; `rms` of the observers' residual and of its `noise`, N m; `correlation` (about zero) with the
+        smoother's, and `smoother_rms`, that one behind the same low-passes, N m; `bandwidth` of the narrower low-pass, Hz.
+        Numbers are None where the observers do not converge.
+    """
+    if not all(one.converged for one in observed):
+        return {"converged": False} | dict.fromkeys(("rms", "noise", "correlation", "smoother_rms", "bandwidth"))
+    share = _share(experiment)
+    own, other, noise, bandwidth = [], [], [], cutoff
+    for one, smooth in zip(observed, residuals, strict=True):
+        late = lfilter([share], [1.0, share - 1.0], smooth.torque, zi=[(1.0 - share) * smooth.torque[0]])[0]
+        low, _ = narrowed(one.residual, cutoff)
+        beside = Residual(
+            smooth.name, one.residual.time, late[one.skipped :], one.residual.deviation, one.residual.correlation,
+            one.residual.bandwidth,
+        )  # fmt: skip
+        own.append(low.torque)
+        noise.append(low.deviation)
+        other.append(narrowed(beside, cutoff)[0].torque)
+        bandwidth = low.bandwidth
+    mine, theirs = np.concatenate(own), np.concatenate(other)
+    both = math.sqrt(float(np.mean(mine**2) * np.mean(theirs**2)))
+    return {
+        "converged": True,
+        "rms": float(np.sqrt(np.mean(mine**2))),
+        "noise": float(np.sqrt(np.mean(np.concatenate(noise) ** 2))),
+        "correlation": float(np.mean(mine * theirs)) / both if both > 0.0 else None,
+        "smoother_rms": float(np.sqrt(np.mean(theirs**2))),
+        "bandwidth": bandwidth,
+    }
