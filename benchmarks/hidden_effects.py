@@ -21,23 +21,42 @@ from pathlib import Path
 from typing import Any
 
 from hidden.cases import KINDS, Case, Log, cases, save
-from hidden.scoring import Diagnose, Outcome, markdown, outcome, prove, run, write
+from hidden.scoring import Diagnose, Oracle, Outcome, markdown, outcome, prove, run, write
 from hidden.simulator import engine
+
+CACHE = Path(__file__).parents[1] / ".cache" / "jax"
+
+
+def _files(logs: Sequence[Log], holdout: Log, folder: Path) -> tuple[list[Path], Path]:
+    """Logs as files, as people have them; programs compiled before are found again."""
+    import jax
+
+    if jax.config.values["jax_compilation_cache_dir"] is None:
+        jax.config.update("jax_compilation_cache_dir", str(CACHE))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    paths = [folder / f"log{i}.csv" for i in range(len(logs))]
+    for log, path in zip([*logs, holdout], [*paths, folder / "holdout.csv"], strict=True):
+        log.write(path)
+    return paths, folder / "holdout.csv"
 
 
 def package(logs: Sequence[Log], model: Mapping[str, Any], holdout: Log) -> Mapping[str, Any]:
-    """`jaxbl.diagnose` on logs as files, as people have them."""
+    """`jaxbl.diagnose`."""
     import jaxbl
 
     with tempfile.TemporaryDirectory() as folder:
-        paths = [Path(folder) / f"log{i}.csv" for i in range(len(logs))]
-        for log, path in zip([*logs, holdout], [*paths, Path(folder) / "holdout.csv"], strict=True):
-            log.write(path)
-        diagnose = jaxbl.diagnose  # type: ignore[attr-defined]
-        found = diagnose(paths if len(paths) > 1 else paths[0], model, holdout=Path(folder) / "holdout.csv")
-    if isinstance(found, Mapping):
-        return found
+        paths, other = _files(logs, holdout, Path(folder))
+        found = jaxbl.diagnose(paths if len(paths) > 1 else paths[0], model, holdout=other)
     return {**found.summary, "model": found.model.resolved()}
+
+
+def oracle(case: Case) -> Mapping[str, float]:
+    """Held-out rmse by channel of the true effects, all numbers fitted from the true ones of the effects."""
+    from jaxbl.study.diagnosis import read_task, with_known
+
+    with tempfile.TemporaryDirectory() as folder:
+        paths, other = _files([case.log], case.holdout, Path(folder))
+        return with_known(read_task(paths[0], case.model, holdout=other), case.truth["effects"])
 
 
 def left(found: Sequence[Case], folder: Path) -> list[Outcome]:
@@ -67,6 +86,7 @@ def main() -> None:
     parser.add_argument(
         "--diagnose", metavar="MODULE:FUNCTION", help="diagnose(logs, model, holdout); left out: the package's"
     )
+    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes that share the work")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="leave scores.md, JSON files and figures there")
     asked = parser.parse_args()
 
@@ -81,10 +101,11 @@ def main() -> None:
         outcomes = left(found, asked.results)
     else:
         diagnose: Diagnose = package
+        best: Oracle | None = oracle
         if asked.diagnose:
             module, _, function = asked.diagnose.partition(":")
-            diagnose = getattr(importlib.import_module(module), function)
-        outcomes = run(found, diagnose)
+            diagnose, best = getattr(importlib.import_module(module), function), None
+        outcomes = run(found, diagnose, best, asked.jobs)
     heading = f"Seed {asked.seed}, {len(found)} cases, {asked.kind}"
     print(markdown(outcomes, heading))
     if asked.out is not None:

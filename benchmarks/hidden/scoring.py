@@ -16,12 +16,16 @@ every finding of an `explained` verdict is a bet that pays where the effect was 
 
 import json
 import math
+import multiprocessing
 import sys
 import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +40,7 @@ Diagnose = Callable[[list[Log], dict[str, Any], Log], Mapping[str, Any]]
 
 VERDICTS = ("explained", "no_discrepancy", "unknown_effect")
 CONFIDENT = 0.9
+_MOST_CASES = 8
 BINS = 10
 
 TARGETS = {
@@ -116,30 +121,49 @@ class Outcome:
         return [effect for effect in self.named if effect not in self.hidden]
 
 
-def run(
-    found: Sequence[Case], diagnose: Diagnose, oracle: Callable[[Case], Mapping[str, float]] | None = None
-) -> list[Outcome]:
-    """Diagnose every case; one that fails is an outcome too.
+Oracle = Callable[[Case], Mapping[str, float]]
+"""Held-out rmse by channel of the true effects, fitted."""
+
+
+def _one(case: Case, diagnose: Diagnose, oracle: Oracle | None) -> tuple[Outcome, Mapping[str, Any] | None]:
+    """Outcome of a case, and the extended model; one that fails is an outcome too."""
+    start = time.perf_counter()
+    try:
+        diagnosis, error = diagnose([case.log], case.model, case.holdout), ""
+    except Exception as failure:
+        traceback.print_exc()
+        diagnosis, error = {}, f"{type(failure).__name__}: {failure}"
+    seconds = time.perf_counter() - start
+    best = oracle(case) if oracle is not None and case.hidden and diagnosis else None
+    return outcome(case, diagnosis, best, seconds, error), diagnosis.get("model")
+
+
+def run(found: Sequence[Case], diagnose: Diagnose, oracle: Oracle | None = None, jobs: int = 1) -> list[Outcome]:
+    """Diagnose every case.
 
     Args:
         found: cases.
         diagnose: what is put to the test.
-        oracle: held-out rmse by channel of the true effect, fitted.
+        oracle: what the true effects can reach.
+        jobs: processes that share the work; functions must then be importable.
     """
-    outcomes, models = [], []
-    for i, case in enumerate(found):
-        start = time.perf_counter()
-        try:
-            diagnosis, error = diagnose([case.log], case.model, case.holdout), ""
-            best = oracle(case) if oracle is not None else None
-        except Exception as failure:
-            traceback.print_exc()
-            diagnosis, error, best = {}, f"{type(failure).__name__}: {failure}", None
-        outcomes.append(outcome(case, diagnosis, best, time.perf_counter() - start, error))
-        models.append(diagnosis.get("model"))
-        if sys.stderr.isatty():
-            print(f"\r{i + 1} of {len(found)}", end="\n" if i + 1 == len(found) else "", file=sys.stderr)
-    prove(found, outcomes, models)
+    results = []
+    with ExitStack() as stack:
+        each: Callable[..., Iterable[Any]] = map
+        if jobs > 1:
+            # compiled programs add up in a process, and what one may map into memory is limited
+            context = multiprocessing.get_context("spawn")
+            each = stack.enter_context(ProcessPoolExecutor(jobs, context, max_tasks_per_child=_MOST_CASES)).map
+        for i, (one, model) in enumerate(each(partial(_one, diagnose=diagnose, oracle=oracle), found)):
+            results.append((one, model))
+            said = "right" if one.right and not one.spurious else "WRONG"
+            print(
+                f"{i + 1} of {len(found)}: {one.name} {said} ({_tells(one)}), {one.seconds:.0f} s",
+                file=sys.stderr,
+                flush=True,
+            )
+    outcomes = [one for one, _ in results]
+    prove(found, outcomes, [model for _, model in results])
     return outcomes
 
 

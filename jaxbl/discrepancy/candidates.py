@@ -230,7 +230,7 @@ class Signals:
         self.real = np.asarray(part.weight) > 0.0
         self.torque = np.asarray(part.torque)
         # what must be held where a side stands still
-        self.needed = {side: np.asarray(values) for side, values in _needed(experiment, part).items()}
+        self.needed = {side: np.asarray(values) for side, values in _needed(experiment, part.moving()).items()}
         self.direction = {side: self._direction(side) for side in self.sides}
 
     def _direction(self, side: str) -> Array:
@@ -262,8 +262,9 @@ class Signals:
                 some = which[first : first + _AT_ONCE]
                 # as many at once each time, so that one compiled program serves
                 spare = [effects[some[-1]]] * (_AT_ONCE - len(some))
-                stack = jax.tree.map(lambda *x: jnp.stack(x), *(as_arrays(effects[i], float) for i in some), *spare)
-                torques = np.asarray(_torques(self.experiment, stack, self.part, direction))
+                members = (*(effects[i] for i in some), *spare)
+                stack = jax.tree.map(lambda *x: jnp.asarray(np.array([float(one) for one in x])), *members)
+                torques = np.asarray(_torques(self.experiment, stack, self.part.moving(), direction))
                 for i, torque in zip(some, torques, strict=False):
                     found[i] = torque
         return found

@@ -86,6 +86,8 @@ class Scorer:
         total = total + float(precision @ centre**2)
         size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
         root = _root(matrix / np.outer(size, size))
+        if root is None:
+            return None
         inside = solve_triangular(root, towards / size, lower=True)
         coefficients = -solve_triangular(root, inside, lower=True, trans=1) / size
         cost = total - float(inside @ inside)
@@ -104,11 +106,11 @@ class Scorer:
         return Set(which, evidence, misfit, tuple(numbers), coefficients[: c.own])
 
 
-def _root(unit: Array) -> Array:
-    """Cholesky factor of a matrix with ones on its diagonal, whose columns may be all but alike."""
-    for ridge in (1e-12, 1e-11, 1e-10, 1e-9):
+def _root(unit: Array) -> Array | None:
+    """Cholesky factor of a matrix with ones on its diagonal, whose columns may be all but alike; None if it is none."""
+    for ridge in (1e-12, 1e-11, 1e-10, 1e-9, 1e-8):
         try:
             return np.linalg.cholesky(unit + ridge * np.eye(len(unit)))
         except np.linalg.LinAlgError:
             continue
-    return np.linalg.cholesky(unit + 1e-8 * np.eye(len(unit)))
+    return None

@@ -40,13 +40,14 @@ _BEHIND = 0.5
 _NEAR = 25.0
 _STEPS = 15
 _SETTLED = 2e-3
+_DIVERGED = 1e30
 _LEAST_CHANCE = 0.01
-CLEAR = 10.0
+CLEAR = 50.0
 """Nats that a free function must earn to tell that something else is missing."""
 _SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
 _MOST = 4
-FLOOR = 0.004
-"""Nats a prediction error that structure in the noise (quantisation, above all) may be worth: 0.8 % of its variance."""
+FLOOR = 0.01
+"""Nats a prediction error that structure in the noise (quantisation, above all) may be worth: 2 % of its variance."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,6 +119,18 @@ class _Finalist(NamedTuple):
     numbers: Numbers
     own: Array
     gain: float
+
+
+class _Tried(NamedTuple):
+    """A candidate that was put into the model: what it earns (nats), and its numbers."""
+
+    name: str
+    gain: float
+    numbers: Numbers
+
+    @property
+    def size(self) -> int:
+        return len(self.numbers)
 
 
 class _Point(NamedTuple):
@@ -200,10 +213,11 @@ class Explainer:
             name, leaf = path.removeprefix("effects.").rsplit(".", 1)
             if leaf in _AMPLITUDES:
                 scale[i] = sizes[name]
-        if not np.isfinite(columns.products).all() or not np.isfinite(scale[1:]).all():
+        found = None
+        if np.max(np.abs(columns.products)) < _DIVERGED and np.isfinite(scale[1:]).all():
+            found = Scorer(dataclasses.replace(columns, scale=scale), ())(())
+        if found is None:
             return _Point(experiment, linear, values, theta, Set((), -np.inf, np.inf, (), np.zeros(0)), np.inf)
-        found = Scorer(dataclasses.replace(columns, scale=scale), ())(())
-        assert found is not None
         cost = float(columns.products[0, 0] + np.sum((theta / self.prior) ** 2))
         return _Point(experiment, linear, values, theta, found, cost)
 
@@ -221,29 +235,45 @@ class Explainer:
         linear = self.linear(self.nominal, (), theta)
         smoothness, deviation = linear.choose(())
         nominal = current = self.refit((), {}, theta, smoothness, deviation)
-        findings: list[Finding] = []
+        found: dict[str, list[_Tried]] = {}
         wrong: Model | None = None
-        while len(findings) < _MOST:
+        while len(found) < _MOST:
             smoothness, tried = self._round(current)
             if not tried or tried[0][0] <= 0.0:
                 break
-            chances = _softmax(np.array([gain for gain, _ in tried]))
             (_, current), *others = tried
-            alternatives = tuple(
-                (model.names[-1], float(chance))
-                for (_, model), chance in zip(others, chances[1:], strict=True)
-                if chance > _LEAST_CHANCE
-            )
+            record = [_Tried(model.names[-1], gain, model.numbers[model.names[-1]]) for gain, model in tried]
             current, gone = self._pruned(current, smoothness)
-            findings = [one for one in findings if one.effect not in gone]
-            findings.append(Finding(current.names[-1], float(chances[0]), current.numbers[current.names[-1]], alternatives))
+            found = {name: one for name, one in found.items() if name not in gone} | {record[0].name: record}
             wrong = others[0][1] if others else None
-        findings = [dataclasses.replace(one, numbers=current.numbers[one.effect]) for one in findings]
         rest = self.remainder(current)
-        verdict: Verdict = "explained" if findings else "no_discrepancy"
-        if any(gain > CLEAR for gain, _ in rest.values()):
-            verdict = "unknown_effect"
-        return Explanation(verdict, tuple(findings), current, nominal, wrong, rest)
+        left = _most(rest)
+        if left > CLEAR and found:
+            current, found = self._plain(current, found, left)
+            rest = self.remainder(current)
+            left = _most(rest)
+        findings = tuple(_finding(one, current, left) for one in found.values())
+        verdict: Verdict = "unknown_effect" if left > CLEAR else "explained" if findings else "no_discrepancy"
+        return Explanation(verdict, findings, current, nominal, wrong, rest)
+
+    def _plain(self, model: Model, found: dict[str, list["_Tried"]], left: float) -> tuple[Model, dict[str, list["_Tried"]]]:
+        """Where something unknown remains, only what earns more than that is named, and of what it does not part, the
+        simplest: numbers to spare dress up as what they do not know."""
+        smoothness, deviation = model.linear.choose(())
+        kept = {name: tried for name, tried in found.items() if tried[0].gain > left}
+        numbers = {name: model.numbers[name] for name in kept}
+        model = self.refit(tuple(kept), numbers, model.theta, smoothness, deviation)
+        for name, tried in list(kept.items()):
+            others = [one for one in tried[1:] if one.gain > tried[0].gain - left and one.size < tried[0].size]
+            others = [one for one in others if one.name not in kept and not _same(one.name, set(kept) - {name})]
+            for one in sorted(others, key=lambda one: (one.size, -one.gain))[:1]:
+                numbers = {a: model.numbers[a] for a in model.names if a != name} | {one.name: one.numbers}
+                plainer = self.refit(tuple(numbers), numbers, model.theta, smoothness, deviation)
+                if model.log_evidence - plainer.log_evidence < left:
+                    model = plainer
+                    kept = {(one.name if a == name else a): b for a, b in kept.items()}
+                    kept[one.name] = [one, *(other for other in tried if other.name != one.name)]
+        return model, kept
 
     def _pruned(self, model: Model, smoothness: Sequence[float]) -> tuple[Model, set[str]]:
         """A model without the earlier effects that a later one has made needless, and their names."""
@@ -339,6 +369,19 @@ def _same(name: str, others: Iterable[str]) -> bool:
     """Whether an effect is of a kind with one that is there: of dry friction a side has one law."""
     place, kind = name.split(".")
     return kind in _DRY and any(f"{place}.{one}" in others for one in _DRY)
+
+
+def _most(rest: Mapping[str, tuple[float, float]]) -> float:
+    return max(gain for gain, _ in rest.values())
+
+
+def _finding(tried: Sequence[_Tried], model: Model, left: float) -> Finding:
+    """The first of those tried, with its confidence: structure that is left over makes differences mean less."""
+    heat = max(left / CLEAR, 1.0) if left > CLEAR else 1.0
+    chances = _softmax(np.array([one.gain for one in tried]) / heat)
+    others = tuple((one.name, float(chance)) for one, chance in zip(tried[1:], chances[1:], strict=True))
+    name = tried[0].name
+    return Finding(name, float(chances[0]), model.numbers[name], tuple(one for one in others if one[1] > _LEAST_CHANCE))
 
 
 def _softmax(values: Array) -> Array:

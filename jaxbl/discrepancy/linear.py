@@ -64,8 +64,7 @@ def linearise(
         one = {side: smoothed[side][i] for side in experiment.sides}
         time = record.time[rows] - record.time[0]
         readings = {side: record.positions[side][rows] for side in experiment.sides}
-        found = _part(experiment, chosen, chosen.padded(theta, 0.0), time, record.torque[rows], readings, one)
-        parts.append(eqx.tree_at(lambda part: part.own, found, found.own[:, :, : len(free)]))
+        parts.append(_part(experiment, chosen, chosen.padded(theta, 0.0), time, record.torque[rows], readings, one))
     return parts
 
 
@@ -369,9 +368,15 @@ class Linear:
         """Prediction errors under a given gain, part by part, rad; shape (samples, sides, columns)."""
         gain = self.gain(smoothness)
         return [
-            np.asarray(_errors(part, gain, self._forces((), signals)))
+            np.asarray(_errors(part, gain, self._forces((), signals)))[:, :, self._some(0, 0)]
             for part, signals in zip(self.parts, self.signals, strict=True)
         ]
+
+    def _some(self, forces: int, width: int) -> np.ndarray:
+        """Columns that are not there to fill up, some of the forces among them."""
+        own, padded = len(self.free), self.parts[0].own.shape[2]
+        last = 1 + padded + width + np.arange(self.states)
+        return np.concatenate([np.arange(1 + own), 1 + padded + np.arange(forces), last])
 
     def choose(self, variants: Sequence[Candidate]) -> tuple[list[float], np.ndarray]:
         """The predictor with the least errors, some candidates taken in: smoothness of each side, and errors' rms, rad."""
@@ -398,7 +403,10 @@ class Linear:
 
     def _predictors(self, options: list[list[float]], forces: list[np.ndarray]) -> list[Predictor]:
         gains = jnp.stack([self.gain(one) for one in options])
-        grams = [np.asarray(_grams(part, gains, force)) for part, force in zip(self.parts, forces, strict=True)]
+        grams = []
+        for part, force in zip(self.parts, forces, strict=True):
+            some = self._some(force.shape[2], force.shape[2])
+            grams.append(np.asarray(_grams(part, gains, force))[:, :, some[:, None], some])
         return [Predictor(self, one, [gram[i] for gram in grams]) for i, one in enumerate(options)]
 
     def _forces(self, variants: Sequence[Candidate], signals: Signals) -> np.ndarray:
@@ -421,8 +429,8 @@ class Linear:
         i = int(np.argmax([float(one.weight.sum()) for one in self.parts]))
         part, side = self.parts[i], self.sides.index(self.experiment.drive.place("load"))
         predictor, forces = self._last
-        errors = _errors(part, self.gain(predictor.smoothness), forces[i])
-        left = np.asarray(errors) @ predictor.coefficients[i]
+        errors = np.asarray(_errors(part, self.gain(predictor.smoothness), forces[i]))
+        left = errors[:, :, self._some(forces[i].shape[2], forces[i].shape[2])] @ predictor.coefficients[i]
         time, real = np.asarray(part.time), int(np.asarray(part.weight).sum())
         span, top = real * self.period, min(0.25 / self.period, 50.0)
         few = np.geomspace(1.0 / span, top, _COARSE)
@@ -430,7 +438,7 @@ class Linear:
         waves = np.zeros((len(time), len(self.sides) + 1, 2 * _COARSE))
         waves[:, side] = np.concatenate([np.sin(phase), np.cos(phase)], axis=1)
         gain = self.gain(smoothness)
-        responses = np.asarray(_errors(part, gain, waves))[:, :, 1 + len(self.free) : -self.states]
+        responses = np.asarray(_errors(part, gain, waves))[:, :, 1 + part.own.shape[2] : -self.states]
         power = np.sum((responses / deviation[None, :, None]) ** 2, axis=(0, 1)).reshape(2, -1).mean(axis=0)
         slope = np.asarray(_gradient(part, gain, jnp.asarray(left / deviation[None, :] ** 2)))[:real, side]
         size = 4 * 2 ** int(np.ceil(np.log2(real)))
@@ -460,9 +468,9 @@ class Linear:
         for part, signals in zip(self.parts, self.signals, strict=True):
             forces = self._forces(variants, signals)
             power += self._power(forces[:, :, : at - 1 - own], signals)
-            gram = np.einsum("s,scd->cd", deviation**-2.0, np.asarray(_grams(part, gain[None], forces))[0])
-            every = np.concatenate([np.arange(at), np.arange(len(gram) - self.states, len(gram))])
-            gram = gram[np.ix_(every, every)]
+            some = self._some(at - 1 - own, forces.shape[2])
+            gram = np.asarray(_grams(part, gain[None], forces))[0][:, some[:, None], some]
+            gram = np.einsum("s,scd->cd", deviation**-2.0, gram)
             for one, place in zip(variants, places, strict=True):
                 # the error of a number that is free acts as that number does, dry friction or not
                 if (i := self.same(one.name)) is not None:

@@ -17,7 +17,7 @@ class Part(eqx.Module):
         held: 1 where a side is not shown to move for a while, else 0.
         step: A, shape (samples, states, states).
         force: B, by torque on each side and by the input, shape (samples, states, sides + 1).
-        own: change of a step by each of the model's own numbers (theta), shape (samples, states, numbers).
+        own: change of a step by each free number (theta), padded with zeros, shape (samples, states, numbers).
         defect: model's step less the smoothed one, shape (samples, states).
         weight: 1, or 0 where samples are padding.
     """
@@ -36,3 +36,7 @@ class Part(eqx.Module):
     own: Float[Array, "samples states numbers"]
     defect: Float[Array, "samples states"]
     weight: Float[Array, " samples"]
+
+    def moving(self) -> "Part":
+        """Without the model's step: what torques along the motion need, of one shape whatever numbers are free."""
+        return eqx.tree_at(lambda part: (part.step, part.force, part.own, part.defect), self, (None,) * 4)

@@ -120,7 +120,8 @@ class Windows(eqx.Module):
     def only(self, which: np.ndarray) -> "Windows":
         """Some of the windows."""
         per_window = self.torque, self.measured, self.time, self.start, self.rest
-        torque, measured, time, start, rest = jax.tree.map(lambda x: x[which], per_window)
+        # without a compiled program for each length
+        torque, measured, time, start, rest = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[which]), per_window)
         weight = None if self.weight is None else self.weight[which]
         return Windows(torque, measured, time, start, self.noise, rest, self.gain, weight)
 
@@ -444,16 +445,18 @@ def cut(
     """
     count = len(torque) // samples
     standing = np.arange(count) == (0 if rest else -1)
-    start = jax.tree.map(lambda x: jnp.asarray(x)[: count * samples : samples], start)
-    still = jax.tree.map(lambda x: jnp.where(standing, 0.0, x), start.velocity)
+    # in NumPy, without a compiled program for each length
+    start = jax.tree.map(lambda x: np.asarray(x)[: count * samples : samples], start)
+    still = jax.tree.map(lambda x: jnp.asarray(np.where(standing, 0.0, x)), start.velocity)
+    start = jax.tree.map(jnp.asarray, start)
 
     def split(values: Any) -> Array:
-        return jnp.asarray(values)[: count * samples].reshape(count, samples)
+        return jnp.asarray(np.asarray(values)[: count * samples].reshape(count, samples))
 
     return Windows(
         torque=split(torque),
         measured={side: split(values) for side, values in measured.items()},
-        time=first + period * samples * jnp.arange(count),
+        time=jnp.asarray(first + period * samples * np.arange(count)),
         start=PlantState(start.position, still, start.effects),
         noise={side: jnp.asarray(value, float) for side, value in noise.items()},
         rest=jnp.asarray(standing),

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from jaxbl.discrepancy.complete import ACTUATOR_ORDER, complete, neutral
+from jaxbl.discrepancy.complete import ACTUATOR_ORDER, complete
 from jaxbl.discrepancy.explain import CLEAR, Explanation, Finding, Model, explain, paths_of, with_effects
 from jaxbl.discrepancy.observed import Observed, compared, observed_torques
 from jaxbl.discrepancy.proof import WINDOW, Ground, Proof, foretold
@@ -26,10 +26,10 @@ from jaxbl.discrepancy.refine import refined
 from jaxbl.discrepancy.residuals import Residual
 from jaxbl.discrepancy.where import SIGNIFICANT, Localised, Values, as_json, coordinates_of, describe, where
 from jaxbl.drive.effects import effect_class, effect_kinds
-from jaxbl.drive.parameters import parameters, set_leaves
+from jaxbl.drive.parameters import get_leaf, parameters, set_leaves
 from jaxbl.errors import InputError
 from jaxbl.identification.regression import Kinematics
-from jaxbl.identification.search import Channels, smoothed_channels
+from jaxbl.identification.search import smoothed_channels
 from jaxbl.identification.trajectory import WIDE, Free, free_parameters
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
@@ -227,6 +227,10 @@ def _check_machine(record: Record, other: Record) -> None:
         )
 
 
+def _numeric(field: dataclasses.Field) -> bool:
+    return not field.metadata.get("static")
+
+
 class _Fitted(NamedTuple):
     """A model with some effects, all numbers fitted."""
 
@@ -239,6 +243,21 @@ class _Fitted(NamedTuple):
     @property
     def values(self) -> dict[str, float]:
         return {one.path: float(one.value(self.theta[i])) for i, one in enumerate(self.free)}
+
+    @property
+    def own(self) -> dict[str, float]:
+        """Values of the nominal model's own numbers."""
+        added = tuple(f"effects.{name}." for name in self.names)
+        return {path: value for path, value in self.values.items() if not path.startswith(added)}
+
+    @property
+    def numbers(self) -> dict[str, dict[str, float]]:
+        """All numbers of the effects, those that were not free among them."""
+        effects = {name: get_leaf(self.experiment, f"effects.{name}") for name in self.names}
+        return {
+            name: {field.name: float(getattr(one, field.name)) for field, _ in parameters(one) if _numeric(field)}
+            for name, one in effects.items()
+        }
 
     def errors(self) -> dict[str, float]:
         """Standard errors of the values."""
@@ -268,25 +287,14 @@ def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
             progress(stage, _STAGES)
 
     with jax.enable_x64(True):
-        # one structure for all models, so that they share their compiled programs
-        bare = on_record(config, record)
-        nominal = complete(bare)
-        own = free_parameters(bare, default_paths(config, bare), float(np.std(record.torque)))
-        prior = np.full(len(own), config.uncertainty.relative)
-        rest = config.log.initial_state == "rest"
-        seen, other = (_ground(nominal, one, rest) for one in (record, task.holdout))
-        other = dataclasses.replace(other, rest=rest and task.separate)
-        _check_stable(task, nominal, seen)
-        lacking = seen.torques(nominal)
+        setting = _setting(task)
+        bare, nominal, own, prior, seen, other, lacking, located = setting
         coordinates = _coordinates(nominal, seen, lacking)
-        located = where(nominal, lacking, seen.parts, seen.smoothed, rotating=_rotating(record, nominal))
-        bandwidth = {name: one.bandwidth for name, one in located.items()}
-        seen, other = (dataclasses.replace(one, bandwidth=bandwidth) for one in (seen, other))
         before = other.prove(_at(nominal, task.holdout))
         done()
         found = explain(bare, own, prior.tolist(), record, seen.channels.smoothed)
         done()
-        proving = _Proving(task, nominal, own, prior, seen.channels, other, before)
+        proving = _Proving(task, setting, before)
         fitted, after, withdrawn = proving.extended(found)
         done()
         names = fitted.names
@@ -304,7 +312,7 @@ def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
         _, gain_values = gains_for(task.missing, fitted.experiment, record, seen.channels)
         witness = _Witness(task, set_leaves(bare, arrays(gain_values)), seen, other)
         trace = trace.assign(**witness.columns(len(trace)))
-        model = _model(config, names, fitted.values, gain_values)
+        model = _model(config, fitted.numbers, fitted.own | gain_values)
         summary = _summary(task, fitted, found, findings, verdict, withdrawn, located)
         witness.tell(summary, lacking)
         summary["gap"] = gap
@@ -325,6 +333,75 @@ def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
         config, model, record, task.holdout, plain(summary), trace, lacking, witness.observed, coordinates, located, pairs,
         replays,
     )  # fmt: skip
+
+
+def with_known(task: Task, effects: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    """What a diagnosis that names just these effects would reach: rms errors on what is held out, by channel.
+
+    Args:
+        task: study and logs.
+        effects: numbers of each, from which all are fitted.
+    """
+    with jax.enable_x64(True):
+        setting = _setting(task)
+        numbers = {name: dict(one) for name, one in effects.items()}
+        fitted = _fitted(task, setting, numbers, np.zeros(len(setting.own)))
+        return setting.other.prove(_at(fitted.experiment, task.holdout)).errors
+
+
+class _Setting(NamedTuple):
+    """The nominal model and the logs.
+
+    Attributes:
+        bare: the model as given.
+        nominal: the same with all effects at neutral numbers.
+        own: its numbers that are not exactly known.
+        prior: relative standard deviation of each.
+        seen: the log.
+        other: what was held out.
+        lacking: torques that the model lacks on the log, by side.
+        located: where they live.
+    """
+
+    bare: Experiment
+    nominal: Experiment
+    own: tuple[Free, ...]
+    prior: np.ndarray
+    seen: Ground
+    other: Ground
+    lacking: dict[str, list[Residual]]
+    located: dict[str, Localised]
+
+
+def _setting(task: Task) -> _Setting:
+    config, record = task.config, task.record
+    assert record.torque is not None
+    bare = on_record(config, record)
+    # one structure for all models, so that they share their compiled programs
+    nominal = complete(bare)
+    own = free_parameters(bare, default_paths(config, bare), float(np.std(record.torque)))
+    prior = np.full(len(own), config.uncertainty.relative)
+    rest = config.log.initial_state == "rest"
+    seen, other = (_ground(nominal, one, rest) for one in (record, task.holdout))
+    other = dataclasses.replace(other, rest=rest and task.separate)
+    _check_stable(task, nominal, seen)
+    lacking = seen.torques(nominal)
+    located = where(nominal, lacking, seen.parts, seen.smoothed, rotating=_rotating(record, nominal))
+    bandwidth = {name: one.bandwidth for name, one in located.items()}
+    seen, other = (dataclasses.replace(one, bandwidth=bandwidth) for one in (seen, other))
+    return _Setting(bare, nominal, own, prior, seen, other, lacking, located)
+
+
+def _fitted(task: Task, setting: _Setting, numbers: Mapping[str, Mapping[str, float]], theta: np.ndarray) -> _Fitted:
+    """A model with some effects, its own numbers and theirs fitted from given ones."""
+    experiment = with_effects(setting.nominal, numbers)
+    assert task.record.torque is not None
+    added = free_parameters(experiment, paths_of(numbers), float(np.std(task.record.torque)))
+    free = (*setting.own, *added)
+    start = np.concatenate([np.asarray(theta), np.zeros(len(added))])
+    width = np.concatenate([setting.prior, np.full(len(added), WIDE)])
+    found = refined(experiment, free, start, width, task.record, setting.seen.channels.smoothed)
+    return _Fitted(tuple(numbers), found.experiment, free, found.theta, found.deviation)
 
 
 def _ground(nominal: Experiment, record: Record, rest: bool) -> Ground:
@@ -409,26 +486,17 @@ class _Witness:
 class _Proving:
     """Models fitted on the log, and held against what was held out."""
 
-    def __init__(
-        self,
-        task: Task,
-        nominal: Experiment,
-        own: tuple[Free, ...],
-        prior: np.ndarray,
-        channels: Channels,
-        other: Ground,
-        before: Proof,
-    ):
-        self.task, self.nominal, self.own, self.prior = task, nominal, own, prior
-        self.channels, self.other, self.before = channels, other, before
-        self.floor = other.floor(before.torques)
+    def __init__(self, task: Task, setting: _Setting, before: Proof):
+        self.task, self.setting, self.before = task, setting, before
+        self.nominal, self.own, self.other = setting.nominal, setting.own, setting.other
+        self.floor = self.other.floor(before.torques)
 
     def extended(self, found: Explanation) -> tuple[_Fitted, Proof, list[str]]:
         """The model with what was found, its proof, and the effects that did not earn their place."""
         names, withdrawn = found.model.names, []
         while True:
             base = found.model if names else found.nominal
-            fitted = self.fitted(base, names)
+            fitted = _fitted(self.task, self.setting, {name: base.numbers[name] for name in names}, base.theta)
             after = self.other.prove(self.at(fitted.experiment))
             if not self.worse(after):
                 return fitted, after, withdrawn
@@ -436,7 +504,7 @@ class _Proving:
                 break
             withdrawn.append(names[-1])
             names = names[:-1]
-        given = _Fitted((), self.nominal, self.own, np.zeros(len(self.own)), self.prior)
+        given = _Fitted((), self.nominal, self.own, np.zeros(len(self.own)), self.setting.prior)
         return given, self.before, withdrawn
 
     def worse(self, after: Proof) -> bool:
@@ -450,12 +518,6 @@ class _Proving:
     def at(self, experiment: Experiment) -> Experiment:
         """A model at the period of what was held out."""
         return _at(experiment, self.other.record)
-
-    def fitted(self, base: Model, names: tuple[str, ...]) -> _Fitted:
-        """All numbers by the simulator, from those of the explanation; the better of both."""
-        experiment, free, theta, width = _start(self.nominal, self.own, self.prior, base, names)
-        found = refined(experiment, free, theta, width, self.task.record, self.channels.smoothed)
-        return _Fitted(names, found.experiment, free, found.theta, found.deviation)
 
     def gap(self, fitted: _Fitted, after: Proof, rival: Model | None) -> dict[str, Any]:
         """What is left on held-out data before and after, the floor, and controls."""
@@ -500,16 +562,6 @@ def _values(free: Sequence[Free], theta: np.ndarray) -> dict[str, Any]:
     return {one.path: jnp.asarray(one.value(theta[i])) for i, one in enumerate(free)}
 
 
-def _start(
-    nominal: Experiment, own: tuple[Free, ...], prior: np.ndarray, base: Model, names: tuple[str, ...]
-) -> tuple[Experiment, tuple[Free, ...], np.ndarray, np.ndarray]:
-    """A model with some of the effects that another has; its numbers, where they start, and their prior."""
-    experiment = with_effects(base.experiment, {one: neutral(one) for one in base.names if one not in names})
-    added = free_parameters(experiment, paths_of(names), float(nominal.run.sample_period))
-    theta = np.concatenate([np.asarray(base.theta), np.zeros(len(added))])
-    return experiment, (*own, *added), theta, np.concatenate([prior, np.full(len(added), WIDE)])
-
-
 _UNITS = {"theta": "rad", "velocity": "rad/s", "torque": "N m"}
 
 
@@ -518,18 +570,9 @@ def _unit(record: Record, name: str) -> str:
     return unit_on(record, f"{side}.position", _UNITS[name.split("_")[0]])
 
 
-def _model(config: Config, names: Sequence[str], values: Mapping[str, float], gains: Mapping[str, float]) -> Config:
+def _model(config: Config, numbers: Mapping[str, Mapping[str, float]], values: Mapping[str, float]) -> Config:
     """The study with effects more, and with these numbers."""
-    data = config.resolved()
-    numbers: dict[str, dict[str, Any]] = {name: {} for name in names}
-    own = {}
-    for path, value in values.items():
-        name, leaf = path.removeprefix("effects.").rsplit(".", 1)
-        if path.startswith("effects.") and name in numbers:
-            numbers[name][leaf] = value
-        else:
-            own[path] = value
-    return with_values(_with_effects(data, numbers), own | dict(gains))
+    return with_values(_with_effects(config.resolved(), numbers), values)
 
 
 def _with_effects(data: dict[str, Any], numbers: Mapping[str, Mapping[str, Any]]) -> Config:
@@ -543,8 +586,7 @@ def _with_effects(data: dict[str, Any], numbers: Mapping[str, Mapping[str, Any]]
 def _rival(config: Config, own: Sequence[Free], rival: Model) -> dict[str, Any]:
     """The best model with another effect, as tables of a study."""
     values = {path: float(value) for path, value in _values(own, rival.theta).items()}
-    values |= {f"effects.{name}.{leaf}": value for name in rival.names for leaf, value in rival.numbers[name].items()}
-    data = _model(config, rival.names, values, {}).resolved()
+    data = _model(config, {name: rival.numbers[name] for name in rival.names}, values).resolved()
     return {"effect": rival.names[-1]} | {key: data[key] for key in ("drive", "transmission", "effects") if key in data}
 
 

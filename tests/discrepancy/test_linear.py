@@ -59,6 +59,7 @@ def errors(model, forces=None):
     width = 0 if forces is None else forces.shape[2]
     none = np.zeros((signals.count, len(model.sides) + 1, width)) if forces is None else forces
     found = np.asarray(module._errors(model.parts[0], model.gain([1e-6] * len(model.sides)), jnp.asarray(none)))
+    found = found[:, :, model._some(width, width)]
     flat = found.reshape(-1, found.shape[2])
     basis = np.linalg.qr(flat[:, -model.states :])[0]
     rest = flat[:, : -model.states]
