@@ -232,6 +232,7 @@ class Signals:
         # what must be held where a side stands still
         self.needed = {side: np.asarray(values) for side, values in _needed(experiment, part.moving()).items()}
         self.direction = {side: self._direction(side) for side in self.sides}
+        self.known: dict[int, tuple[Candidate, Array]] = {}
 
     def _direction(self, side: str) -> Array:
         velocity, deviation = np.asarray(self.part.velocity[side]), np.asarray(self.part.deviation[side])
@@ -273,11 +274,23 @@ class Signals:
 _AT_ONCE = 6
 
 
-def forces_of(candidates: Sequence[Candidate], signals: Signals) -> Array:
-    """Columns of candidates, one after the other, N m; shape (samples, sides + 1, columns)."""
-    torques = iter(signals.of([effect for one in candidates for effect in one.effects]))
-    columns = [one.columns(signals, [next(torques) for _ in one.effects]) for one in candidates]
-    return np.concatenate([np.zeros((signals.count, len(signals.sides) + 1, 0)), *columns], axis=2)
+def forces_of(candidates: Sequence[Candidate], signals: Signals, spare: int = 0) -> Array:
+    """Columns of candidates, one after the other, N m, and columns of zeros; shape (samples, sides + 1, columns)."""
+    widths = [one.width + one.offset for one in candidates]
+    found = np.zeros((signals.count, len(signals.sides) + 1, sum(widths) + spare))
+    new = [one for one in candidates if id(one) not in signals.known]
+    torques = iter(signals.of([effect for one in new for effect in one.effects]))
+    at = 0
+    for one, width in zip(candidates, widths, strict=True):
+        if id(one) in signals.known:
+            columns = signals.known[id(one)][1]
+        else:
+            columns = one.columns(signals, [next(torques) for _ in one.effects])
+        found[:, :, at : at + width] = columns
+        # what was computed stays as long as the candidate does
+        signals.known[id(one)] = one, found[:, :, at : at + width]
+        at += width
+    return found
 
 
 @eqx.filter_jit

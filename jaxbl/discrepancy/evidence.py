@@ -27,7 +27,7 @@ class Columns:
         own: number of the model's own numbers.
         places: columns of each variant.
         offsets: column of each variant's offset, or -1.
-        scale: prior standard deviation of each column's coefficient.
+        scale: prior standard deviation of each column's coefficient; infinite where it does nothing along this record.
         centre: prior mean of each.
     """
 
@@ -76,6 +76,8 @@ class Scorer:
         c = self.columns
         chosen = np.concatenate([self.base, *(np.asarray(c.places[i]) for i in which)]).astype(int)
         fixed = np.array([0, *(c.offsets[i] for i in which if c.offsets[i] >= 0)])
+        if not np.isfinite(c.scale[chosen]).all():
+            return None
         inner = c.products[np.ix_(chosen, chosen)]
         towards = c.products[np.ix_(chosen, fixed)].sum(axis=1)
         total = c.products[np.ix_(fixed, fixed)].sum()

@@ -21,7 +21,7 @@ from jaxbl.identification.trajectory import Free, free_parameters
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
-from .candidates import SHARE, Numbers, variants_of
+from .candidates import SHARE, Candidate, Numbers, variants_of
 from .complete import candidates, complete
 from .evidence import Scorer, Set
 from .linear import Linear
@@ -34,20 +34,21 @@ Verdict = Literal["explained", "no_discrepancy", "unknown_effect"]
 
 ODDS = -2.0
 """Log prior odds of each effect to be missing."""
-_FINALISTS = 5
+_FINALISTS, _LEADERS = 5, 3
 _BEHIND = 0.5
 """Share of the best gain in evidence that a finalist must reach (or be within :data:`_NEAR`)."""
 _NEAR = 25.0
 _STEPS = 15
 _SETTLED = 2e-3
+_HEAT = 0.2
 _DIVERGED = 1e30
 _LEAST_CHANCE = 0.01
 CLEAR = 50.0
 """Nats that a free function must earn to tell that something else is missing."""
 _SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
 _MOST = 4
-FLOOR = 0.01
-"""Nats a prediction error that structure in the noise (quantisation, above all) may be worth: 2 % of its variance."""
+FLOOR = 0.006
+"""Nats a prediction error that structure in the noise (quantisation, above all) may be worth: 1.2 % of its variance."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,8 +60,8 @@ class Model:
         experiment: with the effects and all numbers.
         numbers: of the effects.
         theta: the nominal model's own numbers.
-        log_evidence: nats; only differences between models under one gain count.
-        misfit: sum of squared prediction errors over their variance.
+        log_evidence: nats; only differences count.
+        log_likelihood: nats; as `log_evidence`.
         linear: the model along the record.
     """
 
@@ -69,7 +70,7 @@ class Model:
     numbers: dict[str, Numbers]
     theta: Array
     log_evidence: float
-    misfit: float
+    log_likelihood: float
     linear: Linear
 
 
@@ -119,6 +120,22 @@ class _Finalist(NamedTuple):
     numbers: Numbers
     own: Array
     gain: float
+
+
+class _Scored(NamedTuple):
+    """A candidate on the linearised model; `scale` makes evidences under different predictors compare."""
+
+    name: str
+    found: Set
+    scale: float
+
+    @property
+    def log_evidence(self) -> float:
+        return self.scale + self.found.log_evidence
+
+    @property
+    def log_likelihood(self) -> float:
+        return self.scale - 0.5 * self.found.misfit
 
 
 class _Tried(NamedTuple):
@@ -188,13 +205,15 @@ class Explainer:
                 break
             theta, values = self._moved(best, change)
         if best is None:
-            return Model(names, point.experiment, values, theta, -np.inf, np.inf, point.linear)
+            return Model(names, point.experiment, values, theta, -np.inf, -np.inf, point.linear)
         experiment, linear, found, values, theta = best.experiment, best.linear, best.found, best.values, best.theta
         if any(one.get("breakaway_torque", np.inf) <= one.get("torque", 0.0) for one in values.values()):
             # then it is Coulomb's
-            return Model(names, experiment, values, theta, -np.inf, np.inf, linear)
-        evidence = found.log_evidence + len(names) * ODDS - sum(linear.choices(name) for name in names)
-        return Model(names, experiment, values, theta, evidence, found.misfit, linear)
+            return Model(names, experiment, values, theta, -np.inf, -np.inf, linear)
+        # densities of the errors, so that models under different predictors compare
+        scale = -linear.count * float(np.sum(np.log(deviation)))
+        evidence = scale + found.log_evidence + len(names) * ODDS - sum(linear.choices(name) for name in names)
+        return Model(names, experiment, values, theta, evidence, scale - 0.5 * found.misfit, linear)
 
     def _point(
         self,
@@ -291,10 +310,12 @@ class Explainer:
         """Models with one effect more, and what each earns (nats), best first."""
         smoothness, deviation = current.linear.choose(())
         current = self.refit(current.names, current.numbers, current.theta, smoothness, deviation)
-        smoothness, deviation, finalists = self._screen(current)
+        smoothness, deviation, finalists = self._screen(current, smoothness)
         if not finalists:
             return smoothness, []
         base = self.refit(current.names, current.numbers, current.theta, smoothness, deviation)
+        # under the predictor that suits it best
+        base = max(base, current, key=lambda one: one.log_evidence)
         tried: list[tuple[float, Model]] = []
         best = finalists[0].gain
         for one in finalists:
@@ -322,44 +343,55 @@ class Explainer:
                 scorer = Scorer(dataclasses.replace(columns, scale=scale), functions)
                 none, some = scorer(()), scorer((i,))
                 assert none is not None and some is not None
-                best = max(best, (self._gain(none, some), size * SHARE))
+                best = max(best, (self._gain(_Scored("", none, 0.0), _Scored("", some, 0.0)), size * SHARE))
             found[one.name] = best
         return found
 
-    def _gain(self, base: Model | Set, model: Model | Set) -> float:
+    def _gain(self, base: "Model | _Scored", model: "Model | _Scored") -> float:
         """What a model's effect earns: evidence, less a floor of what it takes off the misfit."""
-        explained = 0.5 * (base.misfit - model.misfit)
+        explained = model.log_likelihood - base.log_likelihood
         gain = model.log_evidence - base.log_evidence
         return gain - min(max(explained, 0.0), self.floor) if np.isfinite(gain) else -np.inf
 
-    def _screen(self, model: Model) -> tuple[list[float], Array, list[_Finalist]]:
+    def _screen(self, model: Model, smoothness: list[float]) -> tuple[list[float], Array, list[_Finalist]]:
         """Candidates that do well on the linearised model, and the predictor to judge them by: with the best of them in."""
         linear = model.linear
-        smoothness, deviation = linear.choose(())
+        smoothness, deviation = linear.choose((), smoothness)
         lacking = [name for name in self.lacking if name not in model.names and not _same(name, model.names)]
         variants = variants_of(model.experiment, lacking, linear.grids(linear.frequencies(smoothness, deviation)))
-        finalists: list[_Finalist] = []
-        for _ in range(2):
-            scorer = Scorer(linear.columns(variants, smoothness, deviation), variants)
-            none = scorer(())
-            assert none is not None
-            allowed = [one for i in range(len(variants)) if (one := scorer((i,))) is not None]
-            best: dict[str, tuple[float, Set]] = {}
-            for one in sorted(allowed, key=lambda one: -one.log_evidence):
-                best.setdefault(variants[one.which[0]].name, (self._gain(none, one), one))
-            ordered = sorted(best.items(), key=lambda pair: -pair[1][0])
-            top = ordered[0][1][0] if ordered else 0.0
-            if top <= 0.0:
-                return smoothness, deviation, []
-            finalists = [
-                _Finalist(name, one.numbers[0], one.own[: len(self.free)], gain)
-                for name, (gain, one) in ordered[:_FINALISTS]
-                if gain > 0.0
-            ]
-            smoothness, deviation = linear.choose([variants[ordered[0][1][1].which[0]]])
-            few = {name for name, _ in ordered[: 2 * _FINALISTS]}
-            variants = [one for one in variants if one.name in few]
+        base, ranked = self._ranked(linear, variants, smoothness, deviation)
+        if not ranked:
+            return smoothness, deviation, []
+        # a predictor that makes up for what is missing hides it: the best ones together show which is due
+        leaders = [variants[one.found.which[0]] for one in ranked[:_LEADERS]]
+        few = {one.name for one in ranked[: 2 * _FINALISTS]}
+        variants = [one for one in variants if one.name in few]
+        smoothness, deviation = linear.choose(leaders)
+        other, ranked = self._ranked(linear, variants, smoothness, deviation)
+        base = max(base, other, key=lambda one: one.log_evidence)
+        finalists = [
+            _Finalist(one.name, one.found.numbers[0], one.found.own[: len(self.free)], self._gain(base, one))
+            for one in ranked[:_FINALISTS]
+        ]
+        finalists = sorted((one for one in finalists if one.gain > 0.0), key=lambda one: -one.gain)
+        if finalists:
+            (best,) = (variants[one.found.which[0]] for one in ranked if one.name == finalists[0].name)
+            smoothness, deviation = linear.choose([best], smoothness)
         return smoothness, deviation, finalists
+
+    def _ranked(
+        self, linear: Linear, variants: Sequence[Candidate], smoothness: Sequence[float], deviation: Array
+    ) -> tuple["_Scored", list["_Scored"]]:
+        """The model without candidates, and with the best variant of each, best first."""
+        scorer = Scorer(linear.columns(variants, smoothness, deviation), variants)
+        scale = -linear.count * float(np.sum(np.log(deviation)))
+        none = scorer(())
+        assert none is not None
+        allowed = [one for i in range(len(variants)) if (one := scorer((i,))) is not None]
+        best: dict[str, _Scored] = {}
+        for one in sorted(allowed, key=lambda one: -one.log_evidence):
+            best.setdefault(variants[one.which[0]].name, _Scored(variants[one.which[0]].name, one, scale))
+        return _Scored("", none, scale), list(best.values())
 
 
 _DRY = "coulomb_friction", "stribeck_friction"
@@ -377,7 +409,7 @@ def _most(rest: Mapping[str, tuple[float, float]]) -> float:
 
 def _finding(tried: Sequence[_Tried], model: Model, left: float) -> Finding:
     """The first of those tried, with its confidence: structure that is left over makes differences mean less."""
-    heat = max(left / CLEAR, 1.0) if left > CLEAR else 1.0
+    heat = max(_HEAT * left, 1.0) if left > CLEAR else 1.0
     chances = _softmax(np.array([one.gain for one in tried]) / heat)
     others = tuple((one.name, float(chance)) for one, chance in zip(tried[1:], chances[1:], strict=True))
     name = tried[0].name

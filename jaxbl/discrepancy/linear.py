@@ -250,6 +250,7 @@ _LEAST = 1e-11
 OFF = 0.5
 """Prior size of the error of an inertia or a viscous friction, relative."""
 _FREQUENCIES, _COARSE, _HARMONICS = 8, 16, 40
+_NO_INPUT = 1e-3
 _COLUMNS = 16
 """Least padded number of candidate columns."""
 
@@ -315,8 +316,19 @@ class Linear:
         self.signals = [Signals(self.experiment, part) for part in self.parts]
         self.count = sum(int(np.asarray(one.weight).sum()) for one in self.parts)
         self.states = self.parts[0].defect.shape[1]
-        self.drive = rms(np.concatenate([one.torque[one.real] for one in self.signals]))
+        self.drive = self._drive()
         self._last: tuple[Predictor, list[np.ndarray]] | None = None
+
+    def _drive(self) -> float:
+        """Size of the torques, N m rms at the motor: the input's; where there is none, what the motion takes."""
+        driving = rms(np.concatenate([one.torque[one.real] for one in self.signals]))
+        taken = [
+            float(self.experiment.plant.inertia(side)) / one.over(side) * np.asarray(one.part.acceleration[side])[one.real]
+            for one in self.signals
+            for side in self.sides
+        ]
+        inertial = rms(np.concatenate(taken))
+        return driving if driving > _NO_INPUT * inertial else inertial
 
     def grids(self, frequencies: Sequence[float]) -> Grids:
         """Values to be tried of numbers that are not linear."""
@@ -378,8 +390,11 @@ class Linear:
         last = 1 + padded + width + np.arange(self.states)
         return np.concatenate([np.arange(1 + own), 1 + padded + np.arange(forces), last])
 
-    def choose(self, variants: Sequence[Candidate]) -> tuple[list[float], np.ndarray]:
-        """The predictor with the least errors, some candidates taken in: smoothness of each side, and errors' rms, rad."""
+    def choose(self, variants: Sequence[Candidate], near: list[float] | None = None) -> tuple[list[float], np.ndarray]:
+        """The predictor with the least errors, some candidates taken in: smoothness of each side, and errors' rms, rad.
+
+        With `near`, the search begins there.
+        """
         forces = [self._forces(variants, signals) for signals in self.signals]
 
         def best(options: list[list[float]]) -> Predictor:
@@ -390,14 +405,16 @@ class Linear:
             costs = [float(np.sum(np.log(one.squares))) if (one.squares > 0.0).all() else np.inf for one in found]
             return found[int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))]
 
-        chosen = best([[float(q)] * len(self.sides) for q in _COARSE_SMOOTHNESS])
-        if len(self.sides) > 1:
-            for i in range(len(self.sides)):
-                now = chosen.smoothness
-                options = [[max(float(q * f), _LEAST) if j == i else q for j, q in enumerate(now)] for f in _FINE_SMOOTHNESS]
-                other = best(options)
-                if np.sum(np.log(other.squares)) < np.sum(np.log(chosen.squares)):
-                    chosen = other
+        if near is None:
+            chosen = best([[float(q)] * len(self.sides) for q in _COARSE_SMOOTHNESS])
+        else:
+            (chosen,) = self._predictors([near], forces)
+        for i in range(len(self.sides)) if len(self.sides) > 1 or near is not None else ():
+            now = chosen.smoothness
+            options = [[max(float(q * f), _LEAST) if j == i else q for j, q in enumerate(now)] for f in _FINE_SMOOTHNESS]
+            other = best(options)
+            if np.sum(np.log(other.squares)) < np.sum(np.log(chosen.squares)):
+                chosen = other
         self._last = chosen, forces
         return chosen.smoothness, np.sqrt(chosen.squares / self.count)
 
@@ -411,10 +428,8 @@ class Linear:
 
     def _forces(self, variants: Sequence[Candidate], signals: Signals) -> np.ndarray:
         """Torques of candidates, padded with columns of zeros; shape (samples, sides + 1, columns)."""
-        forces = forces_of(variants, signals)
-        width = forces.shape[2]
-        spare = bucket(width, _COLUMNS, 2) - width if width else 0
-        return np.concatenate([forces, np.zeros((*forces.shape[:2], spare))], axis=2)
+        width = sum(one.width + one.offset for one in variants)
+        return forces_of(variants, signals, bucket(width, _COLUMNS, 2) - width if width else 0)
 
     def deviation(self, smoothness: Sequence[float]) -> np.ndarray:
         """Rms of the prediction errors, rad, by side, with a given predictor."""
@@ -478,7 +493,9 @@ class Linear:
                     gram[place[0]] = gram[1 + i] / slope
                     gram[:, place[0]] = gram[:, 1 + i] / slope
             total += _eliminated(gram, self.states)
-        size = SHARE * self.drive / np.sqrt(np.maximum(power / self.count, 1e-300))
+        with np.errstate(divide="ignore"):
+            # what has no torque along this motion cannot be found
+            size = SHARE * self.drive / np.sqrt(power / self.count)
         scale = np.concatenate([[np.inf], self.prior, size])
         for one, place in zip(variants, places, strict=True):
             if one.offset:

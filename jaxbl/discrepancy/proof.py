@@ -111,7 +111,7 @@ class Ground:
         driven = self._driven(experiment, {})
         windows, firsts = self.windows(driven, self.samples)
         torques = self.torques(experiment)
-        errors = self._errors(driven, windows, firsts, 12)
+        errors = self._errors(driven, windows, firsts, 8)
         return Proof(errors | self.torque_errors(torques), torques)
 
     def _driven(self, experiment: Experiment, tables: Mapping[str, np.ndarray]) -> Experiment:
@@ -137,7 +137,7 @@ class Ground:
         spare = max(longest.bit_length() - 4, 0)
         windows, firsts = windows_of(self.record, self.channels, experiment, longest >> spare << spare, self.rest)
         windows, firsts = windows.only(np.arange(1)).padded(1), firsts[:1]
-        errors = self._errors(experiment, windows, firsts, 6)
+        errors = self._errors(experiment, windows, firsts, 3)
         first = np.flatnonzero([part.start == firsts[0] for part in self.record.segments])[0]
         deviation = {
             side: float(np.median(np.asarray(pieces[first].deviation(1)))) for side, pieces in self.channels.smoothed.items()
@@ -184,7 +184,7 @@ class Ground:
             ]
         model = self._driven(experiment, tables)
         windows, firsts = self.windows(model, self.samples)
-        return Proof(self._errors(model, windows, firsts, 12) | self.torque_errors(torques), torques)
+        return Proof(self._errors(model, windows, firsts, 8) | self.torque_errors(torques), torques)
 
 
 def foretold(growth: float) -> bool:
