@@ -298,6 +298,7 @@ def _diagnose_batch(source: Path, model: Path | None, out: Path, overwrite: bool
     with _running(words, model or source, out, unit="logs") as progress:
         for i, file in enumerate(logs):
             progress(i, len(logs))
+            _forget_programs()
             folder = out / file.stem
             try:
                 task = read_task(file, models[file], holdout=held.get(file.stem))  # pyright: ignore[reportArgumentType]
@@ -394,6 +395,20 @@ def _start_jax() -> None:
     if jax.config.values["jax_compilation_cache_dir"] is None:
         cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "jaxbl"
         jax.config.update("jax_compilation_cache_dir", str(cache))
+
+
+_MOST_MAPPINGS = 30_000
+"""Half of what Linux allows a process by default."""
+
+
+def _forget_programs() -> None:
+    """Let go of compiled programs before those of logs of many lengths use up the mappings that the system allows."""
+    import jax
+
+    with suppress(OSError):
+        count = Path("/proc/self/maps").read_bytes().count(b"\n")
+        if count > _MOST_MAPPINGS:
+            jax.clear_caches()
 
 
 @contextmanager

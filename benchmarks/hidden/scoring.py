@@ -22,7 +22,6 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -153,7 +152,7 @@ def run(found: Sequence[Case], diagnose: Diagnose, oracle: Oracle | None = None,
         if jobs > 1:
             # compiled programs add up in a process, and what one may map into memory is limited
             context = multiprocessing.get_context("spawn")
-            each = stack.enter_context(ProcessPoolExecutor(jobs, context, max_tasks_per_child=_MOST_CASES)).map
+            each = stack.enter_context(context.Pool(jobs, maxtasksperchild=_MOST_CASES)).imap
         for i, (one, model) in enumerate(each(partial(_one, diagnose=diagnose, oracle=oracle), found)):
             results.append((one, model))
             said = "right" if one.right and not one.spurious else "WRONG"

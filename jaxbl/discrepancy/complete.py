@@ -111,10 +111,10 @@ class Chosen(eqx.Module):
         spare = -len(free) % _WIDTH
         return cls(
             paths,
-            jnp.asarray([*(paths.index(one.path) for one in free), *[len(paths)] * spare]),
+            jnp.asarray([*(paths.index(one.path) for one in free), *[len(paths)] * spare], int),
             jnp.asarray([*(one.nominal for one in free), *[0.0] * spare], float),
             jnp.asarray([*(one.scale for one in free), *[1.0] * spare], float),
-            jnp.asarray([*(one.positive for one in free), *[False] * spare]),
+            jnp.asarray([*(one.positive for one in free), *[False] * spare], bool),
         )
 
     def put(self, experiment: Experiment, theta: Float[Array, " numbers"]) -> Experiment:

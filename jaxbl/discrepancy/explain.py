@@ -40,6 +40,7 @@ _BEHIND = 0.5
 _NEAR = 25.0
 _STEPS = 15
 _SETTLED = 2e-3
+_EARNED = 0.2
 _HEAT = 0.2
 _DIVERGED = 1e30
 _LEAST_CHANCE = 0.01
@@ -123,19 +124,29 @@ class _Finalist(NamedTuple):
 
 
 class _Scored(NamedTuple):
-    """A candidate on the linearised model; `scale` makes evidences under different predictors compare."""
+    """A candidate on the linearised model, judged by the density of its errors whatever the predictor and its variance.
+
+    Attributes:
+        name: of the candidate.
+        found: under a given deviation of the errors.
+        count: of samples.
+        deviation: of the errors by side, rad; its size, common to both sides, is then the one of largest likelihood.
+    """
 
     name: str
     found: Set
-    scale: float
-
-    @property
-    def log_evidence(self) -> float:
-        return self.scale + self.found.log_evidence
+    count: int
+    deviation: Array
 
     @property
     def log_likelihood(self) -> float:
-        return self.scale - 0.5 * self.found.misfit
+        errors = self.count * len(self.deviation)
+        size = max(self.found.misfit / errors, 1e-300)
+        return -0.5 * errors * (np.log(size) + 1.0) - self.count * float(np.sum(np.log(self.deviation)))
+
+    @property
+    def log_evidence(self) -> float:
+        return self.found.log_evidence + 0.5 * self.found.misfit + self.log_likelihood
 
 
 class _Tried(NamedTuple):
@@ -210,10 +221,9 @@ class Explainer:
         if any(one.get("breakaway_torque", np.inf) <= one.get("torque", 0.0) for one in values.values()):
             # then it is Coulomb's
             return Model(names, experiment, values, theta, -np.inf, -np.inf, linear)
-        # densities of the errors, so that models under different predictors compare
-        scale = -linear.count * float(np.sum(np.log(deviation)))
-        evidence = scale + found.log_evidence + len(names) * ODDS - sum(linear.choices(name) for name in names)
-        return Model(names, experiment, values, theta, evidence, scale - 0.5 * found.misfit, linear)
+        scored = _Scored("", found, linear.count, deviation)
+        evidence = scored.log_evidence + len(names) * ODDS - sum(linear.choices(name) for name in names)
+        return Model(names, experiment, values, theta, evidence, scored.log_likelihood, linear)
 
     def _point(
         self,
@@ -276,10 +286,10 @@ class Explainer:
         return Explanation(verdict, findings, current, nominal, wrong, rest)
 
     def _plain(self, model: Model, found: dict[str, list["_Tried"]], left: float) -> tuple[Model, dict[str, list["_Tried"]]]:
-        """Where something unknown remains, only what earns more than that is named, and of what it does not part, the
+        """Where something unknown remains, only what earns a good part of that is named, and of what it does not part, the
         simplest: numbers to spare dress up as what they do not know."""
         smoothness, deviation = model.linear.choose(())
-        kept = {name: tried for name, tried in found.items() if tried[0].gain > left}
+        kept = {name: tried for name, tried in found.items() if tried[0].gain > _EARNED * left}
         numbers = {name: model.numbers[name] for name in kept}
         model = self.refit(tuple(kept), numbers, model.theta, smoothness, deviation)
         for name, tried in list(kept.items()):
@@ -334,7 +344,7 @@ class Explainer:
         smoothness, deviation = linear.choose(())
         functions = functions_of(linear.signals)
         columns = linear.columns(functions, smoothness, deviation)
-        found = {}
+        earned = {}
         for i, one in enumerate(functions):
             best = (-np.inf, 0.0)
             for size in _SIZES:
@@ -343,9 +353,10 @@ class Explainer:
                 scorer = Scorer(dataclasses.replace(columns, scale=scale), functions)
                 none, some = scorer(()), scorer((i,))
                 assert none is not None and some is not None
-                best = max(best, (self._gain(_Scored("", none, 0.0), _Scored("", some, 0.0)), size * SHARE))
-            found[one.name] = best
-        return found
+                base, more = (_Scored("", found, linear.count, deviation) for found in (none, some))
+                best = max(best, (self._gain(base, more), size * SHARE))
+            earned[one.name] = best
+        return earned
 
     def _gain(self, base: "Model | _Scored", model: "Model | _Scored") -> float:
         """What a model's effect earns: evidence, less a floor of what it takes off the misfit."""
@@ -359,16 +370,16 @@ class Explainer:
         smoothness, deviation = linear.choose((), smoothness)
         lacking = [name for name in self.lacking if name not in model.names and not _same(name, model.names)]
         variants = variants_of(model.experiment, lacking, linear.grids(linear.frequencies(smoothness, deviation)))
-        base, ranked = self._ranked(linear, variants, smoothness, deviation)
+        _, ranked = self._ranked(linear, variants, smoothness, deviation)
         if not ranked:
             return smoothness, deviation, []
-        # a predictor that makes up for what is missing hides it: the best ones together show which is due
-        leaders = [variants[one.found.which[0]] for one in ranked[:_LEADERS]]
+        # a predictor that makes up for what is missing hides it: the best ones are tried with predictors of their own
+        leaders = [linear.choose([variants[one.found.which[0]]]) for one in ranked[:_LEADERS]]
         few = {one.name for one in ranked[: 2 * _FINALISTS]}
         variants = [one for one in variants if one.name in few]
-        smoothness, deviation = linear.choose(leaders)
-        other, ranked = self._ranked(linear, variants, smoothness, deviation)
-        base = max(base, other, key=lambda one: one.log_evidence)
+        smoothness, deviation = min(leaders, key=lambda one: float(np.sum(np.log(one[1]))))
+        # beside the model without them under the same predictor: what they earn in truth, models that have them tell
+        base, ranked = self._ranked(linear, variants, smoothness, deviation)
         finalists = [
             _Finalist(one.name, one.found.numbers[0], one.found.own[: len(self.free)], self._gain(base, one))
             for one in ranked[:_FINALISTS]
@@ -384,14 +395,14 @@ class Explainer:
     ) -> tuple["_Scored", list["_Scored"]]:
         """The model without candidates, and with the best variant of each, best first."""
         scorer = Scorer(linear.columns(variants, smoothness, deviation), variants)
-        scale = -linear.count * float(np.sum(np.log(deviation)))
         none = scorer(())
         assert none is not None
         allowed = [one for i in range(len(variants)) if (one := scorer((i,))) is not None]
         best: dict[str, _Scored] = {}
         for one in sorted(allowed, key=lambda one: -one.log_evidence):
-            best.setdefault(variants[one.which[0]].name, _Scored(variants[one.which[0]].name, one, scale))
-        return _Scored("", none, scale), list(best.values())
+            name = variants[one.which[0]].name
+            best.setdefault(name, _Scored(name, one, linear.count, deviation))
+        return _Scored("", none, linear.count, deviation), list(best.values())
 
 
 _DRY = "coulomb_friction", "stribeck_friction"

@@ -154,7 +154,7 @@ def _derivatives(
     count = vectors.shape[1]
     blocks = jax.tree.map(lambda x: x.reshape(-1, 2 * _BLOCK, *x.shape[1:]), (vectors, torque, time))
     found = jax.lax.map(lambda given: jax.vmap(one)(*given), blocks)
-    slope, f, value = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
+    slope, f, value = jax.tree.map(lambda x: x.reshape(len(time), *x.shape[2:]), found)
     period = experiment.run.sample_period
     modelled = {side: (value[:, len(sides) + i] - vectors[:, len(sides) + i]) / period for i, side in enumerate(sides)}
     defect = value - jnp.concatenate([vectors[1:], value[-1:]])

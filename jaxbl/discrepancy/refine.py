@@ -41,11 +41,15 @@ class Refined(NamedTuple):
         experiment: with these numbers.
         theta: of the free ones.
         deviation: standard deviation of theta, of data and prior together.
+        smoothness: of the predictor, by side.
+        start: positions and velocities at the first sample of each part, side by side, rad and rad/s.
     """
 
     experiment: Experiment
     theta: Array
     deviation: Array
+    smoothness: list[float]
+    start: list[Array]
 
 
 class _Point(NamedTuple):
@@ -206,4 +210,5 @@ def refined(
     """
     refiner = _Refiner(experiment, free, width, record, smoothed)
     best = refiner.run(np.asarray(theta))
-    return Refined(with_values(experiment, free, jnp.asarray(best.theta)), best.theta, refiner.deviation(best))
+    model = with_values(experiment, free, jnp.asarray(best.theta))
+    return Refined(model, best.theta, refiner.deviation(best), best.predictor.smoothness, best.start)

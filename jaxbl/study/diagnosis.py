@@ -533,6 +533,7 @@ class _Proving:
                 "bandwidth": dict(other.bandwidth),
             },
             "units": {name: _unit(record, name) for name in self.floor},
+            "driving": {"motor": _rms_of(record)},
             "holdout_rmse_before": self.before.errors,
             "holdout_rmse_after": after.errors,
             "noise_floor": self.floor,
@@ -556,6 +557,12 @@ class _Proving:
             }
             found["controls"]["permuted"] = {"rmse": other.permuted(self.at(self.nominal), added).errors}
         return found
+
+
+def _rms_of(record: Record) -> float:
+    """Of the input on what is held out, N m."""
+    assert record.torque is not None
+    return float(np.sqrt(np.mean(np.concatenate([np.square(record.torque[part]) for part in record.segments]))))
 
 
 def _values(free: Sequence[Free], theta: np.ndarray) -> dict[str, Any]:
