@@ -133,7 +133,12 @@ def _one(case: Case, diagnose: Diagnose, oracle: Oracle | None) -> tuple[Outcome
         traceback.print_exc()
         diagnosis, error = {}, f"{type(failure).__name__}: {failure}"
     seconds = time.perf_counter() - start
-    best = oracle(case) if oracle is not None and case.hidden and diagnosis else None
+    best = None
+    if oracle is not None and case.hidden and diagnosis:
+        try:
+            best = oracle(case)
+        except Exception:
+            traceback.print_exc()
     return outcome(case, diagnosis, best, seconds, error), diagnosis.get("model")
 
 

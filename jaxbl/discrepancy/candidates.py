@@ -68,14 +68,12 @@ class Variant:
         unit: for each column an effect and its size: the column is its torque over that size.
         trial: in place of these, the effect at a trial value, and at values a little below and above.
         numbers: the effect's numbers from the columns' coefficients; None where they are not allowed.
-        about: what was tried, for messages.
     """
 
     name: str
     unit: tuple[tuple[AbstractEffect, float], ...]
     trial: tuple[AbstractEffect, AbstractEffect, AbstractEffect] | None
     numbers: Callable[[Sequence[float]], Numbers | None]
-    about: Numbers
 
     @property
     def width(self) -> int:
@@ -156,9 +154,10 @@ def variants_of(experiment: Experiment, lacking: Collection[str], grids: Grids) 
         found.append(_single("transmission.hardening", "cubic_stiffness"))
         if "half_gap" not in experiment.transmission.truth():
             found += [_trial("transmission.backlash", "half_gap", share * grids.twist[1]) for share in _GAPS]
-    found.append(_single("actuator.gain_error", "relative"))
-    found += [_trial("actuator.saturation", "limit", share * grids.torque) for share in _LIMITS]
-    found += [_trial("actuator.lag", "time_constant", samples * grids.period) for samples in _LAGS]
+    if grids.torque > 0.0:
+        found.append(_single("actuator.gain_error", "relative"))
+        found += [_trial("actuator.saturation", "limit", share * grids.torque) for share in _LIMITS]
+        found += [_trial("actuator.lag", "time_constant", samples * grids.period) for samples in _LAGS]
     return [one for one in found if one.name in lacking]
 
 
@@ -182,7 +181,7 @@ def _single(name: str, leaf: str) -> Variant:
         (value,) = values
         return None if about.minimum is not None and value <= about.minimum else {leaf: value}
 
-    return Variant(name, ((_effect(name, {leaf: 1.0}), 1.0),), None, numbers, {})
+    return Variant(name, ((_effect(name, {leaf: 1.0}), 1.0),), None, numbers)
 
 
 def _stribeck(side: str, speed: float) -> Variant:
@@ -196,7 +195,7 @@ def _stribeck(side: str, speed: float) -> Variant:
             return None
         return {"torque": low, "breakaway_torque": low + more, "stribeck_velocity": speed}
 
-    return Variant(name, ((sliding, 1.0), (excess, 1.0)), None, numbers, {"stribeck_velocity": speed})
+    return Variant(name, ((sliding, 1.0), (excess, 1.0)), None, numbers)
 
 
 def _wave(name: str, leaf: str, known: Numbers, turn: float = 1.0, size: float = 1.0) -> Variant:
@@ -207,7 +206,7 @@ def _wave(name: str, leaf: str, known: Numbers, turn: float = 1.0, size: float =
         sine, cosine = values
         return {leaf: math.hypot(sine, cosine), "phase": turn * math.atan2(cosine, sine)} | known
 
-    return Variant(name, pair, None, numbers, known)
+    return Variant(name, pair, None, numbers)
 
 
 def _trial(name: str, leaf: str, value: float) -> Variant:
@@ -217,7 +216,7 @@ def _trial(name: str, leaf: str, value: float) -> Variant:
         (change,) = values
         return {leaf: value * math.exp(change)} if abs(change) < 4.0 * SPACING else None
 
-    return Variant(name, (), effects, numbers, {leaf: value})  # type: ignore[arg-type]
+    return Variant(name, (), effects, numbers)  # type: ignore[arg-type]
 
 
 class Signals:
@@ -287,7 +286,6 @@ def forces_of(candidates: Sequence[Candidate], signals: Signals, spare: int = 0)
         else:
             columns = one.columns(signals, [next(torques) for _ in one.effects])
         found[:, :, at : at + width] = columns
-        # what was computed stays as long as the candidate does
         signals.known[id(one)] = one, found[:, :, at : at + width]
         at += width
     return found

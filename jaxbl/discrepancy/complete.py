@@ -5,7 +5,8 @@ matter of numbers. Free numbers are named by their place among all of the model'
 what is free is a matter of numbers too.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,8 +18,10 @@ from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths, set_leaves
 from jaxbl.identification.trajectory import PHYSICAL, Free
 from jaxbl.simulate import Experiment
 
+Effect = TypeVar("Effect")
+
 ACTUATOR_ORDER = ("actuator.gain_error", "actuator.saturation", "actuator.lag")
-"""In which effects of the actuator act."""
+"""In which effects of the actuator act, unless the config says otherwise."""
 
 NEUTRAL: dict[str, dict[str, float]] = {
     "coulomb_friction": {"torque": 0.0},
@@ -65,10 +68,19 @@ def candidates(experiment: Experiment) -> list[str]:
 def complete(experiment: Experiment) -> Experiment:
     """A model with all effects that it lacks at neutral numbers; array leaves."""
     added = [as_arrays(effect_kinds()[name](**neutral(name)), float) for name in candidates(experiment)]
-    effects = sorted(
-        (*experiment.effects, *added), key=lambda one: ACTUATOR_ORDER.index(one.name) if one.name in ACTUATOR_ORDER else -1
-    )
+    effects = joined(experiment.effects, added, lambda one: one.name)
     return eqx.tree_at(lambda e: e.effects, experiment, tuple(effects))
+
+
+def joined(given: Iterable[Effect], added: Iterable[Effect], name_of: Callable[[Effect], str]) -> list[Effect]:
+    """Effects that a model has, in their order, and others behind them; effects of the actuator before those given that
+    come later in :data:`ACTUATOR_ORDER`."""
+    effects = list(given)
+    for one in added:
+        later = ACTUATOR_ORDER[ACTUATOR_ORDER.index(name_of(one)) + 1 :] if name_of(one) in ACTUATOR_ORDER else ()
+        at = next((i for i, other in enumerate(effects) if name_of(other) in later), len(effects))
+        effects.insert(at, one)
+    return effects
 
 
 def numbers_of(experiment: Experiment) -> tuple[str, ...]:

@@ -76,8 +76,9 @@ class Scorer:
         c = self.columns
         chosen = np.concatenate([self.base, *(np.asarray(c.places[i]) for i in which)]).astype(int)
         fixed = np.array([0, *(c.offsets[i] for i in which if c.offsets[i] >= 0)])
-        if not np.isfinite(c.scale[chosen]).all():
-            return None
+        # what has no torque along this record has no coefficient either
+        every, alive = len(chosen), np.isfinite(c.scale[chosen])
+        chosen = chosen[alive]
         inner = c.products[np.ix_(chosen, chosen)]
         towards = c.products[np.ix_(chosen, fixed)].sum(axis=1)
         total = c.products[np.ix_(fixed, fixed)].sum()
@@ -93,10 +94,12 @@ class Scorer:
         inside = solve_triangular(root, towards / size, lower=True)
         coefficients = -solve_triangular(root, inside, lower=True, trans=1) / size
         cost = total - float(inside @ inside)
+        given = np.zeros(every)
+        given[alive] = coefficients
         numbers, place = [], len(self.base)
         for i in which:
             width = len(c.places[i])
-            found = self.variants[i].numbers(coefficients[place : place + width].tolist())
+            found = self.variants[i].numbers(given[place : place + width].tolist())
             if found is None:
                 return None
             numbers.append(found)

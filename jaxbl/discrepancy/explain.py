@@ -40,8 +40,9 @@ _BEHIND = 0.5
 _NEAR = 25.0
 _STEPS = 15
 _SETTLED = 2e-3
+_LEAST_GAIN = 1e-3
 _EARNED = 0.2
-_HEAT = 0.2
+"""Share of what free functions earn beside an effect that it must earn itself to be named."""
 _DIVERGED = 1e30
 _LEAST_CHANCE = 0.01
 CLEAR = 50.0
@@ -58,7 +59,7 @@ class Model:
 
     Attributes:
         names: of the effects.
-        experiment: with the effects and all numbers.
+        experiment: with all effects, those of `names` at `numbers`; its own numbers are the nominal ones.
         numbers: of the effects.
         theta: the nominal model's own numbers.
         log_evidence: nats; only differences count.
@@ -186,7 +187,8 @@ class Explainer:
         self.nominal, self.free, self.prior = complete(experiment), tuple(free), np.asarray(prior)
         self.lacking = candidates(experiment)
         self.record, self.smoothed = record, smoothed
-        self.floor = FLOOR * len(record.time) * len(experiment.sides)
+        samples = sum(part.stop - part.start for part in record.segments)
+        self.floor = FLOOR * samples * len(experiment.sides)
 
     def linear(self, experiment: Experiment, names: Names, theta: Array) -> Linear:
         paths = paths_of(names)
@@ -266,6 +268,7 @@ class Explainer:
         nominal = current = self.refit((), {}, theta, smoothness, deviation)
         found: dict[str, list[_Tried]] = {}
         wrong: Model | None = None
+        rest: dict[str, tuple[float, float]] | None = None
         while len(found) < _MOST:
             smoothness, tried = self._round(current)
             if not tried or tried[0][0] <= 0.0:
@@ -275,10 +278,16 @@ class Explainer:
             current, gone = self._pruned(current, smoothness)
             found = {name: one for name, one in found.items() if name not in gone} | {record[0].name: record}
             wrong = others[0][1] if others else None
-        rest = self.remainder(current)
+            rest = self.remainder(current)
+            # next to what no effect explains, this one is little: more of them would dress up as that
+            if record[0].gain < _EARNED * _most(rest) and _most(rest) > CLEAR:
+                break
+        rest = self.remainder(current) if rest is None else rest
         left = _most(rest)
         if left > CLEAR and found:
+            before = current.names
             current, found = self._plain(current, found, left)
+            wrong = wrong if current.names == before else None
             rest = self.remainder(current)
             left = _most(rest)
         findings = tuple(_finding(one, current, left) for one in found.values())
@@ -384,7 +393,7 @@ class Explainer:
             _Finalist(one.name, one.found.numbers[0], one.found.own[: len(self.free)], self._gain(base, one))
             for one in ranked[:_FINALISTS]
         ]
-        finalists = sorted((one for one in finalists if one.gain > 0.0), key=lambda one: -one.gain)
+        finalists = sorted((one for one in finalists if one.gain > _LEAST_GAIN), key=lambda one: -one.gain)
         if finalists:
             (best,) = (variants[one.found.which[0]] for one in ranked if one.name == finalists[0].name)
             smoothness, deviation = linear.choose([best], smoothness)
@@ -420,7 +429,7 @@ def _most(rest: Mapping[str, tuple[float, float]]) -> float:
 
 def _finding(tried: Sequence[_Tried], model: Model, left: float) -> Finding:
     """The first of those tried, with its confidence: structure that is left over makes differences mean less."""
-    heat = max(_HEAT * left, 1.0) if left > CLEAR else 1.0
+    heat = left if left > CLEAR else 1.0
     chances = _softmax(np.array([one.gain for one in tried]) / heat)
     others = tuple((one.name, float(chance)) for one, chance in zip(tried[1:], chances[1:], strict=True))
     name = tried[0].name

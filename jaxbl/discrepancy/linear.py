@@ -260,16 +260,22 @@ class Predictor:
 
     Attributes:
         smoothness: of each side.
-        given: sum of squared errors of each side as the model stands, rad^2, shape (sides,).
+        given: sum of squared errors of each side as the model stands, the effects' own initial states at their best, rad^2;
+            shape (sides,).
         squares: the least that changes of all numbers leave; as `given`.
         coefficients: of all columns, part by part; 1 first.
     """
 
     def __init__(self, linear: "Linear", smoothness: list[float], grams: list[np.ndarray]):
         self.smoothness, self.count = smoothness, linear.count
-        self.given = np.sum([one[:, 0, 0] for one in grams], axis=0)
+        own_states = linear.states - 2 * len(linear.sides)
+        self.given = np.sum([_as_it_stands(one, own_states) for one in grams], axis=0)
         sides, own, states, count = len(linear.sides), len(linear.free), linear.states, linear.count
         width = grams[0].shape[1] - 1 - states
+        if not np.max([np.max(np.abs(one)) for one in grams]) < np.inf:
+            self.squares = np.full(sides, np.inf)
+            self.coefficients = [np.zeros(1 + width + states) for _ in grams]
+            return
         weight = np.ones(sides)
         precision, centre = np.zeros(width), np.zeros(width)
         centre[:own] = linear.centre
@@ -542,10 +548,24 @@ class Linear:
 def _scaled(gram: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
     """Inverse of the products of the last columns, the initial states, which may be all but alike; and their size."""
     inner = gram[-states:, -states:]
+    if not np.isfinite(inner).all():  # of a model that diverges
+        return np.zeros_like(inner), np.ones(states)
     size = np.sqrt(np.maximum(np.diag(inner), 0.0))
     # the state of an effect that does nothing
     size = np.where(size > 1e-20 * np.max(size), size, np.inf)
     return np.linalg.pinv(inner / np.outer(size, size), rcond=1e-12, hermitian=True), size
+
+
+def _as_it_stands(grams: np.ndarray, states: int) -> np.ndarray:
+    """Squares of the first column by side, some last states at their best."""
+    if states == 0 or not np.isfinite(grams).all():
+        return grams[:, 0, 0]
+    weight = 1.0 / np.maximum(grams[:, 0, 0], 1e-300)
+    total = np.einsum("s,scd->cd", weight, grams)
+    at = np.zeros(total.shape[0])
+    at[0] = 1.0
+    at[-states:] = -_response(total, states)[:, 0]
+    return np.einsum("c,scd,d->s", at, grams, at)
 
 
 def _response(gram: np.ndarray, states: int) -> np.ndarray:

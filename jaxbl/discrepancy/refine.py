@@ -184,8 +184,10 @@ def _filtered(
     found = {}
     for side in sides:
         error = readings[side] - states.position[side]
+        # the first state is that of the predictor before it has seen anything
+        seen = jnp.where(jnp.arange(len(error)) > 0, error, 0.0)
         found[side] = jnp.stack(
-            [states.position[side] + gains[side][0] * error, states.velocity[side] + gains[side][1] * error], axis=1
+            [states.position[side] + gains[side][0] * seen, states.velocity[side] + gains[side][1] * seen], axis=1
         )
     return found
 

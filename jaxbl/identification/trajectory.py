@@ -234,7 +234,10 @@ def _eliminate(experiment: Experiment, window: Windows, passes: int, rest: bool)
     first = _Inner(guess, none, jnp.zeros((len(none), len(guess))), jnp.asarray(jnp.inf), jnp.asarray(_RIDGE), guess)
     found = jax.lax.fori_loop(0, passes, attempt, first)
     size = jnp.sqrt(jnp.sum(found.slope**2, axis=0))
-    basis, _ = jnp.linalg.qr(found.slope / jnp.where(size > _INFLUENCE * jnp.max(size), size, jnp.inf)[None, :])
+    seen = size > _INFLUENCE * jnp.max(size)
+    basis, _ = jnp.linalg.qr(found.slope / jnp.where(seen, size, jnp.inf)[None, :])
+    # of a column of zeros the decomposition makes any direction
+    basis = jnp.where(seen[None, :], basis, 0.0)
     return _Eliminated(found.start, basis)
 
 
@@ -445,18 +448,16 @@ def cut(
     """
     count = len(torque) // samples
     standing = np.arange(count) == (0 if rest else -1)
-    # in NumPy, without a compiled program for each length
-    start = jax.tree.map(lambda x: np.asarray(x)[: count * samples : samples], start)
-    still = jax.tree.map(lambda x: jnp.asarray(np.where(standing, 0.0, x)), start.velocity)
-    start = jax.tree.map(jnp.asarray, start)
+    start = jax.tree.map(lambda x: jnp.asarray(x)[: count * samples : samples], start)
+    still = jax.tree.map(lambda x: jnp.where(standing, 0.0, x), start.velocity)
 
     def split(values: Any) -> Array:
-        return jnp.asarray(np.asarray(values)[: count * samples].reshape(count, samples))
+        return jnp.asarray(values)[: count * samples].reshape(count, samples)
 
     return Windows(
         torque=split(torque),
         measured={side: split(values) for side, values in measured.items()},
-        time=jnp.asarray(first + period * samples * np.arange(count)),
+        time=first + period * samples * jnp.arange(count),
         start=PlantState(start.position, still, start.effects),
         noise={side: jnp.asarray(value, float) for side, value in noise.items()},
         rest=jnp.asarray(standing),

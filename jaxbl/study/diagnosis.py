@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from jaxbl.discrepancy.complete import ACTUATOR_ORDER, complete
+from jaxbl.discrepancy.complete import complete, joined
 from jaxbl.discrepancy.explain import CLEAR, Explanation, Finding, Model, explain, paths_of, with_effects
 from jaxbl.discrepancy.observed import Observed, compared, observed_torques
 from jaxbl.discrepancy.proof import WINDOW, Ground, Proof, foretold
@@ -56,8 +56,6 @@ GEAR_TOLERANCE = 0.15
 """A missing effect (a soft shaft, a gap) shifts the ratio of both motions by some per cent."""
 _FEWEST = 100
 """Samples of a part of a log, and of what is held out."""
-_SAMPLES = 500
-"""Of the windows that numbers are fitted on."""
 _WORSE = 1.02
 _DIVERGED = 10.0
 """Errors on short windows over the motion's range from which on a model counts as diverging."""
@@ -583,10 +581,8 @@ def _model(config: Config, numbers: Mapping[str, Mapping[str, float]], values: M
 
 
 def _with_effects(data: dict[str, Any], numbers: Mapping[str, Mapping[str, Any]]) -> Config:
-    effects = [*data.get("effects", []), *({"kind": name, **one} for name, one in numbers.items())]
-    data["effects"] = sorted(
-        effects, key=lambda one: ACTUATOR_ORDER.index(one["kind"]) if one["kind"] in ACTUATOR_ORDER else -1
-    )
+    added = [{"kind": name, **one} for name, one in numbers.items()]
+    data["effects"] = joined(data.get("effects", []), added, lambda one: one["kind"])
     return read_config(data)
 
 
@@ -711,7 +707,7 @@ def _least_seen(record: Record, located: Mapping[str, Localised]) -> list[str]:
     for side, one in located.items():
         least = SIGNIFICANT * one.coordinates["all"].regions[0].mean_error
         lines.append(f"{side}: a steady torque of less than about {least:.2g} {unit[side]} would not have been seen.")
-        if side == "motor" and least > _HIDDEN * driving:
+        if side == "motor" and least > _HIDDEN * driving > 0.0:
             lines.append(
                 f"Noise hides nearly everything: the input is {driving:.2g} {unit[side]} rms. A longer log, larger torques "
                 "or a finer encoder are needed."

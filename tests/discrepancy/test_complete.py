@@ -17,7 +17,7 @@ from jaxbl.study.engine import prepare
 KNOWN = [{"kind": "motor.coulomb_friction", "torque": 0.05}]
 
 
-def model(sides, law="backlash"):
+def model(sides):
     data = small() if sides == 2 else rigid()
     return as_arrays(prepare(read_config({**data, "effects": KNOWN})), float)
 
@@ -77,3 +77,14 @@ def test_buckets_are_few_and_large_enough():
     assert len(set(sizes)) < 32
     assert all(size % 256 == 0 for size in sizes)
     assert [bucket(count, 1) for count in (1, 2, 3, 5, 9, 17)] == [1, 2, 3, 5, 10, 20]
+
+
+def test_given_effects_keep_their_order():
+    data = small()
+    saturated = [{"kind": "actuator.saturation", "limit": 4.0}, {"kind": "actuator.gain_error", "relative": 0.1}]
+    every = complete(as_arrays(prepare(read_config({**data, "effects": saturated})), float))
+    acting = [one.name for one in every.effects if one.place == "actuator"]
+    assert acting == ["actuator.saturation", "actuator.gain_error", "actuator.lag"]
+    late = complete(as_arrays(prepare(read_config({**data, "effects": saturated[:1]})), float))
+    acting = [one.name for one in late.effects if one.place == "actuator"]
+    assert acting == ["actuator.gain_error", "actuator.saturation", "actuator.lag"]

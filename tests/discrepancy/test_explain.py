@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from hidden.cases import cases
+from hidden_log import logged, model
 
-from jaxbl.discrepancy.explain import explain
+from jaxbl.discrepancy.explain import CLEAR, explain
 from jaxbl.identification.search import smoothed_channels
 from jaxbl.identification.trajectory import free_parameters
 from jaxbl.study.identification import read_task
@@ -55,4 +56,20 @@ def test_nothing_is_named_on_a_clean_machine(i, tmp_path):
 def test_what_no_effect_explains_is_said_to_be_unknown(i, tmp_path):
     found = explained(cases(SEED, 2, "unknown", DURATION)[i], tmp_path)
     assert found.verdict == "unknown_effect"
-    assert max(gain for gain, _ in found.rest.values()) > 10.0
+    assert max(gain for gain, _ in found.rest.values()) > CLEAR
+
+
+def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
+    """Free functions have knots where there are no samples."""
+    log = logged()
+    keep = (log.t < 1.2) | (log.t > 2.0)
+    table = np.column_stack([log.t, log.u, log.theta_e])[keep]
+    np.savetxt(tmp_path / "log.csv", table, "%.10g", ",", header="t,u,theta_e", comments="")
+    task = read_task(tmp_path / "log.csv", model())
+    assert len(task.record.segments) == 2
+    nominal = on_record(task.config, task.record)
+    free = free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
+    smoothed = smoothed_channels(task.record, nominal.sides).smoothed
+    found = explain(nominal, free, [task.config.uncertainty.relative] * len(free), task.record, smoothed)
+    assert found.verdict == "explained"
+    assert [one.effect for one in found.findings] == ["motor.coulomb_friction"]

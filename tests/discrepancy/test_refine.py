@@ -45,6 +45,7 @@ def test_prediction_errors_are_least(setting):
         states = _filtered(one, jnp.asarray(given[:2]), torque, jnp.asarray(0.0), {"motor": reading}, gain)
         # the corrected position leaves a share 1 - k of each prediction error
         errors = (np.asarray(reading) - np.asarray(states["motor"])[:, 0]) / (1.0 - k1)
+        errors[0] *= 1.0 - k1
         return len(errors) * np.log(np.sum(errors**2)) + np.sum((given[2:] * 0.01 / width) ** 2)
 
     here = np.concatenate([found.start[0], 100.0 * found.theta])

@@ -9,6 +9,7 @@ import pytest
 from hidden_log import FRICTION, logged, model
 
 import jaxbl.study.diagnosis as under_test
+from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.errors import InputError
 from jaxbl.records import read_record
 from jaxbl.report import diagnosis_lines, write_diagnosis_report
@@ -119,24 +120,18 @@ def test_the_extended_model_runs_and_the_report_says_what_was_found(found, tmp_p
 
 
 def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
-    """The explanation is told to have found a number that is far off, and the fit to leave it."""
-    real, fit = under_test.explain, under_test._fit
+    """The fit is made to end at a number that is far off."""
+    real = under_test.refined
 
-    def wrong(*arguments):
-        one = real(*arguments)
-        model = dataclasses.replace(one.model, experiment=spoilt(one.model.experiment))
-        return dataclasses.replace(one, model=model)
+    def spoilt(experiment, free, *rest):
+        found = real(experiment, free, *rest)
+        if not any(one.path.startswith("effects.") for one in free):
+            return found
+        path = "effects.motor.coulomb_friction.torque"
+        wrong = set_leaves(found.experiment, {path: 4.0 * get_leaf(found.experiment, path)})
+        return found._replace(experiment=wrong)
 
-    def spoilt(experiment):
-        import equinox as eqx
-
-        return eqx.tree_at(lambda e: e.effects[0].torque, experiment, experiment.effects[0].torque * 4.0)
-
-    def lazy(experiment, free, windows, theta, **how):
-        return fit(experiment, free, windows, theta, **(how | {"held": np.ones(len(theta), bool)}))
-
-    monkeypatch.setattr(under_test, "explain", wrong)
-    monkeypatch.setattr(under_test, "_fit", lazy)
+    monkeypatch.setattr(under_test, "refined", spoilt)
     task = read_task(logs / "axis.csv", model(), holdout=logs / "other.csv")
     stages = []
     found = run_task(task, lambda *at: stages.append(at))
