@@ -298,7 +298,7 @@ def _diagnose_batch(source: Path, model: Path | None, out: Path, overwrite: bool
     with _running(words, model or source, out, unit="logs") as progress:
         for i, file in enumerate(logs):
             progress(i, len(logs))
-            _forget_programs()
+            forget_programs()
             folder = out / file.stem
             try:
                 task = read_task(file, models[file], holdout=held.get(file.stem))  # pyright: ignore[reportArgumentType]
@@ -401,7 +401,7 @@ _MOST_MAPPINGS = 30_000
 """Half of what Linux allows a process by default."""
 
 
-def _forget_programs() -> None:
+def forget_programs() -> None:
     """Let go of compiled programs before those of logs of many lengths use up the mappings that the system allows."""
     import jax
 

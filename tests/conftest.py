@@ -4,7 +4,10 @@ import sys
 from pathlib import Path
 
 import jax
+import pytest
 from hypothesis import settings
+
+from jaxbl.cli import forget_programs
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -19,3 +22,10 @@ settings.load_profile("patient")
 
 # benchmarks are scripts beside the package; the tests' bench of hidden effects is one of them
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+
+@pytest.fixture(autouse=True)
+def _few_programs():
+    """Over a thousand tests, compiled programs would use up what the system lets a process map into memory."""
+    yield
+    forget_programs()
