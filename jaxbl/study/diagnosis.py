@@ -21,8 +21,8 @@ import pandas as pd
 from jaxbl.discrepancy.complete import complete, joined
 from jaxbl.discrepancy.explain import CLEAR, Explanation, Finding, Model, explain, paths_of, with_effects
 from jaxbl.discrepancy.observed import Observed, compared, observed_torques
+from jaxbl.discrepancy.polish import refined
 from jaxbl.discrepancy.proof import WINDOW, Ground, Proof, foretold
-from jaxbl.discrepancy.refine import refined
 from jaxbl.discrepancy.residuals import Residual
 from jaxbl.discrepancy.where import SIGNIFICANT, Localised, Values, as_json, coordinates_of, describe, where
 from jaxbl.drive.effects import effect_class, effect_kinds

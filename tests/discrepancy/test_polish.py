@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 from jaxbl.discrepancy.complete import complete
 from jaxbl.discrepancy.explain import paths_of, with_effects
 from jaxbl.discrepancy.linear import Linear
-from jaxbl.discrepancy.refine import _filtered, refined
+from jaxbl.discrepancy.polish import _filtered, refined
 from jaxbl.identification.search import smoothed_channels
 from jaxbl.identification.trajectory import free_parameters, with_values
 from jaxbl.study.diagnosis import read_task
