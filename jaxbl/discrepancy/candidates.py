@@ -8,7 +8,7 @@ the only number is of that kind, the effect at a trial value is taken as it is, 
 import dataclasses
 import math
 from collections.abc import Callable, Collection, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import equinox as eqx
 import jax
@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxbl.drive.effects import AbstractEffect, Motion, effect_class, effect_kinds
 from jaxbl.drive.parameters import as_arrays, parameters
+from jaxbl.identification.regression import actuator_path, lasting
 from jaxbl.simulate import Experiment
 
 from .part import Part
@@ -281,14 +282,19 @@ def forces_of(candidates: Sequence[Candidate], signals: Signals, spare: int = 0)
     torques = iter(signals.of([effect for one in new for effect in one.effects]))
     at = 0
     for one, width in zip(candidates, widths, strict=True):
-        if id(one) in signals.known:
-            columns = signals.known[id(one)][1]
-        else:
+        # with the candidate itself, so that no other one gets its identity
+        _, columns = signals.known.get(id(one), (one, None))
+        if columns is None:
             columns = one.columns(signals, [next(torques) for _ in one.effects])
+            signals.known[id(one)] = one, columns
         found[:, :, at : at + width] = columns
-        signals.known[id(one)] = one, found[:, :, at : at + width]
         at += width
     return found
+
+
+def _lasted(experiment: Experiment, torque: jax.Array) -> jax.Array:
+    """The torque that acts, of one that was commanded and had lasted before."""
+    return actuator_path(experiment, torque, lasting(experiment, torque[0]))[1]
 
 
 @eqx.filter_jit
@@ -301,7 +307,7 @@ def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direct
         place = drive.place(effect.place)
         if place == "actuator":
             alone = eqx.tree_at(lambda e: e.effects, experiment, (effect,))
-            found = found.at[:, -1].set(actuated(alone, part.torque)[1] - part.torque)
+            found = found.at[:, -1].set(_lasted(alone, part.torque) - part.torque)
         elif place == "transmission":
             others = tuple(one for one in experiment.effects if one.name != effect.name)
             both = (eqx.tree_at(lambda e: e.effects, experiment, some) for some in (others, (*others, effect)))
@@ -322,28 +328,9 @@ def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direct
 def _needed(experiment: Experiment, part: Part) -> dict[str, jax.Array]:
     """Torque on each side that its motion does not take up, dry friction left out, N m."""
     plant = experiment.plant
-    acting = plant.torques(part.position, part.velocity, actuated(experiment, part.torque)[1], part.time)
+    acting = plant.torques(part.position, part.velocity, _lasted(experiment, part.torque), part.time)
     found = {}
     for side in experiment.sides:
         rest = acting[side][0] - experiment.drive.viscous(side) * part.velocity[side]
         found[side] = jnp.broadcast_to(rest - plant.inertia(side) * part.acceleration[side], part.time.shape)
     return found
-
-
-def actuated(experiment: Experiment, torque: jax.Array) -> tuple[tuple[Any, ...], jax.Array]:
-    """The effects' own states along an input, from one that has lasted, and the torque that acts; N m."""
-    period = experiment.run.sample_period
-
-    def sample(states: list, torque: jax.Array) -> tuple[list, tuple[list, jax.Array]]:
-        new, acting = [], torque
-        for effect, state in zip(experiment.effects, states, strict=True):
-            state, acting = effect.actuate(state, acting, period)
-            new.append(state)
-        return new, (states, acting)
-
-    start = [
-        jax.tree.map(lambda x: jnp.asarray(x, torque.dtype) * 0.0 + torque[0], effect.init())
-        for effect in experiment.effects
-    ]
-    states, acting = jax.lax.scan(sample, start, torque)[1]
-    return tuple(states), acting

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxbl.drive.effects import effect_kinds
+from jaxbl.drive.effects import effect_class, effect_kinds
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths, set_leaves
 from jaxbl.identification.trajectory import PHYSICAL, Free
 from jaxbl.simulate import Experiment
@@ -22,31 +22,6 @@ Effect = TypeVar("Effect")
 
 ACTUATOR_ORDER = ("actuator.gain_error", "actuator.saturation", "actuator.lag")
 """In which effects of the actuator act, unless the config says otherwise."""
-
-NEUTRAL: dict[str, dict[str, float]] = {
-    "coulomb_friction": {"torque": 0.0},
-    "stribeck_friction": {"torque": 0.0, "breakaway_torque": 0.0, "stribeck_velocity": 1.0},
-    "viscous_friction": {"viscous": 0.0},
-    "quadratic_drag": {"drag": 0.0},
-    "constant_torque": {"torque": 0.0},
-    "inertia": {"inertia": 0.0},
-    "gravity": {"torque": 0.0, "phase": 0.0},
-    "periodic_disturbance": {"amplitude": 0.0, "frequency": 1.0, "phase": 0.0},
-    "cogging": {"amplitude": 0.0, "harmonic": 1.0, "phase": 0.0},
-    "backlash": {"half_gap": 0.0},
-    "hardening": {"cubic_stiffness": 0.0},
-    "damping": {"damping": 0.0},
-    "eccentricity": {"amplitude": 0.0, "harmonic": 1.0, "phase": 0.0},
-    "gain_error": {"relative": 0.0},
-    "saturation": {"limit": 1e30},
-    "lag": {"time_constant": 1e-30},
-}
-"""Numbers with which an effect does nothing, by kind."""
-
-
-def neutral(name: str) -> dict[str, float]:
-    """Numbers with which an effect does nothing."""
-    return NEUTRAL[name.partition(".")[2]]
 
 
 def candidates(experiment: Experiment) -> list[str]:
@@ -60,14 +35,14 @@ def candidates(experiment: Experiment) -> list[str]:
         place, _, kind = name.partition(".")
         # on a rigid drive the motor has all that both sides may have; only a load has the others
         twice = place == "load" and place not in experiment.sides and f"motor.{kind}" in effect_kinds()
-        if kind in NEUTRAL and place in places and name not in known and not twice:
+        if effect_class(name).neutral and place in places and name not in known and not twice:
             names.append(name)
     return names
 
 
 def complete(experiment: Experiment) -> Experiment:
     """A model with all effects that it lacks at neutral numbers; array leaves."""
-    added = [as_arrays(effect_kinds()[name](**neutral(name)), float) for name in candidates(experiment)]
+    added = [as_arrays(effect_kinds()[name](**effect_class(name).neutral), float) for name in candidates(experiment)]
     effects = joined(experiment.effects, added, lambda one: one.name)
     return eqx.tree_at(lambda e: e.effects, experiment, tuple(effects))
 
@@ -86,16 +61,6 @@ def joined(given: Iterable[Effect], added: Iterable[Effect], name_of: Callable[[
 def numbers_of(experiment: Experiment) -> tuple[str, ...]:
     """Dotted paths of all numbers of a model's plant."""
     return tuple(path for path in leaf_paths(experiment) if path.split(".")[0] in PHYSICAL)
-
-
-def stacked(experiment: Experiment, paths: Sequence[str]) -> Float[Array, " numbers"]:
-    """Numbers of a model."""
-    return jnp.stack([jnp.asarray(get_leaf(experiment, path), float) for path in paths])
-
-
-def placed(experiment: Experiment, paths: Sequence[str], values: Float[Array, " numbers"]) -> Experiment:
-    """A model with other numbers."""
-    return set_leaves(experiment, {path: values[i] for i, path in enumerate(paths)})
 
 
 _WIDTH = 4
@@ -132,7 +97,9 @@ class Chosen(eqx.Module):
     def put(self, experiment: Experiment, theta: Float[Array, " numbers"]) -> Experiment:
         """The model with these numbers."""
         values = jnp.where(self.positive, self.scale * jnp.exp(theta), self.nominal + self.scale * theta)
-        return placed(experiment, self.paths, stacked(experiment, self.paths).at[self.index].set(values, mode="drop"))
+        every = jnp.stack([jnp.asarray(get_leaf(experiment, path), float) for path in self.paths])
+        every = every.at[self.index].set(values, mode="drop")
+        return set_leaves(experiment, {path: every[i] for i, path in enumerate(self.paths)})
 
     def padded(self, values: np.ndarray, rest: float) -> Array:
         """Values of the free numbers, with `rest` for those that are none."""

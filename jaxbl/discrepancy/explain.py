@@ -378,7 +378,7 @@ class Explainer:
         linear = model.linear
         smoothness, deviation = linear.choose((), smoothness)
         lacking = [name for name in self.lacking if name not in model.names and not _same(name, model.names)]
-        variants = variants_of(model.experiment, lacking, linear.grids(linear.frequencies(smoothness, deviation)))
+        variants = variants_of(model.experiment, lacking, linear.grids(linear.frequencies()))
         _, ranked = self._ranked(linear, variants, smoothness, deviation)
         if not ranked:
             return smoothness, deviation, []

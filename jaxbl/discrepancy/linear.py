@@ -26,19 +26,19 @@ from jaxbl.drive.effects import ConstantTorque
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
 from jaxbl.identification.prediction import kalman_gain
+from jaxbl.identification.regression import actuator_path, lasting
 from jaxbl.identification.smoother import Smoothed
 from jaxbl.identification.trajectory import Free, with_values
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment, move
 
-from .candidates import SHARE, SPACING, Candidate, Grids, Signals, actuated, forces_of, rms
+from .candidates import SHARE, SPACING, Candidate, Grids, Signals, forces_of, rms
 from .complete import Chosen, bucket
 from .evidence import Columns
 from .part import Part
 
 SAMPLES, _BLOCK = 1024, 128
 """Least padded length of a part, so that records of about one length share their compiled programs; a block of it."""
-_HELD = 3.0
 
 
 def linearise(
@@ -87,18 +87,12 @@ def _part(
     own = {side: np.asarray(smoothed[side].state) for side in sides}
     states = {side: padded(own[side]) for side in sides}
     deviation = {side: padded(np.asarray(smoothed[side].deviation(1))) for side in sides}
-    held = {side: padded(_held(smoothed[side], experiment, own[side])) for side in sides}
+    period = float(experiment.run.sample_period)
+    held = {side: padded(np.asarray(smoothed[side].held(period), float)) for side in sides}
     read = np.stack([padded(readings[side]) - states[side][:, 0] for side in sides], axis=1)
     weight = (np.arange(size) < count).astype(float)
     given = padded(time), padded(torque), read, states, deviation, held, weight
     return _derivatives(experiment, chosen, theta, *jax.tree.map(jnp.asarray, given))
-
-
-def _held(smoothed: Smoothed, experiment: Experiment, state: np.ndarray) -> np.ndarray:
-    period = float(experiment.run.sample_period)
-    corner = float((smoothed.jerk / smoothed.noise**2 / period) ** (1.0 / 6.0))
-    still = _HELD * np.asarray(smoothed.deviation(1))
-    return ((np.abs(state[:, 1]) < still) & (np.abs(state[:, 2]) < corner * still)).astype(float)
 
 
 @eqx.filter_jit
@@ -116,7 +110,7 @@ def _derivatives(
 ) -> Part:
     sides = experiment.sides
     at = chosen.put(experiment, theta)
-    effects, _ = actuated(at, torque)
+    effects, _ = actuator_path(at, torque, lasting(at, torque[0]))
     motion = PlantState({side: states[side][:, 0] for side in sides}, {side: states[side][:, 1] for side in sides}, effects)
     _, unravel = ravel_pytree(jax.tree.map(lambda x: x[0], motion.effects))
 
@@ -441,16 +435,17 @@ class Linear:
         """Rms of the prediction errors, rad, by side, with a given predictor."""
         return np.sqrt(self.predictor(smoothness).squares / self.count)
 
-    def frequencies(self, smoothness: Sequence[float], deviation: np.ndarray) -> list[float]:
+    def frequencies(self) -> list[float]:
         """Frequencies (Hz) at which a disturbance of the load explains most, by the gradient of the errors' squares.
 
-        Of the longest part, at what the last call of :meth:`choose` left over.
+        Of the longest part, under what the last call of :meth:`choose` chose, and at what it left over.
         """
         assert self._last is not None
         i = int(np.argmax([float(one.weight.sum()) for one in self.parts]))
         part, side = self.parts[i], self.sides.index(self.experiment.drive.place("load"))
         predictor, forces = self._last
-        errors = np.asarray(_errors(part, self.gain(predictor.smoothness), forces[i]))
+        gain, deviation = self.gain(predictor.smoothness), np.sqrt(predictor.squares / self.count)
+        errors = np.asarray(_errors(part, gain, forces[i]))
         left = errors[:, :, self._some(forces[i].shape[2], forces[i].shape[2])] @ predictor.coefficients[i]
         time, real = np.asarray(part.time), int(np.asarray(part.weight).sum())
         span, top = real * self.period, min(0.25 / self.period, 50.0)
@@ -458,7 +453,6 @@ class Linear:
         phase = 2.0 * np.pi * few[None, :] * time[:, None]
         waves = np.zeros((len(time), len(self.sides) + 1, 2 * _COARSE))
         waves[:, side] = np.concatenate([np.sin(phase), np.cos(phase)], axis=1)
-        gain = self.gain(smoothness)
         responses = np.asarray(_errors(part, gain, waves))[:, :, 1 + part.own.shape[2] : -self.states]
         power = np.sum((responses / deviation[None, :, None]) ** 2, axis=(0, 1)).reshape(2, -1).mean(axis=0)
         slope = np.asarray(_gradient(part, gain, jnp.asarray(left / deviation[None, :] ** 2)))[:real, side]

@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxbl.drive.plant import PlantState
 from jaxbl.identification.intervals import spread
+from jaxbl.identification.regression import lasting
 from jaxbl.identification.smoother import Smoothed
 from jaxbl.identification.trajectory import Fit, Free, with_values
 from jaxbl.records import Record
@@ -174,10 +175,7 @@ def _filtered(
 ) -> dict[str, jax.Array]:
     """Positions and velocities of the predictor after each reading, by side; shape (samples, 2)."""
     sides = experiment.sides
-    effects = tuple(
-        jax.tree.map(lambda x: jnp.asarray(x, torque.dtype) * 0.0 + torque[0], effect.init())
-        for effect in experiment.effects
-    )
+    effects = lasting(experiment, torque[0])
     position, velocity = ({side: start[i * len(sides) + j] for j, side in enumerate(sides)} for i in (0, 1))
     gains = {side: gain[j] for j, side in enumerate(sides)}
     states = trajectory(experiment, PlantState(position, velocity, effects), torque, time, readings, gains)

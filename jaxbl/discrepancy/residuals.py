@@ -23,8 +23,6 @@ from jaxbl.identification.regression import Kinematics, actuated
 from jaxbl.identification.smoother import Smoothed, smooth
 from jaxbl.simulate import Experiment
 
-_HELD = 3.0
-"""Standard deviations of the velocity within which a side may be held by its dry friction."""
 _REACH = 60.0
 """Length of the noise's correlation, over 1 / w_c: what is slow is a small rest of what is fast, and needs all of it."""
 _LARGEST = 2**18
@@ -157,9 +155,7 @@ def _acting(experiment: Experiment, side: str, part: Kinematics, smoothed: Smoot
     passage = jnp.clip(velocity / step, -1.0, 1.0)
     direction = passage * (2.0 - jnp.abs(passage))
     # what is not shown to move for a while may be held: friction is then what is missing, as far as it goes
-    corner = (smoothed.jerk / smoothed.noise**2 / period) ** (1.0 / 6.0)
-    still = _HELD * smoothed.deviation(1)
-    held = (jnp.abs(velocity) < still) & (jnp.abs(acceleration) < corner * still)
+    held = smoothed.held(period)
     friction = jnp.where(held, jnp.clip(total - inertia * acceleration, -level, level), level * direction)
     return _Acting(total, friction, level, held, passage, step)
 

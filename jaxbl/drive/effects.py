@@ -35,11 +35,13 @@ class AbstractEffect(eqx.Module):
     """Base of all effects; every hook has a neutral default.
 
     `place` says where the effect acts: motor, load, transmission or actuator. `velocity_dependent` effects are evaluated
-    twice a step (predictor and corrector) to keep the integrator's second order.
+    twice a step (predictor and corrector) to keep the integrator's second order. `neutral` are numbers with which the
+    effect does nothing; one without them is no candidate of a diagnosis.
     """
 
     kind: ClassVar[str]
     velocity_dependent: ClassVar[bool] = False
+    neutral: ClassVar[Mapping[str, float]] = {}
 
     @property
     def place(self) -> str:
@@ -113,6 +115,7 @@ class CoulombFriction(SideEffect):
     """Dry friction of constant level: sticks below it, F_c sign(v) in motion."""
 
     kind: ClassVar[str] = "coulomb_friction"
+    neutral: ClassVar[Mapping[str, float]] = {"torque": 0.0}
     torque: Scalar = parameter("N m", "friction torque F_c", minimum=0.0)
 
     def dry_friction(self, velocity):
@@ -124,6 +127,7 @@ class StribeckFriction(SideEffect):
 
     kind: ClassVar[str] = "stribeck_friction"
     velocity_dependent: ClassVar[bool] = True
+    neutral: ClassVar[Mapping[str, float]] = {"torque": 0.0, "breakaway_torque": 0.0, "stribeck_velocity": 1.0}
     torque: Scalar = parameter("N m", "sliding friction torque F_c", minimum=0.0)
     breakaway_torque: Scalar = parameter("N m", "break-away torque F_s", minimum=0.0)
     stribeck_velocity: Scalar = parameter("rad/s", "speed v_s over which friction falls", above=0.0)
@@ -137,6 +141,7 @@ class ViscousFriction(SideEffect):
 
     kind: ClassVar[str] = "viscous_friction"
     velocity_dependent: ClassVar[bool] = True
+    neutral: ClassVar[Mapping[str, float]] = {"viscous": 0.0}
     viscous: Scalar = parameter("N m s/rad", "viscous friction on top of the nominal one; may be negative")
 
     def resist(self, motion):
@@ -148,6 +153,7 @@ class QuadraticDrag(SideEffect):
 
     kind: ClassVar[str] = "quadratic_drag"
     velocity_dependent: ClassVar[bool] = True
+    neutral: ClassVar[Mapping[str, float]] = {"drag": 0.0}
     drag: Scalar = parameter("N m s²/rad²", "drag coefficient b", minimum=0.0)
 
     def resist(self, motion):
@@ -158,6 +164,7 @@ class ConstantTorque(SideEffect):
     """A constant resisting torque (an offset of the amplifier, a weight on a drum)."""
 
     kind: ClassVar[str] = "constant_torque"
+    neutral: ClassVar[Mapping[str, float]] = {"torque": 0.0}
     torque: Scalar = parameter("N m", "resisting torque; may be negative")
 
     def resist(self, motion):
@@ -168,6 +175,7 @@ class Inertia(SideEffect):
     """Error of the nominal inertia."""
 
     kind: ClassVar[str] = "inertia"
+    neutral: ClassVar[Mapping[str, float]] = {"inertia": 0.0}
     inertia: Scalar = parameter("kg m²", "inertia on top of the nominal one; may be negative")
 
     def added_inertia(self):
@@ -178,6 +186,7 @@ class Gravity(SideEffect):
     """An eccentric mass: m g l sin(theta - phase)."""
 
     kind: ClassVar[str] = "gravity"
+    neutral: ClassVar[Mapping[str, float]] = {"torque": 0.0, "phase": 0.0}
     torque: Scalar = parameter("N m", "largest gravity torque m g l")
     phase: Scalar = parameter("rad", "position at which the mass hangs down", default=0.0)
 
@@ -189,6 +198,7 @@ class PeriodicDisturbance(SideEffect):
     """A torque periodic in time: A sin(2 pi f t + phase)."""
 
     kind: ClassVar[str] = "periodic_disturbance"
+    neutral: ClassVar[Mapping[str, float]] = {"amplitude": 0.0, "frequency": 1.0, "phase": 0.0}
     amplitude: Scalar = parameter("N m", "amplitude A")
     frequency: Scalar = parameter("Hz", "frequency f", minimum=0.0)
     phase: Scalar = parameter("rad", "phase at t = 0", default=0.0)
@@ -201,6 +211,7 @@ class Cogging(SideEffect):
     """Cogging of the motor: A sin(n theta + phase)."""
 
     kind: ClassVar[str] = "cogging"
+    neutral: ClassVar[Mapping[str, float]] = {"amplitude": 0.0, "harmonic": 1.0, "phase": 0.0}
     amplitude: Scalar = parameter("N m", "amplitude A")
     harmonic: Scalar = parameter("1/turn", "periods n a turn", above=0.0)
     phase: Scalar = parameter("rad", "phase at theta = 0", default=0.0)
@@ -213,6 +224,7 @@ class Backlash(TransmissionEffect):
     """A hard gap in series with the law: contact only outside of +-half_gap."""
 
     kind: ClassVar[str] = "backlash"
+    neutral: ClassVar[Mapping[str, float]] = {"half_gap": 0.0}
     half_gap: Scalar = parameter("rad", "half of the free play, on the motor side", minimum=0.0)
 
     def deflect(self, z):
@@ -223,6 +235,7 @@ class Hardening(TransmissionEffect):
     """Stiffness that grows with deflection: + K_3 z^3."""
 
     kind: ClassVar[str] = "hardening"
+    neutral: ClassVar[Mapping[str, float]] = {"cubic_stiffness": 0.0}
     cubic_stiffness: Scalar = parameter("N m/rad³", "cubic stiffness K_3")
 
     def transmit(self, deflection, rate):
@@ -234,6 +247,7 @@ class Damping(TransmissionEffect):
 
     kind: ClassVar[str] = "damping"
     velocity_dependent: ClassVar[bool] = True
+    neutral: ClassVar[Mapping[str, float]] = {"damping": 0.0}
     damping: Scalar = parameter("N m s/rad", "damping D", minimum=0.0)
 
     def transmit(self, deflection, rate):
@@ -244,6 +258,7 @@ class Eccentricity(TransmissionEffect):
     """Eccentric gear: a transmission error A sin(n theta_s + phase); the torque ratio follows it (no power is lost)."""
 
     kind: ClassVar[str] = "eccentricity"
+    neutral: ClassVar[Mapping[str, float]] = {"amplitude": 0.0, "harmonic": 1.0, "phase": 0.0}
     amplitude: Scalar = parameter("rad", "amplitude A, on the motor side")
     harmonic: Scalar = parameter("1/turn", "periods n a load turn", above=0.0, default=1.0)
     phase: Scalar = parameter("rad", "phase at theta_s = 0", default=0.0)
@@ -256,6 +271,7 @@ class GainError(ActuatorEffect):
     """Torque constant off by a relative error: u (1 + e)."""
 
     kind: ClassVar[str] = "gain_error"
+    neutral: ClassVar[Mapping[str, float]] = {"relative": 0.0}
     relative: Scalar = parameter("", "relative error e of the torque", minimum=-1.0)
 
     def actuate(self, state, torque, step):
@@ -266,6 +282,7 @@ class Saturation(ActuatorEffect):
     """Torque limit: clip(u, -limit, limit)."""
 
     kind: ClassVar[str] = "saturation"
+    neutral: ClassVar[Mapping[str, float]] = {"limit": 1e30}
     limit: Scalar = parameter("N m", "largest torque", above=0.0)
 
     def actuate(self, state, torque, step):
@@ -276,6 +293,7 @@ class Lag(ActuatorEffect):
     """First-order lag of the torque: T du_a/dt = u - u_a, advanced exactly for a held u; starts at zero torque."""
 
     kind: ClassVar[str] = "lag"
+    neutral: ClassVar[Mapping[str, float]] = {"time_constant": 1e-30}
     time_constant: Scalar = parameter("s", "time constant T", above=0.0)
 
     def init(self):

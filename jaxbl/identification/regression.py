@@ -7,7 +7,7 @@ set and reference models of EMPS, Workshop on Nonlinear System Identification Be
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -153,19 +153,33 @@ def _transmitted(plant: Plant, k: Kinematics) -> Float[Array, " samples"]:
 
 
 def actuated(experiment: Experiment, torque: Float[Array, " samples"]) -> Float[Array, " samples"]:
-    """The torque that acts, of the one that was commanded."""
-    effects, period = experiment.effects, experiment.run.sample_period
+    """The torque that acts, of the one that was commanded; from rest."""
+    effects = experiment.effects
     if not any(effect.place == "actuator" for effect in effects):
         return torque
+    start = jax.tree.map(lambda x: jnp.asarray(x, torque.dtype), tuple(effect.init() for effect in effects))
+    return actuator_path(experiment, torque, start)[1]
 
-    def sample(states: list, torque: Array) -> tuple[list, Array]:
-        new = []
-        for effect, state in zip(effects, states, strict=True):
-            state, torque = effect.actuate(state, torque, period)
+
+def lasting(experiment: Experiment, torque: Float[Array, ""]) -> tuple[Any, ...]:
+    """The effects' own states after an input that has lasted."""
+    init = tuple(effect.init() for effect in experiment.effects)
+    return jax.tree.map(lambda x: jnp.asarray(x, torque.dtype) * 0.0 + torque, init)
+
+
+def actuator_path(
+    experiment: Experiment, torque: Float[Array, " samples"], start: tuple[Any, ...]
+) -> tuple[tuple[Any, ...], Float[Array, " samples"]]:
+    """The effects' own states at each sample of a commanded torque (N m), from given ones, and the torque that acts."""
+    period = experiment.run.sample_period
+
+    def sample(states: tuple[Any, ...], torque: Array) -> tuple[tuple[Any, ...], tuple[tuple[Any, ...], Array]]:
+        new, acting = [], torque
+        for effect, state in zip(experiment.effects, states, strict=True):
+            state, acting = effect.actuate(state, acting, period)
             new.append(state)
-        return new, torque
+        return tuple(new), (states, acting)
 
-    start = jax.tree.map(lambda x: jnp.asarray(x, torque.dtype), [effect.init() for effect in effects])
     return jax.lax.scan(sample, start, torque)[1]
 
 

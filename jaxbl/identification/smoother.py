@@ -12,12 +12,14 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 _SMOOTHNESS = 1e-14, 1e4
 _GRID = 19
 _ZOOMS = 3
 _SPREAD = 10.0
+_SHOWN = 3.0
+"""Standard deviations from which on a velocity is shown."""
 
 
 class Smoothed(NamedTuple):
@@ -52,6 +54,15 @@ class Smoothed(NamedTuple):
     def deviation(self, order: int) -> Float[Array, " samples"]:
         """Standard deviation of the position (0), velocity (1) or acceleration (2)."""
         return jnp.sqrt(self.covariance[:, order, order])
+
+    def held(self, period: float | Float[Array, ""]) -> Bool[Array, " samples"]:
+        """Where the position is not shown to move for a while: dry friction may hold it there.
+
+        Neither velocity nor acceleration stands out of the velocity's noise, the latter over the smoother's time constant.
+        """
+        corner = (self.jerk / self.noise**2 / period) ** (1.0 / 6.0)
+        still = _SHOWN * self.deviation(1)
+        return (jnp.abs(self.velocity) < still) & (jnp.abs(self.acceleration) < corner * still)
 
 
 class _Forward(NamedTuple):

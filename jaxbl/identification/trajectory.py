@@ -347,8 +347,6 @@ def fit(
     most_steps: int = 100,
     held: Bool[Array, " parameters"] | None = None,
     rounds: int = 3,
-    prior: Float[Array, " parameters"] | None = None,
-    centre: Float[Array, " parameters"] | None = None,
 ) -> Fit:
     """Fit from one start; `vmap` it over starts, or over records.
 
@@ -362,12 +360,8 @@ def fit(
         most_steps: of the solver, each time.
         held: which numbers stay at the start; none if left out.
         rounds: how often at most the solver is started again, where initial states sought anew are better ones.
-        prior: standard deviation of each theta before the record was seen, in place of the weak pull.
-        centre: its mean; zeros, the nominal values, if left out.
     """
 
-    width = jnp.full(len(theta), WIDE) if prior is None else prior
-    middle = jnp.zeros(len(theta)) if centre is None else centre
     given = theta
     moving = jnp.ones(len(theta)) if held is None else jnp.where(held, 0.0, 1.0)
 
@@ -376,9 +370,9 @@ def fit(
         theta = jnp.where(moving > 0.0, theta, given)
         value, start, slope = _sloped(experiment, free, dataclasses.replace(windows, start=guess), theta)
         each = jnp.sum(value**2, axis=(1, 2))
-        total = jnp.sum(each) + jnp.sum(((theta - middle) / width) ** 2)
-        normal = jnp.outer(moving, moving) * jnp.einsum("wtsp,wtsq->pq", slope, slope) + jnp.diag(moving / width**2)
-        towards = moving * (jnp.einsum("wtsp,wts->p", slope, value) + (theta - middle) / width**2)
+        total = jnp.sum(each) + jnp.sum((theta / WIDE) ** 2)
+        normal = jnp.outer(moving, moving) * jnp.einsum("wtsp,wtsq->pq", slope, slope) + jnp.diag(moving / WIDE**2)
+        towards = moving * (jnp.einsum("wtsp,wts->p", slope, value) + theta / WIDE**2)
         size = jnp.sqrt(jnp.diag(normal)) + (1.0 - moving)
         root = jnp.linalg.cholesky(normal / jnp.outer(size, size) + jnp.diag(1.0 - moving))
         seen = jax.scipy.linalg.solve_triangular(root, towards / size, lower=True)

@@ -26,7 +26,7 @@ from jaxbl.discrepancy.proof import WINDOW, Ground, Proof, foretold
 from jaxbl.discrepancy.residuals import Residual
 from jaxbl.discrepancy.where import SIGNIFICANT, Localised, Values, as_json, coordinates_of, describe, where
 from jaxbl.drive.effects import effect_class, effect_kinds
-from jaxbl.drive.parameters import get_leaf, parameters, set_leaves
+from jaxbl.drive.parameters import get_leaf, leaf_paths, parameters, set_leaves
 from jaxbl.errors import InputError
 from jaxbl.identification.regression import Kinematics
 from jaxbl.identification.search import smoothed_channels
@@ -225,10 +225,6 @@ def _check_machine(record: Record, other: Record) -> None:
         )
 
 
-def _numeric(field: dataclasses.Field) -> bool:
-    return not field.metadata.get("static")
-
-
 class _Fitted(NamedTuple):
     """A model with some effects, all numbers fitted."""
 
@@ -252,10 +248,7 @@ class _Fitted(NamedTuple):
     def numbers(self) -> dict[str, dict[str, float]]:
         """All numbers of the effects, those that were not free among them."""
         effects = {name: get_leaf(self.experiment, f"effects.{name}") for name in self.names}
-        return {
-            name: {field.name: float(getattr(one, field.name)) for field, _ in parameters(one) if _numeric(field)}
-            for name, one in effects.items()
-        }
+        return {name: {leaf: float(get_leaf(one, leaf)) for leaf in leaf_paths(one)} for name, one in effects.items()}
 
     def errors(self) -> dict[str, float]:
         """Standard errors of the values."""
@@ -461,6 +454,8 @@ class _Witness:
             torque, noise = np.full((2, samples), np.nan)
             for record, pieces in ((self.task.record, self.observed), (self.task.holdout, self.held)):
                 for part, one in zip(record.segments if pieces else (), pieces.get(side, ()), strict=True):
+                    if not one.converged:
+                        continue
                     torque[part.start + one.skipped : part.stop] = one.residual.torque
                     noise[part.start + one.skipped : part.stop] = one.residual.deviation
             found |= {f"{side}.observed_before": torque, f"{side}.observed_noise": noise}

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from small_study import rigid, small
 
-from jaxbl.discrepancy.complete import Chosen, bucket, candidates, complete, neutral, numbers_of
-from jaxbl.drive.effects import effect_kinds
+from jaxbl.discrepancy.complete import Chosen, bucket, candidates, complete, numbers_of
+from jaxbl.drive.effects import effect_class, effect_kinds
 from jaxbl.drive.parameters import as_arrays, get_leaf, parameters
 from jaxbl.identification.trajectory import free_parameters, with_values
 from jaxbl.simulate import trajectory
@@ -53,8 +53,8 @@ def test_all_effects_are_there_once(sides):
 
 @pytest.mark.parametrize("name", effect_kinds())
 def test_every_effect_has_neutral_numbers(name):
-    effect = effect_kinds()[name](**neutral(name))
-    assert {field.name for field, _ in parameters(effect)} == set(neutral(name))
+    neutral = effect_class(name).neutral
+    assert {field.name for field, _ in parameters(effect_kinds()[name](**neutral))} == set(neutral)
 
 
 def test_chosen_numbers_are_set_as_named_ones_are():

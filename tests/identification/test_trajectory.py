@@ -107,22 +107,6 @@ def test_agrees_with_one_least_squares_problem_over_parameters_and_states():
     np.testing.assert_allclose(np.sqrt(np.diag(plain)), deviation, rtol=0.02)
 
 
-def test_a_prior_weighs_as_much_as_the_record():
-    """On linear residuals the estimate is the mean of both, weighted by their information."""
-    noise = {"motor": 1e-3, "load": 2e-4}
-    torque, states = recorded("multisine", 200)
-    experiment, free = drive(2), free_parameters(drive(2), ["drive.load_viscous"], 1.0)
-    windows = windows_of(torque, noisy(states, noise, jax.random.key(0)), noise, 100)
-    run = eqx.filter_jit(lambda **how: fit(experiment, free, windows, jnp.zeros(1), **how))
-    plain = run()
-    information = float(jnp.einsum("wtsp,wtsq->pq", plain.jacobian, plain.jacobian)[0, 0])
-    deviation, centre = information**-0.5, float(plain.theta[0]) + 0.5 * information**-0.5
-    found = run(prior=jnp.full(1, deviation), centre=jnp.full(1, centre))
-    assert float(found.theta[0] - plain.theta[0]) == pytest.approx(0.25 * deviation, rel=0.1)
-    tight = run(prior=jnp.full(1, 1e-3 * deviation), centre=jnp.full(1, centre))
-    assert float(tight.theta[0]) == pytest.approx(centre, abs=1e-2 * deviation)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["multisine", "steps", "chirp"])
 def test_intervals_cover_the_truth_as_often_as_they_say(kind):

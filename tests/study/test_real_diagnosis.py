@@ -52,7 +52,6 @@ def test_emps_friction_and_offset_are_named_and_the_force_error_falls():
     driving = summary["gap"]["driving"]["motor"]
     ((before, after, held),) = found.pairs["motor"]
     error = [np.sqrt(np.mean(narrowed(one, 100.0)[0].torque ** 2)) / driving for one in (before, after)]
-    print(error, [summary["gap"][f"holdout_rmse_{name}"]["torque_motor"] / driving for name in ("before", "after")])
     assert held
     assert error[0] == pytest.approx(0.66, abs=0.03)
     assert error[1] < 0.058
