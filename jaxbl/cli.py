@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -224,6 +224,10 @@ def diagnose(
             "--batch", metavar="FOLDER", help="diagnose every log of a folder; NAME.toml beside NAME.csv is its model"
         ),
     ] = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option("--jobs", metavar="N", min=1, help="processes that share a batch [default: one a core]"),
+    ] = None,
     next_experiment: Annotated[
         Path | None,
         typer.Option("--next-experiment", metavar="FILE.csv", help="write the input that would part tied effects"),
@@ -236,8 +240,10 @@ def diagnose(
         if log or holdout is not None or next_experiment is not None:
             raise InputError("--batch FOLDER takes no logs, --holdout or --next-experiment; give these one by one")
         _start_jax()
-        _diagnose_batch(batch, model, out if out is not None else Path("results") / batch.name, overwrite)
+        _diagnose_batch(batch, model, out if out is not None else Path("results") / batch.name, jobs, overwrite)
         return
+    if jobs is not None:
+        raise InputError("--jobs goes with --batch: one log is one process's work")
     if not log:
         raise InputError("diagnose: no log; give one or several of one machine, or a folder with --batch")
     if model is None:
@@ -272,11 +278,21 @@ def diagnose(
 _LOGS = (".csv", ".parquet", ".mat")
 
 
-def _diagnose_batch(source: Path, model: Path | None, out: Path, overwrite: bool) -> None:
+class _Job(NamedTuple):
+    """A log of a batch, its model and its hold-out log, and the folder of its results."""
+
+    log: Path
+    model: Path
+    holdout: Path | None
+    folder: Path
+    overwrite: bool
+
+
+def _diagnose_batch(source: Path, model: Path | None, out: Path, jobs: int | None, overwrite: bool) -> None:
     """Diagnose all logs of a folder, each into a folder of its own; go on where an earlier call stopped."""
-    from .report.diagnosed import batch_row, write_batch, write_diagnosis_report
-    from .study.diagnosis import read_task, run_task
+    from .report.diagnosed import write_batch
     from .study.store import make_folder
+    from .workers import each, worth
 
     if not source.is_dir():
         raise InputError(f"{source}: no such folder; --batch needs one with logs ({', '.join(_LOGS)})")
@@ -287,36 +303,48 @@ def _diagnose_batch(source: Path, model: Path | None, out: Path, overwrite: bool
     for name in stems:
         if stems.count(name) > 1:
             raise InputError(f"{source}: two logs are called {name}; each needs a name of its own for its results")
-    models = {file: own if (own := file.with_suffix(".toml")).exists() else model for file in logs}
-    bare = next((file for file, own in models.items() if own is None), None)
-    if bare is not None:
-        raise InputError(f"{bare}: no model; give --model TOML, or {bare.with_suffix('.toml').name} beside it")
-    make_folder(out)
     held = {file.stem: file for file in (source / "holdout").glob("*") if file.suffix.lower() in _LOGS}
+    work = []
+    for file in logs:
+        own = file.with_suffix(".toml") if file.with_suffix(".toml").exists() else model
+        if own is None:
+            raise InputError(f"{file}: no model; give --model TOML, or {file.with_suffix('.toml').name} beside it")
+        work.append(_Job(file, own, held.get(file.stem), out / file.stem, overwrite))
+    make_folder(out)
+    words = ["diagnose", "--batch", str(source), *(["--model", str(model)] if model else [])]
+    words += [*(["--jobs", str(jobs)] if jobs else []), *["--overwrite"] * overwrite]
     rows = []
-    words = ["diagnose", "--batch", str(source), *(["--model", str(model)] if model else []), *["--overwrite"] * overwrite]
     with _running(words, model or source, out, unit="logs") as progress:
-        for i, file in enumerate(logs):
-            progress(i, len(logs))
-            forget_programs()
-            folder = out / file.stem
-            try:
-                task = read_task(file, models[file], holdout=held.get(file.stem))  # pyright: ignore[reportArgumentType]
-                _claim_for_log(folder, file, overwrite=overwrite)
-                finished = _finished(folder / "diagnosis.json", task.identity)
-                if finished is None:
-                    with _leaving_nothing(folder):
-                        found = run_task(task)
-                        write_diagnosis_report(found, folder)
-                    finished = found.summary
-                rows.append(batch_row(file, finished))
-            except InputError as error:
-                rows.append(batch_row(file, None, str(error)))
+        progress(0, len(work))
+        for row in each(_diagnosed, work, worth(len(work)) if jobs is None else min(jobs, len(work))):
+            rows.append(row)
+            progress(len(rows), len(work))
     for line in write_batch(rows, out):
         typer.echo(line)
     typer.echo(f"{out / 'batch.csv'}")
     if all(row["refused"] for row in rows):
         raise typer.Exit(2)
+
+
+def _diagnosed(job: _Job) -> dict[str, Any]:
+    """Row of a batch: a log's diagnosis, or why there is none."""
+    from .report.diagnosed import batch_row, write_diagnosis_report
+    from .study.diagnosis import read_task, run_task
+    from .workers import forget_programs
+
+    forget_programs()
+    try:
+        task = read_task(job.log, job.model, holdout=job.holdout)
+        _claim_for_log(job.folder, job.log, overwrite=job.overwrite)
+        finished = _finished(job.folder / "diagnosis.json", task.identity)
+        if finished is None:
+            with _leaving_nothing(job.folder):
+                found = run_task(task)
+                write_diagnosis_report(found, job.folder)
+            finished = found.summary
+        return batch_row(job.log, finished)
+    except InputError as error:
+        return batch_row(job.log, None, str(error))
 
 
 @contextmanager
@@ -395,20 +423,6 @@ def _start_jax() -> None:
     if jax.config.values["jax_compilation_cache_dir"] is None:
         cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "jaxbl"
         jax.config.update("jax_compilation_cache_dir", str(cache))
-
-
-_MOST_MAPPINGS = 30_000
-"""Half of what Linux allows a process by default."""
-
-
-def forget_programs() -> None:
-    """Let go of compiled programs before those of logs of many lengths use up the mappings that the system allows."""
-    import jax
-
-    with suppress(OSError):
-        count = Path("/proc/self/maps").read_bytes().count(b"\n")
-        if count > _MOST_MAPPINGS:
-            jax.clear_caches()
 
 
 @contextmanager

@@ -7,7 +7,7 @@ import jax
 import pytest
 from hypothesis import settings
 
-from jaxbl.cli import forget_programs
+from jaxbl.workers import forget_programs
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -16,13 +16,11 @@ every finding of an `explained` verdict is a bet that pays where the effect was 
 
 import json
 import math
-import multiprocessing
 import sys
 import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -39,7 +37,6 @@ Diagnose = Callable[[list[Log], dict[str, Any], Log], Mapping[str, Any]]
 
 VERDICTS = ("explained", "no_discrepancy", "unknown_effect")
 CONFIDENT = 0.9
-_MOST_CASES = 8
 BINS = 10
 
 TARGETS = {
@@ -151,21 +148,15 @@ def run(found: Sequence[Case], diagnose: Diagnose, oracle: Oracle | None = None,
         oracle: what the true effects can reach.
         jobs: processes that share the work; functions must then be importable.
     """
+    from jaxbl.workers import each
+
     results = []
-    with ExitStack() as stack:
-        each: Callable[..., Iterable[Any]] = map
-        if jobs > 1:
-            # compiled programs add up in a process, and what one may map into memory is limited
-            context = multiprocessing.get_context("spawn")
-            each = stack.enter_context(context.Pool(jobs, maxtasksperchild=_MOST_CASES)).imap
-        for i, (one, model) in enumerate(each(partial(_one, diagnose=diagnose, oracle=oracle), found)):
-            results.append((one, model))
-            said = "right" if one.right and not one.spurious else "WRONG"
-            print(
-                f"{i + 1} of {len(found)}: {one.name} {said} ({_tells(one)}), {one.seconds:.0f} s",
-                file=sys.stderr,
-                flush=True,
-            )
+    for i, (one, model) in enumerate(each(partial(_one, diagnose=diagnose, oracle=oracle), found, jobs)):
+        results.append((one, model))
+        said = "right" if one.right and not one.spurious else "WRONG"
+        print(
+            f"{i + 1} of {len(found)}: {one.name} {said} ({_tells(one)}), {one.seconds:.0f} s", file=sys.stderr, flush=True
+        )
     outcomes = [one for one, _ in results]
     prove(found, outcomes, [model for _, model in results])
     return outcomes

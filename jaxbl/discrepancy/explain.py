@@ -83,12 +83,14 @@ class Finding:
     Attributes:
         effect: its name.
         confidence: probability that it is this one.
+        evidence: what it earned when it was found, nats.
         numbers: of the effect.
         alternatives: other effects that the record does not rule out in its place, and their probabilities.
     """
 
     effect: str
     confidence: float
+    evidence: float
     numbers: Numbers
     alternatives: tuple[tuple[str, float], ...]
 
@@ -433,7 +435,8 @@ def _finding(tried: Sequence[_Tried], model: Model, left: float) -> Finding:
     chances = _softmax(np.array([one.gain for one in tried]) / heat)
     others = tuple((one.name, float(chance)) for one, chance in zip(tried[1:], chances[1:], strict=True))
     name = tried[0].name
-    return Finding(name, float(chances[0]), model.numbers[name], tuple(one for one in others if one[1] > _LEAST_CHANCE))
+    others = tuple(one for one in others if one[1] > _LEAST_CHANCE)
+    return Finding(name, float(chances[0]), tried[0].gain, model.numbers[name], others)
 
 
 def _softmax(values: Array) -> Array:

@@ -290,7 +290,7 @@ def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
         done()
         names = fitted.names
         findings = [one for one in found.findings if one.effect in names]
-        verdict = found.verdict if findings or not found.findings else _without_findings(found)
+        verdict = _verdict(found, findings)
         rival = found.wrong if findings and not withdrawn and found.wrong is not None else None
         gap = proving.gap(fitted, after, rival)
         done()
@@ -370,6 +370,7 @@ def _setting(task: Task) -> _Setting:
     bare = on_record(config, record)
     # one structure for all models, so that they share their compiled programs
     nominal = complete(bare)
+    _check_order(bare, nominal)
     own = free_parameters(bare, default_paths(config, bare), float(np.std(record.torque)))
     prior = np.full(len(own), config.uncertainty.relative)
     rest = config.log.initial_state == "rest"
@@ -420,6 +421,14 @@ def _coordinates(
     }
 
 
+def _check_order(bare: Experiment, nominal: Experiment) -> None:
+    """Refuse a model of which two effects share a name, and are called by positions that others would shift."""
+    names = [effect.name for effect in bare.effects]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None and [effect.name for effect in nominal.effects[: len(names)]] != names:
+        raise InputError(f"effects: two are {twice}; list them before those of the actuator")
+
+
 def _check_stable(task: Task, nominal: Experiment, ground: Ground) -> None:
     for side, apart in ground.strays(nominal).items():
         if not apart < _DIVERGED:
@@ -429,8 +438,13 @@ def _check_stable(task: Task, nominal: Experiment, ground: Ground) -> None:
             )
 
 
-def _without_findings(found: Explanation) -> str:
-    return "unknown_effect" if any(gain > CLEAR for gain, _ in found.rest.values()) else "no_discrepancy"
+def _verdict(found: Explanation, kept: Sequence[Finding]) -> str:
+    """What is said of a log once effects that did not earn their place are withdrawn: what they were found for is left."""
+    earned = [one.evidence for one in found.findings if one not in kept]
+    if not earned:
+        return found.verdict
+    left = max(*earned, *(gain for gain, _ in found.rest.values()))
+    return "unknown_effect" if left > CLEAR else "explained" if kept else "no_discrepancy"
 
 
 def _at(experiment: Experiment, record: Record) -> Experiment:
@@ -681,6 +695,7 @@ def _finding(
     return {
         "effect": one.effect,
         "confidence": one.confidence,
+        "evidence": one.evidence,
         "parameters": numbers,
         "alternatives": [{"effect": name, "confidence": chance} for name, chance in one.alternatives],
         "where": {"place": place, "sentences": {side: lives[side]["sentence"] for side in sides}},

@@ -193,6 +193,24 @@ def test_a_diagnosis_that_fails_is_an_outcome(found, capsys):
     assert "RuntimeError: no" in markdown(outcomes)
 
 
+def _sees_nothing(logs, model, holdout):
+    gap = {"holdout_rmse_before": {"theta_e": 1.0}, "holdout_rmse_after": {"theta_e": 1.0}, "noise_floor": {"theta_e": 0.1}}
+    return {"verdict": "no_discrepancy", "findings": [], "gap": gap}
+
+
+def _no_oracle(case):
+    raise RuntimeError("not this one")
+
+
+def test_processes_share_the_cases_and_an_oracle_may_fail(found, capsys):
+    some = [case for case in found if case.hidden][:3]
+    outcomes = run(some, _sees_nothing, _no_oracle, jobs=2)
+    assert [one.name for one in outcomes] == [case.name for case in some]
+    assert all(one.ratio is None and one.reduction == 0.0 for one in outcomes)
+    told = [line for line in capsys.readouterr().err.splitlines() if " of 3: " in line]
+    assert len(told) == 3 and all("WRONG" in line for line in told)
+
+
 def test_the_proof_parts_true_from_nominal_model(found):
     case = next(case for case in found if case.kind == "single")
     nominal, true = foretold([(case, case.model), (case, case.oracle)])

@@ -1,0 +1,107 @@
+"""Independent jobs on all cores, in processes of their own; and how long a process keeps compiled programs."""
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from pathlib import Path
+from typing import TypeVar
+
+from .errors import NoResult
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+_MEMORY = 4 * 2**30
+"""Bytes that a process is granted: one that diagnoses long logs takes some three."""
+_MOST_MAPPINGS = 30_000
+"""Half of what Linux allows a process by default."""
+
+
+def worth(jobs: int) -> int:
+    """Processes that so many jobs are worth: one a core, as memory allows; an accelerator serves one alone."""
+    import jax
+
+    if jax.default_backend() != "cpu":
+        return 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return max(min(cores, memory // _MEMORY, jobs), 1)
+
+
+def each(function: Callable[[Job], Result], jobs: Sequence[Job], processes: int) -> Iterator[Result]:
+    """Results of a function, in the order of its arguments.
+
+    Args:
+        function: importable by name if there are several processes.
+        jobs: its arguments.
+        processes: that share the work; 1 is this one. An interrupt reaches the jobs under way, and no further ones begin.
+
+    Raises:
+        NoResult: a process was killed.
+    """
+    if processes == 1:
+        yield from map(function, jobs)
+        return
+    import jax
+
+    # a process that was forked would share the locks of this one's compiler
+    context = multiprocessing.get_context("spawn")
+    cache = jax.config.values["jax_compilation_cache_dir"], jax.config.values["jax_persistent_cache_min_compile_time_secs"]
+    with ProcessPoolExecutor(processes, context, _prepare, cache) as pool:
+        futures = [pool.submit(_interruptible, function, job) for job in jobs]
+        try:
+            for one in futures:
+                yield one.result()
+        except BrokenProcessPool:
+            raise NoResult("a process was killed, perhaps for want of memory; --jobs 1 takes least of it") from None
+        finally:
+            if not all(one.done() for one in futures):
+                for one in futures:
+                    one.cancel()
+                for child in multiprocessing.active_children():
+                    with suppress(ProcessLookupError):
+                        os.kill(child.pid, signal.SIGINT)  # pyright: ignore[reportArgumentType]
+
+
+_busy = _stopped = False
+
+
+def _interrupted(number: int, frame: object) -> None:
+    """Between two jobs an interrupt would end the process with a traceback; jobs that wait in its queue must not begin."""
+    global _stopped
+    _stopped = True
+    if _busy:
+        raise KeyboardInterrupt
+
+
+def _prepare(cache: str | None, least: float) -> None:
+    import jax
+
+    signal.signal(signal.SIGINT, _interrupted)
+    jax.config.update("jax_compilation_cache_dir", cache)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
+
+
+def _interruptible(function: Callable[[Job], Result], job: Job) -> Result:
+    global _busy
+    if _stopped:
+        raise KeyboardInterrupt
+    _busy = True
+    try:
+        return function(job)
+    finally:
+        _busy = False
+
+
+def forget_programs() -> None:
+    """Let go of compiled programs before those of logs of many lengths use up the mappings that the system allows."""
+    import jax
+
+    with suppress(OSError):
+        count = Path("/proc/self/maps").read_bytes().count(b"\n")
+        if count > _MOST_MAPPINGS:
+            jax.clear_caches()

@@ -1,0 +1,73 @@
+"""Jobs in processes of their own."""
+
+import os
+import signal
+import threading
+import time
+
+import jax
+import pytest
+
+from jaxbl.errors import NoResult
+from jaxbl.workers import each, forget_programs, worth
+
+
+def square(x):
+    return x * x
+
+
+def fails(x):
+    raise ValueError(f"not {x}")
+
+
+def is_killed(x):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def lasts(folder):
+    (folder / f"{os.getpid()}").touch()
+    try:
+        time.sleep(60.0)
+    except KeyboardInterrupt:
+        (folder / "interrupted").touch()
+        raise
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_results_come_in_order(processes):
+    assert list(each(square, [3, 1, 2], processes)) == [9, 1, 4]
+    with pytest.raises(ValueError, match="not 7"):
+        list(each(fails, [7], processes))
+
+
+def test_a_killed_process_is_told():
+    with pytest.raises(NoResult, match="a process was killed"):
+        list(each(is_killed, [1, 2], 2))
+
+
+def test_an_interrupt_reaches_the_jobs_under_way(tmp_path):
+    def interrupt():
+        while not any(tmp_path.iterdir()):
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    start = time.monotonic()
+    threading.Thread(target=interrupt).start()
+    with pytest.raises(KeyboardInterrupt):
+        list(each(lasts, [tmp_path] * 9, 2))
+    assert (tmp_path / "interrupted").exists() and time.monotonic() - start < 50.0
+    assert len(list(tmp_path.iterdir())) <= 3
+
+
+def test_there_is_a_process_for_each_core_and_no_more_than_jobs():
+    assert worth(1) == 1
+    assert 1 <= worth(10_000) <= (os.cpu_count() or 1)
+
+
+def test_programs_are_forgotten_once_they_are_many(monkeypatch):
+    calls = []
+    monkeypatch.setattr(jax, "clear_caches", lambda: calls.append(1))
+    forget_programs()
+    monkeypatch.setattr("jaxbl.workers._MOST_MAPPINGS", 10)
+    forget_programs()
+    assert len(calls) == 1
