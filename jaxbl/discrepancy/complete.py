@@ -44,6 +44,10 @@ def complete(experiment: Experiment) -> Experiment:
     """A model with all effects that it lacks at neutral numbers; array leaves."""
     added = [as_arrays(effect_kinds()[name](**effect_class(name).neutral), float) for name in candidates(experiment)]
     effects = joined(experiment.effects, added, lambda one: one.name)
+    kinds = list(effect_kinds())
+    if len({one.name for one in effects}) == len(effects):
+        # one order whatever was given, so that models share their programs; that of the actuator's matters
+        effects.sort(key=lambda one: len(kinds) if one.place == "actuator" else kinds.index(one.name))
     return eqx.tree_at(lambda e: e.effects, experiment, tuple(effects))
 
 

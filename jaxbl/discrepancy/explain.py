@@ -49,6 +49,8 @@ CLEAR = 50.0
 """Nats that a free function must earn to tell that something else is missing."""
 _SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
 _MOST = 4
+_RECENT = 4
+"""Models along the record that are kept: where a refit ended, the next one begins."""
 FLOOR = 0.006
 """Nats a prediction error that structure in the noise (quantisation, above all) may be worth: 1.2 % of its variance."""
 
@@ -191,8 +193,18 @@ class Explainer:
         self.record, self.smoothed = record, smoothed
         samples = sum(part.stop - part.start for part in record.segments)
         self.floor = FLOOR * samples * len(experiment.sides)
+        self._recent: dict[tuple, Linear] = {}
 
-    def linear(self, experiment: Experiment, names: Names, theta: Array) -> Linear:
+    def linear(self, values: Mapping[str, Numbers], theta: Array) -> Linear:
+        """The model with some effects along the record."""
+        key = (*((name, *numbers.items()) for name, numbers in values.items()), theta.tobytes())
+        if key not in self._recent:
+            if len(self._recent) == _RECENT:
+                self._recent.pop(next(iter(self._recent)))
+            self._recent[key] = self._linear(with_effects(self.nominal, values), tuple(values), theta)
+        return self._recent[key]
+
+    def _linear(self, experiment: Experiment, names: Names, theta: Array) -> Linear:
         paths = paths_of(names)
         torque = float(np.std(self.record.torque))  # type: ignore[arg-type]
         own = (*self.free, *free_parameters(experiment, paths, torque))
@@ -239,7 +251,7 @@ class Explainer:
     ) -> _Point:
         """Cost at some numbers, and where the linear step leads."""
         experiment = with_effects(self.nominal, values)
-        linear = self.linear(experiment, names, theta)
+        linear = self.linear(values, theta)
         columns = linear.columns((), smoothness, deviation)
         scale, sizes = columns.scale.copy(), linear.sizes(names)
         for i, path in enumerate(paths_of(names), 1 + len(self.free)):
@@ -265,7 +277,7 @@ class Explainer:
     def run(self) -> Explanation:
         """Find what is missing."""
         theta = np.zeros(len(self.free))
-        linear = self.linear(self.nominal, (), theta)
+        linear = self.linear({}, theta)
         smoothness, deviation = linear.choose(())
         nominal = current = self.refit((), {}, theta, smoothness, deviation)
         found: dict[str, list[_Tried]] = {}

@@ -317,7 +317,9 @@ class Linear:
         self.count = sum(int(np.asarray(one.weight).sum()) for one in self.parts)
         self.states = self.parts[0].defect.shape[1]
         self.drive = self._drive()
+        # what the last search chose, and what the one without candidates did, which is asked for again and again
         self._last: tuple[Predictor, list[np.ndarray]] | None = None
+        self._alone: tuple[Predictor, list[np.ndarray]] | None = None
 
     def _drive(self) -> float:
         """Size of the torques, N m rms at the motor: the input's; where there is none, what the motion takes."""
@@ -395,6 +397,9 @@ class Linear:
 
         With `near`, the search begins there.
         """
+        if not variants and near is None and self._alone is not None:
+            self._last = self._alone
+            return self._chosen(self._alone[0])
         forces = [self._forces(variants, signals) for signals in self.signals]
 
         def best(options: list[list[float]]) -> Predictor:
@@ -416,7 +421,12 @@ class Linear:
             if np.sum(np.log(other.squares)) < np.sum(np.log(chosen.squares)):
                 chosen = other
         self._last = chosen, forces
-        return chosen.smoothness, np.sqrt(chosen.squares / self.count)
+        if not variants and near is None:
+            self._alone = self._last
+        return self._chosen(chosen)
+
+    def _chosen(self, predictor: Predictor) -> tuple[list[float], np.ndarray]:
+        return predictor.smoothness, np.sqrt(predictor.squares / self.count)
 
     def _predictors(self, options: list[list[float]], forces: list[np.ndarray]) -> list[Predictor]:
         gains = jnp.stack([self.gain(one) for one in options])

@@ -137,6 +137,7 @@ def _over_coordinates(
             rasterized=True,
         )  # fmt: skip
         _means(ax, one)
+        ax.locator_params(axis="x", nbins=5)
         symbol = f" {one.symbol}" if one.symbol else ""
         ax.set_xlabel(with_unit(f"{one.name}{symbol}", one.unit))
         ax.set_title(

@@ -85,7 +85,8 @@ def on_record(config: Config, record: Record) -> Experiment:
         dataclasses.replace(
             experiment.run,
             sample_period=jnp.asarray(record.sample_period),
-            steps=len(record.time),
+            # along a log nothing asks for it; programs are compiled for one
+            steps=1,
             substeps=substeps,
         ),
     )
