@@ -12,14 +12,14 @@ the nominal model knows.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .effects import EFFECTS, LEVELS, UNKNOWN, Motion, draw, exclusive, on_rigid, rms
+from .effects import EFFECTS, LEVELS, UNKNOWN, Motion, draw, error_of, exclusive, on_rigid, rms
 from .simulator import Machine, Run, Trace, simulate
 
 KINDS = ("single", "pairs", "none", "unknown", "hard")
@@ -468,7 +468,7 @@ def _case(
     verdict = {"none": "no_discrepancy", "unknown": "unknown_effect"}.get(plan.kind, "explained")
     true = Machine(machine.drive, machine.transmission, (*known, *_ordered(_explained(machine, hidden))))
     nominal = Machine(
-        _off(machine.drive, plan.uncertainty, plan.rng),
+        _off(machine.drive, plan.uncertainty, plan.rng, [error_of(kind) for kind in hidden]),
         None if machine.transmission is None else _off(machine.transmission, plan.uncertainty, plan.rng),
         [_off(effect, plan.uncertainty, plan.rng) for effect in known],
     )
@@ -499,14 +499,17 @@ def _explained(machine: Machine, hidden: Mapping[str, Mapping[str, Any]]) -> lis
     return [{"kind": kind, **values} for kind, values in hidden.items() if not kind.startswith("unknown.")]
 
 
-def _off(table: Mapping[str, Any], uncertainty: float, rng: np.random.Generator) -> dict[str, Any]:
-    """A table as someone knows it who knows its numbers so well, to four digits."""
+def _off(
+    table: Mapping[str, Any], uncertainty: float, rng: np.random.Generator, exact: Collection[str | None] = ()
+) -> dict[str, Any]:
+    """A table as someone knows it who knows its numbers so well, to four digits; but for those that are exact."""
     found = {}
     for key, value in table.items():
         if isinstance(value, str) or key == "gear_ratio":
             found[key] = value
         else:
-            error = float(np.clip(rng.standard_normal(), -2.0, 2.0))
+            error = 0.0 if key in exact else 1.0
+            error *= float(np.clip(rng.standard_normal(), -2.0, 2.0))
             found[key] = float(f"{value * (1.0 + uncertainty * error):.4g}")
     return found
 

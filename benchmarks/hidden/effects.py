@@ -10,7 +10,7 @@ The size that is asked for is not always to be had; what became of it stands in 
 
 - an inertia, a viscous friction or a torque gain that is off by less than the nominal numbers are uncertain cannot be told
   from them, so it is made at least `APART` times that uncertainty (the gain, which moves all numbers at once, three
-  quarters of that);
+  quarters of that); the nominal number is off by nothing but the effect then, which is its error;
 - an inertia or a viscous friction grows fourfold at most and loses 60 % at most, a dent is at most 80 % of the driving
   torque's rms high, a shaft at most one and a half times critically damped, a drifting friction at most 40 %.
 """
@@ -41,6 +41,12 @@ _LARGEST, _LEAST = 3.0, -0.6
 def on_rigid(effect: str) -> bool:
     """Whether an effect has a meaning on a rigid drive."""
     return effect not in GEAR_EFFECTS and not (effect.startswith("load.") and effect not in LOAD_EFFECTS)
+
+
+def error_of(effect: str) -> str | None:
+    """The number of the drive that an effect is the error of."""
+    side, _, kind = effect.partition(".")
+    return {"inertia": f"{side}_inertia", "viscous_friction": f"{side}_viscous"}.get(kind) if side != "actuator" else None
 
 
 def exclusive(one: str, other: str) -> bool:

@@ -244,6 +244,8 @@ _LEAST = 1e-11
 OFF = 0.5
 """Prior size of the error of an inertia or a viscous friction, relative."""
 _FREQUENCIES, _COARSE, _HARMONICS = 8, 16, 40
+_ARC = 0.5 * np.pi
+"""Of a wave of cogging, rad, that the motion must cover for it to be tried."""
 _NO_INPUT = 1e-3
 _COLUMNS = 16
 """Least padded number of candidate columns."""
@@ -350,7 +352,7 @@ class Linear:
             (rms(twist), float(np.max(np.abs(twist)))),
             speed,
             tuple(frequencies),
-            tuple(float(n) for n in range(1, _HARMONICS + 1) if n * travel["motor"] > np.pi),
+            tuple(float(n) for n in range(1, _HARMONICS + 1) if n * travel["motor"] > _ARC),
             tuple(float(n) for n in range(1, 9) if n * travel.get("load", 0.0) > 0.5),
         )
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hidden.cases import KINDS, _targets, cases, save
-from hidden.effects import APART, EFFECTS, LEVELS, UNKNOWN, on_rigid
+from hidden.effects import APART, EFFECTS, LEVELS, UNKNOWN, error_of, on_rigid
 from hidden.proof import foretold, proofs
 from hidden.scoring import calibration, calibration_error, confusion, markdown, outcome, run, scores, write
 from hidden_effects import left
@@ -191,6 +191,17 @@ def test_a_diagnosis_that_fails_is_an_outcome(found, capsys):
     outcomes = run(found[:2], fails)
     assert scores(outcomes)["failed"]["value"] == 1.0
     assert "RuntimeError: no" in markdown(outcomes)
+
+
+def test_the_error_of_a_nominal_number_is_the_effect_and_nothing_else():
+    some = [case for case in cases(4, 44, "single", duration=2.0) if error_of(*case.hidden) is not None]
+    assert some
+    for case in some:
+        (name,) = case.hidden
+        added = sum(case.truth["effects"][name].values())
+        key = error_of(name)
+        assert case.model["drive"][key] == pytest.approx(case.oracle["drive"][key], rel=1e-3)
+        assert abs(added) > 0.99 * APART * case.conditions["uncertainty"] * case.model["drive"][key]
 
 
 def _sees_nothing(logs, model, holdout):
