@@ -8,7 +8,7 @@ is missing.
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from jaxbl.simulate import Experiment
 from .candidates import SHARE, Candidate, Numbers, variants_of
 from .complete import candidates, complete
 from .evidence import Scorer, Set
-from .linear import Linear
+from .linear import DIVERGED, Linear
 from .remainder import functions_of
 
 Array = np.ndarray
@@ -43,7 +43,6 @@ _SETTLED = 2e-3
 _LEAST_GAIN = 1e-3
 _EARNED = 0.2
 """Share of what free functions earn beside an effect that it must earn itself to be named."""
-_DIVERGED = 1e30
 _LEAST_CHANCE = 0.01
 CLEAR = 50.0
 """Nats that a free function must earn to tell that something else is missing."""
@@ -178,7 +177,7 @@ class _Point(NamedTuple):
 
 
 class Explainer:
-    """A record, a nominal model, and the models tried."""
+    """Which effects a model lacks on a record: the record, the nominal model, and the models tried."""
 
     def __init__(
         self,
@@ -188,6 +187,16 @@ class Explainer:
         record: Record,
         smoothed: Mapping[str, Sequence[Smoothed]],
     ):
+        """Prepare to explain a record.
+
+        Args:
+            experiment: the nominal model, with array leaves; its sample period is that of the record. Models of the
+                explanation have all effects, those that are not found at neutral numbers (:mod:`.complete`).
+            free: its own numbers that are not exactly known.
+            prior: relative standard deviation of each.
+            record: the log.
+            smoothed: its positions, part by part (:func:`jaxbl.identification.search.smoothed_channels`).
+        """
         self.nominal, self.free, self.prior = complete(experiment), tuple(free), np.asarray(prior)
         self.lacking = candidates(experiment)
         self.record, self.smoothed = record, smoothed
@@ -259,7 +268,7 @@ class Explainer:
             if leaf in _AMPLITUDES:
                 scale[i] = sizes[name]
         found = None
-        if np.max(np.abs(columns.products)) < _DIVERGED and np.isfinite(scale[1:]).all():
+        if np.max(np.abs(columns.products)) < DIVERGED and np.isfinite(scale[1:]).all():
             found = Scorer(dataclasses.replace(columns, scale=scale), ())(())
         if found is None:
             return _Point(experiment, linear, values, theta, Set((), -np.inf, np.inf, (), np.zeros(0)), np.inf)
@@ -305,8 +314,18 @@ class Explainer:
             rest = self.remainder(current)
             left = _most(rest)
         findings = tuple(_finding(one, current, left) for one in found.values())
-        verdict: Verdict = "unknown_effect" if left > CLEAR else "explained" if findings else "no_discrepancy"
-        return Explanation(verdict, findings, current, nominal, wrong, rest)
+        return Explanation(_verdict(left, findings), findings, current, nominal, wrong, rest)
+
+    def without(self, found: Explanation, names: Collection[str]) -> Explanation:
+        """What is left of an explanation when some of its effects are withdrawn: what is not explained is sought anew."""
+        model, kept = found.model, tuple(name for name in found.model.names if name not in names)
+        smoothness, deviation = model.linear.choose(())
+        # where nothing is kept, its own numbers have nothing to do with those beside effects
+        theta = model.theta if kept else found.nominal.theta
+        model = self.refit(kept, {name: model.numbers[name] for name in kept}, theta, smoothness, deviation)
+        rest = self.remainder(model)
+        findings = tuple(one for one in found.findings if one.effect in kept)
+        return Explanation(_verdict(_most(rest), findings), findings, model, found.nominal, None, rest)
 
     def _plain(self, model: Model, found: dict[str, list["_Tried"]], left: float) -> tuple[Model, dict[str, list["_Tried"]]]:
         """Where something unknown remains, only what earns a good part of that is named, and of what it does not part, the
@@ -437,6 +456,10 @@ def _same(name: str, others: Iterable[str]) -> bool:
     return kind in _DRY and any(f"{place}.{one}" in others for one in _DRY)
 
 
+def _verdict(left: float, findings: Sequence[Finding]) -> Verdict:
+    return "unknown_effect" if left > CLEAR else "explained" if findings else "no_discrepancy"
+
+
 def _most(rest: Mapping[str, tuple[float, float]]) -> float:
     return max(gain for gain, _ in rest.values())
 
@@ -487,23 +510,3 @@ def with_effects(experiment: Experiment, values: Mapping[str, Numbers]) -> Exper
             for leaf, value in numbers.items()
         },
     )
-
-
-def explain(
-    experiment: Experiment,
-    free: Sequence[Free],
-    prior: Sequence[float],
-    record: Record,
-    smoothed: Mapping[str, Sequence[Smoothed]],
-) -> Explanation:
-    """Which effects a model lacks on a record.
-
-    Args:
-        experiment: the nominal model, with array leaves; its sample period is that of the record. Models of the explanation
-            have all effects, those that are not found at neutral numbers (:mod:`.complete`).
-        free: its own numbers that are not exactly known.
-        prior: relative standard deviation of each.
-        record: the log.
-        smoothed: its positions, part by part (:func:`jaxbl.identification.search.smoothed_channels`).
-    """
-    return Explainer(experiment, free, prior, record, smoothed).run()

@@ -247,6 +247,8 @@ _FREQUENCIES, _COARSE, _HARMONICS = 8, 16, 40
 _ARC = 0.5 * np.pi
 """Of a wave of cogging, rad, that the motion must cover for it to be tried."""
 _NO_INPUT = 1e-3
+DIVERGED = 1e30
+"""Products of prediction errors, over their variance or in rad^2, from which on a model is one that diverges."""
 _COLUMNS = 16
 """Least padded number of candidate columns."""
 
@@ -268,9 +270,8 @@ class Predictor:
         self.given = np.sum([_as_it_stands(one, own_states) for one in grams], axis=0)
         sides, own, states, count = len(linear.sides), len(linear.free), linear.states, linear.count
         width = grams[0].shape[1] - 1 - states
-        if not np.max([np.max(np.abs(one)) for one in grams]) < np.inf:
-            self.squares = np.full(sides, np.inf)
-            self.coefficients = [np.zeros(1 + width + states) for _ in grams]
+        if not np.max([np.max(np.abs(one)) for one in grams]) < DIVERGED:
+            self._nothing(grams)
             return
         weight = np.ones(sides)
         precision, centre = np.zeros(width), np.zeros(width)
@@ -281,6 +282,9 @@ class Predictor:
             variance = 1.0 if turn else max(total[0, 0] / (count * sides), 1e-300)
             precision[:own] = variance / linear.prior**2
             matrix = total[1:, 1:] + np.diag(precision)
+            if total[0, 0] < 0.0 or np.min(np.diag(matrix), initial=0.0) < 0.0:
+                self._nothing(grams)
+                return
             size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
             towards = (total[1:, 0] - precision * centre) / size
             found = -np.linalg.lstsq(matrix / np.outer(size, size), towards, rcond=1e-12)[0] / size
@@ -289,7 +293,15 @@ class Predictor:
             self.squares = np.sum(
                 [np.einsum("c,scd,d->s", at, one, at) for at, one in zip(self.coefficients, grams, strict=True)], axis=0
             )
-            weight = 1.0 / np.maximum(self.squares / count, 1e-300)
+            if not (self.squares > 0.0).all():
+                self._nothing(grams)
+                return
+            weight = count / self.squares
+
+    def _nothing(self, grams: list[np.ndarray]) -> None:
+        """Of a gain under which errors diverge, or all but: what is left is smaller than the rounding of their products."""
+        self.squares = np.full(len(self.smoothness), np.inf)
+        self.coefficients = [np.zeros(one.shape[1]) for one in grams]
 
     def cost(self, theta: np.ndarray, width: np.ndarray) -> float:
         """Minus twice the log-likelihood, with the prior's, that a step from theta promises."""

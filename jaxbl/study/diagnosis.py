@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.discrepancy.complete import complete, joined
-from jaxbl.discrepancy.explain import CLEAR, Explanation, Finding, Model, explain, paths_of, with_effects
+from jaxbl.discrepancy.explain import Explainer, Explanation, Finding, Model, paths_of, with_effects
 from jaxbl.discrepancy.observed import Observed, compared, observed_torques
 from jaxbl.discrepancy.polish import refined
 from jaxbl.discrepancy.proof import WINDOW, Ground, Proof, foretold
@@ -283,15 +283,15 @@ def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
         coordinates = _coordinates(nominal, seen, lacking)
         before = other.prove(_at(nominal, task.holdout))
         done()
-        found = explain(bare, own, prior.tolist(), record, seen.channels.smoothed)
+        explainer = Explainer(bare, own, prior.tolist(), record, seen.channels.smoothed)
+        found = explainer.run()
         done()
         proving = _Proving(task, setting, before)
         fitted, after, withdrawn = proving.extended(found)
         done()
-        names = fitted.names
-        findings = [one for one in found.findings if one.effect in names]
-        verdict = _verdict(found, findings)
-        rival = found.wrong if findings and not withdrawn and found.wrong is not None else None
+        if withdrawn:
+            found = explainer.without(found, withdrawn)
+        verdict, rival = found.verdict, found.wrong
         gap = proving.gap(fitted, after, rival)
         done()
         missing_after = seen.torques(fitted.experiment)
@@ -304,7 +304,7 @@ def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
         witness = _Witness(task, set_leaves(bare, arrays(gain_values)), seen, other)
         trace = trace.assign(**witness.columns(len(trace)))
         model = _model(config, fitted.numbers, fitted.own | gain_values)
-        summary = _summary(task, fitted, found, findings, verdict, withdrawn, located)
+        summary = _summary(task, fitted, found, withdrawn, located)
         witness.tell(summary, lacking)
         summary["gap"] = gap
         if left:
@@ -436,15 +436,6 @@ def _check_stable(task: Task, nominal: Experiment, ground: Ground) -> None:
                 f"{task.record.path}: the model diverges under this log's input: within {WINDOW:g} s its {side} leaves the "
                 f"measured motion by {apart:.2g} times the whole of it; a number of it, or its sign, is wrong"
             )
-
-
-def _verdict(found: Explanation, kept: Sequence[Finding]) -> str:
-    """What is said of a log once effects that did not earn their place are withdrawn: what they were found for is left."""
-    earned = [one.evidence for one in found.findings if one not in kept]
-    if not earned:
-        return found.verdict
-    left = max(*earned, *(gain for gain, _ in found.rest.values()))
-    return "unknown_effect" if left > CLEAR else "explained" if kept else "no_discrepancy"
 
 
 def _at(experiment: Experiment, record: Record) -> Experiment:
@@ -630,8 +621,6 @@ def _summary(
     task: Task,
     fitted: _Fitted,
     found: Explanation,
-    findings: Sequence[Finding],
-    verdict: str,
     withdrawn: Sequence[str],
     located: Mapping[str, Localised],
 ) -> dict[str, Any]:
@@ -642,9 +631,9 @@ def _summary(
     if task.separate:
         notes += [f"{task.holdout.path.name}: {note}" for note in task.holdout.notes if note not in record.notes]
     notes += [f"{name} was found, and withdrawn: with it the held-out data are met no better." for name in withdrawn]
-    if task.separate and any(one.effect == "load.periodic_disturbance" for one in findings):
+    if task.separate and any(one.effect == "load.periodic_disturbance" for one in found.findings):
         notes.append("The phase of load.periodic_disturbance is taken to be the same at the start of both logs.")
-    if verdict == "no_discrepancy":
+    if found.verdict == "no_discrepancy":
         notes += _least_seen(record, located)
     own = [one for one in fitted.free if not any(one.path.startswith(f"effects.{name}.") for name in fitted.names)]
     return {
@@ -653,8 +642,8 @@ def _summary(
         "file": str(record.path.resolve()),
         "samples": len(record.time),
         "sample_period": record.sample_period,
-        "verdict": verdict,
-        "findings": [_finding(task, one, values, errors, lives, located) for one in findings],
+        "verdict": found.verdict,
+        "findings": [_finding(task, one, values, errors, lives, located) for one in found.findings],
         "parameters": {
             one.path: {
                 "value": values[one.path],

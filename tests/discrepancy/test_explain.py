@@ -5,7 +5,7 @@ import pytest
 from hidden.cases import cases
 from hidden_log import logged, model
 
-from jaxbl.discrepancy.explain import CLEAR, explain
+from jaxbl.discrepancy.explain import CLEAR, Explainer
 from jaxbl.identification.search import smoothed_channels
 from jaxbl.identification.trajectory import free_parameters
 from jaxbl.study.identification import read_task
@@ -23,7 +23,7 @@ def explained(case, tmp_path):
     free = free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
     prior = [task.config.uncertainty.relative] * len(free)
     smoothed = smoothed_channels(task.record, nominal.sides).smoothed
-    return explain(nominal, free, prior, task.record, smoothed)
+    return Explainer(nominal, free, prior, task.record, smoothed).run()
 
 
 @pytest.mark.slow
@@ -70,6 +70,6 @@ def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
     nominal = on_record(task.config, task.record)
     free = free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
     smoothed = smoothed_channels(task.record, nominal.sides).smoothed
-    found = explain(nominal, free, [task.config.uncertainty.relative] * len(free), task.record, smoothed)
+    found = Explainer(nominal, free, [task.config.uncertainty.relative] * len(free), task.record, smoothed).run()
     assert found.verdict == "explained"
     assert [one.effect for one in found.findings] == ["motor.coulomb_friction"]

@@ -5,7 +5,7 @@ import pytest
 from measured import EMPS, XL330, real
 from small_study import rigid
 
-from jaxbl.discrepancy.explain import explain
+from jaxbl.discrepancy.explain import Explainer
 from jaxbl.discrepancy.residuals import narrowed
 from jaxbl.identification.search import smoothed_channels
 from jaxbl.identification.trajectory import free_parameters
@@ -33,7 +33,7 @@ def explained(log, study):
     nominal = on_record(task.config, task.record)
     free = free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
     smoothed = smoothed_channels(task.record, nominal.sides).smoothed
-    return explain(nominal, free, [task.config.uncertainty.relative] * len(free), task.record, smoothed)
+    return Explainer(nominal, free, [task.config.uncertainty.relative] * len(free), task.record, smoothed).run()
 
 
 @pytest.mark.slow
