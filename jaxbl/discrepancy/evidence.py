@@ -7,7 +7,7 @@ Computation 4 (1992); R. Kass, A. Raftery, Bayes factors, JASA 90 (1995).
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -29,6 +29,8 @@ class Columns:
         offsets: column of each variant's offset, or -1.
         scale: prior standard deviation of each column's coefficient; infinite where it does nothing along this record.
         centre: prior mean of each.
+        twins: columns that are a multiple of one of the model's own, which is always there: that one, and the factor. Only
+            their priors part the two, so that these are joined: the data's precision may be too large for them to be seen.
     """
 
     products: Array
@@ -37,6 +39,7 @@ class Columns:
     offsets: tuple[int, ...]
     scale: Array
     centre: Array
+    twins: Mapping[int, tuple[int, float]] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,13 +80,20 @@ class Scorer:
         chosen = np.concatenate([self.base, *(np.asarray(c.places[i]) for i in which)]).astype(int)
         fixed = np.array([0, *(c.offsets[i] for i in which if c.offsets[i] >= 0)])
         # what has no torque along this record has no coefficient either
-        every, alive = len(chosen), np.isfinite(c.scale[chosen])
-        chosen = chosen[alive]
+        values = np.zeros(len(c.scale))
+        variance, middle = c.scale**2, c.centre.copy()
+        alive = [int(k) for k in chosen if np.isfinite(c.scale[k])]
+        joined = [k for k in alive if k in c.twins]
+        for k in joined:
+            of, factor = c.twins[k]
+            variance[of] += factor**2 * variance[k]
+            middle[of] += factor * middle[k]
+        places, chosen = chosen, np.array([k for k in alive if k not in joined], int)
         inner = c.products[np.ix_(chosen, chosen)]
         towards = c.products[np.ix_(chosen, fixed)].sum(axis=1)
         total = c.products[np.ix_(fixed, fixed)].sum()
-        precision = 1.0 / c.scale[chosen] ** 2
-        centre = c.centre[chosen]
+        precision = 1.0 / variance[chosen]
+        centre = middle[chosen]
         matrix = inner + np.diag(precision)
         towards = towards - precision * centre
         total = total + float(precision @ centre**2)
@@ -94,8 +104,14 @@ class Scorer:
         inside = solve_triangular(root, towards / size, lower=True)
         coefficients = -solve_triangular(root, inside, lower=True, trans=1) / size
         cost = total - float(inside @ inside)
-        given = np.zeros(every)
-        given[alive] = coefficients
+        values[chosen] = coefficients
+        # the sum's distance from its mean is shared out by the variances
+        away = values - middle
+        for k in joined:
+            of, factor = c.twins[k]
+            values[k] = c.centre[k] + factor * c.scale[k] ** 2 / variance[of] * away[of]
+            values[of] -= factor * values[k]
+        given = values[places]
         numbers, place = [], len(self.base)
         for i in which:
             width = len(c.places[i])
@@ -105,10 +121,10 @@ class Scorer:
             numbers.append(found)
             place += width
         spread = 2.0 * float(np.sum(np.log(np.diag(root)))) + 2.0 * float(np.sum(np.log(size)))
-        prior = 2.0 * float(np.sum(np.log(c.scale[chosen])))
+        prior = float(np.sum(np.log(variance[chosen])))
         evidence = -0.5 * (cost + spread + prior)
         misfit = cost - float(precision @ (coefficients - centre) ** 2)
-        return Set(which, evidence, misfit, tuple(numbers), coefficients[: c.own])
+        return Set(which, evidence, misfit, tuple(numbers), values[self.base])
 
 
 def _root(unit: Array) -> Array | None:

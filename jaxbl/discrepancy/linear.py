@@ -510,12 +510,6 @@ class Linear:
             some = self._some(at - 1 - own, forces.shape[2])
             gram = np.asarray(_grams(part, gain[None], forces))[0][:, some[:, None], some]
             gram = np.einsum("s,scd->cd", deviation**-2.0, gram)
-            for one, place in zip(variants, places, strict=True):
-                # the error of a number that is free acts as that number does, dry friction or not
-                if (i := self.same(one.name)) is not None:
-                    slope = float(self.free[i].slope(self.theta[i]))
-                    gram[place[0]] = gram[1 + i] / slope
-                    gram[:, place[0]] = gram[:, 1 + i] / slope
             total += _eliminated(gram, self.states)
         with np.errstate(divide="ignore"):
             # what has no torque along this motion cannot be found
@@ -528,7 +522,20 @@ class Linear:
                 scale[list(place)] = np.minimum(scale[list(place)], OFF * nominal)
         centre = np.zeros(at)
         centre[1 : 1 + own] = self.centre
-        return Columns(total, own, tuple(places), tuple(offsets), scale, centre)
+        return Columns(total, own, tuple(places), tuple(offsets), scale, centre, self._twins(variants, places))
+
+    def _twins(self, variants: Sequence[Candidate], places: Sequence[tuple[int, ...]]) -> dict[int, tuple[int, float]]:
+        """Columns that are those of other numbers: the error of a number that is free acts as that number does."""
+        slopes = [float(one.slope(self.theta[i])) for i, one in enumerate(self.free)]
+        found = {}
+        for one, place in zip(variants, places, strict=True):
+            if (i := self.same(one.name)) is not None:
+                found[place[0]] = 1 + i, 1.0 / slopes[i]
+        for j, one in enumerate(self.free):
+            name, _, leaf = one.path.removeprefix("effects.").rpartition(".")
+            if leaf in ("inertia", "viscous") and (i := self.same(name)) is not None:
+                found[1 + j] = 1 + i, slopes[j] / slopes[i]
+        return found
 
     def _power(self, torques: np.ndarray, signals: Signals) -> np.ndarray:
         """Sums of squares of torques, referred to the motor."""
