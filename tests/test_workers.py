@@ -2,8 +2,11 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
 
 import jax
 import pytest
@@ -33,6 +36,14 @@ def lasts(folder):
         raise
 
 
+def alive(process):
+    try:
+        state = Path(f"/proc/{process}/stat").read_text()
+    except FileNotFoundError:
+        return False
+    return state.rpartition(")")[2].split()[0] != "Z"
+
+
 @pytest.mark.parametrize("processes", [1, 2])
 def test_results_come_in_order(processes):
     assert list(each(square, [3, 1, 2], processes)) == [9, 1, 4]
@@ -57,6 +68,21 @@ def test_an_interrupt_reaches_the_jobs_under_way(tmp_path):
         list(each(lasts, [tmp_path] * 9, 2))
     assert (tmp_path / "interrupted").exists() and time.monotonic() - start < 50.0
     assert len(list(tmp_path.iterdir())) <= 3
+
+
+def test_processes_end_with_the_one_they_work_for(tmp_path):
+    code = "import sys, pathlib, test_workers as t; list(t.each(t.lasts, [pathlib.Path(sys.argv[1])], 2))"
+    paths = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
+    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], env=os.environ | {"PYTHONPATH": paths}) as parent:
+        while not (found := list(tmp_path.iterdir())):
+            time.sleep(0.05)
+        parent.kill()
+    child = int(found[0].name)
+    for _ in range(200):
+        if not alive(child):
+            return
+        time.sleep(0.05)
+    raise AssertionError("it still runs")
 
 
 def test_there_is_a_process_for_each_core_and_no_more_than_jobs():
