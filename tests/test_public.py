@@ -29,7 +29,8 @@ BELOW = {
 BELOW["discrepancy"] = {*BELOW["identification"], "identification"}
 BELOW["study"] = {*BELOW["discrepancy"], "discrepancy"}
 BELOW["report"] = {*BELOW["study"], "study"}
-BELOW["cli"] = {*BELOW["report"], "report"}
+BELOW["workers"] = {"errors"}
+BELOW["cli"] = {*BELOW["report"], "report", "workers"}
 
 
 def test_public_names_resolve_and_are_documented():

@@ -56,7 +56,15 @@ def test_a_killed_process_is_told():
         list(each(is_killed, [1, 2], 2))
 
 
-def test_an_interrupt_reaches_the_jobs_under_way(tmp_path):
+@pytest.fixture
+def heeded():
+    """Interrupts, which a test runner's own processes may ignore."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_reaches_the_jobs_under_way(tmp_path, heeded):
     def interrupt():
         while not any(tmp_path.iterdir()):
             time.sleep(0.05)
