@@ -45,7 +45,8 @@ _EARNED = 0.2
 """Share of what free functions earn beside an effect that it must earn itself to be named."""
 _LEAST_CHANCE = 0.01
 CLEAR = 100.0
-"""Nats that a free function must earn to tell that something else is missing; time stepping leaves up to some 70."""
+"""Nats that a free function must earn to tell that something else is missing. Beside the right effect one has earned 72,
+where something was unknown 320 and more (benchmarks/NOTES.md)."""
 _SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
 _MOST = 4
 _RECENT = 4
@@ -84,14 +85,12 @@ class Finding:
     Attributes:
         effect: its name.
         confidence: probability that it is this one.
-        evidence: what it earned when it was found, nats.
         numbers: of the effect.
         alternatives: other effects that the record does not rule out in its place, and their probabilities.
     """
 
     effect: str
     confidence: float
-    evidence: float
     numbers: Numbers
     alternatives: tuple[tuple[str, float], ...]
 
@@ -472,7 +471,7 @@ def _finding(tried: Sequence[_Tried], model: Model, left: float) -> Finding:
     others = tuple((one.name, float(chance)) for one, chance in zip(tried[1:], chances[1:], strict=True))
     name = tried[0].name
     others = tuple(one for one in others if one[1] > _LEAST_CHANCE)
-    return Finding(name, float(chances[0]), tried[0].gain, model.numbers[name], others)
+    return Finding(name, float(chances[0]), model.numbers[name], others)
 
 
 def _softmax(values: Array) -> Array:

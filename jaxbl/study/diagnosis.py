@@ -684,7 +684,6 @@ def _finding(
     return {
         "effect": one.effect,
         "confidence": one.confidence,
-        "evidence": one.evidence,
         "parameters": numbers,
         "alternatives": [{"effect": name, "confidence": chance} for name, chance in one.alternatives],
         "where": {"place": place, "sentences": {side: lives[side]["sentence"] for side in sides}},
