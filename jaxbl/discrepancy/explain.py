@@ -51,6 +51,8 @@ _SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
 _MOST = 4
 _RECENT = 4
 """Models along the record that are kept: where a refit ended, the next one begins."""
+LEAST = 1e-3
+"""Share of the driving torque that an effect must have to be named: time stepping leaves a twentieth of it."""
 FLOOR = 0.006
 """Nats a prediction error that structure in the noise (quantisation, above all) may be worth: 1.2 % of its variance."""
 
@@ -377,7 +379,8 @@ class Explainer:
                 break
             numbers = current.numbers | {one.name: one.numbers}
             model = self.refit((*current.names, one.name), numbers, current.theta + one.own, smoothness, deviation)
-            tried.append((self._gain(base, model), model))
+            gain = self._gain(base, model) if model.linear.share(one.name) > LEAST else -np.inf
+            tried.append((gain, model))
         return smoothness, sorted(tried, key=lambda pair: -pair[0])
 
     def remainder(self, model: Model) -> dict[str, tuple[float, float]]:

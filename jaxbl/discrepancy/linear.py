@@ -542,14 +542,19 @@ class Linear:
         over = np.array([*(signals.over(side) for side in self.sides), 1.0])
         return np.einsum("tsc,tsc,s->c", torques, torques, over**-2.0)
 
+    def share(self, name: str) -> float:
+        """Torque of an effect that the model has, rms over the driving torque's."""
+        effect = get_leaf(self.experiment, f"effects.{name}")
+        power = sum(self._power(signals.of([effect])[0][:, :, None], signals)[0] for signals in self.signals)
+        return float(np.sqrt(power / self.count)) / self.drive
+
     def sizes(self, names: Sequence[str]) -> dict[str, float]:
         """Prior relative standard deviation of the amplitudes of effects that the model has."""
         found = {}
         for name in names:
-            effect = get_leaf(self.experiment, f"effects.{name}")
-            power = sum(self._power(signals.of([effect])[0][:, :, None], signals)[0] for signals in self.signals)
-            found[name] = SHARE * self.drive / np.sqrt(max(power / self.count, 1e-300))
+            found[name] = SHARE / max(self.share(name), 1e-150)
             if (nominal := self.nominal(name)) is not None:
+                effect = get_leaf(self.experiment, f"effects.{name}")
                 (value,) = (abs(float(getattr(effect, leaf))) for leaf in ("inertia", "viscous") if hasattr(effect, leaf))
                 found[name] = min(found[name], OFF * nominal / max(value, 1e-300))
         return found

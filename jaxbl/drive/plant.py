@@ -1,9 +1,11 @@
 """The drive as it moves: eqs. (1)-(2) with a transmission law and any effects, one time step at a time.
 
 Time stepping is Moreau's midpoint rule: drift half a step, kick, drift half a step. The kick takes the elastic torque at
-the midpoint position, viscous friction implicitly, and dry friction as the set-valued law it is, by projection: the side
-sticks exactly while the rest of the torque stays below the friction level. On smooth drives this is the Stoermer-Verlet
-scheme (second order, symplectic, one evaluation of the law a step). Measured against others in benchmarks/integrators.py.
+the midpoint position, viscous friction implicitly, and dry friction as the set-valued law it is: the side sticks exactly
+while the rest of the torque stays below the friction level. Within a step it comes to rest, or turns around, at the time
+at which its velocity passes zero; a projection at the step's end, as in Moreau's rule, would take friction of one sign off
+all of the step. On smooth drives this is the Stoermer-Verlet scheme (second order, symplectic, one evaluation of the law a
+step). Measured against others in benchmarks/integrators.py.
 References: J. J. Moreau, Numerical aspects of the sweeping process, CMAME 177 (1999); V. Acary, B. Brogliato, Numerical
 Methods for Nonsmooth Dynamical Systems, Springer (2008), ch. 10.
 """
@@ -224,13 +226,28 @@ class Plant(eqx.Module):
             mass = self.inertia(side) / step
             drag = 0.5 * self.drive.viscous(side)
             free = ((mass - drag) * velocity[side] + total) / (mass + drag)
-            new[side] = free if isinstance(level, float) else _soften(free, level / (mass + drag))
+            if not isinstance(level, float):
+                free = _rubbed(velocity[side], free, level / (mass + drag))
+            new[side] = free
         return new
 
     def _at(self, place: str) -> list[AbstractEffect]:
         return [effect for effect in self.effects if self.drive.place(effect.place) == place]
 
 
-def _soften(velocity: Float[Array, ""], stop: Scalar) -> Float[Array, ""]:
-    """Projection of set-valued friction: the impulse takes off `stop`, or all of the velocity if that is less."""
-    return velocity - jnp.clip(velocity, -stop, stop)
+def _rubbed(before: Float[Array, ""], free: Scalar, stop: Scalar) -> Float[Array, ""]:
+    """Velocity after a step under set-valued friction, rad/s.
+
+    Args:
+        before: velocity.
+        free: velocity that the step would reach without friction.
+        stop: what friction takes off in a whole step of motion.
+    """
+    direction = jnp.where(before != 0.0, jnp.sign(before), -jnp.sign(free))
+    along = free - direction * stop
+    apart = before - along
+    rests = direction * along <= 0.0
+    # it comes to rest within the step: friction has the other sign for what is left of it, or holds
+    left = 1.0 - before / jnp.where(apart == 0.0, 1.0, apart)
+    turned = direction * jnp.minimum(direction * along + 2.0 * stop * left, 0.0)
+    return jnp.where(rests, turned, along)

@@ -156,6 +156,18 @@ def test_a_sliding_block_stops_where_and_when_the_closed_form_says_and_stays(dty
     assert not speed[moving:].any() and (position[moving:] == position[-1]).all()
 
 
+@pytest.mark.parametrize("velocity", [0.0321, -0.5, 1.2345])
+def test_a_block_turns_around_when_the_closed_form_says(velocity):
+    """Within a substep: friction changes its sign at the turn, not at the step's end."""
+    torque = -0.15 * np.sign(velocity)
+    turn = abs(velocity) / ((0.15 + 0.1) / 0.05)
+    position, speed = moved(COULOMB, torque, 1.0, velocity=velocity)
+    assert speed[-1] == pytest.approx((1.0 - turn) * (0.15 - 0.1) / 0.05 * np.sign(torque), rel=1e-9)
+    end = 0.5 * velocity * turn + 0.5 * speed[-1] * (1.0 - turn)
+    # a h^2 / 4 at most in the step of the turn
+    assert position[-1] == pytest.approx(end, abs=0.25 * 5.0 * 1e-8)
+
+
 def test_stribeck_friction_holds_what_it_would_let_slide():
     """Between sliding friction and break-away: at rest it stays, in motion it goes on."""
     assert not moved(STRIBECK, 0.08, 2.0).any()
