@@ -21,7 +21,8 @@ from jaxbl.identification.trajectory import Free, free_parameters
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
-from .candidates import SHARE, Candidate, Numbers, variants_of
+from .candidates import SHARE, Candidate, Numbers, Variant, variants_of
+from .coloured import Spectrum
 from .complete import candidates, complete
 from .evidence import Scorer, Set
 from .linear import DIVERGED, Linear
@@ -296,6 +297,8 @@ class Explainer:
         while len(found) < _MOST:
             smoothness, tried = self._round(current)
             if not tried or tried[0][0] <= 0.0:
+                smoothness, tried = self._coloured_round(current)
+            if not tried or tried[0][0] <= 0.0:
                 break
             (_, current), *others = tried
             record = [_Tried(model.names[-1], gain, model.numbers[model.names[-1]]) for gain, model in tried]
@@ -383,6 +386,25 @@ class Explainer:
             tried.append((gain, model))
         return smoothness, sorted(tried, key=lambda pair: -pair[0])
 
+    def _coloured_round(self, current: Model) -> tuple[list[float], list[tuple[float, Model]]]:
+        """As :meth:`_round`, where errors are not white and count by their spectrum; what earns nothing is left out."""
+        linear = current.linear
+        smoothness, deviation = linear.choose(())
+        spectrum = linear.spectrum(smoothness)
+        if not spectrum.coloured:
+            return smoothness, []
+        base, ranked = self._ranked(linear, self._variants(current), smoothness, spectrum)
+        tried = []
+        for one in ranked[:_FINALISTS]:
+            gain = self._gain(base, one) + ODDS - linear.choices(one.name)
+            if gain > 0.0:
+                numbers = current.numbers | {one.name: one.found.numbers[0]}
+                theta = current.theta + one.found.own[: len(self.free)]
+                model = self.refit((*current.names, one.name), numbers, theta, smoothness, deviation)
+                if np.isfinite(model.log_evidence) and model.linear.share(one.name) > LEAST:
+                    tried.append((gain, model))
+        return smoothness, sorted(tried, key=lambda pair: -pair[0])
+
     def remainder(self, model: Model) -> dict[str, tuple[float, float]]:
         """What free functions would earn beside a model (nats), and their size over the driving torque, by name."""
         linear = model.linear
@@ -413,8 +435,7 @@ class Explainer:
         """Candidates that do well on the linearised model, and the predictor to judge them by: with the best of them in."""
         linear = model.linear
         smoothness, deviation = linear.choose((), smoothness)
-        lacking = [name for name in self.lacking if name not in model.names and not _same(name, model.names)]
-        variants = variants_of(model.experiment, lacking, linear.grids(linear.frequencies()))
+        variants = self._variants(model)
         _, ranked = self._ranked(linear, variants, smoothness, deviation)
         if not ranked:
             return smoothness, deviation, []
@@ -435,11 +456,18 @@ class Explainer:
             smoothness, deviation = linear.choose([best], smoothness)
         return smoothness, deviation, finalists
 
+    def _variants(self, model: Model) -> list[Variant]:
+        """Effects that a model lacks, at what was chosen last for it."""
+        lacking = [name for name in self.lacking if name not in model.names and not _same(name, model.names)]
+        return variants_of(model.experiment, lacking, model.linear.grids(model.linear.frequencies()))
+
     def _ranked(
-        self, linear: Linear, variants: Sequence[Candidate], smoothness: Sequence[float], deviation: Array
+        self, linear: Linear, variants: Sequence[Candidate], smoothness: Sequence[float], noise: Array | Spectrum
     ) -> tuple["_Scored", list["_Scored"]]:
         """The model without candidates, and with the best variant of each, best first."""
-        scorer = Scorer(linear.columns(variants, smoothness, deviation), variants)
+        scorer = Scorer(linear.columns(variants, smoothness, noise), variants)
+        # errors over their spectrum are of size 1
+        deviation = np.ones(len(linear.sides)) if isinstance(noise, Spectrum) else noise
         none = scorer(())
         assert none is not None
         allowed = [one for i in range(len(variants)) if (one := scorer((i,))) is not None]
@@ -470,7 +498,8 @@ def _most(rest: Mapping[str, tuple[float, float]]) -> float:
 def _finding(tried: Sequence[_Tried], model: Model, left: float) -> Finding:
     """The first of those tried, with its confidence: structure that is left over makes differences mean less."""
     heat = left if left > CLEAR else 1.0
-    chances = _softmax(np.array([one.gain for one in tried]) / heat)
+    # or nothing is missing
+    *chances, _ = _softmax(np.array([*(one.gain for one in tried), 0.0]) / heat)
     others = tuple((one.name, float(chance)) for one, chance in zip(tried[1:], chances[1:], strict=True))
     name = tried[0].name
     others = tuple(one for one in others if one[1] > _LEAST_CHANCE)

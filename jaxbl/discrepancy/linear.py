@@ -33,6 +33,7 @@ from jaxbl.records import Record
 from jaxbl.simulate import Experiment, move
 
 from .candidates import SHARE, SPACING, Candidate, Grids, Signals, forces_of, rms
+from .coloured import Spectrum, spectrum_of, weighted_products
 from .complete import Chosen, bucket
 from .evidence import Columns
 from .part import Part
@@ -494,8 +495,21 @@ class Linear:
                 break
         return found
 
-    def columns(self, variants: Sequence[Candidate], smoothness: Sequence[float], deviation: np.ndarray) -> Columns:
-        """Products of everything that the prediction errors are linear in, initial states eliminated."""
+    def spectrum(self, smoothness: Sequence[float]) -> Spectrum:
+        """Of the errors that are left under a given gain when all numbers are at their best."""
+        predictor = self.predictor(smoothness)
+        errors = self.errors(smoothness)
+        left = [one @ at for one, at in zip(errors, predictor.coefficients, strict=True)]
+        return spectrum_of([one[signals.real] for one, signals in zip(left, self.signals, strict=True)])
+
+    def columns(self, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray | Spectrum) -> Columns:
+        """Products of everything that the prediction errors are linear in, initial states eliminated.
+
+        Args:
+            variants: candidates, the columns of which are to be among them.
+            smoothness: of the predictor, by side.
+            noise: rms of its errors by side, rad, where they are white; or their spectrum.
+        """
         gain, own = self.gain(smoothness), len(self.free)
         places, offsets, at = [], [], 1 + own
         for one in variants:
@@ -508,8 +522,12 @@ class Linear:
             forces = self._forces(variants, signals)
             power += self._power(forces[:, :, : at - 1 - own], signals)
             some = self._some(at - 1 - own, forces.shape[2])
-            gram = np.asarray(_grams(part, gain[None], forces))[0][:, some[:, None], some]
-            gram = np.einsum("s,scd->cd", deviation**-2.0, gram)
+            if isinstance(noise, Spectrum):
+                errors = np.asarray(_errors(part, gain, forces))[signals.real][:, :, some]
+                gram = weighted_products(errors, noise)
+            else:
+                gram = np.asarray(_grams(part, gain[None], forces))[0][:, some[:, None], some]
+                gram = np.einsum("s,scd->cd", noise**-2.0, gram)
             total += _eliminated(gram, self.states)
         with np.errstate(divide="ignore"):
             # what has no torque along this motion cannot be found

@@ -72,7 +72,7 @@ def test_emps_an_effect_that_is_taken_out_is_named_again(left_out):
 
 
 @pytest.mark.slow
-def test_xl330_gravity_is_named_first():
+def test_xl330_gravity_and_then_coulomb_friction_are_named():
     """A pendulum released, neither gravity nor friction in the model."""
     study = rigid(
         {"drive.motor_inertia": 0.0049, "drive.motor_viscous": 0.0, "run.substeps": 2, "run.sample_period": 3.5e-3},
@@ -86,4 +86,7 @@ def test_xl330_gravity_is_named_first():
     assert found.findings[0].effect == "load.gravity"
     # of the inertia m l² = 0.0049 kg m², a mass point: gravity pulls less, as the servo's own inertia adds to it
     assert 0.25 < found.findings[0].numbers["torque"] < 0.49 * 0.1 * 9.81
-    assert {one.effect for one in found.findings} <= {"load.gravity", "motor.coulomb_friction", "motor.viscous_friction"}
+    # small beside a swing of 10 to 20 Hz that no effect accounts for; all of the friction, as the model has no viscous one
+    assert found.findings[1].effect == "motor.coulomb_friction"
+    assert 0.005 < found.findings[1].numbers["torque"] < 0.02
+    assert len(found.findings) == 2

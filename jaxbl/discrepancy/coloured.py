@@ -1,0 +1,105 @@
+"""Prediction errors that are not white: their spectrum, and what columns are worth beside it.
+
+A predictor knows white noise of the torque and of the readings alone. Where something swings that no effect accounts for,
+its errors are correlated, and what is small but steady is worth more, or less, than their variance says. By Whittle's
+likelihood, each frequency counts by the power that is left there.
+Reference: P. Whittle, Estimation and information in stationary time series, Arkiv foer Matematik 2 (1953).
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+Array = np.ndarray
+
+_BANDS, _FEWEST = 24, 12
+"""Bands of a spectrum, evenly spaced in the logarithm of the frequency; frequencies in one of them."""
+
+
+class Spectrum(NamedTuple):
+    """Power of the errors over frequency, interpolated between bands.
+
+    Attributes:
+        frequency: middle of each band, cycles a sample.
+        power: variance of a sample, if it were so at all frequencies, by side; rad^2, shape (bands, sides).
+        gain: what it is worth beside a flat one, nats.
+    """
+
+    frequency: Array
+    power: Array
+    gain: float
+
+    def at(self, samples: int) -> Array:
+        """Power at the frequencies of that many samples, shape (frequencies, sides)."""
+        where = np.log(np.maximum(np.fft.rfftfreq(samples), 0.5 / samples))
+        known = np.log(self.frequency)
+        return np.exp(np.stack([np.interp(where, known, np.log(one)) for one in self.power.T], axis=1))
+
+    @property
+    def coloured(self) -> bool:
+        """Whether the errors are clearly not white: by chance a spectrum is worth half of a nat a band."""
+        return self.gain > self.power.size
+
+
+def spectrum_of(errors: Sequence[Array]) -> Spectrum:
+    """Spectrum of errors, part by part, each of shape (samples, sides)."""
+    powers = [np.abs(_transformed(one)) ** 2 for one in errors]
+    weights = [_weights(len(one)) for one in errors]
+    frequency = np.concatenate([np.fft.rfftfreq(len(one)) for one in errors])
+    order = np.argsort(frequency, kind="stable")
+    frequency, power, weight = frequency[order], np.concatenate(powers)[order], np.concatenate(weights)[order]
+    edges = _edges(len(frequency))
+    bands = [slice(low, high) for low, high in itertools.pairwise(edges)]
+    # parts have a frequency 0 each
+    middle = np.maximum([np.mean(frequency[band]) for band in bands], 1e-9)
+    level = np.stack([np.average(power[band], axis=0, weights=weight[band]) for band in bands])
+    level = np.maximum(level, 1e-300)
+    flat = np.average(power, axis=0, weights=weight)
+    found = Spectrum(middle, level, 0.0)
+    gain = 0.0
+    for samples, one, factor in zip(map(len, errors), powers, weights, strict=True):
+        at = found.at(samples)
+        gain += 0.5 * float(np.sum(factor[:, None] * (np.log(flat / at) + one / flat - one / at)))
+    return found._replace(gain=gain)
+
+
+def weighted_products(errors: Array, spectrum: Spectrum) -> Array:
+    """Products of columns of errors with one another, each frequency over its power; shape (columns, columns).
+
+    Args:
+        errors: rad, shape (samples, sides, columns).
+        spectrum: of what they leave.
+    """
+    found = np.zeros((errors.shape[2], errors.shape[2]))
+    size = np.sqrt(_weights(len(errors))[:, None] / spectrum.at(len(errors)))
+    for side in range(errors.shape[1]):
+        one = _transformed(errors[:, side]) * size[:, side, None]
+        found += np.real(one.conj().T @ one)
+    return found
+
+
+def _transformed(errors: Array) -> Array:
+    return np.fft.rfft(errors, axis=0) / np.sqrt(len(errors))
+
+
+def _weights(samples: int) -> Array:
+    """How often each frequency counts: all but the first, and the last of an even number, stand for two."""
+    found = np.full(samples // 2 + 1, 2.0)
+    found[0] = 1.0
+    if samples % 2 == 0:
+        found[-1] = 1.0
+    return found
+
+
+def _edges(count: int) -> list[int]:
+    """Of bands of growing width, none of fewer frequencies than :data:`_FEWEST` if there are as many."""
+    found = [0]
+    for edge in np.round(np.geomspace(_FEWEST, count, _BANDS)).astype(int):
+        if edge - found[-1] >= _FEWEST:
+            found.append(int(edge))
+    if len(found) == 1:
+        return [0, count]
+    found[-1] = count
+    return found
