@@ -61,6 +61,8 @@ _DIVERGED = 10.0
 """Errors on short windows over the motion's range from which on a model counts as diverging."""
 _ALIKE = 3.0
 """Factor between the inertias that two logs of one machine may show."""
+_FAR = 5.0
+"""Times its uncertainty that a number of the model may change without a word."""
 _HIDDEN = 0.3
 """Share of the driving torque: where a torque of that size would not have been seen, noise hides everything."""
 
@@ -636,6 +638,7 @@ def _summary(
     if found.verdict == "no_discrepancy":
         notes += _least_seen(record, located)
     own = [one for one in fitted.free if not any(one.path.startswith(f"effects.{name}.") for name in fitted.names)]
+    notes += _far_off(own, values, task.config.uncertainty.relative)
     return {
         "title": task.config.title,
         "identity": task.identity,
@@ -694,6 +697,19 @@ def _lives(record: Record, located: Mapping[str, Localised]) -> dict[str, Any]:
     """Where missing torques live, with sentences in the log's units."""
     told = {name: describe(one, unit_on(record, f"{name}.torque", "N m")) for name, one in located.items()}
     return {name: one | {"sentence": told[name]} for name, one in as_json(located).items()}
+
+
+def _far_off(own: Sequence[Free], values: Mapping[str, float], uncertainty: float) -> list[str]:
+    """Which numbers of the model ended where they hardly can be, as it says itself."""
+    lines = []
+    for one in own:
+        change = values[one.path] / one.nominal - 1.0 if one.nominal else 0.0
+        if abs(change) > _FAR * uncertainty:
+            lines.append(
+                f"{one.path} had to change by {change:+.0%}, {abs(change) / uncertainty:.0f} times its [uncertainty]: "
+                "findings may make up for it, or it for them. Noise of the torque channel does it, or too small a relative."
+            )
+    return lines
 
 
 def _least_seen(record: Record, located: Mapping[str, Localised]) -> list[str]:

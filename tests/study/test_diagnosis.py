@@ -11,6 +11,7 @@ from hidden_log import FRICTION, logged, model
 import jaxbl.study.diagnosis as under_test
 from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.errors import InputError
+from jaxbl.identification.trajectory import Free
 from jaxbl.records import read_record
 from jaxbl.report import diagnosis_lines, write_diagnosis_report
 from jaxbl.study.config import read_config
@@ -117,6 +118,13 @@ def test_the_extended_model_runs_and_the_report_says_what_was_found(found, tmp_p
     summary = json.loads((tmp_path / "diagnosis.json").read_text())
     assert summary == found.summary and diagnosis_lines(summary) == lines
     assert again.effects[0].torque == summary["findings"][0]["parameters"]["torque"]["value"]
+
+
+def test_a_number_that_ends_far_from_what_is_known_of_it_is_told():
+    own = [Free("drive.motor_inertia", "kg m²", 0.02, 0.02, True), Free("drive.motor_viscous", "N m s/rad", 0.0, 1.0, False)]
+    assert under_test._far_off(own, {"drive.motor_inertia": 0.021, "drive.motor_viscous": 0.1}, 0.02) == []
+    (note,) = under_test._far_off(own, {"drive.motor_inertia": 0.01, "drive.motor_viscous": 0.0}, 0.02)
+    assert note.startswith("drive.motor_inertia had to change by -50%, 25 times its [uncertainty]")
 
 
 def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
