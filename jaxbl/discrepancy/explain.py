@@ -17,7 +17,7 @@ import numpy as np
 from jaxbl.drive.effects import effect_class
 from jaxbl.drive.parameters import parameters, set_leaves
 from jaxbl.identification.smoother import Smoothed
-from jaxbl.identification.trajectory import Free, free_parameters
+from jaxbl.identification.trajectory import WIDE, Free, free_parameters
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
@@ -26,6 +26,7 @@ from .coloured import Spectrum
 from .complete import candidates, complete
 from .evidence import Scorer, Set
 from .linear import DIVERGED, Linear
+from .polish import Refined, refined
 from .remainder import functions_of
 
 Array = np.ndarray
@@ -46,8 +47,7 @@ _EARNED = 0.2
 """Share of what free functions earn beside an effect that it must earn itself to be named."""
 _LEAST_CHANCE = 0.01
 CLEAR = 100.0
-"""Nats that a free function must earn to tell that something else is missing. Beside the right effect one has earned 72,
-where something was unknown 320 and more (benchmarks/NOTES.md)."""
+"""Nats that a free function must earn to tell that something else is missing, of a size that counts (:data:`LEAST`)."""
 _SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
 _MOST = 4
 _RECENT = 4
@@ -118,6 +118,13 @@ class Explanation:
     nominal: Model
     wrong: Model | None
     rest: dict[str, tuple[float, float]]
+
+
+class Polished(NamedTuple):
+    """A model with the numbers of least prediction errors, and which of them were free: its own first."""
+
+    free: tuple[Free, ...]
+    refined: Refined
 
 
 class _Finalist(NamedTuple):
@@ -205,20 +212,36 @@ class Explainer:
         samples = sum(part.stop - part.start for part in record.segments)
         self.floor = FLOOR * samples * len(experiment.sides)
         self._recent: dict[tuple, Linear] = {}
+        self._polished: tuple[tuple, Polished] | None = None
+
+    def polished(self, values: Mapping[str, Numbers], theta: Array) -> "Polished":
+        """The model with some effects, with the numbers of least prediction errors (:mod:`.polish`)."""
+        key = _key(values, theta)
+        if self._polished is None or self._polished[0] != key:
+            experiment = with_effects(self.nominal, values)
+            added = free_parameters(experiment, paths_of(values), self._torque)
+            free, width = (*self.free, *added), np.concatenate([self.prior, np.full(len(added), WIDE)])
+            start = np.concatenate([theta, np.zeros(len(added))])
+            self._polished = key, Polished(free, refined(experiment, free, start, width, self.record, self.smoothed))
+        return self._polished[1]
 
     def linear(self, values: Mapping[str, Numbers], theta: Array) -> Linear:
         """The model with some effects along the record."""
-        key = (*((name, *numbers.items()) for name, numbers in values.items()), theta.tobytes())
+        key = _key(values, theta)
         if key not in self._recent:
             if len(self._recent) == _RECENT:
                 self._recent.pop(next(iter(self._recent)))
             self._recent[key] = self._linear(with_effects(self.nominal, values), tuple(values), theta)
         return self._recent[key]
 
+    @property
+    def _torque(self) -> float:
+        """Size of the input, N m."""
+        return float(np.std(self.record.torque))  # type: ignore[arg-type]
+
     def _linear(self, experiment: Experiment, names: Names, theta: Array) -> Linear:
         paths = paths_of(names)
-        torque = float(np.std(self.record.torque))  # type: ignore[arg-type]
-        own = (*self.free, *free_parameters(experiment, paths, torque))
+        own = (*self.free, *free_parameters(experiment, paths, self._torque))
         prior = np.concatenate([self.prior, [_width(path) for path in paths]])
         centre = np.concatenate([-theta, np.zeros(len(paths))])
         at = np.concatenate([theta, np.zeros(len(paths))])
@@ -407,7 +430,13 @@ class Explainer:
 
     def remainder(self, model: Model) -> dict[str, tuple[float, float]]:
         """What free functions would earn beside a model (nats), and their size over the driving torque, by name."""
-        linear = model.linear
+        rest = self._remainder(model.linear)
+        if _most(rest) > CLEAR:
+            # errors of the smoothed motion cancel to first order only; along the predictor's own path nothing is approximate
+            rest = self._remainder(self.polished(model.numbers, model.theta).refined.linear)
+        return rest
+
+    def _remainder(self, linear: Linear) -> dict[str, tuple[float, float]]:
         smoothness, deviation = linear.choose(())
         functions = functions_of(linear.signals)
         columns = linear.columns(functions, smoothness, deviation)
@@ -492,7 +521,12 @@ def _verdict(left: float, findings: Sequence[Finding]) -> Verdict:
 
 
 def _most(rest: Mapping[str, tuple[float, float]]) -> float:
-    return max(gain for gain, _ in rest.values())
+    """What the best free function earns of those that are large enough for an effect."""
+    return max((gain for gain, share in rest.values() if share > LEAST), default=0.0)
+
+
+def _key(values: Mapping[str, Numbers], theta: Array) -> tuple:
+    return (*((name, *numbers.items()) for name, numbers in values.items()), theta.tobytes())
 
 
 def _finding(tried: Sequence[_Tried], model: Model, left: float) -> Finding:

@@ -44,6 +44,7 @@ class Refined(NamedTuple):
         deviation: standard deviation of theta, of data and prior together.
         smoothness: of the predictor, by side.
         start: positions and velocities at the first sample of each part, side by side, rad and rad/s.
+        linear: the model along the path of its predictor.
     """
 
     experiment: Experiment
@@ -51,6 +52,7 @@ class Refined(NamedTuple):
     deviation: Array
     smoothness: list[float]
     start: list[Array]
+    linear: Linear
 
 
 class _Point(NamedTuple):
@@ -211,4 +213,4 @@ def refined(
     refiner = _Refiner(experiment, free, width, record, smoothed)
     best = refiner.run(np.asarray(theta))
     model = with_values(experiment, free, jnp.asarray(best.theta))
-    return Refined(model, best.theta, refiner.deviation(best), best.predictor.smoothness, best.start)
+    return Refined(model, best.theta, refiner.deviation(best), best.predictor.smoothness, best.start, best.linear)

@@ -19,9 +19,8 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.discrepancy.complete import complete, joined
-from jaxbl.discrepancy.explain import Explainer, Explanation, Finding, Model, paths_of, with_effects
+from jaxbl.discrepancy.explain import Explainer, Explanation, Finding, Model
 from jaxbl.discrepancy.observed import Observed, compared, observed_torques
-from jaxbl.discrepancy.polish import refined
 from jaxbl.discrepancy.proof import WINDOW, Ground, Proof, foretold
 from jaxbl.discrepancy.residuals import Residual
 from jaxbl.discrepancy.where import SIGNIFICANT, Localised, Values, as_json, coordinates_of, describe, where
@@ -30,7 +29,7 @@ from jaxbl.drive.parameters import get_leaf, leaf_paths, parameters, set_leaves
 from jaxbl.errors import InputError
 from jaxbl.identification.regression import Kinematics
 from jaxbl.identification.search import smoothed_channels
-from jaxbl.identification.trajectory import WIDE, Free, free_parameters
+from jaxbl.identification.trajectory import Free, free_parameters
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
@@ -281,14 +280,14 @@ def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
 
     with jax.enable_x64(True):
         setting = _setting(task)
-        bare, nominal, own, prior, seen, other, lacking, located = setting
+        bare, nominal, own, _, seen, other, lacking, located = setting
         coordinates = _coordinates(nominal, seen, lacking)
         before = other.prove(_at(nominal, task.holdout))
         done()
-        explainer = Explainer(bare, own, prior.tolist(), record, seen.channels.smoothed)
+        explainer = _explainer(task, setting)
         found = explainer.run()
         done()
-        proving = _Proving(task, setting, before)
+        proving = _Proving(task, setting, explainer, before)
         fitted, after, withdrawn = proving.extended(found)
         done()
         if withdrawn:
@@ -337,8 +336,7 @@ def with_known(task: Task, effects: Mapping[str, Mapping[str, float]]) -> dict[s
     """
     with jax.enable_x64(True):
         setting = _setting(task)
-        numbers = {name: dict(one) for name, one in effects.items()}
-        fitted = _fitted(task, setting, numbers, np.zeros(len(setting.own)))
+        fitted = _fitted(_explainer(task, setting), effects, np.zeros(len(setting.own)))
         return setting.other.prove(_at(fitted.experiment, task.holdout)).errors
 
 
@@ -386,15 +384,13 @@ def _setting(task: Task) -> _Setting:
     return _Setting(bare, nominal, own, prior, seen, other, lacking, located)
 
 
-def _fitted(task: Task, setting: _Setting, numbers: Mapping[str, Mapping[str, float]], theta: np.ndarray) -> _Fitted:
+def _explainer(task: Task, setting: _Setting) -> Explainer:
+    return Explainer(setting.bare, setting.own, setting.prior.tolist(), task.record, setting.seen.channels.smoothed)
+
+
+def _fitted(explainer: Explainer, numbers: Mapping[str, Mapping[str, float]], theta: np.ndarray) -> _Fitted:
     """A model with some effects, its own numbers and theirs fitted from given ones."""
-    experiment = with_effects(setting.nominal, numbers)
-    assert task.record.torque is not None
-    added = free_parameters(experiment, paths_of(numbers), float(np.std(task.record.torque)))
-    free = (*setting.own, *added)
-    start = np.concatenate([np.asarray(theta), np.zeros(len(added))])
-    width = np.concatenate([setting.prior, np.full(len(added), WIDE)])
-    found = refined(experiment, free, start, width, task.record, setting.seen.channels.smoothed)
+    free, found = explainer.polished({name: dict(one) for name, one in numbers.items()}, theta)
     return _Fitted(tuple(numbers), found.experiment, free, found.theta, found.deviation)
 
 
@@ -486,8 +482,8 @@ class _Witness:
 class _Proving:
     """Models fitted on the log, and held against what was held out."""
 
-    def __init__(self, task: Task, setting: _Setting, before: Proof):
-        self.task, self.setting, self.before = task, setting, before
+    def __init__(self, task: Task, setting: _Setting, explainer: Explainer, before: Proof):
+        self.task, self.setting, self.explainer, self.before = task, setting, explainer, before
         self.nominal, self.own, self.other = setting.nominal, setting.own, setting.other
         self.floor = self.other.floor(before.torques)
 
@@ -496,7 +492,7 @@ class _Proving:
         names, withdrawn = found.model.names, []
         while True:
             base = found.model if names else found.nominal
-            fitted = _fitted(self.task, self.setting, {name: base.numbers[name] for name in names}, base.theta)
+            fitted = _fitted(self.explainer, {name: base.numbers[name] for name in names}, base.theta)
             after = self.other.prove(self.at(fitted.experiment))
             if not self.worse(after):
                 return fitted, after, withdrawn

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hidden_log import FRICTION, logged, model
 
+import jaxbl.discrepancy.explain as explain
 import jaxbl.study.diagnosis as under_test
 from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.errors import InputError
@@ -129,7 +130,7 @@ def test_a_number_that_ends_far_from_what_is_known_of_it_is_told():
 
 def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
     """The fit is made to end at a number that is far off."""
-    real = under_test.refined
+    real = explain.refined
 
     def spoilt(experiment, free, *rest):
         found = real(experiment, free, *rest)
@@ -139,7 +140,7 @@ def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
         wrong = set_leaves(found.experiment, {path: 4.0 * get_leaf(found.experiment, path)})
         return found._replace(experiment=wrong)
 
-    monkeypatch.setattr(under_test, "refined", spoilt)
+    monkeypatch.setattr(explain, "refined", spoilt)
     task = read_task(logs / "axis.csv", model(), holdout=logs / "other.csv")
     stages = []
     found = run_task(task, lambda *at: stages.append(at))
