@@ -8,6 +8,7 @@ Computation 4 (1992); R. Kass, A. Raftery, Bayes factors, JASA 90 (1995).
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -29,6 +30,7 @@ class Columns:
         offsets: column of each variant's offset, or -1.
         scale: prior standard deviation of each column's coefficient; infinite where it does nothing along this record.
         centre: prior mean of each.
+        bound: standard deviations of its prior that each of the model's own numbers may be off at most; shape (own,).
         twins: columns that are a multiple of one of the model's own, which is always there: that one, and the factor. Only
             their priors part the two, so that these are joined: the data's precision may be too large for them to be seen.
     """
@@ -39,6 +41,7 @@ class Columns:
     offsets: tuple[int, ...]
     scale: Array
     centre: Array
+    bound: Array
     twins: Mapping[int, tuple[int, float]] = dataclasses.field(default_factory=dict)
 
 
@@ -92,18 +95,25 @@ class Scorer:
         inner = c.products[np.ix_(chosen, chosen)]
         towards = c.products[np.ix_(chosen, fixed)].sum(axis=1)
         total = c.products[np.ix_(fixed, fixed)].sum()
-        precision = 1.0 / variance[chosen]
-        centre = middle[chosen]
-        matrix = inner + np.diag(precision)
-        towards = towards - precision * centre
-        total = total + float(precision @ centre**2)
-        size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-        root = _root(matrix / np.outer(size, size))
-        if root is None:
-            return None
-        inside = solve_triangular(root, towards / size, lower=True)
-        coefficients = -solve_triangular(root, inside, lower=True, trans=1) / size
-        cost = total - float(inside @ inside)
+        spread, centre = np.sqrt(variance[chosen]), middle[chosen]
+        bound = np.where(chosen <= c.own, np.append(c.bound, np.inf)[np.minimum(chosen - 1, c.own)], np.inf)
+        free, coefficients = np.ones(len(chosen), bool), np.zeros(len(chosen))
+        while True:
+            known = np.where(free, 0.0, coefficients)
+            at = np.ix_(free, free)
+            rest = total + float(2.0 * towards @ known + known @ inner @ known)
+            solved = _solved(inner[at], (towards + inner @ known)[free], rest, spread[free], centre[free])
+            if solved is None:
+                return None
+            coefficients = known
+            coefficients[free] = solved.coefficients
+            away = (coefficients - centre) / spread
+            over = free & (np.abs(away) > bound)
+            if not over.any():
+                break
+            # what is beyond its bound stays at it
+            coefficients = np.where(over, centre + np.sign(away) * bound * spread, coefficients)
+            free &= ~over
         values[chosen] = coefficients
         # the sum's distance from its mean is shared out by the variances
         away = values - middle
@@ -120,11 +130,33 @@ class Scorer:
                 return None
             numbers.append(found)
             place += width
-        spread = 2.0 * float(np.sum(np.log(np.diag(root)))) + 2.0 * float(np.sum(np.log(size)))
-        prior = float(np.sum(np.log(variance[chosen])))
-        evidence = -0.5 * (cost + spread + prior)
-        misfit = cost - float(precision @ (coefficients - centre) ** 2)
+        held = float(np.sum(((coefficients - centre) / spread)[~free] ** 2))
+        evidence = -0.5 * (solved.cost + held + solved.determinant + 2.0 * float(np.sum(np.log(spread[free]))))
+        misfit = solved.cost - float(np.sum(((coefficients - centre) / spread)[free] ** 2))
         return Set(which, evidence, misfit, tuple(numbers), values[self.base])
+
+
+class _Solved(NamedTuple):
+    """Coefficients of least squares with a prior, the least cost, and the logarithm of the determinant of the precision."""
+
+    coefficients: Array
+    cost: float
+    determinant: float
+
+
+def _solved(inner: Array, towards: Array, total: float, spread: Array, centre: Array) -> _Solved | None:
+    precision = spread**-2.0
+    matrix = inner + np.diag(precision)
+    towards = towards - precision * centre
+    total = total + float(precision @ centre**2)
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    root = _root(matrix / np.outer(size, size))
+    if root is None:
+        return None
+    inside = solve_triangular(root, towards / size, lower=True)
+    coefficients = -solve_triangular(root, inside, lower=True, trans=1) / size
+    determinant = 2.0 * float(np.sum(np.log(np.diag(root)))) + 2.0 * float(np.sum(np.log(size)))
+    return _Solved(coefficients, total - float(inside @ inside), determinant)
 
 
 def _root(unit: Array) -> Array | None:

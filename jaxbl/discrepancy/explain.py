@@ -40,6 +40,8 @@ _FINALISTS, _LEADERS = 5, 3
 _BEHIND = 0.5
 """Share of the best gain in evidence that a finalist must reach (or be within :data:`_NEAR`)."""
 _NEAR = 25.0
+FAR = 5.0
+"""Standard deviations of what is known of a number that it can hardly be off."""
 _STEPS = 15
 _SETTLED = 2e-3
 _LEAST_GAIN = 1e-3
@@ -195,6 +197,7 @@ class Explainer:
         prior: Sequence[float],
         record: Record,
         smoothed: Mapping[str, Sequence[Smoothed]],
+        bound: float = np.inf,
     ):
         """Prepare to explain a record.
 
@@ -205,7 +208,9 @@ class Explainer:
             prior: relative standard deviation of each.
             record: the log.
             smoothed: its positions, part by part (:func:`jaxbl.identification.search.smoothed_channels`).
+            bound: standard deviations that each number may be off while effects are sought.
         """
+        self.bound = bound
         self.nominal, self.free, self.prior = complete(experiment), tuple(free), np.asarray(prior)
         self.lacking = candidates(experiment)
         self.record, self.smoothed = record, smoothed
@@ -224,6 +229,11 @@ class Explainer:
             start = np.concatenate([theta, np.zeros(len(added))])
             self._polished = key, Polished(free, refined(experiment, free, start, width, self.record, self.smoothed))
         return self._polished[1]
+
+    def plausible(self, found: Explanation) -> bool:
+        """Whether the model's own numbers, fitted to the last digit, are where they may be by what is known of them."""
+        theta = self.polished(found.model.numbers, found.model.theta).refined.theta[: len(self.free)]
+        return bool(np.all(np.abs(theta) < FAR * self.prior))
 
     def linear(self, values: Mapping[str, Numbers], theta: Array) -> Linear:
         """The model with some effects along the record."""
@@ -245,7 +255,8 @@ class Explainer:
         prior = np.concatenate([self.prior, [_width(path) for path in paths]])
         centre = np.concatenate([-theta, np.zeros(len(paths))])
         at = np.concatenate([theta, np.zeros(len(paths))])
-        return Linear(experiment, own, at, prior, centre, self.record, self.smoothed)
+        bound = np.concatenate([np.full(len(self.free), self.bound), np.full(len(paths), np.inf)])
+        return Linear(experiment, own, at, prior, centre, self.record, self.smoothed, bound)
 
     def refit(
         self, names: Names, numbers: Mapping[str, Numbers], theta: Array, smoothness: Sequence[float], deviation: Array
@@ -327,6 +338,12 @@ class Explainer:
             record = [_Tried(model.names[-1], gain, model.numbers[model.names[-1]]) for gain, model in tried]
             current, gone = self._pruned(current, smoothness)
             found = {name: one for name, one in found.items() if name not in gone} | {record[0].name: record}
+            current, renamed = self._simplified(current, smoothness)
+            found = {renamed.get(name, name): one for name, one in found.items()}
+            for plain in renamed.values():
+                first, *rivals = found[plain]
+                rivals = [one for one in rivals if one.name != plain]
+                found[plain] = [_Tried(plain, first.gain, current.numbers[plain]), *rivals]
             wrong = others[0][1] if others else None
             rest = self.remainder(current)
             # next to what no effect explains, this one is little: more of them would dress up as that
@@ -385,6 +402,23 @@ class Explainer:
             if self._gain(less, full) <= 0.0:
                 model, gone = less, gone | {name}
         return model, gone
+
+    def _simplified(self, model: Model, smoothness: Sequence[float]) -> tuple[Model, dict[str, str]]:
+        """A model in which friction that need not fall with speed does not, and the effects' new names."""
+        renamed: dict[str, str] = {}
+        for name in model.names:
+            place, kind = name.split(".")
+            if kind != "stribeck_friction":
+                continue
+            plain = f"{place}.coulomb_friction"
+            deviation = model.linear.deviation(smoothness)
+            full = self.refit(model.names, model.numbers, model.theta, smoothness, deviation)
+            numbers = {plain if a == name else a: b for a, b in full.numbers.items()}
+            numbers[plain] = {"torque": full.numbers[name]["torque"]}
+            less = self.refit(tuple(numbers), numbers, full.theta, smoothness, deviation)
+            if self._gain(less, full) <= 0.0:
+                model, renamed = less, renamed | {name: plain}
+        return model, renamed
 
     def _round(self, current: Model) -> tuple[list[float], list[tuple[float, Model]]]:
         """Models with one effect more, and what each earns (nats), best first."""

@@ -275,20 +275,17 @@ class Predictor:
             self._nothing(grams)
             return
         weight = np.ones(sides)
-        precision, centre = np.zeros(width), np.zeros(width)
-        centre[:own] = linear.centre
+        prior, centre = np.full(width, np.inf), np.zeros(width)
+        prior[:own], centre[:own] = linear.prior, linear.centre
+        bound = np.concatenate([linear.bound, np.full(width - own, np.inf)])
         for turn in range(2):
             weighted = [np.einsum("s,scd->cd", weight, one) for one in grams]
             total = np.sum([_eliminated(one, states) for one in weighted], axis=0)
             variance = 1.0 if turn else max(total[0, 0] / (count * sides), 1e-300)
-            precision[:own] = variance / linear.prior**2
-            matrix = total[1:, 1:] + np.diag(precision)
-            if total[0, 0] < 0.0 or np.min(np.diag(matrix), initial=0.0) < 0.0:
+            if total[0, 0] < 0.0 or np.min(np.diag(total)[1:], initial=0.0) < 0.0:
                 self._nothing(grams)
                 return
-            size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-            towards = (total[1:, 0] - precision * centre) / size
-            found = -np.linalg.lstsq(matrix / np.outer(size, size), towards, rcond=1e-12)[0] / size
+            found = _least_squares(total, variance / prior**2, centre, bound * prior)
             free = np.concatenate([[1.0], found])
             self.coefficients = [np.concatenate([free, -_response(one, states) @ free]) for one in weighted]
             self.squares = np.sum(
@@ -322,8 +319,11 @@ class Linear:
         centre: np.ndarray,
         record: Record,
         smoothed: Mapping[str, Sequence[Smoothed]],
+        bound: np.ndarray | None = None,
     ):
-        """Args as of :func:`linearise`; `prior` and `centre` are of the change of each number from theta."""
+        """Args as of :func:`linearise`; `prior` and `centre` are of the change of each number from theta, `bound` says how
+        many standard deviations it may be from `centre` (left out: any number)."""
+        self.bound = np.full(len(free), np.inf) if bound is None else bound
         self.free, self.theta, self.prior, self.centre = tuple(free), np.asarray(theta), prior, centre
         self.experiment = with_values(experiment, free, jnp.asarray(self.theta))
         self.period, self.sides = record.sample_period, experiment.sides
@@ -540,7 +540,7 @@ class Linear:
                 scale[list(place)] = np.minimum(scale[list(place)], OFF * nominal)
         centre = np.zeros(at)
         centre[1 : 1 + own] = self.centre
-        return Columns(total, own, tuple(places), tuple(offsets), scale, centre, self._twins(variants, places))
+        return Columns(total, own, tuple(places), tuple(offsets), scale, centre, self.bound, self._twins(variants, places))
 
     def _twins(self, variants: Sequence[Candidate], places: Sequence[tuple[int, ...]]) -> dict[int, tuple[int, float]]:
         """Columns that are those of other numbers: the error of a number that is free acts as that number does."""
@@ -591,6 +591,25 @@ class Linear:
         drive = self.experiment.drive
         value = float(drive.inertia(side) if kind == "inertia" else drive.viscous(side))
         return value if value > 0.0 else None
+
+
+def _least_squares(total: np.ndarray, precision: np.ndarray, centre: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Coefficients of the columns behind the first with a prior; none is further from its centre than `reach`."""
+    fixed = np.zeros(len(centre), bool)
+    at = centre.copy()
+    while True:
+        matrix = total[1:, 1:] + np.diag(precision)
+        size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        towards = total[1:, 0] - precision * centre + matrix[:, fixed] @ at[fixed]
+        free = ~fixed
+        unit = (matrix / np.outer(size, size))[np.ix_(free, free)]
+        found = at.copy()
+        found[free] = -np.linalg.lstsq(unit, (towards / size)[free], rcond=1e-12)[0] / size[free]
+        over = free & (np.abs(found - centre) > reach)
+        if not over.any():
+            return found
+        at[over] = centre[over] + np.sign(found - centre)[over] * reach[over]
+        fixed |= over
 
 
 def _scaled(gram: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:

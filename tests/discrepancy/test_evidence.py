@@ -4,9 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 from scipy.stats import multivariate_normal
 
 from jaxbl.discrepancy.evidence import Columns, Scorer
+from jaxbl.discrepancy.linear import _least_squares
 
 
 @dataclasses.dataclass
@@ -21,7 +23,7 @@ class Candidate:
 def columns(design, errors, scale, centre, **more):
     """Two own numbers, one candidate; errors of unit variance are `errors` plus the columns."""
     whole = np.column_stack([errors, design])
-    return Columns(whole.T @ whole, 2, ((3,),), (-1,), np.r_[np.inf, scale], np.r_[0.0, centre], **more)
+    return Columns(whole.T @ whole, 2, ((3,),), (-1,), np.r_[np.inf, scale], np.r_[0.0, centre], np.full(2, np.inf), **more)
 
 
 def drawn(size=1.0):
@@ -62,3 +64,23 @@ def test_twins_are_parted_by_their_priors(size):
         assert found.log_evidence == pytest.approx(together.log_evidence, rel=1e-6)
         np.testing.assert_allclose(found.own, together.own, atol=1e-6)
         assert value == pytest.approx(together.numbers[0]["value"], abs=1e-6)
+
+
+def test_a_number_is_held_at_its_bound():
+    """Against SciPy's bounded least squares; the other numbers, and the misfit, make the best of it."""
+    design, errors = drawn()
+    scale, centre = np.array([0.05, 0.5, 0.7]), np.array([0.01, 0.0, 0.0])
+    given = columns(design, errors, scale, centre)
+    free, held = (
+        Scorer(dataclasses.replace(given, bound=np.array([one, np.inf])), [Candidate()])((0,)) for one in (np.inf, 0.3)
+    )
+    assert abs(free.own[0] - centre[0]) > 0.3 * scale[0]
+    stacked, towards = np.vstack([design, np.diag(1.0 / scale)]), np.concatenate([-errors, centre / scale])
+    reach = np.array([0.3 * scale[0], np.inf, np.inf])
+    expected = lsq_linear(stacked, towards, (centre - reach, centre + reach), tol=1e-12).x
+    np.testing.assert_allclose([*held.own, held.numbers[0]["value"]], expected, atol=1e-6)
+    assert held.misfit == pytest.approx(np.sum((errors + design @ expected) ** 2), rel=1e-6)
+    assert held.misfit > free.misfit
+    total = np.asarray(given.products)
+    found = _least_squares(total, scale**-2.0, centre, reach)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
