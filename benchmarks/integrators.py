@@ -38,7 +38,7 @@ HALF_GAP = 0.08
 
 
 # Schemes: (plant, state, torque, time, step, smoothing) -> state. `smoothing` is the velocity over which the others turn
-# dry friction into a tanh; Moreau's midpoint projects and has no use for it.
+# dry friction into a tanh; Moreau's midpoint takes it as it is.
 
 
 def accelerations(plant, position, velocity, torque, smoothing):
