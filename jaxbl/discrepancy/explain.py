@@ -42,6 +42,8 @@ _BEHIND = 0.5
 _NEAR = 25.0
 FAR = 5.0
 """Standard deviations of what is known of a number that it can hardly be off."""
+_WEAK = 6.0
+"""Standard errors up to which an effect's torque is small enough for the effect to be needless."""
 _STEPS = 15
 _SETTLED = 2e-3
 _LEAST_GAIN = 1e-3
@@ -358,6 +360,13 @@ class Explainer:
             # what was seen beside an effect that was little next to it is there without that effect too
             rest = {name: max(rest[name], one) for name, one in self.remainder(current).items()}
             left = _most(rest)
+        if len(found) > 1:
+            settled = self._settled(current)
+            if settled.names != current.names:
+                current, wrong = settled, wrong if current.names[-1] in settled.names else None
+                found = {name: tried for name, tried in found.items() if name in current.names}
+                rest = self.remainder(current)
+                left = _most(rest)
         findings = tuple(_finding(one, current, left) for one in found.values())
         return Explanation(_verdict(left, findings), findings, current, nominal, wrong, rest)
 
@@ -402,6 +411,28 @@ class Explainer:
             if self._gain(less, full) <= 0.0:
                 model, gone = less, gone | {name}
         return model, gone
+
+    def _settled(self, model: Model) -> Model:
+        """A model without effects that are needless once all numbers are those of least prediction errors: where a fit
+        along the smoothed motion had ended wrong, an effect may have been found that only made up for it."""
+        free, best = self.polished(model.numbers, model.theta)
+        count = len(self.free)
+        numbers = {name: dict(one) for name, one in model.numbers.items()}
+        weak: set[str] = set()
+        for one, at, by in zip(free[count:], best.theta[count:], best.deviation[count:], strict=True):
+            name, leaf = one.path.removeprefix("effects.").rsplit(".", 1)
+            numbers[name][leaf] = float(one.value(at))
+            if leaf in _AMPLITUDES and abs(numbers[name][leaf]) < _WEAK * float(one.slope(at)) * by:
+                weak.add(name)
+        theta = best.theta[:count]
+        for name in sorted(weak, key=model.names.index, reverse=True):
+            names = tuple(one for one in model.names if one != name)
+            smoothness, deviation = self.linear(numbers, theta).choose(())
+            full = self.refit(model.names, numbers, theta, smoothness, deviation)
+            less = self.refit(names, numbers, theta, smoothness, deviation)
+            if names and self._gain(less, full) <= 0.0:
+                model, numbers, theta = less, less.numbers, less.theta
+        return model
 
     def _simplified(self, model: Model, smoothness: Sequence[float]) -> tuple[Model, dict[str, str]]:
         """A model in which friction that need not fall with speed does not, and the effects' new names."""

@@ -20,6 +20,8 @@ import pandas as pd
 
 from jaxbl.discrepancy.complete import complete, joined
 from jaxbl.discrepancy.explain import FAR, Explainer, Explanation, Finding, Model
+from jaxbl.discrepancy.input_noise import noise_of, smoothed_input
+from jaxbl.discrepancy.linear import Linear
 from jaxbl.discrepancy.observed import Observed, compared, observed_torques
 from jaxbl.discrepancy.proof import WINDOW, Ground, Proof, foretold
 from jaxbl.discrepancy.residuals import Residual
@@ -62,6 +64,10 @@ _ALIKE = 4.0
 """Factor between the inertias that two logs of one machine may show."""
 _BOUND = 4.0
 """Standard deviations that the model's own numbers may be off where they are held."""
+_NOISY = 1e-3
+"""Noise over the input's rms from which on it is asked whether the drive felt it."""
+_TOLD = 3.0
+"""Nats by which it is told."""
 _HIDDEN = 0.3
 """Share of the driving torque: where a torque of that size would not have been seen, noise hides everything."""
 
@@ -280,11 +286,11 @@ def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
 
     with jax.enable_x64(True):
         setting = _setting(task)
-        bare, nominal, own, _, seen, other, lacking, located = setting
+        bare, nominal, own, _, seen, other, lacking, located, noise = setting
         coordinates = _coordinates(nominal, seen, lacking)
         before = other.prove(_at(nominal, task.holdout))
         done()
-        explainer, found = _explained(task, setting)
+        explainer, found = _explained(setting)
         done()
         proving = _Proving(task, setting, explainer, before)
         fitted, after, withdrawn = proving.extended(found)
@@ -305,6 +311,8 @@ def run_task(task: Task, progress: Progress | None = None) -> Diagnosis:
         trace = trace.assign(**witness.columns(len(trace)))
         model = _model(config, fitted.numbers, fitted.own | gain_values)
         summary = _summary(task, fitted, found, withdrawn, located)
+        if noise > 0.0:
+            summary["notes"].append(_noise_said(record, noise))
         witness.tell(summary, lacking)
         summary["gap"] = gap
         if left:
@@ -335,7 +343,7 @@ def with_known(task: Task, effects: Mapping[str, Mapping[str, float]]) -> dict[s
     """
     with jax.enable_x64(True):
         setting = _setting(task)
-        fitted = _fitted(_explainer(task, setting), effects, np.zeros(len(setting.own)))
+        fitted = _fitted(_explainer(setting), effects, np.zeros(len(setting.own)))
         return setting.other.prove(_at(fitted.experiment, task.holdout)).errors
 
 
@@ -351,6 +359,7 @@ class _Setting(NamedTuple):
         other: what was held out.
         lacking: torques that the model lacks on the log, by side.
         located: where they live.
+        torque_noise: of the channel that recorded the input, N m, which `seen` and `other` are without; 0 where it drives.
     """
 
     bare: Experiment
@@ -361,6 +370,7 @@ class _Setting(NamedTuple):
     other: Ground
     lacking: dict[str, list[Residual]]
     located: dict[str, Localised]
+    torque_noise: float
 
 
 def _setting(task: Task) -> _Setting:
@@ -376,29 +386,49 @@ def _setting(task: Task) -> _Setting:
     seen, other = (_ground(nominal, one, rest) for one in (record, task.holdout))
     other = dataclasses.replace(other, rest=rest and task.separate)
     _check_stable(task, nominal, seen)
+    noise = _torque_noise(record, nominal, own, seen)
+    if noise > 0.0:
+        seen, other = (_driven(one, smoothed_input(one.record, noise)) for one in (seen, other))
     lacking = seen.torques(nominal)
     located = where(nominal, lacking, seen.parts, seen.smoothed, rotating=_rotating(record, nominal))
     bandwidth = {name: one.bandwidth for name, one in located.items()}
     seen, other = (dataclasses.replace(one, bandwidth=bandwidth) for one in (seen, other))
-    return _Setting(bare, nominal, own, prior, seen, other, lacking, located)
+    return _Setting(bare, nominal, own, prior, seen, other, lacking, located, noise)
 
 
-def _explainer(task: Task, setting: _Setting, bound: float = np.inf) -> Explainer:
+def _torque_noise(record: Record, nominal: Experiment, own: Sequence[Free], seen: Ground) -> float:
+    """Noise of the channel that recorded the input, N m, where the drive does not feel it; 0 where it does.
+
+    Both inputs drive the model as given: that of the less surprising motion is the one that acted. Noise is like nothing
+    that the model lacks, so that a few nats tell.
+    """
+    noise, size = noise_of(record), _rms_of(record)
+    if not _NOISY * size < noise:
+        return 0.0
+    none, width = np.zeros(len(own)), np.ones(len(own))
+    costs = []
+    for one in (record, smoothed_input(record, noise)):
+        linear = Linear(nominal, own, none, width, none, one, seen.channels.smoothed, none)
+        costs.append(linear.predictor(linear.choose(())[0]).cost(none, width))
+    return noise if costs[0] - costs[1] > 2.0 * _TOLD else 0.0
+
+
+def _explainer(setting: _Setting, bound: float = np.inf) -> Explainer:
     smoothed = setting.seen.channels.smoothed
-    return Explainer(setting.bare, setting.own, setting.prior.tolist(), task.record, smoothed, bound)
+    return Explainer(setting.bare, setting.own, setting.prior.tolist(), setting.seen.record, smoothed, bound)
 
 
-def _explained(task: Task, setting: _Setting) -> tuple[Explainer, Explanation]:
+def _explained(setting: _Setting) -> tuple[Explainer, Explanation]:
     """What the log says that the model lacks.
 
     For want of two effects at once the model's own numbers may go astray, and hide both. If they do, effects are sought with
     these numbers held near to what is known of them; what that finds counts if it explains the log, with numbers that are
     there without being held.
     """
-    explainer = _explainer(task, setting)
+    explainer = _explainer(setting)
     found = explainer.run()
     if not explainer.plausible(found):
-        other = _explainer(task, setting, _BOUND)
+        other = _explainer(setting, _BOUND)
         again = other.run()
         if again.verdict != "unknown_effect" and other.plausible(again):
             return other, again
@@ -412,10 +442,13 @@ def _fitted(explainer: Explainer, numbers: Mapping[str, Mapping[str, float]], th
 
 
 def _ground(nominal: Experiment, record: Record, rest: bool) -> Ground:
-    channels = smoothed_channels(record, nominal.sides)
+    return _driven(Ground(record, smoothed_channels(record, nominal.sides), (), {}, rest), record)
+
+
+def _driven(ground: Ground, record: Record) -> Ground:
+    """A record with another input in place of a ground's."""
     # nothing is decimated here
-    parts = kinematics_of(record, channels, 1)
-    return Ground(record, channels, parts, {}, rest)
+    return dataclasses.replace(ground, record=record, parts=kinematics_of(record, ground.channels, 1))
 
 
 def _rotating(record: Record, nominal: Experiment) -> dict[str, bool]:
@@ -724,6 +757,14 @@ def _far_off(own: Sequence[Free], values: Mapping[str, float], uncertainty: floa
                 "findings may make up for it, or it for them. Noise of the torque channel does it, or too small a relative."
             )
     return lines
+
+
+def _noise_said(record: Record, noise: float) -> str:
+    unit = unit_on(record, "motor.torque", "N m")
+    return (
+        f"The channel u carries noise of {noise:.2g} {unit} rms ({noise / _rms_of(record):.1%} of the input) that the drive "
+        "does not feel: models are driven by u smoothed between its jumps."
+    )
 
 
 def _least_seen(record: Record, located: Mapping[str, Localised]) -> list[str]:

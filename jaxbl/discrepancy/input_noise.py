@@ -1,0 +1,89 @@
+"""Noise of the channel that recorded the input: noise that the drive never felt.
+
+The model is driven by the recorded torque. Where that carries noise of its own the model shakes, and the machine did not;
+fits then choose whatever shakes less: a lag, a larger motor inertia. A recorded input is smoothed between its jumps
+(penalised third differences, generalised cross-validation); which of the two drove the machine, its motion tells.
+References: P. Eilers, A perfect smoother, Analytical Chemistry 75 (2003); P. Craven, G. Wahba, Smoothing noisy data with
+spline functions, Numerische Mathematik 31 (1979).
+"""
+
+import dataclasses
+import itertools
+
+import numpy as np
+from scipy.linalg import solveh_banded
+
+from jaxbl.records import Record
+
+Array = np.ndarray
+
+_JUMP = 6.0
+"""Standard deviations of the noise that a jump must stand out by."""
+_FEWEST = 8
+"""Samples between two jumps that can be smoothed."""
+_MEDIAN = 1.4826
+"""Standard deviation over the median absolute value, of a Gaussian."""
+_CUTOFFS = np.geomspace(0.015, 2.0, 30)
+"""Corner frequencies tried, rad a sample."""
+
+
+def noise_of(record: Record) -> float:
+    """Standard deviation of the input's white noise, N m, from its fourth differences: what is smooth is not in them, nor
+    are jumps, of which there are few."""
+    assert record.torque is not None
+    found = np.concatenate([np.diff(record.torque[part], n=4) for part in record.segments])
+    return float(_MEDIAN * np.median(np.abs(found)) / np.sqrt(70.0))
+
+
+def smoothed_input(record: Record, noise: float) -> Record:
+    """A record with its input smoothed between jumps; `noise`: its standard deviation, N m."""
+    assert record.torque is not None
+    torque = record.torque.copy()
+    for part in record.segments:
+        values = record.torque[part]
+        ends = [0, *jumps(values, noise), len(values)]
+        for first, last in itertools.pairwise(ends):
+            if last - first >= _FEWEST:
+                torque[part.start + first : part.start + last] = _smoothed(values[first:last])
+    return dataclasses.replace(record, torque=torque)
+
+
+def jumps(torque: Array, noise: float) -> list[int]:
+    """First samples after jumps: differences that stand out from those beside them."""
+    change = np.diff(torque)
+    beside = np.pad(change, 1, mode="edge")
+    beyond = np.abs(change - 0.5 * (beside[:-2] + beside[2:]))
+    highest = (beyond >= np.append(beyond[1:], 0.0)) & (beyond > np.insert(beyond[:-1], 0, 0.0))
+    return (1 + np.flatnonzero(highest & (beyond > _JUMP * np.sqrt(5.0) * noise))).tolist()
+
+
+_ORDER = 3
+
+
+def _smoothed(values: Array) -> Array:
+    """The smooth curve that generalised cross-validation chooses."""
+    count = len(values)
+    penalty = _penalty(count)
+    frequency = np.linspace(0.0, np.pi, 4096)
+    best, least = values, np.inf
+    for cutoff in _CUTOFFS:
+        # half of a wave of this frequency is let through
+        weight = (2.0 * np.sin(0.5 * cutoff)) ** (-2.0 * _ORDER)
+        matrix = weight * penalty
+        matrix[0] += 1.0
+        found = solveh_banded(matrix, values, lower=True)
+        freedom = np.mean(1.0 / (1.0 + weight * (2.0 * np.sin(0.5 * frequency)) ** (2 * _ORDER))) + _ORDER / count
+        score = np.mean((values - found) ** 2) / max(1.0 - freedom, 1e-3) ** 2
+        if score < least:
+            best, least = found, score
+    return best
+
+
+def _penalty(count: int) -> Array:
+    """Products of third differences, as lower bands."""
+    stencil = np.diff(np.eye(_ORDER + 1), n=_ORDER, axis=0)[0]
+    bands = np.zeros((_ORDER + 1, count))
+    for start in range(_ORDER + 1):
+        for other in range(start, _ORDER + 1):
+            bands[other - start, start : start + count - _ORDER] += stencil[start] * stencil[other]
+    return bands
