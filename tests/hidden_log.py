@@ -34,15 +34,23 @@ def model(**tables: Any) -> dict[str, Any]:
 
 
 @cache
-def logged(effects: tuple[str, ...] = ("friction",), seed: int = 1, noise: float = 3e-5, inertia: float = 0.02) -> Log:
-    """4 s of a multisine."""
+def logged(
+    effects: tuple[str, ...] = ("friction",),
+    seed: int = 1,
+    noise: float = 3e-5,
+    inertia: float = 0.02,
+    torque_noise: float = 0.0,
+    felt: bool = False,
+) -> Log:
+    """4 s of a multisine; `torque_noise`: of the recorded input, N m, which the drive has felt or not."""
     t = 2e-3 * np.arange(2000)
     phases = np.random.default_rng(seed).uniform(-np.pi, np.pi, 6)
     k = np.arange(1, 7)
     torque = 0.3 * np.sum(np.sin(2.0 * np.pi * 0.5 * k[:, None] * t + phases[:, None]), axis=0)
     machine = Machine(DRIVE | {"motor_inertia": inertia}, None, [FRICTION] if effects else [])
-    (trace,) = simulate([Run(machine, 2e-3, torque, motor_noise=noise, seed=seed)])
-    return Log(trace.t, trace.u, trace.theta_e, None)
+    shaking = torque_noise * np.random.default_rng(seed + 100).standard_normal(len(t))
+    (trace,) = simulate([Run(machine, 2e-3, torque + shaking * felt, motor_noise=noise, seed=seed)])
+    return Log(trace.t, trace.u + shaking * (not felt), trace.theta_e, None)
 
 
 @cache

@@ -353,20 +353,17 @@ class Explainer:
                 break
         rest = self.remainder(current) if rest is None else rest
         left = _most(rest)
+        before = current.names
         if left > CLEAR and found:
-            before = current.names
             current, found = self._plain(current, found, left)
-            wrong = wrong if current.names == before else None
+        if len(current.names) > 1:
+            current = self._settled(current)
+            found = {name: tried for name, tried in found.items() if name in current.names}
+        if current.names != before:
+            wrong = wrong if current.names[-1:] == before[-1:] else None
             # what was seen beside an effect that was little next to it is there without that effect too
             rest = {name: max(rest[name], one) for name, one in self.remainder(current).items()}
             left = _most(rest)
-        if len(found) > 1:
-            settled = self._settled(current)
-            if settled.names != current.names:
-                current, wrong = settled, wrong if current.names[-1] in settled.names else None
-                found = {name: tried for name, tried in found.items() if name in current.names}
-                rest = self.remainder(current)
-                left = _most(rest)
         findings = tuple(_finding(one, current, left) for one in found.values())
         return Explanation(_verdict(left, findings), findings, current, nominal, wrong, rest)
 

@@ -17,7 +17,7 @@ from jaxbl.records import Record
 
 Array = np.ndarray
 
-_JUMP = 6.0
+_JUMP = 5.0
 """Standard deviations of the noise that a jump must stand out by."""
 _FEWEST = 8
 """Samples between two jumps that can be smoothed."""

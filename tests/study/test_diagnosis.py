@@ -47,6 +47,29 @@ def test_the_missing_effect_is_named_with_its_number(found):
         assert summary["parameters"][path]["value"] == pytest.approx(true, rel=0.02)
 
 
+def test_noise_of_the_input_that_was_not_felt_does_not_drive_the_model(tmp_path):
+    log = logged(torque_noise=0.02)
+    log.write(tmp_path / "axis.csv")
+    found = diagnose(tmp_path / "axis.csv", model())
+    (one,) = found.summary["findings"]
+    assert one["effect"] == "motor.coulomb_friction"
+    assert one["parameters"]["torque"]["value"] == pytest.approx(FRICTION["torque"], rel=0.02)
+    (note,) = (note for note in found.summary["notes"] if "does not feel" in note)
+    assert note.startswith("The channel u carries noise of 0.02")
+    np.testing.assert_allclose(found.trace["u"], log.u, rtol=1e-9)
+
+
+@pytest.mark.parametrize("felt", [False, True])
+def test_the_motion_tells_whether_noise_of_the_input_was_felt(felt, tmp_path):
+    logged(torque_noise=0.02, felt=felt).write(tmp_path / "axis.csv")
+    task = read_task(tmp_path / "axis.csv", model())
+    with jax.enable_x64(True):
+        setting = under_test._setting(task)
+    assert setting.torque_noise == (0.0 if felt else pytest.approx(0.02, rel=0.1))
+    for ground, record in ((setting.seen, task.record), (setting.other, task.holdout)):
+        assert np.array_equal(ground.record.torque, record.torque) is felt
+
+
 def test_the_gap_shrinks_to_the_noise_on_what_was_held_out(found):
     gap = found.summary["gap"]
     assert gap["holdout"]["separate"] is False and gap["holdout"]["from"] == pytest.approx(3.0)
