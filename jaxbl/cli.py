@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import os
 import shlex
 import signal
@@ -232,10 +233,27 @@ def diagnose(
         Path | None,
         typer.Option("--next-experiment", metavar="FILE.csv", help="write the input that would part tied effects"),
     ] = None,
+    max_torque: Annotated[
+        float | None,
+        typer.Option("--max-torque", metavar="N·m", help="that the next experiment may ask for [default: the log's]"),
+    ] = None,
+    max_travel: Annotated[
+        float | None,
+        typer.Option(
+            "--max-travel",
+            metavar="RAD",
+            help="of its motor (m on a linear axis) [default: the log's]",
+        ),
+    ] = None,
     out: LogOutOption = None,
     overwrite: LogOverwriteOption = False,
 ) -> None:
     """Find what a model lacks, name it, add it, and prove on held-out data that the gap shrinks."""
+    for name, limit in (("--max-torque", max_torque), ("--max-travel", max_travel)):
+        if limit is not None and next_experiment is None:
+            raise InputError(f"{name} limits what --next-experiment FILE.csv asks for; give both")
+        if limit is not None and not 0.0 < limit < math.inf:
+            raise InputError(f"{name} is {limit:g}; it has to be positive")
     if batch is not None:
         if log or holdout is not None or next_experiment is not None:
             raise InputError("--batch FOLDER takes no logs, --holdout or --next-experiment; give these one by one")
@@ -260,6 +278,8 @@ def diagnose(
         again = ["diagnose", *map(str, log), "--model", str(model)]
         again += ["--holdout", str(holdout)] if holdout is not None else []
         again += ["--next-experiment", str(next_experiment)] if next_experiment is not None else []
+        again += ["--max-torque", f"{max_torque:g}"] if max_torque is not None else []
+        again += ["--max-travel", f"{max_travel:g}"] if max_travel is not None else []
         with (
             _leaving_nothing(folder),
             _running(again + ["--overwrite"] * overwrite, model, folder, unit="steps", kept=False) as progress,
@@ -269,9 +289,9 @@ def diagnose(
     else:
         lines = diagnosis_lines(finished)
     if next_experiment is not None:
-        from .study.next_experiment import write_next_experiment
+        from .study.next_experiment import Limits, write_next_experiment
 
-        lines += write_next_experiment(folder, finished, task.record, next_experiment)
+        lines += write_next_experiment(folder, finished, task.record, next_experiment, Limits(max_torque, max_travel))
     _tell(lines, folder)
 
 

@@ -250,6 +250,10 @@ _ARC = 0.5 * np.pi
 _NO_INPUT = 1e-3
 DIVERGED = 1e30
 """Products of prediction errors, over their variance or in rad^2, from which on a model is one that diverges."""
+_SILENT = 1e-20
+"""Influence of an initial state over that of others below which it has none: that of an effect that does nothing."""
+_LOST = 0.01
+"""Nats that rounding may take: under too low a gain an initial state's influence may grow from sample to sample."""
 _COLUMNS = 16
 """Least padded number of candidate columns."""
 
@@ -282,7 +286,8 @@ class Predictor:
             weighted = [np.einsum("s,scd->cd", weight, one) for one in grams]
             total = np.sum([_eliminated(one, states) for one in weighted], axis=0)
             variance = 1.0 if turn else max(total[0, 0] / (count * sides), 1e-300)
-            if total[0, 0] < 0.0 or np.min(np.diag(total)[1:], initial=0.0) < 0.0:
+            lost = sum(_lost(one, states) for one in weighted) / variance
+            if lost > _LOST or total[0, 0] < 0.0 or np.min(np.diag(total)[1:], initial=0.0) < 0.0:
                 self._nothing(grams)
                 return
             found = _least_squares(total, variance / prior**2, centre, bound * prior)
@@ -366,7 +371,8 @@ class Linear:
             speed,
             tuple(frequencies),
             tuple(float(n) for n in range(1, _HARMONICS + 1) if n * travel["motor"] > _ARC),
-            tuple(float(n) for n in range(1, 9) if n * travel.get("load", 0.0) > 0.5),
+            # once a turn is what eccentricity means; of others something must be seen
+            (1.0, *(float(n) for n in range(2, 9) if n * travel.get("load", 0.0) > 0.5)),
         )
 
     def choices(self, name: str) -> float:
@@ -618,8 +624,7 @@ def _scaled(gram: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
     if not np.isfinite(inner).all():  # of a model that diverges
         return np.zeros_like(inner), np.ones(states)
     size = np.sqrt(np.maximum(np.diag(inner), 0.0))
-    # the state of an effect that does nothing
-    size = np.where(size > 1e-20 * np.max(size), size, np.inf)
+    size = np.where(size > _SILENT * np.max(size), size, np.inf)
     return np.linalg.pinv(inner / np.outer(size, size), rcond=1e-12, hermitian=True), size
 
 
@@ -633,6 +638,17 @@ def _as_it_stands(grams: np.ndarray, states: int) -> np.ndarray:
     at[0] = 1.0
     at[-states:] = -_response(total, states)[:, 0]
     return np.einsum("c,scd,d->s", at, grams, at)
+
+
+def _lost(gram: np.ndarray, states: int) -> float:
+    """What rounding may take off the square of the first column when the initial states are eliminated."""
+    inner = gram[-states:, -states:]
+    size = np.sqrt(np.maximum(np.diag(inner), 0.0))
+    real = size > _SILENT * np.max(size)
+    if not real.any() or not np.isfinite(inner).all():
+        return 0.0
+    spread = np.abs(np.linalg.eigvalsh((inner / np.outer(size, size))[np.ix_(real, real)]))
+    return float(np.finfo(float).eps * gram[0, 0] * spread[-1] / max(spread[0], 1e-300))
 
 
 def _response(gram: np.ndarray, states: int) -> np.ndarray:

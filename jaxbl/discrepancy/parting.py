@@ -19,8 +19,8 @@ from jaxbl.records import Record
 from jaxbl.simulate import Experiment, trajectory
 
 KINDS = "sine", "multisine", "chirp", "steps"
-_SHARES = 0.1, 0.25, 0.5, 0.75, 1.0
-"""Amplitudes, over the largest torque of the log."""
+_SHARES = 0.01, 0.03, 0.1, 0.25, 0.5, 0.75, 1.0
+"""Amplitudes, over the largest torque allowed."""
 _FREQUENCIES = 6
 _HARMONICS = 8
 _LONGEST = 10.0
@@ -35,7 +35,8 @@ class Input(NamedTuple):
         amplitude: largest torque, N m.
         frequency: Hz; of a multisine the lowest, of a chirp the first, of steps one over twice their length.
         torque: shape (samples,).
-        apart: rms difference of the positions that two models make of it, over the noise of the readings.
+        apart: nats by which readings of it tell one model from the other: half the sum of squares of the difference of
+            their positions, over the variance of the readings' noise.
     """
 
     kind: str
@@ -45,14 +46,12 @@ class Input(NamedTuple):
     apart: float
 
 
-def inputs(record: Record) -> list[Input]:
-    """Inputs within the torque of a log: kinds, amplitudes and frequencies."""
-    assert record.torque is not None
+def inputs(record: Record, largest: float) -> list[Input]:
+    """Inputs of up to a torque (N m), at the period of a log: kinds, amplitudes and frequencies."""
     period = record.sample_period
     # gaps of a log are no part of it
     duration = min(sum(part.stop - part.start for part in record.segments) * period, _LONGEST)
     time = period * np.arange(round(duration / period))
-    largest = float(np.max(np.abs(record.torque)))
     top = min(0.02 / period, 10.0)
     found = []
     for frequency in np.geomspace(min(2.0 / duration, 0.5 * top), top, _FREQUENCIES):
@@ -77,8 +76,15 @@ def _wave(kind: str, time: np.ndarray, frequency: float) -> np.ndarray:
     return 2.0 * bits[np.floor(2.0 * frequency * time + 1e-9).astype(int) % len(bits)] - 1.0
 
 
-def parting(one: Experiment, other: Experiment, record: Record, noise: Mapping[str, float]) -> Input | None:
-    """The input on which two models' positions differ most, within torque and travel of a log; None where all go beyond.
+def parting(
+    one: Experiment,
+    other: Experiment,
+    record: Record,
+    noise: Mapping[str, float],
+    torque: float | None = None,
+    travel: float | None = None,
+) -> Input | None:
+    """The input on which two models' positions differ most, within torque and travel; None where all go beyond.
 
     Both begin at rest in the middle of the log's motion. What another initial position or speed would make of the
     difference does not count.
@@ -87,8 +93,11 @@ def parting(one: Experiment, other: Experiment, record: Record, noise: Mapping[s
         one, other: the models, with array leaves; the sample period is that of the record.
         record: the log.
         noise: of its readings, by side, rad.
+        torque: largest that is allowed, N m; left out: that of the log.
+        travel: of the motor that is allowed, rad (the load may move as far over the gear); left out: those of the log.
     """
-    tried = inputs(record)
+    assert record.torque is not None
+    tried = inputs(record, float(np.max(np.abs(record.torque))) if torque is None else torque)
     torques = jnp.asarray(np.stack([each.torque for each in tried]))
     start = {
         side: jnp.asarray(float(np.median(np.concatenate([values[part] for part in record.segments]))))
@@ -100,20 +109,23 @@ def parting(one: Experiment, other: Experiment, record: Record, noise: Mapping[s
     paths = [_runs(model, start, torques) for model in (one, other)]
     apart, inside = np.zeros(len(tried)), np.ones(len(tried), bool)
     for side in one.sides:
-        travel = max(float(np.ptp(record.positions[side][part])) for part in record.segments)
+        if travel is None:
+            reach = max(float(np.ptp(record.positions[side][part])) for part in record.segments)
+        else:
+            reach = travel / (abs(float(one.drive.ratio(side))) if side != "motor" else 1.0)
         first, second = (np.asarray(path[side]) for path in paths)
         for path in (first, second):
             finite = np.isfinite(path).all(axis=1)
-            inside &= finite & (np.ptp(np.where(np.isfinite(path), path, 0.0), axis=1) <= travel)
+            inside &= finite & (np.ptp(np.where(np.isfinite(path), path, 0.0), axis=1) <= reach)
         difference = np.where(np.isfinite(second - first), second - first, 0.0)
         line = np.vander(np.linspace(-1.0, 1.0, difference.shape[1]), 2)
         basis, _ = np.linalg.qr(line)
         left = difference - (difference @ basis) @ basis.T
-        apart += np.mean((left / noise[side]) ** 2, axis=1)
+        apart += 0.5 * np.sum((left / noise[side]) ** 2, axis=1)
     if not inside.any():
         return None
     best = int(np.argmax(np.where(inside, apart, -1.0)))
-    return tried[best]._replace(apart=float(np.sqrt(apart[best] / len(one.sides))))
+    return tried[best]._replace(apart=float(apart[best]))
 
 
 @eqx.filter_jit

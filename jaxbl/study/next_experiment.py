@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -16,24 +16,40 @@ from jaxbl.records import Record
 from .config import Config, read_config
 from .logs import on_record
 
-_CLEAR = 3.0
-"""Rms difference over the noise from which on an experiment tells."""
+_CLEAR = 10.0
+"""Nats from which on an experiment tells: refitted numbers take some of them back."""
 
 
-def next_experiment(summary: Mapping[str, Any], model: Config, record: Record) -> Input | None:
+class Limits(NamedTuple):
+    """What an experiment may ask of the machine; None: no more than the log.
+
+    Attributes:
+        torque: largest, N m.
+        travel: of the motor, rad.
+    """
+
+    torque: float | None = None
+    travel: float | None = None
+
+
+_LOGS = Limits()
+
+
+def next_experiment(summary: Mapping[str, Any], model: Config, record: Record, limits: Limits = _LOGS) -> Input | None:
     """The input on which the first finding and its best alternative differ most; None where no input stays within limits.
 
     Args:
         summary: of a diagnosis that has a tie (:func:`tied`).
         model: the extended model.
-        record: the log: its torque and travel are the limits.
+        record: the log.
+        limits: of the machine.
     """
     rival = summary["rival"]
     data = model.resolved() | {key: rival[key] for key in ("drive", "transmission", "effects") if key in rival}
     with jax.enable_x64(True):
         one, other = (on_record(each, record) for each in (model, read_config(data)))
         noise = smoothed_channels(record, one.sides).noise
-        return parting(one, other, record, noise)
+        return parting(one, other, record, noise, limits.torque, limits.travel)
 
 
 def tied(summary: Mapping[str, Any]) -> tuple[str, str] | None:
@@ -44,7 +60,9 @@ def tied(summary: Mapping[str, Any]) -> tuple[str, str] | None:
     return findings[-1]["effect"], summary["rival"]["effect"]
 
 
-def write_next_experiment(folder: Path, summary: Mapping[str, Any], record: Record, path: Path) -> list[str]:
+def write_next_experiment(
+    folder: Path, summary: Mapping[str, Any], record: Record, path: Path, limits: Limits = _LOGS
+) -> list[str]:
     """Write the input as CSV with columns t (s) and u (N m). Returns lines for the terminal.
 
     Args:
@@ -52,6 +70,7 @@ def write_next_experiment(folder: Path, summary: Mapping[str, Any], record: Reco
         summary: its `diagnosis.json`.
         record: the log.
         path: the file to be written.
+        limits: of the machine.
 
     Raises:
         InputError: the file cannot be written.
@@ -59,18 +78,17 @@ def write_next_experiment(folder: Path, summary: Mapping[str, Any], record: Reco
     pair = tied(summary)
     if pair is None:
         return ["Nothing is tied: no experiment is needed to part effects, and none was written."]
-    found = next_experiment(summary, read_config(folder / "model.toml"), record)
+    found = next_experiment(summary, read_config(folder / "model.toml"), record, limits)
     if found is None:
-        return [f"No input within the log's torque and travel was found that parts {pair[0]} from {pair[1]}."]
+        return [f"No input stays within the torque and travel allowed that would part {pair[0]} from {pair[1]}."]
     time = record.sample_period * np.arange(len(found.torque))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         pd.DataFrame({"t": time, "u": found.torque}).to_csv(path, index=False, float_format="%.9g")
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
-    clear = "" if found.apart > _CLEAR else "; that is little: larger torques, or finer encoders, would be needed"
+    clear = "" if found.apart > _CLEAR else ": too little; --max-torque and --max-travel allow for more"
     return [
         f"To part {pair[0]} from {pair[1]}: {found.kind} of {found.amplitude:.3g} N m, {found.frequency:.3g} Hz, "
-        f"{time[-1] + record.sample_period:.3g} s; their positions differ by {found.apart:.3g} times the noise{clear}: "
-        f"{path}"
+        f"{time[-1] + record.sample_period:.3g} s; it would tell them apart by up to {found.apart:.2g} nats{clear}: {path}"
     ]

@@ -17,7 +17,7 @@ from jaxbl.records import read_record
 from jaxbl.report import diagnosis_lines, write_diagnosis_report
 from jaxbl.study.config import read_config
 from jaxbl.study.diagnosis import diagnose, read_task, run_task
-from jaxbl.study.next_experiment import next_experiment, tied, write_next_experiment
+from jaxbl.study.next_experiment import Limits, next_experiment, tied, write_next_experiment
 
 
 @pytest.fixture(scope="module")
@@ -188,9 +188,13 @@ def test_a_tie_has_an_experiment(logs, found, tmp_path):
     rival = {"effect": "motor.quadratic_drag", "drive": model()["drive"], "effects": other}
     finding = {"effect": "motor.coulomb_friction", "alternatives": [{"effect": "motor.quadratic_drag", "confidence": 0.3}]}
     summary = {"findings": [finding], "rival": rival}
+    largest = np.max(np.abs(record.torque))
     best = next_experiment(summary, found.model, record)
     assert best is not None and best.apart > 10.0
-    assert np.max(np.abs(best.torque)) <= np.max(np.abs(record.torque)) + 1e-12
+    assert np.max(np.abs(best.torque)) <= largest + 1e-12
+    less = next_experiment(summary, found.model, record, Limits(torque=0.1 * largest, travel=0.5))
+    assert less is not None and less.apart < best.apart and np.max(np.abs(less.torque)) <= 0.1 * largest + 1e-12
+    assert next_experiment(summary, found.model, record, Limits(travel=1e-9)) is None
     write_diagnosis_report(found, tmp_path)
     (line,) = write_next_experiment(tmp_path, summary, record, tmp_path / "new" / "next.csv")
     assert line.startswith(f"To part motor.coulomb_friction from motor.quadratic_drag: {best.kind} of ")
