@@ -1,6 +1,7 @@
 """A log from the bench's own simulator, which shares nothing with the package: a direct drive with hidden dry friction."""
 
 import sys
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -47,10 +48,16 @@ def logged(
     phases = np.random.default_rng(seed).uniform(-np.pi, np.pi, 6)
     k = np.arange(1, 7)
     torque = 0.3 * np.sum(np.sin(2.0 * np.pi * 0.5 * k[:, None] * t + phases[:, None]), axis=0)
-    machine = Machine(DRIVE | {"motor_inertia": inertia}, None, [FRICTION] if effects else [])
     shaking = torque_noise * np.random.default_rng(seed + 100).standard_normal(len(t))
-    (trace,) = simulate([Run(machine, 2e-3, torque + shaking * felt, motor_noise=noise, seed=seed)])
-    return Log(trace.t, trace.u + shaking * (not felt), trace.theta_e, None)
+    log = driven(torque + shaking * felt, [FRICTION] if effects else [], noise, seed, inertia)
+    return replace(log, u=log.u + shaking * (not felt))
+
+
+def driven(torque: np.ndarray, effects: list[dict[str, Any]], noise: float, seed: int, inertia: float = 0.02) -> Log:
+    """The direct drive under a torque (N m, every 2 ms)."""
+    machine = Machine(DRIVE | {"motor_inertia": inertia}, None, effects)
+    (trace,) = simulate([Run(machine, 2e-3, torque, motor_noise=noise, seed=seed)])
+    return Log(trace.t, trace.u, trace.theta_e, None)
 
 
 @cache

@@ -642,6 +642,8 @@ def test_a_log_is_diagnosed_once(axis, quick, call, tmp_path):
         ([*DIAGNOSE, "--holdout", "an axis.csv", "--out", "new"], "is the log itself"),
         ([*DIAGNOSE, "--batch", "."], "takes no logs"),
         ([*DIAGNOSE, "--jobs", "2"], "--jobs goes with --batch"),
+        ([*DIAGNOSE, "--max-travel", "1"], "--max-travel limits what --next-experiment"),
+        ([*DIAGNOSE, "--next-experiment", "next.csv", "--max-torque", "-1"], "--max-torque is -1; it has to be positive"),
         (["diagnose", "--batch", "none"], "none: no such folder"),
         (["diagnose", "--batch", "empty"], "empty: holds no log"),
         (["diagnose", "--batch", "."], r"an axis\.csv: no model; give --model TOML, or an axis\.toml beside it"),

@@ -142,3 +142,37 @@ def test_products_are_those_of_the_errors(tmp_path, sides):
     found = model.columns((), [1e-6] * sides, np.ones(sides)).products
     every = errors(model)
     assert found == pytest.approx(every.T @ every, rel=1e-6, abs=1e-9 * np.max(found))
+
+
+@pytest.mark.parametrize("growth", [0.0, 5.0, 10.0, 15.0, 20.0, 25.0])
+def test_what_rounding_takes_is_known(growth):
+    """Initial states whose influence grows e-fold `growth` times, eliminated from products and by a QR of the columns."""
+    count, states = 2000, 4
+    rng = np.random.default_rng(5)
+    time = np.linspace(0.0, 1.0, count)[:, None]
+    # what grows is one motion, which all states take part in
+    mixed = np.exp(growth * time) * rng.standard_normal(states) + rng.standard_normal((count, states))
+    columns = np.concatenate([rng.standard_normal((count, 3)) + np.exp(growth * time), mixed], axis=1)
+    gram = columns.T @ columns
+    basis = np.linalg.qr(mixed / np.linalg.norm(mixed, axis=0))[0]
+    left = columns[:, :3] - basis @ (basis.T @ columns[:, :3])
+    true = float(left[:, 0] @ left[:, 0])
+    error, told = abs(module._eliminated(gram, states)[0, 0] - true), module._lost(gram, states)
+    assert error < max(30.0 * told, 1e-9 * true)
+    assert told < module._LOST or growth > 5.0
+    assert told > module._LOST or growth < 20.0
+
+
+def test_a_gain_under_which_rounding_would_decide_is_left_out(tmp_path, monkeypatch):
+    model = linear(tmp_path, 1)
+    smoothness, _ = model.choose(())
+    assert np.isfinite(model.predictor(smoothness).squares).all()
+    monkeypatch.setattr(module, "_LOST", 0.0)
+    assert not np.isfinite(model.predictor(smoothness).squares).any()
+
+
+def test_eccentricity_is_tried_once_a_turn_however_small_the_motion(tmp_path):
+    model = linear(tmp_path, 2)
+    travel = float(np.ptp(np.asarray(model.parts[0].position["load"])))
+    least = int(np.floor(0.5 / travel)) + 1
+    assert model.grids(()).load_harmonics == (1.0, *(float(n) for n in range(max(least, 2), 9)))

@@ -6,7 +6,7 @@ import json
 import jax
 import numpy as np
 import pytest
-from hidden_log import FRICTION, logged, model
+from hidden_log import FRICTION, driven, logged, model
 
 import jaxbl.discrepancy.explain as explain
 import jaxbl.study.diagnosis as under_test
@@ -200,6 +200,26 @@ def test_a_tie_has_an_experiment(logs, found, tmp_path):
     assert line.startswith(f"To part motor.coulomb_friction from motor.quadratic_drag: {best.kind} of ")
     columns = np.genfromtxt(tmp_path / "new" / "next.csv", delimiter=",", names=True)
     np.testing.assert_allclose(columns["u"], best.torque, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_what_is_tied_is_parted_by_the_experiment_that_is_asked_for(tmp_path):
+    """At 5 Hz and under that noise dry friction of 1 % of the torque looks viscous; a slower motion tells them apart."""
+    friction = {"kind": "motor.coulomb_friction", "torque": 0.004}
+    fast = 0.3 * np.sin(2.0 * np.pi * 5.0 * 2e-3 * np.arange(2000))
+    log, other, holdout = (tmp_path / name for name in ("log.csv", "next_log.csv", "holdout.csv"))
+    driven(fast, [friction], 1e-3, 1).write(log)
+    driven(0.8 * fast, [friction], 1e-3, 2).write(holdout)
+    task = read_task(log, model(), holdout=holdout)
+    found = run_task(task)
+    pair = tied(found.summary)
+    assert pair is not None and set(pair) == {"motor.coulomb_friction", "motor.viscous_friction"}
+    best = next_experiment(found.summary, found.model, task.record, Limits(travel=6.0))
+    assert best is not None and best.apart > 100.0
+    driven(best.torque, [friction], 1e-3, 3).write(other)
+    (one,) = diagnose([log, other], model(), holdout=holdout).summary["findings"]
+    assert one["effect"] == "motor.coulomb_friction" and one["confidence"] > 0.99
+    assert one["parameters"]["torque"]["value"] == pytest.approx(0.004, rel=0.05)
 
 
 def refused(logs, *arguments, **keywords):
