@@ -9,11 +9,14 @@ spline functions, Numerische Mathematik 31 (1979).
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import solveh_banded
 
 from jaxbl.records import Record
+
+from .coloured import spectrum_of, weighted_products
 
 Array = np.ndarray
 
@@ -33,6 +36,23 @@ def noise_of(record: Record) -> float:
     assert record.torque is not None
     found = np.concatenate([np.diff(record.torque[part], n=4) for part in record.segments])
     return float(_MEDIAN * np.median(np.abs(found)) / np.sqrt(70.0))
+
+
+def unfelt(given: Sequence[Array], smooth: Sequence[Array]) -> float:
+    """Nats by which noise of the input did not drive the motion, rather than did.
+
+    What both inputs' prediction errors differ by is what that noise does to them. It is in the errors of the recorded input
+    if the drive has not felt it; each frequency counts by the power that is there, so that what the model lacks, which is
+    slow, does not matter.
+
+    Args:
+        given, smooth: prediction errors of one model and gain under the input as recorded and smoothed, part by part, rad;
+            shape (samples, sides).
+    """
+    spectrum = spectrum_of(given)
+    pairs = [np.stack([one, one - other], axis=2) for one, other in zip(given, smooth, strict=True)]
+    products = np.sum([weighted_products(pair, spectrum) for pair in pairs], axis=0)
+    return float(products[0, 1] - 0.5 * products[1, 1])
 
 
 def smoothed_input(record: Record, noise: float) -> Record:

@@ -501,12 +501,16 @@ class Linear:
                 break
         return found
 
-    def spectrum(self, smoothness: Sequence[float]) -> Spectrum:
-        """Of the errors that are left under a given gain when all numbers are at their best."""
-        predictor = self.predictor(smoothness)
-        errors = self.errors(smoothness)
+    def left(self, smoothness: Sequence[float]) -> list[np.ndarray]:
+        """Errors that are left under a given gain when all numbers are at their best, part by part, rad; shape
+        (samples, sides)."""
+        errors, predictor = self.errors(smoothness), self.predictor(smoothness)
         left = [one @ at for one, at in zip(errors, predictor.coefficients, strict=True)]
-        return spectrum_of([one[signals.real] for one, signals in zip(left, self.signals, strict=True)])
+        return [one[signals.real] for one, signals in zip(left, self.signals, strict=True)]
+
+    def spectrum(self, smoothness: Sequence[float]) -> Spectrum:
+        """Of what is left."""
+        return spectrum_of(self.left(smoothness))
 
     def columns(self, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray | Spectrum) -> Columns:
         """Products of everything that the prediction errors are linear in, initial states eliminated.

@@ -20,7 +20,7 @@ import pandas as pd
 
 from jaxbl.discrepancy.complete import complete, joined
 from jaxbl.discrepancy.explain import FAR, Explainer, Explanation, Finding, Model
-from jaxbl.discrepancy.input_noise import noise_of, smoothed_input
+from jaxbl.discrepancy.input_noise import noise_of, smoothed_input, unfelt
 from jaxbl.discrepancy.linear import Linear
 from jaxbl.discrepancy.observed import Observed, compared, observed_torques
 from jaxbl.discrepancy.proof import WINDOW, Ground, Proof, foretold
@@ -67,7 +67,7 @@ _BOUND = 4.0
 _NOISY = 1e-3
 """Noise over the input's rms from which on it is asked whether the drive felt it."""
 _TOLD = 3.0
-"""Nats by which it is told."""
+"""Nats by which it has to be told that it did not."""
 _HIDDEN = 0.3
 """Share of the driving torque: where a torque of that size would not have been seen, noise hides everything."""
 
@@ -397,20 +397,18 @@ def _setting(task: Task) -> _Setting:
 
 
 def _torque_noise(record: Record, nominal: Experiment, own: Sequence[Free], seen: Ground) -> float:
-    """Noise of the channel that recorded the input, N m, where the drive does not feel it; 0 where it does.
-
-    Both inputs drive the model as given: that of the less surprising motion is the one that acted. Noise is like nothing
-    that the model lacks, so that a few nats tell.
-    """
+    """Noise of the channel that recorded the input, N m, where the drive does not feel it; 0 where it does."""
     noise, size = noise_of(record), _rms_of(record)
     if not _NOISY * size < noise:
         return 0.0
+    # the model as given: numbers that may change would make up for some of the noise
     none, width = np.zeros(len(own)), np.ones(len(own))
-    costs = []
-    for one in (record, smoothed_input(record, noise)):
-        linear = Linear(nominal, own, none, width, none, one, seen.channels.smoothed, none)
-        costs.append(linear.predictor(linear.choose(())[0]).cost(none, width))
-    return noise if costs[0] - costs[1] > 2.0 * _TOLD else 0.0
+    given, smooth = (
+        Linear(nominal, own, none, width, none, one, seen.channels.smoothed, none)
+        for one in (record, smoothed_input(record, noise))
+    )
+    smoothness, _ = given.choose(())
+    return noise if unfelt(given.left(smoothness), smooth.left(smoothness)) > _TOLD else 0.0
 
 
 def _explainer(setting: _Setting, bound: float = np.inf) -> Explainer:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from jaxbl.discrepancy.input_noise import _smoothed, jumps, noise_of, smoothed_input
+from jaxbl.discrepancy.input_noise import _smoothed, jumps, noise_of, smoothed_input, unfelt
 from jaxbl.records.reader import Record
 
 PERIOD, SAMPLES = 1e-3, 8000
@@ -83,3 +83,21 @@ def test_the_smooth_curve_is_one_of_least_penalised_squares():
     # what has no curvature is let through untouched
     line = 0.3 + 1e-3 * np.arange(count)
     np.testing.assert_allclose(_smoothed(line), line, atol=1e-5)
+
+
+@pytest.mark.parametrize("felt", [False, True])
+def test_noise_is_found_in_the_errors_under_what_is_slow(felt):
+    """What the model lacks is a hundred times larger; the noise's own likelihood ratio is known where it alone is there."""
+    rng = np.random.default_rng(6)
+    lacking = 1e-2 * np.stack(
+        [np.sin(2.0 * np.pi * TIME), np.cos(4.0 * np.pi * TIME)], axis=1
+    )  # whole periods of both parts
+    reading = 1e-4 * rng.standard_normal((SAMPLES, 2))
+    effect = np.convolve(1e-4 * rng.standard_normal(SAMPLES), [0.2, 0.5, 0.3], "same")[:, None] * np.array([1.0, 0.0])
+    given = lacking + reading + effect * (not felt)
+    smooth = given - effect
+    alone = (1.0 - 2.0 * felt) * 0.5 * np.sum(effect**2) / 1e-8
+    parts = slice(0, 3000), slice(3000, SAMPLES)
+    found = unfelt([given[part] for part in parts], [smooth[part] for part in parts])
+    # the given errors' spectrum holds the effect too, where that is not felt
+    assert 0.4 < found / alone < 1.2
