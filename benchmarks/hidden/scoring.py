@@ -65,6 +65,7 @@ class Outcome:
     Attributes:
         findings: effect, confidence and alternatives of each, as they were ordered.
         reduction, worse, ratio: of the held-out gap by its own account; None where it was not given.
+        reachable: reduction by the oracle, by the same account.
         proved, proved_worse: reduction of the gap by the bench's account, and whether there is more of it.
         error: why there is no diagnosis.
     """
@@ -81,6 +82,7 @@ class Outcome:
     reduction: float | None = None
     worse: bool | None = None
     ratio: float | None = None
+    reachable: float | None = None
     proved: float | None = None
     proved_worse: bool | None = None
     seconds: float = 0.0
@@ -218,19 +220,22 @@ def _gap(
         value = numbers.get(channel)
         return math.nan if value is None else float(value)
 
-    reductions, ratios, worse = [], [], False
+    reductions, best, ratios, worse = [], [], [], False
     for channel in before:
         b, a = given(before, channel), given(after, channel)
         f = given(floor, channel) if channel in floor else 0.0
         if not math.isfinite(b):
             continue
         worse = worse or not a <= 1.05 * max(b, f)  # nan is worse
+        o = math.nan if oracle is None else given(oracle, channel)
         if b > 0.0 and b**2 - f**2 >= f**2:
-            reductions.append(1.0 - math.sqrt(max(a**2 - f**2, 0.0) / (b**2 - f**2)))
-        if oracle is not None and given(oracle, channel) > 0.0:
-            ratios.append(a / given(oracle, channel))
+            for found, left in ((reductions, a), (best, o)):
+                found.append(1.0 - math.sqrt(max(left**2 - f**2, 0.0) / (b**2 - f**2)))
+        if o > 0.0:
+            ratios.append(a / o)
     result.worse = worse
     result.reduction = float(np.mean(reductions)) if reductions else None
+    result.reachable = float(np.mean(best)) if best and np.isfinite(best).all() else None
     result.ratio = float(np.median(ratios)) if ratios else None
 
 
@@ -309,6 +314,7 @@ def scores(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "unknown_missed": rate(by["unknown"], lambda one: one.verdict == "no_discrepancy"),
         "confidently_wrong": rate(by["unknown"], lambda one: bool(one.named) and one.findings[0][1] >= CONFIDENT),
         "gap_reduction": number([one.reduction for one in known if one.reduction is not None]),
+        "reachable": number([one.reachable for one in known if one.reachable is not None]),
         "oracle_ratio": number([one.ratio for one in known if one.ratio is not None]),
         "proved": number([one.proved for one in known if one.proved is not None]),
         "proved_worse": rate([one for one in outcomes if one.proved_worse is not None], lambda one: bool(one.proved_worse)),
@@ -336,6 +342,7 @@ _TITLES = {
     "unknown_missed": "- sees nothing",
     "confidently_wrong": f"- explains them at confidence {CONFIDENT:g} or more",
     "gap_reduction": "gap reduction on held-out data, median",
+    "reachable": "- by the true effects, fitted (the oracle), median",
     "worse": "- made worse",
     "proved": "- the same by the bench's simulator, median",
     "proved_worse": "- made worse by the bench's simulator",

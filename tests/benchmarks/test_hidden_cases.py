@@ -149,6 +149,7 @@ def test_an_oracle_gets_full_marks(found, oracle):
     ):
         assert figures[key]["value"] == 0.0
     assert figures["gap_reduction"]["value"] == pytest.approx(0.9)
+    assert figures["reachable"]["value"] == pytest.approx(0.9)
     assert figures["oracle_ratio"]["value"] == pytest.approx(1.0)
     assert figures["proved"]["value"] == pytest.approx(1.0)
     rows, columns, counts = confusion(outcomes)
@@ -173,7 +174,9 @@ def test_a_wrong_answer_is_counted_where_it_belongs(found):
     gap = {"holdout_rmse_before": {"theta_e": 1.0}, "holdout_rmse_after": {"theta_e": 1.1}, "noise_floor": {"theta_e": 0.1}}
     told = outcome(pair, {"verdict": "explained", "findings": findings, "gap": gap})
     assert told.right and told.spurious == [wrong] and told.worse
-    assert told.reduction < 0.0
+    assert told.reduction < 0.0 and told.reachable is None
+    assert outcome(pair, {"verdict": "explained", "gap": gap}, {"theta_e": 0.1}).reachable == pytest.approx(1.0)
+    assert outcome(pair, {"verdict": "explained", "gap": gap}, {}).reachable is None
     curve = calibration([told])
     assert curve == [{"confidence": pytest.approx(0.8), "right": pytest.approx(2 / 3), "count": 3}]
     assert calibration_error(curve) == pytest.approx(0.8 - 2 / 3)
