@@ -1,0 +1,44 @@
+"""Records cut into windows: what each begins with."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hidden_log import driven, model
+from scipy.signal import lfilter
+
+from jaxbl.discrepancy.proof import Ground
+from jaxbl.identification.search import smoothed_channels, windows_of
+from jaxbl.records import read_record
+from jaxbl.study.config import read_model
+from jaxbl.study.logs import kinematics_of, on_record
+
+LAG = {"kind": "actuator.lag", "time_constant": 0.05}
+
+
+@pytest.fixture(scope="module")
+def setting(tmp_path_factory):
+    t = 2e-3 * np.arange(2000)
+    path = tmp_path_factory.mktemp("log") / "axis.csv"
+    driven(0.5 * np.sin(2.0 * np.pi * 1.3 * t), [LAG], 3e-5, 1).write(path)
+    record = read_record(path)
+    true = model(drive={"kind": "rigid", "motor_inertia": 0.02, "motor_viscous": 0.03}, effects=[LAG])
+    experiment = on_record(read_model(true)[0], record)
+    return record, experiment, smoothed_channels(record, experiment.sides)
+
+
+def test_windows_begin_with_the_torque_that_the_actuator_makes_then(setting):
+    record, experiment, channels = setting
+    windows, firsts = windows_of(record, channels, experiment, 250)
+    keep = np.exp(-2e-3 / LAG["time_constant"])
+    made = lfilter([0.0, 1.0 - keep], [1.0, -keep], record.torque, zi=[record.torque[0] * keep])[0]
+    made[0] = record.torque[0]
+    ((found,),) = windows.start.effects
+    np.testing.assert_allclose(found, made[firsts], atol=1e-3 * np.max(np.abs(made)))
+    np.testing.assert_allclose(windows.start.position["motor"], channels.smoothed["motor"][0].position[jnp.asarray(firsts)])
+
+
+def test_the_true_model_of_a_lag_leaves_noise(setting):
+    record, experiment, channels = setting
+    ground = Ground(record, channels, kinematics_of(record, channels, 1), {"motor": 30.0})
+    errors = ground.prove(experiment).errors
+    assert errors["theta_e"] < 1.1 * channels.noise["motor"]
