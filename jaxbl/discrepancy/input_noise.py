@@ -26,6 +26,8 @@ _FEWEST = 8
 """Samples between two jumps that can be smoothed."""
 _MEDIAN = 1.4826
 """Standard deviation over the median absolute value, of a Gaussian."""
+_ORDER = 3
+"""Of the differences that are penalised."""
 _CUTOFFS = np.geomspace(0.015, 2.0, 30)
 """Corner frequencies tried, rad a sample."""
 
@@ -75,9 +77,6 @@ def jumps(torque: Array, noise: float) -> list[int]:
     beyond = np.abs(change - 0.5 * (beside[:-2] + beside[2:]))
     highest = (beyond >= np.append(beyond[1:], 0.0)) & (beyond > np.insert(beyond[:-1], 0, 0.0))
     return (1 + np.flatnonzero(highest & (beyond > _JUMP * np.sqrt(5.0) * noise))).tolist()
-
-
-_ORDER = 3
 
 
 def _smoothed(values: Array) -> Array:
