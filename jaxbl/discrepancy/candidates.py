@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxbl.drive.effects import AbstractEffect, Motion, effect_class, effect_kinds
 from jaxbl.drive.parameters import as_arrays, parameters
-from jaxbl.identification.regression import actuator_path, lasting
+from jaxbl.identification.regression import lasting_path
 from jaxbl.simulate import Experiment
 
 from .part import Part
@@ -292,11 +292,6 @@ def forces_of(candidates: Sequence[Candidate], signals: Signals, spare: int = 0)
     return found
 
 
-def _lasted(experiment: Experiment, torque: jax.Array) -> jax.Array:
-    """The torque that acts, of one that was commanded and had lasted before."""
-    return actuator_path(experiment, torque, lasting(experiment, torque[0]))[1]
-
-
 @eqx.filter_jit
 def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direction: jax.Array) -> jax.Array:
     """Torques of effects of one name, leaves of shape (effects,); shape (effects, samples, sides + 1)."""
@@ -307,7 +302,7 @@ def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direct
         place = drive.place(effect.place)
         if place == "actuator":
             alone = eqx.tree_at(lambda e: e.effects, experiment, (effect,))
-            found = found.at[:, -1].set(_lasted(alone, part.torque) - part.torque)
+            found = found.at[:, -1].set(lasting_path(alone, part.torque)[1] - part.torque)
         elif place == "transmission":
             others = tuple(one for one in experiment.effects if one.name != effect.name)
             both = (eqx.tree_at(lambda e: e.effects, experiment, some) for some in (others, (*others, effect)))
@@ -328,7 +323,7 @@ def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direct
 def _needed(experiment: Experiment, part: Part) -> dict[str, jax.Array]:
     """Torque on each side that its motion does not take up, dry friction left out, N m."""
     plant = experiment.plant
-    acting = plant.torques(part.position, part.velocity, _lasted(experiment, part.torque), part.time)
+    acting = plant.torques(part.position, part.velocity, lasting_path(experiment, part.torque)[1], part.time)
     found = {}
     for side in experiment.sides:
         rest = acting[side][0] - experiment.drive.viscous(side) * part.velocity[side]

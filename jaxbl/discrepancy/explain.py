@@ -402,12 +402,24 @@ class Explainer:
         gone: set[str] = set()
         for name in model.names[:-1]:
             deviation = model.linear.deviation(smoothness)
-            names = tuple(one for one in model.names if one != name)
-            full = self.refit(model.names, model.numbers, model.theta, smoothness, deviation)
-            less = self.refit(names, model.numbers, model.theta, smoothness, deviation)
-            if self._gain(less, full) <= 0.0:
+            less = self._needless(name, model.names, model.numbers, model.theta, smoothness, deviation)
+            if less is not None:
                 model, gone = less, gone | {name}
         return model, gone
+
+    def _needless(
+        self,
+        name: str,
+        names: Names,
+        numbers: Mapping[str, Numbers],
+        theta: Array,
+        smoothness: Sequence[float],
+        deviation: Array,
+    ) -> Model | None:
+        """The model without one of its effects where that earns nothing beside the others, all numbers refitted."""
+        full = self.refit(names, numbers, theta, smoothness, deviation)
+        less = self.refit(tuple(one for one in names if one != name), numbers, theta, smoothness, deviation)
+        return less if self._gain(less, full) <= 0.0 else None
 
     def _settled(self, model: Model) -> Model:
         """A model without effects that are needless once all numbers are those of least prediction errors: where a fit
@@ -423,11 +435,11 @@ class Explainer:
                 weak.add(name)
         theta = best.theta[:count]
         for name in sorted(weak, key=model.names.index, reverse=True):
-            names = tuple(one for one in model.names if one != name)
+            if len(model.names) == 1:
+                break
             smoothness, deviation = self.linear(numbers, theta).choose(())
-            full = self.refit(model.names, numbers, theta, smoothness, deviation)
-            less = self.refit(names, numbers, theta, smoothness, deviation)
-            if names and self._gain(less, full) <= 0.0:
+            less = self._needless(name, model.names, numbers, theta, smoothness, deviation)
+            if less is not None:
                 model, numbers, theta = less, less.numbers, less.theta
         return model
 

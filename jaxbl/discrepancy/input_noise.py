@@ -17,6 +17,7 @@ from scipy.linalg import solveh_banded
 from jaxbl.records import Record
 
 from .coloured import spectrum_of, weighted_products
+from .residuals import white_noise
 
 Array = np.ndarray
 
@@ -24,8 +25,6 @@ _JUMP = 5.0
 """Standard deviations of the noise that a jump must stand out by."""
 _FEWEST = 8
 """Samples between two jumps that can be smoothed."""
-_MEDIAN = 1.4826
-"""Standard deviation over the median absolute value, of a Gaussian."""
 _ORDER = 3
 """Of the differences that are penalised."""
 _CUTOFFS = np.geomspace(0.015, 2.0, 30)
@@ -33,11 +32,9 @@ _CUTOFFS = np.geomspace(0.015, 2.0, 30)
 
 
 def noise_of(record: Record) -> float:
-    """Standard deviation of the input's white noise, N m, from its fourth differences: what is smooth is not in them, nor
-    are jumps, of which there are few."""
+    """Standard deviation of the input's white noise, N m."""
     assert record.torque is not None
-    found = np.concatenate([np.diff(record.torque[part], n=4) for part in record.segments])
-    return float(_MEDIAN * np.median(np.abs(found)) / np.sqrt(70.0))
+    return white_noise([record.torque[part] for part in record.segments])
 
 
 def unfelt(given: Sequence[Array], smooth: Sequence[Array]) -> float:

@@ -26,7 +26,7 @@ from jaxbl.drive.effects import ConstantTorque
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
 from jaxbl.identification.prediction import kalman_gain
-from jaxbl.identification.regression import actuator_path, lasting
+from jaxbl.identification.regression import lasting_path
 from jaxbl.identification.smoother import Smoothed
 from jaxbl.identification.trajectory import Free, with_values
 from jaxbl.records import Record
@@ -111,7 +111,7 @@ def _derivatives(
 ) -> Part:
     sides = experiment.sides
     at = chosen.put(experiment, theta)
-    effects, _ = actuator_path(at, torque, lasting(at, torque[0]))
+    effects, _ = lasting_path(at, torque)
     motion = PlantState({side: states[side][:, 0] for side in sides}, {side: states[side][:, 1] for side in sides}, effects)
     _, unravel = ravel_pytree(jax.tree.map(lambda x: x[0], motion.effects))
 

@@ -214,10 +214,11 @@ def _transmission(
     return part.transmitted - jax.vmap(of)(part.position, part.velocity), *slopes
 
 
-def _of_white(values: np.ndarray) -> float:
-    """Standard deviation of white noise on a smooth signal, by its third differences."""
-    third = np.diff(values, n=3)
-    return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20.0))
+def white_noise(parts: Sequence[np.ndarray]) -> float:
+    """Standard deviation of white noise on a signal in parts, by its fourth differences: what is smooth is not in them, nor
+    are jumps, of which there are few."""
+    fourth = np.concatenate([np.diff(part, n=4) for part in parts])
+    return float(np.median(np.abs(fourth)) / 0.6745 / np.sqrt(70.0))
 
 
 def residual_torques(
@@ -238,13 +239,13 @@ def residual_torques(
         parts: of the record, by :func:`jaxbl.identification.regression.from_smoothed`.
         smoothed: the positions of each part, by side.
         torque_noise: standard deviation of the input's noise from sample to sample, N m.
-        transmitted_noise: of the measured transmitted torque, N m; left out, by its third differences.
+        transmitted_noise: of the measured transmitted torque, N m; left out, by its fourth differences.
     """
     found: dict[str, list[Residual]] = {}
     for part, channels in zip(parts, smoothed, strict=True):
         sensor = 0.0
         if part.transmitted is not None:
-            sensor = _of_white(np.asarray(part.transmitted)) if transmitted_noise is None else transmitted_noise
+            sensor = white_noise([np.asarray(part.transmitted)]) if transmitted_noise is None else transmitted_noise
         if part.transmitted is not None and experiment.transmission is not None:
             missing, by_position, by_velocity = _transmission(experiment, part, dict(channels))
             noise = _Noise(part, channels, by_position, by_velocity)

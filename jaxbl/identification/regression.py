@@ -167,6 +167,14 @@ def lasting(experiment: Experiment, torque: Float[Array, ""]) -> tuple[Any, ...]
     return jax.tree.map(lambda x: jnp.asarray(x, torque.dtype) * 0.0 + torque, init)
 
 
+@eqx.filter_jit
+def lasting_path(
+    experiment: Experiment, torque: Float[Array, " samples"]
+) -> tuple[tuple[Any, ...], Float[Array, " samples"]]:
+    """As :func:`actuator_path`, of a torque that had lasted before its first sample."""
+    return actuator_path(experiment, torque, lasting(experiment, torque[0]))
+
+
 def actuator_path(
     experiment: Experiment, torque: Float[Array, " samples"], start: tuple[Any, ...]
 ) -> tuple[tuple[Any, ...], Float[Array, " samples"]]:

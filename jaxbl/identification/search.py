@@ -16,7 +16,7 @@ from jaxbl.simulate import Experiment
 
 from .intervals import Refusal, Spread, refusals, spread
 from .prediction import predictor
-from .regression import actuator_path, lasting
+from .regression import lasting_path
 from .smoother import Smoothed, smooth
 from .trajectory import Fit, Free, Windows, cut, fit, with_values
 
@@ -69,7 +69,7 @@ def windows_of(
         start = PlantState(
             {side: one.position for side, one in found.items()},
             {side: one.velocity for side, one in found.items()},
-            _effects(experiment, jnp.asarray(record.torque[part])),
+            lasting_path(experiment, jnp.asarray(record.torque[part]))[0],
         )
         measured = {side: record.positions[side][part] for side in found}
         first = float(record.time[part.start] - record.time[0])
@@ -77,12 +77,6 @@ def windows_of(
         pieces.append(cut(torque, measured, record.sample_period, start, channels.noise, samples, first, rest))
         firsts.append(part.start + samples * np.arange(count // samples))
     return Windows.join(pieces), np.concatenate(firsts)
-
-
-@eqx.filter_jit
-def _effects(experiment: Experiment, torque: jax.Array) -> tuple[Any, ...]:
-    """The effects' own states at each sample of an input."""
-    return actuator_path(experiment, torque, lasting(experiment, torque[0]))[0]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,7 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hidden_log import driven, model
+from hidden.cases import Log
+from hidden.simulator import Machine, Run, simulate
+from hidden_log import GAP, GEARED, driven, model
 from scipy.signal import lfilter
 
 from jaxbl.discrepancy.proof import Ground
@@ -37,8 +39,15 @@ def test_windows_begin_with_the_torque_that_the_actuator_makes_then(setting):
     np.testing.assert_allclose(windows.start.position["motor"], channels.smoothed["motor"][0].position[jnp.asarray(firsts)])
 
 
-def test_the_true_model_of_a_lag_leaves_noise(setting):
-    record, experiment, channels = setting
-    ground = Ground(record, channels, kinematics_of(record, channels, 1), {"motor": 30.0})
+def test_the_true_model_of_a_lag_before_a_hard_gap_leaves_noise(tmp_path):
+    """From an actuator without torque the search for the windows' initial states ends a thousand times as far off."""
+    torque = 5.0 * np.sin(2.0 * np.pi * 0.9 * 2e-3 * np.arange(2000))
+    (trace,) = simulate([Run(Machine(GEARED, GAP, [LAG]), 2e-3, torque, motor_noise=1e-5, load_noise=2e-6, seed=1)])
+    Log(trace.t, trace.u, trace.theta_e, trace.theta_s).write(tmp_path / "axis.csv")
+    config, _ = read_model(model(drive=GEARED, transmission=GAP, effects=[LAG]))
+    record = read_record(tmp_path / "axis.csv", gear_ratio=GEARED["gear_ratio"])
+    experiment = on_record(config, record)
+    channels = smoothed_channels(record, experiment.sides)
+    ground = Ground(record, channels, kinematics_of(record, channels, 1), {"motor": 30.0, "load": 30.0})
     errors = ground.prove(experiment).errors
-    assert errors["theta_e"] < 1.1 * channels.noise["motor"]
+    assert errors["theta_e"] < 1.2 * channels.noise["motor"] and errors["theta_s"] < 1.2 * channels.noise["load"]
