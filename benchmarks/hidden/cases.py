@@ -289,6 +289,8 @@ def _known(
     rigid = machine.rigid
     possible = ["motor.coulomb_friction", "load.gravity"] + ([] if rigid else ["load.coulomb_friction"])
     possible = [kind for kind in possible if not any(exclusive(name, kind) for name in names)]
+    if not possible:
+        return ()
     chosen, wanted = str(rng.choice(possible)), rng.random() < 0.3
     torque = float(rng.uniform(0.05, 0.12)) * float(np.mean(given["torque"]))
     torque *= machine.ratio if chosen.startswith("load.") else 1.0

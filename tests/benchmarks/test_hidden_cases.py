@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hidden.cases import KINDS, _targets, cases, save
+from hidden.cases import _PLANTS, KINDS, _known, _targets, cases, save
 from hidden.effects import APART, EFFECTS, LEVELS, UNKNOWN, error_of, on_rigid
 from hidden.proof import foretold, proofs
 from hidden.scoring import calibration, calibration_error, confusion, markdown, outcome, run, scores, write
+from hidden.simulator import Machine
 from hidden_effects import left
 
 from jaxbl.drive import Initial, Plant, as_arrays
@@ -52,6 +53,16 @@ def test_all_effects_of_the_package_are_hidden_at_all_sizes():
     assert {(effect, level) for _, ((effect, level),) in targets} == {(e, s) for e in EFFECTS for s in LEVELS}
     assert all(on_rigid(effect) for plant, hidden in _targets(1, 200, "pairs") for effect, _ in hidden if plant == "direct")
     assert {effect for _, ((effect, _),) in _targets(0, 8, "unknown")} == set(UNKNOWN)
+
+
+def test_a_machine_may_have_no_place_for_an_effect_that_the_model_knows():
+    given = _PLANTS["direct"]
+    machine = Machine(given["drive"], None)
+    hidden = ["motor.coulomb_friction", "load.gravity"]
+    drawn = [_known(machine, hidden, given, np.random.default_rng(seed)) for seed in range(20)]
+    assert drawn == [()] * 20
+    one = [_known(machine, hidden[:1], given, np.random.default_rng(seed)) for seed in range(20)]
+    assert {effects[0]["kind"] for effects in one if effects} == {"load.gravity"}
 
 
 def test_same_seed_same_cases():
