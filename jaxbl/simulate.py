@@ -5,6 +5,7 @@ without a trace, with any reducers: :func:`scan` for simulated and :func:`replay
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -249,10 +250,53 @@ def unit_noise(seed: Int[Array, ""], indices: Int[Array, " samples"], sides: tup
     return {side: draws[:, i] for i, side in enumerate(sides)}
 
 
-def _block(steps: int) -> int:
+def simulated(experiment: Experiment, time: Number, noise: dict[str, Number]) -> Sample:
+    """A sample of a simulation, with unit noise in the precision of the experiment."""
+    return Sample(time, {side: value.astype(jnp.result_type(time)) for side, value in noise.items()})
+
+
+def block_length(steps: int) -> int:
     """Samples whose noise is drawn at once: the largest divisor of `steps` up to 512, or 256 with a rest."""
     divisors = [n for n in range(64, 513) if steps % n == 0]
     return divisors[-1] if divisors else min(256, steps)
+
+
+Carry = tuple[State, tuple[Any, ...]]
+"""The state of the chain, and each reducer's carry."""
+
+
+def begin(experiment: Experiment, reducers: tuple[Reducer, ...], state: State | None = None) -> Carry:
+    """What the loop over time starts from."""
+    return initial_state(experiment) if state is None else state, tuple(r.init(experiment) for r in reducers)
+
+
+def proceed(
+    experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry, index: Int[Array, ""], given: Sample
+) -> tuple[Carry, Signals]:
+    """One sample further: state, reducers, and the signals at sample `index`."""
+    state, totals = carry
+    state, signals = step(experiment, state, given)
+    return (state, tuple(r.update(experiment, t, index, signals) for r, t in zip(reducers, totals, strict=True))), signals
+
+
+def time_of(experiment: Experiment, index: Int[Array, ""]) -> Number:
+    """Time of a sample, s."""
+    return index.astype(jnp.result_type(experiment.run.sample_period)) * experiment.run.sample_period
+
+
+def settled(experiment: Experiment, carry: Carry) -> Carry:
+    """What goes from one block of samples to the next."""
+    state, totals = carry
+    return settle(experiment, state), totals
+
+
+def figures(experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry) -> dict[str, Array]:
+    """The reducers' figures from the last carry."""
+    state, totals = carry
+    found: dict[str, Array] = {}
+    for reducer, total in zip(reducers, totals, strict=True):
+        found |= reducer.result(experiment, total, state)
+    return found
 
 
 def scan(
@@ -274,15 +318,12 @@ def scan(
     Returns:
         The reducers' figures, and the record with a leading time axis (None without one).
     """
-    dtype = jnp.result_type(experiment.run.sample_period)
 
     def samples(indices: Int[Array, " samples"]) -> tuple[dict[str, Array], ...]:
         return (unit_noise(seed, indices, experiment.sides),)
 
-    def sample(time: Number, noise: dict[str, Number]) -> Sample:
-        return Sample(time, {side: value.astype(dtype) for side, value in noise.items()})
-
-    return _scan(experiment, initial_state(experiment), experiment.run.steps, samples, sample, reducers, record, every)
+    sample = partial(simulated, experiment)
+    return _scan(experiment, begin(experiment, reducers), experiment.run.steps, samples, sample, reducers, record, every)
 
 
 def replay(
@@ -322,12 +363,12 @@ def replay(
     def sample(time: Number, torque: Number, measured: dict[str, Number], told: dict[str, Number] | None) -> Sample:
         return Sample(time, None, torque, measured, told)
 
-    return _scan(experiment, state, len(torque), samples, sample, reducers, record, every)
+    return _scan(experiment, begin(experiment, reducers, state), len(torque), samples, sample, reducers, record, every)
 
 
 def _scan(
     experiment: Experiment,
-    state: State,
+    start: Carry,
     steps: int,
     samples: Callable[[Int[Array, " samples"]], tuple[Any, ...]],
     sample_of: Callable[..., Sample],
@@ -336,34 +377,25 @@ def _scan(
     every: int,
 ) -> tuple[dict[str, Array], Any]:
     """The loop over time; `samples` gives what samples of a block are made of, `sample_of` makes one of time and that."""
-    dtype = jnp.result_type(experiment.run.sample_period)
-    start = (state, tuple(reducer.init(experiment) for reducer in reducers))
 
-    def sample(carry: Any, given: tuple[Array, tuple[Any, ...]]) -> tuple[Any, Any]:
-        (state, totals), (index, parts) = carry, given
-        time = index.astype(dtype) * experiment.run.sample_period
-        new, signals = step(experiment, state, sample_of(time, *parts))
-        totals = tuple(r.update(experiment, total, index, signals) for r, total in zip(reducers, totals, strict=True))
-        return (new, totals), None if record is None else record(new, signals)
+    def sample(carry: Carry, given: tuple[Array, tuple[Any, ...]]) -> tuple[Carry, Any]:
+        index, parts = given
+        carry, signals = proceed(experiment, reducers, carry, index, sample_of(time_of(experiment, index), *parts))
+        return carry, None if record is None else record(carry[0], signals)
 
-    def block(carry: Any, first: Array, length: int) -> tuple[Any, Any]:
+    def block(carry: Carry, first: Array, length: int) -> tuple[Carry, Any]:
         indices = first + jnp.arange(length, dtype=jnp.int32)
         carry, kept = jax.lax.scan(sample, carry, (indices, samples(indices)))
-        state, totals = carry
-        return (settle(experiment, state), totals), jax.tree.map(lambda x: x[::every], kept)
+        return settled(experiment, carry), jax.tree.map(lambda x: x[::every], kept)
 
-    length = _block(steps) if record is None or every == 1 else every
+    length = block_length(steps) if record is None or every == 1 else every
     blocks, rest = divmod(steps, length)
     carry, kept = jax.lax.scan(lambda carry, i: block(carry, i * length, length), start, jnp.arange(blocks, dtype=jnp.int32))
     kept = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), kept)
     if rest:
         carry, last = block(carry, jnp.asarray(blocks * length, jnp.int32), rest)
         kept = jax.tree.map(lambda *parts: jnp.concatenate(parts), kept, last)
-    state, totals = carry
-    figures: dict[str, Array] = {}
-    for reducer, total in zip(reducers, totals, strict=True):
-        figures |= reducer.result(experiment, total, state)
-    return figures, kept
+    return figures(experiment, reducers, carry), kept
 
 
 def trajectory(

@@ -1,0 +1,72 @@
+"""The C++ kernel: compiled here, called through ctypes."""
+
+import ctypes
+import hashlib
+import os
+import shutil
+import subprocess
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..workload import Workload, constants, figures_of
+
+_FLAGS = ("-std=c++20", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fopenmp", "-shared", "-fPIC")
+"""Fused multiply-add as the compiler likes (GCC's default), but no reordering: sums are compensated."""
+_SOURCE = Path(__file__).with_name("chain.cpp")
+SUMS = 9
+
+
+class _Constants(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_double) for name in constants()]
+
+
+def compiler() -> str | None:
+    """The C++ compiler that `CXX` names, or g++; None without one."""
+    return shutil.which(os.environ.get("CXX", "g++"))
+
+
+@cache
+def _library(folder: Path) -> ctypes.CDLL:
+    command = compiler()
+    assert command is not None
+    text = _SOURCE.read_bytes() + " ".join([command, *_FLAGS]).encode()
+    target = folder / f"chain-{hashlib.sha256(text).hexdigest()[:16]}.so"
+    if not target.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        draft = target.with_suffix(f".{os.getpid()}")
+        done = subprocess.run([command, *_FLAGS, "-o", str(draft), str(_SOURCE)], capture_output=True, text=True)
+        if done.returncode:
+            raise RuntimeError(f"{command} cannot compile {_SOURCE.name}: {done.stderr.strip().splitlines()[-1:]}")
+        draft.replace(target)
+    return ctypes.CDLL(str(target))
+
+
+class Native:
+    """One workload, ready to run; arrays are the kernel's, so that a run allocates nothing."""
+
+    def __init__(self, workload: Workload, threads: int, vectors: int, folder: Path):
+        self.workload, self.threads, self.vectors = workload, threads, vectors
+        self._function = getattr(_library(folder), f"chain_{workload.precision}")
+        # whole blocks of the widest registers there are
+        self._padded = -(-workload.lanes // 64) * 64
+        values = [np.resize(column, self._padded) for column in workload.values().values()]
+        self._given = [np.ascontiguousarray(column) for column in values]
+        self._out = [np.zeros(self._padded, workload.dtype) for _ in range(SUMS)]
+        self._torque, self._noise = map(np.ascontiguousarray, workload.inputs())
+        self._constants = _Constants(**constants())
+        self._table = [_pointers(arrays) for arrays in (self._given, self._out)]
+
+    def __call__(self) -> dict[str, np.ndarray]:
+        w = self.workload
+        self._function(
+            ctypes.byref(self._constants), w.steps, w.start, w.window, self._torque.ctypes, self._noise.ctypes,
+            self._padded, *self._table, self.threads, self.vectors,
+        )  # fmt: skip
+        return figures_of(w, [sums[: w.lanes] for sums in self._out])
+
+
+def _pointers(arrays: list[np.ndarray]) -> Any:
+    return (ctypes.c_void_p * len(arrays))(*[array.ctypes.data for array in arrays])

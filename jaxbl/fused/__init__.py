@@ -1,0 +1,6 @@
+"""Fused runs: the loop over time inside, a lane's state in registers, from the same step function as the scan.
+
+XLA makes several kernels of a time step and passes the state through memory between them. Here the traced step is split
+(`split`) into what all lanes share, which XLA computes once, and what each lane does, which one loop does in registers: on
+CPUs compiled by LLVM (`llvm`).
+"""

@@ -1,0 +1,174 @@
+"""Split a traced function of one lane into what all lanes share and what each has to do by itself.
+
+`vmap` leaves what no axis touches unbatched, and computes it once; so does this. A value is *fixed* if it depends on
+neither lane nor time, *shared* if it depends on time alone, a *lane's* otherwise.
+"""
+
+import enum
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
+
+_CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call", "checkpoint")
+"""Primitives that only call another jaxpr."""
+
+
+class Kind(enum.IntFlag):
+    """What a value depends on."""
+
+    FIXED = 0
+    SHARED = 1
+    LANE = 2
+
+
+class Parts(NamedTuple):
+    """A function `f(values, carry, given) -> carry` of one lane in two parts.
+
+    Attributes:
+        fixed: arrays that the lanes' part reads and that never change.
+        shared: from the shared part of the carry and `given` to the next shared part and what the lanes' part reads of it.
+        lane: the lanes' part: values, its part of the carry, `fixed`, what `shared` hands over -> its part of the carry.
+    """
+
+    fixed: list[jax.Array]
+    shared: Callable[[Sequence[Any], Any], tuple[list[Any], list[Any]]]
+    lane: ClosedJaxpr
+
+
+def carry_kinds(start: Callable[..., Any], functions: Iterable[tuple[Callable[..., Any], Any]], values: Any) -> list[Kind]:
+    """Kinds of the leaves of a carry.
+
+    Args:
+        start: from values to the first carry.
+        functions: each from (values, carry, given) to a carry, with an example of what is given.
+        values: example of the values that differ from lane to lane.
+    """
+    made = flat(start, values)
+    kinds = _kinds(made.jaxpr, [Kind.LANE] * len(made.jaxpr.invars))
+    found = [_kind(kinds, out) for out in made.jaxpr.outvars]
+    count = len(jax.tree.leaves(values))
+    example = jax.eval_shape(start, values)
+    traced = [(flat(f, values, example, given), len(jax.tree.leaves(given))) for f, given in functions]
+    while True:
+        before = list(found)
+        for closed, shared in traced:
+            jaxpr = closed.jaxpr
+            kinds = _kinds(jaxpr, [Kind.LANE] * count + found + [Kind.SHARED] * shared)
+            for i, (old, new) in enumerate(zip(jaxpr.invars[count:], jaxpr.outvars, strict=False)):
+                if new is not old:
+                    found[i] |= _kind(kinds, new) | Kind.SHARED
+        if found == before:
+            return [Kind.LANE if kind & Kind.LANE else Kind.SHARED for kind in found]
+
+
+def split(function: Callable[..., Any], values: Any, carry: Any, given: Any, kinds: Sequence[Kind]) -> Parts:
+    """The two parts of a function of one lane; `kinds` are those of the carry's leaves."""
+    closed = flat(function, values, carry, given)
+    jaxpr = closed.jaxpr
+    count = len(jax.tree.leaves(values))
+    carried, rest = jaxpr.invars[count : count + len(kinds)], jaxpr.invars[count + len(kinds) :]
+    of_lane = [kind == Kind.LANE for kind in kinds]
+    known = _kinds(jaxpr, [Kind.LANE] * count + list(kinds) + [Kind.SHARED] * len(rest))
+    live = _live(jaxpr)
+    lanes = [eqn for eqn in live if any(known[out] & Kind.LANE for out in eqn.outvars)]
+    others = [eqn for eqn in live if not any(known[out] & Kind.LANE for out in eqn.outvars)]
+    constants = dict(zip(jaxpr.constvars, closed.consts, strict=True))
+
+    results = [out for out, lane in zip(jaxpr.outvars, of_lane, strict=True) if lane]
+    read = dict.fromkeys(v for eqn in lanes for v in eqn.invars if isinstance(v, Var))
+    read |= dict.fromkeys(v for v in results if isinstance(v, Var))
+    outside = [v for v in read if not known[v] & Kind.LANE]
+    fixed = [v for v in outside if known[v] == Kind.FIXED]
+    crossing = [v for v in outside if known[v] == Kind.SHARED]
+    lane_in = [*jaxpr.invars[:count], *(v for v, lane in zip(carried, of_lane, strict=True) if lane)]
+
+    def shared(state: Sequence[Any], given: Any) -> tuple[list[Any], list[Any]]:
+        env = constants | dict(zip([v for v, lane in zip(carried, of_lane, strict=True) if not lane], state, strict=True))
+        env |= dict(zip(rest, jax.tree.leaves(given), strict=True))
+        _run(others, env)
+        new = [_read(env, out) for out, lane in zip(jaxpr.outvars, of_lane, strict=True) if not lane]
+        return new, [env[v] for v in crossing]
+
+    def once() -> list[Any]:
+        env = dict(constants)
+        _run([eqn for eqn in others if all(known[out] == Kind.FIXED for out in eqn.outvars)], env)
+        return [env[v] for v in fixed]
+
+    def lane(*arguments: Any) -> list[Any]:
+        env = dict(zip([*lane_in, *fixed, *crossing], arguments, strict=True))
+        _run(lanes, env)
+        return [_read(env, out) for out in results]
+
+    examples = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in [*lane_in, *fixed, *crossing]]
+    return Parts(jax.jit(once)(), shared, jax.make_jaxpr(lane)(*examples))
+
+
+def flat(function: Callable[..., Any], *examples: Any) -> ClosedJaxpr:
+    """Trace a function of pytrees, without calls inside."""
+    closed = jax.make_jaxpr(function)(*examples)
+    leaves = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in closed.jaxpr.invars]
+    return jax.make_jaxpr(partial(_inlined, closed))(*leaves)
+
+
+def callee(eqn: JaxprEqn) -> ClosedJaxpr | None:
+    """What an equation calls, if it does nothing else."""
+    if eqn.primitive.name not in _CALLS:
+        return None
+    inner = eqn.params["jaxpr" if "jaxpr" in eqn.params else "call_jaxpr"]
+    return inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
+
+
+def _inlined(closed: ClosedJaxpr, *arguments: Any) -> list[Any]:
+    jaxpr = closed.jaxpr
+    env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *arguments], strict=True))
+    for eqn in jaxpr.eqns:
+        given = [_read(env, v) for v in eqn.invars]
+        called = callee(eqn)
+        if called is not None:
+            results = _inlined(called, *given)
+        else:
+            params = eqn.params
+            if eqn.primitive.name == "scan":
+                params = params | {"jaxpr": flat(partial(_inlined, params["jaxpr"]), *params["jaxpr"].in_avals)}
+            results = eqn.primitive.bind(*given, **params)
+            results = results if eqn.primitive.multiple_results else [results]
+        env |= dict(zip(eqn.outvars, results, strict=True))
+    return [_read(env, v) for v in jaxpr.outvars]
+
+
+def _run(eqns: Iterable[JaxprEqn], env: dict[Var, Any]) -> None:
+    for eqn in eqns:
+        results = eqn.primitive.bind(*[_read(env, v) for v in eqn.invars], **eqn.params)
+        env |= dict(zip(eqn.outvars, results if eqn.primitive.multiple_results else [results], strict=True))
+
+
+def _read(env: dict[Var, Any], v: Var | Literal) -> Any:
+    return v.val if isinstance(v, Literal) else env[v]
+
+
+def _kind(kinds: dict[Var, Kind], v: Var | Literal) -> Kind:
+    return Kind.FIXED if isinstance(v, Literal) else kinds[v]
+
+
+def _kinds(jaxpr: Jaxpr, given: Sequence[Kind]) -> dict[Var, Kind]:
+    kinds = dict.fromkeys(jaxpr.constvars, Kind.FIXED) | dict(zip(jaxpr.invars, given, strict=True))
+    for eqn in jaxpr.eqns:
+        kind = Kind.FIXED
+        for v in eqn.invars:
+            kind |= _kind(kinds, v)
+        kinds |= dict.fromkeys(eqn.outvars, Kind.LANE if kind & Kind.LANE else kind)
+    return kinds
+
+
+def _live(jaxpr: Jaxpr) -> list[JaxprEqn]:
+    """Equations that an output needs."""
+    needed = {v for v in jaxpr.outvars if isinstance(v, Var)}
+    kept = []
+    for eqn in reversed(jaxpr.eqns):
+        if any(out in needed for out in eqn.outvars):
+            kept.append(eqn)
+            needed |= {v for v in eqn.invars if isinstance(v, Var)}
+    return kept[::-1]

@@ -1,0 +1,141 @@
+"""The fused loop does what the scan does: all laws, effects and observers, both precisions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxbl.bench.workload import FIGURES, RANGES, SEED, Workload
+from jaxbl.drive import Encoders, Initial, LinearShaft, Rigid, TwoInertia, as_arrays, get_leaf, set_leaves
+from jaxbl.drive.effects import effect_kinds
+from jaxbl.drive.excitation import Chirp, Sine
+from jaxbl.drive.parameters import leaf_paths
+from jaxbl.drive.transmission import DeadZone
+from jaxbl.fused.llvm import Unsupported
+from jaxbl.fused.passage import Passage
+from jaxbl.observer import OBSERVERS, EquivalentControl, Identifier, Observers
+from jaxbl.simulate import Experiment, Reducer, Run, scan
+from jaxbl.study.metrics import METRICS
+
+NUMBERS = {
+    "motor.coulomb_friction": {"torque": 0.1},
+    "load.coulomb_friction": {"torque": 1.0},
+    "motor.stribeck_friction": {"torque": 0.1, "breakaway_torque": 0.15, "stribeck_velocity": 0.5},
+    "load.stribeck_friction": {"torque": 1.0, "breakaway_torque": 1.5, "stribeck_velocity": 0.1},
+    "motor.viscous_friction": {"viscous": 0.02},
+    "load.viscous_friction": {"viscous": 1.0},
+    "motor.quadratic_drag": {"drag": 0.01},
+    "load.quadratic_drag": {"drag": 0.5},
+    "motor.constant_torque": {"torque": 0.1},
+    "load.constant_torque": {"torque": 1.0},
+    "motor.inertia": {"inertia": 0.01},
+    "load.inertia": {"inertia": 0.5},
+    "load.gravity": {"torque": 2.0, "phase": 0.3},
+    "load.periodic_disturbance": {"amplitude": 0.5, "frequency": 3.0, "phase": 0.1},
+    "motor.cogging": {"amplitude": 0.2, "harmonic": 6.0, "phase": 0.2},
+    "transmission.backlash": {"half_gap": 0.02},
+    "transmission.hardening": {"cubic_stiffness": 100.0},
+    "transmission.damping": {"damping": 0.05},
+    "transmission.eccentricity": {"amplitude": 0.01, "phase": 0.4},
+    "actuator.gain_error": {"relative": 0.05},
+    "actuator.saturation": {"limit": 4.0},
+    "actuator.lag": {"time_constant": 0.004},
+}
+HALF = ["motor.coulomb_friction", "load.stribeck_friction", "load.gravity", "motor.cogging", "load.periodic_disturbance",
+        "transmission.damping", "actuator.lag", "actuator.saturation"]  # fmt: skip
+OTHERS = [name for name in NUMBERS if name not in HALF]
+
+
+def experiment(names, law=None, observer="implicit", rigid=False, substeps=2, steps=700):
+    kind = OBSERVERS[observer]
+    motor = kind(10.0, 90.0, velocity_error=0.5)
+    return as_arrays(
+        Experiment(
+            drive=Rigid(0.02, 0.03) if rigid else TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0),
+            transmission=law,
+            effects=tuple(effect_kinds()[name](**NUMBERS[name]) for name in names),
+            initial=Initial(),
+            excitation=Chirp(5.0, 0.5, 3.0, 0.5) if rigid else Sine(5.0, 0.8),
+            encoders=Encoders(1e-4, motor_resolution=1e-5),
+            observer=Observers(motor) if rigid else Observers(motor, kind(2.5, 8.2)),
+            equivalent_control=EquivalentControl(0.01),
+            identifier=None if rigid else Identifier(0.1),
+            run=Run(1e-3, steps, substeps),
+        ),
+        np.float64,
+    )
+
+
+def both(experiment, paths, reducers, lanes=7, seed=3):
+    """Figures of the fused loop, with threads that get different numbers of lanes, and of the scan."""
+    values = {path: np.asarray(get_leaf(experiment, path)) * np.linspace(0.6, 1.4, lanes) for path in paths}
+    fused = Passage(experiment, reducers, tuple(paths), threads=2)(values, seed)
+
+    def lane(values):
+        return scan(set_leaves(experiment, values), jnp.asarray(seed), reducers)[0]
+
+    return fused, jax.jit(jax.vmap(lane))(values)
+
+
+def test_every_effect_of_the_package_is_among_them():
+    assert sorted(NUMBERS) == sorted(effect_kinds())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("names", "law", "options"),
+    [
+        (HALF, DeadZone(60.0, 0.05), {}),
+        (OTHERS, LinearShaft(60.0), {"observer": "explicit", "substeps": 1}),
+        (["motor.coulomb_friction", "load.gravity"], None, {"rigid": True, "substeps": 3}),
+    ],
+    ids=["half", "others", "rigid"],
+)
+def test_figures_are_those_of_the_scan(names, law, options):
+    whole = experiment(names, law, **options)
+    effects = [path for path in leaf_paths(whole) if path.startswith("effects.")]
+    fused, scanned = both(whole, [*effects, "observer.motor.alpha", "encoders.noise"], (METRICS,), lanes=37)
+    assert set(fused) == set(scanned)
+    for name, figure in fused.items():
+        np.testing.assert_allclose(figure, scanned[name], rtol=1e-7, err_msg=name)
+
+
+@pytest.mark.slow
+def test_what_no_axis_touches_is_computed_once():
+    """Axes on gains alone leave the plant to the shared part: no law is evaluated in a lane."""
+    whole = experiment([], DeadZone(60.0, 0.05))
+    passage = Passage(whole, (METRICS,), ("observer.motor.alpha",), 1)
+    varied = Passage(whole, (METRICS,), ("transmission.half_gap",), 1)
+    assert passage.carried < varied.carried
+    fused, scanned = both(whole, ["observer.motor.alpha", "observer.motor.lambda"], (METRICS,))
+    for name, figure in fused.items():
+        np.testing.assert_allclose(figure, scanned[name], rtol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_the_benchmarks_work_in_both_precisions(precision):
+    work = Workload(40, 1500, precision)
+    values = work.values()
+    with jax.enable_x64(precision == "float64"):
+        whole = work.experiment()
+        fused = Passage(whole, (FIGURES,), tuple(RANGES), 2)(values, SEED)
+        scanned = jax.jit(jax.vmap(lambda v: scan(set_leaves(whole, v), jnp.asarray(SEED), (FIGURES,))[0]))(values)
+    for name, figure in fused.items():
+        assert figure.dtype == precision
+        if precision == "float64":
+            np.testing.assert_allclose(figure, scanned[name], rtol=1e-6)
+        elif "rmse" in name:
+            # a switching term makes an error of rounding one of a sample
+            apart = np.abs(figure / np.asarray(scanned[name]) - 1.0)
+            assert np.median(apart) < 1e-3
+
+
+def test_an_unknown_operation_is_refused_by_name():
+    whole = experiment([], DeadZone(60.0, 0.05), steps=100)
+    odd = Reducer(
+        lambda e: jnp.zeros_like(e.run.sample_period),
+        lambda e, total, index, signals: total + jax.scipy.special.erf(signals.motor.measured),
+        lambda e, total, state: {"odd": total},
+    )
+    with pytest.raises(Unsupported, match="erf"):
+        Passage(whole, (odd,), ("transmission.half_gap",), 1)

@@ -1,0 +1,52 @@
+"""What all lanes share is found, and both parts together do what the function does."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxbl.fused.split import Kind, carry_kinds, split
+
+
+def begin(values):
+    return {"shared": jnp.asarray(0.0), "own": values[0], "kept": jnp.asarray(2.0), "led": jnp.asarray(1.0)}
+
+
+def step(values, carry, given):
+    # `led` becomes a lane's only by way of `own`
+    shared = carry["shared"] + jnp.tanh(given) * carry["kept"]
+    own = jax.lax.fori_loop(0, 3, lambda i, x: 0.5 * x + shared * values[1], carry["own"])
+    return {"shared": shared, "own": own, "kept": carry["kept"], "led": carry["led"] + carry["own"]}
+
+
+@pytest.fixture
+def parts():
+    values = [jnp.asarray(1.0), jnp.asarray(3.0)]
+    kinds = carry_kinds(begin, ((step, jnp.asarray(0.0)),), values)
+    return kinds, split(step, values, begin(values), jnp.asarray(0.0), kinds)
+
+
+def test_kinds_of_a_carry(parts):
+    names = sorted(begin([jnp.asarray(1.0)]))
+    assert [name for name, kind in zip(names, parts[0], strict=True) if kind == Kind.LANE] == ["led", "own"]
+
+
+def test_parts_make_the_whole(parts):
+    kinds, (fixed, shared, lane) = parts
+    values = [jnp.asarray(0.3), jnp.asarray(-1.2)]
+    carry = begin(values)
+    leaves, tree = jax.tree.flatten(carry)
+    own = [leaf for leaf, kind in zip(leaves, kinds, strict=True) if kind == Kind.LANE]
+    state = [leaf for leaf, kind in zip(leaves, kinds, strict=True) if kind != Kind.LANE]
+    for given in jnp.linspace(0.1, 2.0, 5):
+        carry = step(values, carry, given)
+        state, handed = shared(state, given)
+        own = jax.core.eval_jaxpr(lane.jaxpr, lane.consts, *values, *own, *fixed, *handed)
+    found = iter(own), iter(state)
+    together = tree.unflatten([next(found[0] if kind == Kind.LANE else found[1]) for kind in kinds])
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14), together, carry)
+
+
+def test_the_lanes_part_leaves_the_shared_work_to_the_other(parts):
+    names = {eqn.primitive.name for eqn in parts[1].lane.jaxpr.eqns}
+    assert "tanh" not in names
