@@ -430,6 +430,30 @@ def plot(
     _tell(write_sweep_report(result, folder), folder)
 
 
+@app.command()
+def bench(
+    quick: Annotated[
+        bool, typer.Option("--quick", help="in less than a minute: shorter runs, rivals in float32 alone")
+    ] = False,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the results")] = Path("results/bench"),
+) -> None:
+    """Measure this machine: the same work by jaxbl, C++, numba, diffrax, NumPy, SciPy, OpenSMC; table, chart, bench.json."""
+    _start_jax()
+    import jax
+
+    from .bench.run import bench as run_bench
+    from .report import write_bench_report
+    from .study.store import make_folder
+
+    # what was compiled before does not count
+    jax.config.update("jax_enable_compilation_cache", False)
+    make_folder(out)
+    with _progress("parts") as progress:
+        result = run_bench(out / ".kernel", quick=quick, progress=progress)
+    for line in write_bench_report(result, out):
+        typer.echo(line)
+
+
 def _folder(config: Path, out: Path | None) -> Path:
     return out if out is not None else Path("results") / config.stem
 

@@ -5,6 +5,7 @@ recorded. Every lane has a dead zone, a noise level and gains of its own; all sh
 """
 
 import math
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -17,6 +18,7 @@ from jaxbl.observer import EquivalentControl, ExplicitSuperTwisting, Identifier,
 from jaxbl.simulate import Experiment, Reducer, Run, State, unit_noise
 from jaxbl.study.metrics import window_start
 
+SEED = 0
 SIDES = ("motor", "load")
 RANGES = {
     "observer.motor.alpha": (8.0, 40.0),
@@ -27,8 +29,8 @@ RANGES = {
     "encoders.noise": (1e-5, 1e-3),
 }
 """What differs from lane to lane, from and to; spread by the logarithm."""
-_PERIOD, _START, _MISS = 1e-3, 1.0, 0.5
-"""Sample period (s), start of the identifiers (s), velocity error of the motor's observer at t = 0 (rad/s)."""
+_PERIOD, _MISS = 1e-3, 0.5
+"""Sample period (s), velocity error of the motor's observer at t = 0 (rad/s)."""
 _DRIVE = {"motor_inertia": 0.05, "motor_viscous": 0.15, "load_inertia": 7.0, "load_viscous": 16.0, "gear_ratio": 5.0}
 _STIFFNESS, _SLOPE, _LOW_PASS = 1.0, 20.0, 0.01
 
@@ -78,8 +80,8 @@ class Workload(NamedTuple):
 
     @property
     def start(self) -> int:
-        """First sample that the identifiers count."""
-        return round(_START / _PERIOD)
+        """First sample that the identifiers count: the observers have converged."""
+        return self.steps // 4
 
     @property
     def window(self) -> int:
@@ -112,22 +114,24 @@ class Workload(NamedTuple):
             encoders=Encoders(1e-4),
             observer=Observers(ExplicitSuperTwisting(4.0, 9.0, velocity_error=_MISS), ExplicitSuperTwisting(0.5, 0.2)),
             equivalent_control=EquivalentControl(_LOW_PASS),
-            identifier=Identifier(_START),
+            identifier=Identifier(self.start * _PERIOD),
             run=Run(_PERIOD, self.steps, 1),
         )
         return as_arrays(experiment, self.dtype)
 
     def inputs(self) -> tuple[np.ndarray, np.ndarray]:
         """Torque (N m) `(steps,)` and unit noise `(steps, 2)` of motor and load, for entries that do not make them."""
-        experiment = self.experiment()
-        indices = jnp.arange(self.steps, dtype=jnp.int32)
-        time = indices.astype(self.dtype) * experiment.run.sample_period
-        noise = jax.jit(lambda: unit_noise(jnp.asarray(SEED), indices, SIDES))()
-        torque = jax.vmap(experiment.excitation)(time)
-        return np.asarray(torque), np.stack([np.asarray(noise[side], self.dtype) for side in SIDES], 1)
+        return _inputs(self.steps, self.precision)
 
 
-SEED = 0
+@cache
+def _inputs(steps: int, precision: str) -> tuple[np.ndarray, np.ndarray]:
+    work = Workload(1, steps, precision)
+    experiment = work.experiment()
+    indices = jnp.arange(steps, dtype=jnp.int32)
+    noise = jax.jit(lambda: unit_noise(jnp.asarray(SEED), indices, SIDES))()
+    torque = jax.vmap(experiment.excitation)(indices.astype(work.dtype) * experiment.run.sample_period)
+    return np.asarray(torque), np.stack([np.asarray(noise[side], work.dtype) for side in SIDES], 1)
 
 
 def constants() -> dict[str, float]:

@@ -47,8 +47,8 @@ def _library(folder: Path) -> ctypes.CDLL:
 class Native:
     """One workload, ready to run; arrays are the kernel's, so that a run allocates nothing."""
 
-    def __init__(self, workload: Workload, threads: int, vectors: int, folder: Path):
-        self.workload, self.threads, self.vectors = workload, threads, vectors
+    def __init__(self, workload: Workload, threads: int, folder: Path):
+        self.workload, self.threads = workload, threads
         self._function = getattr(_library(folder), f"chain_{workload.precision}")
         # whole blocks of the widest registers there are
         self._padded = -(-workload.lanes // 64) * 64
@@ -63,7 +63,7 @@ class Native:
         w = self.workload
         self._function(
             ctypes.byref(self._constants), w.steps, w.start, w.window, self._torque.ctypes, self._noise.ctypes,
-            self._padded, *self._table, self.threads, self.vectors,
+            self._padded, *self._table, self.threads,
         )  # fmt: skip
         return figures_of(w, [sums[: w.lanes] for sums in self._out])
 

@@ -1,0 +1,223 @@
+"""The chain in numba: a plain scalar loop over threads, and lanes in blocks that LLVM turns into vectors."""
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+
+from ..workload import Workload, constants, figures_of
+
+WIDTH = 64
+"""Lanes of a block: several registers of the widest vectors, and a state that stays in the first cache."""
+
+
+class Compiled:
+    """One workload; `blocked` chooses the form that vectorises."""
+
+    def __init__(self, workload: Workload, threads: int, blocked: bool):
+        self._workload, self._threads = workload, threads
+        self._function = _blocked(workload.precision) if blocked else _plain()
+        self._torque, self._noise = workload.inputs()
+        padded = -(-workload.lanes // WIDTH) * WIDTH
+        self._values = np.stack([np.resize(column, padded) for column in workload.values().values()])
+        # with them 0, 1 and 2: an untyped number would make float64 of a float32
+        self._constants = np.array([*constants().values(), 0, 1, 2], workload.dtype)
+
+    def __call__(self) -> dict[str, np.ndarray]:
+        import numba
+
+        w = self._workload
+        numba.set_num_threads(min(self._threads, numba.config.NUMBA_NUM_THREADS))  # pyright: ignore
+        sums = self._function(w.steps, w.start, w.window, self._torque, self._noise, self._constants, self._values)
+        return figures_of(w, list(sums[:, : w.lanes]))
+
+
+def forget() -> None:
+    """Compile anew next time."""
+    _plain.cache_clear()
+    _blocked.cache_clear()
+
+
+@cache
+def _plain() -> Callable[..., np.ndarray]:
+    import math
+
+    from numba import njit, prange
+
+    @njit(parallel=True, error_model="numpy")
+    def run(steps, start, window, torque, noise, c, values):  # pragma: no cover
+        lanes = values.shape[1]
+        out = np.zeros((9, lanes))
+        h, motor_inertia, motor_viscous, load_inertia, load_viscous = c[0], c[1], c[2], c[3], c[4]
+        ratio, stiffness, slope, share, motor_error, zero, two = c[5], c[6], c[7], c[8], c[9], c[10], c[12]
+        half, bow = h / two, slope / two
+        motor_mass, motor_drag = motor_inertia / h, motor_viscous / two
+        load_mass, load_drag = load_inertia / h, load_viscous / two
+        for lane in prange(lanes):
+            motor_alpha, motor_lambda, load_alpha = values[0, lane], values[1, lane], values[2, lane]
+            load_lambda, gap, level = values[3, lane], two * two * values[4, lane], values[5, lane]
+            motor = motor_rate = load = load_rate = motor_seen = load_seen = load_guess = zero
+            motor_control = load_control = twist = bend = zero
+            motor_guess = -motor_error
+            s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = 0.0
+            for i in range(steps):
+                u = torque[i]
+                motor_read = motor + level * noise[i, 0]
+                load_read = load + level / ratio * noise[i, 1]
+                if i >= window:
+                    s7 += (motor_rate - motor_guess) * (motor_rate - motor_guess)
+                    s8 += (load_rate - load_guess) * (load_rate - load_guess)
+                motor_middle, load_middle = motor + half * motor_rate, load + half * load_rate
+                z = motor_middle - ratio * load_middle
+                through = stiffness * (z - gap * math.tanh(bow * z))
+                motor_rate = ((motor_mass - motor_drag) * motor_rate + u - through) / (motor_mass + motor_drag)
+                load_rate = ((load_mass - load_drag) * load_rate + ratio * through) / (load_mass + load_drag)
+                motor, load = motor_middle + half * motor_rate, load_middle + half * load_rate
+                motor_miss, load_miss = motor_read - motor_seen, load_read - load_seen
+                motor_sign, load_sign = np.sign(motor_miss), np.sign(load_miss)
+                motor_now, load_now = motor_alpha * motor_sign, load_alpha * load_sign
+                motor_seen += h * (motor_guess + motor_lambda * motor_sign * math.sqrt(abs(motor_miss)))
+                load_seen += h * (load_guess + load_lambda * load_sign * math.sqrt(abs(load_miss)))
+                motor_guess += h * ((u - motor_viscous * motor_guess) / motor_inertia + motor_now)
+                load_guess += h * (load_now - load_viscous * load_guess / load_inertia)
+                motor_control += share * (motor_now - motor_control)
+                load_control += share * (load_now - load_control)
+                if i >= start:
+                    motor_torque, load_torque = -motor_inertia * motor_control, load_inertia / ratio * load_control
+                    s0 += twist * twist
+                    s1 += twist * bend
+                    s2 += bend * bend
+                    s3 += twist * motor_torque
+                    s4 += bend * motor_torque
+                    s5 += twist * load_torque
+                    s6 += bend * load_torque
+                z = motor_read - ratio * load_read
+                twist += share * (z - twist)
+                bend -= share * (two * two * math.tanh(bow * z) + bend)
+            out[0, lane], out[1, lane], out[2, lane], out[3, lane], out[4, lane] = s0, s1, s2, s3, s4
+            out[5, lane], out[6, lane], out[7, lane], out[8, lane] = s5, s6, s7, s8
+        return out
+
+    return run
+
+
+@cache
+def _blocked(precision: str) -> Callable[..., np.ndarray]:
+    from numba import njit, prange
+
+    tanh = _tanh(precision)
+    n = WIDTH
+
+    @njit(parallel=True, error_model="numpy", fastmath={"contract"})
+    def run(steps, start, window, torque, noise, c, values):  # pragma: no cover
+        lanes = values.shape[1]
+        out = np.zeros((9, lanes))
+        h, motor_inertia, motor_viscous, load_inertia, load_viscous = c[0], c[1], c[2], c[3], c[4]
+        ratio, stiffness, slope, share, motor_error, zero, one, two = c[5], c[6], c[7], c[8], c[9], c[10], c[11], c[12]
+        half, bow, four = h / two, slope / two, two * two
+        motor_mass, motor_drag = motor_inertia / h, motor_viscous / two
+        load_mass, load_drag = load_inertia / h, load_viscous / two
+        motor_keep, motor_gain = (motor_mass - motor_drag) / (motor_mass + motor_drag), one / (motor_mass + motor_drag)
+        load_keep, load_gain = (load_mass - load_drag) / (load_mass + load_drag), one / (load_mass + load_drag)
+        motor_inverse, load_friction, load_share = one / motor_inertia, load_viscous / load_inertia, load_inertia / ratio
+        for block in prange(lanes // n):
+            # one buffer: of its parts the compiler knows that they do not overlap
+            s = np.zeros(27 * n, c.dtype)
+            for k in range(6):
+                for j in range(n):
+                    s[k * n + j] = values[k, block * n + j]
+            for j in range(n):
+                s[13 * n + j] = -motor_error
+            for i in range(steps):
+                u, motor_unit, load_unit = torque[i], noise[i, 0], noise[i, 1] / ratio
+                counts, inside = (one if i >= start else zero), (one if i >= window else zero)
+                for j in range(n):
+                    motor, motor_rate, load, load_rate = s[6 * n + j], s[7 * n + j], s[8 * n + j], s[9 * n + j]
+                    motor_guess, load_guess = s[13 * n + j], s[14 * n + j]
+                    motor_read, load_read = motor + s[5 * n + j] * motor_unit, load + s[5 * n + j] * load_unit
+                    motor_off, load_off = motor_rate - motor_guess, load_rate - load_guess
+                    s[25 * n + j] += inside * motor_off * motor_off
+                    s[26 * n + j] += inside * load_off * load_off
+                    motor, load = motor + half * motor_rate, load + half * load_rate
+                    z = motor - ratio * load
+                    through = stiffness * (z - four * s[4 * n + j] * tanh(bow * z))
+                    motor_rate = motor_keep * motor_rate + motor_gain * (u - through)
+                    load_rate = load_keep * load_rate + load_gain * (ratio * through)
+                    s[6 * n + j], s[7 * n + j] = motor + half * motor_rate, motor_rate
+                    s[8 * n + j], s[9 * n + j] = load + half * load_rate, load_rate
+                    motor_miss, load_miss = motor_read - s[11 * n + j], load_read - s[12 * n + j]
+                    motor_sign = (one if motor_miss > zero else zero) - (one if motor_miss < zero else zero)
+                    load_sign = (one if load_miss > zero else zero) - (one if load_miss < zero else zero)
+                    motor_now, load_now = s[j] * motor_sign, s[2 * n + j] * load_sign
+                    s[11 * n + j] += h * (motor_guess + s[n + j] * motor_sign * np.sqrt(abs(motor_miss)))
+                    s[12 * n + j] += h * (load_guess + s[3 * n + j] * load_sign * np.sqrt(abs(load_miss)))
+                    s[13 * n + j] = motor_guess + h * ((u - motor_viscous * motor_guess) * motor_inverse + motor_now)
+                    s[14 * n + j] = load_guess + h * (load_now - load_friction * load_guess)
+                    s[15 * n + j] += share * (motor_now - s[15 * n + j])
+                    s[16 * n + j] += share * (load_now - s[16 * n + j])
+                    motor_torque, load_torque = -motor_inertia * s[15 * n + j], load_share * s[16 * n + j]
+                    twist, bend = s[17 * n + j], s[10 * n + j]
+                    first, second = counts * twist, counts * bend
+                    s[18 * n + j] += first * twist
+                    s[19 * n + j] += first * bend
+                    s[20 * n + j] += second * bend
+                    s[21 * n + j] += first * motor_torque
+                    s[22 * n + j] += second * motor_torque
+                    s[23 * n + j] += first * load_torque
+                    s[24 * n + j] += second * load_torque
+                    z = motor_read - ratio * load_read
+                    s[17 * n + j] = twist + share * (z - twist)
+                    s[10 * n + j] = bend - share * (four * tanh(bow * z) + bend)
+                if i % 512 == 511 or i == steps - 1:
+                    for k in range(9):
+                        for j in range(n):
+                            out[k, block * n + j] += s[(18 + k) * n + j]
+                            s[(18 + k) * n + j] = zero
+        return out
+
+    return run
+
+
+def _tanh(precision: str) -> Callable[[float], float]:
+    """tanh by rational functions, without calls, so that it can be computed in vectors."""
+    from numba import njit
+
+    t = np.dtype(precision).type
+    if precision == "float32":
+        edge = t(7.90531110763549805)
+        p0, p1, p2, p3 = t(-2.76076847742355e-16), t(2.00018790482477e-13), t(-8.60467152213735e-11), t(5.12229709037114e-08)
+        p4, p5, p6 = t(1.48572235717979e-05), t(6.37261928875436e-04), t(4.89352455891786e-03)
+        q0, q1, q2, q3 = t(1.19825839466702e-06), t(1.18534705686654e-04), t(2.26843463243900e-03), t(4.89352518554385e-03)
+
+        @njit(inline="always")
+        def single(x):  # pragma: no cover
+            x = min(max(x, -edge), edge)
+            z = x * x
+            up = (((((p0 * z + p1) * z + p2) * z + p3) * z + p4) * z + p5) * z + p6
+            return x * up / (((q0 * z + q1) * z + q2) * z + q3)
+
+        return single
+
+    @njit(inline="always")
+    def double(x):  # pragma: no cover
+        a = min(abs(x), 22.0)
+        z = a * a
+        up = (-9.64399179425052238628e-1 * z - 9.92877231001918586564e1) * z - 1.61468768441708447952e3
+        down = ((z + 1.12811678491632931402e2) * z + 2.23548839060100448583e3) * z + 4.84406305325125486048e3
+        near = a + a * z * up / down
+        y = 2.0 * a
+        n = np.floor(y * 1.4426950408889634 + 0.5)
+        r = (y - n * 6.93145751953125e-1) - n * 1.42860682030941723212e-6
+        s = r * r
+        up = r * ((1.26177193074810590878e-4 * s + 3.02994407707441961300e-2) * s + 9.99999999999999999910e-1)
+        down = ((3.00198505138664455042e-6 * s + 2.52448340349684104192e-3) * s + 2.27265548208155028766e-1) * s + 2.0
+        power = 1.0
+        for bit in (32.0, 16.0, 8.0, 4.0, 2.0, 1.0):
+            # a power by its binary digits: there is no vector form of ldexp
+            power = power * 2.0**bit if n >= bit else power
+            n = n - bit if n >= bit else n
+        far = 1.0 - 2.0 / ((1.0 + 2.0 * up / (down - up)) * power + 1.0)
+        value = near if a < 0.625 else far
+        return value if x >= 0.0 else -value
+
+    return double

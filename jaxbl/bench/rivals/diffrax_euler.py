@@ -1,0 +1,58 @@
+"""The chain in diffrax: fixed steps of Euler's method, vmapped over lanes.
+
+Its right-hand side is the package's own step, divided by the period: Euler's method then takes exactly the chain's steps.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbl.drive import set_leaves
+from jaxbl.simulate import begin, figures, proceed, simulated, time_of
+
+from ..workload import FIGURES, Workload
+
+
+class Diffrax:
+    """One workload, compiled."""
+
+    def __init__(self, workload: Workload):
+        import diffrax
+
+        experiment, dtype = workload.experiment(), workload.dtype
+        _, noise = workload.inputs()
+        units = jnp.asarray(noise)
+        period = experiment.run.sample_period
+
+        def lane(values: dict[str, Any]) -> dict[str, Any]:
+            own = set_leaves(experiment, values)
+
+            start, tree = jax.tree.flatten(begin(own, (FIGURES,)))
+
+            def rates(t: Any, y: tuple[Any, ...], args: Any) -> tuple[Any, ...]:
+                index = jnp.round(t / period).astype(jnp.int32)
+                given = simulated(own, time_of(own, index), dict(zip(own.sides, units[index], strict=True)))
+                new, _ = proceed(own, (FIGURES,), tree.unflatten(y), index, given)
+                return tuple((after - before) / period for after, before in zip(jax.tree.leaves(new), y, strict=True))
+
+            solution = diffrax.diffeqsolve(
+                diffrax.ODETerm(rates),
+                diffrax.Euler(),
+                0.0,
+                workload.steps * float(period),
+                float(period),
+                tuple(jnp.asarray(x, dtype) for x in start),
+                saveat=diffrax.SaveAt(t1=True),
+                max_steps=workload.steps + 1,
+                adjoint=diffrax.ForwardMode(),
+            )
+            last: Any = solution.ys
+            return figures(own, (FIGURES,), tree.unflatten([x[0] for x in last]))
+
+        self._given = jax.tree.map(jnp.asarray, workload.values())
+        self.compiled = jax.jit(jax.vmap(lane)).lower(self._given).compile()
+
+    def __call__(self) -> dict[str, np.ndarray]:
+        return jax.tree.map(np.asarray, jax.block_until_ready(self.compiled(self._given)))

@@ -1,0 +1,298 @@
+"""`jaxbl bench`: every entry on the same work, checked against one reference, then timed in turns."""
+
+import importlib.util
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxbl.errors import NoResult
+
+from .ours import Fused, Scanned
+from .rivals.compiled import Compiled, forget
+from .rivals.diffrax_euler import Diffrax
+from .rivals.native import Native, compiler
+from .rivals.plain import Plain
+from .workload import Workload
+
+Runner = Callable[[], dict[str, np.ndarray]]
+Progress = Callable[[int, int], None]
+
+CEILING, OURS, SCAN = "c++, all cores", "jaxbl fused, all cores", "jaxbl scan, all cores"
+PRECISIONS = ("float32", "float64")
+_REFERENCE_LANES = 64
+_TOLERANCE = {
+    "float64": dict.fromkeys(("velocity_rmse", "stiffness", "dead_zone"), 1e-8),
+    # rounding decides some signs of a switching term; an error of one sample follows
+    "float32": {"velocity_rmse": 1e-3, "stiffness": 0.02, "dead_zone": 0.05},
+}
+"""Largest median deviation of a figure from the reference, relative."""
+
+
+class Entry(NamedTuple):
+    """Who runs the workload.
+
+    Attributes:
+        name: in `bench.json` and on charts.
+        make: from a workload to what runs it.
+        lanes: that it is given, as many as it can bear.
+        needs: a module it cannot do without.
+        tolerance: of its own method, where it does not take the reference's steps.
+    """
+
+    name: str
+    make: Callable[[Workload], Runner]
+    lanes: int
+    needs: str | None = None
+    tolerance: float = 0.0
+
+
+def entries(folder: Path, cores: int) -> list[Entry]:
+    """All of them; `folder` keeps the compiled kernel."""
+    many, few = 2**17, 2**14
+    return [
+        Entry(CEILING, lambda w: Native(w, cores, folder), many),
+        Entry("c++, one core", lambda w: Native(w, 1, folder), many),
+        Entry(OURS, lambda w: Fused(w, cores), many),
+        Entry("jaxbl fused, one core", lambda w: Fused(w, 1), many),
+        Entry(SCAN, lambda w: Scanned(w, cores), few),
+        Entry("jaxbl scan, one device", lambda w: Scanned(w, 1), few),
+        Entry("numba, blocks of lanes", lambda w: Compiled(w, cores, blocked=True), many, "numba"),
+        Entry("numba, prange", lambda w: Compiled(w, cores, blocked=False), few, "numba"),
+        Entry("diffrax, Euler", Diffrax, few, "diffrax"),
+        Entry("NumPy, lane arrays", Plain, 2**12),
+        Entry("NumPy, one lane", Plain, 1),
+        Entry("OpenSMC, one lane", partial(Plain, library=True), 1, "opensmc"),
+        Entry("SciPy RK45, one lane", partial(Plain, solver="RK45"), 1, tolerance=1e-3),
+        Entry("SciPy LSODA, one lane", partial(Plain, solver="LSODA"), 1, tolerance=1e-3),
+    ]
+
+
+@dataclass
+class Row:
+    """What an entry took.
+
+    Attributes:
+        name: of the entry.
+        precision: `float32` or `float64`.
+        lanes, steps: of the workload.
+        first_seconds: of making it and calling it once: tracing and compilation included.
+        deviation: largest median deviation of its figures from the reference, relative.
+        seconds: of each round.
+        lane_steps_per_second: by the least of them.
+        median_lane_steps_per_second: by their median.
+    """
+
+    name: str
+    precision: str
+    lanes: int
+    steps: int
+    first_seconds: float
+    deviation: float
+    seconds: list[float] = field(default_factory=list)
+    lane_steps_per_second: float = 0.0
+    median_lane_steps_per_second: float = 0.0
+
+    def finish(self) -> None:
+        work = self.lanes * self.steps
+        self.lane_steps_per_second = work / min(self.seconds)
+        self.median_lane_steps_per_second = work / statistics.median(self.seconds)
+
+
+@dataclass(frozen=True)
+class Result:
+    """All figures of a benchmark.
+
+    Attributes:
+        machine: processor, cores, versions.
+        rows: of every entry and precision.
+        curve: lane-steps per second over the number of lanes: {"name", "precision", "lanes", "lane_steps_per_second"}.
+        study: seconds of a whole small study from nothing: {"name", "precision", "lanes", "steps", "seconds"}.
+        left_out: entries that this machine cannot run, and what they need.
+    """
+
+    machine: dict[str, Any]
+    rows: list[Row]
+    curve: list[dict[str, Any]]
+    study: list[dict[str, Any]]
+    left_out: dict[str, str]
+
+    def plain(self) -> dict[str, Any]:
+        """As `bench.json` has it."""
+        return asdict(self)
+
+    def speed(self, name: str, precision: str) -> float | None:
+        """Lane-steps per second of an entry, None if it did not run."""
+        found = [row.lane_steps_per_second for row in self.rows if (row.name, row.precision) == (name, precision)]
+        return found[0] if found else None
+
+
+def bench(folder: Path, *, quick: bool = False, progress: Progress | None = None) -> Result:
+    """Run the benchmark.
+
+    Args:
+        folder: keeps the compiled C++ kernel.
+        quick: fewer rounds, shorter runs, rivals in float32 alone.
+        progress: called with finished and all parts.
+
+    Raises:
+        NoResult: an entry's figures are not those of the reference.
+    """
+    cores = len(jax.local_devices())
+    able, left_out = _able(entries(folder, cores))
+    steps, rounds = (1500, 3) if quick else (4000, 7)
+    jobs = [
+        (entry, precision)
+        for precision in PRECISIONS
+        for entry in able
+        if not quick or precision == "float32" or entry.name.startswith(("c++", "jaxbl fused"))
+    ]
+    lanes = [2**k for k in range(6, 21, 2 if quick else 1)]
+    parts, done = 2 * len(jobs) + len(lanes) + 1, 0
+
+    def tick() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, parts)
+
+    rows, runners = [], []
+    references = {precision: _reference(steps, precision) for precision in PRECISIONS}
+    for entry, precision in jobs:
+        work = Workload(entry.lanes // (8 if quick and entry.lanes > 1 else 1), steps, precision)
+        with _in(precision):
+            begun = time.perf_counter()
+            runner = entry.make(work)
+            figures = runner()
+            row = Row(entry.name, precision, work.lanes, steps, time.perf_counter() - begun, 0.0)
+        row.deviation = _check(entry, precision, figures, references[precision])
+        rows.append(row)
+        runners.append(runner)
+        tick()
+    for _ in range(rounds):
+        for row, runner in zip(rows, runners, strict=True):
+            with _in(row.precision):
+                begun = time.perf_counter()
+                runner()
+                row.seconds.append(time.perf_counter() - begun)
+    for row in rows:
+        row.finish()
+        tick()
+    del runners
+    curve = []
+    for count in lanes:
+        curve += _curve(able, count, 500 if quick else 1000, ("float32",) if quick else PRECISIONS)
+        tick()
+    study = _study(cores, {entry.name for entry in able}, 1000)
+    tick()
+    return Result(_machine(cores), rows, curve, study, left_out)
+
+
+def _in(precision: str) -> Any:
+    return jax.enable_x64(precision == "float64")
+
+
+def _able(found: Sequence[Entry]) -> tuple[list[Entry], dict[str, str]]:
+    left_out = {}
+    for entry in found:
+        if entry.name.startswith("c++") and compiler() is None:
+            left_out[entry.name] = "no C++ compiler; install g++, or name one in CXX"
+        elif entry.needs is not None and importlib.util.find_spec(entry.needs) is None:
+            left_out[entry.name] = f"no {entry.needs}; pip install 'jaxbl[bench]'"
+    return [entry for entry in found if entry.name not in left_out], left_out
+
+
+def _reference(steps: int, precision: str) -> dict[str, np.ndarray]:
+    """Figures of the first lanes by the plainest entry, in float64 whatever the precision of the inputs."""
+    with _in("float64"):
+        return Plain(Workload(_REFERENCE_LANES, steps, "float64"))()
+
+
+def _check(entry: Entry, precision: str, figures: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> float:
+    worst = 0.0
+    for name, values in figures.items():
+        found, true = np.asarray(values[:_REFERENCE_LANES], float), reference[name][: len(values)]
+        apart = float(np.median(np.abs(found / true - 1.0)))
+        if not apart <= max(entry.tolerance, _TOLERANCE[precision][name.partition(".")[2]]):
+            raise NoResult(
+                f"{entry.name}, {precision}: {name} is off by {apart:.2g} of it; times of wrong results mean nothing"
+            )
+        worst = max(worst, apart)
+    return worst
+
+
+def _curve(able: Sequence[Entry], lanes: int, steps: int, precisions: Sequence[str]) -> list[dict[str, Any]]:
+    points = []
+    for precision in precisions:
+        chosen = [e for e in able if e.name in (CEILING, OURS, SCAN) and (e.name != SCAN or lanes <= 2**17)]
+        with _in(precision):
+            runners = [entry.make(Workload(lanes, steps, precision)) for entry in chosen]
+            best = [float("inf")] * len(chosen)
+            # short ones are repeated until they have taken a tenth of a second
+            for _ in range(max(3, min(50, round(1e8 / lanes / steps)))):
+                for i, runner in enumerate(runners):
+                    begun = time.perf_counter()
+                    runner()
+                    best[i] = min(best[i], time.perf_counter() - begun)
+        points += [
+            {
+                "name": e.name,
+                "precision": precision,
+                "lanes": lanes,
+                "steps": steps,
+                "lane_steps_per_second": lanes * steps / t,
+            }
+            for e, t in zip(chosen, best, strict=True)
+        ]
+    return points
+
+
+def _study(cores: int, able: set[str], lanes: int) -> list[dict[str, Any]]:
+    """A small study from nothing: what was compiled before is forgotten."""
+    rows = []
+    work = Workload(lanes, 3000, "float32")
+    with _in(work.precision), TemporaryDirectory() as folder:
+        work.inputs()
+        for entry in entries(Path(folder), cores):
+            if entry.name not in able or entry.lanes <= lanes or entry.name.endswith(("one core", "one device")):
+                continue
+            jax.clear_caches()
+            forget()
+            begun = time.perf_counter()
+            entry.make(work)()
+            seconds = time.perf_counter() - begun
+            rows.append({"name": entry.name, "precision": work.precision, "lanes": lanes, "steps": work.steps})
+            rows[-1]["seconds"] = seconds
+    return rows
+
+
+def _machine(cores: int) -> dict[str, Any]:
+    packages = ["jax", "numpy", "scipy", "llvmlite", "numba", "diffrax", "opensmc"]
+    return {
+        "processor": _processor(),
+        "cores": cores,
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "versions": {name: version(name) for name in packages if importlib.util.find_spec(name) is not None},
+        "compiler": Path(found).name if (found := compiler()) else None,
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()

@@ -1,0 +1,113 @@
+"""What `jaxbl bench` leaves: table, `bench.json`, a bar chart, and throughput against lanes."""
+
+import json
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from jaxbl.bench.run import CEILING, OURS, PRECISIONS, SCAN, Result
+from jaxbl.study.store import make_folder, write_atomic
+
+from .maps import Drawn
+from .reports import save_all
+from .style import COLOURS, style
+
+_COLUMNS: list[str] = ["", "bits", "lanes", "lane-steps/s", "median", "of C++", "first call", "deviation"]
+
+
+def draw_throughput(result: Result) -> list[Drawn]:
+    """The figures of a benchmark."""
+    with style():
+        return [_bars(result), _curve(result)]
+
+
+def _bars(result: Result) -> Drawn:
+    names = list(dict.fromkeys(row.name for row in result.rows))
+    names.sort(key=lambda name: result.speed(name, "float32") or 0.0)
+    figure = Figure(figsize=(8.0, 0.42 * len(names) + 1.1))
+    axes = figure.add_subplot()
+    height = 0.38
+    for shift, precision, alpha in ((height / 2, "float32", 1.0), (-height / 2, "float64", 0.45)):
+        for i, name in enumerate(names):
+            speed = result.speed(name, precision)
+            if speed is not None:
+                colour = COLOURS[1] if name.startswith("jaxbl") else COLOURS[0]
+                axes.barh(i + shift, speed, height, color=colour, alpha=alpha)
+                axes.text(1.15 * speed, i + shift, f"{speed:.2g}", va="center", fontsize=7)
+    axes.set_xscale("log")
+    axes.set_yticks(range(len(names)), names)
+    axes.grid(axis="y", visible=False)
+    top = max(row.lane_steps_per_second for row in result.rows)
+    axes.set_xlim(right=12.0 * top)
+    axes.set_xlabel("lane-steps per second (log scale); upper bar float32, lower bar float64")
+    caption = (
+        "The paper's chain on many lanes, by everyone: one step of one lane is one plant, two observers, filter and both "
+        "identifiers for one sample. Longer is faster, a factor of ten from line to line."
+    )
+    return Drawn("throughput", figure, caption)
+
+
+def _curve(result: Result) -> Drawn:
+    figure = Figure(figsize=(7.0, 3.8))
+    axes = figure.add_subplot()
+    for name, colour in ((CEILING, COLOURS[0]), (OURS, COLOURS[1]), (SCAN, COLOURS[2])):
+        for precision, line in zip(PRECISIONS, ("-", "--"), strict=True):
+            points = [point for point in result.curve if (point["name"], point["precision"]) == (name, precision)]
+            lanes, speeds = [p["lanes"] for p in points], [p["lane_steps_per_second"] for p in points]
+            if points:
+                axes.plot(lanes, speeds, line, color=colour, marker="o", markersize=3, label=f"{name}, {precision}")
+    axes.set_xscale("log", base=2)
+    axes.set_yscale("log")
+    axes.set_xlabel("lanes")
+    axes.set_ylabel("lane-steps per second")
+    axes.legend()
+    caption = (
+        "Throughput against the number of lanes: what a call and a block of samples cost whatever their lanes shows on the "
+        "left, caches and memory on the right."
+    )
+    return Drawn("lanes", figure, caption)
+
+
+def table(result: Result) -> list[list[str]]:
+    """Header and rows of the table, as text."""
+    rows = [_COLUMNS]
+    for row in result.rows:
+        ceiling = result.speed(CEILING, row.precision)
+        rows.append(
+            [
+                row.name,
+                row.precision[-2:],
+                str(row.lanes),
+                f"{row.lane_steps_per_second:.3g}",
+                f"{row.median_lane_steps_per_second:.3g}",
+                f"{row.lane_steps_per_second / ceiling:.2g}" if ceiling else "–",
+                f"{row.first_seconds:.2f} s",
+                f"{row.deviation:.1g}",
+            ]
+        )
+    return rows
+
+
+def throughput_lines(result: Result) -> list[str]:
+    """The benchmark for the terminal."""
+    rows = table(result)
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = [
+        "  ".join(cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True)))
+        for row in rows
+    ]
+    machine, study = result.machine, result.study[0]
+    on = f"{machine['processor']}, {machine['cores']} cores; jax {machine['versions']['jax']}"
+    lines.insert(0, f"{on}; {result.rows[0].steps} samples a run")
+    lines += ["", f"A small study from nothing, {study['lanes']} lanes of {study['steps']} samples, {study['precision']}:"]
+    lines += [f"  {row['name'].ljust(widths[0])}  {row['seconds']:.2f} s" for row in result.study]
+    lines += [f"{name}: left out, {why}" for name, why in result.left_out.items()]
+    return lines
+
+
+def write_bench_report(result: Result, folder: Path) -> list[str]:
+    """Write `bench.json` and figures. Returns the lines for the terminal."""
+    make_folder(folder)
+    write_atomic(folder / "bench.json", json.dumps(result.plain(), indent=2, ensure_ascii=False))
+    save_all(draw_throughput(result), folder)
+    return throughput_lines(result)
