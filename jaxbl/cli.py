@@ -74,6 +74,10 @@ def sweep(
     out: OutOption = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what it will cost, and stop")] = False,
     overwrite: OverwriteOption = False,
+    backend: Annotated[
+        str | None,
+        typer.Option("--backend", metavar="NAME", help="fused: a loop in registers; scan: XLA's [default: the faster here]"),
+    ] = None,
 ) -> None:
     """Run all points of a study: table of metrics, maps, report. Goes on where an interrupted run stopped."""
     _start_jax()
@@ -82,9 +86,11 @@ def sweep(
     from .study.config import read_config
     from .study.metrics import metric_columns
     from .study.points import Points
+    from .study.programs import backend_of
     from .study.sweep import dry_run as estimate_cost
     from .study.sweep import sweep as run_sweep
 
+    chosen = backend_of(backend)
     study = read_config(config)
     if not study.axes and study.sweep.seeds == 1:
         raise InputError(f"{config}: axes: the study has none; add [[axes]], or use 'jaxbl simulate'")
@@ -92,7 +98,7 @@ def sweep(
         Points(study)
         check_figures(study, study.figures, metric_columns(study.build()))
         if dry_run:
-            cost = estimate_cost(study)
+            cost = estimate_cost(study, backend=chosen)
             refined = study.sweep.refine is not None
             coarse = " on the coarse grid" if refined else ""
             typer.echo(f"points       {cost.points}{coarse} ({cost.rows} runs with all seeds)")
@@ -108,8 +114,9 @@ def sweep(
             )
             return
     folder = _folder(config, out)
-    with _running(["sweep", str(config)], config, folder) as progress:
-        result = run_sweep(study, folder, progress=progress, overwrite=overwrite)
+    words = ["sweep", str(config), *(["--backend", chosen] if chosen else [])]
+    with _running(words, config, folder) as progress:
+        result = run_sweep(study, folder, progress=progress, overwrite=overwrite, backend=chosen)
     _tell(write_sweep_report(result, folder), folder, result.cost)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxbl.drive import set_leaves
-from jaxbl.fused.passage import Passage
+from jaxbl.fused.passage import HostPassage
 from jaxbl.simulate import scan
 from jaxbl.study.engine import LANES_PER_DEVICE
 
@@ -29,7 +29,7 @@ class Scanned:
             jax.vmap(lane, (0, None)), mesh=mesh, in_specs=(lanes, PartitionSpec()), out_specs=lanes, check_vma=False
         )
         self._lanes = workload.lanes
-        self._chunk = min(LANES_PER_DEVICE * devices, -(-workload.lanes // devices) * devices)
+        self._chunk = min(LANES_PER_DEVICE["scan"] * devices, -(-workload.lanes // devices) * devices)
         values, size = workload.values(), -(-workload.lanes // self._chunk) * self._chunk
         padded = {path: np.pad(column, (0, size - workload.lanes), "edge") for path, column in values.items()}
         self._given = [
@@ -47,7 +47,7 @@ class Fused:
     """The loop over time in registers, threads side by side."""
 
     def __init__(self, workload: Workload, threads: int):
-        self._passage = Passage(workload.experiment(), (FIGURES,), tuple(RANGES), threads)
+        self._passage = HostPassage(workload.experiment(), (FIGURES,), tuple(RANGES), threads)
         self._values = workload.values()
 
     def __call__(self) -> dict[str, np.ndarray]:

@@ -13,8 +13,8 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 from llvmlite import binding, ir
 
-from . import elementary
-from .split import callee
+from .elementary import FUNCTIONS
+from .split import substituted
 
 _INT, _BIT, _POINTER = ir.IntType(64), ir.IntType(1), ir.PointerType()
 _KINDS = {
@@ -84,6 +84,7 @@ class Loop:
         self, body: ClosedJaxpr, after: ClosedJaxpr, values: int, carry: int, fixed: tuple[int, int], dtype: np.dtype
     ):
         self.lanes = vector_lanes(dtype)
+        body, after = substituted(body, FUNCTIONS), substituted(after, FUNCTIONS)
         module = ir.Module("loop")
         _Writer(module, self.lanes).loop(body, after, values, carry, fixed[0])
         parsed = binding.parse_assembly(str(module))
@@ -205,14 +206,10 @@ class _Writer:
         return [read(v) for v in jaxpr.outvars]
 
     def equation(self, eqn: JaxprEqn, given: list[Vector]) -> list[Vector]:
-        name, called = eqn.primitive.name, callee(eqn)
-        if called is not None:
-            return self.run(called, given)
+        name = eqn.primitive.name
         if name == "scan":
             return self.scan(eqn.params, given)
         dtype = _dtype(eqn.invars[0])
-        if name in elementary.FUNCTIONS and jnp.issubdtype(dtype, jnp.floating):
-            return self.run(elementary.traced(name, dtype), given)
         rule = (_OF_FLOATS if jnp.issubdtype(dtype, jnp.floating) else _OF_INTEGERS).get(name) or _OF_ALL.get(name)
         if rule is None:
             raise Unsupported(f"{name} of {dtype}")

@@ -1,5 +1,6 @@
-"""A sweep's lanes through time by the fused loop: what :func:`jaxbl.simulate.scan` computes, many lanes at once."""
+"""Lanes through time by a fused loop: what :func:`jaxbl.simulate.scan` computes, for many lanes at once."""
 
+import abc
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
@@ -22,29 +23,28 @@ from jaxbl.simulate import (
     unit_noise,
 )
 
-from .llvm import Loop
+from .llvm import Loop, vector_lanes
+from .pallas import LANES, Kernel
 from .split import Kind, carry_kinds, split
 
 
-class Passage:
+class Passage(abc.ABC):
     """Simulates lanes of an experiment; compiled for their structure, whatever their number.
 
     Args:
         experiment: with array leaves (:func:`jaxbl.drive.as_arrays`).
         reducers: figures to compute along the run.
         paths: of the leaves that differ from lane to lane.
-        threads: that share the lanes.
 
     Attributes:
-        lanes: that are computed together.
         carried: numbers that a lane carries; what all share is not among them.
-
-    Raises:
-        Unsupported: a step does something that the compiler has no instruction for.
     """
 
-    def __init__(self, experiment: Experiment, reducers: tuple[Reducer, ...], paths: tuple[str, ...], threads: int):
-        self._paths, self._threads, self._steps = paths, threads, experiment.run.steps
+    _together: int
+    """Lanes that are computed together; their number is filled up to a multiple."""
+
+    def __init__(self, experiment: Experiment, reducers: tuple[Reducer, ...], paths: tuple[str, ...]):
+        self._paths, self._steps = paths, experiment.run.steps
         self._length = block_length(self._steps)
         dtype = jnp.result_type(experiment.run.sample_period)
         self._dtype = np.dtype(dtype)
@@ -63,77 +63,110 @@ class Passage:
         def settle(values: list[Any], carry: Any, given: Any) -> Any:
             return settled(own(values), carry)
 
-        number = jax.ShapeDtypeStruct((), dtype)
-        values = [number] * len(paths)
-        given = jax.ShapeDtypeStruct((), jnp.int32), dict.fromkeys(experiment.sides, jax.ShapeDtypeStruct((), jnp.float32))
-        carry = jax.eval_shape(start, values)
-        self._tree = jax.tree.structure(carry)
-        kinds = carry_kinds(start, ((sample, given), (settle, ())), values)
-        self._of_lane = [kind == Kind.LANE for kind in kinds]
-        inner = split(sample, values, carry, given, kinds)
-        outer = split(settle, values, carry, (), kinds)
-        self._fixed = [np.asarray(value) for value in inner.fixed], [np.asarray(value) for value in outer.fixed]
-        counts = len(inner.fixed), len(outer.fixed)
-        self.carried = sum(self._of_lane)
-        self._loop = Loop(inner.lane, outer.lane, len(values), self.carried, counts, self._dtype)
-        self.lanes = self._loop.lanes
-
-        def shared(state: list[Any], seed: Any, first: Any, length: int) -> tuple[list[Any], list[Any], list[Any]]:
-            indices = first + jnp.arange(length, dtype=jnp.int32)
-            noise = unit_noise(seed, indices, experiment.sides)
-            state, handed = jax.lax.scan(inner.shared, state, (indices, noise))
-            return *outer.shared(state, ()), handed
-
-        self._shared = jax.jit(shared, static_argnums=3)
-        self._start = jax.jit(jax.vmap(start))
-        axes = self._tree.unflatten([0 if lane else None for lane in self._of_lane])
-
         def result(values: list[Any], carry: Any) -> dict[str, Any]:
             return figures(own(values), reducers, carry)
 
-        self._result = jax.jit(jax.vmap(result, (0, axes)))
-        self._first = jax.jit(
-            lambda: [
-                leaf
-                for leaf, lane in zip(
-                    jax.tree.leaves(start([jnp.zeros((), dtype)] * len(paths))), self._of_lane, strict=True
-                )
-                if not lane
-            ]
-        )
+        values = [jax.ShapeDtypeStruct((), dtype)] * len(paths)
+        given = jax.ShapeDtypeStruct((), jnp.int32), dict.fromkeys(experiment.sides, jax.ShapeDtypeStruct((), jnp.float32))
+        carry = jax.eval_shape(start, values)
+        kinds = carry_kinds(start, ((sample, given), (settle, ())), values)
+        self._tree = jax.tree.structure(carry)
+        self._of_lane = [kind == Kind.LANE for kind in kinds]
+        self.carried = sum(self._of_lane)
+        self._inner = split(sample, values, carry, given, kinds)
+        self._outer = split(settle, values, carry, (), kinds)
+
+        def shared(state: list[Any], seed: Any, first: Any, length: int) -> tuple[list[Any], list[Any], list[Any]]:
+            """What all lanes share: its next state, what follows a block of samples reads, and what each of them reads."""
+            indices = first + jnp.arange(length, dtype=jnp.int32)
+            noise = unit_noise(seed, indices, experiment.sides)
+            state, handed = jax.lax.scan(self._inner.shared, state, (indices, noise))
+            return *self._outer.shared(state, ()), handed
+
+        self._shared = jax.jit(shared, static_argnums=3)
+        self._start = jax.jit(jax.vmap(start))
+        self._result = jax.jit(jax.vmap(result, (0, self._tree.unflatten([0 if lane else None for lane in self._of_lane]))))
 
     def __call__(self, values: dict[str, np.ndarray], seed: int) -> dict[str, np.ndarray]:
         """Figures `(lanes,)` of one seed; `values` `(lanes,)` by path."""
         lanes = len(next(iter(values.values())))
-        padded = -(-lanes // self.lanes) * self.lanes
-        given = [np.pad(np.asarray(values[path], self._dtype), (0, padded - lanes), "edge") for path in self._paths]
-        carry = [
-            np.array(leaf, order="C")
-            for leaf, lane in zip(jax.tree.leaves(self._start(given)), self._of_lane, strict=True)
-            if lane
-        ]
-        state = self._first()
-        blocks = padded // self.lanes
-        edges = [blocks * i // self._threads * self.lanes for i in range(self._threads + 1)]
-        with ThreadPoolExecutor(self._threads) as pool:
-            first = 0
-            ahead = self._ahead(state, seed, first)
-            while first < self._steps:
-                length = min(self._length, self._steps - first)
-                state, last, handed = ahead
-                first += length
-                inputs = [np.asarray(x) for x in handed]
-                arrays = [*given, *carry, *self._fixed[0], *inputs, *self._fixed[1], *map(np.asarray, last)]
-                running = [pool.submit(self._loop, arrays, length, *pair) for pair in pairwise(edges)]
-                # what all lanes share of the next samples is computed meanwhile
-                if first < self._steps:
-                    ahead = self._ahead(state, seed, first)
-                for one in running:
-                    one.result()
-        left, right = iter(carry), iter(state)
-        whole = self._tree.unflatten([next(left) if lane else next(right) for lane in self._of_lane])
+        filled = -(-lanes // self._together) * self._together - lanes
+        given = [np.pad(np.asarray(values[path], self._dtype), (0, filled), "edge") for path in self._paths]
+        leaves = jax.tree.leaves(self._start(given))
+        carry = [leaf for leaf, lane in zip(leaves, self._of_lane, strict=True) if lane]
+        state = [np.asarray(leaf)[0] for leaf, lane in zip(leaves, self._of_lane, strict=True) if not lane]
+        carry, state = map(iter, self._march(given, carry, state, seed))
+        whole = self._tree.unflatten([next(carry) if lane else next(state) for lane in self._of_lane])
         return {name: np.asarray(figure)[:lanes] for name, figure in self._result(given, whole).items()}
 
-    def _ahead(self, state: Any, seed: int, first: int) -> Any:
-        length = min(self._length, self._steps - first)
-        return self._shared(state, np.uint32(seed), np.int32(first), length)
+    @abc.abstractmethod
+    def _march(self, given: list[Any], carry: list[Any], state: list[Any], seed: int) -> tuple[list[Any], list[Any]]:
+        """Carry of the lanes `(lanes,)` each, and state of what they share, after all samples."""
+
+    def _ahead(self, state: list[Any], seed: int, first: int) -> tuple[list[Any], list[Any], list[Any]]:
+        """What lanes share, over the block of samples that begins at `first`."""
+        return self._shared(state, np.uint32(seed), np.int32(first), min(self._length, self._steps - first))
+
+
+class HostPassage(Passage):
+    """By code for this machine's processor; threads share the lanes.
+
+    Raises:
+        Unsupported: a step does something that the compiler has no instruction for.
+    """
+
+    def __init__(self, experiment: Experiment, reducers: tuple[Reducer, ...], paths: tuple[str, ...], threads: int):
+        super().__init__(experiment, reducers, paths)
+        inner, outer = self._inner, self._outer
+        self._fixed = [np.asarray(value) for value in inner.fixed], [np.asarray(value) for value in outer.fixed]
+        counts = len(inner.fixed), len(outer.fixed)
+        self._loop = Loop(inner.lane, outer.lane, len(paths), self.carried, counts, self._dtype)
+        self._together, self._threads = vector_lanes(self._dtype), threads
+
+    def _march(self, given, carry, state, seed):
+        carry = [np.array(leaf, order="C") for leaf in carry]
+        blocks = len(given[0]) // self._together
+        edges = [blocks * i // self._threads * self._together for i in range(self._threads + 1)]
+        ahead = self._ahead(state, seed, 0)
+        with ThreadPoolExecutor(self._threads) as pool:
+            for first in range(0, self._steps, self._length):
+                state, last, handed = ahead
+                last, handed = [np.asarray(x) for x in last], [np.asarray(x) for x in handed]
+                arrays = [*given, *carry, *self._fixed[0], *handed, *self._fixed[1], *last]
+                length = min(self._length, self._steps - first)
+                running = [pool.submit(self._loop, arrays, length, *pair) for pair in pairwise(edges)]
+                # what lanes share of the next samples is computed meanwhile
+                if first + length < self._steps:
+                    ahead = self._ahead(state, seed, first + length)
+                for one in running:
+                    one.result()
+        return carry, state
+
+
+class DevicePassage(Passage):
+    """By one kernel of an accelerator, which takes its lanes through the whole run; `interpret` runs it anywhere, slowly."""
+
+    _together = LANES
+
+    def __init__(
+        self, experiment: Experiment, reducers: tuple[Reducer, ...], paths: tuple[str, ...], *, interpret: bool = False
+    ):
+        super().__init__(experiment, reducers, paths)
+        self._kernel = Kernel(self._inner.lane, self._outer.lane, len(paths), self.carried, interpret=interpret)
+
+    def _march(self, given, carry, state, seed):
+        blocks, rest = divmod(self._steps, self._length)
+        # a loop of scalars is the work of a processor; a GPU would start a kernel for each of its steps
+        with jax.default_device(jax.local_devices(backend="cpu")[0]):
+            state = [np.asarray(leaf) for leaf in state]
+            parts = []
+            for first in range(0, self._steps, self._length):
+                state, *part = self._ahead(state, seed, first)
+                parts.append(part)
+        fixed = self._inner.fixed, self._outer.fixed
+        for some in (parts[:blocks], parts[blocks:] if rest else []):
+            if some:
+                last, handed = ([np.stack([np.asarray(x) for x in column]) for column in zip(*one, strict=True)]
+                                for one in zip(*some, strict=True))  # fmt: skip
+                carry = self._kernel(given, carry, fixed, (handed, last))
+        return carry, state

@@ -5,15 +5,19 @@ neither lane nor time, *shared* if it depends on time alone, a *lane's* otherwis
 """
 
 import enum
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 
 _CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call", "checkpoint")
 """Primitives that only call another jaxpr."""
+
+
+Functions = Mapping[str, Callable[..., Any]]
 
 
 class Kind(enum.IntFlag):
@@ -108,9 +112,19 @@ def split(function: Callable[..., Any], values: Any, carry: Any, given: Any, kin
 
 def flat(function: Callable[..., Any], *examples: Any) -> ClosedJaxpr:
     """Trace a function of pytrees, without calls inside."""
-    closed = jax.make_jaxpr(function)(*examples)
-    leaves = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in closed.jaxpr.invars]
-    return jax.make_jaxpr(partial(_inlined, closed))(*leaves)
+    return _flattened(jax.make_jaxpr(function)(*examples), {})
+
+
+def substituted(closed: ClosedJaxpr, functions: Functions) -> ClosedJaxpr:
+    """The same with functions in place of primitives of floating-point numbers, by the primitives' names."""
+    return _flattened(closed, functions)
+
+
+def _flattened(closed: ClosedJaxpr, functions: Functions) -> ClosedJaxpr:
+    leaves = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in closed.in_avals]
+    found = jax.make_jaxpr(partial(_inlined, closed, functions))(*leaves)
+    # a function may itself call others
+    return found if not any(callee(eqn) for eqn in found.jaxpr.eqns) else _flattened(found, functions)
 
 
 def callee(eqn: JaxprEqn) -> ClosedJaxpr | None:
@@ -121,18 +135,20 @@ def callee(eqn: JaxprEqn) -> ClosedJaxpr | None:
     return inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
 
 
-def _inlined(closed: ClosedJaxpr, *arguments: Any) -> list[Any]:
+def _inlined(closed: ClosedJaxpr, functions: Functions, *arguments: Any) -> list[Any]:
     jaxpr = closed.jaxpr
     env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *arguments], strict=True))
     for eqn in jaxpr.eqns:
         given = [_read(env, v) for v in eqn.invars]
-        called = callee(eqn)
+        called, name = callee(eqn), eqn.primitive.name
         if called is not None:
-            results = _inlined(called, *given)
+            results = _inlined(called, functions, *given)
+        elif name in functions and jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
+            results = [functions[name](*given)]
         else:
             params = eqn.params
-            if eqn.primitive.name == "scan":
-                params = params | {"jaxpr": flat(partial(_inlined, params["jaxpr"]), *params["jaxpr"].in_avals)}
+            if name == "scan":
+                params = params | {"jaxpr": _flattened(params["jaxpr"], functions)}
             results = eqn.primitive.bind(*given, **params)
             results = results if eqn.primitive.multiple_results else [results]
         env |= dict(zip(eqn.outvars, results, strict=True))

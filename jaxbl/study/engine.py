@@ -14,27 +14,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from jax.sharding import Mesh, PartitionSpec
 
-from jaxbl.drive.parameters import as_arrays, set_leaves
-from jaxbl.simulate import Experiment, scan
+from jaxbl.drive.parameters import as_arrays
+from jaxbl.simulate import Experiment
 
 from .config import Config
-from .metrics import METRICS, metric_columns, observer_gains, with_conditions
+from .metrics import metric_columns, with_conditions
 from .points import Points
+from .programs import Backend, Layout, Program, compile_program, default_backend
 
 Progress = Callable[[int, int], None]
 """Called with the number of finished and of all lanes."""
 
-LANES_PER_DEVICE = 4096
-"""Default lanes a device computes at once: the carry then stays in a core's cache (benchmarks/NOTES.md)."""
-
-
-class Layout(NamedTuple):
-    """Shape of a chunk: seeds and points."""
-
-    seeds: int
-    points: int
+LANES_PER_DEVICE: dict[Backend, int] = {"scan": 4096, "fused": 16384}
+"""Default lanes a device computes at once: the scan's carry then stays in a core's cache, and what lanes of the fused loop
+share counts little (benchmarks/NOTES.md)."""
 
 
 class Chunk(NamedTuple):
@@ -67,14 +61,14 @@ def prepare(config: Config) -> Experiment:
     return as_arrays(config.build(), jnp.dtype(config.run.precision))
 
 
-def layout_for(config: Config, points: Points, devices: int) -> Layout:
+def layout_for(config: Config, points: Points, devices: int, backend: Backend) -> Layout:
     """Chunk shape: as many lanes as the devices want at once, whole rows of points before several seeds.
 
     Every device gets two lanes or more: one alone is compiled to other roundings than a row of them.
     """
     if points.refinement is not None:
         return _refined_layout(config, devices)
-    capacity = config.sweep.chunk or LANES_PER_DEVICE * devices
+    capacity = config.sweep.chunk or LANES_PER_DEVICE[backend] * devices
     # chunks of equal size waste no padding on the last one; a multiple of the devices, along the longer side, suits them
     per_chunk = math.ceil(points.lanes / math.ceil(points.lanes / capacity))
     if points.lanes >= devices and points.lanes > 1:
@@ -101,16 +95,27 @@ class Engine:
         config: the study.
         layout: chunk shape; left out, one that suits the devices.
         devices: left out, all local ones.
+        backend: left out, the faster one here.
+        insist: refuse a study that the fused loop cannot run; else it is scanned.
     """
 
-    def __init__(self, config: Config, layout: Layout | None = None, devices: list[Any] | None = None):
+    def __init__(
+        self,
+        config: Config,
+        layout: Layout | None = None,
+        devices: list[Any] | None = None,
+        backend: Backend | None = None,
+        insist: bool = False,
+    ):
         self.config = config
         self.points = Points(config)
         self.devices = devices or jax.local_devices()
-        self.layout = layout or layout_for(config, self.points, len(self.devices))
+        self.backend: Backend = backend or default_backend(self.devices)
+        self._insist = insist
+        self.layout = layout or layout_for(config, self.points, len(self.devices), self.backend)
         self.compile_seconds = 0.0
         self.run_seconds = 0.0
-        self._compiled: tuple[int, tuple[Any, list[str]]] | None = None
+        self._compiled: tuple[int, tuple[Program, list[str]]] | None = None
 
     def __len__(self) -> int:
         """Number of chunks; of a refined study, those of its coarse grid."""
@@ -157,7 +162,7 @@ class Engine:
         with precision(group.config):
             given = self._arguments(group.config, self.points.columns(chunk.points), chunk.seeds)
             start = time.perf_counter()
-            figures = jax.block_until_ready(with_conditions(*program(*given)))
+            figures = jax.block_until_ready(with_conditions(*program.run(*given)))
             self.run_seconds += time.perf_counter() - start
         data = self.labels(chunk)
         for name in names:
@@ -188,39 +193,18 @@ class Engine:
         padded = {path: pad(np.asarray(v, dtype), self.layout.points) for path, v in columns.items()}
         return padded, pad(seeds.astype(np.uint32), self.layout.seeds)
 
-    def _program(self, group: int) -> tuple[Any, list[str]]:
+    def _program(self, group: int) -> tuple[Program, list[str]]:
         """The compiled program of a group and the names of its figures; the last one is kept."""
         if self._compiled is None or self._compiled[0] != group:
             self._compiled = (group, self._compile(self.points.groups[group].config))
         return self._compiled[1]
 
-    def _compile(self, config: Config) -> tuple[Any, list[str]]:
+    def _compile(self, config: Config) -> tuple[Program, list[str]]:
         with precision(config):
             experiment = prepare(config)
-
-            def lane(values: dict[str, Any], seed: Any) -> tuple[dict[str, Any], Any]:
-                experiment_of_lane = set_leaves(experiment, values)
-                figures, _ = scan(experiment_of_lane, seed, (METRICS,))
-                return figures, observer_gains(experiment_of_lane)
-
-            # shards along the longer side that divides evenly; one device does the rest
-            seeds, points = self.layout
-            count = len(self.devices)
-            by_points, by_seeds = points % count == 0, points % count != 0 and seeds % count == 0
-            mesh = Mesh(np.array(self.devices if by_points or by_seeds else self.devices[:1]), ("lanes",))
-            over_points = PartitionSpec("lanes" if by_points else None)
-            over_seeds = PartitionSpec("lanes" if by_seeds else None)
-            local_points = points // count if by_points else points
-            chunk = jax.shard_map(
-                jax.vmap(jax.vmap(lane, in_axes=(0, None), axis_size=local_points), in_axes=(None, 0)),
-                mesh=mesh,
-                in_specs=(over_points, over_seeds),
-                out_specs=PartitionSpec(*over_seeds, *over_points),
-                check_vma=False,
-            )
-            columns = self.points.columns(np.arange(1))
+            columns, _ = self._arguments(config, self.points.columns(np.arange(1)), np.arange(1))
             start = time.perf_counter()
-            program = jax.jit(chunk).lower(*self._arguments(config, columns, np.arange(1))).compile()
+            program = compile_program(experiment, self.layout, self.devices, self.backend, columns, insist=self._insist)
             self.compile_seconds += time.perf_counter() - start
             return program, metric_columns(experiment)
 
@@ -239,10 +223,8 @@ class Engine:
             seconds = []
             for _ in range(3):
                 start = time.perf_counter()
-                jax.block_until_ready(program(*given))
+                jax.block_until_ready(program.run(*given))
                 seconds.append(time.perf_counter() - start)
-        memory = program.memory_analysis()
-        size = 0 if memory is None else memory.temp_size_in_bytes + memory.output_size_in_bytes
         lane_steps = short * math.prod(self.layout)
         steps = [group.config.run.steps for group in self.points.groups]
         chunks_a_group = len(self) // len(steps)
@@ -255,7 +237,7 @@ class Engine:
             compile_seconds=compiling * len(steps),
             run_seconds=min(seconds) / short * sum(steps) * chunks_a_group,
             lane_steps_per_second=lane_steps / min(seconds),
-            megabytes=size / 1e6,
+            megabytes=program.megabytes,
         )
 
 

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from jaxbl.errors import InputError
 
 from .config import Config, read_config
-from .engine import Layout
+from .programs import Backend, Layout
 
 FORMAT = 2
 
@@ -178,7 +178,7 @@ class Store:
         self.manifest = manifest
 
     @classmethod
-    def create(cls, folder: Path, config: Config, layout: Layout, parts: int, rows: int) -> "Store":
+    def create(cls, folder: Path, config: Config, layout: Layout, backend: Backend, parts: int, rows: int) -> "Store":
         """Open a folder that this study may have (:func:`claim`), or take up the one that is there."""
         if (folder / "manifest.json").exists():
             store = cls.open(folder)
@@ -187,6 +187,7 @@ class Store:
                 "format": FORMAT,
                 **mark(config, "sweep"),
                 "layout": {"seeds": layout.seeds, "points": layout.points},
+                "backend": backend,
                 "parts": parts,
                 "rows": rows,
                 "finished": False,
@@ -217,6 +218,11 @@ class Store:
     @property
     def layout(self) -> Layout:
         return Layout(**self.manifest["layout"])
+
+    @property
+    def backend(self) -> Backend:
+        """That of all chunks; those of former versions were scanned."""
+        return self.manifest.get("backend", "scan")
 
     def update(self, **values: Any) -> None:
         """Set entries of the manifest."""

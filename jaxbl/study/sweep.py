@@ -10,9 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from jaxbl.errors import InputError
+
 from .config import Config, read_config
-from .engine import Chunk, Engine, Estimate, Layout, Progress
+from .engine import Chunk, Engine, Estimate, Progress
 from .metrics import describe
+from .programs import Backend
 from .refine import refine
 from .store import Store, claim
 
@@ -98,6 +101,7 @@ def sweep(
     progress: Progress | None = None,
     devices: list[Any] | None = None,
     overwrite: bool = False,
+    backend: Backend | None = None,
 ) -> StudyResult:
     """Run all points of a study.
 
@@ -108,20 +112,25 @@ def sweep(
         progress: called with finished and total lanes after each chunk; the total of a refined study grows.
         devices: JAX devices to use; left out, all local ones.
         overwrite: remove the results of another study from `out`.
+        backend: `fused` or `scan`; left out, the faster one here. A study that goes on keeps to that of its first chunks.
 
     Raises:
-        InputError: wrong config, or a folder that holds something else.
+        InputError: wrong config, a folder that holds something else, or a backend that cannot run the study.
     """
     config = read_config(study)
-    engine = Engine(config, devices=devices)
+    engine = Engine(config, devices=devices, backend=backend, insist=backend is not None)
     store = None
     if out is not None:
         folder = Path(out)
         claim(folder, config, overwrite=overwrite)
-        store = Store.create(folder, config, engine.layout, len(engine), engine.rows)
-        if store.layout != engine.layout:
+        store = Store.create(folder, config, engine.layout, engine.backend, len(engine), engine.rows)
+        if backend not in (None, store.backend) and not store.manifest["finished"]:
+            raise InputError(
+                f"{folder}: was begun with --backend {store.backend}; go on with that, or choose another folder with --out"
+            )
+        if (store.layout, store.backend) != (engine.layout, engine.backend):
             # taken up on another machine: the chunks must stay what they were
-            engine = Engine(config, Layout(*store.layout), devices)
+            engine = Engine(config, store.layout, devices, store.backend, backend is not None)
     run = _Run(engine, store, progress)
     run.all()
     if store is None:
@@ -210,6 +219,6 @@ def load(folder: str | Path) -> StudyResult:
     return StudyResult(store.config(), store)
 
 
-def dry_run(study: str | Path | Mapping[str, Any] | Config) -> Estimate:
+def dry_run(study: str | Path | Mapping[str, Any] | Config, *, backend: Backend | None = None) -> Estimate:
     """What a study will cost, from a compilation and a short calibration run; of a refined one, its coarse grid."""
-    return Engine(read_config(study)).estimate()
+    return Engine(read_config(study), backend=backend, insist=backend is not None).estimate()

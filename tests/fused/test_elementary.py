@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbl.fused.elementary import FUNCTIONS, LIMIT
+from jaxbl.fused.elementary import FUNCTIONS, LIMIT, rounded
 
 TRUE = {
     "exp": np.exp,
@@ -38,3 +38,9 @@ def test_edges(dtype):
     np.testing.assert_array_equal(FUNCTIONS["tanh"](x)[:4], np.array([1, -1, np.nan, 0], dtype))
     np.testing.assert_array_equal(FUNCTIONS["expm1"](x), np.array([np.inf, -1, np.nan, 0, np.inf, -1], dtype))
     assert np.isnan(FUNCTIONS["sin"](x)[:3]).all()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_rounded_to_the_even_one_of_two(dtype):
+    x = np.array([0.5, 1.5, 2.5, -0.5, -1.5, 0.49999, 1e6 + 0.5, 3e9, -7.7], dtype)
+    np.testing.assert_array_equal(jax.jit(rounded)(jnp.asarray(x)), np.round(x))
