@@ -167,7 +167,7 @@ def bench(folder: Path, *, quick: bool = False, progress: Progress | None = None
             progress(done, parts)
 
     rows, runners = [], []
-    references = {precision: _reference(steps, precision) for precision in PRECISIONS}
+    reference = _reference(steps)
     for entry, precision in jobs:
         work = Workload(entry.lanes // (8 if quick and entry.lanes > 1 else 1), steps, precision)
         with _in(precision):
@@ -175,7 +175,7 @@ def bench(folder: Path, *, quick: bool = False, progress: Progress | None = None
             runner = entry.make(work)
             figures = runner()
             row = Row(entry.name, precision, work.lanes, steps, time.perf_counter() - begun, 0.0)
-        row.deviation = _check(entry, precision, figures, references[precision])
+        row.deviation = _check(entry, precision, figures, reference)
         rows.append(row)
         runners.append(runner)
         tick()
@@ -212,8 +212,8 @@ def _able(found: Sequence[Entry]) -> tuple[list[Entry], dict[str, str]]:
     return [entry for entry in found if entry.name not in left_out], left_out
 
 
-def _reference(steps: int, precision: str) -> dict[str, np.ndarray]:
-    """Figures of the first lanes by the plainest entry, in float64 whatever the precision of the inputs."""
+def _reference(steps: int) -> dict[str, np.ndarray]:
+    """Figures of the first lanes by the plainest entry, in float64."""
     with _in("float64"):
         return Plain(Workload(_REFERENCE_LANES, steps, "float64"))()
 

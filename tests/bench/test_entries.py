@@ -1,0 +1,73 @@
+"""Everyone does the same work: each entry's figures are those of a loop in NumPy; wrong ones are not timed."""
+
+import importlib.util
+
+import jax
+import numpy as np
+import pytest
+
+from jaxbl.bench import run
+from jaxbl.bench.run import PRECISIONS, Entry, _able, _check, _reference, entries
+from jaxbl.bench.workload import NAMES, RANGES, Workload
+from jaxbl.errors import NoResult
+
+STEPS = 1500
+
+
+def names():
+    return [entry.name for entry in entries(None, 2)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("kernel")
+
+
+@pytest.fixture(scope="module")
+def reference():
+    return _reference(STEPS)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", names())
+def test_figures_are_those_of_the_reference(name, precision, folder, reference):
+    able, left_out = _able(entries(folder, 2))
+    if name in left_out:
+        pytest.skip(left_out[name])
+    entry = next(entry for entry in able if entry.name == name)
+    with jax.enable_x64(precision == "float64"):
+        figures = entry.make(Workload(min(entry.lanes, 70), STEPS, precision))()
+    assert set(figures) == set(NAMES)
+    assert all(len(values) == min(entry.lanes, 70) for values in figures.values())
+    assert _check(entry, precision, figures, reference) >= 0.0
+
+
+def test_a_wrong_result_is_not_timed(reference):
+    wrong = {name: 1.01 * values for name, values in reference.items()}
+    entry = Entry("someone", lambda workload: lambda: wrong, 64)
+    with pytest.raises(NoResult, match=r"someone, float64: .* is off by 0.01"):
+        _check(entry, "float64", wrong, reference)
+    missing = reference | {"motor.stiffness": np.full(64, np.nan)}
+    with pytest.raises(NoResult, match=r"motor\.stiffness"):
+        _check(entry, "float64", missing, reference)
+
+
+def test_who_cannot_run_is_left_out_with_a_reason(monkeypatch, folder):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(run.importlib.util, "find_spec", lambda name: None if name == "numba" else find(name))
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    able, left_out = _able(entries(folder, 2))
+    assert "install g++" in left_out["c++, one core"]
+    assert "jaxbl[bench]" in left_out["numba, prange"]
+    assert {"jaxbl fused, all cores", "NumPy, one lane"} <= {entry.name for entry in able}
+
+
+def test_fewer_lanes_are_the_first_of_more():
+    few, many = (Workload(lanes, STEPS, "float64").values() for lanes in (5, 500))
+    for path, (low, high) in RANGES.items():
+        np.testing.assert_array_equal(few[path], many[path][:5])
+        assert many[path].min() >= low
+        assert many[path].max() <= high
+        # every tenth of the range has its share of lanes
+        shares = np.histogram(np.log(many[path]), 10, np.log([low, high]))[0]
+        assert shares.min() > 40

@@ -1,0 +1,45 @@
+"""Table, chart and file of a benchmark."""
+
+import json
+
+import pytest
+
+from jaxbl.bench.run import CEILING, OURS, SCAN, Result, Row
+from jaxbl.report.throughput import throughput_lines, write_bench_report
+
+
+@pytest.fixture
+def result():
+    rows = []
+    for precision, speed in (("float32", 2e9), ("float64", 5e8)):
+        for name, share in ((CEILING, 1.0), (OURS, 0.8), (SCAN, 0.2), ("NumPy, one lane", 1e-5)):
+            row = Row(name, precision, 1000, 100, 1.5, 1e-12, seconds=[1e5 / speed / share, 2e5 / speed / share])
+            row.finish()
+            rows.append(row)
+    curve = [
+        {"name": name, "precision": "float32", "lanes": lanes, "steps": 100, "lane_steps_per_second": 1e6 * lanes}
+        for name in (CEILING, OURS)
+        for lanes in (64, 128, 256)
+    ]
+    study = [{"name": OURS, "precision": "float32", "lanes": 1000, "steps": 3000, "seconds": 1.25}]
+    machine = {"processor": "a processor", "cores": 2, "versions": {"jax": "1.0"}}
+    return Result(machine, rows, curve, study, {"numba, prange": "no numba; pip install 'jaxbl[bench]'"})
+
+
+def test_files_and_figures(result, tmp_path):
+    write_bench_report(result, tmp_path)
+    found = json.loads((tmp_path / "bench.json").read_text())
+    row = next(r for r in found["rows"] if (r["name"], r["precision"]) == (OURS, "float64"))
+    assert row["lane_steps_per_second"] == pytest.approx(4e8)
+    assert row["median_lane_steps_per_second"] == pytest.approx(4e8 / 1.5)
+    assert {"name", "precision", "lanes", "steps", "lane_steps_per_second"} <= set(row)
+    assert sorted(path.name for path in (tmp_path / "figures").iterdir()) == ["lanes.png", "throughput.png"]
+
+
+def test_the_table_says_who_where_and_how_far_from_the_ceiling(result):
+    lines = throughput_lines(result)
+    assert lines[0].startswith("a processor, 2 cores; jax 1.0; 100 samples")
+    ours = next(line for line in lines if line.startswith(OURS))
+    assert ours.split()[4:] == ["32", "1000", "1.6e+09", "1.07e+09", "0.8", "1.50", "s", "1e-12"]
+    assert lines[-1] == "numba, prange: left out, no numba; pip install 'jaxbl[bench]'"
+    assert any("1.25 s" in line for line in lines)
