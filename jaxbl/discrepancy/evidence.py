@@ -112,7 +112,7 @@ class Scorer:
             if not over.any():
                 break
             # what is beyond its bound stays at it
-            coefficients = np.where(over, centre + np.sign(away) * bound * spread, coefficients)
+            coefficients[over] = (centre + np.clip(away, -bound, bound) * spread)[over]
             free &= ~over
         values[chosen] = coefficients
         # the sum's distance from its mean is shared out by the variances
@@ -150,7 +150,8 @@ def _solved(inner: Array, towards: Array, total: float, spread: Array, centre: A
     towards = towards - precision * centre
     total = total + float(precision @ centre**2)
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    root = _root(matrix / np.outer(size, size))
+    with np.errstate(over="ignore"):
+        root = _root(matrix / np.outer(size, size))
     if root is None:
         return None
     inside = solve_triangular(root, towards / size, lower=True)

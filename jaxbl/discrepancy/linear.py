@@ -13,6 +13,7 @@ References: L. Ljung, System Identification (1999), 7.4; M. Basseville, Detectin
 Automatica 24 (1988), for the local approach.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 
 import equinox as eqx
@@ -20,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
 from jaxbl.drive.effects import ConstantTorque
@@ -93,7 +95,9 @@ def _part(
     read = np.stack([padded(readings[side]) - states[side][:, 0] for side in sides], axis=1)
     weight = (np.arange(size) < count).astype(float)
     given = padded(time), padded(torque), read, states, deviation, held, weight
-    return _derivatives(experiment, chosen, theta, *jax.tree.map(jnp.asarray, given))
+    found = _derivatives(experiment, chosen, theta, *jax.tree.map(jnp.asarray, given))
+    # several devices have made it; what follows is one's work
+    return jax.device_put(found, jax.local_devices()[0])
 
 
 @eqx.filter_jit
@@ -148,7 +152,17 @@ def _derivatives(
     vectors = jax.vmap(pack)(motion)
     count = vectors.shape[1]
     blocks = jax.tree.map(lambda x: x.reshape(-1, 2 * _BLOCK, *x.shape[1:]), (vectors, torque, time))
-    found = jax.lax.map(lambda given: jax.vmap(one)(*given), blocks)
+    # devices share the blocks
+    devices = jax.local_devices()
+    mesh = Mesh(np.array(devices[: math.gcd(len(devices), len(blocks[1]))]), ("blocks",))
+    along = jax.shard_map(
+        lambda blocks: jax.lax.map(lambda given: jax.vmap(one)(*given), blocks),
+        mesh=mesh,
+        in_specs=PartitionSpec("blocks"),
+        out_specs=PartitionSpec("blocks"),
+        check_vma=False,
+    )
+    found = along(blocks)
     slope, f, value = jax.tree.map(lambda x: x.reshape(len(time), *x.shape[2:]), found)
     period = experiment.run.sample_period
     modelled = {side: (value[:, len(sides) + i] - vectors[:, len(sides) + i]) / period for i, side in enumerate(sides)}
@@ -651,7 +665,7 @@ def _lost(gram: np.ndarray, states: int) -> float:
     real = size > _SILENT * np.max(size)
     if not real.any() or not np.isfinite(inner).all():
         return 0.0
-    spread = np.abs(np.linalg.eigvalsh((inner / np.outer(size, size))[np.ix_(real, real)]))
+    spread = np.abs(np.linalg.eigvalsh(inner[np.ix_(real, real)] / np.outer(size[real], size[real])))
     return float(np.finfo(float).eps * gram[0, 0] * spread[-1] / max(spread[0], 1e-300))
 
 

@@ -241,12 +241,10 @@ def _growth(experiment: Experiment, windows: Windows, deviation: dict[str, float
     start, torque, time = jax.tree.map(lambda x: x[0], (windows.start, windows.torque, windows.time))
     step = 1e-3
     moved = {side: value + step * jnp.asarray(deviation[side]) for side, value in start.velocity.items()}
-    runs = [
-        trajectory(experiment, state, torque, time).position
-        for state in (start, PlantState(start.position, moved, start.effects))
-    ]
+    both = jax.tree.map(lambda *x: jnp.stack(x), start, PlantState(start.position, moved, start.effects))
+    runs = jax.vmap(lambda state: trajectory(experiment, state, torque, time).position)(both)
     shares = [
-        jnp.sqrt(jnp.mean((runs[1][side] - runs[0][side]) ** 2)) / step / jnp.std(windows.measured[side][0])
+        jnp.sqrt(jnp.mean((runs[side][1] - runs[side][0]) ** 2)) / step / jnp.std(windows.measured[side][0])
         for side in experiment.sides
     ]
     return jnp.max(jnp.stack(shares))

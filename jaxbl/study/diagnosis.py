@@ -8,6 +8,7 @@ the fit has seen.
 # pyright: reportArgumentType=false
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -542,7 +543,7 @@ class _Proving:
             base = found.model if names else found.nominal
             fitted = _fitted(self.explainer, {name: base.numbers[name] for name in names}, base.theta)
             after = self.other.prove(self.at(fitted.experiment))
-            if not self.worse(after):
+            if not self.worse(after) and (names or self.better(after)):
                 return fitted, after, withdrawn
             if not names:
                 break
@@ -559,6 +560,10 @@ class _Proving:
             <= (_WORSE_SPEED if name.startswith("velocity") else _WORSE) * max(self.before.errors[name], self.floor[name])
             for name, value in after.errors.items()
         )
+
+    def better(self, after: Proof) -> bool:
+        """Whether a model is better than the one given, all in all: what new numbers alone have to be to take its place."""
+        return sum(math.log(value / self.before.errors[name]) for name, value in after.errors.items()) < 0.0
 
     def at(self, experiment: Experiment) -> Experiment:
         """A model at the period of what was held out."""

@@ -176,6 +176,9 @@ def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
     assert gap["holdout"]["separate"] is True
     for name in ("theta_e", "torque_motor"):
         assert gap["holdout_rmse_after"][name] <= 1.02 * gap["holdout_rmse_before"][name]
+    # new numbers alone take the model's place only where they are better
+    after, before = gap["holdout_rmse_after"], gap["holdout_rmse_before"]
+    assert sum(np.log(after[name] / before[name]) for name in before) <= 0.0
     assert found.model.effects == []
 
 
