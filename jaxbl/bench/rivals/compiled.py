@@ -1,5 +1,8 @@
 """The chain in numba: a plain scalar loop over threads, and lanes in blocks that LLVM turns into vectors."""
 
+# of the extra `bench`, which need not be there
+# pyright: reportMissingImports=false
+
 from collections.abc import Callable
 from functools import cache
 

@@ -3,6 +3,9 @@
 Its right-hand side is the package's own step, divided by the period: Euler's method then takes exactly the chain's steps.
 """
 
+# of the extra `bench`, which need not be there
+# pyright: reportMissingImports=false
+
 from typing import Any
 
 import jax

@@ -1,6 +1,9 @@
 """The chain in NumPy, a loop over time in Python: with lane arrays, or one lane whose plant SciPy solves, or whose observers
 are OpenSMC's."""
 
+# of the extra `bench`, which need not be there
+# pyright: reportMissingImports=false
+
 from collections.abc import Callable
 from typing import Any
 
