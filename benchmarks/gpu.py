@@ -1,8 +1,8 @@
 """The workload on a GPU: the scan, the fused kernel, a kernel by hand as the ceiling; and Lorenz's system.
 
-The chain: lane-steps per second of the scan, of the fused kernel (Pallas, lowered by Triton) and of a CUDA kernel (CuPy), their
-figures compared. Lorenz: trajectory-steps per second of 1000 steps of the classical Runge-Kutta method, 8 to 8 million of them,
-as in the DiffEqGPU benchmark (published on a V100: MPGOS 8.9e10, DiffEqGPU 5.8e10, JAX with diffrax 8.4e8).
+The chain: lane-steps per second of the scan, of the fused kernel (Pallas, lowered by Triton) and of a CUDA kernel (CuPy),
+their figures compared. Lorenz: trajectory-steps per second of 1000 steps of the classical Runge-Kutta method, 8 to 8 million
+of them, as in the DiffEqGPU benchmark (published on a V100: MPGOS 8.9e10, DiffEqGPU 5.8e10, JAX with diffrax 8.4e8).
 
 Least of several rounds in turns, after a warm-up. Needs a GPU, JAX for it, and CuPy; without a GPU it says so and ends.
 
