@@ -24,10 +24,10 @@ import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
-from jaxbl.bench.workload import FIGURES, RANGES, SEED, Workload, constants, figures_of
 from jaxbl.drive import set_leaves
 from jaxbl.fused.passage import DevicePassage
 from jaxbl.simulate import scan
+from jaxbl.throughput.workload import FIGURES, RANGES, SEED, Workload, constants, figures_of
 
 _THREADS = 128
 

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from .study.tune import tune as tune
     from .study.verify import Verdict as Verdict
     from .study.verify import verify as verify
+    from .throughput import bench as bench
 
 _WHERE = {
     "InputError": "errors",
@@ -70,6 +71,7 @@ _WHERE = {
     "run": "study.trial",
     "Tuning": "study.tune",
     "tune": "study.tune",
+    "bench": "throughput",
     "Verdict": "study.verify",
     "verify": "study.verify",
 }

@@ -448,9 +448,9 @@ def bench(
     _start_jax()
     import jax
 
-    from .bench.run import bench as run_bench
     from .report import write_bench_report
     from .study.store import make_folder
+    from .throughput.run import bench as run_bench
 
     # what was compiled before does not count
     jax.config.update("jax_enable_compilation_cache", False)

@@ -27,8 +27,10 @@ BELOW = {
     "identification": {"simulate", "observer", "drive", "records", "errors"},
 }
 BELOW["discrepancy"] = {*BELOW["identification"], "identification"}
-BELOW["study"] = {*BELOW["discrepancy"], "discrepancy"}
-BELOW["report"] = {*BELOW["study"], "study"}
+BELOW["fused"] = {*BELOW["simulate"], "simulate"}
+BELOW["study"] = {*BELOW["discrepancy"], "discrepancy", "fused"}
+BELOW["throughput"] = {*BELOW["study"], "study"}
+BELOW["report"] = {*BELOW["throughput"], "throughput"}
 BELOW["workers"] = {"errors"}
 BELOW["cli"] = {*BELOW["report"], "report", "workers"}
 

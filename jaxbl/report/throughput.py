@@ -5,8 +5,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from jaxbl.bench.run import CEILING, OURS, PRECISIONS, SCAN, Result
 from jaxbl.study.store import make_folder, write_atomic
+from jaxbl.throughput.run import CEILING, OURS, PRECISIONS, SCAN, Result
 
 from .maps import Drawn
 from .reports import save_all

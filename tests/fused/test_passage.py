@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbl.bench.workload import FIGURES, RANGES, SEED, Workload
 from jaxbl.drive import Encoders, Initial, LinearShaft, Rigid, TwoInertia, as_arrays, get_leaf, set_leaves
 from jaxbl.drive.effects import effect_kinds
 from jaxbl.drive.excitation import Chirp, Sine
@@ -16,6 +15,7 @@ from jaxbl.fused.passage import DevicePassage, HostPassage
 from jaxbl.observer import OBSERVERS, EquivalentControl, Identifier, Observers
 from jaxbl.simulate import Experiment, Reducer, Run, scan
 from jaxbl.study.metrics import METRICS
+from jaxbl.throughput.workload import FIGURES, RANGES, SEED, Workload
 
 NUMBERS = {
     "motor.coulomb_friction": {"torque": 0.1},

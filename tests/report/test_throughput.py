@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from jaxbl.bench.run import CEILING, OURS, SCAN, Result, Row
 from jaxbl.report.throughput import throughput_lines, write_bench_report
+from jaxbl.throughput.run import CEILING, OURS, SCAN, Result, Row
 
 
 @pytest.fixture

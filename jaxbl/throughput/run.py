@@ -137,8 +137,8 @@ class Result:
         return found[0] if found else None
 
 
-def bench(folder: Path, *, quick: bool = False, progress: Progress | None = None) -> Result:
-    """Run the benchmark.
+def bench(folder: str | Path, *, quick: bool = False, progress: Progress | None = None) -> Result:
+    """Measure this machine: the paper's chain by everyone, in turns, each checked against one reference.
 
     Args:
         folder: keeps the compiled C++ kernel.
@@ -149,7 +149,7 @@ def bench(folder: Path, *, quick: bool = False, progress: Progress | None = None
         NoResult: an entry's figures are not those of the reference.
     """
     cores = len(jax.local_devices())
-    able, left_out = _able(entries(folder, cores))
+    able, left_out = _able(entries(Path(folder), cores))
     steps, rounds = (1500, 3) if quick else (4000, 7)
     jobs = [
         (entry, precision)

@@ -2,3 +2,6 @@
 
 What rivals run is written once more in each one's own way (`rivals`), and used nowhere else.
 """
+
+from .run import Result as Result
+from .run import bench as bench

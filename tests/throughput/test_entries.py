@@ -6,10 +6,10 @@ import jax
 import numpy as np
 import pytest
 
-from jaxbl.bench import run
-from jaxbl.bench.run import PRECISIONS, Entry, _able, _check, _reference, entries
-from jaxbl.bench.workload import NAMES, RANGES, Workload
 from jaxbl.errors import NoResult
+from jaxbl.throughput import run
+from jaxbl.throughput.run import PRECISIONS, Entry, _able, _check, _reference, entries
+from jaxbl.throughput.workload import NAMES, RANGES, Workload
 
 STEPS = 1500
 
