@@ -133,6 +133,12 @@ BAD = {
         ["sweep", "axis.toml", "--dry-run"],
         "axis.toml: axes[0]: unknown path 'observer.motor.alfa'; nearest valid path: 'observer.motor.alpha'",
     ),
+    "no such backend": (["sweep", "study.toml", "--backend", "gpu"], "--backend gpu: there is none; one of fused, scan"),
+    "seeds alone, fused": (
+        ["sweep", "seeds.toml", "--backend", "fused"],
+        "seeds.toml: --backend fused: the fused loop does not know lanes that differ in nothing but their seed; "
+        "use --backend scan",
+    ),
     "wrong figure": (
         ["sweep", "figure.toml"],
         "figure.toml: figures[0].value: 'motor.velocity_rms' is no metric; did you mean 'motor.velocity_rmse'?",
@@ -187,6 +193,7 @@ def test_bad_input_is_one_line_and_exit_2(case, tmp_path, monkeypatch, capsys):
     arguments, message = BAD[case]
     write(tmp_path)
     write(tmp_path, rigid(), "plain.toml")
+    write(tmp_path, rigid(sweep={"seeds": 2}), "seeds.toml")
     write(tmp_path, rigid({"run.durations": 1.0}), "wrong.toml")
     write(tmp_path, rigid(axes=[listed("observer.motor.alfa", 1.0)]), "axis.toml")
     write(tmp_path, rigid(axes=AXES, figures=[FIGURE | {"value": "motor.velocity_rms"}]), "figure.toml")

@@ -52,7 +52,9 @@ def _machine() -> Any:
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
     features = binding.get_host_cpu_features()
-    features["prefer-256-bit"] = False
+    if features.get("avx512f"):
+        # some processors have wide registers and compilers that shun them
+        features["prefer-256-bit"] = False
     return binding.Target.from_default_triple().create_target_machine(
         cpu=binding.get_host_cpu_name(), features=features.flatten(), opt=3
     )
@@ -126,6 +128,8 @@ class _Writer:
         own = values + carry
         dtypes = [_dtype(v) for v in [*body.jaxpr.invars, *after.jaxpr.invars[own:]]]
         kinds = [_KINDS[str(dtype)] for dtype in dtypes]
+        if any(not jnp.issubdtype(dtype, jnp.floating) for dtype in dtypes[:own]):
+            raise Unsupported("lanes that carry other numbers than floating-point ones")
         arrays = [build.load(build.gep(table, [_INT(i)], source_etype=_POINTER), typ=_POINTER) for i in range(len(dtypes))]
 
         def scalar(i: int, at: Vector) -> Vector:

@@ -193,6 +193,11 @@ class Engine:
         padded = {path: pad(np.asarray(v, dtype), self.layout.points) for path, v in columns.items()}
         return padded, pad(seeds.astype(np.uint32), self.layout.seeds)
 
+    def check(self) -> None:
+        """Compile the programs of all groups; the last one is kept. Raises `InputError` if the backend cannot be had."""
+        for group in range(len(self.points.groups)):
+            self._program(group)
+
     def _program(self, group: int) -> tuple[Program, list[str]]:
         """The compiled program of a group and the names of its figures; the last one is kept."""
         if self._compiled is None or self._compiled[0] != group:

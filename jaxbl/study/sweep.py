@@ -119,6 +119,9 @@ def sweep(
     """
     config = read_config(study)
     engine = Engine(config, devices=devices, backend=backend, insist=backend is not None)
+    if backend is not None:
+        # refused, if it is, before anything is written
+        engine.check()
     store = None
     if out is not None:
         folder = Path(out)

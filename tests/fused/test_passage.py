@@ -171,3 +171,10 @@ def test_an_unknown_operation_is_refused_by_name():
     )
     with pytest.raises(Unsupported, match="erf"):
         HostPassage(whole, (odd,), ("transmission.half_gap",), 1)
+    truth = Reducer(
+        lambda e: jnp.asarray(False),
+        lambda e, total, index, signals: total | (signals.motor.measured > 1.0),
+        lambda e, total, state: {"truth": total},
+    )
+    with pytest.raises(Unsupported, match="carry other numbers"):
+        HostPassage(whole, (truth,), ("transmission.half_gap",), 1)
