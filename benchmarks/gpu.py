@@ -14,7 +14,6 @@ import json
 import sys
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +73,7 @@ def chain_scanned(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
 
 def chain_fused(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
     """The chain by the fused kernel."""
-    passage, values = DevicePassage(work.experiment(), (FIGURES,), tuple(RANGES)), work.values()
+    passage, values = DevicePassage(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes), work.values()
     return lambda: passage(values, SEED)
 
 
@@ -191,7 +190,7 @@ def main() -> None:
                 )
     for lanes in options.trajectories:
         makers = {"cuda": lorenz_by_hand, "fused": lorenz_fused, "scan": lorenz_scanned}
-        runners = {name: partial(make(lanes, 1000, 1e-3)) for name, make in makers.items()}
+        runners = {name: make(lanes, 1000, 1e-3) for name, make in makers.items()}
         found = {name: np.asarray(run() if name != "cuda" else run().get()) for name, run in runners.items()}  # type: ignore[attr-defined]
         apart = {name: float(np.max(np.abs(value - found["cuda"]))) for name, value in found.items()}
         for name, seconds in timed(runners, options.rounds).items():

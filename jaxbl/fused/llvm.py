@@ -14,7 +14,7 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 from llvmlite import binding, ir
 
 from .elementary import FUNCTIONS
-from .split import substituted
+from .split import Unsupported, substituted
 
 _INT, _BIT, _POINTER = ir.IntType(64), ir.IntType(1), ir.PointerType()
 _KINDS = {
@@ -35,12 +35,11 @@ _FLAGS = ("contract",)
 _BOOL = np.dtype(bool)
 
 
-class Unsupported(Exception):
-    """An operation that this compiler has no instruction for."""
-
-
 def _dtype(v: Var | Literal) -> np.dtype:
-    return np.dtype(v.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
+    dtype = v.aval.dtype  # pyright: ignore[reportAttributeAccessIssue]
+    if str(dtype) not in _KINDS:
+        raise Unsupported(f"numbers of type {dtype}")
+    return np.dtype(dtype)
 
 
 def _shape(v: Var | Literal) -> tuple[int, ...]:
@@ -314,6 +313,8 @@ def _convert(w: _Writer, eqn: JaxprEqn, a: Vector) -> Vector:
         return a
     if new == _BOOL:
         raise Unsupported(f"conversion of {old} to bool")
+    if str(new) not in _KINDS:
+        raise Unsupported(f"numbers of type {new}")
     target, wider = w.vector(_KINDS[str(new)]), old == _BOOL or new.itemsize > old.itemsize
     signed = jnp.issubdtype(old, jnp.signedinteger)
     was, becomes = (jnp.issubdtype(dtype, jnp.floating) for dtype in (old, new))

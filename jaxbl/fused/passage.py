@@ -2,6 +2,7 @@
 
 import abc
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -29,22 +30,29 @@ from .split import Kind, carry_kinds, split
 
 
 class Passage(abc.ABC):
-    """Simulates lanes of an experiment; compiled for their structure, whatever their number.
+    """Simulates lanes of an experiment.
+
+    Made and called in the precision of the experiment (`jax.enable_x64`).
 
     Args:
         experiment: with array leaves (:func:`jaxbl.drive.as_arrays`).
         reducers: figures to compute along the run.
         paths: of the leaves that differ from lane to lane.
+        lanes: how many there are; compiled for this number.
+        together: lanes that are computed together; their number is filled up to a multiple.
 
     Attributes:
         carried: numbers that a lane carries; what all share is not among them.
+
+    Raises:
+        Unsupported: a step does something that a fused loop cannot do.
     """
 
-    _together: int
-    """Lanes that are computed together; their number is filled up to a multiple."""
-
-    def __init__(self, experiment: Experiment, reducers: tuple[Reducer, ...], paths: tuple[str, ...]):
+    def __init__(
+        self, experiment: Experiment, reducers: tuple[Reducer, ...], paths: tuple[str, ...], lanes: int, together: int
+    ):
         self._paths, self._steps = paths, experiment.run.steps
+        self._lanes, self._filled = lanes, -(-lanes // together) * together
         self._length = block_length(self._steps)
         dtype = jnp.result_type(experiment.run.sample_period)
         self._dtype = np.dtype(dtype)
@@ -83,21 +91,30 @@ class Passage(abc.ABC):
             state, handed = jax.lax.scan(self._inner.shared, state, (indices, noise))
             return *self._outer.shared(state, ()), handed
 
-        self._shared = jax.jit(shared, static_argnums=3)
-        self._start = jax.jit(jax.vmap(start))
-        self._result = jax.jit(jax.vmap(result, (0, self._tree.unflatten([0 if lane else None for lane in self._of_lane]))))
+        def side_by_side(leaf: Any) -> jax.ShapeDtypeStruct:
+            return jax.ShapeDtypeStruct((self._filled,), leaf.dtype)
+
+        # compiled now, so that a call only runs
+        many = [side_by_side(value) for value in values]
+        one = [leaf for leaf, lane in zip(jax.tree.leaves(carry), self._of_lane, strict=True) if not lane]
+        first = jax.ShapeDtypeStruct((), jnp.uint32), jax.ShapeDtypeStruct((), jnp.int32)
+        lengths = {min(self._length, self._steps), self._steps % self._length} - {0}
+        self._shared = {n: jax.jit(partial(shared, length=n)).lower(one, *first).compile() for n in lengths}
+        self._start = jax.jit(jax.vmap(start)).lower(many).compile()
+        axes = self._tree.unflatten([0 if lane else None for lane in self._of_lane])
+        ends = [side_by_side(x) if lane else x for x, lane in zip(jax.tree.leaves(carry), self._of_lane, strict=True)]
+        self._result = jax.jit(jax.vmap(result, (0, axes))).lower(many, self._tree.unflatten(ends)).compile()
 
     def __call__(self, values: dict[str, np.ndarray], seed: int) -> dict[str, np.ndarray]:
-        """Figures `(lanes,)` of one seed; `values` `(lanes,)` by path."""
-        lanes = len(next(iter(values.values())))
-        filled = -(-lanes // self._together) * self._together - lanes
-        given = [np.pad(np.asarray(values[path], self._dtype), (0, filled), "edge") for path in self._paths]
+        """Figures `(lanes,)` of one seed, by name; `values` `(lanes,)` by path, in SI units."""
+        more = (0, self._filled - self._lanes)
+        given = [np.pad(np.asarray(values[path], self._dtype), more, "edge") for path in self._paths]
         leaves = jax.tree.leaves(self._start(given))
         carry = [leaf for leaf, lane in zip(leaves, self._of_lane, strict=True) if lane]
         state = [np.asarray(leaf)[0] for leaf, lane in zip(leaves, self._of_lane, strict=True) if not lane]
         carry, state = map(iter, self._march(given, carry, state, seed))
         whole = self._tree.unflatten([next(carry) if lane else next(state) for lane in self._of_lane])
-        return {name: np.asarray(figure)[:lanes] for name, figure in self._result(given, whole).items()}
+        return {name: np.asarray(figure)[: self._lanes] for name, figure in self._result(given, whole).items()}
 
     @abc.abstractmethod
     def _march(self, given: list[Any], carry: list[Any], state: list[Any], seed: int) -> tuple[list[Any], list[Any]]:
@@ -105,23 +122,22 @@ class Passage(abc.ABC):
 
     def _ahead(self, state: list[Any], seed: int, first: int) -> tuple[list[Any], list[Any], list[Any]]:
         """What lanes share, over the block of samples that begins at `first`."""
-        return self._shared(state, np.uint32(seed), np.int32(first), min(self._length, self._steps - first))
+        return self._shared[min(self._length, self._steps - first)](state, np.uint32(seed), np.int32(first))
 
 
 class HostPassage(Passage):
-    """By code for this machine's processor; threads share the lanes.
+    """By code for this machine's processor; threads share the lanes."""
 
-    Raises:
-        Unsupported: a step does something that the compiler has no instruction for.
-    """
-
-    def __init__(self, experiment: Experiment, reducers: tuple[Reducer, ...], paths: tuple[str, ...], threads: int):
-        super().__init__(experiment, reducers, paths)
+    def __init__(
+        self, experiment: Experiment, reducers: tuple[Reducer, ...], paths: tuple[str, ...], lanes: int, threads: int
+    ):
+        dtype = np.dtype(jnp.result_type(experiment.run.sample_period))
+        self._together, self._threads = vector_lanes(dtype), threads
+        super().__init__(experiment, reducers, paths, lanes, self._together)
         inner, outer = self._inner, self._outer
         self._fixed = [np.asarray(value) for value in inner.fixed], [np.asarray(value) for value in outer.fixed]
         counts = len(inner.fixed), len(outer.fixed)
         self._loop = Loop(inner.lane, outer.lane, len(paths), self.carried, counts, self._dtype)
-        self._together, self._threads = vector_lanes(self._dtype), threads
 
     def _march(self, given, carry, state, seed):
         carry = [np.array(leaf, order="C") for leaf in carry]
@@ -146,27 +162,30 @@ class HostPassage(Passage):
 class DevicePassage(Passage):
     """By one kernel of an accelerator, which takes its lanes through the whole run; `interpret` runs it anywhere, slowly."""
 
-    _together = LANES
-
     def __init__(
-        self, experiment: Experiment, reducers: tuple[Reducer, ...], paths: tuple[str, ...], *, interpret: bool = False
+        self,
+        experiment: Experiment,
+        reducers: tuple[Reducer, ...],
+        paths: tuple[str, ...],
+        lanes: int,
+        *,
+        interpret: bool = False,
     ):
-        super().__init__(experiment, reducers, paths)
+        # a loop of scalars is the work of a processor; a GPU would start a kernel for each of its steps
+        with jax.default_device(jax.local_devices(backend="cpu")[0]):
+            super().__init__(experiment, reducers, paths, lanes, LANES)
         self._kernel = Kernel(self._inner.lane, self._outer.lane, len(paths), self.carried, interpret=interpret)
 
     def _march(self, given, carry, state, seed):
         blocks, rest = divmod(self._steps, self._length)
-        # a loop of scalars is the work of a processor; a GPU would start a kernel for each of its steps
-        with jax.default_device(jax.local_devices(backend="cpu")[0]):
-            state = [np.asarray(leaf) for leaf in state]
-            parts = []
-            for first in range(0, self._steps, self._length):
-                state, *part = self._ahead(state, seed, first)
-                parts.append(part)
+        state, parts = [np.asarray(leaf) for leaf in state], []
+        for first in range(0, self._steps, self._length):
+            state, *part = self._ahead(state, seed, first)
+            parts.append(part)
         fixed = self._inner.fixed, self._outer.fixed
         for some in (parts[:blocks], parts[blocks:] if rest else []):
             if some:
                 last, handed = ([np.stack([np.asarray(x) for x in column]) for column in zip(*one, strict=True)]
                                 for one in zip(*some, strict=True))  # fmt: skip
                 carry = self._kernel(given, carry, fixed, (handed, last))
-        return carry, state
+        return [np.asarray(leaf) for leaf in carry], state

@@ -17,7 +17,13 @@ _CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call", "c
 """Primitives that only call another jaxpr."""
 
 
+NUMBERS = ("float32", "float64", "int32", "uint32", "int64", "bool")
+"""Types that lanes may read."""
 Functions = Mapping[str, Callable[..., Any]]
+
+
+class Unsupported(Exception):
+    """Something in a step that a fused loop cannot do."""
 
 
 class Kind(enum.IntFlag):
@@ -69,7 +75,11 @@ def carry_kinds(start: Callable[..., Any], functions: Iterable[tuple[Callable[..
 
 
 def split(function: Callable[..., Any], values: Any, carry: Any, given: Any, kinds: Sequence[Kind]) -> Parts:
-    """The two parts of a function of one lane; `kinds` are those of the carry's leaves."""
+    """The two parts of a function of one lane; `kinds` are those of the carry's leaves.
+
+    Raises:
+        Unsupported: lanes read something that is no number: an array, or the state of a random number generator.
+    """
     closed = flat(function, values, carry, given)
     jaxpr = closed.jaxpr
     count = len(jax.tree.leaves(values))
@@ -107,24 +117,23 @@ def split(function: Callable[..., Any], values: Any, carry: Any, given: Any, kin
         return [_read(env, out) for out in results]
 
     examples = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in [*lane_in, *fixed, *crossing]]
+    for one in examples:
+        if one.shape or str(one.dtype) not in NUMBERS:
+            raise Unsupported(f"lanes that read {one.dtype}{list(one.shape) or ''}")
     return Parts(jax.jit(once)(), shared, jax.make_jaxpr(lane)(*examples))
 
 
 def flat(function: Callable[..., Any], *examples: Any) -> ClosedJaxpr:
     """Trace a function of pytrees, without calls inside."""
-    return _flattened(jax.make_jaxpr(function)(*examples), {})
+    return substituted(jax.make_jaxpr(function)(*examples), {})
 
 
 def substituted(closed: ClosedJaxpr, functions: Functions) -> ClosedJaxpr:
-    """The same with functions in place of primitives of floating-point numbers, by the primitives' names."""
-    return _flattened(closed, functions)
-
-
-def _flattened(closed: ClosedJaxpr, functions: Functions) -> ClosedJaxpr:
+    """The same without calls, and with functions in place of primitives of floating-point numbers, by their names."""
     leaves = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in closed.in_avals]
     found = jax.make_jaxpr(partial(_inlined, closed, functions))(*leaves)
     # a function may itself call others
-    return found if not any(callee(eqn) for eqn in found.jaxpr.eqns) else _flattened(found, functions)
+    return found if not any(callee(eqn) for eqn in found.jaxpr.eqns) else substituted(found, functions)
 
 
 def callee(eqn: JaxprEqn) -> ClosedJaxpr | None:
@@ -148,7 +157,7 @@ def _inlined(closed: ClosedJaxpr, functions: Functions, *arguments: Any) -> list
         else:
             params = eqn.params
             if name == "scan":
-                params = params | {"jaxpr": _flattened(params["jaxpr"], functions)}
+                params = params | {"jaxpr": substituted(params["jaxpr"], functions)}
             results = eqn.primitive.bind(*given, **params)
             results = results if eqn.primitive.multiple_results else [results]
         env |= dict(zip(eqn.outvars, results, strict=True))

@@ -16,12 +16,13 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.drive.parameters import as_arrays
+from jaxbl.errors import InputError
 from jaxbl.simulate import Experiment
 
 from .config import Config
 from .metrics import metric_columns, with_conditions
 from .points import Points
-from .programs import Backend, Layout, Program, compile_program, default_backend
+from .programs import BACKENDS, Backend, Layout, Program, compile_program, faster
 
 Progress = Callable[[int, int], None]
 """Called with the number of finished and of all lanes."""
@@ -110,7 +111,10 @@ class Engine:
         self.config = config
         self.points = Points(config)
         self.devices = devices or jax.local_devices()
-        self.backend: Backend = backend or default_backend(self.devices)
+        if backend not in (None, *BACKENDS):
+            raise InputError(f"backend: there is no {backend!r}; one of {', '.join(BACKENDS)}")
+        preferred = layout_for(config, self.points, len(self.devices), backend or "fused")
+        self.backend: Backend = backend or faster(layout or preferred, self.devices)
         self._insist = insist
         self.layout = layout or layout_for(config, self.points, len(self.devices), self.backend)
         self.compile_seconds = 0.0
@@ -194,8 +198,8 @@ class Engine:
         return padded, pad(seeds.astype(np.uint32), self.layout.seeds)
 
     def check(self) -> None:
-        """Compile the programs of all groups; the last one is kept. Raises `InputError` if the backend cannot be had."""
-        for group in range(len(self.points.groups)):
+        """Compile the programs of all groups; the first one is kept. Raises `InputError` if the backend cannot be had."""
+        for group in reversed(range(len(self.points.groups))):
             self._program(group)
 
     def _program(self, group: int) -> tuple[Program, list[str]]:

@@ -1,7 +1,7 @@
 """Compiled programs for the chunks of a study: the scan by XLA, or the fused loop."""
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +10,13 @@ from jax.sharding import Mesh, PartitionSpec
 
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
-from jaxbl.fused.llvm import Unsupported
-from jaxbl.fused.passage import DevicePassage, HostPassage, Passage
+from jaxbl.fused.split import Unsupported
 from jaxbl.simulate import Experiment, scan
 
-from .metrics import METRICS, Gains, observer_gains
+from .metrics import METRICS, Gains, metric_columns, observer_gains
+
+if TYPE_CHECKING:
+    from jaxbl.fused.passage import Passage
 
 Backend = Literal["fused", "scan"]
 BACKENDS: tuple[Backend, ...] = ("fused", "scan")
@@ -41,7 +43,8 @@ class Program(NamedTuple):
     """What runs a chunk.
 
     Attributes:
-        run: from values by path `(points,)` and seeds `(seeds,)` to figures and gains, `(seeds, points)` each.
+        run: from values by path `(points,)` and seeds `(seeds,)` to figures `(seeds, points)` and gains, which have these
+            axes or fit them.
         megabytes: of memory that it takes.
     """
 
@@ -49,9 +52,20 @@ class Program(NamedTuple):
     megabytes: float
 
 
-def default_backend(devices: list[Any]) -> Backend:
-    """The faster one on such devices."""
-    return "fused" if devices[0].platform in ("cpu", "gpu") else "scan"
+_FUSED, _SCAN = (1.5, 1e-3), (4.5, 2.5e-3)
+"""Microseconds that a sample costs, and each of its lanes, on one core (benchmarks/NOTES.md)."""
+
+
+def faster(layout: Layout, devices: list[Any]) -> Backend:
+    """The backend that takes less time for a chunk.
+
+    The fused loop runs seed after seed, and pays for each what its lanes share; the scan has all lanes side by side. On
+    accelerators it is the scan: the fused kernel has not been tried on one.
+    """
+    if devices[0].platform != "cpu":
+        return "scan"
+    fused = layout.seeds * (_FUSED[0] + _FUSED[1] * layout.points)
+    return "fused" if fused < _SCAN[0] + _SCAN[1] * layout.seeds * layout.points else "scan"
 
 
 def compile_program(
@@ -69,9 +83,8 @@ def compile_program(
         experiment: with array leaves.
         layout: of its chunks.
         devices: that share a chunk.
-        backend: where the fused loop has no instruction for something in the step, or no lane differs from another, the scan
-            takes its place.
-        columns: example of the values.
+        backend: where the fused loop cannot run the step, or no lane differs from another, the scan takes its place.
+        columns: example of the values, `(points,)` by path.
         insist: refuse that in place of it.
 
     Raises:
@@ -79,8 +92,6 @@ def compile_program(
     """
     if backend == "fused":
         try:
-            if not columns:
-                raise Unsupported("lanes that differ in nothing but their seed")
             return _fused(experiment, layout, devices, tuple(columns))
         except Unsupported as why:
             if insist:
@@ -89,19 +100,32 @@ def compile_program(
 
 
 def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tuple[str, ...]) -> Program:
+    if not paths:
+        raise Unsupported("lanes that differ in nothing but their seed")
+    try:
+        from jaxbl.fused.passage import DevicePassage, HostPassage
+    except ImportError as error:
+        raise Unsupported(f"how to compile here ({error})") from None
     if devices[0].platform == "cpu":
-        passage: Passage = HostPassage(experiment, (METRICS,), paths, len(devices))
+        passage: Passage = HostPassage(experiment, (METRICS,), paths, layout.points, len(devices))
+    elif devices[0].platform == "gpu" and len(devices) == 1:
+        passage = DevicePassage(experiment, (METRICS,), paths, layout.points)
     else:
-        passage = DevicePassage(experiment, (METRICS,), paths)
+        raise Unsupported(f"{len(devices)} devices of platform {devices[0].platform}")
     gains = jax.jit(jax.vmap(lambda values: observer_gains(set_leaves(experiment, values))))
 
     def run(values: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[dict[str, Any], dict[str, Gains]]:
-        figures = [passage(values, int(seed)) for seed in seeds]
-        stacked = {name: jnp.asarray(np.stack([one[name] for one in figures])) for name in figures[0]}
-        return stacked, gains(values)
+        with jax.default_device(devices[0]):
+            # seeds that only fill up the last chunk are copies of one
+            found = {seed: passage(values, seed) for seed in dict.fromkeys(int(seed) for seed in seeds)}
+            stacked = {
+                name: jnp.asarray(np.stack([found[int(seed)][name] for seed in seeds])) for name in found[int(seeds[0])]
+            }
+            return stacked, gains(values)
 
     size = jnp.result_type(experiment.run.sample_period).itemsize
-    return Program(run, (passage.carried + len(paths)) * layout.points * size / 1e6)
+    figures = len(metric_columns(experiment)) * layout.seeds
+    return Program(run, (passage.carried + len(paths) + figures) * layout.points * size / 1e6)
 
 
 def _scanned(experiment: Experiment, layout: Layout, devices: list[Any], columns: dict[str, np.ndarray]) -> Program:

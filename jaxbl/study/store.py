@@ -191,7 +191,7 @@ class Store:
                 "parts": parts,
                 "rows": rows,
                 "finished": False,
-                "versions": {name: version(name) for name in ("jaxbl", "jax", "equinox", "numpy")},
+                "versions": {name: version(name) for name in ("jaxbl", "jax", "equinox", "llvmlite", "numpy")},
                 "machine": {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count()},
             }
             store = cls(folder, manifest)
@@ -221,7 +221,7 @@ class Store:
 
     @property
     def backend(self) -> Backend:
-        """That of all chunks; those of former versions were scanned."""
+        """That of all chunks, but for groups that the fused loop cannot run; those of former versions were scanned."""
         return self.manifest.get("backend", "scan")
 
     def update(self, **values: Any) -> None:

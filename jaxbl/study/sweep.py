@@ -119,7 +119,7 @@ def sweep(
     """
     config = read_config(study)
     engine = Engine(config, devices=devices, backend=backend, insist=backend is not None)
-    if backend is not None:
+    if backend == "fused" and (out is None or not (Path(out) / "manifest.json").exists()):
         # refused, if it is, before anything is written
         engine.check()
     store = None

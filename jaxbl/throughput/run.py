@@ -21,14 +21,14 @@ from jaxbl.errors import NoResult
 from .ours import Fused, Scanned
 from .rivals.compiled import Compiled, forget
 from .rivals.diffrax_euler import Diffrax
-from .rivals.native import Native, compiler
+from .rivals.native import Native, NoCompiler, compiler, library
 from .rivals.plain import Plain
 from .workload import Workload
 
 Runner = Callable[[], dict[str, np.ndarray]]
 Progress = Callable[[int, int], None]
 
-CEILING, OURS, SCAN = "c++, all cores", "jaxbl fused, all cores", "jaxbl scan, all cores"
+CEILING, OURS, SCAN = "c++, all cores", "jaxbl fused, all cores", "jaxbl scan, all devices"
 PRECISIONS = ("float32", "float64")
 _REFERENCE_LANES = 64
 _TOLERANCE = {
@@ -57,19 +57,19 @@ class Entry(NamedTuple):
     tolerance: float = 0.0
 
 
-def entries(folder: Path, cores: int) -> list[Entry]:
-    """All of them; `folder` keeps the compiled kernel."""
+def entries(folder: Path, cores: int, devices: int) -> list[Entry]:
+    """All of them; `folder` keeps the compiled kernel, `devices` are JAX's."""
     many, few = 2**17, 2**14
     return [
         Entry(CEILING, lambda w: Native(w, cores, folder), many),
         Entry("c++, one core", lambda w: Native(w, 1, folder), many),
         Entry(OURS, lambda w: Fused(w, cores), many),
         Entry("jaxbl fused, one core", lambda w: Fused(w, 1), many),
-        Entry(SCAN, lambda w: Scanned(w, cores), few),
+        Entry(SCAN, lambda w: Scanned(w, devices), few),
         Entry("jaxbl scan, one device", lambda w: Scanned(w, 1), few),
         Entry("numba, blocks of lanes", lambda w: Compiled(w, cores, blocked=True), many, "numba"),
         Entry("numba, prange", lambda w: Compiled(w, cores, blocked=False), few, "numba"),
-        Entry("diffrax, Euler", Diffrax, few, "diffrax"),
+        Entry("diffrax, Euler, one device", Diffrax, few, "diffrax"),
         Entry("NumPy, lane arrays", Plain, 2**12),
         Entry("NumPy, one lane", Plain, 1),
         Entry("OpenSMC, one lane", partial(Plain, library=True), 1, "opensmc"),
@@ -148,8 +148,17 @@ def bench(folder: str | Path, *, quick: bool = False, progress: Progress | None 
     Raises:
         NoResult: an entry's figures are not those of the reference.
     """
-    cores = len(jax.local_devices())
-    able, left_out = _able(entries(Path(folder), cores))
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+        found = _bench(Path(folder), cores, quick, progress)
+    found.machine["load"] = load
+    return found
+
+
+def _bench(folder: Path, cores: int, quick: bool, progress: Progress | None) -> Result:
+    devices = len(jax.local_devices(backend="cpu"))
+    able, left_out = _able(entries(folder, cores, devices), folder)
     steps, rounds = (1500, 3) if quick else (4000, 7)
     jobs = [
         (entry, precision)
@@ -158,7 +167,7 @@ def bench(folder: str | Path, *, quick: bool = False, progress: Progress | None 
         if not quick or precision == "float32" or entry.name.startswith(("c++", "jaxbl fused"))
     ]
     lanes = [2**k for k in range(6, 21, 2 if quick else 1)]
-    parts, done = 2 * len(jobs) + len(lanes) + 1, 0
+    parts, done = (1 + rounds) * len(jobs) + len(lanes) + 1, 0
 
     def tick() -> None:
         nonlocal done
@@ -167,7 +176,10 @@ def bench(folder: str | Path, *, quick: bool = False, progress: Progress | None 
             progress(done, parts)
 
     rows, runners = [], []
-    reference = _reference(steps)
+    references: dict[int, dict[str, np.ndarray]] = {}
+    for precision in PRECISIONS:
+        with _in(precision):
+            Workload(1, steps, precision).inputs()
     for entry, precision in jobs:
         work = Workload(entry.lanes // (8 if quick and entry.lanes > 1 else 1), steps, precision)
         with _in(precision):
@@ -175,7 +187,9 @@ def bench(folder: str | Path, *, quick: bool = False, progress: Progress | None 
             runner = entry.make(work)
             figures = runner()
             row = Row(entry.name, precision, work.lanes, steps, time.perf_counter() - begun, 0.0)
-        row.deviation = _check(entry, precision, figures, reference)
+        if work.lanes not in references:
+            references[work.lanes] = _reference(work.lanes, steps)
+        row.deviation = _check(entry, precision, figures, references[work.lanes])
         rows.append(row)
         runners.append(runner)
         tick()
@@ -185,15 +199,15 @@ def bench(folder: str | Path, *, quick: bool = False, progress: Progress | None 
                 begun = time.perf_counter()
                 runner()
                 row.seconds.append(time.perf_counter() - begun)
+            tick()
     for row in rows:
         row.finish()
-        tick()
     del runners
     curve = []
     for count in lanes:
         curve += _curve(able, count, 500 if quick else 1000, ("float32",) if quick else PRECISIONS)
         tick()
-    study = _study(cores, {entry.name for entry in able}, 1000)
+    study = _study(cores, devices, {entry.name for entry in able}, 1000)
     tick()
     return Result(_machine(cores), rows, curve, study, left_out)
 
@@ -202,26 +216,33 @@ def _in(precision: str) -> Any:
     return jax.enable_x64(precision == "float64")
 
 
-def _able(found: Sequence[Entry]) -> tuple[list[Entry], dict[str, str]]:
+def _able(found: Sequence[Entry], folder: Path) -> tuple[list[Entry], dict[str, str]]:
     left_out = {}
+    try:
+        library(folder)
+    except NoCompiler as why:
+        left_out = {entry.name: str(why) for entry in found if entry.name.startswith("c++")}
     for entry in found:
-        if entry.name.startswith("c++") and compiler() is None:
-            left_out[entry.name] = "no C++ compiler; install g++, or name one in CXX"
-        elif entry.needs is not None and importlib.util.find_spec(entry.needs) is None:
+        if entry.needs is not None and importlib.util.find_spec(entry.needs) is None:
             left_out[entry.name] = f"no {entry.needs}; pip install 'jaxbl[bench]'"
     return [entry for entry in found if entry.name not in left_out], left_out
 
 
-def _reference(steps: int) -> dict[str, np.ndarray]:
-    """Figures of the first lanes by the plainest entry, in float64."""
+def _spread(lanes: int) -> np.ndarray:
+    """Lanes from all over, the first and the last among them."""
+    return np.unique(np.linspace(0, lanes - 1, _REFERENCE_LANES).round().astype(int))
+
+
+def _reference(lanes: int, steps: int) -> dict[str, np.ndarray]:
+    """Figures of some of so many lanes by the plainest entry, in float64."""
     with _in("float64"):
-        return Plain(Workload(_REFERENCE_LANES, steps, "float64"))()
+        return Plain(Workload(lanes, steps, "float64"), chosen=_spread(lanes))()
 
 
 def _check(entry: Entry, precision: str, figures: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> float:
     worst = 0.0
     for name, values in figures.items():
-        found, true = np.asarray(values[:_REFERENCE_LANES], float), reference[name][: len(values)]
+        found, true = np.asarray(values, float)[_spread(len(values))], reference[name]
         apart = float(np.median(np.abs(found / true - 1.0)))
         if not apart <= max(entry.tolerance, _TOLERANCE[precision][name.partition(".")[2]]):
             raise NoResult(
@@ -257,17 +278,18 @@ def _curve(able: Sequence[Entry], lanes: int, steps: int, precisions: Sequence[s
     return points
 
 
-def _study(cores: int, able: set[str], lanes: int) -> list[dict[str, Any]]:
+def _study(cores: int, devices: int, able: set[str], lanes: int) -> list[dict[str, Any]]:
     """A small study from nothing: what was compiled before is forgotten."""
     rows = []
     work = Workload(lanes, 3000, "float32")
     with _in(work.precision), TemporaryDirectory() as folder:
         work.inputs()
-        for entry in entries(Path(folder), cores):
+        for entry in entries(Path(folder), cores, devices):
             if entry.name not in able or entry.lanes <= lanes or entry.name.endswith(("one core", "one device")):
                 continue
             jax.clear_caches()
             forget()
+            library.cache_clear()
             begun = time.perf_counter()
             entry.make(work)()
             seconds = time.perf_counter() - begun
@@ -285,7 +307,6 @@ def _machine(cores: int) -> dict[str, Any]:
         "python": platform.python_version(),
         "versions": {name: version(name) for name in packages if importlib.util.find_spec(name) is not None},
         "compiler": Path(found).name if (found := compiler()) else None,
-        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
     }
 
 

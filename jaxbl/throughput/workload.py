@@ -131,7 +131,19 @@ def _inputs(steps: int, precision: str) -> tuple[np.ndarray, np.ndarray]:
     indices = jnp.arange(steps, dtype=jnp.int32)
     noise = jax.jit(lambda: unit_noise(jnp.asarray(SEED), indices, SIDES))()
     torque = jax.vmap(experiment.excitation)(indices.astype(work.dtype) * experiment.run.sample_period)
-    return np.asarray(torque), np.stack([np.asarray(noise[side], work.dtype) for side in SIDES], 1)
+    return np.asarray(torque, work.dtype), np.stack([np.asarray(noise[side], work.dtype) for side in SIDES], 1)
+
+
+def chunks(values: dict[str, np.ndarray], size: int, lanes: int) -> list[dict[str, Any]]:
+    """Values in parts of one size, the last one filled up."""
+    count = -(-lanes // size) * size
+    padded = {path: np.pad(column, (0, count - lanes), "edge") for path, column in values.items()}
+    return [{path: jnp.asarray(column[at : at + size]) for path, column in padded.items()} for at in range(0, count, size)]
+
+
+def joined(parts: list[dict[str, Any]], lanes: int) -> dict[str, np.ndarray]:
+    """Figures of parts, one after the other."""
+    return {name: np.concatenate([np.asarray(part[name]) for part in parts])[:lanes] for name in parts[0]}
 
 
 def constants() -> dict[str, float]:

@@ -10,8 +10,8 @@ from jaxbl.drive.effects import effect_kinds
 from jaxbl.drive.excitation import Chirp, Sine
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.drive.transmission import DeadZone
-from jaxbl.fused.llvm import Unsupported
 from jaxbl.fused.passage import DevicePassage, HostPassage
+from jaxbl.fused.split import Unsupported
 from jaxbl.observer import OBSERVERS, EquivalentControl, Identifier, Observers
 from jaxbl.simulate import Experiment, Reducer, Run, scan
 from jaxbl.study.metrics import METRICS
@@ -69,7 +69,7 @@ def experiment(names, law=None, observer="implicit", rigid=False, substeps=2, st
 def both(experiment, paths, reducers, lanes=7, seed=3):
     """Figures of the fused loop, with threads that get different numbers of lanes, and of the scan."""
     values = {path: np.asarray(get_leaf(experiment, path)) * np.linspace(0.6, 1.4, lanes) for path in paths}
-    fused = HostPassage(experiment, reducers, tuple(paths), threads=2)(values, seed)
+    fused = HostPassage(experiment, reducers, tuple(paths), lanes, threads=2)(values, seed)
 
     def lane(values):
         return scan(set_leaves(experiment, values), jnp.asarray(seed), reducers)[0]
@@ -104,8 +104,8 @@ def test_figures_are_those_of_the_scan(names, law, options):
 def test_what_no_axis_touches_is_computed_once():
     """Axes on gains alone leave the plant to the shared part: no law is evaluated in a lane."""
     whole = experiment([], DeadZone(60.0, 0.05))
-    passage = HostPassage(whole, (METRICS,), ("observer.motor.alpha",), 1)
-    varied = HostPassage(whole, (METRICS,), ("transmission.half_gap",), 1)
+    passage = HostPassage(whole, (METRICS,), ("observer.motor.alpha",), 9, 1)
+    varied = HostPassage(whole, (METRICS,), ("transmission.half_gap",), 9, 1)
     assert passage.carried < varied.carried
     fused, scanned = both(whole, ["observer.motor.alpha", "observer.motor.lambda"], (METRICS,))
     for name, figure in fused.items():
@@ -118,7 +118,7 @@ def test_the_benchmarks_work_in_both_precisions(precision):
     values = work.values()
     with jax.enable_x64(precision == "float64"):
         whole = work.experiment()
-        fused = HostPassage(whole, (FIGURES,), tuple(RANGES), 2)(values, SEED)
+        fused = HostPassage(whole, (FIGURES,), tuple(RANGES), work.lanes, 2)(values, SEED)
         scanned = jax.jit(jax.vmap(lambda v: scan(set_leaves(whole, v), jnp.asarray(SEED), (FIGURES,))[0]))(values)
     for name, figure in fused.items():
         assert figure.dtype == precision
@@ -137,8 +137,8 @@ def test_the_kernel_of_accelerators_interpreted(precision):
     with jax.enable_x64(precision == "float64"):
         whole = work.experiment()
         passages = [
-            HostPassage(whole, (METRICS,), tuple(RANGES), 1),
-            DevicePassage(whole, (METRICS,), tuple(RANGES), interpret=True),
+            HostPassage(whole, (METRICS,), tuple(RANGES), work.lanes, 1),
+            DevicePassage(whole, (METRICS,), tuple(RANGES), work.lanes, interpret=True),
         ]
         host, device = (passage(work.values(), SEED) for passage in passages)
     for name, figure in device.items():
@@ -156,8 +156,8 @@ def test_every_effect_in_the_kernel_of_accelerators(names):
     whole = experiment(names, law, steps=200)
     paths = tuple(path for path in leaf_paths(whole) if path.startswith("effects."))
     values = {path: np.asarray(get_leaf(whole, path)) * np.linspace(0.6, 1.4, 5) for path in paths}
-    host = HostPassage(whole, (METRICS,), paths, 1)(values, 0)
-    device = DevicePassage(whole, (METRICS,), paths, interpret=True)(values, 0)
+    host = HostPassage(whole, (METRICS,), paths, 5, 1)(values, 0)
+    device = DevicePassage(whole, (METRICS,), paths, 5, interpret=True)(values, 0)
     for name, figure in device.items():
         np.testing.assert_allclose(figure, host[name], rtol=1e-6, err_msg=name)
 
@@ -170,11 +170,11 @@ def test_an_unknown_operation_is_refused_by_name():
         lambda e, total, state: {"odd": total},
     )
     with pytest.raises(Unsupported, match="erf"):
-        HostPassage(whole, (odd,), ("transmission.half_gap",), 1)
+        HostPassage(whole, (odd,), ("transmission.half_gap",), 9, 1)
     truth = Reducer(
         lambda e: jnp.asarray(False),
         lambda e, total, index, signals: total | (signals.motor.measured > 1.0),
         lambda e, total, state: {"truth": total},
     )
     with pytest.raises(Unsupported, match="carry other numbers"):
-        HostPassage(whole, (truth,), ("transmission.half_gap",), 1)
+        HostPassage(whole, (truth,), ("transmission.half_gap",), 9, 1)

@@ -83,6 +83,43 @@ def test_both_backends_give_the_same_figures(study, precision):
             assert same.mean() >= 0.9, name
 
 
+@pytest.mark.parametrize(
+    ("excitation", "path"),
+    [
+        ({"kind": "sine", "amplitude": 0.1, "frequency": 1.0}, "frequency"),
+        ({"kind": "multisine", "amplitude": 0.1, "frequency": 1.0}, "frequency"),
+        (
+            {"kind": "chirp", "amplitude": 0.1, "start_frequency": 0.5, "stop_frequency": 2.0, "sweep_time": 0.2},
+            "sweep_time",
+        ),
+        ({"kind": "steps", "amplitude": 0.1, "hold": 0.05}, "hold"),
+        ({"kind": "prbs", "amplitude": 0.1, "hold": 0.05}, "hold"),
+    ],
+    ids=lambda value: value["kind"] if isinstance(value, dict) else "",
+)
+def test_what_the_fused_loop_cannot_do_is_scanned(excitation, path):
+    """Axes on an input's numbers make it a lane's: random levels and sums over harmonics are no work for the loop."""
+    path = f"excitation.{path}"
+    study = rigid(axes=[listed(path, 0.04, 0.06, 0.09)]) | {"excitation": excitation}
+    config = read_config(study)
+    assert Engine(config).backend == "fused"
+    found, scanned = sweep(config).frame, sweep(config, backend="scan").frame
+    np.testing.assert_allclose(found["motor.velocity_rmse"], scanned["motor.velocity_rmse"], rtol=1e-6)
+
+
+def test_the_faster_backend_is_chosen():
+    def backend(points, seeds):
+        config = read_config(rigid(axes=[spaced(ALPHA, 1.0, 2.0, points)], sweep={"seeds": seeds}))
+        return Engine(config, devices=jax.devices()[:1]).backend
+
+    assert backend(10_000, 4) == "fused"
+    assert backend(3, 1) == "fused"
+    # seed after seed would pay for each what lanes share
+    assert backend(3, 1000) == "scan"
+    with pytest.raises(InputError, match="no 'Fused'; one of fused, scan"):
+        sweep(rigid(axes=[listed(ALPHA, 1.0, 2.0)]), backend="Fused")
+
+
 def test_a_study_goes_on_with_the_backend_of_its_first_chunks(tmp_path, study):
     config = with_chunk(study, 12)
 

@@ -14,8 +14,9 @@ import numpy as np
 
 from jaxbl.drive import set_leaves
 from jaxbl.simulate import begin, figures, proceed, simulated, time_of
+from jaxbl.study.engine import LANES_PER_DEVICE
 
-from ..workload import FIGURES, Workload
+from ..workload import FIGURES, Workload, chunks, joined
 
 
 class Diffrax:
@@ -54,8 +55,9 @@ class Diffrax:
             last: Any = solution.ys
             return figures(own, (FIGURES,), tree.unflatten([x[0] for x in last]))
 
-        self._given = jax.tree.map(jnp.asarray, workload.values())
-        self.compiled = jax.jit(jax.vmap(lane)).lower(self._given).compile()
+        self._given = chunks(workload.values(), LANES_PER_DEVICE["scan"], workload.lanes)
+        self._lanes = workload.lanes
+        self.compiled = jax.jit(jax.vmap(lane)).lower(self._given[0]).compile()
 
     def __call__(self) -> dict[str, np.ndarray]:
-        return jax.tree.map(np.asarray, jax.block_until_ready(self.compiled(self._given)))
+        return joined([self.compiled(values) for values in self._given], self._lanes)

@@ -1,7 +1,6 @@
 """The C++ kernel: compiled here, called through ctypes."""
 
 import ctypes
-import hashlib
 import os
 import shutil
 import subprocess
@@ -28,19 +27,25 @@ def compiler() -> str | None:
     return shutil.which(os.environ.get("CXX", "g++"))
 
 
+class NoCompiler(Exception):
+    """There is none, or it cannot compile the kernel."""
+
+
 @cache
-def _library(folder: Path) -> ctypes.CDLL:
+def library(folder: Path) -> ctypes.CDLL:
+    """The kernel for this machine, compiled into a folder. Raises `NoCompiler`."""
     command = compiler()
-    assert command is not None
-    text = _SOURCE.read_bytes() + " ".join([command, *_FLAGS]).encode()
-    target = folder / f"chain-{hashlib.sha256(text).hexdigest()[:16]}.so"
-    if not target.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        draft = target.with_suffix(f".{os.getpid()}")
-        done = subprocess.run([command, *_FLAGS, "-o", str(draft), str(_SOURCE)], capture_output=True, text=True)
-        if done.returncode:
-            raise RuntimeError(f"{command} cannot compile {_SOURCE.name}: {done.stderr.strip().splitlines()[-1:]}")
-        draft.replace(target)
+    if command is None:
+        raise NoCompiler("no C++ compiler; install g++, or name one in CXX")
+    target = folder.resolve() / "chain.so"
+    folder.mkdir(parents=True, exist_ok=True)
+    # anew each time: what lies there may be another machine's
+    draft = target.with_suffix(f".{os.getpid()}")
+    done = subprocess.run([command, *_FLAGS, "-o", str(draft), str(_SOURCE)], capture_output=True, text=True)
+    if done.returncode:
+        said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+        raise NoCompiler(f"{command} cannot compile {_SOURCE.name}: {said[-1]}")
+    draft.replace(target)
     return ctypes.CDLL(str(target))
 
 
@@ -49,7 +54,7 @@ class Native:
 
     def __init__(self, workload: Workload, threads: int, folder: Path):
         self.workload, self.threads = workload, threads
-        self._function = getattr(_library(folder), f"chain_{workload.precision}")
+        self._function = getattr(library(folder), f"chain_{workload.precision}")
         # whole blocks of the widest registers there are
         self._padded = -(-workload.lanes // 64) * 64
         values = [np.resize(column, self._padded) for column in workload.values().values()]

@@ -23,26 +23,33 @@ class Plain:
         workload: of one lane where `solver` or `library` is given.
         solver: method of SciPy's `solve_ivp` that takes the plant from sample to sample.
         library: observers are OpenSMC's.
+        chosen: indices of the lanes to run; left out, all.
     """
 
-    def __init__(self, workload: Workload, solver: str | None = None, library: bool = False):
+    def __init__(
+        self,
+        workload: Workload,
+        solver: str | None = None,
+        library: bool = False,
+        chosen: np.ndarray | slice = slice(None),
+    ):
         self._workload, self._solver, self._library = workload, solver, library
         self._torque, self._noise = workload.inputs()
-        self._values = workload.values()
+        self._values = {path: column[chosen] for path, column in workload.values().items()}
 
     def __call__(self) -> dict[str, np.ndarray]:
         w, c, dtype = self._workload, constants(), self._workload.dtype
         c = {name: dtype.type(value) for name, value in c.items()}
         h, ratio = c["period"], c["gear_ratio"]
         motor_alpha, motor_lambda, load_alpha, load_lambda, dead_zone, noise = self._values.values()
-        zero = np.zeros(w.lanes, dtype)
+        zero = np.zeros_like(noise)
         plant = self._moreau(c, dead_zone) if self._solver is None else self._solved(c, float(dead_zone[0]))
         observer = _opensmc if self._library else _euler
         motor = observer(motor_lambda, motor_alpha, h, zero - c["motor_error"])
         load = observer(load_lambda, load_alpha, h, zero)
         state = np.stack([zero] * 4)
         motor_control = load_control = twist = bend = zero
-        sums = np.zeros((9, w.lanes))
+        sums = np.zeros((9, len(noise)))
         for i in range(w.steps):
             u, (motor_unit, load_unit) = self._torque[i], self._noise[i]
             motor_read, load_read = state[0] + noise * motor_unit, state[2] + noise / ratio * load_unit
