@@ -2,5 +2,5 @@
 
 XLA makes several kernels of a time step and passes the state through memory between them. Here the traced step is split
 (`split`) into what all lanes share, which XLA computes once, and what each lane does, which one loop does in registers: on
-CPUs compiled by LLVM (`llvm`).
+CPUs compiled by LLVM (`llvm`), on a GPU as one kernel (`pallas`). `passage` takes lanes through a whole run by either.
 """

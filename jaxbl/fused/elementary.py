@@ -55,7 +55,7 @@ def _within(x: Number) -> tuple[Number, float, float]:
 
 
 def exp(x: Number) -> Number:
-    """e^x, infinite where it overflows, zero where it would be subnormal."""
+    """e^x; infinite above 88 (float32) or 709, zero below -87 or -708, a little before it has to be."""
     inside, low, high = _within(x)
     beyond, power = _exponential(inside)
     value = beyond * power + power
