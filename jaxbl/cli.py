@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
@@ -440,7 +441,7 @@ def plot(
 @app.command()
 def bench(
     quick: Annotated[
-        bool, typer.Option("--quick", help="in less than a minute: shorter runs, rivals in float32 alone")
+        bool, typer.Option("--quick", help="in less than a minute: shorter runs, rivals in one precision")
     ] = False,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the results")] = Path("results/bench"),
 ) -> None:
@@ -496,10 +497,12 @@ def _running(words: list[str], config: Path, folder: Path, *, unit: str = "runs"
     """
     interrupted = False
 
-    def interrupt(number: int, frame: object) -> None:
+    def interrupt(number: int, frame: FrameType | None) -> None:
         nonlocal interrupted
         interrupted = True
-        raise KeyboardInterrupt
+        # an error out of JAX's part of the garbage collection would be printed and ignored
+        if frame is None or frame.f_code.co_name != "_xla_gc_callback":
+            raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGINT, interrupt)
     try:

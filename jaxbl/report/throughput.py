@@ -23,7 +23,7 @@ def draw_throughput(result: Result) -> list[Drawn]:
 
 def _bars(result: Result) -> Drawn:
     names = list(dict.fromkeys(row.name for row in result.rows))
-    names.sort(key=lambda name: result.speed(name, "float32") or 0.0)
+    names.sort(key=lambda name: result.speed(name, "float32") or result.speed(name, "float64") or 0.0)
     figure = Figure(figsize=(8.0, 0.42 * len(names) + 1.1))
     axes = figure.add_subplot()
     height = 0.38

@@ -17,6 +17,7 @@ from jaxbl.report.reports import headline
 from jaxbl.study.config import read_config
 from jaxbl.study.engine import Engine, Layout
 from jaxbl.study.points import Points
+from jaxbl.study.programs import BACKENDS
 from jaxbl.study.refine import Criterion, Grid, refine
 from jaxbl.study.sweep import StudyResult, dry_run, load, sweep
 
@@ -459,10 +460,11 @@ def test_every_point_has_all_seeds_and_one_that_disagrees_is_enough():
     assert shared["motor.velocity_rmse"].sum() == pytest.approx(one["motor.velocity_rmse"].sum(), rel=1e-12)
 
 
-def test_first_seed_shifts_the_noise():
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_first_seed_shifts_the_noise(backend):
     axes = [listed(ALPHA, 5.0, 9.0)]
-    four = sweep(rigid(axes=axes, sweep={"seeds": 4})).frame
-    last = sweep(rigid(axes=axes, sweep={"seeds": 2, "first_seed": 2})).frame
+    four = sweep(rigid(axes=axes, sweep={"seeds": 4}), backend=backend).frame
+    last = sweep(rigid(axes=axes, sweep={"seeds": 2, "first_seed": 2}), backend=backend).frame
     exact = [name for name in four if not name.endswith("convergence_time_bound")]
     pd.testing.assert_frame_equal(four[four["seed"] >= 2].reset_index(drop=True)[exact], last[exact], check_exact=True)
 
