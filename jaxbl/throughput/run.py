@@ -161,7 +161,7 @@ def _bench(folder: Path, cores: int, quick: bool, progress: Progress | None) -> 
     able, left_out = _able(entries(folder, cores, devices), folder)
     steps, rounds = (1500, 3) if quick else (4000, 7)
     jobs = [(entry, precision) for precision in PRECISIONS for entry in able if _is_run(entry, precision, quick)]
-    lanes = [2**k for k in range(6, 21, 2 if quick else 1)]
+    lanes = [2**k for k in (range(6, 19, 3) if quick else range(6, 21))]
     parts, done = (1 + rounds) * len(jobs) + len(lanes) + 1, 0
 
     def tick() -> None:
