@@ -449,15 +449,17 @@ def bench(
     _start_jax()
     import jax
 
-    from .report import write_bench_report
+    from .report.throughput import write_bench_report
     from .study.store import make_folder
-    from .throughput.run import bench as run_bench
+    from .throughput import bench as run_bench
 
     # what was compiled before does not count
     jax.config.update("jax_enable_compilation_cache", False)
     make_folder(out)
-    with _progress("parts") as progress:
-        result = run_bench(out / ".kernel", quick=quick, progress=progress)
+    if any(out.iterdir()) and not (out / "bench.json").exists():
+        raise InputError(f"{out}: is not empty and holds no benchmark; choose another folder with --out")
+    with _leaving_nothing(out), _running(["bench", *["--quick"] * quick], out, out, unit="parts", kept=False) as progress:
+        result = run_bench(quick=quick, progress=progress)
     for line in write_bench_report(result, out):
         typer.echo(line)
 
@@ -470,8 +472,10 @@ def _start_jax() -> None:
     """Use every core as a device, and keep compiled programs between runs."""
     import jax
 
+    from .workers import cores
+
     if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
-        jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)
+        jax.config.update("jax_num_cpu_devices", cores())
     if jax.config.values["jax_compilation_cache_dir"] is None:
         cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "jaxbl"
         jax.config.update("jax_compilation_cache_dir", str(cache))

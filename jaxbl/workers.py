@@ -22,15 +22,19 @@ _MOST_MAPPINGS = 30_000
 """Half of what Linux allows a process by default."""
 
 
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def worth(jobs: int) -> int:
     """Processes that so many jobs are worth: one a core, as memory allows; an accelerator serves one alone."""
     import jax
 
     if jax.default_backend() != "cpu":
         return 1
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return max(min(cores, memory // _MEMORY, jobs), 1)
+    return max(min(cores(), memory // _MEMORY, jobs), 1)
 
 
 def each(function: Callable[[Job], Result], jobs: Sequence[Job], processes: int) -> Iterator[Result]:

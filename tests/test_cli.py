@@ -151,6 +151,10 @@ BAD = {
         ["simulate", "study.toml", "--out", "full"],
         "full: is not empty and holds no study; choose another folder with --out",
     ),
+    "foreign folder, benchmark": (
+        ["bench", "--out", "full"],
+        "full: is not empty and holds no benchmark; choose another folder with --out",
+    ),
     "a file as folder": (
         ["sweep", "study.toml", "--out", "plain.toml"],
         "plain.toml: is a file; --out should name a folder",

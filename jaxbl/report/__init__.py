@@ -9,5 +9,4 @@ from .inspected import write_inspection_report as write_inspection_report
 from .maps import draw as draw
 from .reports import write_sweep_report as write_sweep_report
 from .reports import write_trial_report as write_trial_report
-from .throughput import write_bench_report as write_bench_report
 from .tuning import write_tune_report as write_tune_report

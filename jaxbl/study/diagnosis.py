@@ -8,7 +8,6 @@ the fit has seen.
 # pyright: reportArgumentType=false
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -563,7 +562,9 @@ class _Proving:
 
     def better(self, after: Proof) -> bool:
         """Whether a model is better than the one given, all in all: what new numbers alone have to be to take its place."""
-        return sum(math.log(value / self.before.errors[name]) for name, value in after.errors.items()) < 0.0
+        old, new = (np.array([proof.errors[name] for name in self.before.errors]) for proof in (self.before, after))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return bool(np.sum(np.log(new) - np.log(old)) < 0.0)
 
     def at(self, experiment: Experiment) -> Experiment:
         """A model at the period of what was held out."""

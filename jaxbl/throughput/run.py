@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from jaxbl.errors import NoResult
+from jaxbl.workers import cores
 
 from .ours import Fused, Scanned
 from .rivals.compiled import Compiled, forget
@@ -57,18 +58,18 @@ class Entry(NamedTuple):
     tolerance: float = 0.0
 
 
-def entries(folder: Path, cores: int, devices: int) -> list[Entry]:
-    """All of them; `folder` keeps the compiled kernel, `devices` are JAX's."""
+def entries(folder: Path, count: int, devices: int) -> list[Entry]:
+    """All of them; `folder` keeps the compiled kernel, `count` are cores, `devices` JAX's."""
     many, few = 2**17, 2**14
     return [
-        Entry(CEILING, lambda w: Native(w, cores, folder), many),
+        Entry(CEILING, lambda w: Native(w, count, folder), many),
         Entry("c++, one core", lambda w: Native(w, 1, folder), many),
-        Entry(OURS, lambda w: Fused(w, cores), many),
+        Entry(OURS, lambda w: Fused(w, count), many),
         Entry("jaxbl fused, one core", lambda w: Fused(w, 1), many),
         Entry(SCAN, lambda w: Scanned(w, devices), few),
         Entry("jaxbl scan, one device", lambda w: Scanned(w, 1), few),
-        Entry("numba, blocks of lanes", lambda w: Compiled(w, cores, blocked=True), many, "numba"),
-        Entry("numba, prange", lambda w: Compiled(w, cores, blocked=False), few, "numba"),
+        Entry("numba, blocks of lanes", lambda w: Compiled(w, count, blocked=True), many, "numba"),
+        Entry("numba, prange", lambda w: Compiled(w, count, blocked=False), few, "numba"),
         Entry("diffrax, Euler, one device", Diffrax, few, "diffrax"),
         Entry("NumPy, lane arrays", Plain, 2**12),
         Entry("NumPy, one lane", Plain, 1),
@@ -137,11 +138,10 @@ class Result:
         return found[0] if found else None
 
 
-def bench(folder: str | Path, *, quick: bool = False, progress: Progress | None = None) -> Result:
+def bench(*, quick: bool = False, progress: Progress | None = None) -> Result:
     """Measure this machine: the paper's chain by everyone, in turns, each checked against one reference.
 
     Args:
-        folder: keeps the compiled C++ kernel.
         quick: fewer rounds, shorter runs, rivals in one precision alone.
         progress: called with finished and all parts.
 
@@ -149,16 +149,15 @@ def bench(folder: str | Path, *, quick: bool = False, progress: Progress | None 
         NoResult: an entry's figures are not those of the reference.
     """
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    with jax.default_device(jax.local_devices(backend="cpu")[0]):
-        found = _bench(Path(folder), cores, quick, progress)
+    with TemporaryDirectory() as folder, jax.default_device(jax.local_devices(backend="cpu")[0]):
+        found = _bench(Path(folder), cores(), quick, progress)
     found.machine["load"] = load
     return found
 
 
-def _bench(folder: Path, cores: int, quick: bool, progress: Progress | None) -> Result:
+def _bench(folder: Path, count: int, quick: bool, progress: Progress | None) -> Result:
     devices = len(jax.local_devices(backend="cpu"))
-    able, left_out = _able(entries(folder, cores, devices), folder)
+    able, left_out = _able(entries(folder, count, devices), folder)
     steps, rounds = (1500, 3) if quick else (4000, 7)
     jobs = [(entry, precision) for precision in PRECISIONS for entry in able if _is_run(entry, precision, quick)]
     lanes = [2**k for k in (range(6, 19, 3) if quick else range(6, 21))]
@@ -202,9 +201,9 @@ def _bench(folder: Path, cores: int, quick: bool, progress: Progress | None) -> 
     for count in lanes:
         curve += _curve(able, count, 500 if quick else 1000, ("float32",) if quick else PRECISIONS)
         tick()
-    study = _study(cores, devices, {entry.name for entry in able}, 1000)
+    study = _study(count, devices, {entry.name for entry in able}, 1000)
     tick()
-    return Result(_machine(cores), rows, curve, study, left_out)
+    return Result(_machine(count), rows, curve, study, left_out)
 
 
 def _is_run(entry: Entry, precision: str, quick: bool) -> bool:
@@ -280,13 +279,13 @@ def _curve(able: Sequence[Entry], lanes: int, steps: int, precisions: Sequence[s
     return points
 
 
-def _study(cores: int, devices: int, able: set[str], lanes: int) -> list[dict[str, Any]]:
+def _study(count: int, devices: int, able: set[str], lanes: int) -> list[dict[str, Any]]:
     """A small study from nothing: what was compiled before is forgotten."""
     rows = []
     work = Workload(lanes, 3000, "float32")
     with _in(work.precision), TemporaryDirectory() as folder:
         work.inputs()
-        for entry in entries(Path(folder), cores, devices):
+        for entry in entries(Path(folder), count, devices):
             if (
                 entry.name not in able
                 or entry.lanes <= lanes
@@ -304,11 +303,11 @@ def _study(cores: int, devices: int, able: set[str], lanes: int) -> list[dict[st
     return rows
 
 
-def _machine(cores: int) -> dict[str, Any]:
+def _machine(count: int) -> dict[str, Any]:
     packages = ["jax", "numpy", "scipy", "llvmlite", "numba", "diffrax", "opensmc"]
     return {
         "processor": _processor(),
-        "cores": cores,
+        "cores": count,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "versions": {name: version(name) for name in packages if importlib.util.find_spec(name) is not None},

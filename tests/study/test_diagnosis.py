@@ -151,6 +151,18 @@ def test_a_number_that_ends_far_from_what_is_known_of_it_is_told():
     assert note.startswith("drive.motor_inertia had to change by -50%, 25 times its [uncertainty]")
 
 
+def test_new_numbers_are_better_all_in_all():
+    def better(before, after):
+        proving = under_test._Proving.__new__(under_test._Proving)
+        proving.before = under_test.Proof({"theta_e": before, "torque_motor": 1.0}, {})
+        return proving.better(under_test.Proof({"theta_e": after, "torque_motor": 1.1}, {}))
+
+    assert better(1.0, 0.9) and not better(1.0, 0.95)
+    # a model that diverges, or errs by nothing, is no error
+    assert better(np.inf, 1.0) and better(1.0, 0.0)
+    assert not better(1.0, np.inf) and not better(np.inf, np.inf) and not better(0.0, 1.0)
+
+
 def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
     """The fit is made to end at a number that is far off."""
     real = explain.refined

@@ -11,7 +11,6 @@ import numpy as np
 
 from ..workload import Workload, constants, figures_of
 
-Pair = tuple[Any, Any]
 Plant = Callable[[np.ndarray, float], np.ndarray]
 """From motor and load position and velocity, and a torque, to the next sample's."""
 
@@ -44,7 +43,7 @@ class Plain:
         motor_alpha, motor_lambda, load_alpha, load_lambda, dead_zone, noise = self._values.values()
         zero = np.zeros_like(noise)
         plant = self._moreau(c, dead_zone) if self._solver is None else self._solved(c, float(dead_zone[0]))
-        observer = _opensmc if self._library else _euler
+        observer = _OpenSMC if self._library else _Euler
         motor = observer(motor_lambda, motor_alpha, h, zero - c["motor_error"])
         load = observer(load_lambda, load_alpha, h, zero)
         state = np.stack([zero] * 4)
@@ -114,7 +113,7 @@ class Plain:
         return step
 
 
-class _euler:
+class _Euler:
     """Explicit super-twisting (7)-(8) of one side."""
 
     def __init__(self, lambda_: np.ndarray, alpha: np.ndarray, period: float, velocity: np.ndarray):
@@ -131,7 +130,7 @@ class _euler:
         return control
 
 
-class _opensmc:
+class _OpenSMC:
     """OpenSMC's Levant differentiator of first order: a super-twisting observer without a model, which is added."""
 
     def __init__(self, lambda_: np.ndarray, alpha: np.ndarray, period: float, velocity: np.ndarray):
