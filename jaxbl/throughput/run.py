@@ -198,8 +198,8 @@ def _bench(folder: Path, count: int, quick: bool, progress: Progress | None) -> 
         row.finish()
     del runners
     curve = []
-    for count in lanes:
-        curve += _curve(able, count, 500 if quick else 1000, ("float32",) if quick else PRECISIONS)
+    for many in lanes:
+        curve += _curve(able, many, 500 if quick else 1000, ("float32",) if quick else PRECISIONS)
         tick()
     study = _study(count, devices, {entry.name for entry in able}, 1000)
     tick()

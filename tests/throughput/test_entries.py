@@ -12,6 +12,7 @@ from jaxbl.errors import NoResult
 from jaxbl.throughput import run
 from jaxbl.throughput.run import PRECISIONS, Entry, _able, _check, _is_run, _reference, entries
 from jaxbl.throughput.workload import NAMES, RANGES, Workload
+from jaxbl.workers import cores
 
 STEPS = 1500
 
@@ -52,6 +53,23 @@ def test_a_wrong_result_is_not_timed():
     missing = true | {"motor.stiffness": np.full(64, np.nan)}
     with pytest.raises(NoResult, match=r"motor\.stiffness"):
         _check(entry, "float64", missing, true)
+
+
+def test_the_whole_benchmark_uses_the_cores_there_are(monkeypatch):
+    used = []
+
+    def only_ours(folder, count, devices):
+        used.append(count)
+        return [entry for entry in entries(folder, count, devices) if entry.name == run.OURS]
+
+    monkeypatch.setattr(run, "entries", only_ours)
+    parts = []
+    result = run.bench(quick=True, progress=lambda done, all_: parts.append((done, all_)))
+    assert set(used) == {result.machine["cores"]} == {cores()}
+    assert parts[-1][0] == parts[-1][1]
+    assert all(row.lane_steps_per_second >= row.median_lane_steps_per_second > 0 for row in result.rows)
+    assert [point["lanes"] for point in result.curve] == [2**k for k in range(6, 19, 3)]
+    assert len(result.study) == 1
 
 
 def test_who_cannot_run_is_left_out_with_a_reason(monkeypatch, folder):
