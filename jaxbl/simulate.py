@@ -398,6 +398,16 @@ def _scan(
     return figures(experiment, reducers, carry), kept
 
 
+def corrected(state: PlantState, readings: dict[str, Array], gain: dict[str, Any]) -> PlantState:
+    """A state after a look at the encoders: positions (1) and velocities (1/s) moved by gains times prediction errors."""
+    errors = {side: readings[side] - state.position[side] for side in gain}
+    return PlantState(
+        {side: value + gain[side][0] * errors[side] if side in gain else value for side, value in state.position.items()},
+        {side: value + gain[side][1] * errors[side] if side in gain else value for side, value in state.velocity.items()},
+        state.effects,
+    )
+
+
 def trajectory(
     experiment: Experiment,
     start: PlantState,
@@ -418,20 +428,10 @@ def trajectory(
     """
     plant, run = experiment.plant, experiment.run
 
-    def corrected(state: PlantState, readings: dict[str, Array]) -> PlantState:
-        if gain is None:
-            return state
-        errors = {side: readings[side] - state.position[side] for side in readings}
-        return PlantState(
-            {side: state.position[side] + gain[side][0] * error for side, error in errors.items()},
-            {side: state.velocity[side] + gain[side][1] * error for side, error in errors.items()},
-            state.effects,
-        )
-
     def sample(state: PlantState, given: tuple[Array, Array, dict[str, Array]]) -> tuple[PlantState, PlantState]:
         index, torque, readings = given
         at = time + index.astype(torque.dtype) * run.sample_period
-        return move(plant, run, corrected(state, readings), torque, at), state
+        return move(plant, run, corrected(state, readings, gain or {}), torque, at), state
 
     samples = jnp.arange(len(torque), dtype=jnp.int32), torque, measured if measured is not None and gain is not None else {}
     _, states = jax.lax.scan(sample, start, samples)

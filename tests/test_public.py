@@ -26,9 +26,9 @@ BELOW = {
     "simulate": {"observer", "drive", "errors"},
     "identification": {"simulate", "observer", "drive", "records", "errors"},
 }
-BELOW["discrepancy"] = {*BELOW["identification"], "identification"}
 BELOW["fused"] = {*BELOW["simulate"], "simulate"}
-BELOW["study"] = {*BELOW["discrepancy"], "discrepancy", "fused"}
+BELOW["discrepancy"] = {*BELOW["identification"], "identification", *BELOW["fused"], "fused"}
+BELOW["study"] = {*BELOW["discrepancy"], "discrepancy"}
 BELOW["throughput"] = {*BELOW["study"], "study", "workers"}
 BELOW["report"] = {*BELOW["throughput"], "throughput"}
 BELOW["workers"] = {"errors"}

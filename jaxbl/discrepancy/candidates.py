@@ -55,7 +55,7 @@ class Candidate(Protocol):
         ...
 
     def columns(self, signals: "Signals", torques: Sequence[Array]) -> Array:
-        """Columns in N m, shape (samples, sides + 1, width), and behind them what is there at coefficients of 0, if
+        """Columns in N m, shape (width, samples, sides + 1), and behind them what is there at coefficients of 0, if
         anything is."""
         ...
 
@@ -92,9 +92,9 @@ class Variant:
     def columns(self, signals: "Signals", torques: Sequence[Array]) -> Array:
         """As :meth:`Candidate.columns`."""
         if self.trial is None:
-            return np.stack([torque / size for torque, (_, size) in zip(torques, self.unit, strict=True)], axis=2)
+            return np.stack([torque / size for torque, (_, size) in zip(torques, self.unit, strict=True)])
         below, at, above = torques
-        return np.stack([(above - below) / (2.0 * _STEP), at], axis=2)
+        return np.stack([(above - below) / (2.0 * _STEP), at])
 
 
 class Grids(NamedTuple):
@@ -275,9 +275,9 @@ _AT_ONCE = 6
 
 
 def forces_of(candidates: Sequence[Candidate], signals: Signals, spare: int = 0) -> Array:
-    """Columns of candidates, one after the other, N m, and columns of zeros; shape (samples, sides + 1, columns)."""
+    """Columns of candidates, one after the other, N m, and columns of zeros; shape (columns, samples, sides + 1)."""
     widths = [one.width + one.offset for one in candidates]
-    found = np.zeros((signals.count, len(signals.sides) + 1, sum(widths) + spare))
+    found = np.zeros((sum(widths) + spare, signals.count, len(signals.sides) + 1))
     new = [one for one in candidates if id(one) not in signals.known]
     torques = iter(signals.of([effect for one in new for effect in one.effects]))
     at = 0
@@ -287,7 +287,7 @@ def forces_of(candidates: Sequence[Candidate], signals: Signals, spare: int = 0)
         if columns is None:
             columns = one.columns(signals, [next(torques) for _ in one.effects])
             signals.known[id(one)] = one, columns
-        found[:, :, at : at + width] = columns
+        found[at : at + width] = columns
         at += width
     return found
 

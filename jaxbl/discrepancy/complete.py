@@ -1,21 +1,16 @@
 """A model with every effect in it: those that it lacks are there at numbers with which they do nothing.
 
 All models that a diagnosis tries then have one structure, and one compiled program serves them all: which effects act is a
-matter of numbers. Free numbers are named by their place among all of the model's (:class:`Chosen`), so that the choice of
-what is free is a matter of numbers too.
+matter of numbers.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import TypeVar
 
 import equinox as eqx
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int
 
 from jaxbl.drive.effects import effect_class, effect_kinds
-from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths, set_leaves
-from jaxbl.identification.trajectory import PHYSICAL, Free
+from jaxbl.drive.parameters import as_arrays
 from jaxbl.simulate import Experiment
 
 Effect = TypeVar("Effect")
@@ -60,54 +55,6 @@ def joined(given: Iterable[Effect], added: Iterable[Effect], name_of: Callable[[
         at = next((i for i, other in enumerate(effects) if name_of(other) in later), len(effects))
         effects.insert(at, one)
     return effects
-
-
-def numbers_of(experiment: Experiment) -> tuple[str, ...]:
-    """Dotted paths of all numbers of a model's plant."""
-    return tuple(path for path in leaf_paths(experiment) if path.split(".")[0] in PHYSICAL)
-
-
-_WIDTH = 4
-
-
-class Chosen(eqx.Module):
-    """Free numbers, by their place among all of a model's; shapes (numbers,), padded to a multiple of four.
-
-    Attributes:
-        paths: of all numbers of the model's plant.
-        index: which of them each one is; their count where there is none.
-        nominal, scale, positive: as of :class:`jaxbl.identification.trajectory.Free`.
-    """
-
-    paths: tuple[str, ...] = eqx.field(static=True)
-    index: Int[Array, " numbers"]
-    nominal: Float[Array, " numbers"]
-    scale: Float[Array, " numbers"]
-    positive: Bool[Array, " numbers"]
-
-    @classmethod
-    def of(cls, experiment: Experiment, free: Sequence[Free]) -> "Chosen":
-        """Numbers of a model with all effects."""
-        paths = numbers_of(experiment)
-        spare = -len(free) % _WIDTH
-        return cls(
-            paths,
-            jnp.asarray([*(paths.index(one.path) for one in free), *[len(paths)] * spare], int),
-            jnp.asarray([*(one.nominal for one in free), *[0.0] * spare], float),
-            jnp.asarray([*(one.scale for one in free), *[1.0] * spare], float),
-            jnp.asarray([*(one.positive for one in free), *[False] * spare], bool),
-        )
-
-    def put(self, experiment: Experiment, theta: Float[Array, " numbers"]) -> Experiment:
-        """The model with these numbers."""
-        values = jnp.where(self.positive, self.scale * jnp.exp(theta), self.nominal + self.scale * theta)
-        every = jnp.stack([jnp.asarray(get_leaf(experiment, path), float) for path in self.paths])
-        every = every.at[self.index].set(values, mode="drop")
-        return set_leaves(experiment, {path: every[i] for i, path in enumerate(self.paths)})
-
-    def padded(self, values: np.ndarray, rest: float) -> Array:
-        """Values of the free numbers, with `rest` for those that are none."""
-        return jnp.asarray(np.concatenate([values, np.full(len(self.index) - len(values), rest)]))
 
 
 def bucket(count: int, least: int, digits: int = 3) -> int:

@@ -20,28 +20,29 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
 from jaxbl.drive.effects import ConstantTorque
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
+from jaxbl.fused.plant import Direction, slopes
 from jaxbl.identification.prediction import kalman_gain
 from jaxbl.identification.regression import lasting_path
 from jaxbl.identification.smoother import Smoothed
 from jaxbl.identification.trajectory import Free, with_values
 from jaxbl.records import Record
-from jaxbl.simulate import Experiment, move
+from jaxbl.simulate import Experiment
 
 from .candidates import SHARE, SPACING, Candidate, Grids, Signals, forces_of, rms
 from .coloured import Spectrum, spectrum_of, weighted_products
-from .complete import Chosen, bucket
+from .complete import bucket
 from .evidence import Columns
 from .part import Part
 
-SAMPLES, _BLOCK = 1024, 128
-"""Least padded length of a part, so that records of about one length share their compiled programs; a block of it."""
+SAMPLES, _BLOCK, _NUMBERS = 1024, 128, 4
+"""Least padded length of a part, so that records of about one length share their compiled programs; a block of it; multiple
+to which the number of free numbers is padded."""
 
 
 def linearise(
@@ -56,25 +57,28 @@ def linearise(
     Args:
         experiment: the model with all effects (:func:`.complete.complete`); its sample period is that of the record.
         free: its own numbers.
-        theta: their values.
+        theta: their values, which the model has.
         record: the log.
         smoothed: its positions, part by part.
     """
     assert record.torque is not None
-    chosen = Chosen.of(experiment, free)
+    sides = experiment.sides
+    # which the derivatives by a torque on each side are those of
+    added = tuple(ConstantTorque(side=side, torque=jnp.zeros(())) for side in sides)  # type: ignore[arg-type]
+    extended = eqx.tree_at(lambda e: e.effects, experiment, (*experiment.effects, *added))
     parts = []
     for i, rows in enumerate(record.segments):
-        one = {side: smoothed[side][i] for side in experiment.sides}
+        one = {side: smoothed[side][i] for side in sides}
         time = record.time[rows] - record.time[0]
-        readings = {side: record.positions[side][rows] for side in experiment.sides}
-        parts.append(_part(experiment, chosen, chosen.padded(theta, 0.0), time, record.torque[rows], readings, one))
+        readings = {side: record.positions[side][rows] for side in sides}
+        parts.append(_part(extended, free, theta, time, record.torque[rows], readings, one))
     return parts
 
 
 def _part(
     experiment: Experiment,
-    chosen: Chosen,
-    theta: Array,
+    free: Sequence[Free],
+    theta: np.ndarray,
     time: np.ndarray,
     torque: np.ndarray,
     readings: dict[str, np.ndarray],
@@ -87,95 +91,54 @@ def _part(
         return np.concatenate([values, np.repeat(values[-1:], size - count, axis=0)])
 
     sides = experiment.sides
-    own = {side: np.asarray(smoothed[side].state) for side in sides}
-    states = {side: padded(own[side]) for side in sides}
+    states = {side: padded(np.asarray(smoothed[side].state)) for side in sides}
     deviation = {side: padded(np.asarray(smoothed[side].deviation(1))) for side in sides}
     period = float(experiment.run.sample_period)
     held = {side: padded(np.asarray(smoothed[side].held(period), float)) for side in sides}
     read = np.stack([padded(readings[side]) - states[side][:, 0] for side in sides], axis=1)
-    weight = (np.arange(size) < count).astype(float)
-    given = padded(time), padded(torque), read, states, deviation, held, weight
-    found = _derivatives(experiment, chosen, theta, *jax.tree.map(jnp.asarray, given))
-    # several devices have made it; what follows is one's work
-    return jax.device_put(found, jax.local_devices()[0])
-
-
-@eqx.filter_jit
-def _derivatives(
-    experiment: Experiment,
-    chosen: Chosen,
-    theta: Array,
-    time: Array,
-    torque: Array,
-    readings: Array,
-    states: dict[str, Array],
-    deviation: dict[str, Array],
-    held: dict[str, Array],
-    weight: Array,
-) -> Part:
-    sides = experiment.sides
-    at = chosen.put(experiment, theta)
-    effects, _ = lasting_path(at, torque)
-    motion = PlantState({side: states[side][:, 0] for side in sides}, {side: states[side][:, 1] for side in sides}, effects)
-    _, unravel = ravel_pytree(jax.tree.map(lambda x: x[0], motion.effects))
-
-    def pack(state: PlantState) -> Array:
-        own, _ = ravel_pytree(state.effects)
-        return jnp.concatenate([jnp.stack([x[side] for x in (state.position, state.velocity) for side in sides]), own])
-
-    def unpack(vector: Array) -> PlantState:
-        position, velocity = (dict(zip(sides, vector[i * len(sides) :], strict=False)) for i in range(2))
-        return PlantState(position, velocity, unravel(vector[2 * len(sides) :]))
-
-    none = jnp.zeros(len(sides) + 1)
-
-    def step(model: Experiment, vector: Array, force: Array, torque: Array, time: Array) -> Array:
-        added = tuple(ConstantTorque(side=side, torque=-force[i]) for i, side in enumerate(sides))  # type: ignore[arg-type]
-        model = eqx.tree_at(lambda e: e.effects, model, (*model.effects, *added))
-        state = unpack(vector)
-        extended = PlantState(state.position, state.velocity, (*state.effects, *(() for _ in sides)))
-        new = move(model.plant, model.run, extended, torque + force[len(sides)], time)
-        return pack(PlantState(new.position, new.velocity, new.effects[: len(state.effects)]))
-
-    def one(vector: Array, torque: Array, time: Array) -> tuple[Array, Array, Array]:
-        def moved(given: Array) -> tuple[Array, Array]:
-            new = step(at, given[:count], given[count:], torque, time)
-            return new, new
-
-        def numbered(theta: Array) -> Array:
-            return step(chosen.put(experiment, theta), vector, none, torque, time)
-
-        slope, new = jax.jacfwd(moved, has_aux=True)(jnp.concatenate([vector, none]))
-        return slope, jax.jacfwd(numbered)(theta), new
-
-    # block by block, what is computed stays in the cache
-    vectors = jax.vmap(pack)(motion)
-    count = vectors.shape[1]
-    blocks = jax.tree.map(lambda x: x.reshape(-1, 2 * _BLOCK, *x.shape[1:]), (vectors, torque, time))
-    # devices share the blocks
-    devices = jax.local_devices()
-    mesh = Mesh(np.array(devices[: math.gcd(len(devices), len(blocks[1]))]), ("blocks",))
-    along = jax.shard_map(
-        lambda blocks: jax.lax.map(lambda given: jax.vmap(one)(*given), blocks),
-        mesh=mesh,
-        in_specs=PartitionSpec("blocks"),
-        out_specs=PartitionSpec("blocks"),
-        check_vma=False,
-    )
-    found = along(blocks)
-    slope, f, value = jax.tree.map(lambda x: x.reshape(len(time), *x.shape[2:]), found)
-    period = experiment.run.sample_period
-    modelled = {side: (value[:, len(sides) + i] - vectors[:, len(sides) + i]) / period for i, side in enumerate(sides)}
-    defect = value - jnp.concatenate([vectors[1:], value[-1:]])
+    time, torque = padded(time), padded(torque)
+    effects, _ = lasting_path(experiment, jnp.asarray(torque))
+    smooth: list[Any] = [{side: states[side][:, i] for side in sides} for i in range(3)]
+    motion = PlantState(smooth[0], smooth[1], jax.tree.map(np.asarray, effects))
+    # by side, not by name
+    names, each = sorted(sides), len(sides)
+    order = [names.index(side) + i * each for i in range(2) for side in sides]
+    order += range(2 * each, len(jax.tree.leaves(motion)))
+    slope, value = slopes(experiment, motion, torque, time, _directions(experiment, free, theta, motion, order))
+    slope, value = slope[:, order].transpose(2, 1, 0), value[order].T
+    vectors = np.stack(jax.tree.leaves(motion), axis=1)[:, order]
+    modelled = {side: (value[:, each + i] - vectors[:, each + i]) / period for i, side in enumerate(sides)}
+    defect = np.zeros_like(value)
     # nothing happens from the last reading on
-    going = jnp.concatenate([weight[1:], jnp.zeros(1)])
-    defect = jnp.where(going[:, None] > 0.0, defect, 0.0)
-    a, b = slope[:, :, :count], slope[:, :, count:]
-    return Part(
-        time, torque, readings,
-        motion.position, motion.velocity, {side: states[side][:, 2] for side in sides}, modelled, deviation, held,
-        a, b, f, defect, weight,
-    )  # fmt: skip
+    defect[: count - 1] = value[: count - 1] - vectors[1:count]
+    a, b, own = np.split(slope, (len(order), len(order) + each + 1), axis=2)
+    own = np.concatenate([own, np.zeros((*own.shape[:2], -len(free) % _NUMBERS))], axis=2)
+    weight = (np.arange(size) < count).astype(float)
+    given = time, torque, read, *smooth, modelled, deviation, held, a, b, own, defect, weight
+    return Part(*jax.tree.map(jnp.asarray, given))
+
+
+def _directions(
+    experiment: Experiment, free: Sequence[Free], theta: np.ndarray, motion: PlantState, order: Sequence[int]
+) -> list[Direction]:
+    """Each state, torque on each side, input, each free number."""
+    leaves, structure = jax.tree.flatten(experiment)
+    places, shape = structure.unflatten(range(len(leaves))), jax.tree.structure(motion)
+
+    def direction(number: tuple[int, float] = (0, 0.0), state: int = -1, torque: float = 0.0) -> Direction:
+        numbers = np.zeros(len(leaves))
+        numbers[number[0]] = number[1]
+        states = [float(i == state) for i in range(shape.num_leaves)]
+        return Direction(structure.unflatten(list(numbers)), shape.unflatten(states), torque)
+
+    added = places.effects[-len(experiment.sides) :]
+    slopes = [(get_leaf(places, one.path), float(one.slope(at))) for one, at in zip(free, theta, strict=True)]
+    return [
+        *(direction(state=i) for i in order),
+        *(direction((one.torque, -1.0)) for one in added),
+        direction(torque=1.0),
+        *(direction(one) for one in slopes),
+    ]
 
 
 def gain_matrix(gain: Array, states: int) -> Array:
@@ -189,19 +152,37 @@ def _known(part: Part, forces: Array) -> Array:
     """What drives the state's change at each sample; columns: constant, own numbers, forces, initial states."""
     samples, states = part.defect.shape
     none = jnp.zeros((samples, states, states))
-    return jnp.concatenate([part.defect[:, :, None], part.own, part.force @ forces, none], axis=2)
+    forced = jnp.einsum("tni,cti->tnc", part.force, forces)
+    return jnp.concatenate([part.defect[:, :, None], part.own, forced, none], axis=2)
 
 
-def _recursion(a: Array, gains: Array, change: Array, given: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+def _closed(part: Part, gains: Array) -> tuple[Array, Array]:
+    """Step of the predictor's errors under a gain, A (1 - K C), and A K; by sample."""
+    fed = part.step @ gains
+    return part.step.at[:, :, : gains.shape[1]].add(-fed), fed
+
+
+def _product(matrix: Array, columns: Array) -> Array:
+    """Of small matrices: written out, it takes less time than a call of what is made for large ones."""
+    if columns.shape[1] > _MANY:
+        return matrix @ columns
+    return sum((matrix[:, k, None] * columns[k] for k in range(len(columns))), jnp.zeros(()))
+
+
+def _recursion(part: Part, gains: Array, change: Array, known: Array) -> tuple[Array, Array]:
     """Prediction errors along some samples, rad; shape (samples, sides, columns)."""
-    sides = gains.shape[1]
+    closed, fed = _closed(part, gains)
 
-    def sample(change: Array, given: tuple[Array, ...]) -> tuple[Array, Array]:
-        a, known, reading, weight = given
-        error = -change[:sides].at[:, 0].add(-reading)
-        return a @ (change + gains @ error) + known, error * weight
+    def first(values: Array) -> Array:
+        """Of the first column alone."""
+        return jnp.pad(values[..., None], [*[(0, 0)] * values.ndim, (0, known.shape[2] - 1)])
 
-    return jax.lax.scan(sample, change, (a, *given))
+    def sample(change: Array, given: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        closed, known, read = given
+        return _product(closed, change) + known + first(read), change[: gains.shape[1]]
+
+    change, seen = jax.lax.scan(sample, change, (closed, known, jnp.einsum("tis,ts->ti", fed, part.readings)))
+    return change, (first(part.readings) - seen) * part.weight[:, None, None]
 
 
 def _start(states: int, width: int) -> Array:
@@ -213,7 +194,7 @@ def _errors(part: Part, gain: Array, forces: Array) -> Array:
     """Prediction errors, rad, by side; columns as of :func:`_known`; shape (samples, sides, columns)."""
     known = _known(part, forces)
     states, width = known.shape[1:]
-    return _recursion(part.step, gain_matrix(gain, states), _start(states, width), (known, part.readings, part.weight))[1]
+    return _recursion(part, gain_matrix(gain, states), _start(states, width), known)[1]
 
 
 @jax.jit
@@ -221,40 +202,49 @@ def _grams(part: Part, gains: Array, forces: Array) -> Array:
     """Products of the columns of the prediction errors with one another, rad^2, for several gains, by side;
     shape (gains, sides, columns, columns)."""
     states, sides = part.defect.shape[1], part.readings.shape[1]
-    width = 1 + part.own.shape[2] + forces.shape[2] + states
-    matrices = jax.vmap(lambda gain: gain_matrix(gain, states))(gains)
-
-    def block(carry: tuple[Array, Array], given: tuple[Part, Array]) -> tuple[tuple[Array, Array], None]:
-        change, total = carry
-        one, forces = given
-        along = _known(one, forces), one.readings, one.weight
-        change, errors = jax.vmap(lambda gain, change: _recursion(one.step, gain, change, along))(matrices, change)
-        return (change, total + jnp.einsum("gtsc,gtsd->gscd", errors, errors)), None
-
+    width = 1 + part.own.shape[2] + len(forces) + states
     count = len(part.time) // _BLOCK
-    blocks = jax.tree.map(lambda x: x.reshape(count, _BLOCK, *x.shape[1:]), (part, forces))
-    start = jnp.broadcast_to(_start(states, width), (len(gains), states, width))
-    return jax.lax.scan(block, (start, jnp.zeros((len(gains), sides, width, width))), blocks)[0][1]
+    blocks = jax.tree.map(lambda x: x.reshape(count, _BLOCK, *x.shape[1:]), part)
+
+    def some(gains: Array, blocks: Part, forces: Array) -> Array:
+        matrices = jax.vmap(lambda gain: gain_matrix(gain, states))(gains)
+
+        def block(carry: tuple[Array, Array], given: tuple[Part, Array]) -> tuple[tuple[Array, Array], None]:
+            change, total = carry
+            one, i = given
+            known = _known(one, jax.lax.dynamic_slice_in_dim(forces, i * _BLOCK, _BLOCK, 1))
+            change, errors = jax.vmap(lambda gain, change: _recursion(one, gain, change, known))(matrices, change)
+            return (change, total + jnp.einsum("gtsc,gtsd->gscd", errors, errors)), None
+
+        start = jnp.broadcast_to(_start(states, width), (len(gains), states, width))
+        none = jnp.zeros((len(gains), sides, width, width))
+        return jax.lax.scan(block, (start, none), (blocks, jnp.arange(count)))[0][1]
+
+    # devices share the gains
+    devices = jax.local_devices()
+    mesh = Mesh(np.array(devices[: math.gcd(len(devices), len(gains))]), ("gains",))
+    own, every = PartitionSpec("gains"), PartitionSpec()
+    shared = jax.shard_map(some, mesh=mesh, in_specs=(own, every, every), out_specs=own, check_vma=False)
+    return shared(gains, blocks, forces)
 
 
 @jax.jit
 def _gradient(part: Part, gain: Array, left: Array) -> Array:
     """Derivative of the sum of products of errors with `left` by the torque at each sample, shape (samples, sides + 1)."""
     states, sides = part.defect.shape[1], left.shape[1]
-    gains = gain_matrix(gain, states)
+    closed, _ = _closed(part, gain_matrix(gain, states))
+    added = jnp.zeros((len(left), states)).at[:, :sides].set(-left * part.weight[:, None])
 
-    def sample(adjoint: Array, given: tuple[Array, ...]) -> tuple[Array, Array]:
-        a, b, left, weight = given
-        back = a.T @ adjoint
-        return back.at[:sides].add(-left * weight - gains.T @ back), b.T @ adjoint
+    def sample(adjoint: Array, given: tuple[Array, Array]) -> tuple[Array, Array]:
+        closed, added = given
+        return _product(closed.T, adjoint[:, None])[:, 0] + added, adjoint
 
-    given = part.step, part.force, left, part.weight
-    return jax.lax.scan(sample, jnp.zeros(states), given, reverse=True)[1]
+    _, adjoints = jax.lax.scan(sample, jnp.zeros(states), (closed, added), reverse=True)
+    return jnp.einsum("tij,ti->tj", part.force, adjoints)
 
 
 _COARSE_SMOOTHNESS = 10.0 ** np.arange(-11.0, 1.0)
 _FINE_SMOOTHNESS = 10.0 ** np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
-_AT_ONCE = 6
 _LEAST = 1e-11
 OFF = 0.5
 """Prior size of the error of an inertia or a viscous friction, relative."""
@@ -268,8 +258,8 @@ _SILENT = 1e-20
 """Influence of an initial state over that of others below which it has none: that of an effect that does nothing."""
 _LOST = 0.01
 """Nats that rounding may take: under too low a gain an initial state's influence may grow from sample to sample."""
-_COLUMNS = 16
-"""Least padded number of candidate columns."""
+_COLUMNS, _MANY = 16, 80
+"""Least padded number of candidate columns; number from which on they are many."""
 
 
 class Predictor:
@@ -346,7 +336,7 @@ class Linear:
         self.free, self.theta, self.prior, self.centre = tuple(free), np.asarray(theta), prior, centre
         self.experiment = with_values(experiment, free, jnp.asarray(self.theta))
         self.period, self.sides = record.sample_period, experiment.sides
-        self.parts = linearise(experiment, free, self.theta, record, smoothed)
+        self.parts = linearise(self.experiment, free, self.theta, record, smoothed)
         self.signals = [Signals(self.experiment, part) for part in self.parts]
         self.count = sum(int(np.asarray(one.weight).sum()) for one in self.parts)
         self.states = self.parts[0].defect.shape[1]
@@ -438,10 +428,7 @@ class Linear:
         forces = [self._forces(variants, signals) for signals in self.signals]
 
         def best(options: list[list[float]]) -> Predictor:
-            found = []
-            for i in range(0, len(options), _AT_ONCE):
-                some = options[i : i + _AT_ONCE]
-                found += self._predictors(some, forces)
+            found = self._predictors(options, forces)
             costs = [float(np.sum(np.log(one.squares))) if (one.squares > 0.0).all() else np.inf for one in found]
             return found[int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))]
 
@@ -467,12 +454,12 @@ class Linear:
         gains = jnp.stack([self.gain(one) for one in options])
         grams = []
         for part, force in zip(self.parts, forces, strict=True):
-            some = self._some(force.shape[2], force.shape[2])
+            some = self._some(len(force), len(force))
             grams.append(np.asarray(_grams(part, gains, force))[:, :, some[:, None], some])
         return [Predictor(self, one, [gram[i] for gram in grams]) for i, one in enumerate(options)]
 
     def _forces(self, variants: Sequence[Candidate], signals: Signals) -> np.ndarray:
-        """Torques of candidates, padded with columns of zeros; shape (samples, sides + 1, columns)."""
+        """Torques of candidates, padded with columns of zeros; shape (columns, samples, sides + 1)."""
         width = sum(one.width + one.offset for one in variants)
         return forces_of(variants, signals, bucket(width, _COLUMNS, 2) - width if width else 0)
 
@@ -491,13 +478,13 @@ class Linear:
         predictor, forces = self._last
         gain, deviation = self.gain(predictor.smoothness), np.sqrt(predictor.squares / self.count)
         errors = np.asarray(_errors(part, gain, forces[i]))
-        left = errors[:, :, self._some(forces[i].shape[2], forces[i].shape[2])] @ predictor.coefficients[i]
+        left = errors[:, :, self._some(len(forces[i]), len(forces[i]))] @ predictor.coefficients[i]
         time, real = np.asarray(part.time), int(np.asarray(part.weight).sum())
         span, top = real * self.period, min(0.25 / self.period, 50.0)
         few = np.geomspace(1.0 / span, top, _COARSE)
-        phase = 2.0 * np.pi * few[None, :] * time[:, None]
-        waves = np.zeros((len(time), len(self.sides) + 1, 2 * _COARSE))
-        waves[:, side] = np.concatenate([np.sin(phase), np.cos(phase)], axis=1)
+        phase = 2.0 * np.pi * few[:, None] * time[None, :]
+        waves = np.zeros((2 * _COARSE, len(time), len(self.sides) + 1))
+        waves[:, :, side] = np.concatenate([np.sin(phase), np.cos(phase)])
         responses = np.asarray(_errors(part, gain, waves))[:, :, 1 + part.own.shape[2] : -self.states]
         power = np.sum((responses / deviation[None, :, None]) ** 2, axis=(0, 1)).reshape(2, -1).mean(axis=0)
         slope = np.asarray(_gradient(part, gain, jnp.asarray(left / deviation[None, :] ** 2)))[:real, side]
@@ -544,8 +531,8 @@ class Linear:
         total, power = np.zeros((at, at)), np.zeros(at - 1 - own)
         for part, signals in zip(self.parts, self.signals, strict=True):
             forces = self._forces(variants, signals)
-            power += self._power(forces[:, :, : at - 1 - own], signals)
-            some = self._some(at - 1 - own, forces.shape[2])
+            power += self._power(forces[: at - 1 - own], signals)
+            some = self._some(at - 1 - own, len(forces))
             if isinstance(noise, Spectrum):
                 errors = np.asarray(_errors(part, gain, forces))[signals.real][:, :, some]
                 gram = weighted_products(errors, noise)
@@ -582,12 +569,12 @@ class Linear:
     def _power(self, torques: np.ndarray, signals: Signals) -> np.ndarray:
         """Sums of squares of torques, referred to the motor."""
         over = np.array([*(signals.over(side) for side in self.sides), 1.0])
-        return np.einsum("tsc,tsc,s->c", torques, torques, over**-2.0)
+        return np.einsum("cts,cts->cs", torques, torques) @ over**-2.0
 
     def share(self, name: str) -> float:
         """Torque of an effect that the model has, rms over the driving torque's."""
         effect = get_leaf(self.experiment, f"effects.{name}")
-        power = sum(self._power(signals.of([effect])[0][:, :, None], signals)[0] for signals in self.signals)
+        power = sum(self._power(signals.of([effect])[0][None], signals)[0] for signals in self.signals)
         return float(np.sqrt(power / self.count)) / self.drive
 
     def sizes(self, names: Sequence[str]) -> dict[str, float]:

@@ -11,20 +11,19 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.drive.plant import PlantState
+from jaxbl.fused.plant import path
 from jaxbl.identification.intervals import spread
 from jaxbl.identification.regression import lasting
 from jaxbl.identification.smoother import Smoothed
 from jaxbl.identification.trajectory import Fit, Free, with_values
 from jaxbl.records import Record
-from jaxbl.simulate import Experiment, trajectory
+from jaxbl.simulate import Experiment
 
-from .complete import bucket
-from .linear import SAMPLES, Linear, Predictor
+from .linear import Linear, Predictor
 
 Array = np.ndarray
 
@@ -102,18 +101,22 @@ class _Refiner:
         record, sides = self.record, self.experiment.sides
         assert record.torque is not None
         experiment = with_values(self.experiment, self.free, jnp.asarray(theta))
-        gain = Linear.gain_of(smoothness, record.sample_period)
+        gain = np.asarray(Linear.gain_of(smoothness, record.sample_period))
+        gains = {side: gain[j] for j, side in enumerate(sides)}
         found: dict[str, list[Smoothed]] = {side: [] for side in sides}
         for i, rows in enumerate(record.segments):
-            count = rows.stop - rows.start
-            spare = (0, bucket(count, SAMPLES) - count)
-            torque = jnp.asarray(np.pad(record.torque[rows], spare, mode="edge"))
-            readings = {side: jnp.asarray(np.pad(record.positions[side][rows], spare, mode="edge")) for side in sides}
-            first = jnp.asarray(record.time[rows.start] - record.time[0])
-            states = _filtered(experiment, jnp.asarray(start[i]), torque, first, readings, gain)
+            torque, first = record.torque[rows], record.time[rows.start] - record.time[0]
+            readings = {side: record.positions[side][rows] for side in sides}
+            position, velocity = (dict(zip(sides, half, strict=True)) for half in np.split(start[i], 2))
+            begun = PlantState(position, velocity, lasting(experiment, torque[0]))
+            states = path(experiment, begun, torque, first, readings, gains)
             for side in sides:
                 own = self.smoothed[side][i]
-                state = np.concatenate([np.asarray(states[side])[:count], np.asarray(own.state)[:, 2:]], axis=1)
+                error = readings[side] - states.position[side]
+                # the first state is that of the predictor before it has seen anything
+                error[0] = 0.0
+                seen = np.stack([states.position[side], states.velocity[side]], axis=1) + error[:, None] * gains[side]
+                state = np.concatenate([seen, np.asarray(own.state)[:, 2:]], axis=1)
                 found[side].append(own._replace(state=state))  # type: ignore[arg-type]
         return found
 
@@ -164,32 +167,6 @@ class _Refiner:
 
 
 _spread = eqx.filter_jit(spread)
-
-
-@eqx.filter_jit
-def _filtered(
-    experiment: Experiment,
-    start: jax.Array,
-    torque: jax.Array,
-    time: jax.Array,
-    readings: dict[str, jax.Array],
-    gain: jax.Array,
-) -> dict[str, jax.Array]:
-    """Positions and velocities of the predictor after each reading, by side; shape (samples, 2)."""
-    sides = experiment.sides
-    effects = lasting(experiment, torque[0])
-    position, velocity = ({side: start[i * len(sides) + j] for j, side in enumerate(sides)} for i in (0, 1))
-    gains = {side: gain[j] for j, side in enumerate(sides)}
-    states = trajectory(experiment, PlantState(position, velocity, effects), torque, time, readings, gains)
-    found = {}
-    for side in sides:
-        error = readings[side] - states.position[side]
-        # the first state is that of the predictor before it has seen anything
-        seen = jnp.where(jnp.arange(len(error)) > 0, error, 0.0)
-        found[side] = jnp.stack(
-            [states.position[side] + gains[side][0] * seen, states.velocity[side] + gains[side][1] * seen], axis=1
-        )
-    return found
 
 
 def refined(

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from jaxbl.drive.effects import SideEffect
 from jaxbl.drive.parameters import Scalar
 from jaxbl.drive.plant import PlantState
+from jaxbl.fused.plant import path
 from jaxbl.identification.regression import Kinematics
 from jaxbl.identification.search import Channels, windows_of
 from jaxbl.identification.trajectory import Windows, projected_residual
@@ -142,13 +143,18 @@ class Ground:
         deviation = {
             side: float(np.median(np.asarray(pieces[first].deviation(1)))) for side, pieces in self.channels.smoothed.items()
         }
-        return errors, float(_growth(experiment, windows, deviation))
+        return errors, _growth(experiment, windows, deviation)
 
     def _errors(self, experiment: Experiment, windows: Windows, firsts: np.ndarray, passes: int) -> dict[str, float]:
         rows = firsts[:, None] + np.arange(windows.torque.shape[1])[None, :]
-        residual, velocity = jax.tree.map(
-            lambda x: np.asarray(x)[: len(firsts)], _foretold(experiment, windows, passes, self.rest)
-        )
+        residual, start = _foretold(experiment, windows, passes, self.rest)
+        residual = np.asarray(residual)[: len(firsts)]
+        if len(firsts) == 1:
+            velocity = {side: one[None] for side, one in _run(experiment, windows, start).velocity.items()}
+        else:
+            velocity = {
+                side: np.asarray(one)[: len(firsts)] for side, one in _velocities(experiment, windows, start).items()
+            }
         found = {}
         for i, side in enumerate(experiment.sides):
             found[POSITIONS[side]] = self.channels.noise[side] * _rms([residual[:, :, i]])
@@ -156,7 +162,7 @@ class Ground:
             smoothed = np.full(len(self.record.time), np.nan)
             for part, one in zip(self.record.segments, self.channels.smoothed[side], strict=True):
                 smoothed[part] = np.asarray(one.velocity)
-            found[f"velocity_{side}"] = _rms([velocity[side] - smoothed[rows]])
+            found[f"velocity_{side}"] = _rms([np.asarray(velocity[side]) - smoothed[rows]])
         return found
 
     def permuted(self, experiment: Experiment, added: Mapping[str, Sequence[np.ndarray]], seed: int = 0) -> Proof:
@@ -216,14 +222,23 @@ def _order(count: int, size: int, random: np.random.Generator) -> np.ndarray:
 
 
 @eqx.filter_jit
-def _foretold(experiment: Experiment, windows: Windows, passes: int, rest: bool) -> tuple[Array, dict[str, Array]]:
-    """Position residuals over the noise, and velocities, from the best initial states."""
-    residual, start = projected_residual(experiment, windows, passes, rest)
+def _foretold(experiment: Experiment, windows: Windows, passes: int, rest: bool) -> tuple[Array, PlantState]:
+    """Position residuals over the noise from the best initial states, and these."""
+    return projected_residual(experiment, windows, passes, rest)
 
+
+@eqx.filter_jit
+def _velocities(experiment: Experiment, windows: Windows, start: PlantState) -> dict[str, Array]:
     def one(start: PlantState, torque: Array, time: Array) -> dict[str, Array]:
         return trajectory(experiment, start, torque, time).velocity
 
-    return residual, jax.vmap(one)(start, windows.torque, windows.time)
+    return jax.vmap(one)(start, windows.torque, windows.time)
+
+
+def _run(experiment: Experiment, windows: Windows, start: PlantState) -> PlantState:
+    """Path of the first window alone."""
+    start, torque, time = jax.tree.map(lambda x: np.asarray(x)[0], (start, windows.torque, windows.time))
+    return path(experiment, start, torque, time)
 
 
 @eqx.filter_jit
@@ -235,19 +250,14 @@ def _strays(experiment: Experiment, windows: Windows) -> dict[str, Array]:
     return {side: jnp.max(jnp.abs(simulated[side] - windows.measured[side])) for side in experiment.sides}
 
 
-@eqx.filter_jit
-def _growth(experiment: Experiment, windows: Windows, deviation: dict[str, float]) -> Array:
+def _growth(experiment: Experiment, windows: Windows, deviation: dict[str, float]) -> float:
     """Change of the positions by a standard deviation of the initial speeds, over the motion; the larger of the sides."""
-    start, torque, time = jax.tree.map(lambda x: x[0], (windows.start, windows.torque, windows.time))
-    step = 1e-3
-    moved = {side: value + step * jnp.asarray(deviation[side]) for side, value in start.velocity.items()}
-    both = jax.tree.map(lambda *x: jnp.stack(x), start, PlantState(start.position, moved, start.effects))
-    runs = jax.vmap(lambda state: trajectory(experiment, state, torque, time).position)(both)
-    shares = [
-        jnp.sqrt(jnp.mean((runs[side][1] - runs[side][0]) ** 2)) / step / jnp.std(windows.measured[side][0])
-        for side in experiment.sides
-    ]
-    return jnp.max(jnp.stack(shares))
+    start, step = windows.start, 1e-3
+    moved = {side: value + step * deviation[side] for side, value in start.velocity.items()}
+    begun = start, PlantState(start.position, moved, start.effects)
+    one, other = (_run(experiment, windows, state).position for state in begun)
+    change = {side: _rms([np.asarray(other[side] - one[side])]) / step for side in experiment.sides}
+    return float(np.max([change[side] / np.std(windows.measured[side][0]) for side in experiment.sides]))
 
 
 def _rms(pieces: Sequence[np.ndarray]) -> float:

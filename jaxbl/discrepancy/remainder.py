@@ -70,8 +70,8 @@ class Function:
                 columns = _hats(velocity, self.span, self.width)
             case _:
                 columns = _stops(position, np.array(_LENGTHS) * np.std(position[signals.real]))
-        found = np.zeros((signals.count, len(signals.sides) + 1, self.width))
-        found[:, signals.sides.index(side)] = -columns * signals.real[:, None]
+        found = np.zeros((self.width, signals.count, len(signals.sides) + 1))
+        found[:, :, signals.sides.index(side)] = -(columns * signals.real[:, None]).T
         return found
 
 

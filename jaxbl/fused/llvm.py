@@ -70,22 +70,30 @@ class Loop:
     """A compiled loop over samples, and what follows it.
 
     Args:
-        body: jaxpr of one sample, scalars of one lane: values, carry, fixed, one sample's inputs -> carry.
-        after: the same of what is done once after all samples.
+        body: jaxpr of one sample, scalars of one lane: values, carry, fixed, one sample's inputs -> carry, and what is kept.
+        after: the same of what is done once after all samples, to the carry alone; None for nothing.
         values: number of values; they differ from lane to lane.
         carry: numbers that a lane carries.
         fixed: numbers of fixed ones of `body` and of `after`.
         dtype: of the lanes' numbers.
+        lanes: that are computed together; left out, as many as suit the machine.
 
     Raises:
         Unsupported: an operation of theirs is unknown here.
     """
 
     def __init__(
-        self, body: ClosedJaxpr, after: ClosedJaxpr, values: int, carry: int, fixed: tuple[int, int], dtype: np.dtype
+        self,
+        body: ClosedJaxpr,
+        after: ClosedJaxpr | None,
+        values: int,
+        carry: int,
+        fixed: tuple[int, int],
+        dtype: np.dtype,
+        lanes: int | None = None,
     ):
-        self.lanes = vector_lanes(dtype)
-        body, after = substituted(body, FUNCTIONS), substituted(after, FUNCTIONS)
+        self.lanes = lanes or vector_lanes(dtype)
+        body, after = substituted(body, FUNCTIONS), None if after is None else substituted(after, FUNCTIONS)
         module = ir.Module("loop")
         _Writer(module, self.lanes).loop(body, after, values, carry, fixed[0])
         parsed = binding.parse_assembly(str(module))
@@ -102,7 +110,7 @@ class Loop:
 
         Args:
             arrays: contiguous; values and carry `(lanes,)`, fixed `()` and inputs `(steps,)` of the body, fixed and inputs
-                `()` of what follows.
+                `()` of what follows, and of what is kept `(steps, lanes)` with no more lanes than run.
             steps: samples.
             first: lane.
             last: lane behind the last one.
@@ -119,13 +127,15 @@ class _Writer:
         self.constant: set[Vector] = set()
         """Those that do not change in the loop over time."""
 
-    def loop(self, body: ClosedJaxpr, after: ClosedJaxpr, values: int, carry: int, fixed: int) -> None:
+    def loop(self, body: ClosedJaxpr, after: ClosedJaxpr | None, values: int, carry: int, fixed: int) -> None:
         function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [_POINTER, _INT, _INT, _INT]), "loop")
         table, steps, first, last = function.args
         build: Any = ir.IRBuilder(function.append_basic_block("entry"))
         self.build = build
         own = values + carry
-        dtypes = [_dtype(v) for v in [*body.jaxpr.invars, *after.jaxpr.invars[own:]]]
+        follows = [] if after is None else after.jaxpr.invars[own:]
+        kept = body.jaxpr.outvars[carry:]
+        dtypes = [_dtype(v) for v in [*body.jaxpr.invars, *follows, *kept]]
         kinds = [_KINDS[str(dtype)] for dtype in dtypes]
         if any(not jnp.issubdtype(dtype, jnp.floating) for dtype in dtypes[:own]):
             raise Unsupported("lanes that carry other numbers than floating-point ones")
@@ -142,7 +152,9 @@ class _Writer:
 
         inputs = range(own + fixed, len(body.jaxpr.invars))
         steady = [scalar(i, _INT(0)) for i in range(own, own + fixed)]
-        afterwards = [scalar(i, _INT(0)) for i in range(len(body.jaxpr.invars), len(dtypes))]
+        end = len(dtypes) - len(kept)
+        afterwards = [scalar(i, _INT(0)) for i in range(len(body.jaxpr.invars), end)]
+        width = build.sub(last, first)
 
         def lanes(lane: Vector, _: list[Vector]) -> list[Vector]:
             places = [build.gep(arrays[i], [lane], source_etype=kinds[i]) for i in range(own)]
@@ -152,9 +164,15 @@ class _Writer:
             self.constant = {*numbers, *steady}
 
             def sample(index: Vector, state: list[Vector]) -> list[Vector]:
-                return self.run(body, [*numbers, *state, *steady, *(scalar(i, index) for i in inputs)])
+                found = self.run(body, [*numbers, *state, *steady, *(scalar(i, index) for i in inputs)])
+                at = build.add(build.mul(index, width), build.sub(lane, first))
+                for i, value in enumerate(found[carry:], end):
+                    build.store(value, build.gep(arrays[i], [at], source_etype=kinds[i]), align=sizes[i])
+                return found[:carry]
 
-            state = self.run(after, [*numbers, *self.count(_INT(0), steps, state, sample), *afterwards])
+            state = self.count(_INT(0), steps, state, sample)
+            if after is not None:
+                state = self.run(after, [*numbers, *state, *afterwards])
             for i, value in enumerate(state, values):
                 build.store(value, places[i], align=sizes[i])
             return []
@@ -282,12 +300,12 @@ def _clamp(w: _Writer, eqn: JaxprEqn, low: Vector, a: Vector, high: Vector) -> V
 
 def _power(w: _Writer, eqn: JaxprEqn, a: Vector) -> Vector:
     power = eqn.params["y"]
-    if not 1 <= power <= 8:
+    if not 1 <= abs(power) <= 8:
         raise Unsupported(f"integer_pow by {power}")
     result = a
-    for _ in range(power - 1):
+    for _ in range(abs(power) - 1):
         result = w.build.fmul(result, a, flags=_FLAGS)
-    return result
+    return result if power > 0 else w.build.fdiv(w.like(a, 1.0), result)
 
 
 def _comparison(order: str) -> Callable[..., Vector]:
@@ -331,6 +349,7 @@ def _convert(w: _Writer, eqn: JaxprEqn, a: Vector) -> Vector:
 
 _OF_FLOATS: dict[str, Callable[..., Vector]] = {
     "add": lambda w, eqn, a, b: w.build.fadd(a, b, flags=_FLAGS),
+    "add_any": lambda w, eqn, a, b: w.build.fadd(a, b, flags=_FLAGS),
     "sub": lambda w, eqn, a, b: w.build.fsub(a, b, flags=_FLAGS),
     "mul": lambda w, eqn, a, b: w.build.fmul(a, b, flags=_FLAGS),
     "div": _divide,

@@ -178,6 +178,8 @@ def _residual(experiment: Experiment, start: PlantState, window: Windows) -> Flo
 
 class _Eliminated(NamedTuple):
     start: Array
+    residual: Array
+    """At that start, shape (samples, sides)."""
     basis: Array
 
 
@@ -238,7 +240,7 @@ def _eliminate(experiment: Experiment, window: Windows, passes: int, rest: bool)
     basis, _ = jnp.linalg.qr(found.slope / jnp.where(seen, size, jnp.inf)[None, :])
     # of a column of zeros the decomposition makes any direction
     basis = jnp.where(seen[None, :], basis, 0.0)
-    return _Eliminated(found.start, basis)
+    return _Eliminated(found.start, found.value.reshape(-1, len(experiment.sides)), basis)
 
 
 def _without(basis: Array, values: Array) -> Array:
@@ -257,8 +259,7 @@ def projected_residual(
 
     def one(window: Windows) -> tuple[Array, PlantState]:
         found = _eliminate(experiment, window, passes, rest)
-        start = ravel_pytree(window.start)[1](found.start)
-        return _without(found.basis, _residual(experiment, start, window)), start
+        return _without(found.basis, found.residual), ravel_pytree(window.start)[1](found.start)
 
     return jax.vmap(one, in_axes=(_MAPPED,))(windows)
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from small_study import rigid, small
 
-from jaxbl.discrepancy.complete import Chosen, bucket, candidates, complete, numbers_of
+from jaxbl.discrepancy.complete import bucket, candidates, complete
 from jaxbl.drive.effects import effect_class, effect_kinds
-from jaxbl.drive.parameters import as_arrays, get_leaf, parameters
-from jaxbl.identification.trajectory import free_parameters, with_values
+from jaxbl.drive.parameters import as_arrays, parameters
 from jaxbl.simulate import trajectory
 from jaxbl.study.config import read_config
 from jaxbl.study.engine import prepare
@@ -55,19 +54,6 @@ def test_all_effects_are_there_once(sides):
 def test_every_effect_has_neutral_numbers(name):
     neutral = effect_class(name).neutral
     assert {field.name for field, _ in parameters(effect_kinds()[name](**neutral))} == set(neutral)
-
-
-def test_chosen_numbers_are_set_as_named_ones_are():
-    every = complete(model(2))
-    free = free_parameters(
-        every, ["drive.motor_inertia", "effects.load.constant_torque.torque", "transmission.stiffness"], 1.0
-    )
-    theta = np.array([0.1, -0.3, 0.2])
-    chosen = Chosen.of(every, free)
-    found = chosen.put(every, chosen.padded(theta, 7.0))
-    expected = with_values(every, free, jnp.asarray(theta))
-    for path in numbers_of(every):
-        assert float(get_leaf(found, path)) == pytest.approx(float(get_leaf(expected, path)), rel=1e-15)
 
 
 def test_buckets_are_few_and_large_enough():

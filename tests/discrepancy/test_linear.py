@@ -56,10 +56,9 @@ def linear(tmp_path, sides, change=lambda e: e, theta=0.0, disturbed=0.0):
 def errors(model, forces=None):
     """Prediction errors over the noise, initial states eliminated: constant, own numbers, forces."""
     (signals,) = model.signals
-    width = 0 if forces is None else forces.shape[2]
-    none = np.zeros((signals.count, len(model.sides) + 1, width)) if forces is None else forces
+    none = np.zeros((0, signals.count, len(model.sides) + 1)) if forces is None else forces
     found = np.asarray(module._errors(model.parts[0], model.gain([1e-6] * len(model.sides)), jnp.asarray(none)))
-    found = found[:, :, model._some(width, width)]
+    found = found[:, :, model._some(len(none), len(none))]
     flat = found.reshape(-1, found.shape[2])
     basis = np.linalg.qr(flat[:, -model.states :])[0]
     rest = flat[:, : -model.states]
@@ -110,7 +109,7 @@ def test_a_candidates_torque_does_what_the_effect_does(tmp_path, name):
         return eqx.tree_at(lambda e: e.effects, experiment, (*experiment.effects, effect))
 
     base = linear(tmp_path, 2)
-    torque = base.signals[0].of([effect])[0][:, :, None]
+    torque = base.signals[0].of([effect])[0][None]
     columns = errors(base, torque)
     expected = errors(linear(tmp_path, 2, with_effect))[:, 0] - columns[:, 0]
     found = columns[:, -1]
@@ -130,7 +129,7 @@ def test_numbers_of_waves_are_those_of_the_effect(tmp_path):
             columns = forces_of([one], base.signals[0])
             effect = as_arrays(effect_kinds()[one.name](**one.numbers(values)), float)
             (expected,) = base.signals[0].of([effect])
-            assert size(columns @ np.array(values) - expected) < 0.02 * size(expected)
+            assert size(np.tensordot(values, columns, 1) - expected) < 0.02 * size(expected)
             seen.add(one.name)
     assert seen == set(waves)
 

@@ -1,5 +1,6 @@
 """Refined numbers are those of least prediction errors: against an optimiser that knows nothing of the linearisation."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,9 +10,12 @@ from scipy.optimize import minimize
 from jaxbl.discrepancy.complete import complete
 from jaxbl.discrepancy.explain import paths_of, with_effects
 from jaxbl.discrepancy.linear import Linear
-from jaxbl.discrepancy.polish import _filtered, refined
+from jaxbl.discrepancy.polish import refined
+from jaxbl.drive.plant import PlantState
+from jaxbl.identification.regression import lasting
 from jaxbl.identification.search import smoothed_channels
 from jaxbl.identification.trajectory import free_parameters, with_values
+from jaxbl.simulate import trajectory
 from jaxbl.study.diagnosis import read_task
 from jaxbl.study.logs import default_paths, on_record
 
@@ -36,16 +40,17 @@ def test_prediction_errors_are_least(setting):
     """Of the same predictor, by a search without derivatives that begins elsewhere."""
     experiment, free, width, record, smoothed = setting
     found = refined(experiment, free, np.zeros(len(free)), width, record, smoothed)
-    gain = Linear.gain_of(found.smoothness, record.sample_period)
+    gain = {"motor": Linear.gain_of(found.smoothness, record.sample_period)[0]}
     torque, reading = jnp.asarray(record.torque), jnp.asarray(record.positions["motor"])
-    k1 = float(gain[0, 0])
+
+    @eqx.filter_jit
+    def predicted(given):
+        one = with_values(experiment, free, given[2:] * 0.01)
+        start = PlantState({"motor": given[0]}, {"motor": given[1]}, lasting(one, torque[0]))
+        return trajectory(one, start, torque, 0.0, {"motor": reading}, gain).position["motor"]
 
     def cost(given):
-        one = with_values(experiment, free, jnp.asarray(given[2:] * 0.01))
-        states = _filtered(one, jnp.asarray(given[:2]), torque, jnp.asarray(0.0), {"motor": reading}, gain)
-        # the corrected position leaves a share 1 - k of each prediction error
-        errors = (np.asarray(reading) - np.asarray(states["motor"])[:, 0]) / (1.0 - k1)
-        errors[0] *= 1.0 - k1
+        errors = np.asarray(reading - predicted(jnp.asarray(given)))
         return len(errors) * np.log(np.sum(errors**2)) + np.sum((given[2:] * 0.01 / width) ** 2)
 
     here = np.concatenate([found.start[0], 100.0 * found.theta])

@@ -1,0 +1,227 @@
+"""A plant alone under a recorded input: its path, and the derivatives of its steps, by loops for this machine's processor.
+
+The same as :func:`jaxbl.simulate.trajectory` and `jax.jvp` of :func:`jaxbl.simulate.move` compute, many times as fast: XLA
+starts some twenty kernels for a step of a single plant, and passes what they compute through memory. What the loops cannot
+do (effects that read tables) is left to XLA. In float64, under `jax.enable_x64`.
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbl.drive.plant import PlantState
+from jaxbl.simulate import Experiment, corrected, move, trajectory
+
+from .llvm import Loop, vector_lanes
+from .split import Unsupported, flat
+
+_FLOAT = np.dtype(float)
+_NUMBER = jax.ShapeDtypeStruct((), _FLOAT)
+
+
+class Direction(NamedTuple):
+    """In which a step's derivative is sought.
+
+    Attributes:
+        experiment: change of the experiment's leaves: all leaves floats.
+        state: change of the state's.
+        torque: change of the input, N m.
+    """
+
+    experiment: Experiment
+    state: PlantState
+    torque: float
+
+
+def path(
+    experiment: Experiment,
+    start: PlantState,
+    torque: np.ndarray,
+    time: float = 0.0,
+    measured: dict[str, np.ndarray] | None = None,
+    gain: dict[str, np.ndarray] | None = None,
+) -> PlantState:
+    """The plant's states at the samples, with a leading time axis.
+
+    Args:
+        experiment: with array leaves.
+        start: state at the first sample, scalars.
+        torque: input in N m `(samples,)`, held from each sample to the next.
+        time: time of the first sample in s.
+        measured: positions of each side in rad `(samples,)`, to predict from: each state is then what follows from the
+            samples before.
+        gain: by which a prediction error corrects position (1) and velocity (1/s) of its side `(2,)`; needs `measured`.
+    """
+    plant = _Plant.of(experiment, start)
+    sides = () if gain is None else tuple(sorted(gain))
+    loop = _path_loop(plant, sides)
+    if loop is None:
+        states = _scanned(experiment, *jax.tree.map(jnp.asarray, (start, torque, time, measured, gain)))
+        return jax.tree.map(np.asarray, states)
+    carry = [np.array([leaf], float) for leaf in jax.tree.leaves(start)]
+    fixed = [*plant.numbers(experiment), np.asarray(time, float)]
+    fixed += [np.asarray(value, float) for side in sides for value in (gain or {})[side]]
+    given = torque, *((measured or {})[side] for side in sides)
+    inputs = np.arange(len(torque), dtype=np.int32), *(np.ascontiguousarray(column, float) for column in given)
+    kept = [np.empty(len(torque)) for _ in carry]
+    loop([*carry, *fixed, *inputs, *kept], len(torque), 0, 1)
+    return plant.shape.unflatten(kept)
+
+
+def slopes(
+    experiment: Experiment, states: PlantState, torque: np.ndarray, time: np.ndarray, directions: Sequence[Direction]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of the step that follows each sample, and where it leads.
+
+    Args:
+        experiment: with array leaves.
+        states: at the samples, leaves `(samples,)`.
+        torque: input in N m `(samples,)`.
+        time: s `(samples,)`.
+        directions: of change.
+
+    Returns:
+        Change of the state by a change along each direction `(directions, states, samples)`, in the order of the state's
+        leaves, and the state `(states, samples)`.
+    """
+    plant = _Plant.of(experiment, states)
+    leaves = jax.tree.leaves(states)
+    loop = _slopes_loop(plant)
+    if loop is None:
+        found = [_pushed(experiment, states, jnp.asarray(torque), jnp.asarray(time), one) for one in directions]
+        changes, new = [jax.tree.leaves(change) for change, _ in found], jax.tree.leaves(found[0][1])
+        return np.array(changes, float), np.array(new, float)
+    count = len(torque)
+    whole = -(-count // vector_lanes(_FLOAT)) * vector_lanes(_FLOAT)
+    values = [np.pad(np.asarray(column, float), (0, whole - count), "edge") for column in (*leaves, torque, time)]
+    numbers = plant.numbers(experiment)
+    changes, new = np.empty((len(directions), len(leaves), whole)), np.empty((len(leaves), whole))
+
+    def along(one: Direction, change: np.ndarray) -> None:
+        fixed = [*plant.numbers(one.experiment), *jax.tree.leaves(one.state), one.torque]
+        # all find the same new state
+        loop([*values, *numbers, *(np.asarray(number, float) for number in fixed), *change, *new], 1, 0, whole)
+
+    with ThreadPoolExecutor(len(jax.local_devices(backend="cpu"))) as pool:
+        list(pool.map(along, directions, changes))
+    return changes[:, :, :count], new[:, :count]
+
+
+_scanned = eqx.filter_jit(trajectory)
+
+
+@eqx.filter_jit
+def _pushed(
+    experiment: Experiment, states: PlantState, torque: jax.Array, time: jax.Array, direction: Direction
+) -> tuple[PlantState, PlantState]:
+    def step(state: PlantState, torque: jax.Array, time: jax.Array) -> tuple[PlantState, PlantState]:
+        def moved(experiment: Experiment, state: PlantState, torque: jax.Array) -> PlantState:
+            return move(experiment.plant, experiment.run, state, torque, time)
+
+        given = experiment, state, torque
+        changes = jax.tree.map(lambda one, change: jnp.asarray(change, jnp.result_type(one)), given, tuple(direction))
+        new, change = jax.jvp(moved, given, changes)
+        return change, new
+
+    return jax.vmap(step)(states, torque, time)
+
+
+class _Plant(NamedTuple):
+    """What loops are compiled for: experiments of one structure.
+
+    Attributes:
+        structure: of the experiment.
+        kinds: shapes and types of its leaves.
+        shape: structure of the state.
+    """
+
+    structure: Any
+    kinds: tuple[tuple[tuple[int, ...], str], ...]
+    shape: Any
+
+    @classmethod
+    def of(cls, experiment: Experiment, state: PlantState) -> "_Plant":
+        leaves, structure = jax.tree.flatten(experiment)
+        kinds = tuple((np.shape(leaf), str(jnp.result_type(leaf))) for leaf in leaves)
+        return cls(structure, kinds, jax.tree.structure(state))
+
+    def numbers(self, experiment: Experiment) -> list[np.ndarray]:
+        """Those that a step reads."""
+        leaves = jax.tree.leaves(experiment)
+        return [np.asarray(leaves[i], float) for i in _read(self)]
+
+    def put(self, numbers: Sequence[Any]) -> Experiment:
+        """The experiment with these; what no step reads is zero."""
+        leaves = [jnp.zeros(size, dtype) for size, dtype in self.kinds]
+        for i, number in zip(_read(self), numbers, strict=True):
+            leaves[i] = number
+        return self.structure.unflatten(leaves)
+
+    def step(self, experiment: Experiment, state: Sequence[Any], torque: Any, time: Any) -> list[Any]:
+        new = move(experiment.plant, experiment.run, self.shape.unflatten(state), torque, time)
+        return jax.tree.leaves(new)
+
+
+@lru_cache(maxsize=64)
+def _read(plant: _Plant) -> tuple[int, ...]:
+    """Places of the experiment's leaves that a step reads. Raises `Unsupported` if one of them is no number."""
+
+    def step(leaves: list[Any], state: list[Any], torque: Any, time: Any) -> list[Any]:
+        return plant.step(plant.structure.unflatten(leaves), state, torque, time)
+
+    leaves = [jax.ShapeDtypeStruct(size, dtype) for size, dtype in plant.kinds]
+    closed = flat(step, leaves, [_NUMBER] * plant.shape.num_leaves, _NUMBER, _NUMBER)
+    used = {id(v) for eqn in closed.jaxpr.eqns for v in eqn.invars}
+    read = tuple(i for i, v in enumerate(closed.jaxpr.invars[: len(leaves)]) if id(v) in used)
+    for i in read:
+        if plant.kinds[i] != ((), _FLOAT.name):
+            raise Unsupported(f"steps that read {plant.kinds[i]}")
+    return read
+
+
+@lru_cache(maxsize=64)
+def _path_loop(plant: _Plant, sides: tuple[str, ...]) -> Loop | None:
+    """From state, numbers, first time and gains, and a sample's index, torque and readings."""
+
+    def sample(state: list[Any], numbers: list[Any], first: Any, gains: list[Any], index: Any, inputs: list[Any]) -> Any:
+        experiment = plant.put(numbers)
+        torque, *readings = inputs
+        gain = {side: gains[2 * i : 2 * i + 2] for i, side in enumerate(sides)}
+        seen = corrected(plant.shape.unflatten(state), dict(zip(sides, readings, strict=True)), gain)
+        time = first + index.astype(torque.dtype) * experiment.run.sample_period
+        return plant.step(experiment, jax.tree.leaves(seen), torque, time), state
+
+    count = plant.shape.num_leaves
+    try:
+        fixed = [_NUMBER] * len(_read(plant)), _NUMBER, [_NUMBER] * (2 * len(sides))
+        index, inputs = jax.ShapeDtypeStruct((), np.int32), [_NUMBER] * (1 + len(sides))
+        body = flat(sample, [_NUMBER] * count, *fixed, index, inputs)
+        return Loop(body, None, 0, count, (len(jax.tree.leaves(fixed)), 0), _FLOAT, lanes=1)
+    except Unsupported:
+        return None
+
+
+@lru_cache(maxsize=64)
+def _slopes_loop(plant: _Plant) -> Loop | None:
+    """From state, torque and time of a lane, numbers, and changes of numbers, state and torque."""
+
+    def slope(state: list[Any], torque: Any, time: Any, numbers: list[Any], changes: tuple[Any, ...]) -> Any:
+        def step(numbers: list[Any], state: list[Any], torque: Any) -> list[Any]:
+            return plant.step(plant.put(numbers), state, torque, time)
+
+        new, change = jax.jvp(step, (numbers, state, torque), changes)
+        return change, new
+
+    count = plant.shape.num_leaves
+    try:
+        state, numbers = [_NUMBER] * count, [_NUMBER] * len(_read(plant))
+        body = flat(slope, state, _NUMBER, _NUMBER, numbers, (numbers, state, _NUMBER))
+        return Loop(body, None, count + 2, 0, (2 * len(numbers) + count + 1, 0), _FLOAT)
+    except Unsupported:
+        return None

@@ -1,0 +1,164 @@
+"""Loops for one plant do what the scan and `jax.jvp` do, with all effects."""
+
+import gc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from effect_values import VALUES
+
+from jaxbl.drive import Initial, LinearShaft, Rigid, SigmoidBacklash, TwoInertia, as_arrays, get_leaf, leaf_paths, set_leaves
+from jaxbl.drive.effects import SideEffect, effect_kinds
+from jaxbl.drive.excitation import Sine
+from jaxbl.fused import plant as module
+from jaxbl.fused.plant import Direction, path, slopes
+from jaxbl.simulate import Experiment, Run, move, trajectory
+
+STEPS = 500
+OTHERS = ["transmission.backlash", "motor.stribeck_friction", "load.quadratic_drag"]
+
+
+def experiment(names, rigid=False, substeps=1, extra=()):
+    drive = Rigid(0.02, 0.03) if rigid else TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0)
+    effects = (*(effect_kinds()[name](**VALUES[name]) for name in names), *extra)
+    law = LinearShaft(60.0) if "transmission.backlash" in names else SigmoidBacklash(1.0, 0.02, 20.0)
+    found = Experiment(
+        drive, None if rigid else law, effects, Initial(), Sine(1.0, 1.0), None, None, None, None, Run(1e-3, STEPS, substeps)
+    )
+    return as_arrays(found, np.float64)
+
+
+MODELS = {
+    "all": lambda: experiment([name for name in VALUES if name not in OTHERS], substeps=1),
+    "substeps": lambda: experiment([name for name in VALUES if name not in OTHERS], substeps=5),
+    "others": lambda: experiment(OTHERS),
+    "rigid": lambda: experiment(
+        [name for name in VALUES if not name.startswith(("transmission", "load")) and name not in OTHERS], rigid=True
+    ),
+}
+
+
+def record(one):
+    rng = np.random.default_rng(1)
+    torque = 2.0 + np.cumsum(rng.normal(0.0, 0.1, STEPS))
+    start = eqx.tree_at(lambda s: s.velocity, one.plant.init(one.initial), dict.fromkeys(one.sides, jnp.asarray(0.3)))
+    return start, torque, rng
+
+
+@pytest.fixture(autouse=True)
+def _double():
+    with jax.enable_x64():
+        yield
+
+
+@pytest.mark.parametrize("observed", [False, True])
+@pytest.mark.parametrize("name", MODELS)
+def test_the_path_is_that_of_the_scan(name, observed):
+    one = MODELS[name]()
+    start, torque, rng = record(one)
+    more = {}
+    if observed:
+        measured = {side: 0.05 * np.cumsum(rng.normal(0.0, 0.01, STEPS)) for side in one.sides}
+        more = {"measured": measured, "gain": {side: np.array([0.3, 20.0 + i]) for i, side in enumerate(one.sides)}}
+    expected = eqx.filter_jit(trajectory)(one, start, jnp.asarray(torque), 0.7, **jax.tree.map(jnp.asarray, more))
+    assert module._path_loop(module._Plant.of(one, start), tuple(sorted(more.get("gain", ())))) is not None
+    found = path(one, start, torque, 0.7, **more)
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for have, want in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert have.shape == (STEPS,)
+        assert np.ptp(want) > 0.0
+        assert have == pytest.approx(np.asarray(want), rel=1e-9, abs=1e-10)
+
+
+def directions(one, start):
+    """Each state, the input, each number of the plant."""
+    zero, state = jax.tree.map(lambda _: 0.0, one), jax.tree.map(lambda _: 0.0, start)
+    leaves, shape = jax.tree.flatten(state)
+    found = [Direction(zero, shape.unflatten([float(i == j) for j in range(len(leaves))]), 0.0) for i in range(len(leaves))]
+    found.append(Direction(zero, state, 1.0))
+    numbers = [path for path in leaf_paths(one) if path.split(".")[0] in ("drive", "transmission", "effects")]
+    return found + [Direction(set_leaves(zero, {path: 1.0}), state, 0.0) for path in numbers]
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_slopes_are_those_of_differences(name):
+    """Central ones of the step itself; where a step has a kink between the two, they differ."""
+    one = MODELS[name]()
+    start, torque, _ = record(one)
+    time = 1e-3 * np.arange(STEPS)
+    states = path(one, start, torque)
+    ways = directions(one, start)
+    assert module._slopes_loop(module._Plant.of(one, start)) is not None
+    changes, new = slopes(one, states, torque, time, ways)
+    assert changes.shape == (len(ways), len(jax.tree.leaves(start)), STEPS)
+
+    @jax.jit
+    @jax.vmap
+    def step(leaves, state, torque, time):
+        own = jax.tree.unflatten(jax.tree.structure(one), leaves)
+        return jnp.stack(jax.tree.leaves(move(own.plant, own.run, state, torque, time)))
+
+    def moved(way, by):
+        change = jax.tree.map(lambda x, c: np.broadcast_to(np.asarray(x) + by * c, STEPS), (one, states, torque), tuple(way))
+        return np.asarray(step(jax.tree.leaves(change[0]), change[1], change[2], time)).T
+
+    numbers, felt = jax.tree.leaves((one, states, torque)), 0
+    for way, change in zip(ways, changes, strict=True):
+        # of the number's own size
+        by = 1e-5 * (np.max(np.abs(numbers[jax.tree.leaves(way).index(1.0)])) + 1e-3)
+        expected = (moved(way, by) - moved(way, -by)) / (2.0 * by)
+        error = np.abs(change - expected) / (np.max(np.abs(expected)) + 1e-9)
+        assert np.median(error) < 1e-6
+        assert np.mean(error > 1e-3) < 0.02
+        felt += bool(expected.any())
+    # the saturation is not reached everywhere
+    assert felt >= len(ways) - 1
+    assert new == pytest.approx(moved(ways[0], 0.0), rel=1e-10, abs=1e-12)
+
+
+class _Tabled(SideEffect):
+    kind = "tabled"
+    table: jax.Array
+
+    def resist(self, motion):
+        return self.table[jnp.clip(jnp.floor(motion.time * 100.0).astype(int), 0, len(self.table) - 1)]
+
+
+def test_what_a_loop_cannot_do_is_left_to_the_scan():
+    one = experiment(["motor.viscous_friction"], extra=(_Tabled(side="motor", table=jnp.linspace(0.0, 1.0, 30)),))
+    start, torque, _ = record(one)
+    plant = module._Plant.of(one, start)
+    assert module._path_loop(plant, ()) is None
+    assert module._slopes_loop(plant) is None
+    expected = eqx.filter_jit(trajectory)(one, start, jnp.asarray(torque))
+    found = path(one, start, torque)
+    for side in one.sides:
+        assert found.position[side] == pytest.approx(np.asarray(expected.position[side]), rel=1e-12)
+    way = Direction(jax.tree.map(lambda x: np.zeros(np.shape(x)), one), jax.tree.map(lambda _: 0.0, start), 1.0)
+    changes, new = slopes(one, found, torque, 1e-3 * np.arange(STEPS), [way])
+    assert changes.shape == (1, 4, STEPS)
+    inertia = float(one.drive.motor_inertia)
+    motor = sorted(one.sides).index("motor") + 2
+    assert changes[0, motor] == pytest.approx(1e-3 / inertia, rel=0.05)
+    assert new[motor, :-1] == pytest.approx(found.velocity["motor"][1:], rel=1e-10)
+
+
+def test_other_numbers_need_no_other_loop_and_none_outlives_its_use():
+    one = MODELS["rigid"]()
+    start, torque, _ = record(one)
+    runs = []
+    for inertia in (0.02, 0.04):
+        other = set_leaves(one, {"drive.motor_inertia": jnp.asarray(inertia)})
+        before = module._path_loop.cache_info().misses
+        runs.append(path(other, start, torque).position["motor"])
+    assert module._path_loop.cache_info().misses == before
+    assert np.ptp(runs[0] - runs[1]) > 0.0
+    # made, used and dropped many times in one process
+    for _ in range(5):
+        module._path_loop.cache_clear()
+        gc.collect()
+        assert np.array_equal(path(one, start, torque).position["motor"], runs[0]) == (
+            float(get_leaf(one, "drive.motor_inertia")) == 0.02
+        )
