@@ -166,7 +166,7 @@ def _product(matrix: Array, columns: Array) -> Array:
     """Of small matrices: written out, it takes less time than a call of what is made for large ones."""
     if columns.shape[1] > _MANY:
         return matrix @ columns
-    return sum((matrix[:, k, None] * columns[k] for k in range(len(columns))), jnp.zeros(()))
+    return sum((matrix[:, k, None] * columns[None, k] for k in range(len(columns))), jnp.zeros((1, 1)))
 
 
 def _recursion(part: Part, gains: Array, change: Array, known: Array) -> tuple[Array, Array]:
