@@ -167,6 +167,7 @@ class _Writer:
                 found = self.run(body, [*numbers, *state, *steady, *(scalar(i, index) for i in inputs)])
                 at = build.add(build.mul(index, width), build.sub(lane, first))
                 for i, value in enumerate(found[carry:], end):
+                    value = build.zext(value, self.vector(kinds[i])) if dtypes[i] == _BOOL else value
                     build.store(value, build.gep(arrays[i], [at], source_etype=kinds[i]), align=sizes[i])
                 return found[:carry]
 
@@ -211,6 +212,8 @@ class _Writer:
         """The equations of a jaxpr of scalars."""
         jaxpr = closed.jaxpr
         env: dict[Var, Vector] = dict(zip(jaxpr.invars, arguments, strict=True))
+        if any(map(_shape, jaxpr.constvars)):
+            raise Unsupported("steps that read tables")
         env |= {v: self.number(value, _dtype(v)) for v, value in zip(jaxpr.constvars, closed.consts, strict=True)}
 
         def read(v: Var | Literal) -> Vector:

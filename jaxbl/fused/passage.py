@@ -2,7 +2,6 @@
 
 import abc
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -21,12 +20,12 @@ from jaxbl.simulate import (
     settled,
     simulated,
     time_of,
-    unit_noise,
 )
 
+from .ahead import Ahead, Looped, Scanned, Shared
 from .llvm import Loop, vector_lanes
 from .pallas import LANES, Kernel
-from .split import Kind, carry_kinds, split
+from .split import Kind, Unsupported, carry_kinds, split
 
 
 class Passage(abc.ABC):
@@ -84,22 +83,14 @@ class Passage(abc.ABC):
         self._inner = split(sample, values, carry, given, kinds)
         self._outer = split(settle, values, carry, (), kinds)
 
-        def shared(state: list[Any], seed: Any, first: Any, length: int) -> tuple[list[Any], list[Any], list[Any]]:
-            """What all lanes share: its next state, what follows a block of samples reads, and what each of them reads."""
-            indices = first + jnp.arange(length, dtype=jnp.int32)
-            noise = unit_noise(seed, indices, experiment.sides)
-            state, handed = jax.lax.scan(self._inner.shared, state, (indices, noise))
-            return *self._outer.shared(state, ()), handed
-
         def side_by_side(leaf: Any) -> jax.ShapeDtypeStruct:
             return jax.ShapeDtypeStruct((self._filled,), leaf.dtype)
 
         # compiled now, so that a call only runs
         many = [side_by_side(value) for value in values]
         one = [leaf for leaf, lane in zip(jax.tree.leaves(carry), self._of_lane, strict=True) if not lane]
-        first = jax.ShapeDtypeStruct((), jnp.uint32), jax.ShapeDtypeStruct((), jnp.int32)
         lengths = {min(self._length, self._steps), self._steps % self._length} - {0}
-        self._shared = {n: jax.jit(partial(shared, length=n)).lower(one, *first).compile() for n in lengths}
+        self._ahead = self._compiled_ahead(Shared(self._inner.shared, self._outer.shared, one, experiment.sides), lengths)
         self._start = jax.jit(jax.vmap(start)).lower(many).compile()
         axes = self._tree.unflatten([0 if lane else None for lane in self._of_lane])
         ends = [side_by_side(x) if lane else x for x, lane in zip(jax.tree.leaves(carry), self._of_lane, strict=True)]
@@ -120,9 +111,9 @@ class Passage(abc.ABC):
     def _march(self, given: list[Any], carry: list[Any], state: list[Any], seed: int) -> tuple[list[Any], list[Any]]:
         """Carry of the lanes `(lanes,)` each, and state of what they share, after all samples."""
 
-    def _ahead(self, state: list[Any], seed: int, first: int) -> tuple[list[Any], list[Any], list[Any]]:
-        """What lanes share, over the block of samples that begins at `first`."""
-        return self._shared[min(self._length, self._steps - first)](state, np.uint32(seed), np.int32(first))
+    def _compiled_ahead(self, shared: Shared, lengths: set[int]) -> Ahead:
+        """What runs ahead of the lanes, for blocks of these lengths."""
+        return Scanned(shared, lengths)
 
 
 class HostPassage(Passage):
@@ -139,11 +130,17 @@ class HostPassage(Passage):
         counts = len(inner.fixed), len(outer.fixed)
         self._loop = Loop(inner.lane, outer.lane, len(paths), self.carried, counts, self._dtype)
 
+    def _compiled_ahead(self, shared, lengths):
+        try:
+            return Looped(shared, lengths)
+        except Unsupported:
+            return super()._compiled_ahead(shared, lengths)
+
     def _march(self, given, carry, state, seed):
         carry = [np.array(leaf, order="C") for leaf in carry]
         blocks = len(given[0]) // self._together
         edges = [blocks * i // self._threads * self._together for i in range(self._threads + 1)]
-        ahead = self._ahead(state, seed, 0)
+        ahead = self._ahead(state, seed, 0, min(self._length, self._steps))
         with ThreadPoolExecutor(self._threads) as pool:
             for first in range(0, self._steps, self._length):
                 state, last, handed = ahead
@@ -152,8 +149,8 @@ class HostPassage(Passage):
                 length = min(self._length, self._steps - first)
                 running = [pool.submit(self._loop, arrays, length, *pair) for pair in pairwise(edges)]
                 # what lanes share of the next samples is computed meanwhile
-                if first + length < self._steps:
-                    ahead = self._ahead(state, seed, first + length)
+                if rest := self._steps - first - length:
+                    ahead = self._ahead(state, seed, first + length, min(self._length, rest))
                 for one in running:
                     one.result()
         return carry, state
@@ -180,7 +177,7 @@ class DevicePassage(Passage):
         blocks, rest = divmod(self._steps, self._length)
         state, parts = [np.asarray(leaf) for leaf in state], []
         for first in range(0, self._steps, self._length):
-            state, *part = self._ahead(state, seed, first)
+            state, *part = self._ahead(state, seed, first, min(self._length, self._steps - first))
             parts.append(part)
         fixed = self._inner.fixed, self._outer.fixed
         for some in (parts[:blocks], parts[blocks:] if rest else []):

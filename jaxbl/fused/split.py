@@ -123,6 +123,58 @@ def split(function: Callable[..., Any], values: Any, carry: Any, given: Any, kin
     return Parts(jax.jit(once)(), shared, jax.make_jaxpr(lane)(*examples))
 
 
+class Recursion(NamedTuple):
+    """A function `f(state, given) -> (state, handed)` of one sample in two parts.
+
+    Attributes:
+        direct: what is handed over of `given` alone, by place; the rest needs the state.
+        ahead: from `given` to the former, and to what `step` reads of it.
+        step: state, `fixed`, what `ahead` hands it -> state, and the rest of what is handed over.
+        fixed: arrays that `step` reads and that never change.
+    """
+
+    direct: list[bool]
+    ahead: Callable[[Any], tuple[list[Any], list[Any]]]
+    step: ClosedJaxpr
+    fixed: list[jax.Array]
+
+
+def recursion(function: Callable[..., tuple[list[Any], list[Any]]], state: Sequence[Any], given: Any) -> Recursion:
+    """What needs the state of the sample before, and what may be computed for all samples at once.
+
+    Raises:
+        Unsupported: what needs the state reads something that is no number.
+    """
+    count = len(state)
+    jaxpr = flat(function, list(state), given).jaxpr
+    known = _kinds(jaxpr, [Kind.LANE] * count + [Kind.SHARED] * (len(jaxpr.invars) - count))
+    direct = [not _kind(known, out) & Kind.LANE for out in jaxpr.outvars[count:]]
+    kinds = [Kind.LANE] * count + [Kind.SHARED if one else Kind.LANE for one in direct]
+
+    def joined(values: Any, carry: list[Any], given: Any) -> list[Any]:
+        new, handed = function(carry[:count], given)
+        return [*new, *handed]
+
+    # what is handed over stands among the carry, which nothing reads it from
+    spare = [jax.ShapeDtypeStruct(out.aval.shape, out.aval.dtype) for out in jaxpr.outvars[count:]]
+    parts = split(joined, [], [*state, *spare], given, kinds)
+    unread = [jnp.zeros(one.shape, one.dtype) for one, alone in zip(spare, direct, strict=True) if not alone]
+
+    def step(state: list[Any], fixed: list[Any], read: list[Any]) -> list[Any]:
+        env = dict(zip(parts.lane.jaxpr.invars, [*state, *unread, *fixed, *read], strict=True))
+        _run(parts.lane.jaxpr.eqns, env)
+        return [_read(env, out) for out in parts.lane.jaxpr.outvars]
+
+    read = parts.lane.jaxpr.invars[count + len(unread) + len(parts.fixed) :]
+    examples = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in read]
+    return Recursion(
+        direct,
+        lambda given: parts.shared([None] * sum(direct), given),
+        flat(step, list(state), parts.fixed, examples),
+        parts.fixed,
+    )
+
+
 def flat(function: Callable[..., Any], *examples: Any) -> ClosedJaxpr:
     """Trace a function of pytrees, without calls inside."""
     return substituted(jax.make_jaxpr(function)(*examples), {})

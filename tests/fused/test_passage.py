@@ -11,6 +11,7 @@ from jaxbl.drive.effects import effect_kinds
 from jaxbl.drive.excitation import Chirp, Sine
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.drive.transmission import DeadZone
+from jaxbl.fused.ahead import Looped
 from jaxbl.fused.passage import DevicePassage, HostPassage
 from jaxbl.fused.split import Unsupported
 from jaxbl.observer import OBSERVERS, EquivalentControl, Identifier, Observers
@@ -80,6 +81,9 @@ def test_what_no_axis_touches_is_computed_once():
     passage = HostPassage(whole, (METRICS,), ("observer.motor.alpha",), 9, 1)
     varied = HostPassage(whole, (METRICS,), ("transmission.half_gap",), 9, 1)
     assert passage.carried < varied.carried
+    # the plant's states are stepped by a loop of scalars, ahead of the lanes
+    assert isinstance(passage._ahead, Looped)
+    assert passage._ahead._loop is not None
     fused, scanned = both(whole, ["observer.motor.alpha", "observer.motor.lambda"], (METRICS,))
     for name, figure in fused.items():
         np.testing.assert_allclose(figure, scanned[name], rtol=1e-9, err_msg=name)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbl.fused.split import Kind, carry_kinds, split
+from jaxbl.fused.split import Kind, carry_kinds, recursion, split
 
 
 def begin(values):
@@ -50,3 +50,28 @@ def test_parts_make_the_whole(parts):
 def test_the_lanes_part_leaves_the_shared_work_to_the_other(parts):
     names = {eqn.primitive.name for eqn in parts[1].lane.jaxpr.eqns}
     assert "tanh" not in names
+
+
+def test_a_recursion_leaves_what_needs_no_state_to_be_done_at_once():
+    table = jnp.linspace(-1.0, 1.0, 7)
+
+    def sample(state, given):
+        index, noise = given
+        driving = jnp.sin(0.3 * index) + table[index % 7]
+        speed = state[0] + 0.1 * (driving - jnp.tanh(state[1]) + noise)
+        return [speed, state[1] + 0.1 * speed], [driving, state[1], index > 3, speed > 0.0]
+
+    state = [jnp.asarray(0.2), jnp.asarray(-0.1)]
+    given = jnp.arange(9), jnp.linspace(-0.5, 0.5, 9)
+    parts = recursion(sample, state, jax.tree.map(lambda x: x[0], given))
+    assert parts.direct == [True, False, True, False]
+    # neither the table nor a sine is left to the loop
+    assert not {eqn.primitive.name for eqn in parts.step.jaxpr.eqns} & {"sin", "gather", "rem"}
+    direct, read = jax.vmap(parts.ahead)(given)
+    last, handed = jax.lax.scan(sample, state, given)
+    for i in range(9):
+        new = jax.core.eval_jaxpr(parts.step.jaxpr, parts.step.consts, *state, *parts.fixed, *(one[i] for one in read))
+        state, ways = new[:2], {True: iter(one[i] for one in direct), False: iter(new[2:])}
+        for alone, whole in zip(parts.direct, handed, strict=True):
+            np.testing.assert_allclose(next(ways[alone]), whole[i], rtol=1e-6)
+    np.testing.assert_allclose(state, last, rtol=1e-6)

@@ -1,0 +1,70 @@
+"""What lanes share is the same by the loop of scalars and by XLA's scan, block after block."""
+
+import jax
+import numpy as np
+import pytest
+
+from jaxbl.drive import Encoders, Initial, LinearShaft, TwoInertia, as_arrays
+from jaxbl.drive.excitation import Multisine, Sine
+from jaxbl.fused import passage as module
+from jaxbl.fused.ahead import Looped, Scanned
+from jaxbl.fused.passage import HostPassage
+from jaxbl.observer import EquivalentControl, ImplicitSuperTwisting, Observers
+from jaxbl.simulate import Experiment, Run
+from jaxbl.study.metrics import METRICS
+
+
+def experiment(excitation, dtype):
+    whole = Experiment(
+        drive=TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0),
+        transmission=LinearShaft(60.0),
+        effects=(),
+        initial=Initial(),
+        excitation=excitation,
+        encoders=Encoders(1e-4),
+        observer=Observers(ImplicitSuperTwisting(10.0, 90.0), ImplicitSuperTwisting(2.5, 8.2)),
+        equivalent_control=EquivalentControl(0.01),
+        identifier=None,
+        run=Run(1e-3, 600, 2),
+    )
+    return as_arrays(whole, dtype)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize(
+    ("excitation", "path", "states"),
+    [
+        (Sine(5.0, 0.8), "observer.motor.alpha", True),
+        (Multisine(5.0, 0.8, 6), "observer.motor.alpha", True),
+        (Multisine(5.0, 0.8, 6), "drive.motor_inertia", False),
+    ],
+    ids=["shared plant", "tables", "plants of their own"],
+)
+def test_the_loop_does_what_the_scan_does(monkeypatch, precision, excitation, path, states):
+    made = []
+
+    class Noted(Looped):
+        def __init__(self, shared, lengths):
+            super().__init__(shared, lengths)
+            made.append((self, Scanned(shared, lengths), shared))
+
+    monkeypatch.setattr(module, "Looped", Noted)
+    with jax.enable_x64(precision == "float64"):
+        length = HostPassage(experiment(excitation, precision), (METRICS,), (path,), 16, 1)._length
+        ((looped, scanned, shared),) = made
+        assert (looped._loop is not None) >= states
+        # the plant's four states are not carried by each lane
+        assert (len(shared.state) >= 4) == states
+        ours = theirs = [np.zeros((), leaf.dtype) for leaf in shared.state]
+        for first in range(0, 600, length):
+            ours, last, handed = looped(ours, 3, first, length)
+            theirs, *others = scanned(theirs, 3, first, length)
+            for found, expected in zip((ours, last, handed), (theirs, *others), strict=True):
+                for one, other in zip(found, expected, strict=True):
+                    assert np.asarray(one).dtype == other.dtype
+                    # rounding, which a stiff shaft amplifies
+                    tolerance = 1e-9 if precision == "float64" else 1e-2
+                    size = np.max(np.abs(np.asarray(other, float))) + 1e-30
+                    np.testing.assert_allclose(one, other, rtol=tolerance, atol=tolerance * size)
+        assert len(handed) > 0
+        assert any(np.ptp(np.asarray(one, float)) > 0.0 for one in handed)
