@@ -15,6 +15,7 @@ Automatica 24 (1988), for the local approach.
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -63,8 +64,7 @@ def linearise(
     """
     assert record.torque is not None
     sides = experiment.sides
-    # which the derivatives by a torque on each side are those of
-    added = tuple(ConstantTorque(side=side, torque=jnp.zeros(())) for side in sides)  # type: ignore[arg-type]
+    added = tuple(_AddedTorque(side=side, torque=jnp.zeros(())) for side in sides)  # type: ignore[arg-type]
     extended = eqx.tree_at(lambda e: e.effects, experiment, (*experiment.effects, *added))
     parts = []
     for i, rows in enumerate(record.segments):
@@ -73,6 +73,12 @@ def linearise(
         readings = {side: record.positions[side][rows] for side in sides}
         parts.append(_part(extended, free, theta, time, record.torque[rows], readings, one))
     return parts
+
+
+class _AddedTorque(ConstantTorque):
+    """By which the derivatives by a torque on a side are found; a name of its own, beside what the model has."""
+
+    kind: ClassVar[str] = "added_torque"
 
 
 def _part(
