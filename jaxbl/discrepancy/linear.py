@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 from jaxbl.drive.effects import ConstantTorque
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
-from jaxbl.fused.plant import Direction, slopes
+from jaxbl.fused.single_plant import Direction, slopes
 from jaxbl.identification.prediction import kalman_gain
 from jaxbl.identification.regression import lasting_path
 from jaxbl.identification.smoother import Smoothed

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.drive.plant import PlantState
-from jaxbl.fused.plant import path
+from jaxbl.fused.single_plant import path
 from jaxbl.identification.intervals import spread
 from jaxbl.identification.regression import lasting
 from jaxbl.identification.smoother import Smoothed

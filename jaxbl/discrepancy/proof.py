@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from jaxbl.drive.effects import SideEffect
 from jaxbl.drive.parameters import Scalar
 from jaxbl.drive.plant import PlantState
-from jaxbl.fused.plant import path
+from jaxbl.fused.single_plant import path
 from jaxbl.identification.regression import Kinematics
 from jaxbl.identification.search import Channels, windows_of
 from jaxbl.identification.trajectory import Windows, projected_residual

@@ -12,8 +12,8 @@ from effect_values import VALUES
 from jaxbl.drive import Initial, LinearShaft, Rigid, SigmoidBacklash, TwoInertia, as_arrays, get_leaf, leaf_paths, set_leaves
 from jaxbl.drive.effects import SideEffect, effect_kinds
 from jaxbl.drive.excitation import Sine
-from jaxbl.fused import plant as module
-from jaxbl.fused.plant import Direction, path, slopes
+from jaxbl.fused import single_plant as module
+from jaxbl.fused.single_plant import Direction, path, slopes
 from jaxbl.simulate import Experiment, Run, move, trajectory
 
 STEPS = 500
