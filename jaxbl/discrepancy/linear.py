@@ -113,10 +113,12 @@ def _part(
     slope, value = slopes(experiment, motion, torque, time, _directions(experiment, free, theta, motion, order))
     slope, value = slope[:, order].transpose(2, 1, 0), value[order].T
     vectors = np.stack(jax.tree.leaves(motion), axis=1)[:, order]
-    modelled = {side: (value[:, each + i] - vectors[:, each + i]) / period for i, side in enumerate(sides)}
     defect = np.zeros_like(value)
-    # nothing happens from the last reading on
-    defect[: count - 1] = value[: count - 1] - vectors[1:count]
+    # a path along which a model diverges has nothing finite
+    with np.errstate(invalid="ignore", over="ignore"):
+        modelled = {side: (value[:, each + i] - vectors[:, each + i]) / period for i, side in enumerate(sides)}
+        # nothing happens from the last reading on
+        defect[: count - 1] = value[: count - 1] - vectors[1:count]
     a, b, own = np.split(slope, (len(order), len(order) + each + 1), axis=2)
     own = np.concatenate([own, np.zeros((*own.shape[:2], -len(free) % _NUMBERS))], axis=2)
     weight = (np.arange(size) < count).astype(float)

@@ -112,10 +112,12 @@ class _Refiner:
             states = path(experiment, begun, torque, first, readings, gains)
             for side in sides:
                 own = self.smoothed[side][i]
-                error = readings[side] - states.position[side]
-                # the first state is that of the predictor before it has seen anything
-                error[0] = 0.0
-                seen = np.stack([states.position[side], states.velocity[side]], axis=1) + error[:, None] * gains[side]
+                # of numbers under which the predictor diverges nothing finite is left
+                with np.errstate(invalid="ignore", over="ignore"):
+                    error = readings[side] - states.position[side]
+                    # the first state is that of the predictor before it has seen anything
+                    error[0] = 0.0
+                    seen = np.stack([states.position[side], states.velocity[side]], axis=1) + error[:, None] * gains[side]
                 state = np.concatenate([seen, np.asarray(own.state)[:, 2:]], axis=1)
                 found[side].append(own._replace(state=state))  # type: ignore[arg-type]
         return found

@@ -256,8 +256,10 @@ def _growth(experiment: Experiment, windows: Windows, deviation: dict[str, float
     moved = {side: value + step * deviation[side] for side, value in start.velocity.items()}
     begun = start, PlantState(start.position, moved, start.effects)
     one, other = (_run(experiment, windows, state).position for state in begun)
-    change = {side: _rms([np.asarray(other[side] - one[side])]) / step for side in experiment.sides}
-    return float(np.max([change[side] / np.std(windows.measured[side][0]) for side in experiment.sides]))
+    # of what diverges, or of a side that never moved, nothing can be foretold
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        change = {side: _rms([np.asarray(other[side] - one[side])]) / step for side in experiment.sides}
+        return float(np.max([change[side] / np.std(windows.measured[side][0]) for side in experiment.sides]))
 
 
 def _rms(pieces: Sequence[np.ndarray]) -> float:

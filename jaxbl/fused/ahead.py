@@ -11,7 +11,7 @@ import numpy as np
 from jaxbl.simulate import unit_noise
 
 from .llvm import Loop
-from .split import recursion
+from .split import Unsupported, recursion
 
 Block = tuple[list[Any], list[Any], list[Any]]
 """Next state of what lanes share, what follows a block of samples reads of it, and what each sample does."""
@@ -85,3 +85,11 @@ class Looped:
         direct, rest = iter(direct), iter(kept)
         handed = [next(direct) if alone else next(rest) for alone in self._direct]
         return *self._outer([leaf[0] for leaf in carry]), handed
+
+
+def ahead_of_lanes(shared: Shared, lengths: set[int]) -> Ahead:
+    """For blocks of these lengths, by the loop if there can be one."""
+    try:
+        return Looped(shared, lengths)
+    except Unsupported:
+        return Scanned(shared, lengths)

@@ -22,10 +22,10 @@ from jaxbl.simulate import (
     time_of,
 )
 
-from .ahead import Ahead, Looped, Scanned, Shared
+from .ahead import Shared, ahead_of_lanes
 from .llvm import Loop, vector_lanes
 from .pallas import LANES, Kernel
-from .split import Kind, Unsupported, carry_kinds, split
+from .split import Kind, carry_kinds, split
 
 
 class Passage(abc.ABC):
@@ -90,7 +90,7 @@ class Passage(abc.ABC):
         many = [side_by_side(value) for value in values]
         one = [leaf for leaf, lane in zip(jax.tree.leaves(carry), self._of_lane, strict=True) if not lane]
         lengths = {min(self._length, self._steps), self._steps % self._length} - {0}
-        self._ahead = self._compiled_ahead(Shared(self._inner.shared, self._outer.shared, one, experiment.sides), lengths)
+        self._ahead = ahead_of_lanes(Shared(self._inner.shared, self._outer.shared, one, experiment.sides), lengths)
         self._start = jax.jit(jax.vmap(start)).lower(many).compile()
         axes = self._tree.unflatten([0 if lane else None for lane in self._of_lane])
         ends = [side_by_side(x) if lane else x for x, lane in zip(jax.tree.leaves(carry), self._of_lane, strict=True)]
@@ -111,10 +111,6 @@ class Passage(abc.ABC):
     def _march(self, given: list[Any], carry: list[Any], state: list[Any], seed: int) -> tuple[list[Any], list[Any]]:
         """Carry of the lanes `(lanes,)` each, and state of what they share, after all samples."""
 
-    def _compiled_ahead(self, shared: Shared, lengths: set[int]) -> Ahead:
-        """What runs ahead of the lanes, for blocks of these lengths."""
-        return Scanned(shared, lengths)
-
 
 class HostPassage(Passage):
     """By code for this machine's processor; threads share the lanes."""
@@ -129,12 +125,6 @@ class HostPassage(Passage):
         self._fixed = [np.asarray(value) for value in inner.fixed], [np.asarray(value) for value in outer.fixed]
         counts = len(inner.fixed), len(outer.fixed)
         self._loop = Loop(inner.lane, outer.lane, len(paths), self.carried, counts, self._dtype)
-
-    def _compiled_ahead(self, shared, lengths):
-        try:
-            return Looped(shared, lengths)
-        except Unsupported:
-            return super()._compiled_ahead(shared, lengths)
 
     def _march(self, given, carry, state, seed):
         carry = [np.array(leaf, order="C") for leaf in carry]

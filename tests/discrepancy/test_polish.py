@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from jaxbl.discrepancy.complete import complete
 from jaxbl.discrepancy.explain import paths_of, with_effects
 from jaxbl.discrepancy.linear import Linear
-from jaxbl.discrepancy.polish import refined
+from jaxbl.discrepancy.polish import _Refiner, refined
 from jaxbl.drive.plant import PlantState
 from jaxbl.identification.regression import lasting
 from jaxbl.identification.search import smoothed_channels
@@ -81,3 +81,14 @@ def test_deviations_are_those_of_repetitions(tmp_path):
     errors = np.array(values) / np.array(stated)
     assert 0.6 < np.sqrt(np.mean(errors**2)) < 1.5
     assert np.max(np.abs(errors)) < 3.5
+
+
+def test_numbers_under_which_the_predictor_diverges_are_not_taken(setting):
+    """Without a word: what is not finite has no likelihood."""
+    experiment, free, width, record, smoothed = setting
+    wild = with_effects(experiment, {"motor.viscous_friction": {"viscous": -5.0}})
+    refiner = _Refiner(wild, free, width, record, smoothed)
+    theta = np.zeros(len(free))
+    path = refiner._path(theta, refiner.start(), [1e-11])
+    assert not np.isfinite(path["motor"][0].state[:, :2]).all()
+    assert refiner.at(theta, refiner.start(), [1e-11]).cost == np.inf

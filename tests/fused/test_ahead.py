@@ -6,7 +6,7 @@ import pytest
 
 from jaxbl.drive import Encoders, Initial, LinearShaft, TwoInertia, as_arrays
 from jaxbl.drive.excitation import Multisine, Sine
-from jaxbl.fused import passage as module
+from jaxbl.fused import ahead as module
 from jaxbl.fused.ahead import Looped, Scanned
 from jaxbl.fused.passage import HostPassage
 from jaxbl.observer import EquivalentControl, ImplicitSuperTwisting, Observers
