@@ -120,6 +120,7 @@ class HostPassage(Passage):
     ):
         dtype = np.dtype(jnp.result_type(experiment.run.sample_period))
         self._together, self._threads = vector_lanes(dtype), threads
+        self._pool = ThreadPoolExecutor(threads)
         super().__init__(experiment, reducers, paths, lanes, self._together)
         inner, outer = self._inner, self._outer
         self._fixed = [np.asarray(value) for value in inner.fixed], [np.asarray(value) for value in outer.fixed]
@@ -131,18 +132,17 @@ class HostPassage(Passage):
         blocks = len(given[0]) // self._together
         edges = [blocks * i // self._threads * self._together for i in range(self._threads + 1)]
         ahead = self._ahead(state, seed, 0, min(self._length, self._steps))
-        with ThreadPoolExecutor(self._threads) as pool:
-            for first in range(0, self._steps, self._length):
-                state, last, handed = ahead
-                last, handed = [np.asarray(x) for x in last], [np.asarray(x) for x in handed]
-                arrays = [*given, *carry, *self._fixed[0], *handed, *self._fixed[1], *last]
-                length = min(self._length, self._steps - first)
-                running = [pool.submit(self._loop, arrays, length, *pair) for pair in pairwise(edges)]
-                # what lanes share of the next samples is computed meanwhile
-                if rest := self._steps - first - length:
-                    ahead = self._ahead(state, seed, first + length, min(self._length, rest))
-                for one in running:
-                    one.result()
+        for first in range(0, self._steps, self._length):
+            state, last, handed = ahead
+            last, handed = [np.asarray(x) for x in last], [np.asarray(x) for x in handed]
+            arrays = [*given, *carry, *self._fixed[0], *handed, *self._fixed[1], *last]
+            length = min(self._length, self._steps - first)
+            running = [self._pool.submit(self._loop, arrays, length, *pair) for pair in pairwise(edges)]
+            # what lanes share of the next samples is computed meanwhile
+            if rest := self._steps - first - length:
+                ahead = self._ahead(state, seed, first + length, min(self._length, rest))
+            for one in running:
+                one.result()
         return carry, state
 
 
