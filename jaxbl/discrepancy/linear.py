@@ -41,7 +41,7 @@ from .complete import bucket
 from .evidence import Columns
 from .part import Part
 
-SAMPLES, _BLOCK, _NUMBERS = 1024, 128, 4
+_SAMPLES, _BLOCK, _NUMBERS = 1024, 128, 4
 """Least padded length of a part, so that records of about one length share their compiled programs; a block of it; multiple
 to which the number of free numbers is padded."""
 
@@ -91,7 +91,7 @@ def _part(
     smoothed: dict[str, Smoothed],
 ) -> Part:
     count = len(time)
-    size = bucket(count, SAMPLES)
+    size = bucket(count, _SAMPLES)
 
     def padded(values: np.ndarray) -> np.ndarray:
         return np.concatenate([values, np.repeat(values[-1:], size - count, axis=0)])
@@ -140,12 +140,12 @@ def _directions(
         return Direction(structure.unflatten(list(numbers)), shape.unflatten(states), torque)
 
     added = places.effects[-len(experiment.sides) :]
-    slopes = [(get_leaf(places, one.path), float(one.slope(at))) for one, at in zip(free, theta, strict=True)]
+    numbers = [(get_leaf(places, one.path), float(one.slope(at))) for one, at in zip(free, theta, strict=True)]
     return [
         *(direction(state=i) for i in order),
         *(direction((one.torque, -1.0)) for one in added),
         direction(torque=1.0),
-        *(direction(one) for one in slopes),
+        *(direction(one) for one in numbers),
     ]
 
 

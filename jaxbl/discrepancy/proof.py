@@ -138,18 +138,20 @@ class Ground:
         spare = max(longest.bit_length() - 4, 0)
         windows, firsts = windows_of(self.record, self.channels, experiment, longest >> spare << spare, self.rest)
         windows, firsts = windows.only(np.arange(1)).padded(1), firsts[:1]
-        errors = self._errors(experiment, windows, firsts, 3)
+        errors = self._errors(experiment, windows, firsts, 3, alone=True)
         first = np.flatnonzero([part.start == firsts[0] for part in self.record.segments])[0]
         deviation = {
             side: float(np.median(np.asarray(pieces[first].deviation(1)))) for side, pieces in self.channels.smoothed.items()
         }
         return errors, _growth(experiment, windows, deviation)
 
-    def _errors(self, experiment: Experiment, windows: Windows, firsts: np.ndarray, passes: int) -> dict[str, float]:
+    def _errors(
+        self, experiment: Experiment, windows: Windows, firsts: np.ndarray, passes: int, *, alone: bool = False
+    ) -> dict[str, float]:
         rows = firsts[:, None] + np.arange(windows.torque.shape[1])[None, :]
         residual, start = _foretold(experiment, windows, passes, self.rest)
         residual = np.asarray(residual)[: len(firsts)]
-        if len(firsts) == 1:
+        if alone:
             velocity = {side: one[None] for side, one in _run(experiment, windows, start).velocity.items()}
         else:
             velocity = {

@@ -29,7 +29,7 @@ class Direction(NamedTuple):
     """In which a step's derivative is sought.
 
     Attributes:
-        experiment: change of the experiment's leaves: all leaves floats.
+        experiment: change of the experiment's leaves, floats.
         state: change of the state's.
         torque: change of the input, N m.
     """
@@ -68,6 +68,7 @@ def path(
     fixed = [*plant.numbers(experiment), np.asarray(time, float)]
     fixed += [np.asarray(value, float) for side in sides for value in (gain or {})[side]]
     given = torque, *((measured or {})[side] for side in sides)
+    _check(given)
     inputs = np.arange(len(torque), dtype=np.int32), *(np.ascontiguousarray(column, float) for column in given)
     kept = [np.empty(len(torque)) for _ in carry]
     loop([*carry, *fixed, *inputs, *kept], len(torque), 0, 1)
@@ -94,9 +95,12 @@ def slopes(
     leaves = jax.tree.leaves(states)
     loop = _slopes_loop(plant)
     if loop is None:
-        found = [_pushed(experiment, states, jnp.asarray(torque), jnp.asarray(time), one) for one in directions]
+        # numbers as arrays: one program for all directions
+        changes = [jax.tree.map(lambda x: jnp.asarray(x, float), one) for one in directions]
+        found = [_pushed(experiment, states, jnp.asarray(torque), jnp.asarray(time), one) for one in changes]
         changes, new = [jax.tree.leaves(change) for change, _ in found], jax.tree.leaves(found[0][1])
         return np.array(changes, float), np.array(new, float)
+    _check((torque, time, *leaves))
     count = len(torque)
     whole = -(-count // vector_lanes(_FLOAT)) * vector_lanes(_FLOAT)
     values = [np.pad(np.asarray(column, float), (0, whole - count), "edge") for column in (*leaves, torque, time)]
@@ -108,9 +112,15 @@ def slopes(
         # all find the same new state
         loop([*values, *numbers, *(np.asarray(number, float) for number in fixed), *change, *new], 1, 0, whole)
 
-    with ThreadPoolExecutor(len(jax.local_devices(backend="cpu"))) as pool:
+    with ThreadPoolExecutor(len(jax.local_devices())) as pool:
         list(pool.map(along, directions, changes))
     return changes[:, :, :count], new[:, :count]
+
+
+def _check(columns: Sequence[np.ndarray]) -> None:
+    """What is passed by address must be as long as the loop takes it to be."""
+    if len({np.shape(column) for column in columns}) > 1:
+        raise ValueError(f"columns of one length are needed, not of {[len(column) for column in columns]}")
 
 
 _scanned = eqx.filter_jit(trajectory)
@@ -125,7 +135,9 @@ def _pushed(
             return move(experiment.plant, experiment.run, state, torque, time)
 
         given = experiment, state, torque
-        changes = jax.tree.map(lambda one, change: jnp.asarray(change, jnp.result_type(one)), given, tuple(direction))
+        changes = jax.tree.map(
+            lambda one, change: jnp.broadcast_to(change, one.shape).astype(one.dtype), given, tuple(direction)
+        )
         new, change = jax.jvp(moved, given, changes)
         return change, new
 
@@ -158,7 +170,8 @@ class _Plant(NamedTuple):
 
     def put(self, numbers: Sequence[Any]) -> Experiment:
         """The experiment with these; what no step reads is zero."""
-        leaves = [jnp.zeros(size, dtype) for size, dtype in self.kinds]
+        # of NumPy, so that they leave no trace
+        leaves: list[Any] = [np.zeros(size, dtype) for size, dtype in self.kinds]
         for i, number in zip(_read(self), numbers, strict=True):
             leaves[i] = number
         return self.structure.unflatten(leaves)
@@ -177,7 +190,7 @@ def _read(plant: _Plant) -> tuple[int, ...]:
 
     leaves = [jax.ShapeDtypeStruct(size, dtype) for size, dtype in plant.kinds]
     closed = flat(step, leaves, [_NUMBER] * plant.shape.num_leaves, _NUMBER, _NUMBER)
-    used = {id(v) for eqn in closed.jaxpr.eqns for v in eqn.invars}
+    used = {id(v) for eqn in closed.jaxpr.eqns for v in eqn.invars} | {id(v) for v in closed.jaxpr.outvars}
     read = tuple(i for i, v in enumerate(closed.jaxpr.invars[: len(leaves)]) if id(v) in used)
     for i in read:
         if plant.kinds[i] != ((), _FLOAT.name):

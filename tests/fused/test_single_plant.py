@@ -11,7 +11,7 @@ from effect_values import VALUES
 
 from jaxbl.drive import Initial, LinearShaft, Rigid, SigmoidBacklash, TwoInertia, as_arrays, get_leaf, leaf_paths, set_leaves
 from jaxbl.drive.effects import SideEffect, effect_kinds
-from jaxbl.drive.excitation import Sine
+from jaxbl.drive.excitation import Recorded, Sine
 from jaxbl.fused import single_plant as module
 from jaxbl.fused.single_plant import Direction, path, slopes
 from jaxbl.simulate import Experiment, Run, move, trajectory
@@ -136,13 +136,39 @@ def test_what_a_loop_cannot_do_is_left_to_the_scan():
     found = path(one, start, torque)
     for side in one.sides:
         assert found.position[side] == pytest.approx(np.asarray(expected.position[side]), rel=1e-12)
-    way = Direction(jax.tree.map(lambda x: np.zeros(np.shape(x)), one), jax.tree.map(lambda _: 0.0, start), 1.0)
+    way = Direction(jax.tree.map(lambda _: 0.0, one), jax.tree.map(lambda _: 0.0, start), 1.0)
     changes, new = slopes(one, found, torque, 1e-3 * np.arange(STEPS), [way])
     assert changes.shape == (1, 4, STEPS)
     inertia = float(one.drive.motor_inertia)
     motor = sorted(one.sides).index("motor") + 2
     assert changes[0, motor] == pytest.approx(1e-3 / inertia, rel=0.05)
     assert new[motor, :-1] == pytest.approx(found.velocity["motor"][1:], rel=1e-10)
+
+
+def test_tables_that_no_step_reads_are_no_obstacle():
+    """A recorded excitation is part of the experiment, and the input is given."""
+    one = experiment(["motor.viscous_friction"])
+    start, torque, _ = record(one)
+    recorded = as_arrays(Recorded(np.arange(3.0), np.arange(3.0)), np.float64)
+    other = eqx.tree_at(lambda e: e.excitation, one, recorded)
+    assert module._path_loop(module._Plant.of(other, start), ()) is not None
+    assert module._slopes_loop(module._Plant.of(other, start)) is not None
+    expected, found = path(one, start, torque), path(other, start, torque)
+    assert np.array_equal(found.position["motor"], expected.position["motor"])
+    ways = [directions(e, start)[:6] for e in (one, other)]
+    both = [slopes(e, expected, torque, 1e-3 * np.arange(STEPS), way)[0] for e, way in zip((one, other), ways, strict=True)]
+    assert np.array_equal(*both)
+
+
+def test_columns_of_other_lengths_are_refused():
+    one = experiment([])
+    start, torque, _ = record(one)
+    states = path(one, start, torque)
+    with pytest.raises(ValueError, match="of one length"):
+        slopes(one, states, torque[:-1], 1e-3 * np.arange(STEPS - 1), directions(one, start))
+    gain = dict.fromkeys(one.sides, np.array([0.3, 20.0]))
+    with pytest.raises(ValueError, match="of one length"):
+        path(one, start, torque, 0.0, dict.fromkeys(one.sides, torque[:-5]), gain)
 
 
 def test_other_numbers_need_no_other_loop_and_none_outlives_its_use():
