@@ -6,6 +6,7 @@ References: W. Newey, K. West, Econometrica 55 (1987); D. Andrews, Econometrica 
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -35,6 +36,7 @@ class Spread(NamedTuple):
     bandwidth: Float[Array, ""]
 
 
+@eqx.filter_jit
 def spread(fit: Fit) -> Spread:
     """Covariance of theta by the sandwich J+ E[r r^T] J+^T, the middle by Newey and West with Andrews' bandwidth.
 

@@ -7,19 +7,15 @@ References: D. Bates, D. Watts, Nonlinear Regression Analysis (1988), 6.1; D. Ve
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
 from jaxbl.simulate import Experiment
 
 from .intervals import Spread
-from .trajectory import Fit, Free, Windows, fit
+from .trajectory import Fit, Free, Windows, fits
 
 _PASSES = 4
-_AT_ONCE = 8
 _FURTHEST = 3.0
 """Largest step of theta from the best value: a factor of e^3."""
 _MOST_STEPS = 15
@@ -62,22 +58,6 @@ def profile(
     # residuals of noise alone have variance 1; what one of them counts follows from its correlation with its neighbours
     worth = float(width.variance) * np.asarray(width.inflation) ** 2
 
-    @eqx.filter_jit
-    def some(windows: Windows, thetas: jax.Array, which: jax.Array) -> tuple[jax.Array, jax.Array]:
-        def one(theta: jax.Array, i: jax.Array) -> tuple[jax.Array, jax.Array]:
-            found = fit(experiment, free, windows, theta, _MOST_STEPS, jnp.arange(count) == i)
-            return found.cost, found.theta
-
-        return jax.vmap(one)(thetas, which)
-
-    def costs(thetas: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Cost and theta of fits with one number held each; a few at a time, which bounds memory."""
-        cost, found = np.empty(len(which)), np.empty_like(thetas)
-        for first in range(0, len(which), _AT_ONCE):
-            batch = np.arange(first, first + _AT_ONCE) % len(which)
-            cost[batch], found[batch] = some(windows, jnp.asarray(thetas[batch]), jnp.asarray(which[batch]))
-        return cost, found
-
     which = np.repeat(np.arange(count), 2)
     sign = np.tile([-1.0, 1.0], count)
     steps = np.sqrt(limit) * deviation[which]
@@ -86,7 +66,8 @@ def profile(
     for _ in range(_PASSES):
         steps = np.minimum(steps, _FURTHEST)
         thetas = centre[None, :] + (sign * steps)[:, None] * others
-        cost, found = costs(thetas, which)
+        tries = fits(experiment, free, windows, thetas, _MOST_STEPS, np.eye(count, dtype=bool)[which])
+        cost, found = np.array([one.cost for one in tries]), np.array([one.theta for one in tries])
         deviance = 2.0 * (cost - float(best.cost)) / worth[which]
         for i, one in enumerate(deviance):
             tried[i].append((float(steps[i]), float(one)))

@@ -123,6 +123,7 @@ def balance(experiment: Experiment, kinematics: Kinematics) -> dict[str, Balance
     return found
 
 
+@eqx.filter_jit
 def model_torques(
     experiment: Experiment, kinematics: Kinematics, deviation: dict[str, Float[Array, " samples"]]
 ) -> dict[str, Float[Array, " samples"]]:
@@ -259,10 +260,13 @@ def _regress(
         return left(theta) * weights[None, :], theta / WIDE
 
     solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
-    weights, steps, ended = jnp.ones(len(names)), jnp.zeros((), int), jnp.asarray(True)
-    for _ in range(_PASSES):
+
+    def again(_: Array, carry: tuple[Array, ...]) -> tuple[Array, ...]:
+        theta, _, steps, _ = carry
         weights = 1.0 / jnp.maximum(jnp.sqrt(jnp.mean(left(theta) ** 2, axis=0)), jnp.finfo(float).tiny)
         solution = optx.least_squares(weighted, solver, theta, weights, max_steps=200, throw=False)
-        theta, steps = solution.value, steps + solution.stats["num_steps"]
-        ended = solution.result == optx.RESULTS.successful
+        return solution.value, weights, steps + solution.stats["num_steps"], solution.result == optx.RESULTS.successful
+
+    first = theta, jnp.ones(len(names)), jnp.zeros((), int), jnp.asarray(True)
+    theta, weights, steps, ended = jax.lax.fori_loop(0, _PASSES, again, first)
     return theta, left(theta) * weights[None, :], jax.jacfwd(left)(theta) * weights[None, :, None], steps, ended

@@ -4,8 +4,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -18,11 +16,13 @@ from .intervals import Refusal, Spread, refusals, spread
 from .prediction import predictor
 from .regression import lasting_path
 from .smoother import Smoothed, smooth
-from .trajectory import Fit, Free, Windows, cut, fit, with_values
+from .trajectory import Fit, Free, Windows, cut, fits, with_values
 
 _LONG, _SHORT = 500, 50
 """Samples of the windows that are tried where no length is asked for."""
 _MOST_COARSE = 100
+_FEW_STEPS = 30
+"""Of the solver, from each start."""
 _FEWEST = 20
 _PASSES = 2
 """Choices of the predictor's gain, each followed by a fit."""
@@ -147,30 +147,10 @@ class _Whole(NamedTuple):
     between: np.ndarray | None = None
 
 
-def _nearest_turn(free: Sequence[Free], theta: jax.Array) -> jax.Array:
+def _nearest_turn(free: Sequence[Free], theta: np.ndarray) -> np.ndarray:
     """Theta with phases within half a turn of their nominal values."""
-    turns = np.array([2.0 * np.pi / one.scale if one.path.endswith(".phase") else np.inf for one in free])
-    return theta - jnp.where(np.isfinite(turns), turns * jnp.round(theta / turns), 0.0)
-
-
-_fit = eqx.filter_jit(fit)
-
-
-@eqx.filter_jit
-def _batch(experiment: Experiment, free: tuple[Free, ...], windows: Windows, thetas: jax.Array) -> Fit:
-    return jax.vmap(lambda theta: fit(experiment, free, windows, theta, 30, rounds=1))(thetas)
-
-
-def _fits(
-    experiment: Experiment, free: tuple[Free, ...], windows: Windows, thetas: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Cost and theta of a fit from each start.
-
-    All at once on an accelerator; a processor is no faster so, and each of a batch would run as long as the slowest.
-    """
-    size = 1 if jax.default_backend() == "cpu" else len(thetas)
-    found = [_batch(experiment, free, windows, jnp.asarray(thetas[i : i + size])) for i in range(0, len(thetas), size)]
-    return np.concatenate([one.cost for one in found]), np.concatenate([one.theta for one in found])
+    turns = np.array([2.0 * np.pi / one.scale if one.path.endswith(".phase") else 0.0 for one in free])
+    return theta - turns * np.round(theta / np.where(turns > 0.0, turns, 1.0))
 
 
 class Search:
@@ -203,20 +183,22 @@ class Search:
         """
         theta, starts = self._coarse(free)
         refused, held, first_condition = [], [], None
+        kept = np.ones(len(free), bool)
         while True:
-            found = self._whole(free, theta)
-            shown, condition = refusals(free, found.spread)
+            found = self._whole(free, theta, kept)
+            left = tuple(one for one, is_kept in zip(free, kept, strict=True) if is_kept)
+            shown, condition = refusals(left, found.spread)
             if first_condition is None:
                 refused, first_condition = shown, condition
-            if not shown or len(free) == 1:
+            if not shown or len(left) == 1:
                 break
             worst = max(shown, key=lambda one: one.deviation)
             out = max(worst.direction, key=lambda path: abs(worst.direction[path]))
             held.append(out)
-            keep = [i for i, one in enumerate(free) if one.path != out]
-            free, theta = tuple(free[i] for i in keep), theta[jnp.asarray(keep)]
+            kept &= np.array([one.path != out for one in free])
+            theta = np.where(kept, theta, 0.0)
         return Found(
-            free,
+            left,
             found.fit,
             found.spread,
             found.windows,
@@ -232,7 +214,7 @@ class Search:
     def _cut(self, samples: int) -> tuple[Windows, np.ndarray]:
         return windows_of(self.record, self.channels, self.experiment, samples, self.settings.rest)
 
-    def _coarse(self, free: tuple[Free, ...]) -> tuple[jax.Array, list[dict[str, Any]]]:
+    def _coarse(self, free: tuple[Free, ...]) -> tuple[np.ndarray, list[dict[str, Any]]]:
         """Best of several starts, on short windows from all over the record."""
         windows, _ = self._cut(self.lengths[0])
         count = len(windows.time)
@@ -242,8 +224,9 @@ class Search:
         reach = np.log(self.settings.spread)
         thetas = np.zeros((self.settings.starts, len(free)))
         thetas[1:] = random.uniform(-reach, reach, thetas[1:].shape)
-        cost, found = _fits(self.experiment, free, windows, thetas)
-        cost = np.where(np.isfinite(cost), cost, np.inf)
+        tries = fits(self.experiment, free, windows, thetas, _FEW_STEPS, rounds=1)
+        cost = np.array([np.nan_to_num(one.cost, nan=np.inf) for one in tries])
+        found = np.array([one.theta for one in tries])
         if not np.isfinite(cost).any():
             raise InputError(
                 f"{self.record.path}: the model diverges from every start; its nominal numbers should be nearer"
@@ -253,20 +236,23 @@ class Search:
             {"cost": float(c), "agrees": bool(c <= cost[best] * 1.01), "theta": t.tolist()}
             for c, t in zip(cost, found, strict=True)
         ]
-        return _nearest_turn(free, jnp.asarray(found[best])), starts
+        return _nearest_turn(free, found[best]), starts
 
-    def _whole(self, free: tuple[Free, ...], theta: jax.Array) -> _Whole:
-        """Fit to all of the record, in windows of the length that leaves the numbers least open."""
+    def _whole(self, free: tuple[Free, ...], theta: np.ndarray, kept: np.ndarray) -> _Whole:
+        """Fit of the numbers that are kept to all of the record, in windows of the length that leaves them least open."""
+
+        def fitted(windows: Windows) -> Fit:
+            return fits(self.experiment, free, windows, theta[None], held=~kept[None])[0]
+
         tried: list[tuple[float, _Whole]] = []
         for samples in self.lengths:
             windows, firsts = self._cut(samples)
             smoothness: dict[str, float] = {}
             if self.settings.method == "prediction_error":
                 for _ in range(_PASSES):
-                    windows, smoothness = predictor(with_values(self.experiment, free, theta), windows)
-                    found = _fit(self.experiment, free, windows, theta)
-                    theta = found.theta
-            found = _fit(self.experiment, free, windows, theta)
+                    windows, smoothness = predictor(with_values(self.experiment, free, jnp.asarray(theta)), windows)
+                    theta = np.asarray(fitted(windows).theta)
+            found = fitted(windows).only(np.flatnonzero(kept))
             width = spread(found)
             size = float(jnp.sum(jnp.log(jnp.diag(width.covariance))))
             if np.isfinite(size):

@@ -7,7 +7,6 @@ References: Y. Bar-Shalom, X.-R. Li, T. Kirubarajan, Estimation with Application
 (white jerk); G. J. Bierman, Fixed interval smoothing with discrete measurements, Int. J. Control 18 (1973).
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -123,7 +122,6 @@ def _log_likelihood(position: Array, smoothness: Array) -> tuple[Array, Array]:
     return -0.5 * len(e) * jnp.log(variance) - 0.5 * jnp.sum(jnp.log(s)), jnp.sqrt(variance)
 
 
-@partial(jax.jit, static_argnames=("known",))
 def _fit(position: Array, unit: Array, known: bool) -> tuple[Array, Array]:
     """Smoothness q h^5 / sigma^2 and sigma of largest likelihood; `unit` is a first guess of sigma, or sigma itself."""
     scaled = (position - position[0]) / unit
@@ -135,20 +133,21 @@ def _fit(position: Array, unit: Array, known: bool) -> tuple[Array, Array]:
             return -0.5 * jnp.sum(e**2 / s + jnp.log(s))
         return _log_likelihood(scaled, jnp.exp(log_smoothness))[0]
 
-    grid = jnp.linspace(0.0, 1.0, _GRID)
-    low, high = (jnp.asarray(jnp.log(x)) for x in _SMOOTHNESS)
-    for _ in range(_ZOOMS):
-        points = low + (high - low) * grid
+    def zoom(_: Array, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bounds
+        points = low + (high - low) * jnp.linspace(0.0, 1.0, _GRID)
         best = jnp.argmax(jax.vmap(value)(points))
         step = (high - low) / (_GRID - 1)
-        low, high = points[best] - step, points[best] + step
+        return points[best] - step, points[best] + step
+
+    widest = tuple(jnp.log(jnp.asarray(x, position.dtype)) for x in _SMOOTHNESS)
+    low, high = jax.lax.fori_loop(0, _ZOOMS, zoom, widest)
     smoothness = jnp.exp(0.5 * (low + high))
     noise = jnp.ones(()) if known else _log_likelihood(scaled, smoothness)[1]
     return smoothness, noise * unit
 
 
-@jax.jit
-def _smooth(position: Array, smoothness: Array, noise: Array, period: Array) -> Smoothed:
+def _smoothed(position: Array, smoothness: Array, noise: Array, period: Array) -> Smoothed:
     scaled = (position - position[0]) / noise
     forward = _filter(scaled, smoothness, _first_state(scaled, smoothness))
     f = jnp.asarray(_F, position.dtype)
@@ -186,6 +185,11 @@ def smooth(
         noise: standard deviation of the readings' noise, quantisation included, in rad; left out, by maximum likelihood.
         jerk: spectral density of the jerk in rad^2/s^5; left out, by maximum likelihood.
     """
+    return _smooth(position, period, noise, jerk)
+
+
+@jax.jit
+def _smooth(position: Array, period: Array, noise: Array | None, jerk: Array | None) -> Smoothed:
     position = jnp.asarray(position, float)
     if noise is None:
         # third differences of white noise have variance 20 sigma^2; smooth motion adds little to their median
@@ -202,4 +206,4 @@ def smooth(
             smoothness = jnp.asarray(jerk * period**5) / noise_**2
     else:
         smoothness, noise_ = jnp.asarray(jerk * period**5) / unit**2, unit
-    return _smooth(position, smoothness, noise_, jnp.asarray(period, float))
+    return _smoothed(position, smoothness, noise_, jnp.asarray(period, float))

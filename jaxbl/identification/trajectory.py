@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxbl.drive.parameters import Parameter, get_leaf, leaf_paths, set_leaves
 from jaxbl.errors import InputError
@@ -33,6 +33,7 @@ _INFLUENCE = 1e-20
 _ENOUGH = 2e-3
 """A fit has ended where a step takes less than this off the sum of squares, in units of the residuals' variance."""
 _MOST_REJECTED = 12
+_AT_ONCE = 8
 _GAINED = 1.0
 WIDE = 3.0
 
@@ -163,6 +164,11 @@ class Fit(eqx.Module):
     cost: Float[Array, ""]
     steps: Array
     converged: Array
+
+    def only(self, which: np.ndarray) -> "Fit":
+        """Some of the numbers; the others were held."""
+        theta, jacobian = (jnp.asarray(np.asarray(x)[..., which]) for x in (self.theta, self.jacobian))
+        return dataclasses.replace(self, theta=theta, jacobian=jacobian)
 
 
 def with_values(experiment: Experiment, free: Sequence[Free], theta: Float[Array, " parameters"]) -> Experiment:
@@ -296,7 +302,7 @@ def _solve(
     solver: Any,
     theta: Array,
     guess: PlantState,
-    most_steps: int,
+    most_steps: Array,
     count: int,
 ) -> _Solved:
     """Least squares, step by step: the initial states of the best so far are the guess of the next.
@@ -345,9 +351,9 @@ def fit(
     free: Sequence[Free],
     windows: Windows,
     theta: Float[Array, " parameters"],
-    most_steps: int = 100,
+    most_steps: int | Int[Array, ""] = 100,
     held: Bool[Array, " parameters"] | None = None,
-    rounds: int = 3,
+    rounds: int | Int[Array, ""] = 3,
 ) -> Fit:
     """Fit from one start; `vmap` it over starts, or over records.
 
@@ -360,7 +366,7 @@ def fit(
         theta: the start, shape (parameters,); zeros are the nominal values.
         most_steps: of the solver, each time.
         held: which numbers stay at the start; none if left out.
-        rounds: how often at most the solver is started again, where initial states sought anew are better ones.
+        rounds: how often at most the solver is started, again where initial states sought anew are better ones.
     """
 
     given = theta
@@ -401,22 +407,79 @@ def fit(
         return jnp.sum(value**2, axis=(1, 2)), start
 
     def again(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        theta, guess, round, steps, _, _ = carry
-        found = _solve(residual, solver, theta, guess, most_steps, count)
-        theta = jnp.where(moving > 0.0, found.theta, given)
-        if rounds == 1:
-            return theta, found.guess, round + 1, steps + found.steps, found.converged, jnp.asarray(False)
+        theta, guess, left, round, steps, converged, _ = carry
         # a window's initial state may be the best of its neighbourhood only
         other, start = anew(theta)
-        gained = jnp.any(found.left - other > _GAINED * jnp.sum(found.left) / count)
-        guess = jax.tree.map(lambda new, old: jnp.where(other < found.left, new, old), start, found.guess)
-        return theta, guess, round + 1, steps + found.steps, found.converged, gained
+        gained = (round == 0) | jnp.any(left - other > _GAINED * jnp.sum(left) / count)
+        better = (round == 0) | (other < left)
+        guess = jax.tree.map(lambda new, old: jnp.where(better, new, old), start, guess)
+        # the last time looks for initial states alone
+        on = gained & (round < rounds)
+        found = _solve(residual, solver, theta, guess, jnp.where(on, most_steps, 0), count)
+        theta = jnp.where((moving > 0.0) & on, found.theta, theta)
+        left, converged = jnp.where(on, found.left, left), jnp.where(on, found.converged, converged)
+        return theta, found.guess, left, round + 1, steps + found.steps, converged, on & (rounds > 1)
 
     zero = jnp.zeros((), int)
-    first = theta, anew(theta)[1], zero, zero, jnp.asarray(False), jnp.asarray(True)
-    best, guess, _, steps, converged, _ = jax.lax.while_loop(lambda carry: carry[-1] & (carry[2] < rounds), again, first)
+    first = theta, windows.start, jnp.zeros(len(windows.time)), zero, zero, jnp.asarray(False), jnp.asarray(True)
+    # the solver and the search of initial states stand in the program once: it takes long to compile
+    best, guess, _, _, steps, converged, _ = jax.lax.while_loop(lambda carry: carry[-1], again, first)
     value, start, jacobian = _sloped(experiment, free, dataclasses.replace(windows, start=guess), best)
     return Fit(best, start, value, jacobian, 0.5 * jnp.sum(value**2), steps, converged)
+
+
+_fit = eqx.filter_jit(fit)
+
+
+@eqx.filter_jit
+def _batch(
+    experiment: Experiment,
+    free: tuple[Free, ...],
+    windows: Windows,
+    thetas: Float[Array, "fits parameters"],
+    most_steps: Int[Array, ""],
+    held: Bool[Array, "fits parameters"],
+    rounds: Int[Array, ""],
+) -> Fit:
+    return jax.vmap(lambda theta, held: fit(experiment, free, windows, theta, most_steps, held, rounds))(thetas, held)
+
+
+def fits(
+    experiment: Experiment,
+    free: Sequence[Free],
+    windows: Windows,
+    thetas: np.ndarray,
+    most_steps: int = 100,
+    held: np.ndarray | None = None,
+    rounds: int = 3,
+) -> list[Fit]:
+    """Fits from several starts, by one compiled program for all calls with a record of this shape and these numbers.
+
+    Some at a time on an accelerator, one by one on a processor: that is no faster with many, and each of a batch would run
+    as long as the slowest.
+
+    Args:
+        experiment: as of :func:`fit`.
+        free: what is fitted.
+        windows: the record.
+        thetas: the starts, shape (fits, parameters).
+        most_steps: of the solver, each time.
+        held: which numbers stay at the start, shape (fits, parameters); none if left out.
+        rounds: as of :func:`fit`.
+    """
+    held = np.zeros(thetas.shape, bool) if held is None else held
+    most = jnp.asarray(most_steps), jnp.asarray(rounds)
+    if jax.default_backend() == "cpu":
+        given = [(jnp.asarray(theta), jnp.asarray(still)) for theta, still in zip(thetas, held, strict=True)]
+        return [_fit(experiment, tuple(free), windows, theta, most[0], still, most[1]) for theta, still in given]
+    found: list[Fit] = []
+    for first in range(0, len(thetas), _AT_ONCE):
+        # which bounds memory; the last ones are filled up
+        which = np.minimum(first + np.arange(_AT_ONCE), len(thetas) - 1)
+        start, still = jnp.asarray(thetas[which]), jnp.asarray(held[which])
+        some = _batch(experiment, tuple(free), windows, start, most[0], still, most[1])
+        found += [jax.tree.map(lambda x, i=i: x[i], some) for i in range(min(_AT_ONCE, len(thetas) - first))]
+    return found
 
 
 def cut(

@@ -88,6 +88,7 @@ def _arc(h: Values, y: Values, discriminant: Values) -> Values:
     )
 
 
+@jax.jit
 def peak_ratio(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
     """Worst-case ratio rho of successive velocity peaks, in closed form; the error converges in finite time iff rho < 1.
 
@@ -116,6 +117,7 @@ _HALVINGS = 12
 _NEWTON = 2
 
 
+@jax.jit
 def least_lambda_exact(alpha: Values, f_plus: Values) -> Values:
     """Least lambda with rho < 1; zero where f_plus is.
 

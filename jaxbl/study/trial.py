@@ -137,12 +137,19 @@ def _summary(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed
     }
 
 
+@jax.jit
+def _asked(lambda_: jax.Array, alpha: jax.Array, f_plus: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+    """What each condition asks of lambda, and the ratio of peaks."""
+    least = {name: condition.least_lambda(alpha, f_plus) for name, condition in CONDITIONS.items()}
+    return least, peak_ratio(lambda_, alpha, f_plus)
+
+
 def _conditions(observer: Any, f_plus: float) -> dict[str, Any]:
     """Gains of an observer against what each condition asks at a bound f_plus (rad/s^2)."""
     with jax.enable_x64(True):
         lambda_, alpha, bound = (jnp.asarray(x) for x in (float(observer.lambda_), float(observer.alpha), f_plus))
-        least = {name: plain(condition.least_lambda(alpha, bound)) for name, condition in CONDITIONS.items()}
-        rho = plain(peak_ratio(lambda_, alpha, bound))
+        found, rho = _asked(lambda_, alpha, bound)
+    least = {name: plain(value) for name, value in found.items()}
     return {
         "lambda": float(observer.lambda_),
         "alpha": float(observer.alpha),
@@ -150,7 +157,7 @@ def _conditions(observer: Any, f_plus: float) -> dict[str, Any]:
         "alpha_exceeds_f_plus": float(observer.alpha) > f_plus,
         "least_lambda": least,
         "holds": {name: value is not None and float(observer.lambda_) > value for name, value in least.items()},
-        "peak_ratio": rho,
+        "peak_ratio": plain(rho),
     }
 
 
