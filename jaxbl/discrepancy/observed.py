@@ -81,7 +81,7 @@ def observed_torques(
         random = np.random.default_rng(i)
         known, readings = {}, {}
         for side in experiment.sides:
-            known[side] = _held(*beyond_nominal(experiment, side, part, channels[side])) / experiment.drive.inertia(side)
+            known[side] = _told(experiment, side, part, channels[side])
             drawn = float(channels[side].noise) * random.standard_normal((_DRAWS, len(part.time)))
             measured = np.asarray(record.positions[side])[rows]
             readings[side] = jnp.asarray(np.concatenate([measured[None], np.asarray(part.position[side]) + drawn]))
@@ -89,6 +89,12 @@ def observed_torques(
         for side in experiment.sides:
             found[side].append(_observed(experiment, side, part, np.asarray(controls[side])))
     return found
+
+
+@eqx.filter_jit
+def _told(experiment: Experiment, side: str, part: Kinematics, smoothed: Smoothed) -> Float[Array, " samples"]:
+    """Acceleration beyond the nominal one that a side's observer is told of, rad/s^2."""
+    return _held(*beyond_nominal(experiment, side, part, smoothed)) / experiment.drive.inertia(side)
 
 
 def _held(smooth: Float[Array, " samples"], friction: Float[Array, " samples"]) -> Float[Array, " samples"]:

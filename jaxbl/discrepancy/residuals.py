@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from scipy.ndimage import gaussian_filter1d
 
 from jaxbl.identification.regression import Kinematics, actuated
-from jaxbl.identification.smoother import Smoothed, smooth
+from jaxbl.identification.smoother import Smoothed, running_sum, smooth
 from jaxbl.simulate import Experiment
 
 _REACH = 60.0
@@ -105,8 +105,8 @@ def low_passed(
     """Values as if they were accelerations seen through a smoother, its ends included."""
     # a steady acceleration passes unchanged
     steady = jnp.mean(values)
-    rate = jnp.cumsum(values - steady) * period
-    position = jnp.concatenate([jnp.zeros(1), jnp.cumsum(rate)[:-1] * period])
+    rate = running_sum(values - steady) * period
+    position = jnp.concatenate([jnp.zeros(1), running_sum(rate)[:-1] * period])
     # second differences of the position are the values
     return steady + smooth(position, period, noise=smoothed.noise, jerk=smoothed.jerk).acceleration  # type: ignore[arg-type]
 

@@ -120,7 +120,7 @@ def split(function: Callable[..., Any], values: Any, carry: Any, given: Any, kin
     for one in examples:
         if one.shape or str(one.dtype) not in NUMBERS:
             raise Unsupported(f"lanes that read {one.dtype}{list(one.shape) or ''}")
-    return Parts(jax.jit(once)(), shared, jax.make_jaxpr(lane)(*examples))
+    return Parts(jax.jit(once)() if fixed else [], shared, jax.make_jaxpr(lane)(*examples))
 
 
 class Recursion(NamedTuple):

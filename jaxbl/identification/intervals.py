@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import stats
 
+from .smoother import running_sum
 from .trajectory import Fit, Free
 
 LIMIT = 0.5
@@ -76,7 +77,7 @@ def _long_run(scores: Float[Array, "samples parameters"]) -> tuple[Array, Array]
     wide = 1.1447 * (top / jnp.where(bottom > 0.0, bottom, 1.0) * count) ** (1.0 / 3.0)
     length = jnp.clip(jnp.ceil(wide), 1, count // 10).astype(int)
     # Bartlett's weights are those of all sums over `length` neighbours
-    total = jnp.concatenate([jnp.zeros((1, scores.shape[1])), jnp.cumsum(scores, axis=0)])
+    total = jnp.concatenate([jnp.zeros((1, scores.shape[1])), running_sum(scores)])
     last = jnp.arange(2 * count)
     sums = total[jnp.clip(last, 0, count)] - total[jnp.clip(last - length, 0, count)]
     return sums.T @ sums / length, length

@@ -4,15 +4,19 @@ RMS figures are over the last quarter of the run, in SI units. Position and velo
 the motor divided by the gear ratio.
 """
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxbl.errors import InputError
 from jaxbl.observer import conditions
 from jaxbl.simulate import Experiment, Reducer, Signals, State
+
+from .pieces import in_pieces
 
 Number = Float[Array, ""]
 
@@ -180,31 +184,33 @@ def observer_gains(experiment: Experiment) -> dict[str, Gains]:
     return {side: Gains(*(getattr(observer, name) for name in Gains._fields)) for side, observer in observers.items()}
 
 
-def with_conditions(figures: dict[str, Array], gains: dict[str, Gains]) -> dict[str, Array]:
+def with_conditions(figures: Mapping[str, Any], gains: dict[str, Gains]) -> dict[str, np.ndarray]:
     """Figures together with those that follow from gains and f_plus alone: margins to conditions, convergence times.
 
-    Apart from the loop over time, so that they are compiled once for all studies of a chunk's shape.
+    Apart from the loop over time, by programs that serve all studies.
     """
-    sides = list(gains)
-    f_plus = jnp.stack([figures[f"{side}.f_plus"] for side in sides])
+    found = {name: np.asarray(value) for name, value in figures.items()}
+    f_plus = np.stack([found[f"{side}.f_plus"] for side in gains])
     columns = [
-        jnp.stack([jnp.broadcast_to(x, f_plus.shape[1:]) for x in given]) for given in zip(*gains.values(), strict=True)
+        np.stack([np.broadcast_to(np.asarray(x, f_plus.dtype), f_plus.shape[1:]) for x in given])
+        for given in zip(*gains.values(), strict=True)
     ]
-    judged = _judged(Gains(*columns), f_plus)
-    return figures | {f"{side}.{name}": value[i] for i, side in enumerate(sides) for name, value in judged.items()}
+    judged = in_pieces(_judged, [one.ravel() for one in (*columns, f_plus)])
+    for name, value in judged.items():
+        found |= {f"{side}.{name}": one for side, one in zip(gains, value.reshape(f_plus.shape), strict=True)}
+    return found
 
 
 @jax.jit
-def _judged(gains: Gains, f_plus: Array) -> dict[str, Array]:
-    given = (gains.lambda_, gains.alpha, f_plus)
-    errors = (gains.position_error, gains.velocity_error)
+def _judged(lambda_: Array, alpha: Array, position_error: Array, velocity_error: Array, f_plus: Array) -> dict[str, Array]:
+    given, errors = (lambda_, alpha, f_plus), (position_error, velocity_error)
     out = {
         "convergence_time_bound": conditions.convergence_time_bound(*given, *errors),
         "convergence_time_worst": conditions.convergence_time_worst(*given, *errors),
-        "margin_alpha": gains.alpha / f_plus,
+        "margin_alpha": alpha / f_plus,
     }
     for name, condition in conditions.CONDITIONS.items():
-        out[f"margin_{name}"] = gains.lambda_ / condition.least_lambda(gains.alpha, f_plus)
+        out[f"margin_{name}"] = lambda_ / condition.least_lambda(alpha, f_plus)
     # a lane that overflowed has no bound
     return {name: jnp.where(jnp.isnan(f_plus), jnp.nan, value) for name, value in out.items()}
 

@@ -112,16 +112,13 @@ def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tu
         passage = DevicePassage(experiment, (METRICS,), paths, layout.points)
     else:
         raise Unsupported(f"{len(devices)} devices of platform {devices[0].platform}")
-    gains = jax.jit(jax.vmap(lambda values: observer_gains(set_leaves(experiment, values))))
 
     def run(values: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[dict[str, Any], dict[str, Gains]]:
         with jax.default_device(devices[0]):
             # seeds that only fill up the last chunk are copies of one
             found = {seed: passage(values, seed) for seed in dict.fromkeys(int(seed) for seed in seeds)}
-            stacked = {
-                name: jnp.asarray(np.stack([found[int(seed)][name] for seed in seeds])) for name in found[int(seeds[0])]
-            }
-            return stacked, gains(values)
+        stacked = {name: np.stack([found[int(seed)][name] for seed in seeds]) for name in found[int(seeds[0])]}
+        return stacked, observer_gains(set_leaves(experiment, values))
 
     size = jnp.result_type(experiment.run.sample_period).itemsize
     figures = len(metric_columns(experiment)) * layout.seeds

@@ -149,7 +149,7 @@ def _conditions(observer: Any, f_plus: float) -> dict[str, Any]:
     with jax.enable_x64(True):
         lambda_, alpha, bound = (jnp.asarray(x) for x in (float(observer.lambda_), float(observer.alpha), f_plus))
         found, rho = _asked(lambda_, alpha, bound)
-    least = {name: plain(value) for name, value in found.items()}
+    least = {name: plain(found[name]) for name in CONDITIONS}
     return {
         "lambda": float(observer.lambda_),
         "alpha": float(observer.alpha),

@@ -13,7 +13,7 @@ import copy
 import dataclasses
 import json
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from jaxbl.observer.worst_case import half_cycle, least_lambda_simulated
 from .config import Config, read_config
 from .engine import Progress
 from .metrics import NOTHING, undisturbed
+from .pieces import in_pieces
 from .points import Points
 from .store import claim, mark, plain, write_atomic
 from .sweep import sweep
@@ -38,7 +39,6 @@ SWITCHING_LIMIT = 0.02
 
 _MOST_EXPLAINED = 4096
 _MOST_LISTED = 200
-_CELLS = 8192
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,18 +223,15 @@ def _ideal(config: Config) -> Config:
 # normalised level
 
 
-def _over_cells(function: Callable[..., Any], columns: list[np.ndarray], devices: list[Any]) -> list[np.ndarray]:
-    """Apply an elementwise function of float64 arrays to long columns, in pieces of one shape over all devices."""
-    size = len(columns[0])
-    pieces = max(-(-size // _CELLS), 1)
-    padded = [np.concatenate([c, np.repeat(c[-1:], pieces * _CELLS - size)]).reshape(pieces, _CELLS) for c in columns]
-    compiled = jax.jit(function)
-    waves = []
-    for i in range(pieces):
-        device = devices[i % len(devices)]
-        waves.append(compiled(*(jax.device_put(column[i], device) for column in padded)))
-    outs = [jax.tree.leaves(wave) for wave in waves]
-    return [np.concatenate([np.asarray(out[k]) for out in outs])[:size] for k in range(len(outs[0]))]
+@jax.jit
+def _plane(lambda_: Any, alpha: Any) -> Any:
+    one = jnp.ones_like(lambda_)
+    return half_cycle(lambda_, alpha, one).ratio, peak_ratio(lambda_, alpha, one)
+
+
+@jax.jit
+def _border(alpha: Any, damping: Any) -> Any:
+    return least_lambda_simulated(alpha, jnp.ones_like(alpha), damping=damping)
 
 
 def _normalised(config: Config, work: Path | None, devices: list[Any]) -> Normalised:
@@ -245,18 +242,14 @@ def _normalised(config: Config, work: Path | None, devices: list[Any]) -> Normal
     shape = (len(lambda_), len(alpha))
     dampings = [0.0, *settings.damping]
 
-    def both(x: Any, a: Any) -> Any:
-        one = jnp.ones_like(x)
-        return half_cycle(x, a, one).ratio, peak_ratio(x, a, one)
-
     def plane() -> pd.DataFrame:
-        ratio, closed = _over_cells(both, cells, devices)
+        ratio, closed = in_pieces(_plane, cells, devices)
         return pd.DataFrame({"lambda_ratio": cells[0], "alpha_ratio": cells[1], "ratio": ratio, "closed_form": closed})
 
     def borders() -> pd.DataFrame:
         # by bisection: as sharp on a coarse map as on a fine one
         columns = [np.tile(alpha, len(dampings)), np.repeat(dampings, len(alpha))]
-        (least,) = _over_cells(lambda a, d: least_lambda_simulated(a, jnp.ones_like(a), damping=d), columns, devices)
+        least = in_pieces(_border, columns, devices)
         return pd.DataFrame({"alpha_ratio": columns[0], "damping": columns[1], "least_lambda_ratio": least})
 
     with jax.enable_x64(True):
@@ -279,9 +272,8 @@ def _kept(path: Path | None, compute: Callable[[], pd.DataFrame]) -> pd.DataFram
     return table
 
 
-def conditions_of(config: Config) -> dict[str, Condition]:
-    """The gain conditions, with the study's q in (32)."""
-    q = config.verify.q
+@cache
+def _conditions(q: float | None) -> dict[str, Condition]:
     if q is None:
         return CONDITIONS
     return CONDITIONS | {
@@ -289,13 +281,21 @@ def conditions_of(config: Config) -> dict[str, Condition]:
     }
 
 
+def conditions_of(config: Config) -> dict[str, Condition]:
+    """The gain conditions, with the study's q in (32)."""
+    return _conditions(config.verify.q)
+
+
+@cache
+def _demands(q: float | None) -> Callable[..., Any]:
+    return jax.jit(lambda alpha, f_plus: {name: one.least_lambda(alpha, f_plus) for name, one in _conditions(q).items()})
+
+
 def demanded_lambda(config: Config, alpha: np.ndarray, f_plus: np.ndarray) -> dict[str, np.ndarray]:
     """Least lambda (rad^0.5/s) that each condition asks for at alpha and f_plus (rad/s^2), with the study's q in (32)."""
     with jax.enable_x64(True):
-        given = jnp.asarray(alpha, float), jnp.asarray(f_plus, float)
-        return {
-            name: np.asarray(jax.jit(condition.least_lambda)(*given)) for name, condition in conditions_of(config).items()
-        }
+        found = in_pieces(_demands(config.verify.q), [np.asarray(alpha, float), np.asarray(f_plus, float)])
+    return {name: found[name] for name in conditions_of(config)}
 
 
 def _judge_normalised(config: Config, found: Normalised) -> dict[str, Any]:

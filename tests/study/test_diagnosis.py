@@ -144,6 +144,17 @@ def test_the_extended_model_runs_and_the_report_says_what_was_found(found, tmp_p
     assert again.effects[0].torque == summary["findings"][0]["parameters"]["torque"]["value"]
 
 
+@pytest.mark.slow
+def test_the_model_that_was_found_lacks_nothing_on_another_log(logs, found, tmp_path):
+    """As written, with the record of the first log for its excitation."""
+    write_diagnosis_report(found, tmp_path)
+    again = diagnose(logs / "other.csv", tmp_path / "model.toml")
+    assert again.config.excitation.kind == "recorded"
+    assert again.summary["verdict"] == "no_discrepancy" and again.summary["findings"] == []
+    (friction,) = again.model.effects
+    assert friction.torque == pytest.approx(FRICTION["torque"], rel=0.02)
+
+
 def test_a_number_that_ends_far_from_what_is_known_of_it_is_told():
     own = [Free("drive.motor_inertia", "kg m²", 0.02, 0.02, True), Free("drive.motor_viscous", "N m s/rad", 0.0, 1.0, False)]
     assert under_test._far_off(own, {"drive.motor_inertia": 0.021, "drive.motor_viscous": 0.1}, 0.02) == []

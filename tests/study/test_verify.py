@@ -46,14 +46,6 @@ CAUSES = {"run too short", "period too long", "noise", "quantisation", "explicit
 WHOLE = {"several", "f_plus underestimated", "unexplained"}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _small_pieces():
-    """The plane in several pieces, the last one not full."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "_CELLS", 20)
-        yield
-
-
 @pytest.fixture(scope="module")
 def checked(tmp_path_factory):
     folder = tmp_path_factory.mktemp("verified")
@@ -253,7 +245,7 @@ def test_second_call_simulates_nothing_and_says_the_same(checked, monkeypatch):
     results = {path: kept for path, kept in contents(folder).items() if path.parent.name == "points"}
     assert len(results) > 5
     monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished level is simulated"))
-    monkeypatch.setattr(module, "_over_cells", lambda *_: pytest.fail("the plane is simulated again"))
+    monkeypatch.setattr(module, "_plane", lambda *_: pytest.fail("the plane is simulated again"))
     again = verify(STUDY, folder)
     assert again.summary == verdict.summary
     for level, frame in verdict.levels.items():
@@ -274,7 +266,7 @@ def test_another_studys_folder_is_left_as_it_is(checked):
 def test_another_q_and_other_marks_go_on_with_what_is_there(checked, monkeypatch, tmp_path):
     verdict, folder = checked
     shutil.copytree(folder, tmp_path / "copy")
-    monkeypatch.setattr(module, "_over_cells", lambda *_: pytest.fail("the plane is simulated again"))
+    monkeypatch.setattr(module, "_plane", lambda *_: pytest.fail("the plane is simulated again"))
     twice = [{"name": name, "lambda": 5.0, "alpha": 8.0} for name in ("one", "the same")]
     again = verify(STUDY | {"verify": ATLAS | {"q": 0.6, "marks": twice}}, tmp_path / "copy")
     titles = [level["conditions"][0]["title"] for level in again.summary["levels"]]
