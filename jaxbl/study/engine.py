@@ -62,14 +62,14 @@ def prepare(config: Config) -> Experiment:
     return as_arrays(config.build(), jnp.dtype(config.run.precision))
 
 
-def layout_for(config: Config, points: Points, devices: int, backend: Backend) -> Layout:
-    """Chunk shape: as many lanes as the devices want at once, whole rows of points before several seeds.
+def layout_for(config: Config, points: Points, devices: int, backend: Backend, chunk: int | None) -> Layout:
+    """Chunk shape: as many lanes as asked for, or as the devices want at once; whole rows of points before several seeds.
 
     Every device gets two lanes or more: one alone is compiled to other roundings than a row of them.
     """
     if points.refinement is not None:
-        return _refined_layout(config, devices)
-    capacity = config.sweep.chunk or LANES_PER_DEVICE[backend] * devices
+        return _refined_layout(config, devices, chunk)
+    capacity = chunk or LANES_PER_DEVICE[backend] * devices
     # chunks of equal size waste no padding on the last one; a multiple of the devices, along the longer side, suits them
     per_chunk = math.ceil(points.lanes / math.ceil(points.lanes / capacity))
     if points.lanes >= devices and points.lanes > 1:
@@ -82,9 +82,9 @@ def layout_for(config: Config, points: Points, devices: int, backend: Backend) -
     return Layout(seeds, per_chunk)
 
 
-def _refined_layout(config: Config, devices: int) -> Layout:
+def _refined_layout(config: Config, devices: int, chunk: int | None) -> Layout:
     """Several seeds before whole rows of points: a batch has few points, and needs all seeds of them."""
-    capacity = config.sweep.chunk or REFINED_LANES_PER_DEVICE * devices
+    capacity = chunk or REFINED_LANES_PER_DEVICE * devices
     seeds = min(config.sweep.seeds, max(capacity // (64 * devices), 1))
     return Layout(seeds, max(math.ceil(capacity / seeds / devices), 2) * devices)
 
@@ -113,10 +113,11 @@ class Engine:
         self.devices = devices or jax.local_devices()
         if backend not in (None, *BACKENDS):
             raise InputError(f"backend: there is no {backend!r}; one of {', '.join(BACKENDS)}")
-        preferred = layout_for(config, self.points, len(self.devices), backend or "fused")
-        self.backend: Backend = backend or faster(layout or preferred, self.devices)
+        # by the study, however it is cut: roundings differ between backends
+        natural = layout_for(config, self.points, len(self.devices), "fused", None)
+        self.backend: Backend = backend or faster(natural, self.devices)
         self._insist = insist
-        self.layout = layout or layout_for(config, self.points, len(self.devices), self.backend)
+        self.layout = layout or layout_for(config, self.points, len(self.devices), self.backend, config.sweep.chunk)
         self.compile_seconds = 0.0
         self.run_seconds = 0.0
         self._compiled: tuple[int, tuple[Program, list[str]]] | None = None

@@ -52,7 +52,7 @@ class Program(NamedTuple):
     megabytes: float
 
 
-_FUSED, _SCAN = (1.5, 1e-3), (4.5, 2.5e-3)
+_FUSED, _SCAN = (0.7, 1.1e-3), (1.3, 3.6e-3)
 """Microseconds that a sample costs, and each of its lanes, on one core (benchmarks/NOTES.md)."""
 
 

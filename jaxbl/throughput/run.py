@@ -260,12 +260,14 @@ def _curve(able: Sequence[Entry], lanes: int, steps: int, precisions: Sequence[s
         with _in(precision):
             runners = [entry.make(Workload(lanes, steps, precision)) for entry in chosen]
             best = [float("inf")] * len(chosen)
-            # short ones are repeated until they have taken a tenth of a second
-            for _ in range(max(3, min(50, round(1e8 / lanes / steps)))):
+            # short ones are repeated, and several times in a row: threads that wait for more work disturb the next entry
+            short = round(1e8 / lanes / steps)
+            for _ in range(max(3, min(15, short))):
                 for i, runner in enumerate(runners):
-                    begun = time.perf_counter()
-                    runner()
-                    best[i] = min(best[i], time.perf_counter() - begun)
+                    for _ in range(max(1, min(4, short))):
+                        begun = time.perf_counter()
+                        runner()
+                        best[i] = min(best[i], time.perf_counter() - begun)
         points += [
             {
                 "name": e.name,
