@@ -568,7 +568,7 @@ def _duration(seconds: float) -> str:
 
 
 def main(run: Callable[..., object] = app) -> None:
-    """Entry point: exit 0 done, 1 failed, 2 bad input (one line), 130 interrupted."""
+    """Run a command: exit 0 done, 1 failed, 2 bad input (one line), 130 interrupted."""
     try:
         run()
     except InputError as error:
@@ -582,5 +582,20 @@ def main(run: Callable[..., object] = app) -> None:
         sys.exit(130)
 
 
+def program() -> None:
+    """Entry point: as :func:`main`, and what was interrupted ends at once.
+
+    Threads of XLA may still compute then, and crash the process when the interpreter takes down what they work on.
+    """
+    try:
+        main()
+    except SystemExit as end:
+        if end.code != 130:
+            raise
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(130)
+
+
 if __name__ == "__main__":
-    main()
+    program()

@@ -185,6 +185,11 @@ def _single(name: str, leaf: str) -> Variant:
     return Variant(name, ((_effect(name, {leaf: 1.0}), 1.0),), None, numbers)
 
 
+def all_of_the_input() -> Variant:
+    """The torque of the input once more."""
+    return _single("actuator.gain_error", "relative")
+
+
 def _stribeck(side: str, speed: float) -> Variant:
     name = f"{side}.stribeck_friction"
     sliding = _effect(name, {"torque": 1.0, "breakaway_torque": 1.0, "stribeck_velocity": speed})

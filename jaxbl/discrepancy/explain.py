@@ -321,6 +321,11 @@ class Explainer:
             values[name][leaf] = float(one.value(by))
         return point.theta + change[:count], values
 
+    def shown(self) -> float:
+        """Standard deviations by which the record shows its input; infinite where it has none."""
+        linear = self.linear({}, np.zeros(len(self.free)))
+        return linear.shown(*linear.choose(())) if linear.driven else np.inf
+
     def run(self) -> Explanation:
         """Find what is missing."""
         theta = np.zeros(len(self.free))

@@ -35,7 +35,7 @@ from jaxbl.identification.trajectory import Free, with_values
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
-from .candidates import SHARE, SPACING, Candidate, Grids, Signals, forces_of, rms
+from .candidates import SHARE, SPACING, Candidate, Grids, Signals, all_of_the_input, forces_of, rms
 from .coloured import Spectrum, spectrum_of, weighted_products
 from .complete import bucket
 from .evidence import Columns
@@ -348,13 +348,13 @@ class Linear:
         self.signals = [Signals(self.experiment, part) for part in self.parts]
         self.count = sum(int(np.asarray(one.weight).sum()) for one in self.parts)
         self.states = self.parts[0].defect.shape[1]
-        self.drive = self._drive()
+        self.drive, self.driven = self._drive()
         # what the last search chose, and what the one without candidates did, which is asked for again and again
         self._last: tuple[Predictor, list[np.ndarray]] | None = None
         self._alone: tuple[Predictor, list[np.ndarray]] | None = None
 
-    def _drive(self) -> float:
-        """Size of the torques, N m rms at the motor: the input's; where there is none, what the motion takes."""
+    def _drive(self) -> tuple[float, bool]:
+        """Size of the torques, N m rms at the motor: the input's; where there is none, what the motion takes. And which."""
         driving = rms(np.concatenate([one.torque[one.real] for one in self.signals]))
         taken = [
             float(self.experiment.plant.inertia(side)) / one.over(side) * np.asarray(one.part.acceleration[side])[one.real]
@@ -362,7 +362,7 @@ class Linear:
             for side in self.sides
         ]
         inertial = rms(np.concatenate(taken))
-        return driving if driving > _NO_INPUT * inertial else inertial
+        return (driving, True) if driving > _NO_INPUT * inertial else (inertial, False)
 
     def grids(self, frequencies: Sequence[float]) -> Grids:
         """Values to be tried of numbers that are not linear."""
@@ -578,6 +578,16 @@ class Linear:
         """Sums of squares of torques, referred to the motor."""
         over = np.array([*(signals.over(side) for side in self.sides), 1.0])
         return np.einsum("cts,cts->cs", torques, torques) @ over**-2.0
+
+    def shown(self, smoothness: Sequence[float], noise: np.ndarray) -> float:
+        """Standard deviations by which the errors show the input: a part of it is seen where that part of them is.
+
+        Args:
+            smoothness: of the predictor, by side.
+            noise: rms of its errors by side, rad.
+        """
+        products = self.columns([all_of_the_input()], smoothness, noise).products
+        return float(np.sqrt(products[-1, -1]))
 
     def share(self, name: str) -> float:
         """Torque of an effect that the model has, rms over the driving torque's."""

@@ -69,7 +69,7 @@ _NOISY = 1e-3
 _TOLD = 3.0
 """Nats by which it has to be told that it did not."""
 _HIDDEN = 0.3
-"""Share of the driving torque: where a torque of that size would not have been seen, noise hides everything."""
+"""Share of the input: where a torque of that size would not have been seen, noise hides everything."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -424,6 +424,7 @@ def _explained(setting: _Setting) -> tuple[Explainer, Explanation]:
     there without being held.
     """
     explainer = _explainer(setting)
+    _check_shown(setting, explainer.shown())
     found = explainer.run()
     if not explainer.plausible(found):
         other = _explainer(setting, _BOUND)
@@ -431,6 +432,23 @@ def _explained(setting: _Setting) -> tuple[Explainer, Explanation]:
         if again.verdict != "unknown_effect" and other.plausible(again):
             return other, again
     return explainer, found
+
+
+def _check_shown(setting: _Setting, shown: float) -> None:
+    """Refuse a log whose noise hides everything, `shown` being the standard deviations by which it shows its input."""
+    record = setting.seen.record
+    if shown * _HIDDEN >= SIGNIFICANT:
+        return
+    noise = ", ".join(
+        f"{value:.2g} {record.findings.channels[LOG_NAMES[side]].unit} ({LOG_NAMES[side]})"
+        for side, value in setting.seen.channels.noise.items()
+    )
+    least = SIGNIFICANT / max(shown, 1e-12)
+    raise InputError(
+        f"{record.path}: noise hides everything: with readings as noisy as {noise}, no torque of less than "
+        f"{100.0 * least:.2g} % of the input would be seen; noise {least / _HIDDEN:.2g} times smaller, or torques as many "
+        "times larger, are needed"
+    )
 
 
 def _fitted(explainer: Explainer, numbers: Mapping[str, Mapping[str, float]], theta: np.ndarray) -> _Fitted:
@@ -772,17 +790,10 @@ def _noise_said(record: Record, noise: float) -> str:
 
 
 def _least_seen(record: Record, located: Mapping[str, Localised]) -> list[str]:
-    """What would not have been seen, and whether that is nearly everything."""
-    assert record.torque is not None
+    """What would not have been seen."""
     unit = {side: unit_on(record, f"{side}.torque", "N m") for side in located}
-    driving = float(np.sqrt(np.mean(np.square(record.torque))))
     lines = []
     for side, one in located.items():
         least = SIGNIFICANT * one.coordinates["all"].regions[0].mean_error
         lines.append(f"{side}: a steady torque of less than about {least:.2g} {unit[side]} would not have been seen.")
-        if side == "motor" and least > _HIDDEN * driving > 0.0:
-            lines.append(
-                f"Noise hides nearly everything: the input is {driving:.2g} {unit[side]} rms. A longer log, larger torques "
-                "or a finer encoder are needed."
-            )
     return lines
