@@ -8,7 +8,7 @@ demo: .venv/installed
 	$(BIN)/jaxbl sweep sweeps/gain_map.toml
 
 test: .venv/installed-dev
-	$(BIN)/python -m pytest -n auto --dist loadfile
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .

@@ -74,6 +74,7 @@ def test_help_does_not_wait_for_jax(tmp_path):
         assert command in shown.stdout
 
 
+@pytest.mark.slow
 def test_a_sweep_and_its_second_call(tmp_path):
     """As a user sees it: what is printed, what is left, no progress bar in a pipe, no work done twice."""
     write(tmp_path, rigid(axes=AXES, sweep={"seeds": 2}))
@@ -272,6 +273,7 @@ def test_simulate_leaves_trace_summary_figures_and_report(call, tmp_path):
     assert json.loads((folder / "summary.json").read_text())["seed"] == 3
 
 
+@pytest.mark.slow
 def test_verify_leaves_a_verdict_counterexamples_figures_and_report(call, tmp_path, monkeypatch):
     plane = {"start": 1.1, "stop": 5.0, "num": 4}
     write(tmp_path, rigid(axes=GAINS, verify={"alpha_ratio": plane, "lambda_ratio": plane, "damping": []}))
@@ -307,6 +309,7 @@ def tunable(**table):
     return rigid(changes, effects=[{"kind": "motor.constant_torque", "torque": 0.05}], tune=TUNE | table)
 
 
+@pytest.mark.slow
 def test_tune_leaves_gains_numbers_figures_and_report(call, tmp_path, monkeypatch):
     write(tmp_path, tunable())
     code, lines, _ = call("tune", "study.toml")
@@ -390,6 +393,7 @@ def test_default_folder():
     assert cli._folder(Path("a/b.toml"), None) == Path("results/b")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "command"),
     [
@@ -487,6 +491,7 @@ def test_a_refined_sweep_from_the_command_line(call, tmp_path):
     assert drawn == second
 
 
+@pytest.mark.slow
 def test_a_log_is_identified(call, tmp_path):
     study = rigid(
         {"run.duration": 0.6, "encoders.noise": 1e-5, "excitation.frequency": 4.0, "run.substeps": 2},
@@ -531,6 +536,7 @@ def axis(tmp_path):
     log.to_csv(tmp_path / "an axis.csv", index=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["jaxbl.study.identification.run_task", "jaxbl.report.identified.html"])
 def test_an_interrupted_identification_writes_nothing_and_says_how_to_start_again(place, axis, call, tmp_path, monkeypatch):
     def interrupt(*_):

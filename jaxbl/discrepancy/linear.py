@@ -584,7 +584,7 @@ class Linear:
 
         Args:
             smoothness: of the predictor, by side.
-            noise: rms of its errors by side, rad.
+            noise: rms of its errors, by side, rad.
         """
         products = self.columns([all_of_the_input()], smoothness, noise).products
         return float(np.sqrt(products[-1, -1]))

@@ -424,8 +424,9 @@ def _explained(setting: _Setting) -> tuple[Explainer, Explanation]:
     there without being held.
     """
     explainer = _explainer(setting)
-    _check_shown(setting, explainer.shown())
     found = explainer.run()
+    if found.verdict == "no_discrepancy":
+        _check_shown(setting, explainer.shown())
     if not explainer.plausible(found):
         other = _explainer(setting, _BOUND)
         again = other.run()
@@ -435,7 +436,12 @@ def _explained(setting: _Setting) -> tuple[Explainer, Explanation]:
 
 
 def _check_shown(setting: _Setting, shown: float) -> None:
-    """Refuse a log whose noise hides everything, `shown` being the standard deviations by which it shows its input."""
+    """Refuse to say that nothing is missing where noise hides everything.
+
+    Args:
+        setting: of the diagnosis.
+        shown: standard deviations by which the log shows its input.
+    """
     record = setting.seen.record
     if shown * _HIDDEN >= SIGNIFICANT:
         return
@@ -446,7 +452,7 @@ def _check_shown(setting: _Setting, shown: float) -> None:
     least = SIGNIFICANT / max(shown, 1e-12)
     raise InputError(
         f"{record.path}: noise hides everything: with readings as noisy as {noise}, no torque of less than "
-        f"{100.0 * least:.2g} % of the input would be seen; noise {least / _HIDDEN:.2g} times smaller, or torques as many "
+        f"{100.0 * least:.0f} % of the input would be seen; noise {least / _HIDDEN:.2g} times smaller, or torques as many "
         "times larger, are needed"
     )
 

@@ -59,6 +59,7 @@ def test_what_no_effect_explains_is_said_to_be_unknown(i, tmp_path):
     assert max(gain for gain, _ in found.rest.values()) > CLEAR
 
 
+@pytest.mark.slow
 def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
     """Free functions have knots where there are no samples."""
     log = logged()

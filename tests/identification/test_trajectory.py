@@ -107,21 +107,27 @@ def test_agrees_with_one_least_squares_problem_over_parameters_and_states():
     np.testing.assert_allclose(np.sqrt(np.diag(plain)), deviation, rtol=0.02)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["multisine", "steps", "chirp"])
-def test_intervals_cover_the_truth_as_often_as_they_say(kind):
-    """200 noise realisations in one vmapped run; the truth has a hard gap and another integrator."""
+@eqx.filter_jit
+def _many(experiment, free, torque, states, keys):
+    """Numbers found from one motion under several realisations of the noise, and their covariances."""
     noise = {"motor": 3e-4, "load": 6e-5}
-    torque, states = recorded(kind, 600)
-    experiment = drive(6)
-    free = free_parameters(experiment, list(TRUE), 1.0)
 
     def one(key):
         windows = windows_of(torque, noisy(states, noise, key), noise, 300)
         found = fit(experiment, free, windows, 0.03 * jax.random.normal(jax.random.fold_in(key, 1), (len(free),)), 25)
         return found.theta, spread(found).covariance
 
-    theta, covariance = eqx.filter_jit(jax.vmap(one))(jax.random.split(jax.random.key(7), 200))
+    return jax.vmap(one)(keys)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["multisine", "steps", "chirp"])
+def test_intervals_cover_the_truth_as_often_as_they_say(kind):
+    """200 noise realisations in one vmapped run; the truth has a hard gap and another integrator."""
+    experiment = drive(6)
+    torque, states = map(jnp.asarray, recorded(kind, 600))
+    free = free_parameters(experiment, list(TRUE), 1.0)
+    theta, covariance = _many(experiment, free, torque, states, jax.random.split(jax.random.key(7), 200))
     deviation = np.sqrt(np.einsum("rii->ri", covariance))
     covered = np.mean(np.abs(theta / deviation) < 1.96, axis=0)
     assert np.all((covered >= 0.92) & (covered <= 0.98)), covered
@@ -165,6 +171,7 @@ def test_the_gap_at_1_khz_by_the_fit_and_by_the_chain_of_the_paper():
         assert 3.0 * rms[5] < size[side]["half_gap"] < 0.05, (size, rms)
 
 
+@pytest.mark.slow
 def test_scales_that_one_record_cannot_part_are_refused():
     """Torque gain, inertia and friction scaled alike give the same motion."""
     effects = [{"kind": "actuator.gain_error", "relative": 0.0}, {"kind": "motor.coulomb_friction", "torque": 0.01}]

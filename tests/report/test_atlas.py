@@ -31,6 +31,7 @@ def checked(tmp_path_factory):
     return verdict, folder, write_verify_report(verdict, folder)
 
 
+@pytest.mark.slow
 def test_figures(checked):
     verdict, _, _ = checked
     drawn = {drawing.name: drawing for drawing in draw_verdict(verdict)}

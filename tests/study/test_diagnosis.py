@@ -33,6 +33,7 @@ def found(logs):
     return diagnose(logs / "axis.csv", model())
 
 
+@pytest.mark.slow
 def test_the_missing_effect_is_named_with_its_number(found):
     summary = found.summary
     assert summary["verdict"] == "explained"
@@ -174,6 +175,7 @@ def test_new_numbers_are_better_all_in_all():
     assert not better(1.0, np.inf) and not better(np.inf, np.inf) and not better(0.0, 1.0)
 
 
+@pytest.mark.slow
 def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
     """The fit is made to end at a number that is far off."""
     real = explain.refined
@@ -274,6 +276,18 @@ def test_a_log_that_is_too_short_is_refused(logs, tmp_path):
     short = dataclasses.replace(log, **{name: getattr(log, name)[:150] for name in ("t", "u", "theta_e")})
     short.write(tmp_path / "short.csv")
     assert "too few to hold a quarter of them out" in refused(logs, tmp_path / "short.csv", model())
+
+
+def test_a_log_whose_noise_hides_everything_is_refused(tmp_path):
+    """And not called complete: friction of a third of the input goes unseen."""
+    torque = 2e-3 * logged().u
+    driven(torque, [FRICTION | {"torque": 0.3 * float(np.std(torque))}], 3e-2, 1).write(tmp_path / "axis.csv")
+    told = (
+        r"axis\.csv: noise hides everything: with readings as noisy as 0\.03 rad \(theta_e\), no torque of less than "
+        r"2\d\d % of the input would be seen; noise 6\.9 times smaller, or torques as many times larger, are needed$"
+    )
+    with pytest.raises(InputError, match=told):
+        diagnose(tmp_path / "axis.csv", model())
 
 
 def test_effects_of_one_name_behind_an_actuator_are_refused(logs):

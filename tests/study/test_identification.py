@@ -59,6 +59,7 @@ def found(log):
     return identify(log, NOMINAL)
 
 
+@pytest.mark.slow
 def test_numbers_are_those_of_the_machine_within_their_errors(found):
     parameters = found.summary["parameters"]
     assert list(parameters) == list(TRUTH)
@@ -113,6 +114,7 @@ def test_report_has_every_number_and_figure(found, tmp_path):
     assert all(path in page for path in TRUTH)
 
 
+@pytest.mark.slow
 def test_a_direction_that_the_log_does_not_show_is_refused(log):
     """Torque, inertias, frictions and stiffness scaled alike."""
     effects = [*FRICTION, {"kind": "actuator.gain_error", "relative": 0.0}]
@@ -157,6 +159,7 @@ def everything(measured):
     return identify(measured / "log0.csv", study, holdout=measured / "log1.csv", profile=True)
 
 
+@pytest.mark.slow
 def test_a_measured_torque_is_regressed_directly(everything):
     regression = everything.summary["method"]["regression"]
     assert regression["measured_transmitted_torque"]
@@ -210,6 +213,7 @@ def test_model_replays_the_log_where_the_study_has_no_excitation(everything, tmp
     assert "with the measured transmitted torque" in page
 
 
+@pytest.mark.slow
 def test_several_logs_are_one_record(measured):
     study = open_ended(geared())
     study["identify"] = {"starts": 1, "window": 0.5, "parameters": ["transmission.half_gap"]}

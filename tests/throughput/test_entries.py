@@ -55,6 +55,7 @@ def test_a_wrong_result_is_not_timed():
         _check(entry, "float64", missing, true)
 
 
+@pytest.mark.slow
 def test_the_whole_benchmark_uses_the_cores_there_are(monkeypatch):
     used = []
 
