@@ -34,6 +34,7 @@ _ENOUGH = 2e-3
 """A fit has ended where a step takes less than this off the sum of squares, in units of the residuals' variance."""
 _MOST_REJECTED = 12
 _AT_ONCE = 8
+"""Fits that an accelerator does at once."""
 _GAINED = 1.0
 WIDE = 3.0
 
