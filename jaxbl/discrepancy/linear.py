@@ -459,7 +459,9 @@ class Linear:
         return predictor.smoothness, np.sqrt(predictor.squares / self.count)
 
     def _predictors(self, options: list[list[float]], forces: list[np.ndarray]) -> list[Predictor]:
-        gains = jnp.stack([self.gain(one) for one in options])
+        # one compiled program for a few and for all
+        count = len(_COARSE_SMOOTHNESS) if 1 < len(options) < len(_COARSE_SMOOTHNESS) else len(options)
+        gains = jnp.stack([self.gain(options[min(i, len(options) - 1)]) for i in range(count)])
         grams = []
         for part, force in zip(self.parts, forces, strict=True):
             some = self._some(len(force), len(force))
