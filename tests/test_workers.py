@@ -28,8 +28,9 @@ def is_killed(x):
 
 
 def lasts(folder):
-    (folder / f"{os.getpid()}").touch()
     try:
+        # within: an interrupt may come as soon as the file is there
+        (folder / f"{os.getpid()}").touch()
         time.sleep(60.0)
     except KeyboardInterrupt:
         (folder / "interrupted").touch()
