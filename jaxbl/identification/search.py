@@ -225,7 +225,8 @@ class Search:
         thetas = np.zeros((self.settings.starts, len(free)))
         thetas[1:] = random.uniform(-reach, reach, thetas[1:].shape)
         tries = fits(self.experiment, free, windows, thetas, _FEW_STEPS, rounds=1)
-        cost = np.array([np.nan_to_num(one.cost, nan=np.inf) for one in tries])
+        cost = np.array([one.cost for one in tries])
+        cost = np.where(np.isfinite(cost), cost, np.inf)
         found = np.array([one.theta for one in tries])
         if not np.isfinite(cost).any():
             raise InputError(
