@@ -425,13 +425,13 @@ def _explained(setting: _Setting) -> tuple[Explainer, Explanation]:
     """
     explainer = _explainer(setting)
     found = explainer.run()
-    if found.verdict == "no_discrepancy":
-        _check_shown(setting, explainer.shown())
     if not explainer.plausible(found):
         other = _explainer(setting, _BOUND)
         again = other.run()
         if again.verdict != "unknown_effect" and other.plausible(again):
-            return other, again
+            explainer, found = other, again
+    if found.verdict == "no_discrepancy":
+        _check_shown(setting, explainer.shown())
     return explainer, found
 
 
