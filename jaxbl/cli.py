@@ -19,6 +19,8 @@ from .errors import InputError, NoResult
 
 if TYPE_CHECKING:
     from .study.engine import Progress
+    from .study.sweep import StudyResult
+    from .study.tune import Tuning
 
 app = typer.Typer(
     add_completion=False,
@@ -38,6 +40,10 @@ LogOutOption = Annotated[
 ]
 LogOverwriteOption = Annotated[bool, typer.Option("--overwrite", help="replace the results of another log")]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="remove the results of another study from the folder")]
+BackendOption = Annotated[
+    str | None,
+    typer.Option("--backend", metavar="NAME", help="fused: a loop in registers; scan: XLA's [default: the faster here]"),
+]
 
 
 @app.callback()
@@ -75,10 +81,7 @@ def sweep(
     out: OutOption = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what it will cost, and stop")] = False,
     overwrite: OverwriteOption = False,
-    backend: Annotated[
-        str | None,
-        typer.Option("--backend", metavar="NAME", help="fused: a loop in registers; scan: XLA's [default: the faster here]"),
-    ] = None,
+    backend: BackendOption = None,
 ) -> None:
     """Run all points of a study: table of metrics, maps, report. Goes on where an interrupted run stopped."""
     _start_jax()
@@ -91,7 +94,7 @@ def sweep(
     from .study.sweep import dry_run as estimate_cost
     from .study.sweep import sweep as run_sweep
 
-    chosen = backend_of(backend)
+    chosen = backend_of(backend, "--backend")
     study = read_config(config)
     if not study.axes and study.sweep.seeds == 1:
         raise InputError(f"{config}: axes: the study has none; add [[axes]], or use 'jaxbl simulate'")
@@ -115,39 +118,46 @@ def sweep(
             )
             return
     folder = _folder(config, out)
-    words = ["sweep", str(config), *(["--backend", chosen] if chosen else [])]
-    with _running(words, config, folder) as progress:
+    with _running(_words("sweep", config, chosen), config, folder) as progress:
         result = run_sweep(study, folder, progress=progress, overwrite=overwrite, backend=chosen)
-    _tell(write_sweep_report(result, folder), folder, result.cost)
+    _tell(write_sweep_report(result, folder), folder, result)
 
 
 @app.command()
-def tune(config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOption = False) -> None:
+def tune(
+    config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOption = False, backend: BackendOption = None
+) -> None:
     """Choose lambda and alpha of both observers: gains.toml, comparison, report. Goes on where it was interrupted."""
     _start_jax()
     from .report import write_tune_report
     from .study.config import read_config
+    from .study.programs import backend_of
     from .study.tune import tune as run_tune
 
+    chosen = backend_of(backend, "--backend")
     study = read_config(config)
     folder = _folder(config, out)
-    with _running(["tune", str(config)], config, folder) as progress:
-        result = run_tune(study, folder, progress=progress, overwrite=overwrite)
-    _tell(write_tune_report(result, folder), folder, result.cost)
+    with _running(_words("tune", config, chosen), config, folder) as progress:
+        result = run_tune(study, folder, progress=progress, overwrite=overwrite, backend=chosen)
+    _tell(write_tune_report(result, folder), folder, result)
 
 
 @app.command()
-def verify(config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOption = False) -> None:
+def verify(
+    config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOption = False, backend: BackendOption = None
+) -> None:
     """Check the gain conditions on three levels: verdict, counterexamples, atlas. Goes on where it was interrupted."""
     _start_jax()
     from .report import write_verify_report
     from .study.config import read_config
+    from .study.programs import backend_of
     from .study.verify import verify as run_verify
 
+    chosen = backend_of(backend, "--backend")
     study = read_config(config)
     folder = _folder(config, out)
-    with _running(["verify", str(config)], config, folder) as progress:
-        verdict = run_verify(study, folder, progress=progress, overwrite=overwrite)
+    with _running(_words("verify", config, chosen), config, folder) as progress:
+        verdict = run_verify(study, folder, progress=progress, overwrite=overwrite, backend=chosen)
     _tell(write_verify_report(verdict, folder), folder)
 
 
@@ -464,6 +474,11 @@ def bench(
         typer.echo(line)
 
 
+def _words(command: str, config: Path, backend: str | None) -> list[str]:
+    """Of a command that goes on, without its folder."""
+    return [command, str(config), *(["--backend", backend] if backend else [])]
+
+
 def _folder(config: Path, out: Path | None) -> Path:
     return out if out is not None else Path("results") / config.stem
 
@@ -549,13 +564,15 @@ def _progress(unit: str) -> "Iterator[Progress | None]":
         yield update
 
 
-def _tell(lines: list[str], folder: Path, cost: dict[str, float] | None = None) -> None:
+def _tell(lines: list[str], folder: Path, computed: "StudyResult | Tuning | None" = None) -> None:
     """Print the headline of a report, what it took to compute, and where the report lies."""
     for line in lines:
         typer.echo(line)
-    if cost is not None and cost["lanes"]:
+    if computed is not None and (cost := computed.cost)["lanes"]:
         compiling, running = _duration(cost["compile_seconds"]), _duration(cost["run_seconds"])
         typer.echo(f"Compiled in {compiling}, ran {cost['lanes']:.0f} lanes in {running}.")
+        for what in computed.scanned:
+            typer.echo(f"Scanned, and slower for it: the fused loop does not know {what}.")
     typer.echo(f"{folder / 'report.html'}")
 
 

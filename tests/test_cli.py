@@ -134,11 +134,19 @@ BAD = {
         ["sweep", "axis.toml", "--dry-run"],
         "axis.toml: axes[0]: unknown path 'observer.motor.alfa'; nearest valid path: 'observer.motor.alpha'",
     ),
-    "no such backend": (["sweep", "study.toml", "--backend", "gpu"], "--backend gpu: there is none; one of fused, scan"),
+    "no such backend": (["sweep", "study.toml", "--backend", "gpu"], "--backend: there is no 'gpu'; one of fused, scan"),
     "seeds alone, fused": (
         ["sweep", "seeds.toml", "--backend", "fused"],
         "seeds.toml: --backend fused: the fused loop does not know lanes that differ in nothing but their seed; "
         "use --backend scan",
+    ),
+    "no such backend for gains": (
+        ["tune", "study.toml", "--backend", "Scan"],
+        "--backend: there is no 'Scan'; one of fused, scan",
+    ),
+    "no such backend for conditions": (
+        ["verify", "study.toml", "--backend", "xla"],
+        "--backend: there is no 'xla'; one of fused, scan",
     ),
     "wrong figure": (
         ["sweep", "figure.toml"],
@@ -295,9 +303,10 @@ def test_an_interrupted_verification_says_how_to_go_on(call, tmp_path, monkeypat
 
     write(tmp_path, rigid(axes=GAINS))
     monkeypatch.setattr(Engine, "run", interrupt)
-    code, _, errors = call("verify", "study.toml", "--out", "out")
+    code, _, errors = call("verify", "study.toml", "--out", "out", "--backend", "scan")
     assert code == 130
-    assert errors == ["interrupted; what is finished is kept. Go on with: jaxbl verify study.toml --out out"]
+    again = "jaxbl verify study.toml --backend scan --out out"
+    assert errors == [f"interrupted; what is finished is kept. Go on with: {again}"]
 
 
 TUNE = {"num": 3, "refine": 1, "alpha_ratio": {"start": 1.2, "stop": 20.0}, "lambda_ratio": {"start": 0.5, "stop": 10.0}}

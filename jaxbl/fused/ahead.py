@@ -64,7 +64,7 @@ class Looped:
         block = jax.eval_shape(lambda: shared.given(jnp.uint32(0), jnp.int32(0), 1))
         sample = jax.tree.map(lambda x: jax.ShapeDtypeStruct((), x.dtype), block)
         parts = recursion(shared.inner, shared.state, sample)
-        self._direct, self._fixed = parts.direct, [np.asarray(value) for value in parts.fixed]
+        self._direct = parts.direct
         self._dtypes = [out.dtype for out in parts.step.out_avals[len(shared.state) :]]
 
         def ahead(seed: Any, first: Any, length: int) -> tuple[list[Any], list[Any]]:
@@ -73,7 +73,7 @@ class Looped:
         self._parallel = {n: jax.jit(partial(ahead, length=n)).lower(*_FIRST).compile() for n in lengths}
         self._loop = None
         if shared.state:
-            self._loop = Loop(parts.step, None, 0, len(shared.state), (len(self._fixed), 0), np.dtype(float), lanes=1)
+            self._loop = Loop(parts.step, None, 0, len(shared.state), np.dtype(float), lanes=1)
         self._outer = jax.jit(lambda state: shared.outer(state, ())).lower(shared.state).compile()
 
     def __call__(self, state: list[Any], seed: int, first: int, length: int) -> Block:
@@ -81,7 +81,7 @@ class Looped:
         carry = [np.array([leaf]) for leaf in state]
         kept = [np.empty(length, dtype) for dtype in self._dtypes]
         if self._loop is not None:
-            self._loop([*carry, *self._fixed, *map(np.asarray, read), *kept], length, 0, 1)
+            self._loop([*carry, *map(np.asarray, read), *kept], length, 0, 1)
         direct, rest = iter(direct), iter(kept)
         handed = [next(direct) if alone else next(rest) for alone in self._direct]
         return *self._outer([leaf[0] for leaf in carry]), handed

@@ -74,9 +74,9 @@ class Loop:
         after: the same of what is done once after all samples, to the carry alone; None for nothing.
         values: number of values; they differ from lane to lane.
         carry: numbers that a lane carries.
-        fixed: numbers of fixed ones of `body` and of `after`.
         dtype: of the lanes' numbers.
         lanes: that are computed together; left out, as many as suit the machine.
+        fixed: number of those that all lanes read and that differ from call to call.
 
     Raises:
         Unsupported: an operation of theirs is unknown here.
@@ -88,14 +88,14 @@ class Loop:
         after: ClosedJaxpr | None,
         values: int,
         carry: int,
-        fixed: tuple[int, int],
         dtype: np.dtype,
         lanes: int | None = None,
+        fixed: int = 0,
     ):
         self.lanes = lanes or vector_lanes(dtype)
         body, after = substituted(body, FUNCTIONS), None if after is None else substituted(after, FUNCTIONS)
         module = ir.Module("loop")
-        _Writer(module, self.lanes).loop(body, after, values, carry, fixed[0])
+        _Writer(module, self.lanes).loop(body, after, values, carry, fixed)
         parsed = binding.parse_assembly(str(module))
         options = binding.create_pipeline_tuning_options(speed_level=3)
         passes = binding.create_pass_builder(_machine(), options)
@@ -109,8 +109,8 @@ class Loop:
         """Take lanes `first` to `last` (multiples of `lanes`) through samples; the carry's arrays are overwritten.
 
         Args:
-            arrays: contiguous; values and carry `(lanes,)`, fixed `()` and inputs `(steps,)` of the body, fixed and inputs
-                `()` of what follows, and of what is kept `(steps, lanes)` with no more lanes than run.
+            arrays: contiguous; values and carry `(lanes,)`, fixed `()` and inputs `(steps,)` of the body, inputs `()` of
+                what follows, and of what is kept `(steps, lanes)` with no more lanes than run.
             steps: samples.
             first: lane.
             last: lane behind the last one.
@@ -129,6 +129,9 @@ class _Writer:
 
     def loop(self, body: ClosedJaxpr, after: ClosedJaxpr | None, values: int, carry: int, fixed: int) -> None:
         function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [_POINTER, _INT, _INT, _INT]), "loop")
+        # what registers have no room for lies on the stack: no vector of it over two lines of the cache
+        function.attributes.alignstack = 64
+        function.attributes.add("nounwind")  # without another one it is not written
         table, steps, first, last = function.args
         build: Any = ir.IRBuilder(function.append_basic_block("entry"))
         self.build = build

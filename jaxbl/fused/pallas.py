@@ -30,7 +30,7 @@ class Kernel:
     """A loop over blocks of samples and what follows each, for lanes side by side.
 
     Args:
-        body: jaxpr of one sample, scalars of one lane: values, carry, fixed, one sample's inputs -> carry.
+        body: jaxpr of one sample, scalars of one lane: values, carry, one sample's inputs -> carry.
         after: the same of what is done once after every block of samples.
         values: number of values; they differ from lane to lane.
         carry: numbers that a lane carries.
@@ -49,28 +49,28 @@ class Kernel:
         self,
         values: Sequence[ArrayLike],
         carry: Sequence[ArrayLike],
-        fixed: tuple[Sequence[ArrayLike], Sequence[ArrayLike]],
-        inputs: tuple[Sequence[ArrayLike], Sequence[ArrayLike]],
+        inputs: Sequence[ArrayLike],
+        ends: Sequence[ArrayLike],
     ) -> list[Array]:
         """The carry after all blocks of samples.
 
         Args:
             values: `(lanes,)` each, lanes a multiple of `LANES`.
             carry: `(lanes,)` each.
-            fixed: `()` each, of the body and of what follows.
-            inputs: of the body `(blocks, samples)` each, of what follows `(blocks,)` each.
+            inputs: of the body `(blocks, samples)` each.
+            ends: inputs of what follows `(blocks,)` each.
         """
-        return self._run(list(values), list(carry), tuple(map(list, fixed)), tuple(map(list, inputs)))
+        return self._run(list(values), list(carry), list(inputs), list(ends))
 
-    def _called(self, values: Any, carry: Any, fixed: Any, inputs: Any) -> list[Array]:
-        blocks, samples = inputs[0][0].shape
-        # a scalar becomes an array of one, and a truth value a number: both are read from memory
-        shared = [jnp.reshape(x, -1) for x in (*fixed[0], *fixed[1], *inputs[0], *inputs[1])]
+    def _called(self, values: Any, carry: Any, inputs: Any, ends: Any) -> list[Array]:
+        blocks, samples = inputs[0].shape
+        shared = [jnp.reshape(x, -1) for x in (*inputs, *ends)]
+        # a truth value becomes a number: they are read from memory
         truths = [x.dtype == jnp.bool_ for x in shared]
         shared = [x.astype(jnp.int32) if true else x for x, true in zip(shared, truths, strict=True)]
         lanes = pl.BlockSpec((LANES,), lambda i: (i,))
         whole = [pl.BlockSpec(x.shape, lambda i: (0,)) for x in shared]
-        kernel = partial(self._kernel, len(fixed[0]), len(fixed[1]), len(inputs[0]), truths, blocks, samples)
+        kernel = partial(self._kernel, len(inputs), truths, blocks, samples)
         return pl.pallas_call(
             kernel,
             grid=(carry[0].size // LANES,),
@@ -81,9 +81,7 @@ class Kernel:
             compiler_params=None if self._interpret else triton.CompilerParams(num_warps=LANES // 32),
         )(*values, *carry, *shared)
 
-    def _kernel(
-        self, body_fixed: int, after_fixed: int, body_inputs: int, truths: list[bool], blocks: int, samples: int, *refs: Any
-    ) -> None:
+    def _kernel(self, inputs: int, truths: list[bool], blocks: int, samples: int, *refs: Any) -> None:
         own = self._values + self._carry
         numbers = [ref[...] for ref in refs[: self._values]]
         state = [ref[...] for ref in refs[self._values : own]]
@@ -93,19 +91,13 @@ class Kernel:
             value = shared[i][at]
             return value != 0 if truths[i] else value
 
-        steady = [read(i, 0) for i in range(body_fixed)]
-        later = [read(i, 0) for i in range(body_fixed, body_fixed + after_fixed)]
-        first = body_fixed + after_fixed
-        given = range(first, first + body_inputs)
-        ends = range(first + body_inputs, len(shared))
-
         def sample(index: Any, state: list[Array]) -> list[Array]:
-            return self._body(*numbers, *state, *steady, *[read(i, index) for i in given])
+            return self._body(*numbers, *state, *[read(i, index) for i in range(inputs)])
 
         def block(number: Any, state: list[Array]) -> list[Array]:
             begin = number * samples
             state = jax.lax.fori_loop(begin, begin + samples, sample, state)
-            return self._after(*numbers, *state, *later, *[read(i, number) for i in ends])
+            return self._after(*numbers, *state, *[read(i, number) for i in range(inputs, len(shared))])
 
         for ref, value in zip(out, jax.lax.fori_loop(0, blocks, block, state), strict=True):
             ref[...] = value

@@ -122,10 +122,7 @@ class HostPassage(Passage):
         self._together, self._threads = vector_lanes(dtype), threads
         self._pool = ThreadPoolExecutor(threads)
         super().__init__(experiment, reducers, paths, lanes, self._together)
-        inner, outer = self._inner, self._outer
-        self._fixed = [np.asarray(value) for value in inner.fixed], [np.asarray(value) for value in outer.fixed]
-        counts = len(inner.fixed), len(outer.fixed)
-        self._loop = Loop(inner.lane, outer.lane, len(paths), self.carried, counts, self._dtype)
+        self._loop = Loop(self._inner.lane, self._outer.lane, len(paths), self.carried, self._dtype)
 
     def _march(self, given, carry, state, seed):
         carry = [np.array(leaf, order="C") for leaf in carry]
@@ -135,7 +132,7 @@ class HostPassage(Passage):
         for first in range(0, self._steps, self._length):
             state, last, handed = ahead
             last, handed = [np.asarray(x) for x in last], [np.asarray(x) for x in handed]
-            arrays = [*given, *carry, *self._fixed[0], *handed, *self._fixed[1], *last]
+            arrays = [*given, *carry, *handed, *last]
             length = min(self._length, self._steps - first)
             running = [self._pool.submit(self._loop, arrays, length, *pair) for pair in pairwise(edges)]
             # what lanes share of the next samples is computed meanwhile
@@ -169,10 +166,9 @@ class DevicePassage(Passage):
         for first in range(0, self._steps, self._length):
             state, *part = self._ahead(state, seed, first, min(self._length, self._steps - first))
             parts.append(part)
-        fixed = self._inner.fixed, self._outer.fixed
         for some in (parts[:blocks], parts[blocks:] if rest else []):
             if some:
                 last, handed = ([np.stack([np.asarray(x) for x in column]) for column in zip(*one, strict=True)]
                                 for one in zip(*some, strict=True))  # fmt: skip
-                carry = self._kernel(given, carry, fixed, (handed, last))
+                carry = self._kernel(given, carry, handed, last)
         return [np.asarray(leaf) for leaf in carry], state

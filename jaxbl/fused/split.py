@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 
 _CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call", "checkpoint")
 """Primitives that only call another jaxpr."""
@@ -38,12 +39,11 @@ class Parts(NamedTuple):
     """A function `f(values, carry, given) -> carry` of one lane in two parts.
 
     Attributes:
-        fixed: arrays that the lanes' part reads and that never change.
         shared: from the shared part of the carry and `given` to the next shared part and what the lanes' part reads of it.
-        lane: the lanes' part: values, its part of the carry, `fixed`, what `shared` hands over -> its part of the carry.
+        lane: the lanes' part: values, its part of the carry, what `shared` hands over -> its part of the carry. Numbers that
+            never change stand in it as such, so that compilers see what follows from them.
     """
 
-    fixed: list[jax.Array]
     shared: Callable[[Sequence[Any], Any], tuple[list[Any], list[Any]]]
     lane: ClosedJaxpr
 
@@ -111,16 +111,18 @@ def split(function: Callable[..., Any], values: Any, carry: Any, given: Any, kin
         _run([eqn for eqn in others if all(known[out] == Kind.FIXED for out in eqn.outvars)], env)
         return [env[v] for v in fixed]
 
+    for v in [*lane_in, *fixed, *crossing]:
+        if v.aval.shape or str(v.aval.dtype) not in NUMBERS:
+            raise Unsupported(f"lanes that read {v.aval.dtype}{list(v.aval.shape) or ''}")
+    numbers = [np.asarray(value)[()] for value in (jax.jit(once)() if fixed else [])]
+
     def lane(*arguments: Any) -> list[Any]:
-        env = dict(zip([*lane_in, *fixed, *crossing], arguments, strict=True))
+        env = dict(zip([*fixed, *lane_in, *crossing], [*numbers, *arguments], strict=True))
         _run(lanes, env)
         return [_read(env, out) for out in results]
 
-    examples = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in [*lane_in, *fixed, *crossing]]
-    for one in examples:
-        if one.shape or str(one.dtype) not in NUMBERS:
-            raise Unsupported(f"lanes that read {one.dtype}{list(one.shape) or ''}")
-    return Parts(jax.jit(once)() if fixed else [], shared, jax.make_jaxpr(lane)(*examples))
+    examples = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in [*lane_in, *crossing]]
+    return Parts(shared, jax.make_jaxpr(lane)(*examples))
 
 
 class Recursion(NamedTuple):
@@ -129,14 +131,12 @@ class Recursion(NamedTuple):
     Attributes:
         direct: what is handed over of `given` alone, by place; the rest needs the state.
         ahead: from `given` to the former, and to what `step` reads of it.
-        step: state, `fixed`, what `ahead` hands it -> state, and the rest of what is handed over.
-        fixed: arrays that `step` reads and that never change.
+        step: state, what `ahead` hands it -> state, and the rest of what is handed over.
     """
 
     direct: list[bool]
     ahead: Callable[[Any], tuple[list[Any], list[Any]]]
     step: ClosedJaxpr
-    fixed: list[jax.Array]
 
 
 def recursion(function: Callable[..., tuple[list[Any], list[Any]]], state: Sequence[Any], given: Any) -> Recursion:
@@ -160,18 +160,15 @@ def recursion(function: Callable[..., tuple[list[Any], list[Any]]], state: Seque
     parts = split(joined, [], [*state, *spare], given, kinds)
     unread = [jnp.zeros(one.shape, one.dtype) for one, alone in zip(spare, direct, strict=True) if not alone]
 
-    def step(state: list[Any], fixed: list[Any], read: list[Any]) -> list[Any]:
-        env = dict(zip(parts.lane.jaxpr.invars, [*state, *unread, *fixed, *read], strict=True))
-        _run(parts.lane.jaxpr.eqns, env)
-        return [_read(env, out) for out in parts.lane.jaxpr.outvars]
+    def step(state: list[Any], read: list[Any]) -> list[Any]:
+        return jaxpr_as_fun(parts.lane)(*state, *unread, *read)
 
-    read = parts.lane.jaxpr.invars[count + len(unread) + len(parts.fixed) :]
+    read = parts.lane.jaxpr.invars[count + len(unread) :]
     examples = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in read]
     return Recursion(
         direct,
         lambda given: parts.shared([None] * sum(direct), given),
-        flat(step, list(state), parts.fixed, examples),
-        parts.fixed,
+        flat(step, list(state), examples),
     )
 
 

@@ -16,13 +16,12 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.drive.parameters import as_arrays
-from jaxbl.errors import InputError
 from jaxbl.simulate import Experiment
 
 from .config import Config
 from .metrics import metric_columns, with_conditions
 from .points import Points
-from .programs import BACKENDS, Backend, Layout, Program, compile_program, faster
+from .programs import Backend, Layout, Program, backend_of, compile_program, faster
 
 Progress = Callable[[int, int], None]
 """Called with the number of finished and of all lanes."""
@@ -98,6 +97,9 @@ class Engine:
         devices: left out, all local ones.
         backend: left out, the faster one here.
         insist: refuse a study that the fused loop cannot run; else it is scanned.
+
+    Attributes:
+        scanned: what the fused loop did not know of groups that were scanned in its place.
     """
 
     def __init__(
@@ -111,15 +113,14 @@ class Engine:
         self.config = config
         self.points = Points(config)
         self.devices = devices or jax.local_devices()
-        if backend not in (None, *BACKENDS):
-            raise InputError(f"backend: there is no {backend!r}; one of {', '.join(BACKENDS)}")
         # by the study, however it is cut: roundings differ between backends
         natural = layout_for(config, self.points, len(self.devices), "fused", None)
-        self.backend: Backend = backend or faster(natural, self.devices)
+        self.backend: Backend = backend_of(backend) or faster(natural, self.devices)
         self._insist = insist
         self.layout = layout or layout_for(config, self.points, len(self.devices), self.backend, config.sweep.chunk)
         self.compile_seconds = 0.0
         self.run_seconds = 0.0
+        self.scanned: list[str] = []
         self._compiled: tuple[int, tuple[Program, list[str]]] | None = None
 
     def __len__(self) -> int:
@@ -216,6 +217,8 @@ class Engine:
             start = time.perf_counter()
             program = compile_program(experiment, self.layout, self.devices, self.backend, columns, insist=self._insist)
             self.compile_seconds += time.perf_counter() - start
+            if program.instead is not None and program.instead not in self.scanned:
+                self.scanned.append(program.instead)
             return program, metric_columns(experiment)
 
     def estimate(self) -> "Estimate":

@@ -22,13 +22,13 @@ Backend = Literal["fused", "scan"]
 BACKENDS: tuple[Backend, ...] = ("fused", "scan")
 
 
-def backend_of(name: str | None) -> Backend | None:
-    """A backend by its name. Raises `InputError` for another."""
+def backend_of(name: str | None, given: str = "backend") -> Backend | None:
+    """A backend by its name, None for none. Raises `InputError` for another; `given` is what it was given as."""
     for backend in BACKENDS:
         if backend == name:
             return backend
     if name is not None:
-        raise InputError(f"--backend {name}: there is none; one of {', '.join(BACKENDS)}")
+        raise InputError(f"{given}: there is no {name!r}; one of {', '.join(BACKENDS)}")
     return None
 
 
@@ -46,10 +46,12 @@ class Program(NamedTuple):
         run: from values by path `(points,)` and seeds `(seeds,)` to figures `(seeds, points)` and gains, which have these
             axes or fit them.
         megabytes: of memory that it takes.
+        instead: what the fused loop does not know, where the scan takes its place.
     """
 
     run: Callable[[dict[str, np.ndarray], np.ndarray], tuple[dict[str, Any], dict[str, Gains]]]
     megabytes: float
+    instead: str | None = None
 
 
 _FUSED, _SCAN = (0.7, 1.1e-3), (1.3, 3.6e-3)
@@ -96,6 +98,7 @@ def compile_program(
         except Unsupported as why:
             if insist:
                 raise InputError(f"--backend fused: the fused loop does not know {why}; use --backend scan") from None
+            return _scanned(experiment, layout, devices, columns)._replace(instead=str(why))
     return _scanned(experiment, layout, devices, columns)
 
 

@@ -35,11 +35,13 @@ class StudyResult:
         config: the study.
         cost: seconds of compilation and of computing, and lanes computed in this call.
         source: where the rows are: a folder, or memory.
+        scanned: what the fused loop did not know of groups that this call scanned in its place.
     """
 
     config: Config
     source: Store | pd.DataFrame
     cost: dict[str, float] = dataclasses.field(default_factory=dict)
+    scanned: tuple[str, ...] = ()
 
     @functools.cached_property
     def frame(self) -> pd.DataFrame:
@@ -143,7 +145,7 @@ def sweep(
         if not store.manifest["finished"]:
             store.update(finished=True, seconds={"compile": engine.compile_seconds, "run": engine.run_seconds})
     cost = {"compile_seconds": engine.compile_seconds, "run_seconds": engine.run_seconds, "lanes": run.computed}
-    return StudyResult(config, source, cost)
+    return StudyResult(config, source, cost, tuple(engine.scanned))
 
 
 class _Run:

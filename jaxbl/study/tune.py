@@ -25,6 +25,7 @@ from .config import TUNE_NAMES, Config, TuneTable, read_config
 from .engine import Progress
 from .metrics import undisturbed
 from .pilot import Scenarios, pilot, scenarios_of
+from .programs import Backend, backend_of
 from .store import claim, make_folder, mark, write_atomic
 from .sweep import sweep
 from .tune_summary import FIGURES, figures_of, summarise
@@ -50,12 +51,14 @@ class Tuning:
             `torque_rmse`, `convergence_time`, `convergence_time_worst` and `f_plus`, least `margin_alpha` and
             `margin_exact`, `error` (the objective) and `feasible`.
         cost: seconds of compilation and of computing, and lanes computed in this call.
+        scanned: what the fused loop did not know of runs that this call scanned in its place.
     """
 
     config: Config
     summary: dict[str, Any]
     candidates: dict[str, pd.DataFrame]
     cost: dict[str, float]
+    scanned: tuple[str, ...] = ()
 
 
 def tune(
@@ -65,6 +68,7 @@ def tune(
     progress: Progress | None = None,
     devices: list[Any] | None = None,
     overwrite: bool = False,
+    backend: Backend | None = None,
 ) -> Tuning:
     """Choose lambda and alpha of both observers for a study.
 
@@ -75,12 +79,13 @@ def tune(
         progress: called with finished and total lanes of all stages.
         devices: JAX devices to use; left out, all local ones.
         overwrite: remove the results of another study from `out`.
+        backend: `fused` or `scan` (:func:`jaxbl.sweep`); left out, the faster one here.
 
     Raises:
-        InputError: wrong config, or a folder that holds something else.
+        InputError: wrong config, a folder that holds something else, or a backend that cannot run the study.
         NoResult: no gains in the range meet the constraints, or the drive diverges.
     """
-    config = read_config(study)
+    config, backend = read_config(study), backend_of(backend)
     table = config.tune or TuneTable()
     config = config.model_copy(update={"tune": table})
     scenarios = scenarios_of(config, table)
@@ -90,7 +95,7 @@ def tune(
         stages = Path(out) / "tune"
         if (stages / "manifest.json").exists():
             found = json.loads((stages / "manifest.json").read_text(encoding="utf-8")).get("pilot")
-    search = Search(scenarios, table, found or pilot(scenarios, table), stages, devices, overwrite)
+    search = Search(scenarios, table, found or pilot(scenarios, table), stages, devices, overwrite, backend)
     if stages is not None and found is None:
         # before the stages: it is what makes the folder this study's
         make_folder(stages)
@@ -98,7 +103,7 @@ def tune(
     search.progress = progress
     search.run()
     summary = summarise(search, search.compare(held_out=False), search.compare(held_out=True))
-    return Tuning(config, summary, search.candidates, search.cost)
+    return Tuning(config, summary, search.candidates, search.cost, tuple(search.scanned))
 
 
 class Window(NamedTuple):
@@ -136,9 +141,10 @@ class Search:
         folder: Path | None,
         devices: list[Any] | None,
         overwrite: bool,
+        backend: Backend | None,
     ):
         self.scenarios, self.table, self.pilot = scenarios, table, pilot
-        self.folder, self.devices, self.overwrite = folder, devices, overwrite
+        self.folder, self.devices, self.overwrite, self.backend = folder, devices, overwrite, backend
         self.sides = tuple(pilot)
         self.progress: Progress | None = None
         self.metric = f"{table.objective}_rmse"
@@ -152,6 +158,7 @@ class Search:
         self.windows = [dict.fromkeys(self.sides, self.limits)]
         self.candidates: dict[str, pd.DataFrame] = {}
         self.cost = {"compile_seconds": 0.0, "run_seconds": 0.0, "lanes": 0.0}
+        self.scanned: dict[str, None] = {}
         self._done = 0
         seeds, lanes = scenarios.config.sweep.seeds, len(scenarios.names)
         self._total = seeds * lanes * (table.num**2 * (1 + table.refine) + 2 * len(self.gains_to_compare({})))
@@ -307,7 +314,8 @@ class Search:
                 self.progress(self._done, max(self._total, self._done))
 
         folder = None if self.folder is None else self.folder / name
-        result = sweep(data, folder, progress=update, devices=self.devices, overwrite=self.overwrite)
+        result = sweep(data, folder, progress=update, devices=self.devices, overwrite=self.overwrite, backend=self.backend)
+        self.scanned |= dict.fromkeys(result.scanned)
         self.cost = {key: value + result.cost[key] for key, value in self.cost.items()}
         names = [f"{side}.{figure}" for side in self.sides for figure in FIGURES]
         paths = [axis["path"] for axis in data["axes"]]

@@ -31,6 +31,7 @@ from .engine import Progress
 from .metrics import NOTHING, undisturbed
 from .pieces import in_pieces
 from .points import Points
+from .programs import Backend, backend_of
 from .store import claim, mark, plain, write_atomic
 from .sweep import sweep
 
@@ -96,6 +97,7 @@ def verify(
     progress: Progress | None = None,
     devices: list[Any] | None = None,
     overwrite: bool = False,
+    backend: Backend | None = None,
 ) -> Verdict:
     """Check every gain condition on three levels, and list where it held and the observer failed all the same.
 
@@ -105,11 +107,13 @@ def verify(
         progress: called with finished and total runs of the study's levels.
         devices: JAX devices to use; left out, all local ones.
         overwrite: remove the results of another study from `out`.
+        backend: `fused` or `scan` (:func:`jaxbl.sweep`) for the runs of the study's levels; left out, the faster one here.
 
     Raises:
-        InputError: wrong config, no axes over the gains, or a folder that holds something else.
+        InputError: wrong config, no axes over the gains, a folder that holds something else, or a backend that cannot run
+            the study.
     """
-    config = read_config(study)
+    config, backend = read_config(study), backend_of(backend)
     sides = judged_sides(config)
     folder = None if out is None else Path(out)
     if folder is not None:
@@ -124,7 +128,7 @@ def verify(
     for level, study in studies.items():
         report = None if progress is None else partial(_shifted, progress, done, sum(rows.values()))
         place = None if work is None else work / level
-        levels[level] = sweep(study, place, progress=report, devices=devices).frame
+        levels[level] = sweep(study, place, progress=report, devices=devices, backend=backend).frame
         for side in sides:
             size = levels[level][f"{side}.f_plus_acceleration"].max()
             if levels[level][f"{side}.f_plus"].max() <= NOTHING[config.run.precision] * size:

@@ -73,9 +73,10 @@ def entries(folder: Path, count: int, devices: int) -> list[Entry]:
         Entry("diffrax, Euler, one device", Diffrax, few, "diffrax"),
         Entry("NumPy, lane arrays", Plain, 2**12),
         Entry("NumPy, one lane", Plain, 1),
-        Entry("OpenSMC, one lane", partial(Plain, library=True), 1, "opensmc"),
-        Entry("SciPy RK45, one lane", partial(Plain, solver="RK45"), 1, tolerance=1e-3),
-        Entry("SciPy LSODA, one lane", partial(Plain, solver="LSODA"), 1, tolerance=1e-3),
+        Entry("Python numbers, one lane", partial(Plain, numbers=True), 1),
+        Entry("OpenSMC, one lane", partial(Plain, numbers=True, library=True), 1, "opensmc"),
+        Entry("SciPy RK45, one lane", partial(Plain, numbers=True, solver="RK45"), 1, tolerance=1e-3),
+        Entry("SciPy LSODA, one lane", partial(Plain, numbers=True, solver="LSODA"), 1, tolerance=1e-3),
     ]
 
 

@@ -84,26 +84,29 @@ def test_both_backends_give_the_same_figures(study, precision):
 
 
 @pytest.mark.parametrize(
-    ("excitation", "path"),
+    ("excitation", "path", "why"),
     [
-        ({"kind": "sine", "amplitude": 0.1, "frequency": 1.0}, "frequency"),
-        ({"kind": "multisine", "amplitude": 0.1, "frequency": 1.0}, "frequency"),
+        ({"kind": "sine", "amplitude": 0.1, "frequency": 1.0}, "frequency", ()),
+        ({"kind": "multisine", "amplitude": 0.1, "frequency": 1.0}, "frequency", ("lanes that read float64[8]",)),
         (
             {"kind": "chirp", "amplitude": 0.1, "start_frequency": 0.5, "stop_frequency": 2.0, "sweep_time": 0.2},
             "sweep_time",
+            (),
         ),
-        ({"kind": "steps", "amplitude": 0.1, "hold": 0.05}, "hold"),
-        ({"kind": "prbs", "amplitude": 0.1, "hold": 0.05}, "hold"),
+        ({"kind": "steps", "amplitude": 0.1, "hold": 0.05}, "hold", ("lanes that read key<fry>",)),
+        ({"kind": "prbs", "amplitude": 0.1, "hold": 0.05}, "hold", ("lanes that read float64[1023]",)),
     ],
     ids=lambda value: value["kind"] if isinstance(value, dict) else "",
 )
-def test_what_the_fused_loop_cannot_do_is_scanned(excitation, path):
+def test_what_the_fused_loop_cannot_do_is_scanned(excitation, path, why):
     """Axes on an input's numbers make it a lane's: random levels and sums over harmonics are no work for the loop."""
     path = f"excitation.{path}"
     study = rigid(axes=[listed(path, 0.04, 0.06, 0.09)]) | {"excitation": excitation}
     config = read_config(study)
     assert Engine(config).backend == "fused"
-    found, scanned = sweep(config).frame, sweep(config, backend="scan").frame
+    result, scanned = sweep(config), sweep(config, backend="scan").frame
+    assert result.scanned == why
+    found = result.frame
     np.testing.assert_allclose(found["motor.velocity_rmse"], scanned["motor.velocity_rmse"], rtol=1e-6)
 
 

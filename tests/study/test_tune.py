@@ -194,12 +194,14 @@ def test_an_interrupted_search_goes_on_where_it_stopped(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Engine, "run", counted)
     with pytest.raises(KeyboardInterrupt):
-        tune(study, tmp_path)
+        tune(study, tmp_path, backend="scan")
+    with pytest.raises(InputError, match="was begun with --backend scan"):
+        tune(study, tmp_path, backend="fused")
     monkeypatch.setattr(Engine, "run", lambda engine, chunk: ran.append(chunk) or run(engine, chunk))
-    resumed = tune(study, tmp_path)
+    resumed = tune(study, tmp_path, backend="scan")
     # maps of both stages, the named gains twice: each once
     assert len(ran) == 4
-    assert resumed.summary == tune(study).summary
+    assert resumed.summary == tune(study, backend="scan").summary
 
 
 def test_a_range_that_ends_too_early_is_said():

@@ -1,54 +1,75 @@
-"""The chain in NumPy, a loop over time in Python: with lane arrays, or one lane whose plant SciPy solves, or whose observers
-are OpenSMC's."""
+"""The chain as a loop over time in Python: with lane arrays of NumPy, or one lane in Python's own numbers, whose plant SciPy
+solves, or whose observers are OpenSMC's."""
 
 # of the extra `bench`, which need not be there
 # pyright: reportMissingImports=false
 
-from collections.abc import Callable
-from typing import Any
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..workload import Workload, constants, figures_of
 
-Plant = Callable[[np.ndarray, float], np.ndarray]
-"""From motor and load position and velocity, and a torque, to the next sample's."""
+State = Sequence[Any]
+"""Motor and load position and velocity."""
+Plant = Callable[[State, Any], State]
+"""From a state and a torque to the next sample's."""
+
+
+class Functions(NamedTuple):
+    """Of numbers, or of arrays of them."""
+
+    tanh: Callable[[Any], Any]
+    sqrt: Callable[[Any], Any]
+    sign: Callable[[Any], Any]
+
+
+_ARRAYS = Functions(np.tanh, np.sqrt, np.sign)
+_NUMBERS = Functions(math.tanh, math.sqrt, lambda x: (x > 0.0) - (x < 0.0))
 
 
 class Plain:
-    """One workload as a loop over NumPy arrays of lanes.
+    """One workload as a loop over time.
 
     Args:
-        workload: of one lane where `solver` or `library` is given.
-        solver: method of SciPy's `solve_ivp` that takes the plant from sample to sample.
-        library: observers are OpenSMC's.
+        workload: of one lane where `numbers` is asked for.
+        numbers: in Python's own in place of arrays of lanes.
+        solver: method of SciPy's `solve_ivp` that takes the plant from sample to sample; needs `numbers`.
+        library: observers are OpenSMC's; needs `numbers`.
         chosen: indices of the lanes to run; left out, all.
     """
 
     def __init__(
         self,
         workload: Workload,
+        numbers: bool = False,
         solver: str | None = None,
         library: bool = False,
         chosen: np.ndarray | slice = slice(None),
     ):
         self._workload, self._solver, self._library = workload, solver, library
-        self._torque, self._noise = workload.inputs()
-        self._values = {path: column[chosen] for path, column in workload.values().items()}
+        torque, noise = workload.inputs()
+        self._f = _NUMBERS if numbers else _ARRAYS
+        self._torque, self._noise = (torque.tolist(), noise.tolist()) if numbers else (torque, noise)
+        values = [column[chosen] for column in workload.values().values()]
+        self._values: list[Any] = [column.item() for column in values] if numbers else values
+        kind = float if numbers else workload.dtype.type
+        self._c = {name: kind(value) for name, value in constants().items()}
 
     def __call__(self) -> dict[str, np.ndarray]:
-        w, c, dtype = self._workload, constants(), self._workload.dtype
-        c = {name: dtype.type(value) for name, value in c.items()}
-        h, ratio = c["period"], c["gear_ratio"]
-        motor_alpha, motor_lambda, load_alpha, load_lambda, dead_zone, noise = self._values.values()
-        zero = np.zeros_like(noise)
-        plant = self._moreau(c, dead_zone) if self._solver is None else self._solved(c, float(dead_zone[0]))
+        w, c = self._workload, self._c
+        h, ratio, tanh = c["period"], c["gear_ratio"], self._f.tanh
+        motor_alpha, motor_lambda, load_alpha, load_lambda, dead_zone, noise = self._values
+        zero = 0.0 * noise
+        plant = self._moreau(dead_zone) if self._solver is None else self._solved(dead_zone)
         observer = _OpenSMC if self._library else _Euler
-        motor = observer(motor_lambda, motor_alpha, h, zero - c["motor_error"])
-        load = observer(load_lambda, load_alpha, h, zero)
-        state = np.stack([zero] * 4)
+        motor = observer(motor_lambda, motor_alpha, h, zero - c["motor_error"], self._f)
+        load = observer(load_lambda, load_alpha, h, zero, self._f)
+        state = [zero] * 4
         motor_control = load_control = twist = bend = zero
-        sums = np.zeros((9, len(noise)))
+        sums = [np.float64(0.0) * zero for _ in range(9)]
         for i in range(w.steps):
             u, (motor_unit, load_unit) = self._torque[i], self._noise[i]
             motor_read, load_read = state[0] + noise * motor_unit, state[2] + noise / ratio * load_unit
@@ -73,42 +94,42 @@ class Plain:
                 sums[7] += motor_off * motor_off
                 sums[8] += load_off * load_off
             twist = twist + c["share"] * (z - twist)
-            bend = bend + c["share"] * (-4.0 * np.tanh(0.5 * c["slope"] * z) - bend)
-        return figures_of(w, list(sums))
+            bend = bend + c["share"] * (-4.0 * tanh(0.5 * c["slope"] * z) - bend)
+        return figures_of(w, [np.atleast_1d(column) for column in sums])
 
-    @staticmethod
-    def _moreau(c: dict[str, Any], dead_zone: np.ndarray) -> Plant:
+    def _moreau(self, dead_zone: Any) -> Plant:
+        c, tanh = self._c, self._f.tanh
         h, half, gap = c["period"], 0.5 * c["period"], 4.0 * dead_zone
 
-        def step(state: np.ndarray, torque: float) -> np.ndarray:
+        def step(state: State, torque: Any) -> State:
             motor, motor_rate, load, load_rate = state
             motor, load = motor + half * motor_rate, load + half * load_rate
             z = motor - c["gear_ratio"] * load
-            through = c["stiffness"] * (z - gap * np.tanh(0.5 * c["slope"] * z))
+            through = c["stiffness"] * (z - gap * tanh(0.5 * c["slope"] * z))
             mass, drag = c["motor_inertia"] / h, 0.5 * c["motor_viscous"]
             motor_rate = ((mass - drag) * motor_rate + torque - through) / (mass + drag)
             mass, drag = c["load_inertia"] / h, 0.5 * c["load_viscous"]
             load_rate = ((mass - drag) * load_rate + c["gear_ratio"] * through) / (mass + drag)
-            return np.stack([motor + half * motor_rate, motor_rate, load + half * load_rate, load_rate])
+            return motor + half * motor_rate, motor_rate, load + half * load_rate, load_rate
 
         return step
 
-    def _solved(self, c: dict[str, Any], dead_zone: float) -> Plant:
+    def _solved(self, dead_zone: float) -> Plant:
         from scipy.integrate import solve_ivp
 
-        method = self._solver or "RK45"
-        ratio, gap, slope = float(c["gear_ratio"]), 4.0 * dead_zone, 0.5 * float(c["slope"])
+        c, method = self._c, self._solver or "RK45"
+        ratio, gap, slope = c["gear_ratio"], 4.0 * dead_zone, 0.5 * c["slope"]
 
         def rates(t: float, x: np.ndarray, torque: float) -> list[float]:
-            z = x[0] - ratio * x[2]
-            through = c["stiffness"] * (z - gap * np.tanh(slope * z))
-            motor = (torque - through - c["motor_viscous"] * x[1]) / c["motor_inertia"]
-            return [x[1], motor, x[3], (ratio * through - c["load_viscous"] * x[3]) / c["load_inertia"]]
+            motor, motor_rate, load, load_rate = x.tolist()
+            z = motor - ratio * load
+            through = c["stiffness"] * (z - gap * math.tanh(slope * z))
+            faster = (torque - through - c["motor_viscous"] * motor_rate) / c["motor_inertia"]
+            return [motor_rate, faster, load_rate, (ratio * through - c["load_viscous"] * load_rate) / c["load_inertia"]]
 
-        def step(state: np.ndarray, torque: float) -> np.ndarray:
-            span = (0.0, float(c["period"]))
-            found = solve_ivp(rates, span, state[:, 0], method, args=(torque,), rtol=1e-6, atol=1e-9)
-            return found.y[:, -1:]
+        def step(state: State, torque: float) -> State:
+            found = solve_ivp(rates, (0.0, c["period"]), state, method, args=(torque,), rtol=1e-6, atol=1e-9)
+            return found.y[:, -1].tolist()
 
         return step
 
@@ -116,16 +137,17 @@ class Plain:
 class _Euler:
     """Explicit super-twisting (7)-(8) of one side."""
 
-    def __init__(self, lambda_: np.ndarray, alpha: np.ndarray, period: float, velocity: np.ndarray):
+    def __init__(self, lambda_: Any, alpha: Any, period: Any, velocity: Any, functions: Functions):
         self.lambda_, self.alpha, self.period = lambda_, alpha, period
-        self.position, self.velocity = np.zeros_like(velocity), velocity
+        self.sqrt, self.sign = functions.sqrt, functions.sign
+        self.position, self.velocity = 0.0 * velocity, velocity
 
-    def step(self, reading: np.ndarray, nominal: np.ndarray) -> np.ndarray:
+    def step(self, reading: Any, nominal: Any) -> Any:
         """Take in a reading; the equivalent control."""
         error = reading - self.position
-        switch = np.sign(error)
+        switch = self.sign(error)
         control = self.alpha * switch
-        self.position = self.position + self.period * (self.velocity + self.lambda_ * switch * np.sqrt(np.abs(error)))
+        self.position = self.position + self.period * (self.velocity + self.lambda_ * switch * self.sqrt(abs(error)))
         self.velocity = self.velocity + self.period * (nominal + control)
         return control
 
@@ -133,21 +155,20 @@ class _Euler:
 class _OpenSMC:
     """OpenSMC's Levant differentiator of first order: a super-twisting observer without a model, which is added."""
 
-    def __init__(self, lambda_: np.ndarray, alpha: np.ndarray, period: float, velocity: np.ndarray):
+    def __init__(self, lambda_: float, alpha: float, period: float, velocity: float, functions: Functions):
         from opensmc.estimators.levant import LevantDifferentiator
 
         # its gains are lambdas[0] sqrt(L) and lambdas[1] L
-        gains = [float(lambda_[0]), float(alpha[0])]
-        self._estimator = LevantDifferentiator(order=1, L=1.0, lambdas=gains, dt=float(period))
-        self._estimator._z = np.array([0.0, velocity[0]])
-        self.alpha, self.period = float(alpha[0]), float(period)
+        self._estimator = LevantDifferentiator(order=1, L=1.0, lambdas=[lambda_, alpha], dt=period)
+        self._estimator._z = np.array([0.0, velocity])
+        self.alpha, self.period, self.sign = alpha, period, functions.sign
 
     @property
-    def velocity(self) -> np.ndarray:
-        return self._estimator._z[1:]
+    def velocity(self) -> float:
+        return float(self._estimator._z[1])
 
-    def step(self, reading: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-        error = reading - self._estimator._z[:1]
-        self._estimator.estimate(0.0, None, None, y=float(reading[0]))
-        self._estimator._z[1] += self.period * nominal[0]
-        return self.alpha * np.sign(error)
+    def step(self, reading: float, nominal: float) -> float:
+        error = reading - float(self._estimator._z[0])
+        self._estimator.estimate(0.0, None, None, y=reading)
+        self._estimator._z[1] += self.period * nominal
+        return self.alpha * self.sign(error)
