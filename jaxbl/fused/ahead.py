@@ -73,7 +73,7 @@ class Looped:
         self._parallel = {n: jax.jit(partial(ahead, length=n)).lower(*_FIRST).compile() for n in lengths}
         self._loop = None
         if shared.state:
-            self._loop = Loop(parts.step, None, 0, len(shared.state), np.dtype(float), lanes=1)
+            self._loop = Loop(parts.step, np.dtype(float), carry=len(shared.state), lanes=1)
         self._outer = jax.jit(lambda state: shared.outer(state, ())).lower(shared.state).compile()
 
     def __call__(self, state: list[Any], seed: int, first: int, length: int) -> Block:

@@ -14,7 +14,7 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 from llvmlite import binding, ir
 
 from .elementary import FUNCTIONS
-from .split import Unsupported, substituted
+from .split import Around, Unsupported, substituted
 
 _INT, _BIT, _POINTER = ir.IntType(64), ir.IntType(1), ir.PointerType()
 _KINDS = {
@@ -67,16 +67,16 @@ def vector_lanes(dtype: np.dtype) -> int:
 
 
 class Loop:
-    """A compiled loop over samples, and what follows it.
+    """A compiled loop over samples, and what is done around it.
 
     Args:
         body: jaxpr of one sample, scalars of one lane: values, carry, fixed, one sample's inputs -> carry, and what is kept.
-        after: the same of what is done once after all samples, to the carry alone; None for nothing.
+        dtype: of the lanes' numbers.
         values: number of values; they differ from lane to lane.
         carry: numbers that a lane carries.
-        dtype: of the lanes' numbers.
-        lanes: that are computed together; left out, as many as suit the machine.
         fixed: number of those that all lanes read and that differ from call to call.
+        around: left out, nothing.
+        lanes: that are computed together; left out, as many as suit the machine.
 
     Raises:
         Unsupported: an operation of theirs is unknown here.
@@ -85,17 +85,19 @@ class Loop:
     def __init__(
         self,
         body: ClosedJaxpr,
-        after: ClosedJaxpr | None,
-        values: int,
-        carry: int,
         dtype: np.dtype,
-        lanes: int | None = None,
+        *,
+        values: int = 0,
+        carry: int = 0,
         fixed: int = 0,
+        around: Around | None = None,
+        lanes: int | None = None,
     ):
         self.lanes = lanes or vector_lanes(dtype)
-        body, after = substituted(body, FUNCTIONS), None if after is None else substituted(after, FUNCTIONS)
+        body = substituted(body, FUNCTIONS)
+        around = None if around is None else Around(*(substituted(part, FUNCTIONS) for part in around))
         module = ir.Module("loop")
-        _Writer(module, self.lanes).loop(body, after, values, carry, fixed)
+        _Writer(module, self.lanes).loop(body, around, values, carry, fixed)
         parsed = binding.parse_assembly(str(module))
         options = binding.create_pipeline_tuning_options(speed_level=3)
         passes = binding.create_pass_builder(_machine(), options)
@@ -103,20 +105,40 @@ class Loop:
         self._engine = binding.create_mcjit_compiler(parsed, _machine())
         self._engine.finalize_object()
         address = self._engine.get_function_address("loop")
-        self._call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)(address)
+        self._call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, *[ctypes.c_int64] * 5)(address)
 
-    def __call__(self, arrays: Sequence[np.ndarray], steps: int, first: int, last: int) -> None:
+    def __call__(
+        self,
+        arrays: "Arrays | Sequence[np.ndarray]",
+        steps: int,
+        first: int,
+        last: int,
+        *,
+        begins: bool = False,
+        ends: bool = False,
+    ) -> None:
         """Take lanes `first` to `last` (multiples of `lanes`) through samples; the carry's arrays are overwritten.
 
         Args:
             arrays: contiguous; values and carry `(lanes,)`, fixed `()` and inputs `(steps,)` of the body, inputs `()` of
-                what follows, and of what is kept `(steps, lanes)` with no more lanes than run.
+                what is done after it and of the finish, what is kept `(steps, lanes)` with no more lanes than run, and
+                results `(lanes,)`.
             steps: samples.
             first: lane.
             last: lane behind the last one.
+            begins: first block of a run: the carry is not read.
+            ends: last block of a run: results are written, the carry is not.
         """
-        table = (ctypes.c_void_p * len(arrays))(*[array.ctypes.data for array in arrays])
-        self._call(ctypes.addressof(table), steps, first, last)
+        given = arrays if isinstance(arrays, Arrays) else Arrays(arrays)
+        self._call(ctypes.addressof(given.addresses), steps, first, last, begins, ends)
+
+
+class Arrays:
+    """Arrays for a loop, which reads where they lie."""
+
+    def __init__(self, arrays: Sequence[np.ndarray]):
+        self._kept = list(arrays)
+        self.addresses = (ctypes.c_void_p * len(arrays))(*[x.__array_interface__["data"][0] for x in arrays])
 
 
 class _Writer:
@@ -127,18 +149,19 @@ class _Writer:
         self.constant: set[Vector] = set()
         """Those that do not change in the loop over time."""
 
-    def loop(self, body: ClosedJaxpr, after: ClosedJaxpr | None, values: int, carry: int, fixed: int) -> None:
-        function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [_POINTER, _INT, _INT, _INT]), "loop")
+    def loop(self, body: ClosedJaxpr, around: Around | None, values: int, carry: int, fixed: int) -> None:
+        function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [_POINTER, *[_INT] * 5]), "loop")
         # what registers have no room for lies on the stack: no vector of it over two lines of the cache
         function.attributes.alignstack = 64
         function.attributes.add("nounwind")  # without another one it is not written
-        table, steps, first, last = function.args
+        table, steps, first, last, begins, ends = function.args
         build: Any = ir.IRBuilder(function.append_basic_block("entry"))
         self.build = build
         own = values + carry
-        follows = [] if after is None else after.jaxpr.invars[own:]
+        follows = [] if around is None else [*around.after.jaxpr.invars[own:], *around.finish.jaxpr.invars[own:]]
         kept = body.jaxpr.outvars[carry:]
-        dtypes = [_dtype(v) for v in [*body.jaxpr.invars, *follows, *kept]]
+        results = [] if around is None else around.finish.jaxpr.outvars
+        dtypes = [_dtype(v) for v in [*body.jaxpr.invars, *follows, *kept, *results]]
         kinds = [_KINDS[str(dtype)] for dtype in dtypes]
         if any(not jnp.issubdtype(dtype, jnp.floating) for dtype in dtypes[:own]):
             raise Unsupported("lanes that carry other numbers than floating-point ones")
@@ -155,34 +178,72 @@ class _Writer:
 
         inputs = range(own + fixed, len(body.jaxpr.invars))
         steady = [scalar(i, _INT(0)) for i in range(own, own + fixed)]
-        end = len(dtypes) - len(kept)
+        end = len(body.jaxpr.invars) + len(follows)
         afterwards = [scalar(i, _INT(0)) for i in range(len(body.jaxpr.invars), end)]
         width = build.sub(last, first)
 
         def lanes(lane: Vector, _: list[Vector]) -> list[Vector]:
-            places = [build.gep(arrays[i], [lane], source_etype=kinds[i]) for i in range(own)]
             sizes = [dtype.itemsize for dtype in dtypes]
-            read = [build.load(places[i], align=sizes[i], typ=self.vector(kinds[i])) for i in range(own)]
-            numbers, state = read[:values], read[values:]
+
+            def read(some: range) -> list[Vector]:
+                places = {i: build.gep(arrays[i], [lane], source_etype=kinds[i]) for i in some}
+                return [build.load(place, align=sizes[i], typ=self.vector(kinds[i])) for i, place in places.items()]
+
+            def write(i: int, value: Vector, at: Vector) -> None:
+                value = build.zext(value, self.vector(kinds[i])) if dtypes[i] == _BOOL else value
+                build.store(value, build.gep(arrays[i], [at], source_etype=kinds[i]), align=sizes[i])
+
+            numbers = read(range(values))
             self.constant = {*numbers, *steady}
 
             def sample(index: Vector, state: list[Vector]) -> list[Vector]:
                 found = self.run(body, [*numbers, *state, *steady, *(scalar(i, index) for i in inputs)])
                 at = build.add(build.mul(index, width), build.sub(lane, first))
                 for i, value in enumerate(found[carry:], end):
-                    value = build.zext(value, self.vector(kinds[i])) if dtypes[i] == _BOOL else value
-                    build.store(value, build.gep(arrays[i], [at], source_etype=kinds[i]), align=sizes[i])
+                    write(i, value, at)
                 return found[:carry]
 
+            def leave() -> list[Vector]:
+                for i, value in enumerate(state, values):
+                    write(i, value, lane)
+                return []
+
+            def finish(around: Around) -> list[Vector]:
+                found = self.run(around.finish, [*numbers, *state, *afterwards[len(around.after.in_avals) - own :]])
+                for i, value in enumerate(found, end + len(kept)):
+                    write(i, value, lane)
+                return []
+
+            if around is None:
+                state = self.count(_INT(0), steps, read(range(values, own)), sample)
+                return leave()
+            state = self.either(begins, lambda: self.run(around.before, numbers), lambda: read(range(values, own)))
             state = self.count(_INT(0), steps, state, sample)
-            if after is not None:
-                state = self.run(after, [*numbers, *state, *afterwards])
-            for i, value in enumerate(state, values):
-                build.store(value, places[i], align=sizes[i])
-            return []
+            state = self.run(around.after, [*numbers, *state, *afterwards[: len(around.after.in_avals) - own]])
+            return self.either(ends, lambda: finish(around), leave)
 
         self.count(first, last, [], lanes, by=self.lanes)
         build.ret_void()
+
+    def either(self, which: Vector, yes: Callable[[], list[Vector]], no: Callable[[], list[Vector]]) -> list[Vector]:
+        """yes() if which else no()."""
+        build = self.build
+        cases = [build.append_basic_block(name) for name in ("yes", "no")]
+        behind = build.append_basic_block("behind")
+        build.cbranch(build.icmp_signed("!=", which, _INT(0)), *cases)
+        ways = []
+        for block, case in zip(cases, (yes, no), strict=True):
+            build.position_at_end(block)
+            ways.append((case(), build.block))
+            build.branch(behind)
+        build.position_at_end(behind)
+        merged = []
+        for column in zip(*(found for found, _ in ways), strict=True):
+            phi = build.phi(column[0].type)
+            for value, (_, block) in zip(column, ways, strict=True):
+                phi.add_incoming(value, block)
+            merged.append(phi)
+        return merged
 
     def count(
         self,
@@ -372,6 +433,7 @@ _OF_FLOATS: dict[str, Callable[..., Vector]] = {
     "max": _LARGER,
     "min": _SMALLER,
     "clamp": _clamp,
+    "is_finite": lambda w, eqn, a: w.build.fcmp_ordered("<", w.intrinsic("fabs", a), w.like(a, float("inf"))),
 }
 _OF_INTEGERS: dict[str, Callable[..., Vector]] = {
     "add": lambda w, eqn, a, b: w.build.add(a, b),

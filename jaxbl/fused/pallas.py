@@ -5,7 +5,7 @@ the grid takes a block of lanes through all samples, and reads what all lanes sh
 on a CPU it can be interpreted, for tests.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from .elementary import rounded
-from .split import substituted
+from .split import Around, substituted
 
 _ABSENT = {"round": rounded}
 """What Triton's lowering lacks."""
@@ -27,77 +27,92 @@ LANES = 128
 
 
 class Kernel:
-    """A loop over blocks of samples and what follows each, for lanes side by side.
+    """A run of lanes side by side: a loop over samples, and what is done around each block of them.
 
     Args:
         body: jaxpr of one sample, scalars of one lane: values, carry, one sample's inputs -> carry.
-        after: the same of what is done once after every block of samples.
+        around: what is done around a block of samples.
         values: number of values; they differ from lane to lane.
-        carry: numbers that a lane carries.
         interpret: run by Pallas's interpreter, on any device.
     """
 
-    def __init__(self, body: ClosedJaxpr, after: ClosedJaxpr, values: int, carry: int, *, interpret: bool = False):
-        self._values, self._carry, self._interpret = values, carry, interpret
-        body, after = substituted(body, _ABSENT), substituted(after, _ABSENT)
-        own = (0,) * (values + carry)
-        self._body = jax.vmap(jaxpr_as_fun(body), (*own, *[None] * (len(body.in_avals) - len(own))))
-        self._after = jax.vmap(jaxpr_as_fun(after), (*own, *[None] * (len(after.in_avals) - len(own))))
-        self._run = jax.jit(self._called)
+    def __init__(self, body: ClosedJaxpr, around: Around, values: int, *, interpret: bool = False):
+        self._values, self._interpret = values, interpret
+        own = values + len(body.out_avals)
+        self._before, self._body, self._after, self._finish = (
+            self._side_by_side(part, min(own, len(part.in_avals))) for part in (around.before, body, *around[1:])
+        )
+        self._results = around.finish.out_avals
+        self._run = jax.jit(self._called, static_argnames=("steps", "length"))
+
+    @staticmethod
+    def _side_by_side(part: ClosedJaxpr, own: int) -> Callable[..., list[Array]]:
+        """For a block of lanes; what they share stays a scalar."""
+        part = substituted(part, _ABSENT)
+        return jax.vmap(jaxpr_as_fun(part), (*(0,) * own, *[None] * (len(part.in_avals) - own)), axis_size=LANES)
 
     def __call__(
         self,
         values: Sequence[ArrayLike],
-        carry: Sequence[ArrayLike],
-        inputs: Sequence[ArrayLike],
-        ends: Sequence[ArrayLike],
+        inputs: tuple[Sequence[ArrayLike], Sequence[ArrayLike], Sequence[ArrayLike]],
+        steps: int,
+        length: int,
     ) -> list[Array]:
-        """The carry after all blocks of samples.
+        """The lanes' results `(lanes,)` each.
 
         Args:
             values: `(lanes,)` each, lanes a multiple of `LANES`.
-            carry: `(lanes,)` each.
-            inputs: of the body `(blocks, samples)` each.
-            ends: inputs of what follows `(blocks,)` each.
+            inputs: of the body `(steps,)` each, of what follows a block `(blocks,)`, of the finish `()`.
+            steps: samples.
+            length: of a block; the last one has the rest.
         """
-        return self._run(list(values), list(carry), list(inputs), list(ends))
+        found = self._run(list(values), tuple(map(list, inputs)), steps=steps, length=length)
+        return [x.astype(aval.dtype) for x, aval in zip(found, self._results, strict=True)]
 
-    def _called(self, values: Any, carry: Any, inputs: Any, ends: Any) -> list[Array]:
-        blocks, samples = inputs[0].shape
-        shared = [jnp.reshape(x, -1) for x in (*inputs, *ends)]
-        # a truth value becomes a number: they are read from memory
+    def _called(self, values: Any, inputs: Any, steps: int, length: int) -> list[Array]:
+        # a scalar becomes an array of one, and a truth value a number: they are read from memory
+        shared = [jnp.reshape(x, -1) for part in inputs for x in part]
         truths = [x.dtype == jnp.bool_ for x in shared]
         shared = [x.astype(jnp.int32) if true else x for x, true in zip(shared, truths, strict=True)]
         lanes = pl.BlockSpec((LANES,), lambda i: (i,))
-        whole = [pl.BlockSpec(x.shape, lambda i: (0,)) for x in shared]
-        kernel = partial(self._kernel, len(inputs), truths, blocks, samples)
+        count = values[0].size
+        kernel = partial(self._kernel, [len(part) for part in inputs], truths, steps, length)
         return pl.pallas_call(
             kernel,
-            grid=(carry[0].size // LANES,),
-            in_specs=[*[lanes] * (self._values + self._carry), *whole],
-            out_specs=[lanes] * self._carry,
-            out_shape=[jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry],
+            grid=(count // LANES,),
+            in_specs=[*[lanes] * self._values, *(pl.BlockSpec(x.shape, lambda i: (0,)) for x in shared)],
+            out_specs=[lanes] * len(self._results),
+            out_shape=[jax.ShapeDtypeStruct((count,), _stored(aval.dtype)) for aval in self._results],
             interpret=self._interpret,
             compiler_params=None if self._interpret else triton.CompilerParams(num_warps=LANES // 32),
-        )(*values, *carry, *shared)
+        )(*values, *shared)
 
-    def _kernel(self, inputs: int, truths: list[bool], blocks: int, samples: int, *refs: Any) -> None:
-        own = self._values + self._carry
+    def _kernel(self, counts: list[int], truths: list[bool], steps: int, length: int, *refs: Any) -> None:
         numbers = [ref[...] for ref in refs[: self._values]]
-        state = [ref[...] for ref in refs[self._values : own]]
-        shared, out = refs[own : -self._carry], refs[-self._carry :]
+        shared, out = refs[self._values : -len(self._results)], refs[-len(self._results) :]
 
-        def read(i: int, at: Any) -> Array:
-            value = shared[i][at]
-            return value != 0 if truths[i] else value
+        def read(part: int, at: Any) -> list[Array]:
+            """Inputs of the body, of what follows a block, or of the finish."""
+            first = sum(counts[:part])
+            found = [(shared[i][at], truths[i]) for i in range(first, first + counts[part])]
+            return [value != 0 if true else value for value, true in found]
 
         def sample(index: Any, state: list[Array]) -> list[Array]:
-            return self._body(*numbers, *state, *[read(i, index) for i in range(inputs)])
+            return self._body(*numbers, *state, *read(0, index))
 
-        def block(number: Any, state: list[Array]) -> list[Array]:
-            begin = number * samples
-            state = jax.lax.fori_loop(begin, begin + samples, sample, state)
-            return self._after(*numbers, *state, *[read(i, number) for i in range(inputs, len(shared))])
+        def block(number: Any, state: list[Array], end: Any = None) -> list[Array]:
+            begin = number * length
+            state = jax.lax.fori_loop(begin, begin + length if end is None else end, sample, state)
+            return self._after(*numbers, *state, *read(1, number))
 
-        for ref, value in zip(out, jax.lax.fori_loop(0, blocks, block, state), strict=True):
-            ref[...] = value
+        whole, rest = divmod(steps, length)
+        state = jax.lax.fori_loop(0, whole, block, self._before(*numbers))
+        if rest:
+            state = block(whole, state, steps)
+        for ref, value in zip(out, self._finish(*numbers, *state, *read(2, 0)), strict=True):
+            ref[...] = value.astype(ref.dtype)
+
+
+def _stored(dtype: Any) -> Any:
+    """Of a result in memory."""
+    return jnp.int32 if dtype == jnp.bool_ else dtype

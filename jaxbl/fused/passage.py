@@ -1,9 +1,10 @@
 """Lanes through time by a fused loop: what :func:`jaxbl.simulate.scan` computes, for many lanes at once."""
 
 import abc
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
-from typing import Any
+from queue import Queue
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,9 +24,25 @@ from jaxbl.simulate import (
 )
 
 from .ahead import Shared, ahead_of_lanes
-from .llvm import Loop, vector_lanes
+from .llvm import Arrays, Loop, vector_lanes
 from .pallas import LANES, Kernel
-from .split import Kind, carry_kinds, split
+from .split import Around, Kind, carry_kinds, split
+
+
+class Block(NamedTuple):
+    """What lanes need for a block of samples.
+
+    Attributes:
+        length: samples.
+        handed: inputs of each sample `(length,)`.
+        last: inputs of what follows the block `()`.
+        ends: inputs of a lane's figures `()`; of the last block.
+    """
+
+    length: int
+    handed: list[np.ndarray]
+    last: list[np.ndarray]
+    ends: list[np.ndarray] | None
 
 
 class Passage(abc.ABC):
@@ -59,7 +76,7 @@ class Passage(abc.ABC):
         def own(values: list[Any]) -> Experiment:
             return set_leaves(experiment, dict(zip(paths, values, strict=True)))
 
-        def start(values: list[Any]) -> Any:
+        def start(values: list[Any], *_: Any) -> Any:
             return begin(own(values), reducers)
 
         def sample(values: list[Any], carry: Any, given: Any) -> Any:
@@ -70,46 +87,57 @@ class Passage(abc.ABC):
         def settle(values: list[Any], carry: Any, given: Any) -> Any:
             return settled(own(values), carry)
 
-        def result(values: list[Any], carry: Any) -> dict[str, Any]:
+        def result(values: list[Any], carry: Any, given: Any) -> dict[str, Any]:
             return figures(own(values), reducers, carry)
 
         values = [jax.ShapeDtypeStruct((), dtype)] * len(paths)
         given = jax.ShapeDtypeStruct((), jnp.int32), dict.fromkeys(experiment.sides, jax.ShapeDtypeStruct((), jnp.float32))
         carry = jax.eval_shape(start, values)
         kinds = carry_kinds(start, ((sample, given), (settle, ())), values)
-        self._tree = jax.tree.structure(carry)
-        self._of_lane = [kind == Kind.LANE for kind in kinds]
-        self.carried = sum(self._of_lane)
-        self._inner = split(sample, values, carry, given, kinds)
-        self._outer = split(settle, values, carry, (), kinds)
-
-        def side_by_side(leaf: Any) -> jax.ShapeDtypeStruct:
-            return jax.ShapeDtypeStruct((self._filled,), leaf.dtype)
-
+        one = [leaf for leaf, kind in zip(jax.tree.leaves(carry), kinds, strict=True) if kind != Kind.LANE]
+        self.carried = len(kinds) - len(one)
+        begins, inner = split(start, values, (), (), [], kinds), split(sample, values, carry, given, kinds, kinds)
+        outer, ends = split(settle, values, carry, (), kinds, kinds), split(result, values, carry, (), kinds)
+        self._body, self._around = inner.lane, Around(begins.lane, outer.lane, ends.lane)
         # compiled now, so that a call only runs
-        many = [side_by_side(value) for value in values]
-        one = [leaf for leaf, lane in zip(jax.tree.leaves(carry), self._of_lane, strict=True) if not lane]
         lengths = {min(self._length, self._steps), self._steps % self._length} - {0}
-        self._ahead = ahead_of_lanes(Shared(self._inner.shared, self._outer.shared, one, experiment.sides), lengths)
-        self._start = jax.jit(jax.vmap(start)).lower(many).compile()
-        axes = self._tree.unflatten([0 if lane else None for lane in self._of_lane])
-        ends = [side_by_side(x) if lane else x for x, lane in zip(jax.tree.leaves(carry), self._of_lane, strict=True)]
-        self._result = jax.jit(jax.vmap(result, (0, axes))).lower(many, self._tree.unflatten(ends)).compile()
+        self._ahead = ahead_of_lanes(Shared(inner.shared, outer.shared, one, experiment.sides), lengths)
+        self._first = [np.asarray(leaf) for leaf in jax.jit(lambda: begins.shared([], ())[0])()]
+        self._closing = jax.jit(lambda state: ends.shared(state, ())).lower(one).compile()
+        names = sorted(jax.eval_shape(result, values, carry, ()))
+        self._of_lane = dict(zip(names, ends.of_lane, strict=True))
+        self._kinds = [np.dtype(aval.dtype) for aval in ends.lane.out_avals]
 
     def __call__(self, values: dict[str, np.ndarray], seed: int) -> dict[str, np.ndarray]:
         """Figures `(lanes,)` of one seed, by name; `values` `(lanes,)` by path, in SI units."""
         more = (0, self._filled - self._lanes)
-        given = [np.pad(np.asarray(values[path], self._dtype), more, "edge") for path in self._paths]
-        leaves = jax.tree.leaves(self._start(given))
-        carry = [leaf for leaf, lane in zip(leaves, self._of_lane, strict=True) if lane]
-        state = [np.asarray(leaf)[0] for leaf, lane in zip(leaves, self._of_lane, strict=True) if not lane]
-        carry, state = map(iter, self._march(given, carry, state, seed))
-        whole = self._tree.unflatten([next(carry) if lane else next(state) for lane in self._of_lane])
-        return {name: np.asarray(figure)[: self._lanes] for name, figure in self._result(given, whole).items()}
+        given = [np.ascontiguousarray(values[path], self._dtype) for path in self._paths]
+        # the figures that lanes share come with the last block
+        shared: list[np.ndarray] = []
+        found = self._march([np.pad(one, more, "edge") for one in given] if any(more) else given, self._blocks(seed, shared))
+        lanes, others = iter(found), iter(shared)
+        figures = {name: next(lanes if own else others) for name, own in self._of_lane.items()}
+        return {
+            name: figure[: self._lanes] if self._of_lane[name] else np.full(self._lanes, figure)
+            for name, figure in figures.items()
+        }
+
+    def _blocks(self, seed: int, shared: list[np.ndarray]) -> Iterator[Block]:
+        """Block after block of a run; figures that lanes share are added to `shared` with the last one."""
+        state = self._first
+        for first in range(0, self._steps, self._length):
+            length = min(self._length, self._steps - first)
+            state, last, handed = self._ahead(state, seed, first, length)
+            ends = None
+            if first + length == self._steps:
+                figures, read = self._closing(state)
+                shared += map(np.asarray, figures)
+                ends = [np.asarray(x) for x in read]
+            yield Block(length, [np.asarray(x) for x in handed], [np.asarray(x) for x in last], ends)
 
     @abc.abstractmethod
-    def _march(self, given: list[Any], carry: list[Any], state: list[Any], seed: int) -> tuple[list[Any], list[Any]]:
-        """Carry of the lanes `(lanes,)` each, and state of what they share, after all samples."""
+    def _march(self, given: list[np.ndarray], blocks: Iterator[Block]) -> list[np.ndarray]:
+        """The lanes' figures `(lanes,)` each."""
 
 
 class HostPassage(Passage):
@@ -119,28 +147,40 @@ class HostPassage(Passage):
         self, experiment: Experiment, reducers: tuple[Reducer, ...], paths: tuple[str, ...], lanes: int, threads: int
     ):
         dtype = np.dtype(jnp.result_type(experiment.run.sample_period))
-        self._together, self._threads = vector_lanes(dtype), threads
-        self._pool = ThreadPoolExecutor(threads)
+        self._together = vector_lanes(dtype)
         super().__init__(experiment, reducers, paths, lanes, self._together)
-        self._loop = Loop(self._inner.lane, self._outer.lane, len(paths), self.carried, self._dtype)
+        self._threads = min(threads, self._filled // self._together)
+        self._pool = ThreadPoolExecutor(self._threads)
+        self._loop = Loop(self._body, self._dtype, values=len(paths), carry=self.carried, around=self._around)
+        self._unread = [np.zeros((), aval.dtype) for aval in self._around.finish.in_avals[len(paths) + self.carried :]]
 
-    def _march(self, given, carry, state, seed):
-        carry = [np.array(leaf, order="C") for leaf in carry]
-        blocks = len(given[0]) // self._together
-        edges = [blocks * i // self._threads * self._together for i in range(self._threads + 1)]
-        ahead = self._ahead(state, seed, 0, min(self._length, self._steps))
-        for first in range(0, self._steps, self._length):
-            state, last, handed = ahead
-            last, handed = [np.asarray(x) for x in last], [np.asarray(x) for x in handed]
-            arrays = [*given, *carry, *handed, *last]
-            length = min(self._length, self._steps - first)
-            running = [self._pool.submit(self._loop, arrays, length, *pair) for pair in pairwise(edges)]
-            # what lanes share of the next samples is computed meanwhile
-            if rest := self._steps - first - length:
-                ahead = self._ahead(state, seed, first + length, min(self._length, rest))
-            for one in running:
-                one.result()
-        return carry, state
+    def _march(self, given, blocks):
+        carry = [np.empty(self._filled, self._dtype) for _ in range(self.carried)]
+        found = [np.empty(self._filled, dtype) for dtype in self._kinds]
+        parts = self._filled // self._together
+        edges = [parts * i // self._threads * self._together for i in range(self._threads + 1)]
+        # what lanes share is computed meanwhile, a block or two ahead of them
+        waiting: list[Queue[tuple[Arrays, Block, bool] | None]] = [Queue(2) for _ in range(self._threads)]
+
+        def share(thread: int) -> None:
+            while (one := waiting[thread].get()) is not None:
+                arrays, block, begins = one
+                first, last = edges[thread : thread + 2]
+                self._loop(arrays, block.length, first, last, begins=begins, ends=block.ends is not None)
+
+        running = [self._pool.submit(share, thread) for thread in range(self._threads)]
+        try:
+            for number, block in enumerate(blocks):
+                ends = self._unread if block.ends is None else block.ends
+                arrays = Arrays([*given, *carry, *block.handed, *block.last, *ends, *found])
+                for queue in waiting:
+                    queue.put((arrays, block, number == 0))
+        finally:
+            for queue in waiting:
+                queue.put(None)
+        for one in running:
+            one.result()
+        return found
 
 
 class DevicePassage(Passage):
@@ -158,17 +198,14 @@ class DevicePassage(Passage):
         # a loop of scalars is the work of a processor; a GPU would start a kernel for each of its steps
         with jax.default_device(jax.local_devices(backend="cpu")[0]):
             super().__init__(experiment, reducers, paths, lanes, LANES)
-        self._kernel = Kernel(self._inner.lane, self._outer.lane, len(paths), self.carried, interpret=interpret)
+        self._kernel = Kernel(self._body, self._around, len(paths), interpret=interpret)
 
-    def _march(self, given, carry, state, seed):
-        blocks, rest = divmod(self._steps, self._length)
-        state, parts = [np.asarray(leaf) for leaf in state], []
-        for first in range(0, self._steps, self._length):
-            state, *part = self._ahead(state, seed, first, min(self._length, self._steps - first))
-            parts.append(part)
-        for some in (parts[:blocks], parts[blocks:] if rest else []):
-            if some:
-                last, handed = ([np.stack([np.asarray(x) for x in column]) for column in zip(*one, strict=True)]
-                                for one in zip(*some, strict=True))  # fmt: skip
-                carry = self._kernel(given, carry, handed, last)
-        return [np.asarray(leaf) for leaf in carry], state
+    def _march(self, given, blocks):
+        every = list(blocks)
+        # a rest of samples stands behind the whole blocks
+        inputs = [np.concatenate(column) for column in zip(*(block.handed for block in every), strict=True)]
+        ends = [np.stack(column) for column in zip(*(block.last for block in every), strict=True)]
+        return [
+            np.asarray(figure)
+            for figure in self._kernel(given, (inputs, ends, every[-1].ends or []), self._steps, self._length)
+        ]

@@ -215,7 +215,7 @@ def _path_loop(plant: _Plant, sides: tuple[str, ...]) -> Loop | None:
         fixed = [_NUMBER] * len(_read(plant)), _NUMBER, [_NUMBER] * (2 * len(sides))
         index, inputs = jax.ShapeDtypeStruct((), np.int32), [_NUMBER] * (1 + len(sides))
         body = flat(sample, [_NUMBER] * count, *fixed, index, inputs)
-        return Loop(body, None, 0, count, _FLOAT, lanes=1, fixed=len(jax.tree.leaves(fixed)))
+        return Loop(body, _FLOAT, carry=count, lanes=1, fixed=len(jax.tree.leaves(fixed)))
     except Unsupported:
         return None
 
@@ -235,6 +235,6 @@ def _slopes_loop(plant: _Plant) -> Loop | None:
     try:
         state, numbers = [_NUMBER] * count, [_NUMBER] * len(_read(plant))
         body = flat(slope, state, _NUMBER, _NUMBER, numbers, (numbers, state, _NUMBER))
-        return Loop(body, None, count + 2, 0, _FLOAT, fixed=2 * len(numbers) + count + 1)
+        return Loop(body, _FLOAT, values=count + 2, fixed=2 * len(numbers) + count + 1)
     except Unsupported:
         return None

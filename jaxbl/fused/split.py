@@ -36,16 +36,32 @@ class Kind(enum.IntFlag):
 
 
 class Parts(NamedTuple):
-    """A function `f(values, carry, given) -> carry` of one lane in two parts.
+    """A function `f(values, carry, given) -> results` of one lane in two parts.
 
     Attributes:
-        shared: from the shared part of the carry and `given` to the next shared part and what the lanes' part reads of it.
-        lane: the lanes' part: values, its part of the carry, what `shared` hands over -> its part of the carry. Numbers that
+        shared: from the shared part of the carry and `given` to the shared results and what the lanes' part reads of it.
+        lane: the lanes' part: values, its part of the carry, what `shared` hands over -> the lanes' results. Numbers that
             never change stand in it as such, so that compilers see what follows from them.
+        of_lane: which results are the lanes'.
     """
 
     shared: Callable[[Sequence[Any], Any], tuple[list[Any], list[Any]]]
     lane: ClosedJaxpr
+    of_lane: list[bool]
+
+
+class Around(NamedTuple):
+    """What is done around the loop over a block of samples, jaxprs of scalars of one lane.
+
+    Attributes:
+        before: a run's first block: values -> carry.
+        after: every block: values, carry, inputs -> carry.
+        finish: the last block: values, carry, inputs -> results.
+    """
+
+    before: ClosedJaxpr
+    after: ClosedJaxpr
+    finish: ClosedJaxpr
 
 
 def carry_kinds(start: Callable[..., Any], functions: Iterable[tuple[Callable[..., Any], Any]], values: Any) -> list[Kind]:
@@ -74,8 +90,20 @@ def carry_kinds(start: Callable[..., Any], functions: Iterable[tuple[Callable[..
             return [Kind.LANE if kind & Kind.LANE else Kind.SHARED for kind in found]
 
 
-def split(function: Callable[..., Any], values: Any, carry: Any, given: Any, kinds: Sequence[Kind]) -> Parts:
-    """The two parts of a function of one lane; `kinds` are those of the carry's leaves.
+def split(
+    function: Callable[..., Any],
+    values: Any,
+    carry: Any,
+    given: Any,
+    kinds: Sequence[Kind],
+    results: Sequence[Kind] | None = None,
+) -> Parts:
+    """The two parts of a function of one lane.
+
+    Args:
+        function: of examples `values`, `carry` and `given`.
+        kinds: of the carry's leaves.
+        results: kinds that the results are to have; left out, those that they come to have.
 
     Raises:
         Unsupported: lanes read something that is no number: an array, or the state of a random number generator.
@@ -84,23 +112,25 @@ def split(function: Callable[..., Any], values: Any, carry: Any, given: Any, kin
     jaxpr = closed.jaxpr
     count = len(jax.tree.leaves(values))
     carried, rest = jaxpr.invars[count : count + len(kinds)], jaxpr.invars[count + len(kinds) :]
-    of_lane = [kind == Kind.LANE for kind in kinds]
+    carried_by_lane = [kind == Kind.LANE for kind in kinds]
     known = _kinds(jaxpr, [Kind.LANE] * count + list(kinds) + [Kind.SHARED] * len(rest))
     live = _live(jaxpr)
     lanes = [eqn for eqn in live if any(known[out] & Kind.LANE for out in eqn.outvars)]
     others = [eqn for eqn in live if not any(known[out] & Kind.LANE for out in eqn.outvars)]
     constants = dict(zip(jaxpr.constvars, closed.consts, strict=True))
 
-    results = [out for out, lane in zip(jaxpr.outvars, of_lane, strict=True) if lane]
+    of_lane = [bool(kind & Kind.LANE) for kind in results or [_kind(known, out) for out in jaxpr.outvars]]
+    own = [out for out, lane in zip(jaxpr.outvars, of_lane, strict=True) if lane]
     read = dict.fromkeys(v for eqn in lanes for v in eqn.invars if isinstance(v, Var))
-    read |= dict.fromkeys(v for v in results if isinstance(v, Var))
+    read |= dict.fromkeys(v for v in own if isinstance(v, Var))
     outside = [v for v in read if not known[v] & Kind.LANE]
     fixed = [v for v in outside if known[v] == Kind.FIXED]
     crossing = [v for v in outside if known[v] == Kind.SHARED]
-    lane_in = [*jaxpr.invars[:count], *(v for v, lane in zip(carried, of_lane, strict=True) if lane)]
+    lane_in = [*jaxpr.invars[:count], *(v for v, lane in zip(carried, carried_by_lane, strict=True) if lane)]
+    shared_in = [v for v, lane in zip(carried, carried_by_lane, strict=True) if not lane]
 
     def shared(state: Sequence[Any], given: Any) -> tuple[list[Any], list[Any]]:
-        env = constants | dict(zip([v for v, lane in zip(carried, of_lane, strict=True) if not lane], state, strict=True))
+        env = constants | dict(zip(shared_in, state, strict=True))
         env |= dict(zip(rest, jax.tree.leaves(given), strict=True))
         _run(others, env)
         new = [_read(env, out) for out, lane in zip(jaxpr.outvars, of_lane, strict=True) if not lane]
@@ -119,10 +149,10 @@ def split(function: Callable[..., Any], values: Any, carry: Any, given: Any, kin
     def lane(*arguments: Any) -> list[Any]:
         env = dict(zip([*fixed, *lane_in, *crossing], [*numbers, *arguments], strict=True))
         _run(lanes, env)
-        return [_read(env, out) for out in results]
+        return [_read(env, out) for out in own]
 
     examples = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in [*lane_in, *crossing]]
-    return Parts(shared, jax.make_jaxpr(lane)(*examples))
+    return Parts(shared, jax.make_jaxpr(lane)(*examples), of_lane)
 
 
 class Recursion(NamedTuple):
@@ -157,7 +187,7 @@ def recursion(function: Callable[..., tuple[list[Any], list[Any]]], state: Seque
 
     # what is handed over stands among the carry, which nothing reads it from
     spare = [jax.ShapeDtypeStruct(out.aval.shape, out.aval.dtype) for out in jaxpr.outvars[count:]]
-    parts = split(joined, [], [*state, *spare], given, kinds)
+    parts = split(joined, [], [*state, *spare], given, kinds, kinds)
     unread = [jnp.zeros(one.shape, one.dtype) for one, alone in zip(spare, direct, strict=True) if not alone]
 
     def step(state: list[Any], read: list[Any]) -> list[Any]:

@@ -23,7 +23,7 @@ def step(values, carry, given):
 def parts():
     values = [jnp.asarray(1.0), jnp.asarray(3.0)]
     kinds = carry_kinds(begin, ((step, jnp.asarray(0.0)),), values)
-    return kinds, split(step, values, begin(values), jnp.asarray(0.0), kinds)
+    return kinds, split(step, values, begin(values), jnp.asarray(0.0), kinds, kinds)
 
 
 def test_kinds_of_a_carry(parts):
@@ -32,7 +32,8 @@ def test_kinds_of_a_carry(parts):
 
 
 def test_parts_make_the_whole(parts):
-    kinds, (fixed, shared, lane) = parts
+    kinds, (shared, lane, of_lane) = parts
+    assert of_lane == [kind == Kind.LANE for kind in kinds]
     values = [jnp.asarray(0.3), jnp.asarray(-1.2)]
     carry = begin(values)
     leaves, tree = jax.tree.flatten(carry)
@@ -41,7 +42,7 @@ def test_parts_make_the_whole(parts):
     for given in jnp.linspace(0.1, 2.0, 5):
         carry = step(values, carry, given)
         state, handed = shared(state, given)
-        own = jax.core.eval_jaxpr(lane.jaxpr, lane.consts, *values, *own, *fixed, *handed)
+        own = jax.core.eval_jaxpr(lane.jaxpr, lane.consts, *values, *own, *handed)
     found = iter(own), iter(state)
     together = tree.unflatten([next(found[0] if kind == Kind.LANE else found[1]) for kind in kinds])
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14), together, carry)
@@ -70,7 +71,7 @@ def test_a_recursion_leaves_what_needs_no_state_to_be_done_at_once():
     direct, read = jax.vmap(parts.ahead)(given)
     last, handed = jax.lax.scan(sample, state, given)
     for i in range(9):
-        new = jax.core.eval_jaxpr(parts.step.jaxpr, parts.step.consts, *state, *parts.fixed, *(one[i] for one in read))
+        new = jax.core.eval_jaxpr(parts.step.jaxpr, parts.step.consts, *state, *(one[i] for one in read))
         state, ways = new[:2], {True: iter(one[i] for one in direct), False: iter(new[2:])}
         for alone, whole in zip(parts.direct, handed, strict=True):
             np.testing.assert_allclose(next(ways[alone]), whole[i], rtol=1e-6)
