@@ -22,8 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
+from jax.extend.core import jaxpr_as_fun
 
 from jaxbl.drive import set_leaves
+from jaxbl.fused.jaxprs import contracted, flat
+from jaxbl.fused.pallas import multiply_add
 from jaxbl.fused.passage import DevicePassage
 from jaxbl.simulate import scan
 from jaxbl.throughput.workload import FIGURES, RANGES, SEED, Workload, constants, figures_of
@@ -105,12 +108,19 @@ def lorenz_scanned(lanes: int, steps: int, step: float) -> Callable[[], np.ndarr
 def lorenz_fused(lanes: int, steps: int, step: float, interpret: bool = False) -> Callable[[], np.ndarray]:
     """Lorenz's system by a Pallas kernel of the same step."""
     padded = -(-lanes // _THREADS) * _THREADS
+    lane = jax.ShapeDtypeStruct((_THREADS,), jnp.float32)
+
+    def advance(r: Any, *state: Any) -> Any:
+        return _lorenz_step(step, r, state)
+
+    if not interpret:
+        advance = jaxpr_as_fun(contracted(flat(advance, *[lane] * 4), multiply_add))
     rho = jnp.pad(jnp.linspace(0.0, 21.0, lanes, dtype=jnp.float32), (0, padded - lanes))
 
     def kernel(rho: Any, *out: Any) -> None:
         r = rho[...]
         start = jnp.ones_like(r), jnp.zeros_like(r), jnp.zeros_like(r)
-        for ref, value in zip(out, jax.lax.fori_loop(0, steps, lambda _, s: _lorenz_step(step, r, s), start), strict=True):
+        for ref, value in zip(out, jax.lax.fori_loop(0, steps, lambda _, s: tuple(advance(r, *s)), start), strict=True):
             ref[...] = value
 
     block = pl.BlockSpec((_THREADS,), lambda i: (i,))

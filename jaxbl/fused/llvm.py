@@ -14,7 +14,8 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 from llvmlite import binding, ir
 
 from .elementary import FUNCTIONS
-from .split import Around, Unsupported, substituted
+from .jaxprs import substituted
+from .split import Around, Unsupported
 
 _INT, _BIT, _POINTER = ir.IntType(64), ir.IntType(1), ir.PointerType()
 _KINDS = {
@@ -208,19 +209,22 @@ class _Writer:
                     write(i, value, lane)
                 return []
 
-            def finish(around: Around) -> list[Vector]:
-                found = self.run(around.finish, [*numbers, *state, *afterwards[len(around.after.in_avals) - own :]])
+            if around is None:
+                state = self.count(_INT(0), steps, read(range(values, own)), sample)
+                return leave()
+            before, after, closing = around
+            behind = len(after.in_avals) - own
+
+            def finish() -> list[Vector]:
+                found = self.run(closing, [*numbers, *state, *afterwards[behind:]])
                 for i, value in enumerate(found, end + len(kept)):
                     write(i, value, lane)
                 return []
 
-            if around is None:
-                state = self.count(_INT(0), steps, read(range(values, own)), sample)
-                return leave()
-            state = self.either(begins, lambda: self.run(around.before, numbers), lambda: read(range(values, own)))
+            state = self.either(begins, lambda: self.run(before, numbers), lambda: read(range(values, own)))
             state = self.count(_INT(0), steps, state, sample)
-            state = self.run(around.after, [*numbers, *state, *afterwards[: len(around.after.in_avals) - own]])
-            return self.either(ends, lambda: finish(around), leave)
+            state = self.run(after, [*numbers, *state, *afterwards[:behind]])
+            return self.either(ends, finish, leave)
 
         self.count(first, last, [], lanes, by=self.lanes)
         build.ret_void()

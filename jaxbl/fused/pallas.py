@@ -5,7 +5,7 @@ the grid takes a block of lanes through all samples, and reads what all lanes sh
 on a CPU it can be interpreted, for tests.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -14,11 +14,11 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
-from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from .elementary import rounded
-from .split import Around, substituted
+from .jaxprs import contracted, flat, substituted
+from .split import Around, Unsupported
 
 _ABSENT = {"round": rounded}
 """What Triton's lowering lacks."""
@@ -33,52 +33,67 @@ class Kernel:
         body: jaxpr of one sample, scalars of one lane: values, carry, one sample's inputs -> carry.
         around: what is done around a block of samples.
         values: number of values; they differ from lane to lane.
+        size: lanes, a multiple of `LANES`.
+        steps: samples.
+        length: of a block; the last one has the rest.
         interpret: run by Pallas's interpreter, on any device.
+
+    Attributes:
+        arguments: shapes of what it is called with: values `(lanes,)` each; inputs of the body `(steps,)` each, of what
+            follows a block `(blocks,)`, of the finish `()`.
     """
 
-    def __init__(self, body: ClosedJaxpr, around: Around, values: int, *, interpret: bool = False):
-        self._values, self._interpret = values, interpret
+    def __init__(
+        self,
+        body: ClosedJaxpr,
+        around: Around,
+        values: int,
+        size: int,
+        steps: int,
+        length: int,
+        *,
+        interpret: bool = False,
+    ):
+        self._values, self._steps, self._length, self._interpret = values, steps, length, interpret
         own = values + len(body.out_avals)
         self._before, self._body, self._after, self._finish = (
             self._side_by_side(part, min(own, len(part.in_avals))) for part in (around.before, body, *around[1:])
         )
         self._results = around.finish.out_avals
-        self._run = jax.jit(self._called, static_argnames=("steps", "length"))
+        shapes = (steps,), (-(-steps // length),), ()
+        inputs = tuple(
+            [jax.ShapeDtypeStruct(shape, aval.dtype) for aval in part.in_avals[own:]]
+            for shape, part in zip(shapes, (body, *around[1:]), strict=True)
+        )
+        lanes = [jax.ShapeDtypeStruct((size,), aval.dtype) for aval in body.in_avals[:values]]
+        self.arguments = lanes, inputs
 
-    @staticmethod
-    def _side_by_side(part: ClosedJaxpr, own: int) -> Callable[..., list[Array]]:
+    def _side_by_side(self, part: ClosedJaxpr, own: int) -> Callable[..., list[Array]]:
         """For a block of lanes; what they share stays a scalar."""
         part = substituted(part, _ABSENT)
-        return jax.vmap(jaxpr_as_fun(part), (*(0,) * own, *[None] * (len(part.in_avals) - own)), axis_size=LANES)
+        many = jax.vmap(jaxpr_as_fun(part), (*(0,) * own, *[None] * (len(part.in_avals) - own)), axis_size=LANES)
+        if self._interpret:
+            return many
+        block = [jax.ShapeDtypeStruct((LANES,) * (i < own), aval.dtype) for i, aval in enumerate(part.in_avals)]
+        return jaxpr_as_fun(contracted(flat(many, *block), multiply_add))
 
-    def __call__(
-        self,
-        values: Sequence[ArrayLike],
-        inputs: tuple[Sequence[ArrayLike], Sequence[ArrayLike], Sequence[ArrayLike]],
-        steps: int,
-        length: int,
-    ) -> list[Array]:
-        """The lanes' results `(lanes,)` each.
+    def compiled(self) -> Callable[..., list[Array]]:
+        """For the device at hand. Raises `Unsupported` where there is no such kernel."""
+        try:
+            return jax.jit(self.run).lower(*self.arguments).compile()
+        except Exception as error:  # of any kind: lowering, Triton and the assembler have their own
+            raise Unsupported(f"how to compile for this device ({type(error).__name__})") from error
 
-        Args:
-            values: `(lanes,)` each, lanes a multiple of `LANES`.
-            inputs: of the body `(steps,)` each, of what follows a block `(blocks,)`, of the finish `()`.
-            steps: samples.
-            length: of a block; the last one has the rest.
-        """
-        found = self._run(list(values), tuple(map(list, inputs)), steps=steps, length=length)
-        return [x.astype(aval.dtype) for x, aval in zip(found, self._results, strict=True)]
-
-    def _called(self, values: Any, inputs: Any, steps: int, length: int) -> list[Array]:
+    def run(self, values: list[Array], inputs: tuple[list[Array], list[Array], list[Array]]) -> list[Array]:
+        """The lanes' results `(lanes,)` each, of `arguments`."""
         # a scalar becomes an array of one, and a truth value a number: they are read from memory
         shared = [jnp.reshape(x, -1) for part in inputs for x in part]
         truths = [x.dtype == jnp.bool_ for x in shared]
         shared = [x.astype(jnp.int32) if true else x for x, true in zip(shared, truths, strict=True)]
         lanes = pl.BlockSpec((LANES,), lambda i: (i,))
         count = values[0].size
-        kernel = partial(self._kernel, [len(part) for part in inputs], truths, steps, length)
-        return pl.pallas_call(
-            kernel,
+        found = pl.pallas_call(
+            partial(self._kernel, [len(part) for part in inputs], truths),
             grid=(count // LANES,),
             in_specs=[*[lanes] * self._values, *(pl.BlockSpec(x.shape, lambda i: (0,)) for x in shared)],
             out_specs=[lanes] * len(self._results),
@@ -86,8 +101,9 @@ class Kernel:
             interpret=self._interpret,
             compiler_params=None if self._interpret else triton.CompilerParams(num_warps=LANES // 32),
         )(*values, *shared)
+        return [x.astype(aval.dtype) for x, aval in zip(found, self._results, strict=True)]
 
-    def _kernel(self, counts: list[int], truths: list[bool], steps: int, length: int, *refs: Any) -> None:
+    def _kernel(self, counts: list[int], truths: list[bool], *refs: Any) -> None:
         numbers = [ref[...] for ref in refs[: self._values]]
         shared, out = refs[self._values : -len(self._results)], refs[-len(self._results) :]
 
@@ -101,16 +117,37 @@ class Kernel:
             return self._body(*numbers, *state, *read(0, index))
 
         def block(number: Any, state: list[Array], end: Any = None) -> list[Array]:
-            begin = number * length
-            state = jax.lax.fori_loop(begin, begin + length if end is None else end, sample, state)
+            begin = number * self._length
+            state = jax.lax.fori_loop(begin, begin + self._length if end is None else end, sample, state)
             return self._after(*numbers, *state, *read(1, number))
 
-        whole, rest = divmod(steps, length)
+        whole, rest = divmod(self._steps, self._length)
         state = jax.lax.fori_loop(0, whole, block, self._before(*numbers))
         if rest:
-            state = block(whole, state, steps)
+            state = block(whole, state, self._steps)
         for ref, value in zip(out, self._finish(*numbers, *state, *read(2, 0)), strict=True):
             ref[...] = value.astype(ref.dtype)
+
+
+def multiply_add(a: Any, b: Any, c: Any, *, minus_product: bool, minus_rest: bool) -> Array:
+    """One instruction, one rounding: Triton's compiler joins no products with sums of its own accord."""
+    given = jnp.broadcast_arrays(a, b, c)
+    kind, bits = {"float32": ("f", 32), "float64": ("d", 64)}[given[0].dtype.name]
+    if not given[0].shape:
+        return (-a if minus_product else a) * b + (-c if minus_rest else c)
+    turned, other = ("$1", "t, $2, $3") if minus_product else ("$3", "$1, $2, t")
+    if minus_product or minus_rest:
+        code = f"{{.reg .f{bits} t; neg.f{bits} t, {turned}; fma.rn.f{bits} $0, {other};}}"
+    else:
+        code = f"fma.rn.f{bits} $0, $1, $2, $3;"
+    (result,) = triton.elementwise_inline_asm(
+        code,
+        args=given,
+        constraints=f"={kind},{kind},{kind},{kind}",
+        pack=1,
+        result_shape_dtypes=[jax.ShapeDtypeStruct(given[0].shape, given[0].dtype)],
+    )
+    return result
 
 
 def _stored(dtype: Any) -> Any:

@@ -198,14 +198,12 @@ class DevicePassage(Passage):
         # a loop of scalars is the work of a processor; a GPU would start a kernel for each of its steps
         with jax.default_device(jax.local_devices(backend="cpu")[0]):
             super().__init__(experiment, reducers, paths, lanes, LANES)
-        self._kernel = Kernel(self._body, self._around, len(paths), interpret=interpret)
+        kernel = Kernel(self._body, self._around, len(paths), self._filled, self._steps, self._length, interpret=interpret)
+        self._kernel = kernel.compiled()
 
     def _march(self, given, blocks):
         every = list(blocks)
         # a rest of samples stands behind the whole blocks
         inputs = [np.concatenate(column) for column in zip(*(block.handed for block in every), strict=True)]
         ends = [np.stack(column) for column in zip(*(block.last for block in every), strict=True)]
-        return [
-            np.asarray(figure)
-            for figure in self._kernel(given, (inputs, ends, every[-1].ends or []), self._steps, self._length)
-        ]
+        return [np.asarray(figure) for figure in self._kernel(given, (inputs, ends, every[-1].ends or []))]

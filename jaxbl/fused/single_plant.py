@@ -18,8 +18,9 @@ import numpy as np
 from jaxbl.drive.plant import PlantState
 from jaxbl.simulate import Experiment, corrected, move, trajectory
 
+from .jaxprs import flat
 from .llvm import Loop, vector_lanes
-from .split import Unsupported, flat
+from .split import Unsupported
 
 _FLOAT = np.dtype(float)
 _NUMBER = jax.ShapeDtypeStruct((), _FLOAT)

@@ -5,8 +5,7 @@ neither lane nor time, *shared* if it depends on time alone, a *lane's* otherwis
 """
 
 import enum
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -14,13 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 
-_CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call", "checkpoint")
-"""Primitives that only call another jaxpr."""
-
+from .jaxprs import evaluate, flat, value_of
 
 NUMBERS = ("float32", "float64", "int32", "uint32", "int64", "bool")
 """Types that lanes may read."""
-Functions = Mapping[str, Callable[..., Any]]
 
 
 class Unsupported(Exception):
@@ -132,13 +128,13 @@ def split(
     def shared(state: Sequence[Any], given: Any) -> tuple[list[Any], list[Any]]:
         env = constants | dict(zip(shared_in, state, strict=True))
         env |= dict(zip(rest, jax.tree.leaves(given), strict=True))
-        _run(others, env)
-        new = [_read(env, out) for out, lane in zip(jaxpr.outvars, of_lane, strict=True) if not lane]
+        evaluate(others, env)
+        new = [value_of(env, out) for out, lane in zip(jaxpr.outvars, of_lane, strict=True) if not lane]
         return new, [env[v] for v in crossing]
 
     def once() -> list[Any]:
         env = dict(constants)
-        _run([eqn for eqn in others if all(known[out] == Kind.FIXED for out in eqn.outvars)], env)
+        evaluate([eqn for eqn in others if all(known[out] == Kind.FIXED for out in eqn.outvars)], env)
         return [env[v] for v in fixed]
 
     for v in [*lane_in, *fixed, *crossing]:
@@ -148,8 +144,8 @@ def split(
 
     def lane(*arguments: Any) -> list[Any]:
         env = dict(zip([*fixed, *lane_in, *crossing], [*numbers, *arguments], strict=True))
-        _run(lanes, env)
-        return [_read(env, out) for out in own]
+        evaluate(lanes, env)
+        return [value_of(env, out) for out in own]
 
     examples = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in [*lane_in, *crossing]]
     return Parts(shared, jax.make_jaxpr(lane)(*examples), of_lane)
@@ -200,57 +196,6 @@ def recursion(function: Callable[..., tuple[list[Any], list[Any]]], state: Seque
         lambda given: parts.shared([None] * sum(direct), given),
         flat(step, list(state), examples),
     )
-
-
-def flat(function: Callable[..., Any], *examples: Any) -> ClosedJaxpr:
-    """Trace a function of pytrees, without calls inside."""
-    return substituted(jax.make_jaxpr(function)(*examples), {})
-
-
-def substituted(closed: ClosedJaxpr, functions: Functions) -> ClosedJaxpr:
-    """The same without calls, and with functions in place of primitives of floating-point numbers, by their names."""
-    leaves = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in closed.in_avals]
-    found = jax.make_jaxpr(partial(_inlined, closed, functions))(*leaves)
-    # a function may itself call others
-    return found if not any(callee(eqn) for eqn in found.jaxpr.eqns) else substituted(found, functions)
-
-
-def callee(eqn: JaxprEqn) -> ClosedJaxpr | None:
-    """What an equation calls, if it does nothing else."""
-    if eqn.primitive.name not in _CALLS:
-        return None
-    inner = eqn.params["jaxpr" if "jaxpr" in eqn.params else "call_jaxpr"]
-    return inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
-
-
-def _inlined(closed: ClosedJaxpr, functions: Functions, *arguments: Any) -> list[Any]:
-    jaxpr = closed.jaxpr
-    env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *arguments], strict=True))
-    for eqn in jaxpr.eqns:
-        given = [_read(env, v) for v in eqn.invars]
-        called, name = callee(eqn), eqn.primitive.name
-        if called is not None:
-            results = _inlined(called, functions, *given)
-        elif name in functions and jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
-            results = [functions[name](*given)]
-        else:
-            params = eqn.params
-            if name == "scan":
-                params = params | {"jaxpr": substituted(params["jaxpr"], functions)}
-            results = eqn.primitive.bind(*given, **params)
-            results = results if eqn.primitive.multiple_results else [results]
-        env |= dict(zip(eqn.outvars, results, strict=True))
-    return [_read(env, v) for v in jaxpr.outvars]
-
-
-def _run(eqns: Iterable[JaxprEqn], env: dict[Var, Any]) -> None:
-    for eqn in eqns:
-        results = eqn.primitive.bind(*[_read(env, v) for v in eqn.invars], **eqn.params)
-        env |= dict(zip(eqn.outvars, results if eqn.primitive.multiple_results else [results], strict=True))
-
-
-def _read(env: dict[Var, Any], v: Var | Literal) -> Any:
-    return v.val if isinstance(v, Literal) else env[v]
 
 
 def _kind(kinds: dict[Var, Kind], v: Var | Literal) -> Kind:

@@ -12,6 +12,7 @@ from jaxbl.drive.excitation import Chirp, Sine
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.drive.transmission import DeadZone
 from jaxbl.fused.ahead import Looped
+from jaxbl.fused.pallas import LANES, Kernel
 from jaxbl.fused.passage import DevicePassage, HostPassage
 from jaxbl.fused.split import Unsupported
 from jaxbl.observer import OBSERVERS, EquivalentControl, Identifier, Observers
@@ -24,7 +25,7 @@ HALF = ["motor.coulomb_friction", "load.stribeck_friction", "load.gravity", "mot
 OTHERS = [name for name in VALUES if name not in HALF]
 
 
-def experiment(names, law=None, observer="implicit", rigid=False, substeps=2, steps=700):
+def experiment(names, law=None, observer="implicit", rigid=False, substeps=2, steps=700, precision="float64"):
     kind = OBSERVERS[observer]
     motor = kind(10.0, 90.0, velocity_error=0.5)
     return as_arrays(
@@ -40,7 +41,7 @@ def experiment(names, law=None, observer="implicit", rigid=False, substeps=2, st
             identifier=None if rigid else Identifier(0.1),
             run=Run(1e-3, steps, substeps),
         ),
-        np.float64,
+        np.dtype(precision),
     )
 
 
@@ -137,6 +138,23 @@ def test_every_effect_in_the_kernel_of_accelerators(names):
     device = DevicePassage(whole, (METRICS,), paths, 5, interpret=True)(values, 0)
     for name, figure in device.items():
         np.testing.assert_allclose(figure, host[name], rtol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("names", [HALF, OTHERS], ids=["half", "others"])
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_the_kernel_can_be_written_for_a_gpu(names, precision):
+    """No GPU is needed for that: every operation is one that Triton knows, products are joined with sums."""
+    law = DeadZone(60.0, 0.05) if names is HALF else LinearShaft(60.0)
+    with jax.enable_x64(precision == "float64"):
+        whole = experiment(names, law, steps=200, precision=precision)
+        paths = tuple(path for path in leaf_paths(whole) if path.startswith("effects."))
+        parts = DevicePassage(whole, (METRICS,), paths, 5, interpret=True)
+        kernel = Kernel(parts._body, parts._around, len(paths), 2 * LANES, 200, 64)
+        written = jax.jit(kernel.run).trace(*kernel.arguments).lower(lowering_platforms=("cuda",)).as_text()
+    assert "tt.func" in written or "triton" in written
+    # there is no device here that it could be compiled for
+    with pytest.raises(Unsupported, match="how to compile for this device"):
+        kernel.compiled()
 
 
 def test_an_unknown_operation_is_refused_by_name():

@@ -1,5 +1,7 @@
 """The engine: same numbers on any chunking and device count, bounded memory, diverging lanes kept apart."""
 
+from types import SimpleNamespace
+
 import jax
 import numpy as np
 import pandas as pd
@@ -10,6 +12,7 @@ from jaxbl.errors import InputError
 from jaxbl.report.reports import headline
 from jaxbl.study.config import read_config, with_values
 from jaxbl.study.engine import Engine, Layout
+from jaxbl.study.programs import faster
 from jaxbl.study.sweep import StudyResult, dry_run, sweep
 from jaxbl.study.trial import run
 
@@ -119,6 +122,9 @@ def test_the_faster_backend_is_chosen():
     assert backend(3, 1) == "fused"
     # seed after seed would pay for each what lanes share
     assert backend(3, 1000) == "scan"
+    # the scan starts kernels for each time step; several GPUs share lanes by it alone
+    gpu, tpu = SimpleNamespace(platform="gpu"), SimpleNamespace(platform="tpu")
+    assert [faster(Layout(1, 3), devices) for devices in ([gpu], [gpu, gpu], [tpu])] == ["fused", "scan", "scan"]
     with pytest.raises(InputError, match="no 'Fused'; one of fused, scan"):
         sweep(rigid(axes=[listed(ALPHA, 1.0, 2.0)]), backend="Fused")
 
