@@ -29,6 +29,8 @@ Progress = Callable[[int, int], None]
 LANES_PER_DEVICE: dict[Backend, int] = {"scan": 4096, "fused": 16384}
 """Default lanes a device computes at once: the scan's carry then stays in a core's cache, and what lanes of the fused loop
 share counts little (benchmarks/NOTES.md)."""
+LANES_ON_A_GPU = 2**18
+"""The same there, by either backend: some 2000 lanes for each of its processors, which is what keeps all of it busy."""
 
 
 class Chunk(NamedTuple):
@@ -61,23 +63,24 @@ def prepare(config: Config) -> Experiment:
     return as_arrays(config.build(), jnp.dtype(config.run.precision))
 
 
-def layout_for(config: Config, points: Points, devices: int, backend: Backend, chunk: int | None) -> Layout:
+def layout_for(config: Config, points: Points, devices: list[Any], backend: Backend, chunk: int | None) -> Layout:
     """Chunk shape: as many lanes as asked for, or as the devices want at once; whole rows of points before several seeds.
 
     Every device gets two lanes or more: one alone is compiled to other roundings than a row of them.
     """
+    count = len(devices)
     if points.refinement is not None:
-        return _refined_layout(config, devices, chunk)
-    capacity = chunk or LANES_PER_DEVICE[backend] * devices
+        return _refined_layout(config, count, chunk)
+    capacity = chunk or count * (LANES_ON_A_GPU if devices[0].platform == "gpu" else LANES_PER_DEVICE[backend])
     # chunks of equal size waste no padding on the last one; a multiple of the devices, along the longer side, suits them
     per_chunk = math.ceil(points.lanes / math.ceil(points.lanes / capacity))
-    if points.lanes >= devices and points.lanes > 1:
-        per_chunk = max(math.ceil(per_chunk / devices), 2) * devices
+    if points.lanes >= count and points.lanes > 1:
+        per_chunk = max(math.ceil(per_chunk / count), 2) * count
     seeds = min(config.sweep.seeds, max(capacity // per_chunk, 1))
     if points.lanes == 1:
-        seeds = max(math.ceil(seeds / devices), 2) * devices
-    elif points.lanes < devices:
-        seeds = math.ceil(seeds / devices) * devices
+        seeds = max(math.ceil(seeds / count), 2) * count
+    elif points.lanes < count:
+        seeds = math.ceil(seeds / count) * count
     return Layout(seeds, per_chunk)
 
 
@@ -114,10 +117,10 @@ class Engine:
         self.points = Points(config)
         self.devices = devices or jax.local_devices()
         # by the study, however it is cut: roundings differ between backends
-        natural = layout_for(config, self.points, len(self.devices), "fused", None)
+        natural = layout_for(config, self.points, self.devices, "fused", None)
         self.backend: Backend = backend_of(backend) or faster(natural, self.devices)
         self._insist = insist
-        self.layout = layout or layout_for(config, self.points, len(self.devices), self.backend, config.sweep.chunk)
+        self.layout = layout or layout_for(config, self.points, self.devices, self.backend, config.sweep.chunk)
         self.compile_seconds = 0.0
         self.run_seconds = 0.0
         self.scanned: list[str] = []

@@ -161,10 +161,10 @@ def with_chunk(config, chunk):
 def test_layouts():
     """Whole rows of points first, then seeds; two lanes a device at least; little padding."""
 
-    def layout(points, seeds, devices, chunk=None, backend="scan"):
+    def layout(points, seeds, devices, chunk=None, backend="scan", platform="cpu"):
         sweep = {"seeds": seeds} | ({} if chunk is None else {"chunk": chunk})
         config = read_config(small(axes=[spaced(ALPHA, 1.0, 2.0, points)] if points > 1 else [], sweep=sweep))
-        return tuple(Engine(config, devices=[None] * devices, backend=backend).layout)
+        return tuple(Engine(config, devices=[SimpleNamespace(platform=platform)] * devices, backend=backend).layout)
 
     assert layout(12288, 1, 2) == (1, 6144)
     assert layout(4096, 10, 1) == (1, 4096)
@@ -177,6 +177,8 @@ def test_layouts():
     assert layout(1, 1, 1) == (2, 1)
     # the fused loop takes four times as many lanes at once
     assert layout(12288, 4, 2, backend="fused") == (2, 12288)
+    # a GPU takes many more
+    assert layout(500_000, 4, 1, backend="fused", platform="gpu") == (1, 250_000)
 
 
 def test_seeds_of_one_point_share_chunks():
