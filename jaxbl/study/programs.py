@@ -54,7 +54,7 @@ class Program(NamedTuple):
     instead: str | None = None
 
 
-_FUSED, _SCAN = (0.7, 1.1e-3), (1.3, 3.6e-3)
+_FUSED, _SCAN = (0.5, 0.9e-3), (1.5, 3.1e-3)
 """Microseconds that a sample costs, and each of its lanes, on one core (benchmarks/NOTES.md)."""
 
 

@@ -263,7 +263,7 @@ def _curve(able: Sequence[Entry], lanes: int, steps: int, precisions: Sequence[s
             best = [float("inf")] * len(chosen)
             # short ones are repeated, and several times in a row: threads that wait for more work disturb the next entry
             short = round(1e8 / lanes / steps)
-            for _ in range(max(3, min(15, short))):
+            for _ in range(max(5, min(15, short))):
                 for i, runner in enumerate(runners):
                     for _ in range(max(1, min(4, short))):
                         begun = time.perf_counter()

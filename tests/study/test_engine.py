@@ -150,6 +150,9 @@ def test_a_study_goes_on_with_the_backend_of_its_first_chunks(tmp_path, study):
 def test_seeds_alone_are_scanned():
     config = read_config(rigid(sweep={"seeds": 4}))
     assert len(sweep(config).frame) == 4
+    # not even tried
+    assert [Engine(config, devices=jax.devices()[:count]).backend for count in (1, 2)] == ["scan", "scan"]
+    assert sweep(config).scanned == ()
     with pytest.raises(InputError, match="use --backend scan"):
         sweep(config, backend="fused")
 
