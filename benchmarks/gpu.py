@@ -1,8 +1,9 @@
 """The workload on a GPU: the scan, the fused kernel, a kernel by hand as the ceiling; and Lorenz's system.
 
-The chain: lane-steps per second of the scan, of the fused kernel (Pallas, lowered by Triton) and of a CUDA kernel (CuPy),
-their figures compared. Lorenz: trajectory-steps per second of 1000 steps of the classical Runge-Kutta method, 8 to 8 million
-of them, as in the DiffEqGPU benchmark (published on a V100: MPGOS 8.9e10, DiffEqGPU 5.8e10, JAX with diffrax 8.4e8).
+The chain: lane-steps per second of the scan, of a fused run, of its kernel alone (Pallas, lowered by Triton) and of a CUDA
+kernel (CuPy), their figures compared; a fused run makes its input and noise as well, which both kernels are given. Lorenz:
+trajectory-steps per second of 1000 steps of the classical Runge-Kutta method, 8 to 8 million of them, as in the DiffEqGPU
+benchmark (published on a V100: MPGOS 8.9e10, DiffEqGPU 5.8e10, JAX with diffrax 8.4e8).
 
 Least of several rounds in turns, after a warm-up. Needs a GPU, JAX for it, and CuPy; without a GPU it says so and ends.
 
@@ -29,7 +30,7 @@ from jaxbl.fused.jaxprs import contracted, flat
 from jaxbl.fused.pallas import multiply_add
 from jaxbl.fused.passage import DevicePassage
 from jaxbl.simulate import scan
-from jaxbl.throughput.workload import FIGURES, RANGES, SEED, Workload, constants, figures_of
+from jaxbl.throughput.workload import FIGURES, NAMES, RANGES, SEED, Workload, constants, figures_of
 
 _THREADS = 128
 
@@ -78,6 +79,14 @@ def chain_fused(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
     """The chain by the fused kernel."""
     passage, values = DevicePassage(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes), work.values()
     return lambda: passage(values, SEED)
+
+
+def chain_kernel(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
+    """The fused kernel alone, as the CUDA kernel is timed: input and noise lie on the device."""
+    passage = DevicePassage(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes)
+    given = jax.device_put((passage.filled_up(work.values()), passage.inputs(passage.blocks(SEED, []))))
+    names = sorted(NAMES)
+    return lambda: {name: np.asarray(x)[: work.lanes] for name, x in zip(names, passage.kernel(*given), strict=True)}
 
 
 def _lorenz_rates(x: Any, y: Any, z: Any, rho: Any) -> tuple[Any, Any, Any]:
@@ -183,7 +192,8 @@ def main() -> None:
         for lanes in sorted(options.lanes):
             with jax.enable_x64(precision == "float64"):
                 work = Workload(lanes, options.steps, precision)
-                makers = {"cuda": chain_by_hand, "fused": chain_fused} | ({"scan": chain_scanned} if lanes <= 2**16 else {})
+                makers = {"cuda": chain_by_hand, "kernel": chain_kernel, "fused": chain_fused}
+                makers |= {"scan": chain_scanned} if lanes <= 2**16 else {}
                 runners = {name: make(work) for name, make in makers.items()}
                 figures = {name: run() for name, run in runners.items()}
                 best = timed(runners, options.rounds)

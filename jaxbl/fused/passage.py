@@ -110,11 +110,9 @@ class Passage(abc.ABC):
 
     def __call__(self, values: dict[str, np.ndarray], seed: int) -> dict[str, np.ndarray]:
         """Figures `(lanes,)` of one seed, by name; `values` `(lanes,)` by path, in SI units."""
-        more = (0, self._filled - self._lanes)
-        given = [np.ascontiguousarray(values[path], self._dtype) for path in self._paths]
         # the figures that lanes share come with the last block
         shared: list[np.ndarray] = []
-        found = self._march([np.pad(one, more, "edge") for one in given] if any(more) else given, self._blocks(seed, shared))
+        found = self._march(self.filled_up(values), self.blocks(seed, shared))
         lanes, others = iter(found), iter(shared)
         figures = {name: next(lanes if own else others) for name, own in self._of_lane.items()}
         return {
@@ -122,7 +120,13 @@ class Passage(abc.ABC):
             for name, figure in figures.items()
         }
 
-    def _blocks(self, seed: int, shared: list[np.ndarray]) -> Iterator[Block]:
+    def filled_up(self, values: dict[str, np.ndarray]) -> list[np.ndarray]:
+        """Values of as many lanes as are computed."""
+        given = [np.ascontiguousarray(values[path], self._dtype) for path in self._paths]
+        more = (0, self._filled - self._lanes)
+        return [np.pad(one, more, "edge") for one in given] if any(more) else given
+
+    def blocks(self, seed: int, shared: list[np.ndarray]) -> Iterator[Block]:
         """Block after block of a run; figures that lanes share are added to `shared` with the last one."""
         state = self._first
         for first in range(0, self._steps, self._length):
@@ -184,7 +188,11 @@ class HostPassage(Passage):
 
 
 class DevicePassage(Passage):
-    """By one kernel of an accelerator, which takes its lanes through the whole run; `interpret` runs it anywhere, slowly."""
+    """By one kernel of an accelerator, which takes its lanes through the whole run; `interpret` runs it anywhere, slowly.
+
+    Attributes:
+        kernel: compiled; from values `(lanes,)`, lanes filled up, and `inputs` to the lanes' figures.
+    """
 
     def __init__(
         self,
@@ -199,11 +207,16 @@ class DevicePassage(Passage):
         with jax.default_device(jax.local_devices(backend="cpu")[0]):
             super().__init__(experiment, reducers, paths, lanes, LANES)
         kernel = Kernel(self._body, self._around, len(paths), self._filled, self._steps, self._length, interpret=interpret)
-        self._kernel = kernel.compiled()
+        self.kernel = kernel.compiled()
 
     def _march(self, given, blocks):
+        return [np.asarray(figure) for figure in self.kernel(given, self.inputs(blocks))]
+
+    @staticmethod
+    def inputs(blocks: Iterator[Block]) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+        """What the kernel reads of all blocks: each sample's, each block's, and the figures' own."""
         every = list(blocks)
         # a rest of samples stands behind the whole blocks
-        inputs = [np.concatenate(column) for column in zip(*(block.handed for block in every), strict=True)]
-        ends = [np.stack(column) for column in zip(*(block.last for block in every), strict=True)]
-        return [np.asarray(figure) for figure in self._kernel(given, (inputs, ends, every[-1].ends or []))]
+        handed = [np.concatenate(column) for column in zip(*(block.handed for block in every), strict=True)]
+        last = [np.stack(column) for column in zip(*(block.last for block in every), strict=True)]
+        return handed, last, every[-1].ends or []

@@ -1,0 +1,32 @@
+"""What the GPU benchmark runs computes the right thing; Pallas's interpreter stands in for a GPU."""
+
+from functools import partial
+
+import gpu
+import jax
+import numpy as np
+
+from jaxbl.fused.passage import DevicePassage
+from jaxbl.throughput.ours import Fused
+from jaxbl.throughput.workload import Workload
+
+
+def test_lorenz_by_the_kernel_and_by_the_scan():
+    with jax.enable_x64(False):
+        fused, scanned = gpu.lorenz_fused(130, 40, 1e-2, interpret=True)(), gpu.lorenz_scanned(130, 40, 1e-2)()
+    assert fused.shape == scanned.shape == (3, 130)
+    np.testing.assert_allclose(fused, scanned, rtol=1e-5, atol=1e-6)
+    assert np.ptp(fused[2]) > 0.1
+
+
+def test_the_kernel_alone_gives_the_figures_of_a_run(monkeypatch):
+    monkeypatch.setattr(gpu, "DevicePassage", partial(DevicePassage, interpret=True))
+    work = Workload(130, 150, "float64")
+    found, whole, expected = (run() for run in (gpu.chain_kernel(work), gpu.chain_fused(work), Fused(work, 1)))
+    assert set(found) == set(whole) == set(expected)
+    for name, figure in expected.items():
+        assert found[name].shape == (130,)
+        np.testing.assert_array_equal(found[name], whole[name])
+        # so short a run identifies nothing
+        if name.endswith("_rmse"):
+            np.testing.assert_allclose(found[name], figure, rtol=1e-6, err_msg=name)
