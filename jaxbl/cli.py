@@ -113,9 +113,8 @@ def sweep(
             typer.echo(f"chunks       {cost.chunks} of {cost.lanes_a_chunk} lanes")
             typer.echo(f"memory       {cost.megabytes:.1f} MB a chunk")
             typer.echo(f"compilation  about {_duration(cost.compile_seconds)}")
-            typer.echo(
-                f"run          about {_duration(cost.run_seconds)} ({cost.lane_steps_per_second:.2g} lane-steps/s measured)"
-            )
+            rate = f"{cost.lane_steps_per_second:.2g} lane-steps/s measured, backend {cost.backend}"
+            typer.echo(f"run          about {_duration(cost.run_seconds)} ({rate})")
             return
     folder = _folder(config, out)
     with _running(_words("sweep", config, chosen), config, folder) as progress:

@@ -255,9 +255,13 @@ def simulated(experiment: Experiment, time: Number, noise: dict[str, Number]) ->
     return Sample(time, {side: value.astype(jnp.result_type(time)) for side, value in noise.items()})
 
 
+LONGEST_BLOCK = 512
+"""Samples whose noise is drawn at once, at most."""
+
+
 def block_length(steps: int) -> int:
-    """Samples whose noise is drawn at once: the largest divisor of `steps` up to 512, or 256 with a rest."""
-    divisors = [n for n in range(64, 513) if steps % n == 0]
+    """Samples whose noise is drawn at once: the largest divisor of `steps` up to the longest block, or 256 with a rest."""
+    divisors = [n for n in range(64, LONGEST_BLOCK + 1) if steps % n == 0]
     return divisors[-1] if divisors else min(256, steps)
 
 

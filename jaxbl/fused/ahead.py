@@ -1,22 +1,31 @@
 """What lanes share, computed ahead of them: input, noise, and all of the plant where no lane differs in it."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache
 from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.simulate import unit_noise
+from jaxbl.simulate import LONGEST_BLOCK, unit_noise
 
 from .llvm import Loop
 from .split import Unsupported, recursion
 
 Block = tuple[list[Any], list[Any], list[Any]]
 """Next state of what lanes share, what follows a block of samples reads of it, and what each sample does."""
-_FIRST = jax.ShapeDtypeStruct((), jnp.uint32), jax.ShapeDtypeStruct((), jnp.int32)
-"""Seed, and index of a block's first sample."""
+
+
+@cache
+def _drawing() -> Callable[..., dict[str, Any]]:
+    """From a seed and a first sample to noise of as many as a block can have: compiled once for all studies."""
+
+    def draw(seed: Any, first: Any) -> dict[str, Any]:
+        return unit_noise(seed, first + jnp.arange(LONGEST_BLOCK, dtype=jnp.int32), ("motor", "load"))
+
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+        return jax.jit(draw).lower(np.uint32(0), np.int32(0)).compile()
 
 
 class Shared(NamedTuple):
@@ -27,10 +36,17 @@ class Shared(NamedTuple):
     state: list[jax.ShapeDtypeStruct]
     sides: tuple[str, ...]
 
-    def given(self, seed: Any, first: Any, length: int) -> tuple[Any, Any]:
+    def given(self, seed: int, first: int, length: int) -> tuple[Any, Any]:
         """Indices and noise of a block's samples."""
-        indices = first + jnp.arange(length, dtype=jnp.int32)
-        return indices, unit_noise(seed, indices, self.sides)
+        noise = _drawing()(np.uint32(seed), np.int32(first))
+        return np.arange(first, first + length, dtype=np.int32), {
+            side: np.asarray(noise[side])[:length] for side in self.sides
+        }
+
+    def shapes(self, *length: int) -> tuple[Any, Any]:
+        """Of what is given."""
+        noise = jax.ShapeDtypeStruct(length, jnp.float32)
+        return jax.ShapeDtypeStruct(length, jnp.int32), dict.fromkeys(self.sides, noise)
 
 
 class Ahead(Protocol):
@@ -43,14 +59,15 @@ class Scanned:
     """By XLA, sample by sample."""
 
     def __init__(self, shared: Shared, lengths: set[int]):
-        def block(state: list[Any], seed: Any, first: Any, length: int) -> Block:
-            state, handed = jax.lax.scan(shared.inner, state, shared.given(seed, first, length))
+        def block(state: list[Any], given: Any) -> Block:
+            state, handed = jax.lax.scan(shared.inner, state, given)
             return *shared.outer(state, ()), handed
 
-        self._blocks = {n: jax.jit(partial(block, length=n)).lower(shared.state, *_FIRST).compile() for n in lengths}
+        self._given = shared.given
+        self._blocks = {n: jax.jit(block).lower(shared.state, shared.shapes(n)).compile() for n in lengths}
 
     def __call__(self, state: list[Any], seed: int, first: int, length: int) -> Block:
-        return self._blocks[length](state, np.uint32(seed), np.int32(first))
+        return self._blocks[length](state, self._given(seed, first, length))
 
 
 class Looped:
@@ -61,23 +78,18 @@ class Looped:
     """
 
     def __init__(self, shared: Shared, lengths: set[int]):
-        block = jax.eval_shape(lambda: shared.given(jnp.uint32(0), jnp.int32(0), 1))
-        sample = jax.tree.map(lambda x: jax.ShapeDtypeStruct((), x.dtype), block)
-        parts = recursion(shared.inner, shared.state, sample)
-        self._direct = parts.direct
+        parts = recursion(shared.inner, shared.state, shared.shapes())
+        self._given, self._direct = shared.given, parts.direct
         self._dtypes = [out.dtype for out in parts.step.out_avals[len(shared.state) :]]
-
-        def ahead(seed: Any, first: Any, length: int) -> tuple[list[Any], list[Any]]:
-            return jax.vmap(parts.ahead)(shared.given(seed, first, length))
-
-        self._parallel = {n: jax.jit(partial(ahead, length=n)).lower(*_FIRST).compile() for n in lengths}
+        parallel = jax.jit(jax.vmap(parts.ahead))
+        self._parallel = {n: parallel.lower(shared.shapes(n)).compile() for n in lengths}
         self._loop = None
         if shared.state:
             self._loop = Loop(parts.step, np.dtype(float), carry=len(shared.state), lanes=1)
         self._outer = jax.jit(lambda state: shared.outer(state, ())).lower(shared.state).compile()
 
     def __call__(self, state: list[Any], seed: int, first: int, length: int) -> Block:
-        direct, read = self._parallel[length](np.uint32(seed), np.int32(first))
+        direct, read = self._parallel[length](self._given(seed, first, length))
         carry = [np.array([leaf]) for leaf in state]
         kept = [np.empty(length, dtype) for dtype in self._dtypes]
         if self._loop is not None:

@@ -259,6 +259,7 @@ class Engine:
             run_seconds=min(seconds) / short * sum(steps) * chunks_a_group,
             lane_steps_per_second=lane_steps / min(seconds),
             megabytes=program.megabytes,
+            backend="scan" if program.instead is not None else self.backend,
         )
 
 
@@ -276,6 +277,7 @@ class Estimate:
         run_seconds: time of all chunks.
         lane_steps_per_second: measured rate.
         megabytes: memory of a chunk, MB.
+        backend: that was measured.
     """
 
     points: int
@@ -287,3 +289,4 @@ class Estimate:
     run_seconds: float
     lane_steps_per_second: float
     megabytes: float
+    backend: Backend

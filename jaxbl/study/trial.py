@@ -1,18 +1,18 @@
 """One experiment with its whole trace: the function behind `jaxbl simulate` (`jaxbl.run` in Python)."""
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pandas as pd
 
 from jaxbl.errors import InputError
+from jaxbl.fused.single_run import recorded
 from jaxbl.observer.conditions import CONDITIONS, peak_ratio
-from jaxbl.simulate import Experiment, Reducer, Signals, State, scan
+from jaxbl.simulate import Experiment, Reducer, Signals, State
 
 from .config import Config, read_config
 from .engine import precision, prepare
@@ -51,17 +51,9 @@ def run(study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every:
         raise InputError(f"every: should be between 1 and the number of samples {config.run.steps}, not {every}")
     with precision(config):
         experiment = prepare(config)
-
-        names: list[str] = []
-
-        def keep(state: State, signals: Signals) -> dict[str, Any]:
-            row = _row(experiment, state, signals)
-            names[:] = row  # in this order: compiled programs give dicts back sorted
-            return row
-
-        figures, kept = eqx.filter_jit(lambda e, s: scan(e, s, (METRICS, _LAST), keep, every))(experiment, jnp.asarray(seed))
+        figures, kept = recorded(experiment, seed, (METRICS, _LAST), partial(_row, experiment), every)
         figures = with_conditions(figures, observer_gains(experiment))
-        trace = pd.DataFrame({name: np.asarray(kept[name], dtype=float) for name in names})
+        trace = pd.DataFrame({name: column.astype(float) for name, column in kept.items()})
     last = {name: plain(figures.pop(name)) for name in list(figures) if name.startswith("last.")}
     metrics = {name: plain(value) for name, value in figures.items()}
     return Trial(config, trace, _summary(config, last, metrics, seed))

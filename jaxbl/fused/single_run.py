@@ -1,0 +1,94 @@
+"""One run with a record of its samples, by loops for this machine's processor.
+
+The same as :func:`jaxbl.simulate.scan` computes with a record: XLA starts some kernels for each sample of a single lane, and
+takes longer to compile them than a study of that size takes to run.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbl.simulate import (
+    Experiment,
+    Reducer,
+    Signals,
+    State,
+    begin,
+    block_length,
+    figures,
+    proceed,
+    settled,
+    simulated,
+    time_of,
+)
+
+from .ahead import Shared, ahead_of_lanes
+from .jaxprs import flat
+from .llvm import Loop
+from .split import Unsupported
+
+
+def recorded(
+    experiment: Experiment,
+    seed: int,
+    reducers: tuple[Reducer, ...],
+    record: Callable[[State, Signals], dict[str, Any]],
+    every: int = 1,
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Simulate one experiment. Call in its precision (`jax.enable_x64`).
+
+    Args:
+        experiment: with array leaves.
+        seed: seed of the encoder noise.
+        reducers: figures to compute along the run.
+        record: what to keep of every `every`-th sample, scalars by name.
+        every: decimation of the record.
+
+    Returns:
+        The reducers' figures `()`, and the record `(samples,)`, both by name.
+    """
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+        start = jax.eval_shape(lambda: begin(experiment, reducers))
+        tree, leaves = jax.tree.structure(start), jax.tree.leaves(start)
+        names: list[str] = []
+
+        def sample(state: Any, given: Any) -> tuple[list[Any], list[Any]]:
+            index, noise = given
+            drawn = simulated(experiment, time_of(experiment, index), noise)
+            carry, signals = proceed(experiment, reducers, tree.unflatten(state), index, drawn)
+            row = record(carry[0], signals)
+            names[:] = row
+            return jax.tree.leaves(carry), list(row.values())
+
+        def settle(state: Any, _: Any) -> tuple[list[Any], list[Any]]:
+            return jax.tree.leaves(settled(experiment, tree.unflatten(state))), []
+
+        def result(*state: Any) -> dict[str, Any]:
+            return figures(experiment, reducers, tree.unflatten(state))
+
+        steps = experiment.run.steps
+        length = min(block_length(steps), steps)
+        ahead = ahead_of_lanes(Shared(sample, settle, leaves, experiment.sides), {length, steps % length} - {0})
+        state, columns = _once(lambda: jax.tree.leaves(begin(experiment, reducers))), [[] for _ in names]
+        for first in range(0, steps, length):
+            state, _, handed = ahead(state, seed, first, min(length, steps - first))
+            for column, part in zip(columns, handed, strict=True):
+                # copied: what is kept of a block does not keep the rest of it
+                column.append(np.array(part[-first % every :: every]))
+        found = dict(zip(sorted(jax.eval_shape(result, *leaves)), _once(result, *state), strict=True))
+    return found, {name: np.concatenate(column) for name, column in zip(names, columns, strict=True)}
+
+
+def _once(function: Callable[..., Any], *numbers: Any) -> list[Any]:
+    """Leaves of a function of numbers."""
+    closed = flat(function, *(jax.ShapeDtypeStruct((), jnp.result_type(number)) for number in numbers))
+    try:
+        loop = Loop(closed, np.dtype(float), values=len(numbers), lanes=1)
+    except Unsupported:
+        return [np.asarray(x) for x in jax.tree.leaves(jax.jit(function)(*numbers))]
+    kept = [np.empty(1, aval.dtype) for aval in closed.out_avals]
+    loop([*(np.array([number]) for number in numbers), *kept], 1, 0, 1)
+    return [column[0] for column in kept]

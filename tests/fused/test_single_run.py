@@ -1,0 +1,79 @@
+"""One run with a record by loops is what the scan gives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from effect_values import VALUES
+
+from jaxbl.drive import Encoders, Initial, TwoInertia, as_arrays
+from jaxbl.drive.effects import effect_kinds
+from jaxbl.drive.excitation import Multisine, Prbs
+from jaxbl.drive.transmission import DeadZone
+from jaxbl.fused.single_run import recorded
+from jaxbl.observer import EquivalentControl, Identifier, ImplicitSuperTwisting, Observers
+from jaxbl.simulate import Experiment, Reducer, Run, scan
+from jaxbl.study.metrics import METRICS
+
+NAMES = ["motor.stribeck_friction", "load.gravity", "motor.cogging", "actuator.lag"]
+ODD = Reducer(
+    lambda e: jnp.zeros_like(e.run.sample_period),
+    lambda e, total, index, signals: total + jax.scipy.special.erf(signals.motor.measured),
+    lambda e, total, state: {"odd": total, "sum": jax.scipy.special.erf(total)},
+)
+
+
+def experiment(excitation, steps, precision):
+    return as_arrays(
+        Experiment(
+            drive=TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0),
+            transmission=DeadZone(60.0, 0.05),
+            effects=tuple(effect_kinds()[name](**VALUES[name]) for name in NAMES),
+            initial=Initial(),
+            excitation=excitation,
+            encoders=Encoders(1e-4, motor_resolution=1e-5),
+            observer=Observers(ImplicitSuperTwisting(10.0, 90.0, velocity_error=0.5), ImplicitSuperTwisting(2.5, 8.2)),
+            equivalent_control=EquivalentControl(0.01),
+            identifier=Identifier(0.1),
+            run=Run(1e-3, steps, 2),
+        ),
+        np.dtype(precision),
+    )
+
+
+def row(state, signals):
+    # in another order than the alphabet's; one of them needs no state
+    return {"u": signals.input, "torque": signals.torque, "moving": signals.load.true.velocity > 0.0, "t": signals.time}
+
+
+@pytest.mark.parametrize(
+    ("excitation", "steps", "every", "reducers"),
+    [
+        (Multisine(5.0, 0.8), 700, 1, (METRICS,)),
+        (Prbs(5.0, 0.05), 523, 7, (METRICS,)),  # blocks with a rest, none a multiple of what is kept
+        (Prbs(5.0, 0.05), 300, 400, (METRICS,)),
+        (Multisine(5.0, 0.8), 263, 3, (METRICS, ODD)),  # what no loop can do
+    ],
+    ids=["whole", "every seventh", "the first alone", "by XLA"],
+)
+def test_figures_and_record_are_those_of_the_scan(excitation, steps, every, reducers):
+    whole = experiment(excitation, steps, "float64")
+    found, kept = recorded(whole, 3, reducers, row, every)
+    figures, record = jax.jit(lambda seed: scan(whole, seed, reducers, row, 1))(jnp.asarray(3))
+    assert list(kept) == ["u", "torque", "moving", "t"]
+    assert set(found) == set(figures)
+    for name, column in kept.items():
+        assert column.dtype == record[name].dtype
+        np.testing.assert_allclose(column, record[name][::every], rtol=1e-8, atol=1e-12, err_msg=name)
+    for name, figure in found.items():
+        np.testing.assert_allclose(figure, figures[name], rtol=1e-7, err_msg=name)
+
+
+def test_a_run_in_single_precision():
+    with jax.enable_x64(False):
+        whole = experiment(Multisine(5.0, 0.8), 500, "float32")
+        found, kept = recorded(whole, 3, (METRICS,), row)
+        figures, record = jax.jit(lambda seed: scan(whole, seed, (METRICS,), row))(jnp.asarray(3, jnp.uint32))
+    assert {column.dtype.name for column in kept.values()} == {"float32", "bool"}
+    np.testing.assert_allclose(kept["torque"], record["torque"], atol=1e-3 * np.ptp(record["torque"]))
+    np.testing.assert_allclose(found["motor.velocity_rmse"], figures["motor.velocity_rmse"], rtol=1e-3)
