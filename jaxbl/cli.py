@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .study.engine import Progress
     from .study.sweep import StudyResult
     from .study.tune import Tuning
+    from .study.verify import Verdict
 
 app = typer.Typer(
     add_completion=False,
@@ -157,7 +158,7 @@ def verify(
     folder = _folder(config, out)
     with _running(_words("verify", config, chosen), config, folder) as progress:
         verdict = run_verify(study, folder, progress=progress, overwrite=overwrite, backend=chosen)
-    _tell(write_verify_report(verdict, folder), folder)
+    _tell(write_verify_report(verdict, folder), folder, verdict)
 
 
 @app.command()
@@ -493,6 +494,8 @@ def _start_jax() -> None:
     if jax.config.values["jax_compilation_cache_dir"] is None:
         cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "jaxbl"
         jax.config.update("jax_compilation_cache_dir", str(cache))
+        # also what takes less than a second: a study has several of them
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
 @contextmanager
@@ -563,15 +566,16 @@ def _progress(unit: str) -> "Iterator[Progress | None]":
         yield update
 
 
-def _tell(lines: list[str], folder: Path, computed: "StudyResult | Tuning | None" = None) -> None:
+def _tell(lines: list[str], folder: Path, computed: "StudyResult | Tuning | Verdict | None" = None) -> None:
     """Print the headline of a report, what it took to compute, and where the report lies."""
     for line in lines:
         typer.echo(line)
-    if computed is not None and (cost := computed.cost)["lanes"]:
+    cost = getattr(computed, "cost", None)
+    if cost and cost["lanes"]:
         compiling, running = _duration(cost["compile_seconds"]), _duration(cost["run_seconds"])
         typer.echo(f"Compiled in {compiling}, ran {cost['lanes']:.0f} lanes in {running}.")
-        for what in computed.scanned:
-            typer.echo(f"Scanned, and slower for it: the fused loop does not know {what}.")
+    for what in computed.scanned if computed is not None else ():
+        typer.echo(f"Scanned, and slower for it: the fused loop does not know {what}.")
     typer.echo(f"{folder / 'report.html'}")
 
 

@@ -17,6 +17,14 @@ Block = tuple[list[Any], list[Any], list[Any]]
 """Next state of what lanes share, what follows a block of samples reads of it, and what each sample does."""
 
 
+def host() -> Any:
+    """This machine's processor; where JAX has been told to leave it alone, the device that there is."""
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError:
+        return jax.local_devices()[0]
+
+
 @cache
 def _drawing() -> Callable[..., dict[str, Any]]:
     """From a seed and a first sample to noise of as many as a block can have: compiled once for all studies."""
@@ -24,7 +32,7 @@ def _drawing() -> Callable[..., dict[str, Any]]:
     def draw(seed: Any, first: Any) -> dict[str, Any]:
         return unit_noise(seed, first + jnp.arange(LONGEST_BLOCK, dtype=jnp.int32), ("motor", "load"))
 
-    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+    with jax.default_device(host()):
         return jax.jit(draw).lower(np.uint32(0), np.int32(0)).compile()
 
 

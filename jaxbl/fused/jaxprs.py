@@ -1,7 +1,7 @@
 """Rewriting of traced functions: calls opened, operations replaced, products joined with sums."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, Protocol
 
@@ -12,6 +12,7 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 _CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call", "checkpoint")
 """Primitives that only call another jaxpr."""
 Functions = Mapping[str, Callable[..., Any]]
+"""By the name of the primitive that they replace."""
 
 
 def flat(function: Callable[..., Any], *examples: Any) -> ClosedJaxpr:
@@ -42,18 +43,19 @@ def contracted(closed: ClosedJaxpr, multiply_add: MultiplyAdd) -> ClosedJaxpr:
     joined: dict[Var, Var] = {}
     """Product by the sum that reads it."""
     for eqn in jaxpr.eqns:
-        out, name = eqn.outvars[0], eqn.primitive.name
-        if name == "mul" and reads[out] == 1 and jnp.issubdtype(out.aval.dtype, jnp.floating):
-            products[out] = eqn
+        name = eqn.primitive.name
+        if name == "mul" and reads[eqn.outvars[0]] == 1 and str(eqn.outvars[0].aval.dtype) in ("float32", "float64"):
+            products[eqn.outvars[0]] = eqn
         elif name in ("add", "add_any", "sub"):
             taken = next((v for v in eqn.invars if isinstance(v, Var) and v in products), None)
-            joined |= {} if taken is None else {out: taken}
+            if taken is not None:
+                joined[eqn.outvars[0]] = taken
     inside = set(joined.values())
 
     def evaluated(*arguments: Any) -> list[Any]:
-        env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *arguments], strict=True))
+        env = _given(closed, arguments)
         for eqn in jaxpr.eqns:
-            out = eqn.outvars[0]
+            out = next(iter(eqn.outvars), None)
             if out in joined:
                 a, b = (value_of(env, v) for v in products[joined[out]].invars)
                 first = eqn.invars[0] is joined[out]
@@ -80,7 +82,7 @@ def _callee(eqn: JaxprEqn) -> ClosedJaxpr | None:
 
 def _inlined(closed: ClosedJaxpr, functions: Functions, *arguments: Any) -> list[Any]:
     jaxpr = closed.jaxpr
-    env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *arguments], strict=True))
+    env = _given(closed, arguments)
     for eqn in jaxpr.eqns:
         given = [value_of(env, v) for v in eqn.invars]
         called, name = _callee(eqn), eqn.primitive.name
@@ -96,6 +98,12 @@ def _inlined(closed: ClosedJaxpr, functions: Functions, *arguments: Any) -> list
             results = results if eqn.primitive.multiple_results else [results]
         env |= dict(zip(eqn.outvars, results, strict=True))
     return [value_of(env, v) for v in jaxpr.outvars]
+
+
+def _given(closed: ClosedJaxpr, arguments: Sequence[Any]) -> dict[Var, Any]:
+    """What the first equations read."""
+    jaxpr = closed.jaxpr
+    return dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *arguments], strict=True))
 
 
 def evaluate(eqns: Iterable[JaxprEqn], env: dict[Var, Any]) -> None:

@@ -410,7 +410,7 @@ def _convert(w: _Writer, eqn: JaxprEqn, a: Vector) -> Vector:
     if was and becomes:
         return (w.build.fpext if wider else w.build.fptrunc)(a, target)
     if was:
-        return w.build.fptosi(a, target)
+        return (w.build.fptosi if jnp.issubdtype(new, jnp.signedinteger) else w.build.fptoui)(a, target)
     if becomes:
         return (w.build.sitofp if signed else w.build.uitofp)(a, target)
     if a.type == target:

@@ -82,7 +82,8 @@ class Kernel:
         try:
             return jax.jit(self.run).lower(*self.arguments).compile()
         except Exception as error:  # of any kind: lowering, Triton and the assembler have their own
-            raise Unsupported(f"how to compile for this device ({type(error).__name__})") from error
+            said = str(error).strip().partition("\n")[0]
+            raise Unsupported(f"how to compile for this device ({type(error).__name__}: {said:.200})") from error
 
     def run(self, values: list[Array], inputs: tuple[list[Array], list[Array], list[Array]]) -> list[Array]:
         """The lanes' results `(lanes,)` each, of `arguments`."""
@@ -105,7 +106,8 @@ class Kernel:
 
     def _kernel(self, counts: list[int], truths: list[bool], *refs: Any) -> None:
         numbers = [ref[...] for ref in refs[: self._values]]
-        shared, out = refs[self._values : -len(self._results)], refs[-len(self._results) :]
+        end = len(refs) - len(self._results)
+        shared, out = refs[self._values : end], refs[end:]
 
         def read(part: int, at: Any) -> list[Array]:
             """Inputs of the body, of what follows a block, or of the finish."""

@@ -1,9 +1,11 @@
 """Lanes through time by a fused loop: what :func:`jaxbl.simulate.scan` computes, for many lanes at once."""
 
 import abc
+from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from queue import Queue
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -23,7 +25,7 @@ from jaxbl.simulate import (
     time_of,
 )
 
-from .ahead import Shared, ahead_of_lanes
+from .ahead import Shared, ahead_of_lanes, host
 from .llvm import Arrays, Loop, vector_lanes
 from .pallas import LANES, Kernel
 from .split import Around, Kind, carry_kinds, split
@@ -106,7 +108,7 @@ class Passage(abc.ABC):
         self._closing = jax.jit(lambda state: ends.shared(state, ())).lower(one).compile()
         names = sorted(jax.eval_shape(result, values, carry, ()))
         self._of_lane = dict(zip(names, ends.of_lane, strict=True))
-        self._kinds = [np.dtype(aval.dtype) for aval in ends.lane.out_avals]
+        self._figure_dtypes = [np.dtype(aval.dtype) for aval in ends.lane.out_avals]
 
     def __call__(self, values: dict[str, np.ndarray], seed: int) -> dict[str, np.ndarray]:
         """Figures `(lanes,)` of one seed, by name; `values` `(lanes,)` by path, in SI units."""
@@ -123,6 +125,9 @@ class Passage(abc.ABC):
     def filled_up(self, values: dict[str, np.ndarray]) -> list[np.ndarray]:
         """Values of as many lanes as are computed."""
         given = [np.ascontiguousarray(values[path], self._dtype) for path in self._paths]
+        for path, one in zip(self._paths, given, strict=True):
+            if one.shape != (self._lanes,):
+                raise ValueError(f"{path}: {self._lanes} lanes need as many values, not an array of shape {one.shape}")
         more = (0, self._filled - self._lanes)
         return [np.pad(one, more, "edge") for one in given] if any(more) else given
 
@@ -153,37 +158,27 @@ class HostPassage(Passage):
         dtype = np.dtype(jnp.result_type(experiment.run.sample_period))
         self._together = vector_lanes(dtype)
         super().__init__(experiment, reducers, paths, lanes, self._together)
-        self._threads = min(threads, self._filled // self._together)
-        self._pool = ThreadPoolExecutor(self._threads)
+        # a thread a share: its blocks come one after the other, whatever the others do
+        shares = min(threads, self._filled // self._together)
+        self._threads = [ThreadPoolExecutor(1) for _ in range(shares)]
         self._loop = Loop(self._body, self._dtype, values=len(paths), carry=self.carried, around=self._around)
         self._unread = [np.zeros((), aval.dtype) for aval in self._around.finish.in_avals[len(paths) + self.carried :]]
 
     def _march(self, given, blocks):
         carry = [np.empty(self._filled, self._dtype) for _ in range(self.carried)]
-        found = [np.empty(self._filled, dtype) for dtype in self._kinds]
+        found = [np.empty(self._filled, dtype) for dtype in self._figure_dtypes]
         parts = self._filled // self._together
-        edges = [parts * i // self._threads * self._together for i in range(self._threads + 1)]
-        # what lanes share is computed meanwhile, a block or two ahead of them
-        waiting: list[Queue[tuple[Arrays, Block, bool] | None]] = [Queue(2) for _ in range(self._threads)]
-
-        def share(thread: int) -> None:
-            while (one := waiting[thread].get()) is not None:
-                arrays, block, begins = one
-                first, last = edges[thread : thread + 2]
-                self._loop(arrays, block.length, first, last, begins=begins, ends=block.ends is not None)
-
-        running = [self._pool.submit(share, thread) for thread in range(self._threads)]
-        try:
-            for number, block in enumerate(blocks):
-                ends = self._unread if block.ends is None else block.ends
-                arrays = Arrays([*given, *carry, *block.handed, *block.last, *ends, *found])
-                for queue in waiting:
-                    queue.put((arrays, block, number == 0))
-        finally:
-            for queue in waiting:
-                queue.put(None)
-        for one in running:
-            one.result()
+        edges = [parts * i // len(self._threads) * self._together for i in range(len(self._threads) + 1)]
+        running: deque[list[Future[None]]] = deque()
+        for number, block in enumerate(blocks):
+            ends = self._unread if block.ends is None else block.ends
+            arrays = Arrays([*given, *carry, *block.handed, *block.last, *ends, *found])
+            run = partial(self._loop, arrays, block.length, begins=number == 0, ends=block.ends is not None)
+            running.append([thread.submit(run, *part) for thread, part in zip(self._threads, pairwise(edges), strict=True)])
+            # what lanes share is computed meanwhile, a block or two ahead of them
+            while len(running) > (2 if block.ends is None else 0):
+                for one in running.popleft():
+                    one.result()
         return found
 
 
@@ -204,7 +199,7 @@ class DevicePassage(Passage):
         interpret: bool = False,
     ):
         # a loop of scalars is the work of a processor; a GPU would start a kernel for each of its steps
-        with jax.default_device(jax.local_devices(backend="cpu")[0]):
+        with jax.default_device(host()):
             super().__init__(experiment, reducers, paths, lanes, LANES)
         kernel = Kernel(self._body, self._around, len(paths), self._filled, self._steps, self._length, interpret=interpret)
         self.kernel = kernel.compiled()

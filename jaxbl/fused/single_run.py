@@ -25,7 +25,7 @@ from jaxbl.simulate import (
     time_of,
 )
 
-from .ahead import Shared, ahead_of_lanes
+from .ahead import Shared, ahead_of_lanes, host
 from .jaxprs import flat
 from .llvm import Loop
 from .split import Unsupported
@@ -50,7 +50,7 @@ def recorded(
     Returns:
         The reducers' figures `()`, and the record `(samples,)`, both by name.
     """
-    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+    with jax.default_device(host()):
         start = jax.eval_shape(lambda: begin(experiment, reducers))
         tree, leaves = jax.tree.structure(start), jax.tree.leaves(start)
         names: list[str] = []

@@ -58,14 +58,21 @@ _FUSED, _SCAN = (0.5, 0.9e-3), (1.5, 3.1e-3)
 """Microseconds that a sample costs, and each of its lanes, on one core (benchmarks/NOTES.md)."""
 
 
+_GPU_SEEDS = 8
+"""Seeds a chunk up to which a GPU gets the fused loop: some 1 us a sample each, where a step of the scan takes 8 (published
+for a scan by XLA; not measured here)."""
+
+
 def faster(layout: Layout, devices: list[Any]) -> Backend:
     """The backend that takes less time for a chunk.
 
     The fused loop runs seed after seed, and pays for each what its lanes share; the scan has all lanes side by side. On a
-    GPU it is the fused loop: the scan starts several kernels a time step, and waits for them.
+    GPU the scan starts several kernels a time step, and waits for them.
     """
+    if devices[0].platform == "gpu" and len(devices) == 1:
+        return "fused" if layout.seeds <= _GPU_SEEDS else "scan"
     if devices[0].platform != "cpu":
-        return "fused" if devices[0].platform == "gpu" and len(devices) == 1 else "scan"
+        return "scan"
     fused = layout.seeds * (_FUSED[0] + _FUSED[1] * layout.points)
     return "fused" if fused < _SCAN[0] + _SCAN[1] * layout.seeds * layout.points else "scan"
 

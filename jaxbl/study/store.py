@@ -66,6 +66,21 @@ def mark(config: Config, command: str) -> dict[str, Any]:
     return own | {"single_run": identity(config, "simulate"), "title": config.title}
 
 
+def backend_kept(marker: Path, asked: Backend | None) -> Backend | None:
+    """The backend that a search or verification was begun with, so that all of it is by one; as asked if none was begun.
+
+    Raises:
+        InputError: it was begun with another one than is asked for.
+    """
+    if not marker.exists():
+        return asked
+    begun = _read_json(marker).get("backend")
+    if asked not in (None, begun):
+        how = f"with --backend {begun}; go on with that" if begun else "without --backend; go on without it"
+        raise InputError(f"{marker.parent.parent}: was begun {how}, or choose another folder with --out")
+    return begun
+
+
 def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bool = False) -> None:
     """Make sure that a command may write its results for a study into a folder; make the folder.
 

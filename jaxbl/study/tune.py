@@ -26,7 +26,7 @@ from .engine import Progress
 from .metrics import undisturbed
 from .pilot import Scenarios, pilot, scenarios_of
 from .programs import Backend, backend_of
-from .store import claim, make_folder, mark, write_atomic
+from .store import backend_kept, claim, make_folder, mark, write_atomic
 from .sweep import sweep
 from .tune_summary import FIGURES, figures_of, summarise
 
@@ -93,13 +93,17 @@ def tune(
     if out is not None:
         claim(Path(out), config, "tune", overwrite=overwrite)
         stages = Path(out) / "tune"
+        backend = backend_kept(stages / "manifest.json", backend)
         if (stages / "manifest.json").exists():
             found = json.loads((stages / "manifest.json").read_text(encoding="utf-8")).get("pilot")
     search = Search(scenarios, table, found or pilot(scenarios, table), stages, devices, overwrite, backend)
     if stages is not None and found is None:
         # before the stages: it is what makes the folder this study's
         make_folder(stages)
-        write_atomic(stages / "manifest.json", json.dumps(mark(config, "tune") | {"pilot": search.pilot}, indent=2))
+        write_atomic(
+            stages / "manifest.json",
+            json.dumps(mark(config, "tune") | {"pilot": search.pilot, "backend": backend}, indent=2),
+        )
     search.progress = progress
     search.run()
     summary = summarise(search, search.compare(held_out=False), search.compare(held_out=True))

@@ -32,7 +32,7 @@ from .metrics import NOTHING, undisturbed
 from .pieces import in_pieces
 from .points import Points
 from .programs import Backend, backend_of
-from .store import claim, mark, plain, write_atomic
+from .store import backend_kept, claim, mark, plain, write_atomic
 from .sweep import sweep
 
 SWITCHING_LIMIT = 0.02
@@ -81,6 +81,7 @@ class Verdict:
         levels: frames of "drive" and "sampled": the points of a sweep with their metrics.
         counterexamples: runs in which a condition held and the observer failed: level, side, condition, bound ("true" or
             "claimed"), cause, then all axis values, seed and metrics.
+        scanned: what the fused loop did not know of runs that this call scanned in its place.
     """
 
     config: Config
@@ -88,6 +89,7 @@ class Verdict:
     normalised: Normalised
     levels: dict[str, pd.DataFrame]
     counterexamples: pd.DataFrame
+    scanned: tuple[str, ...] = ()
 
 
 def verify(
@@ -119,16 +121,20 @@ def verify(
     if folder is not None:
         claim(folder, config, "verify", overwrite=overwrite)
         (folder / "verify").mkdir(exist_ok=True)
-        write_atomic(folder / "verify" / "manifest.json", json.dumps(mark(config, "verify"), indent=2))
+        marker = folder / "verify" / "manifest.json"
+        backend = backend_kept(marker, backend)
+        write_atomic(marker, json.dumps(mark(config, "verify") | {"backend": backend}, indent=2))
     work = None if folder is None else folder / "verify"
     studies = {"drive": _ideal(config), "sampled": _only(config)}
     rows = {level: len(Points(study)) * study.sweep.seeds for level, study in studies.items()}
     normalised = _normalised(config, work, devices or jax.local_devices())
-    levels, done = {}, 0
+    levels, scanned, done = {}, {}, 0
     for level, study in studies.items():
         report = None if progress is None else partial(_shifted, progress, done, sum(rows.values()))
         place = None if work is None else work / level
-        levels[level] = sweep(study, place, progress=report, devices=devices, backend=backend).frame
+        result = sweep(study, place, progress=report, devices=devices, backend=backend)
+        levels[level] = result.frame
+        scanned |= dict.fromkeys(result.scanned)
         for side in sides:
             size = levels[level][f"{side}.f_plus_acceleration"].max()
             if levels[level][f"{side}.f_plus"].max() <= NOTHING[config.run.precision] * size:
@@ -174,7 +180,7 @@ def verify(
         every.to_parquet(draft, index=False)
         draft.replace(folder / "counterexamples.parquet")
         write_atomic(folder / "verdict.json", json.dumps(summary, indent=1, ensure_ascii=False))
-    return Verdict(config, summary, normalised, levels, every)
+    return Verdict(config, summary, normalised, levels, every, tuple(scanned))
 
 
 def judged_sides(config: Config) -> list[str]:

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from effect_values import VALUES
+from jax.extend.core import jaxpr_as_fun
 
 from jaxbl.drive import Encoders, Initial, LinearShaft, Rigid, TwoInertia, as_arrays, get_leaf, set_leaves
 from jaxbl.drive.effects import effect_kinds
@@ -12,6 +13,7 @@ from jaxbl.drive.excitation import Chirp, Sine
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.drive.transmission import DeadZone
 from jaxbl.fused.ahead import Looped
+from jaxbl.fused.jaxprs import contracted, substituted
 from jaxbl.fused.pallas import LANES, Kernel
 from jaxbl.fused.passage import DevicePassage, HostPassage
 from jaxbl.fused.split import Unsupported
@@ -151,10 +153,56 @@ def test_the_kernel_can_be_written_for_a_gpu(names, precision):
         parts = DevicePassage(whole, (METRICS,), paths, 5, interpret=True)
         kernel = Kernel(parts._body, parts._around, len(paths), 2 * LANES, 200, 64)
         written = jax.jit(kernel.run).trace(*kernel.arguments).lower(lowering_platforms=("cuda",)).as_text()
-    assert "tt.func" in written or "triton" in written
-    # there is no device here that it could be compiled for
-    with pytest.raises(Unsupported, match="how to compile for this device"):
-        kernel.compiled()
+    assert "fma.rn" in written
+    if jax.default_backend() == "cpu":
+        with pytest.raises(Unsupported, match="how to compile for this device"):
+            kernel.compiled()
+
+
+@pytest.mark.parametrize("names", [HALF, OTHERS], ids=["half", "others"])
+def test_what_is_joined_for_a_gpu_computes_the_same(names):
+    law = DeadZone(60.0, 0.05) if names is HALF else LinearShaft(60.0)
+    whole = experiment(names, law, steps=200)
+    paths = tuple(path for path in leaf_paths(whole) if path.startswith("effects."))
+    parts = HostPassage(whole, (METRICS,), paths, 5, 1)
+    joined = []
+
+    def multiply_add(a, b, c, *, minus_product, minus_rest):
+        joined.append(a)
+        return (-a if minus_product else a) * b + (-c if minus_rest else c)
+
+    random = np.random.default_rng(1)
+    for part in (parts._body, *parts._around):
+        given = [random.uniform(0.5, 1.5, aval.shape).astype(aval.dtype) for aval in part.in_avals]
+        found = jaxpr_as_fun(contracted(substituted(part, {}), multiply_add))(*given)
+        for one, expected in zip(found, jaxpr_as_fun(part)(*given), strict=True):
+            np.testing.assert_allclose(one, expected, rtol=1e-12)
+    assert len(joined) > 50
+
+
+def test_values_of_another_number_of_lanes_are_refused():
+    work = Workload(40, 70, "float64")
+    passage = HostPassage(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
+    with pytest.raises(ValueError, match=r"encoders\.noise: 40 lanes need as many values, not an array of shape \(3,\)"):
+        passage(work.values() | {"encoders.noise": np.ones(3)}, SEED)
+
+
+def test_an_error_of_a_thread_reaches_the_caller(monkeypatch):
+    work = Workload(4000, 3000, "float64")
+    passage = HostPassage(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
+    loop, calls = passage._loop, []
+
+    def failing(*arguments, **options):
+        calls.append(1)
+        if len(calls) == 3:
+            raise MemoryError("no more")
+        loop(*arguments, **options)
+
+    monkeypatch.setattr(passage, "_loop", failing)
+    with pytest.raises(MemoryError, match="no more"):
+        passage(work.values(), SEED)
+    monkeypatch.undo()
+    assert np.isfinite(passage(work.values(), SEED)["motor.velocity_rmse"]).all()
 
 
 def test_an_unknown_operation_is_refused_by_name():

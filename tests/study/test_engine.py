@@ -125,6 +125,7 @@ def test_the_faster_backend_is_chosen():
     # the scan starts kernels for each time step; several GPUs share lanes by it alone
     gpu, tpu = SimpleNamespace(platform="gpu"), SimpleNamespace(platform="tpu")
     assert [faster(Layout(1, 3), devices) for devices in ([gpu], [gpu, gpu], [tpu])] == ["fused", "scan", "scan"]
+    assert faster(Layout(1000, 3), [gpu]) == "scan"
     with pytest.raises(InputError, match="no 'Fused'; one of fused, scan"):
         sweep(rigid(axes=[listed(ALPHA, 1.0, 2.0)]), backend="Fused")
 

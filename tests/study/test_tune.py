@@ -195,10 +195,11 @@ def test_an_interrupted_search_goes_on_where_it_stopped(tmp_path, monkeypatch):
     monkeypatch.setattr(Engine, "run", counted)
     with pytest.raises(KeyboardInterrupt):
         tune(study, tmp_path, backend="scan")
-    with pytest.raises(InputError, match="was begun with --backend scan"):
+    with pytest.raises(InputError, match="was begun with --backend scan; go on with that, or choose another folder"):
         tune(study, tmp_path, backend="fused")
     monkeypatch.setattr(Engine, "run", lambda engine, chunk: ran.append(chunk) or run(engine, chunk))
-    resumed = tune(study, tmp_path, backend="scan")
+    # by the same without being told
+    resumed = tune(study, tmp_path)
     # maps of both stages, the named gains twice: each once
     assert len(ran) == 4
     assert resumed.summary == tune(study, backend="scan").summary

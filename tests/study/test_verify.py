@@ -278,6 +278,12 @@ def test_another_q_and_other_marks_go_on_with_what_is_there(checked, monkeypatch
     assert one | {"name": "the same"} == same
 
 
+def test_a_verification_keeps_to_its_backend(checked):
+    _, folder = checked
+    with pytest.raises(InputError, match="was begun without --backend; go on without it, or choose another folder"):
+        verify(STUDY, folder, backend="scan")
+
+
 def test_a_folder_of_other_files_is_left_as_it_is(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
     with pytest.raises(InputError, match="is not empty and holds no study"):

@@ -69,7 +69,7 @@ class Plain:
         load = observer(load_lambda, load_alpha, h, zero, self._f)
         state = [zero] * 4
         motor_control = load_control = twist = bend = zero
-        sums = [np.float64(0.0) * zero for _ in range(9)]
+        sums = [zero if self._f is _NUMBERS else zero.astype(np.float64) for _ in range(9)]
         for i in range(w.steps):
             u, (motor_unit, load_unit) = self._torque[i], self._noise[i]
             motor_read, load_read = state[0] + noise * motor_unit, state[2] + noise / ratio * load_unit
