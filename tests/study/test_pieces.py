@@ -22,10 +22,10 @@ def test_columns_of_any_length_by_two_programs(count, dtype, monkeypatch):
     found = in_pieces(both, [x, y])
     np.testing.assert_array_equal(found["sum"], np.full(count, count - 1.0))
     np.testing.assert_array_equal(found["less"], x < y)
-    assert found["sum"].dtype == dtype and set(shapes) == {(4 if count <= 4 else 8,)}
+    assert found["sum"].dtype == dtype and set(shapes) == {(1, 4) if count <= 4 else (2, 8)}
 
 
-def test_devices_take_turns(monkeypatch):
+def test_devices_share_what_is_large(monkeypatch):
     monkeypatch.setattr(under_test, "_SIZES", (4, 8))
     used = []
 
@@ -36,4 +36,6 @@ def test_devices_take_turns(monkeypatch):
     devices = jax.local_devices()
     assert len(devices) == 2
     assert in_pieces(where, [np.ones(17)], devices).shape == (17,)
-    assert used == [{devices[0]}, {devices[1]}, {devices[0]}]
+    assert used == [set(devices)] * 2
+    assert in_pieces(where, [np.ones(3)], devices[1:]).shape == (3,)
+    assert used[2:] == [{devices[1]}]
