@@ -121,12 +121,14 @@ def test_the_kernel_of_accelerators_interpreted(precision):
             DevicePassage(whole, (METRICS,), tuple(RANGES), work.lanes, interpret=True),
         ]
         host, device = (passage(work.values(), SEED) for passage in passages)
+        scanned = jax.jit(jax.vmap(lambda v: scan(set_leaves(whole, v), jnp.asarray(SEED), (METRICS,))[0]))(work.values())
     for name, figure in device.items():
         assert figure.dtype in (precision, bool)
-        if precision == "float64" and "error" not in name:
-            np.testing.assert_allclose(figure, host[name], rtol=1e-6, err_msg=name)
-        elif name.endswith("_rmse"):
-            assert np.median(np.abs(figure / host[name] - 1.0)) < 1e-3, name
+        for other in (host[name], np.asarray(scanned[name])):
+            if precision == "float64" and "error" not in name:
+                np.testing.assert_allclose(figure, other, rtol=1e-6, err_msg=name)
+            elif name.endswith("_rmse"):
+                assert np.median(np.abs(figure / other - 1.0)) < 1e-3, name
 
 
 @pytest.mark.slow
