@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from .records import Record as Record
     from .records import inspect as inspect
     from .records import read_record as read_record
-    from .report import write_diagnosis_report as write_diagnosis_report
-    from .report import write_identification_report as write_identification_report
-    from .report import write_inspection_report as write_inspection_report
-    from .report import write_sweep_report as write_sweep_report
-    from .report import write_trial_report as write_trial_report
-    from .report import write_tune_report as write_tune_report
-    from .report import write_verify_report as write_verify_report
+    from .report.atlas import write_verify_report as write_verify_report
+    from .report.diagnosed import write_diagnosis_report as write_diagnosis_report
+    from .report.identified import write_identification_report as write_identification_report
+    from .report.inspected import write_inspection_report as write_inspection_report
+    from .report.reports import write_sweep_report as write_sweep_report
+    from .report.reports import write_trial_report as write_trial_report
+    from .report.tuning import write_tune_report as write_tune_report
     from .study.config import Config as Config
     from .study.config import read_config as read_config
     from .study.diagnosis import Diagnosis as Diagnosis
@@ -48,13 +48,13 @@ _WHERE = {
     "Record": "records",
     "inspect": "records",
     "read_record": "records",
-    "write_diagnosis_report": "report",
-    "write_identification_report": "report",
-    "write_inspection_report": "report",
-    "write_sweep_report": "report",
-    "write_trial_report": "report",
-    "write_tune_report": "report",
-    "write_verify_report": "report",
+    "write_diagnosis_report": "report.diagnosed",
+    "write_identification_report": "report.identified",
+    "write_inspection_report": "report.inspected",
+    "write_sweep_report": "report.reports",
+    "write_trial_report": "report.reports",
+    "write_tune_report": "report.tuning",
+    "write_verify_report": "report.atlas",
     "Config": "study.config",
     "read_config": "study.config",
     "Diagnosis": "study.diagnosis",

@@ -62,7 +62,7 @@ def simulate(
 ) -> None:
     """Run the experiment of a study once: trace, figures, summary."""
     _start_jax()
-    from .report import write_trial_report
+    from .report.reports import write_trial_report
     from .study.config import read_config
     from .study.store import claim
     from .study.trial import run
@@ -86,8 +86,8 @@ def sweep(
 ) -> None:
     """Run all points of a study: table of metrics, maps, report. Goes on where an interrupted run stopped."""
     _start_jax()
-    from .report import write_sweep_report
     from .report.maps import check_figures
+    from .report.reports import write_sweep_report
     from .study.config import read_config
     from .study.metrics import metric_columns
     from .study.points import Points
@@ -129,7 +129,7 @@ def tune(
 ) -> None:
     """Choose lambda and alpha of both observers: gains.toml, comparison, report. Goes on where it was interrupted."""
     _start_jax()
-    from .report import write_tune_report
+    from .report.tuning import write_tune_report
     from .study.config import read_config
     from .study.programs import backend_of
     from .study.tune import tune as run_tune
@@ -148,7 +148,7 @@ def verify(
 ) -> None:
     """Check the gain conditions on three levels: verdict, counterexamples, atlas. Goes on where it was interrupted."""
     _start_jax()
-    from .report import write_verify_report
+    from .report.atlas import write_verify_report
     from .study.config import read_config
     from .study.programs import backend_of
     from .study.verify import verify as run_verify
@@ -172,7 +172,7 @@ def inspect(
 ) -> None:
     """Say what a measured log holds and what it can identify: channels, sampling, noise, figures."""
     from .records import inspect as inspect_log
-    from .report import write_inspection_report
+    from .report.inspected import write_inspection_report
     from .study.config import read_log_config
 
     table, gear_ratio = (None, None) if model is None else read_log_config(model)
@@ -204,7 +204,7 @@ def identify(
 ) -> None:
     """Find a machine's numbers in its logs, with intervals: stiffness, gap, inertias, frictions."""
     _start_jax()
-    from .report import identification_lines, write_identification_report
+    from .report.identified import identification_lines, write_identification_report
     from .study.identification import read_task, run_task
 
     task = read_task(log, model, holdout=holdout, profile=profile)
@@ -285,7 +285,7 @@ def diagnose(
     if model is None:
         raise InputError("diagnose: no model; give a study with nominal numbers: --model TOML")
     _start_jax()
-    from .report import diagnosis_lines, write_diagnosis_report
+    from .report.diagnosed import diagnosis_lines, write_diagnosis_report
     from .study.diagnosis import read_task, run_task
 
     task = read_task(log, model, holdout=holdout)
@@ -434,7 +434,7 @@ def plot(
 ) -> None:
     """Redraw figures and report of a sweep from its stored points, without simulating."""
     _start_jax()
-    from .report import write_sweep_report
+    from .report.reports import write_sweep_report
     from .study.config import read_config
     from .study.store import Store, identity
     from .study.sweep import load

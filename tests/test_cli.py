@@ -628,7 +628,7 @@ def quick(monkeypatch):
         return _Found(task)
 
     def report(found, folder):
-        from jaxbl.report import diagnosis_lines
+        from jaxbl.report.diagnosed import diagnosis_lines
 
         (folder / "diagnosis.json").write_text(json.dumps(found.summary))
         return diagnosis_lines(found.summary)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from small_study import ALPHA, LAMBDA, listed, rigid, spaced
 
-from jaxbl.report import write_verify_report
-from jaxbl.report.atlas import draw_verdict
+from jaxbl.report.atlas import draw_verdict, write_verify_report
 from jaxbl.study.verify import verify
 
 ATLAS = {

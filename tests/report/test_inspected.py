@@ -8,8 +8,7 @@ from measured import GEAR_RATIO, SERVO, made, real
 from test_page import Page
 
 from jaxbl.records import inspect
-from jaxbl.report import write_inspection_report
-from jaxbl.report.inspected import draw_inspection, summary
+from jaxbl.report.inspected import draw_inspection, summary, write_inspection_report
 from jaxbl.report.style import save
 
 UNEVEN = np.cumsum(1e-3 * np.random.default_rng(1).uniform(0.7, 1.4, 3000))

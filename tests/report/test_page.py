@@ -6,8 +6,8 @@ from html.parser import HTMLParser
 import pandas as pd
 from small_study import ALPHA, LAMBDA, listed, made, rigid, small, spaced
 
-from jaxbl.report import write_sweep_report, write_trial_report
 from jaxbl.report.page import Picture, TableOf, html
+from jaxbl.report.reports import write_sweep_report, write_trial_report
 from jaxbl.study.trial import run
 
 VOID = {"meta", "img"}

@@ -12,8 +12,7 @@ from small_study import small
 from test_page import Page
 
 from jaxbl.observer.conditions import CONDITIONS
-from jaxbl.report import write_tune_report
-from jaxbl.report.tuning import draw_tuning
+from jaxbl.report.tuning import draw_tuning, write_tune_report
 from jaxbl.study.config import read_config
 from jaxbl.study.trial import run
 from jaxbl.study.tune import tune

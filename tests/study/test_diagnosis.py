@@ -14,7 +14,7 @@ from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.errors import InputError
 from jaxbl.identification.trajectory import Free
 from jaxbl.records import read_record
-from jaxbl.report import diagnosis_lines, write_diagnosis_report
+from jaxbl.report.diagnosed import diagnosis_lines, write_diagnosis_report
 from jaxbl.study.config import read_config
 from jaxbl.study.diagnosis import diagnose, read_task, run_task
 from jaxbl.study.next_experiment import Limits, next_experiment, tied, write_next_experiment

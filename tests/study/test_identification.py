@@ -6,7 +6,7 @@ from measured import EMPS, XL330, real
 from small_study import rigid, small
 
 from jaxbl.errors import InputError
-from jaxbl.report import write_identification_report
+from jaxbl.report.identified import write_identification_report
 from jaxbl.study.config import read_config
 from jaxbl.study.identification import identify
 from jaxbl.study.trial import run

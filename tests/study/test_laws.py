@@ -10,7 +10,7 @@ from small_study import LAMBDA, NOISE, listed, made, rigid, spaced
 
 import jaxbl
 from jaxbl.errors import InputError
-from jaxbl.report import write_sweep_report
+from jaxbl.report.reports import write_sweep_report
 from jaxbl.study.config import read_config
 from jaxbl.study.laws import LEAST_POINTS, accuracy_laws, fit_power_law
 from jaxbl.study.sweep import sweep
