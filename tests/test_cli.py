@@ -634,7 +634,6 @@ def quick(monkeypatch):
         return diagnosis_lines(found.summary)
 
     monkeypatch.setattr("jaxbl.study.diagnosis.run_task", run_task)
-    monkeypatch.setattr("jaxbl.report.write_diagnosis_report", report)
     monkeypatch.setattr("jaxbl.report.diagnosed.write_diagnosis_report", report)
     return tasks
 
