@@ -283,6 +283,17 @@ def proceed(
     return (state, tuple(r.update(experiment, t, index, signals) for r, t in zip(reducers, totals, strict=True))), signals
 
 
+def advance(
+    experiment: Experiment,
+    reducers: tuple[Reducer, ...],
+    carry: Carry,
+    index: Int[Array, ""],
+    noise: dict[str, Number],
+) -> tuple[Carry, Signals]:
+    """One sample of a simulation further, with unit noise: :func:`proceed` with what is :func:`simulated`."""
+    return proceed(experiment, reducers, carry, index, simulated(experiment, time_of(experiment, index), noise))
+
+
 def time_of(experiment: Experiment, index: Int[Array, ""]) -> Number:
     """Time of a sample, s."""
     return index.astype(jnp.result_type(experiment.run.sample_period)) * experiment.run.sample_period

@@ -13,17 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.drive.parameters import set_leaves
-from jaxbl.simulate import (
-    Experiment,
-    Reducer,
-    begin,
-    block_length,
-    figures,
-    proceed,
-    settled,
-    simulated,
-    time_of,
-)
+from jaxbl.simulate import Experiment, Reducer, advance, begin, block_length, figures, settled
 
 from .ahead import Shared, ahead_of_lanes, host
 from .llvm import Arrays, Loop, vector_lanes
@@ -82,9 +72,7 @@ class Passage(abc.ABC):
             return begin(own(values), reducers)
 
         def sample(values: list[Any], carry: Any, given: Any) -> Any:
-            index, noise = given
-            lane = own(values)
-            return proceed(lane, reducers, carry, index, simulated(lane, time_of(lane, index), noise))[0]
+            return advance(own(values), reducers, carry, *given)[0]
 
         def settle(values: list[Any], carry: Any, given: Any) -> Any:
             return settled(own(values), carry)

@@ -11,19 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.simulate import (
-    Experiment,
-    Reducer,
-    Signals,
-    State,
-    begin,
-    block_length,
-    figures,
-    proceed,
-    settled,
-    simulated,
-    time_of,
-)
+from jaxbl.simulate import Experiment, Reducer, Signals, State, advance, begin, block_length, figures, settled
 
 from .ahead import Shared, ahead_of_lanes, host
 from .jaxprs import flat
@@ -56,9 +44,7 @@ def recorded(
         names: list[str] = []
 
         def sample(state: Any, given: Any) -> tuple[list[Any], list[Any]]:
-            index, noise = given
-            drawn = simulated(experiment, time_of(experiment, index), noise)
-            carry, signals = proceed(experiment, reducers, tree.unflatten(state), index, drawn)
+            carry, signals = advance(experiment, reducers, tree.unflatten(state), *given)
             row = record(carry[0], signals)
             names[:] = row
             return jax.tree.leaves(carry), list(row.values())

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.drive import set_leaves
-from jaxbl.simulate import begin, figures, proceed, simulated, time_of
+from jaxbl.simulate import advance, begin, figures
 from jaxbl.study.engine import LANES_PER_DEVICE
 
 from ..workload import FIGURES, Workload, chunks, joined
@@ -37,8 +37,8 @@ class Diffrax:
 
             def rates(t: Any, y: tuple[Any, ...], args: Any) -> tuple[Any, ...]:
                 index = jnp.round(t / period).astype(jnp.int32)
-                given = simulated(own, time_of(own, index), dict(zip(own.sides, units[index], strict=True)))
-                new, _ = proceed(own, (FIGURES,), tree.unflatten(y), index, given)
+                noise = dict(zip(own.sides, units[index], strict=True))
+                new, _ = advance(own, (FIGURES,), tree.unflatten(y), index, noise)
                 return tuple((after - before) / period for after, before in zip(jax.tree.leaves(new), y, strict=True))
 
             solution = diffrax.diffeqsolve(
