@@ -54,7 +54,7 @@ def package(logs: Sequence[Log], model: Mapping[str, Any], holdout: Log) -> Mapp
 
 def oracle(case: Case) -> Mapping[str, float]:
     """Held-out rmse by channel of the true effects, all numbers fitted from the true ones of the effects."""
-    from jaxbl.study.diagnosis import read_task, with_known
+    from jaxbl.diagnosis.diagnose import read_task, with_known
 
     with tempfile.TemporaryDirectory() as folder:
         paths, other = _files([case.log], case.holdout, Path(folder))

@@ -29,16 +29,16 @@ import pandas as pd  # noqa: E402
 from scipy.linalg import expm  # noqa: E402
 from scipy.optimize import brentq  # noqa: E402
 
+from jaxbl.config import read_model  # noqa: E402
 from jaxbl.drive.parameters import set_leaves  # noqa: E402
+from jaxbl.identification import identify as whole  # noqa: E402
 from jaxbl.identification.intervals import spread  # noqa: E402
 from jaxbl.identification.regression import differentiated, errors, regress  # noqa: E402
 from jaxbl.identification.search import Search, smoothed_channels  # noqa: E402
 from jaxbl.identification.trajectory import free_parameters  # noqa: E402
 from jaxbl.records import read_record  # noqa: E402
 from jaxbl.simulate import trajectory  # noqa: E402
-from jaxbl.study import identification as whole  # noqa: E402
-from jaxbl.study.config import read_model  # noqa: E402
-from jaxbl.study.engine import prepare  # noqa: E402
+from jaxbl.sweeps.engine import prepare  # noqa: E402
 
 PERIOD = 1e-3
 NOISE = {"motor": 1e-4, "load": 2e-5}

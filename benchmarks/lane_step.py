@@ -31,7 +31,7 @@ from jaxbl import simulate  # noqa: E402
 from jaxbl.drive import Encoders, Initial, SigmoidBacklash, TwoInertia, as_arrays, set_leaves  # noqa: E402
 from jaxbl.drive.excitation import Sine  # noqa: E402
 from jaxbl.observer import OBSERVERS, EquivalentControl, Identifier, Observers  # noqa: E402
-from jaxbl.study.metrics import METRICS  # noqa: E402
+from jaxbl.sweeps.metrics import METRICS  # noqa: E402
 
 
 class Variant(NamedTuple):

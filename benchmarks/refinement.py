@@ -23,9 +23,9 @@ jax.config.update("jax_num_cpu_devices", 2)
 import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
 
-from jaxbl.study.config import read_config  # noqa: E402
-from jaxbl.study.engine import Engine, Layout  # noqa: E402
-from jaxbl.study.sweep import sweep  # noqa: E402
+from jaxbl.config import read_config  # noqa: E402
+from jaxbl.sweeps.engine import Engine, Layout  # noqa: E402
+from jaxbl.sweeps.sweep import sweep  # noqa: E402
 
 STUDY = Path(__file__).parents[1] / "sweeps" / "gain_boundary.toml"
 

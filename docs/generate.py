@@ -5,10 +5,10 @@ from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
 
+from jaxbl import config
 from jaxbl.drive.effects import effect_class, effect_kinds
 from jaxbl.drive.parameters import parameters
-from jaxbl.study import config
-from jaxbl.study.metrics import SIDE_METRICS
+from jaxbl.sweeps.metrics import SIDE_METRICS
 
 PAGE = Path(__file__).with_name("reference.md")
 

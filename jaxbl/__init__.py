@@ -6,8 +6,20 @@ The public names are loaded on first use, so that `import jaxbl` and the command
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .config import Config as Config
+    from .config import read_config as read_config
+    from .diagnosis.diagnose import Diagnosis as Diagnosis
+    from .diagnosis.diagnose import diagnose as diagnose
     from .errors import InputError as InputError
     from .errors import NoResult as NoResult
+    from .gains.accuracy_laws import Law as Law
+    from .gains.accuracy_laws import accuracy_laws as accuracy_laws
+    from .gains.tune import Tuning as Tuning
+    from .gains.tune import tune as tune
+    from .gains.verify import Verdict as Verdict
+    from .gains.verify import verify as verify
+    from .identification.identify import Identification as Identification
+    from .identification.identify import identify as identify
     from .records import Inspection as Inspection
     from .records import LogTable as LogTable
     from .records import Record as Record
@@ -20,24 +32,12 @@ if TYPE_CHECKING:
     from .report.reports import write_sweep_report as write_sweep_report
     from .report.reports import write_trial_report as write_trial_report
     from .report.tuning import write_tune_report as write_tune_report
-    from .study.config import Config as Config
-    from .study.config import read_config as read_config
-    from .study.diagnosis import Diagnosis as Diagnosis
-    from .study.diagnosis import diagnose as diagnose
-    from .study.identification import Identification as Identification
-    from .study.identification import identify as identify
-    from .study.laws import Law as Law
-    from .study.laws import accuracy_laws as accuracy_laws
-    from .study.sweep import StudyResult as StudyResult
-    from .study.sweep import dry_run as dry_run
-    from .study.sweep import load as load
-    from .study.sweep import sweep as sweep
-    from .study.trial import Trial as Trial
-    from .study.trial import run as run
-    from .study.tune import Tuning as Tuning
-    from .study.tune import tune as tune
-    from .study.verify import Verdict as Verdict
-    from .study.verify import verify as verify
+    from .sweeps.sweep import StudyResult as StudyResult
+    from .sweeps.sweep import dry_run as dry_run
+    from .sweeps.sweep import load as load
+    from .sweeps.sweep import sweep as sweep
+    from .sweeps.trial import Trial as Trial
+    from .sweeps.trial import run as run
     from .throughput import bench as bench
 
 _WHERE = {
@@ -55,25 +55,25 @@ _WHERE = {
     "write_trial_report": "report.reports",
     "write_tune_report": "report.tuning",
     "write_verify_report": "report.atlas",
-    "Config": "study.config",
-    "read_config": "study.config",
-    "Diagnosis": "study.diagnosis",
-    "diagnose": "study.diagnosis",
-    "Identification": "study.identification",
-    "identify": "study.identification",
-    "Law": "study.laws",
-    "accuracy_laws": "study.laws",
-    "StudyResult": "study.sweep",
-    "dry_run": "study.sweep",
-    "load": "study.sweep",
-    "sweep": "study.sweep",
-    "Trial": "study.trial",
-    "run": "study.trial",
-    "Tuning": "study.tune",
-    "tune": "study.tune",
+    "Config": "config",
+    "read_config": "config",
+    "Diagnosis": "diagnosis.diagnose",
+    "diagnose": "diagnosis.diagnose",
+    "Identification": "identification.identify",
+    "identify": "identification.identify",
+    "Law": "gains.accuracy_laws",
+    "accuracy_laws": "gains.accuracy_laws",
+    "StudyResult": "sweeps.sweep",
+    "dry_run": "sweeps.sweep",
+    "load": "sweeps.sweep",
+    "sweep": "sweeps.sweep",
+    "Trial": "sweeps.trial",
+    "run": "sweeps.trial",
+    "Tuning": "gains.tune",
+    "tune": "gains.tune",
     "bench": "throughput",
-    "Verdict": "study.verify",
-    "verify": "study.verify",
+    "Verdict": "gains.verify",
+    "verify": "gains.verify",
 }
 
 

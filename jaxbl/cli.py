@@ -18,10 +18,10 @@ import typer
 from .errors import InputError, NoResult
 
 if TYPE_CHECKING:
-    from .study.engine import Progress
-    from .study.sweep import StudyResult
-    from .study.tune import Tuning
-    from .study.verify import Verdict
+    from jaxbl.gains.tune import Tuning
+    from jaxbl.gains.verify import Verdict
+    from jaxbl.sweeps.sweep import StudyResult
+    from jaxbl.workers import Progress
 
 app = typer.Typer(
     add_completion=False,
@@ -62,10 +62,11 @@ def simulate(
 ) -> None:
     """Run the experiment of a study once: trace, figures, summary."""
     _start_jax()
+    from jaxbl.sweeps.store import claim
+    from jaxbl.sweeps.trial import run
+
+    from .config import read_config
     from .report.reports import write_trial_report
-    from .study.config import read_config
-    from .study.store import claim
-    from .study.trial import run
 
     study = read_config(config)
     folder = _folder(config, out)
@@ -86,14 +87,15 @@ def sweep(
 ) -> None:
     """Run all points of a study: table of metrics, maps, report. Goes on where an interrupted run stopped."""
     _start_jax()
+    from jaxbl.sweeps.metrics import metric_columns
+    from jaxbl.sweeps.points import Points
+    from jaxbl.sweeps.programs import backend_of
+    from jaxbl.sweeps.sweep import dry_run as estimate_cost
+    from jaxbl.sweeps.sweep import sweep as run_sweep
+
+    from .config import read_config
     from .report.maps import check_figures
     from .report.reports import write_sweep_report
-    from .study.config import read_config
-    from .study.metrics import metric_columns
-    from .study.points import Points
-    from .study.programs import backend_of
-    from .study.sweep import dry_run as estimate_cost
-    from .study.sweep import sweep as run_sweep
 
     chosen = backend_of(backend, "--backend")
     study = read_config(config)
@@ -129,10 +131,11 @@ def tune(
 ) -> None:
     """Choose lambda and alpha of both observers: gains.toml, comparison, report. Goes on where it was interrupted."""
     _start_jax()
+    from jaxbl.gains.tune import tune as run_tune
+    from jaxbl.sweeps.programs import backend_of
+
+    from .config import read_config
     from .report.tuning import write_tune_report
-    from .study.config import read_config
-    from .study.programs import backend_of
-    from .study.tune import tune as run_tune
 
     chosen = backend_of(backend, "--backend")
     study = read_config(config)
@@ -148,10 +151,11 @@ def verify(
 ) -> None:
     """Check the gain conditions on three levels: verdict, counterexamples, atlas. Goes on where it was interrupted."""
     _start_jax()
+    from jaxbl.gains.verify import verify as run_verify
+    from jaxbl.sweeps.programs import backend_of
+
+    from .config import read_config
     from .report.atlas import write_verify_report
-    from .study.config import read_config
-    from .study.programs import backend_of
-    from .study.verify import verify as run_verify
 
     chosen = backend_of(backend, "--backend")
     study = read_config(config)
@@ -171,9 +175,9 @@ def inspect(
     overwrite: LogOverwriteOption = False,
 ) -> None:
     """Say what a measured log holds and what it can identify: channels, sampling, noise, figures."""
+    from .config import read_log_config
     from .records import inspect as inspect_log
     from .report.inspected import write_inspection_report
-    from .study.config import read_log_config
 
     table, gear_ratio = (None, None) if model is None else read_log_config(model)
     found = inspect_log(log, table, gear_ratio=gear_ratio)
@@ -204,8 +208,9 @@ def identify(
 ) -> None:
     """Find a machine's numbers in its logs, with intervals: stiffness, gap, inertias, frictions."""
     _start_jax()
+    from jaxbl.identification.identify import read_task, run_task
+
     from .report.identified import identification_lines, write_identification_report
-    from .study.identification import read_task, run_task
 
     task = read_task(log, model, holdout=holdout, profile=profile)
     folder = _folder(log[0], out)
@@ -285,8 +290,9 @@ def diagnose(
     if model is None:
         raise InputError("diagnose: no model; give a study with nominal numbers: --model TOML")
     _start_jax()
+    from jaxbl.diagnosis.diagnose import read_task, run_task
+
     from .report.diagnosed import diagnosis_lines, write_diagnosis_report
-    from .study.diagnosis import read_task, run_task
 
     task = read_task(log, model, holdout=holdout)
     folder = _folder(log[0], out)
@@ -307,7 +313,7 @@ def diagnose(
     else:
         lines = diagnosis_lines(finished)
     if next_experiment is not None:
-        from .study.next_experiment import Limits, write_next_experiment
+        from jaxbl.diagnosis.next_experiment import Limits, write_next_experiment
 
         lines += write_next_experiment(folder, finished, task.record, next_experiment, Limits(max_torque, max_travel))
     _tell(lines, folder)
@@ -328,8 +334,9 @@ class _Job(NamedTuple):
 
 def _diagnose_batch(source: Path, model: Path | None, out: Path, jobs: int | None, overwrite: bool) -> None:
     """Diagnose all logs of a folder, each into a folder of its own; go on where an earlier call stopped."""
+    from jaxbl.files import make_folder
+
     from .report.diagnosed import write_batch
-    from .study.store import make_folder
     from .workers import each, worth
 
     if not source.is_dir():
@@ -366,8 +373,9 @@ def _diagnose_batch(source: Path, model: Path | None, out: Path, jobs: int | Non
 
 def _diagnosed(job: _Job) -> dict[str, Any]:
     """Row of a batch: a log's diagnosis, or why there is none."""
+    from jaxbl.diagnosis.diagnose import read_task, run_task
+
     from .report.diagnosed import batch_row, write_diagnosis_report
-    from .study.diagnosis import read_task, run_task
     from .workers import forget_programs
 
     forget_programs()
@@ -410,7 +418,7 @@ _LOG_MARKERS = ("inspection.json", "identification.json", "diagnosis.json")
 
 def _claim_for_log(folder: Path, log: Path, *, overwrite: bool) -> None:
     """Make the folder; leave other results than those of this log alone."""
-    from .study.store import make_folder
+    from jaxbl.files import make_folder
 
     make_folder(folder)
     markers = [folder / name for name in _LOG_MARKERS if (folder / name).exists()]
@@ -434,10 +442,11 @@ def plot(
 ) -> None:
     """Redraw figures and report of a sweep from its stored points, without simulating."""
     _start_jax()
+    from jaxbl.sweeps.store import Store, identity
+    from jaxbl.sweeps.sweep import load
+
+    from .config import read_config
     from .report.reports import write_sweep_report
-    from .study.config import read_config
-    from .study.store import Store, identity
-    from .study.sweep import load
 
     result = load(folder)
     if config is not None:
@@ -459,8 +468,9 @@ def bench(
     _start_jax()
     import jax
 
+    from jaxbl.files import make_folder
+
     from .report.throughput import write_bench_report
-    from .study.store import make_folder
     from .throughput import bench as run_bench
 
     # what was compiled before does not count

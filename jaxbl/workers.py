@@ -1,4 +1,4 @@
-"""Independent jobs on all cores, in processes of their own; and how long a process keeps compiled programs."""
+"""Independent jobs on all cores, in processes of their own: progress, interrupts, and memory of compiled programs."""
 
 import multiprocessing
 import os
@@ -15,6 +15,9 @@ from .errors import NoResult
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
+
+Progress = Callable[[int, int], None]
+"""Called with the number of finished and of all lanes."""
 
 _MEMORY = 5 * 2**30
 """Bytes that a process is granted: after twenty logs of many lengths one held 4.7e9."""

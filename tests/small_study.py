@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from jaxbl.study.config import read_config
-from jaxbl.study.metrics import metric_columns
-from jaxbl.study.points import Points
-from jaxbl.study.sweep import StudyResult
+from jaxbl.config import read_config
+from jaxbl.sweeps.metrics import metric_columns
+from jaxbl.sweeps.points import Points
+from jaxbl.sweeps.sweep import StudyResult
 
 ALPHA, LAMBDA, NOISE = "observer.motor.alpha", "observer.motor.lambda", "encoders.noise"
 

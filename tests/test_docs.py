@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from jaxbl.config import read_config
 from jaxbl.records import read_log_table
-from jaxbl.study.config import read_config
 
 ROOT = Path(__file__).parents[1]
 

@@ -14,7 +14,7 @@ from jaxbl.drive import Encoders, Initial, Rigid, set_leaves
 from jaxbl.drive.effects import ConstantTorque, CoulombFriction
 from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, Observers
 from jaxbl.simulate import Reducer, initial_state, replay, scan, trajectory, unit_noise
-from jaxbl.study.metrics import METRICS
+from jaxbl.sweeps.metrics import METRICS
 
 SEED = jnp.asarray(3)
 

@@ -1,1 +1,1 @@
-"""What runs offline on a log: smoother, trajectory fits, intervals. See design.md, section 2."""
+"""From a log to numbers with intervals: smoother, trajectory fits, intervals, and the command's result."""

@@ -15,9 +15,9 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from jaxbl.files import write_atomic
+from jaxbl.gains.verify import Verdict, conditions_of, judged_sides
 from jaxbl.observer.conditions import CONDITIONS
-from jaxbl.study.store import write_atomic
-from jaxbl.study.verify import Verdict, conditions_of, judged_sides
 
 from .maps import Drawn, condition_curves
 from .page import TableOf, html

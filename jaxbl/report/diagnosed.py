@@ -10,9 +10,9 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxbl.discrepancy.residuals import narrowed
-from jaxbl.study.diagnosis import Diagnosis
-from jaxbl.study.logs import unit_on
+from jaxbl.diagnosis.diagnose import Diagnosis
+from jaxbl.diagnosis.residuals import narrowed
+from jaxbl.identification.logs import unit_on
 
 from .maps import Drawn
 from .page import TableOf, html

@@ -21,10 +21,10 @@ from matplotlib.figure import Figure
 
 from jaxbl.drive.effects import AbstractEffect
 from jaxbl.drive.plant import Plant
+from jaxbl.identification.identify import Identification
+from jaxbl.identification.logs import unit_on
 from jaxbl.identification.search import NOISE_ALONE
 from jaxbl.simulate import Experiment
-from jaxbl.study.identification import Identification
-from jaxbl.study.logs import unit_on
 
 from .maps import SIDES, Drawn
 from .page import TableOf, html

@@ -8,10 +8,10 @@ import numpy as np
 import tomli_w
 from matplotlib.figure import Figure
 
+from jaxbl.files import plain, write_atomic
 from jaxbl.records import quality
 from jaxbl.records.inspection import Inspection, velocity
 from jaxbl.records.reader import SIDES, Record
-from jaxbl.study.store import plain, write_atomic
 
 from .maps import Drawn
 from .page import TableOf, html

@@ -20,14 +20,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from jaxbl.config import Config, FigureTable, is_boolean, nearest, numeric_paths
 from jaxbl.errors import InputError
+from jaxbl.gains.accuracy_laws import Law, accuracy_laws, check_selection, fixed_values, selected
 from jaxbl.observer.conditions import CONDITIONS, Condition
-from jaxbl.study.config import Config, FigureTable, nearest, numeric_paths
-from jaxbl.study.laws import Law, accuracy_laws, check_selection, fixed_values, selected
-from jaxbl.study.metrics import describe
-from jaxbl.study.points import Points
-from jaxbl.study.refine import is_boolean
-from jaxbl.study.sweep import StudyResult
+from jaxbl.sweeps.metrics import describe
+from jaxbl.sweeps.points import Points
+from jaxbl.sweeps.sweep import StudyResult
 
 from .refined import Filling, on_coarse_values
 from .style import COLOURS, HATCH, MAP, MISSING, style, with_unit

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from jaxbl.study.points import Points
+from jaxbl.sweeps.points import Points
 
 _MOST_SHOWN = 2049
 """Places along an axis of a map; finer ones would not be seen."""

@@ -13,13 +13,14 @@ from tempfile import TemporaryDirectory
 import pandas as pd
 import tomli_w
 
-from jaxbl.study.config import Config
-from jaxbl.study.laws import AGREEMENT, END_OF_SWEEP, Law, accuracy_laws
-from jaxbl.study.metrics import SIDE_METRICS
-from jaxbl.study.points import Points
-from jaxbl.study.store import Store, write_atomic
-from jaxbl.study.sweep import StudyResult
-from jaxbl.study.trial import Trial
+from jaxbl.config import Config
+from jaxbl.files import write_atomic
+from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law, accuracy_laws
+from jaxbl.sweeps.metrics import SIDE_METRICS
+from jaxbl.sweeps.points import Points
+from jaxbl.sweeps.store import Store
+from jaxbl.sweeps.sweep import StudyResult
+from jaxbl.sweeps.trial import Trial
 
 from .maps import SIDES, Drawn, draw
 from .page import Picture, TableOf, html

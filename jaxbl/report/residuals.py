@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxbl.discrepancy.observed import Observed
-from jaxbl.discrepancy.residuals import Residual, narrowed
-from jaxbl.discrepancy.where import SIGNIFICANT, Coordinate, Localised, Values, describe, spectrum_of
+from jaxbl.diagnosis.localise import SIGNIFICANT, Coordinate, Localised, Values, describe, spectrum_of
+from jaxbl.diagnosis.observer_residual import Observed
+from jaxbl.diagnosis.residuals import Residual, narrowed
 
 from .maps import Drawn
 from .style import COLOURS, style, with_unit
@@ -38,7 +38,7 @@ def draw_residuals(
 
     Args:
         residuals: by equation, of each part of the record.
-        coordinates: by equation, of each part (:func:`jaxbl.discrepancy.where.coordinates_of`).
+        coordinates: by equation, of each part (:func:`jaxbl.diagnosis.localise.coordinates_of`).
         found: where they live, by equation.
         unit: of the torques.
         observed: the same torques by the observers, of each part; those of an observer that does not converge are not drawn.

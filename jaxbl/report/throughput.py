@@ -5,7 +5,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from jaxbl.study.store import make_folder, write_atomic
+from jaxbl.files import make_folder, write_atomic
 from jaxbl.throughput.run import CEILING, OURS, PRECISIONS, SCAN, Result
 
 from .maps import Drawn

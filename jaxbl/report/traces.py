@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from jaxbl.study.trial import Trial
+from jaxbl.sweeps.trial import Trial
 
 from .maps import Drawn
 from .style import COLOURS, style

@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
+from jaxbl.files import write_atomic
+from jaxbl.gains.tune import Tuning
+from jaxbl.gains.tune_summary import called_gains
 from jaxbl.observer.conditions import CONDITIONS
-from jaxbl.study.metrics import SIDE_METRICS
-from jaxbl.study.store import write_atomic
-from jaxbl.study.tune import Tuning
-from jaxbl.study.tune_summary import called_gains
+from jaxbl.sweeps.metrics import SIDE_METRICS
 
 from .maps import SIDES, Drawn, cell_edges, color_norm, condition_curves
 from .page import TableOf, html

@@ -10,7 +10,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxbl.drive import set_leaves
 from jaxbl.fused.passage import HostPassage
 from jaxbl.simulate import scan
-from jaxbl.study.engine import LANES_PER_DEVICE
+from jaxbl.sweeps.engine import LANES_PER_DEVICE
 
 from .workload import FIGURES, RANGES, SEED, Workload, chunks, joined
 

@@ -16,7 +16,7 @@ from jaxbl.drive import Encoders, Initial, SigmoidBacklash, TwoInertia, as_array
 from jaxbl.drive.excitation import Sine
 from jaxbl.observer import EquivalentControl, ExplicitSuperTwisting, Identifier, Observers
 from jaxbl.simulate import Experiment, Reducer, Run, State, unit_noise
-from jaxbl.study.metrics import window_start
+from jaxbl.sweeps.metrics import window_start
 
 SEED = 0
 SIDES = ("motor", "load")

@@ -15,10 +15,10 @@ from hidden.scoring import calibration, calibration_error, confusion, markdown, 
 from hidden.simulator import Machine
 from hidden_effects import left
 
+from jaxbl.config import read_model
 from jaxbl.drive import Initial, Plant, as_arrays
 from jaxbl.drive.effects import effect_kinds
 from jaxbl.records import read_record
-from jaxbl.study.config import read_model
 
 DURATION = 0.6
 GAP = {

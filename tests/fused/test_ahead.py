@@ -11,7 +11,7 @@ from jaxbl.fused.ahead import Looped, Scanned
 from jaxbl.fused.passage import HostPassage
 from jaxbl.observer import EquivalentControl, ImplicitSuperTwisting, Observers
 from jaxbl.simulate import Experiment, Run
-from jaxbl.study.metrics import METRICS
+from jaxbl.sweeps.metrics import METRICS
 
 
 def experiment(excitation, dtype):

@@ -19,7 +19,7 @@ from jaxbl.fused.passage import DevicePassage, HostPassage
 from jaxbl.fused.split import Unsupported
 from jaxbl.observer import OBSERVERS, EquivalentControl, Identifier, Observers
 from jaxbl.simulate import Experiment, Reducer, Run, scan
-from jaxbl.study.metrics import METRICS
+from jaxbl.sweeps.metrics import METRICS
 from jaxbl.throughput.workload import FIGURES, RANGES, SEED, Workload
 
 HALF = ["motor.coulomb_friction", "load.stribeck_friction", "load.gravity", "motor.cogging", "load.periodic_disturbance",

@@ -13,7 +13,7 @@ from jaxbl.drive.transmission import DeadZone
 from jaxbl.fused.single_run import recorded
 from jaxbl.observer import EquivalentControl, Identifier, ImplicitSuperTwisting, Observers
 from jaxbl.simulate import Experiment, Reducer, Run, scan
-from jaxbl.study.metrics import METRICS
+from jaxbl.sweeps.metrics import METRICS
 
 NAMES = ["motor.stribeck_friction", "load.gravity", "motor.cogging", "actuator.lag"]
 ODD = Reducer(

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from small_study import rigid
 
+from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
 from jaxbl.identification.intervals import spread
 from jaxbl.identification.prediction import kalman_gain, predictor
 from jaxbl.identification.smoother import smooth
 from jaxbl.identification.trajectory import cut, fit, free_parameters, with_values
-from jaxbl.study.config import read_config
-from jaxbl.study.engine import prepare
 
 PERIOD, SAMPLES = 2e-3, 3000
 

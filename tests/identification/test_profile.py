@@ -7,12 +7,11 @@ import pytest
 from scipy.optimize import brentq
 from small_study import rigid
 
+from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
 from jaxbl.identification.intervals import interval, spread
 from jaxbl.identification.profile import profile
 from jaxbl.identification.trajectory import cut, fit, free_parameters
-from jaxbl.study.config import read_config
-from jaxbl.study.engine import prepare
 
 PERIOD, SAMPLES, NOISE = 2e-3, 400, 1e-3
 

@@ -8,6 +8,7 @@ from measured import EMPS, real
 from scipy import signal
 from small_study import rigid, small
 
+from jaxbl.config import prepare, read_config
 from jaxbl.identification.intervals import interval, spread
 from jaxbl.identification.regression import (
     Kinematics,
@@ -23,8 +24,6 @@ from jaxbl.identification.regression import (
 from jaxbl.identification.smoother import smooth
 from jaxbl.identification.trajectory import free_parameters, with_values
 from jaxbl.records import read_record
-from jaxbl.study.config import read_config
-from jaxbl.study.engine import prepare
 
 T = jnp.linspace(0.0, 2.0, 4001)
 LAW = {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08}

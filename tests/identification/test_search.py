@@ -8,11 +8,11 @@ from hidden.simulator import Machine, Run, simulate
 from hidden_log import GAP, GEARED, driven, model
 from scipy.signal import lfilter
 
-from jaxbl.discrepancy.proof import Ground
+from jaxbl.config import read_model
+from jaxbl.diagnosis.holdout import Ground
+from jaxbl.identification.logs import kinematics_of, on_record
 from jaxbl.identification.search import smoothed_channels, windows_of
 from jaxbl.records import read_record
-from jaxbl.study.config import read_model
-from jaxbl.study.logs import kinematics_of, on_record
 
 LAG = {"kind": "actuator.lag", "time_constant": 0.05}
 

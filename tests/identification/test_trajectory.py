@@ -9,14 +9,13 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 from small_study import rigid, small
 
+from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
 from jaxbl.identification.intervals import refusals, spread
 from jaxbl.identification.smoother import smooth
 from jaxbl.identification.trajectory import Fit, cut, fit, free_parameters, with_values
 from jaxbl.simulate import replay, trajectory
-from jaxbl.study.config import read_config
-from jaxbl.study.engine import prepare
 
 TRUE = {
     "drive.motor_inertia": 0.05,

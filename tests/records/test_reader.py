@@ -12,7 +12,7 @@ from small_study import small
 
 from jaxbl.errors import InputError
 from jaxbl.records import LogTable, read_log_table, read_record
-from jaxbl.study.trial import run
+from jaxbl.sweeps.trial import run
 
 
 def wrote(tmp_path, frame, name="log.parquet"):

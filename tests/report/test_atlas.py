@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from small_study import ALPHA, LAMBDA, listed, rigid, spaced
 
+from jaxbl.gains.verify import verify
 from jaxbl.report.atlas import draw_verdict, write_verify_report
-from jaxbl.study.verify import verify
 
 ATLAS = {
     "alpha_ratio": {"start": 1.02, "stop": 20.0, "num": 24},

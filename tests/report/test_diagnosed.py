@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from jaxbl.discrepancy.residuals import Residual
+from jaxbl.diagnosis.residuals import Residual
 from jaxbl.report.diagnosed import _over_time, _story, batch_row, diagnosis_lines, write_batch
 from jaxbl.report.style import save
 

@@ -10,14 +10,14 @@ import pytest
 from matplotlib.figure import Figure
 from small_study import rigid, small
 
+from jaxbl.config import read_config
+from jaxbl.identification.identify import Identification
+from jaxbl.identification.logs import unit_on
 from jaxbl.identification.regression import Kinematics, model_torques
 from jaxbl.records import read_record
 from jaxbl.report.identified import draw_identification, write_identification_report
 from jaxbl.report.style import save
-from jaxbl.study.config import read_config
-from jaxbl.study.identification import Identification
-from jaxbl.study.logs import unit_on
-from jaxbl.study.trial import run
+from jaxbl.sweeps.trial import run
 
 GEARED = ["intervals", "residuals", "velocities", "torque", "hysteresis", "limit_cycle", "recursive"]
 RIGID = ["intervals", "residuals", "velocities", "resistance", "friction"]

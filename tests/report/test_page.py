@@ -8,7 +8,7 @@ from small_study import ALPHA, LAMBDA, listed, made, rigid, small, spaced
 
 from jaxbl.report.page import Picture, TableOf, html
 from jaxbl.report.reports import write_sweep_report, write_trial_report
-from jaxbl.study.trial import run
+from jaxbl.sweeps.trial import run
 
 VOID = {"meta", "img"}
 

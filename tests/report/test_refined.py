@@ -7,15 +7,15 @@ import pytest
 from matplotlib.collections import QuadMesh
 from small_study import ALPHA, LAMBDA, NOISE, listed, rigid, spaced
 
+from jaxbl.config import read_config
 from jaxbl.report.maps import draw
 from jaxbl.report.refined import Filling
 from jaxbl.report.reports import headline
 from jaxbl.report.style import save
-from jaxbl.study.config import read_config
-from jaxbl.study.metrics import metric_columns
-from jaxbl.study.points import Points
-from jaxbl.study.refine import refine
-from jaxbl.study.sweep import StudyResult
+from jaxbl.sweeps.metrics import metric_columns
+from jaxbl.sweeps.points import Points
+from jaxbl.sweeps.refine import refine
+from jaxbl.sweeps.sweep import StudyResult
 
 RMSE = "motor.velocity_rmse"
 GAINS = [spaced(LAMBDA, 1.0, 16.0, 5), spaced(ALPHA, 1.0, 9.0, 5, "linear")]

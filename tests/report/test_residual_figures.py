@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from jaxbl.discrepancy.observed import Observed
-from jaxbl.discrepancy.residuals import Residual
-from jaxbl.discrepancy.where import Values, describe, locate
+from jaxbl.diagnosis.localise import Values, describe, locate
+from jaxbl.diagnosis.observer_residual import Observed
+from jaxbl.diagnosis.residuals import Residual
 from jaxbl.report.residuals import draw_residuals
 from jaxbl.report.style import save
 

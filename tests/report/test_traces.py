@@ -5,7 +5,7 @@ from small_study import rigid, small
 
 from jaxbl.report.style import save
 from jaxbl.report.traces import draw_trial
-from jaxbl.study.trial import run
+from jaxbl.sweeps.trial import run
 
 BOTH = ["input", "motor_velocity", "motor_position", "load_velocity", "load_position", "torque", "dead_zone", "hysteresis",
         "limit_cycle"]  # fmt: skip

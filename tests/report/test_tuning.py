@@ -11,11 +11,11 @@ from matplotlib.colors import LogNorm
 from small_study import small
 from test_page import Page
 
+from jaxbl.config import read_config
+from jaxbl.gains.tune import tune
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.report.tuning import draw_tuning, write_tune_report
-from jaxbl.study.config import read_config
-from jaxbl.study.trial import run
-from jaxbl.study.tune import tune
+from jaxbl.sweeps.trial import run
 
 SLOW = {"lambda": 1e-3, "alpha": 0.05}
 STUDY = small(

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxbl.drive import set_leaves
 from jaxbl.simulate import advance, begin, figures
-from jaxbl.study.engine import LANES_PER_DEVICE
+from jaxbl.sweeps.engine import LANES_PER_DEVICE
 
 from ..workload import FIGURES, Workload, chunks, joined
 

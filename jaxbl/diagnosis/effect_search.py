@@ -1,0 +1,657 @@
+"""Which effects a model lacks on a record: screened on the linearised model, decided on models that have them.
+
+A round: all candidates are screened on the prediction errors of the model so far; of the best, each is put into the
+model, its numbers and the model's own refitted (Gauss-Newton through the simulated step, the prior on the nominal numbers
+kept), and their evidences compared. What wins stays, and the next round begins, until nothing pays for its columns. Then
+what is left is asked whether it is noise: any function of time, position or velocity that pays says that something else
+is missing.
+"""
+
+import dataclasses
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbl.drive.effects import effect_class
+from jaxbl.drive.parameters import parameters, set_leaves
+from jaxbl.identification.smoother import Smoothed
+from jaxbl.identification.trajectory import WIDE, Free, free_parameters
+from jaxbl.records import Record
+from jaxbl.simulate import Experiment
+
+from .candidates import SHARE, Candidate, Numbers, Variant, variants_of
+from .evidence import Scorer, Set
+from .free_functions import functions_of
+from .linearised_model import DIVERGED, Linear
+from .neutral_effects import candidates, complete
+from .refit import Refined, refined
+from .whittle import Spectrum
+
+Array = np.ndarray
+Names = tuple[str, ...]
+
+Verdict = Literal["explained", "no_discrepancy", "unknown_effect"]
+
+ODDS = -2.0
+"""Log prior odds of each effect to be missing."""
+_FINALISTS, _LEADERS = 5, 3
+_BEHIND = 0.5
+"""Share of the best gain in evidence that a finalist must reach (or be within :data:`_NEAR`)."""
+_NEAR = 25.0
+FAR = 5.0
+"""Standard deviations of what is known of a number that it can hardly be off."""
+_WEAK = 6.0
+"""Standard errors up to which an effect's torque is small enough for the effect to be needless."""
+_STEPS = 15
+_SETTLED = 2e-3
+_LEAST_GAIN = 1e-3
+_EARNED = 0.2
+"""Share of what free functions earn beside an effect that it must earn itself to be named."""
+_LEAST_CHANCE = 0.01
+CLEAR = 100.0
+"""Nats that a free function must earn to tell that something else is missing, of a size that counts (:data:`LEAST`)."""
+_SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
+_MOST = 4
+_RECENT = 4
+"""Models along the record that are kept: where a refit ended, the next one begins."""
+LEAST = 1e-3
+"""Share of the driving torque that an effect must have to be named: time stepping leaves a twentieth of it."""
+FLOOR = 0.006
+"""Nats a prediction error that structure in the noise (quantisation, above all) may be worth: 1.2 % of its variance."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A set of effects in the model, all numbers refitted.
+
+    Attributes:
+        names: of the effects.
+        experiment: with all effects, those of `names` at `numbers`; its own numbers are the nominal ones.
+        numbers: of the effects.
+        theta: the nominal model's own numbers.
+        log_evidence: nats; only differences count.
+        log_likelihood: nats; as `log_evidence`.
+        linear: the model along the record.
+    """
+
+    names: Names
+    experiment: Experiment
+    numbers: dict[str, Numbers]
+    theta: Array
+    log_evidence: float
+    log_likelihood: float
+    linear: Linear
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """An effect that is missing.
+
+    Attributes:
+        effect: its name.
+        confidence: probability that it is this one.
+        numbers: of the effect.
+        alternatives: other effects that the record does not rule out in its place, and their probabilities.
+    """
+
+    effect: str
+    confidence: float
+    numbers: Numbers
+    alternatives: tuple[tuple[str, float], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Explanation:
+    """What a record says that a model lacks.
+
+    Attributes:
+        verdict: as in `diagnosis.json`.
+        findings: in the order in which they were found.
+        model: the nominal model with the findings, all numbers refitted.
+        nominal: the nominal model, its own numbers refitted.
+        wrong: the best model with a wrong effect in place of the last finding, or None.
+        rest: what is left over: evidence (nats) of each function of time, position or velocity, and the share of the driving
+            torque, of those tried, that its size has most likely.
+    """
+
+    verdict: Verdict
+    findings: tuple[Finding, ...]
+    model: Model
+    nominal: Model
+    wrong: Model | None
+    rest: dict[str, tuple[float, float]]
+
+
+class Polished(NamedTuple):
+    """A model with the numbers of least prediction errors, and which of them were free: its own first."""
+
+    free: tuple[Free, ...]
+    refined: Refined
+
+
+class _Finalist(NamedTuple):
+    """A candidate that did well on the linearised model: its numbers, and the change of the model's own beside them."""
+
+    name: str
+    numbers: Numbers
+    own: Array
+    gain: float
+
+
+class _Scored(NamedTuple):
+    """A candidate on the linearised model, judged by the density of its errors whatever the predictor and its variance.
+
+    Attributes:
+        name: of the candidate.
+        found: under a given deviation of the errors.
+        count: of samples.
+        deviation: of the errors by side, rad; its size, common to both sides, is then the one of largest likelihood.
+    """
+
+    name: str
+    found: Set
+    count: int
+    deviation: Array
+
+    @property
+    def log_likelihood(self) -> float:
+        errors = self.count * len(self.deviation)
+        size = max(self.found.misfit / errors, 1e-300)
+        return -0.5 * errors * (np.log(size) + 1.0) - self.count * float(np.sum(np.log(self.deviation)))
+
+    @property
+    def log_evidence(self) -> float:
+        return self.found.log_evidence + 0.5 * self.found.misfit + self.log_likelihood
+
+
+class _Tried(NamedTuple):
+    """A candidate that was put into the model: what it earns (nats), and its numbers."""
+
+    name: str
+    gain: float
+    numbers: Numbers
+
+    @property
+    def size(self) -> int:
+        return len(self.numbers)
+
+
+class _Point(NamedTuple):
+    """A model at some numbers: sum of squares with the prior's, and the linear step from there."""
+
+    experiment: Experiment
+    linear: Linear
+    values: dict[str, Numbers]
+    theta: Array
+    found: Set
+    cost: float
+
+
+class Explainer:
+    """Which effects a model lacks on a record: the record, the nominal model, and the models tried."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        free: Sequence[Free],
+        prior: Sequence[float],
+        record: Record,
+        smoothed: Mapping[str, Sequence[Smoothed]],
+        bound: float = np.inf,
+    ):
+        """Prepare to explain a record.
+
+        Args:
+            experiment: the nominal model, with array leaves; its sample period is that of the record. Models of the
+                explanation have all effects, those that are not found at neutral numbers (:mod:`.complete`).
+            free: its own numbers that are not exactly known.
+            prior: relative standard deviation of each.
+            record: the log.
+            smoothed: its positions, part by part (:func:`jaxbl.identification.search.smoothed_channels`).
+            bound: standard deviations that each number may be off while effects are sought.
+        """
+        self.bound = bound
+        self.nominal, self.free, self.prior = complete(experiment), tuple(free), np.asarray(prior)
+        self.lacking = candidates(experiment)
+        self.record, self.smoothed = record, smoothed
+        samples = sum(part.stop - part.start for part in record.segments)
+        self.floor = FLOOR * samples * len(experiment.sides)
+        self._recent: dict[tuple, Linear] = {}
+        self._polished: tuple[tuple, Polished] | None = None
+
+    def polished(self, values: Mapping[str, Numbers], theta: Array) -> "Polished":
+        """The model with some effects, with the numbers of least prediction errors (:mod:`.polish`)."""
+        key = _key(values, theta)
+        if self._polished is None or self._polished[0] != key:
+            experiment = with_effects(self.nominal, values)
+            added = free_parameters(experiment, paths_of(values), self._torque)
+            free, width = (*self.free, *added), np.concatenate([self.prior, np.full(len(added), WIDE)])
+            start = np.concatenate([theta, np.zeros(len(added))])
+            self._polished = key, Polished(free, refined(experiment, free, start, width, self.record, self.smoothed))
+        return self._polished[1]
+
+    def plausible(self, found: Explanation) -> bool:
+        """Whether the model's own numbers, fitted to the last digit, are where they may be by what is known of them."""
+        theta = self.polished(found.model.numbers, found.model.theta).refined.theta[: len(self.free)]
+        return bool(np.all(np.abs(theta) < FAR * self.prior))
+
+    def linear(self, values: Mapping[str, Numbers], theta: Array) -> Linear:
+        """The model with some effects along the record."""
+        key = _key(values, theta)
+        if key not in self._recent:
+            if len(self._recent) == _RECENT:
+                self._recent.pop(next(iter(self._recent)))
+            self._recent[key] = self._linear(with_effects(self.nominal, values), tuple(values), theta)
+        return self._recent[key]
+
+    @property
+    def _torque(self) -> float:
+        """Size of the input, N m."""
+        return float(np.std(self.record.torque))  # type: ignore[arg-type]
+
+    def _linear(self, experiment: Experiment, names: Names, theta: Array) -> Linear:
+        paths = paths_of(names)
+        own = (*self.free, *free_parameters(experiment, paths, self._torque))
+        prior = np.concatenate([self.prior, [_width(path) for path in paths]])
+        centre = np.concatenate([-theta, np.zeros(len(paths))])
+        at = np.concatenate([theta, np.zeros(len(paths))])
+        bound = np.concatenate([np.full(len(self.free), self.bound), np.full(len(paths), np.inf)])
+        return Linear(experiment, own, at, prior, centre, self.record, self.smoothed, bound)
+
+    def refit(
+        self, names: Names, numbers: Mapping[str, Numbers], theta: Array, smoothness: Sequence[float], deviation: Array
+    ) -> Model:
+        """Put effects into the model and refit everything."""
+        values = {name: dict(numbers[name]) for name in names}
+        best: _Point | None = None
+        change = np.zeros(0)
+        for _ in range(_STEPS):
+            point = self._point(names, values, theta, smoothness, deviation)
+            if best is None or point.cost < best.cost:
+                if not np.isfinite(point.cost):
+                    break
+                best, change = point, np.clip(point.found.own, -1.0, 1.0)
+            else:
+                change = 0.25 * change
+            if np.max(np.abs(change), initial=0.0) < _SETTLED:
+                break
+            theta, values = self._moved(best, change)
+        if best is None:
+            return Model(names, point.experiment, values, theta, -np.inf, -np.inf, point.linear)
+        experiment, linear, found, values, theta = best.experiment, best.linear, best.found, best.values, best.theta
+        if any(one.get("breakaway_torque", np.inf) <= one.get("torque", 0.0) for one in values.values()):
+            # then it is Coulomb's
+            return Model(names, experiment, values, theta, -np.inf, -np.inf, linear)
+        scored = _Scored("", found, linear.count, deviation)
+        evidence = scored.log_evidence + len(names) * ODDS - sum(linear.choices(name) for name in names)
+        return Model(names, experiment, values, theta, evidence, scored.log_likelihood, linear)
+
+    def _point(
+        self,
+        names: Names,
+        values: dict[str, Numbers],
+        theta: Array,
+        smoothness: Sequence[float],
+        deviation: Array,
+    ) -> _Point:
+        """Cost at some numbers, and where the linear step leads."""
+        experiment = with_effects(self.nominal, values)
+        linear = self.linear(values, theta)
+        columns = linear.columns((), smoothness, deviation)
+        scale, sizes = columns.scale.copy(), linear.sizes(names)
+        for i, path in enumerate(paths_of(names), 1 + len(self.free)):
+            name, leaf = path.removeprefix("effects.").rsplit(".", 1)
+            if leaf in _AMPLITUDES:
+                scale[i] = sizes[name]
+        found = None
+        if np.max(np.abs(columns.products)) < DIVERGED and np.isfinite(scale[1:]).all():
+            found = Scorer(dataclasses.replace(columns, scale=scale), ())(())
+        if found is None:
+            return _Point(experiment, linear, values, theta, Set((), -np.inf, np.inf, (), np.zeros(0)), np.inf)
+        cost = float(columns.products[0, 0] + np.sum((theta / self.prior) ** 2))
+        return _Point(experiment, linear, values, theta, found, cost)
+
+    def _moved(self, point: _Point, change: Array) -> tuple[Array, dict[str, Numbers]]:
+        count = len(self.free)
+        values = {name: dict(numbers) for name, numbers in point.values.items()}
+        for one, by in zip(point.linear.free[count:], change[count:], strict=True):
+            name, leaf = one.path.removeprefix("effects.").rsplit(".", 1)
+            values[name][leaf] = float(one.value(by))
+        return point.theta + change[:count], values
+
+    def shown(self) -> float:
+        """Standard deviations by which the record shows its input; infinite where it has none."""
+        linear = self.linear({}, np.zeros(len(self.free)))
+        return linear.shown(*linear.choose(())) if linear.driven else np.inf
+
+    def run(self) -> Explanation:
+        """Find what is missing."""
+        theta = np.zeros(len(self.free))
+        linear = self.linear({}, theta)
+        smoothness, deviation = linear.choose(())
+        nominal = current = self.refit((), {}, theta, smoothness, deviation)
+        found: dict[str, list[_Tried]] = {}
+        wrong: Model | None = None
+        rest: dict[str, tuple[float, float]] | None = None
+        while len(found) < _MOST:
+            smoothness, tried = self._round(current)
+            if not tried or tried[0][0] <= 0.0:
+                smoothness, tried = self._coloured_round(current)
+            if not tried or tried[0][0] <= 0.0:
+                break
+            (_, current), *others = tried
+            record = [_Tried(model.names[-1], gain, model.numbers[model.names[-1]]) for gain, model in tried]
+            current, gone = self._pruned(current, smoothness)
+            found = {name: one for name, one in found.items() if name not in gone} | {record[0].name: record}
+            current, renamed = self._simplified(current, smoothness)
+            found = {renamed.get(name, name): one for name, one in found.items()}
+            for plain in renamed.values():
+                first, *rivals = found[plain]
+                rivals = [one for one in rivals if one.name != plain]
+                found[plain] = [_Tried(plain, first.gain, current.numbers[plain]), *rivals]
+            wrong = others[0][1] if others else None
+            rest = self.remainder(current)
+            # next to what no effect explains, this one is little: more of them would dress up as that
+            if record[0].gain < _EARNED * _most(rest) and _most(rest) > CLEAR:
+                break
+        rest = self.remainder(current) if rest is None else rest
+        left = _most(rest)
+        before = current.names
+        if left > CLEAR and found:
+            current, found = self._plain(current, found, left)
+        if len(current.names) > 1:
+            current = self._settled(current)
+            found = {name: tried for name, tried in found.items() if name in current.names}
+        if current.names != before:
+            wrong = wrong if current.names[-1:] == before[-1:] else None
+            # what was seen beside an effect that was little next to it is there without that effect too
+            rest = {name: max(rest[name], one) for name, one in self.remainder(current).items()}
+            left = _most(rest)
+        findings = tuple(_finding(one, current, left) for one in found.values())
+        return Explanation(_verdict(left, findings), findings, current, nominal, wrong, rest)
+
+    def without(self, found: Explanation, names: Collection[str]) -> Explanation:
+        """What is left of an explanation when some of its effects are withdrawn: what is not explained is sought anew."""
+        model, kept = found.model, tuple(name for name in found.model.names if name not in names)
+        smoothness, deviation = model.linear.choose(())
+        # where nothing is kept, its own numbers have nothing to do with those beside effects
+        theta = model.theta if kept else found.nominal.theta
+        model = self.refit(kept, {name: model.numbers[name] for name in kept}, theta, smoothness, deviation)
+        rest = self.remainder(model)
+        findings = tuple(one for one in found.findings if one.effect in kept)
+        return Explanation(_verdict(_most(rest), findings), findings, model, found.nominal, None, rest)
+
+    def _plain(self, model: Model, found: dict[str, list["_Tried"]], left: float) -> tuple[Model, dict[str, list["_Tried"]]]:
+        """Where something unknown remains, only what earns a good part of that is named, and of what it does not part, the
+        simplest: numbers to spare dress up as what they do not know."""
+        smoothness, deviation = model.linear.choose(())
+        kept = {name: tried for name, tried in found.items() if tried[0].gain > _EARNED * left}
+        numbers = {name: model.numbers[name] for name in kept}
+        model = self.refit(tuple(kept), numbers, model.theta, smoothness, deviation)
+        for name, tried in list(kept.items()):
+            others = [one for one in tried[1:] if one.gain > tried[0].gain - left and one.size < tried[0].size]
+            others = [one for one in others if one.name not in kept and not _same(one.name, set(kept) - {name})]
+            for one in sorted(others, key=lambda one: (one.size, -one.gain))[:1]:
+                numbers = {a: model.numbers[a] for a in model.names if a != name} | {one.name: one.numbers}
+                plainer = self.refit(tuple(numbers), numbers, model.theta, smoothness, deviation)
+                if model.log_evidence - plainer.log_evidence < left:
+                    model = plainer
+                    kept = {(one.name if a == name else a): b for a, b in kept.items()}
+                    kept[one.name] = [one, *(other for other in tried if other.name != one.name)]
+        return model, kept
+
+    def _pruned(self, model: Model, smoothness: Sequence[float]) -> tuple[Model, set[str]]:
+        """A model without the earlier effects that a later one has made needless, and their names."""
+        gone: set[str] = set()
+        for name in model.names[:-1]:
+            deviation = model.linear.deviation(smoothness)
+            less = self._needless(name, model.names, model.numbers, model.theta, smoothness, deviation)
+            if less is not None:
+                model, gone = less, gone | {name}
+        return model, gone
+
+    def _needless(
+        self,
+        name: str,
+        names: Names,
+        numbers: Mapping[str, Numbers],
+        theta: Array,
+        smoothness: Sequence[float],
+        deviation: Array,
+    ) -> Model | None:
+        """The model without one of its effects where that earns nothing beside the others, all numbers refitted."""
+        full = self.refit(names, numbers, theta, smoothness, deviation)
+        less = self.refit(tuple(one for one in names if one != name), numbers, theta, smoothness, deviation)
+        return less if self._gain(less, full) <= 0.0 else None
+
+    def _settled(self, model: Model) -> Model:
+        """A model without effects that are needless once all numbers are those of least prediction errors: where a fit
+        along the smoothed motion had ended wrong, an effect may have been found that only made up for it."""
+        free, best = self.polished(model.numbers, model.theta)
+        count = len(self.free)
+        numbers = {name: dict(one) for name, one in model.numbers.items()}
+        weak: set[str] = set()
+        for one, at, by in zip(free[count:], best.theta[count:], best.deviation[count:], strict=True):
+            name, leaf = one.path.removeprefix("effects.").rsplit(".", 1)
+            numbers[name][leaf] = float(one.value(at))
+            if leaf in _AMPLITUDES and abs(numbers[name][leaf]) < _WEAK * float(one.slope(at)) * by:
+                weak.add(name)
+        theta = best.theta[:count]
+        for name in sorted(weak, key=model.names.index, reverse=True):
+            if len(model.names) == 1:
+                break
+            smoothness, deviation = self.linear(numbers, theta).choose(())
+            less = self._needless(name, model.names, numbers, theta, smoothness, deviation)
+            if less is not None:
+                model, numbers, theta = less, less.numbers, less.theta
+        return model
+
+    def _simplified(self, model: Model, smoothness: Sequence[float]) -> tuple[Model, dict[str, str]]:
+        """A model in which friction that need not fall with speed does not, and the effects' new names."""
+        renamed: dict[str, str] = {}
+        for name in model.names:
+            place, kind = name.split(".")
+            if kind != "stribeck_friction":
+                continue
+            plain = f"{place}.coulomb_friction"
+            deviation = model.linear.deviation(smoothness)
+            full = self.refit(model.names, model.numbers, model.theta, smoothness, deviation)
+            numbers = {plain if a == name else a: b for a, b in full.numbers.items()}
+            numbers[plain] = {"torque": full.numbers[name]["torque"]}
+            less = self.refit(tuple(numbers), numbers, full.theta, smoothness, deviation)
+            if self._gain(less, full) <= 0.0:
+                model, renamed = less, renamed | {name: plain}
+        return model, renamed
+
+    def _round(self, current: Model) -> tuple[list[float], list[tuple[float, Model]]]:
+        """Models with one effect more, and what each earns (nats), best first."""
+        smoothness, deviation = current.linear.choose(())
+        current = self.refit(current.names, current.numbers, current.theta, smoothness, deviation)
+        smoothness, deviation, finalists = self._screen(current, smoothness)
+        if not finalists:
+            return smoothness, []
+        base = self.refit(current.names, current.numbers, current.theta, smoothness, deviation)
+        # under the predictor that suits it best
+        base = max(base, current, key=lambda one: one.log_evidence)
+        tried: list[tuple[float, Model]] = []
+        best = finalists[0].gain
+        for one in finalists:
+            # those far behind have their turn where those before have not kept their promise
+            behind = one.gain < max(min(_BEHIND * best, best - _NEAR), 0.0)
+            if behind and any(gain > 0.0 for gain, _ in tried):
+                break
+            numbers = current.numbers | {one.name: one.numbers}
+            model = self.refit((*current.names, one.name), numbers, current.theta + one.own, smoothness, deviation)
+            gain = self._gain(base, model) if model.linear.share(one.name) > LEAST else -np.inf
+            tried.append((gain, model))
+        return smoothness, sorted(tried, key=lambda pair: -pair[0])
+
+    def _coloured_round(self, current: Model) -> tuple[list[float], list[tuple[float, Model]]]:
+        """As :meth:`_round`, where errors are not white and count by their spectrum; what earns nothing is left out."""
+        linear = current.linear
+        smoothness, deviation = linear.choose(())
+        spectrum = linear.spectrum(smoothness)
+        if not spectrum.coloured:
+            return smoothness, []
+        base, ranked = self._ranked(linear, self._variants(current), smoothness, spectrum)
+        tried = []
+        for one in ranked[:_FINALISTS]:
+            gain = self._gain(base, one) + ODDS - linear.choices(one.name)
+            if gain > 0.0:
+                numbers = current.numbers | {one.name: one.found.numbers[0]}
+                theta = current.theta + one.found.own[: len(self.free)]
+                model = self.refit((*current.names, one.name), numbers, theta, smoothness, deviation)
+                if np.isfinite(model.log_evidence) and model.linear.share(one.name) > LEAST:
+                    tried.append((gain, model))
+        return smoothness, sorted(tried, key=lambda pair: -pair[0])
+
+    def remainder(self, model: Model) -> dict[str, tuple[float, float]]:
+        """What free functions would earn beside a model (nats), and their size over the driving torque, by name."""
+        rest = self._remainder(model.linear)
+        if _most(rest) > CLEAR:
+            # errors of the smoothed motion cancel to first order only; along the predictor's own path nothing is approximate
+            rest = self._remainder(self.polished(model.numbers, model.theta).refined.linear)
+        return rest
+
+    def _remainder(self, linear: Linear) -> dict[str, tuple[float, float]]:
+        smoothness, deviation = linear.choose(())
+        functions = functions_of(linear.signals)
+        columns = linear.columns(functions, smoothness, deviation)
+        earned = {}
+        for i, one in enumerate(functions):
+            best = (-np.inf, 0.0)
+            for size in _SIZES:
+                scale = columns.scale.copy()
+                scale[list(columns.places[i])] *= size
+                scorer = Scorer(dataclasses.replace(columns, scale=scale), functions)
+                none, some = scorer(()), scorer((i,))
+                assert none is not None and some is not None
+                base, more = (_Scored("", found, linear.count, deviation) for found in (none, some))
+                best = max(best, (self._gain(base, more), size * SHARE))
+            earned[one.name] = best
+        return earned
+
+    def _gain(self, base: "Model | _Scored", model: "Model | _Scored") -> float:
+        """What a model's effect earns: evidence, less a floor of what it takes off the misfit."""
+        explained = model.log_likelihood - base.log_likelihood
+        gain = model.log_evidence - base.log_evidence
+        return gain - min(max(explained, 0.0), self.floor) if np.isfinite(gain) else -np.inf
+
+    def _screen(self, model: Model, smoothness: list[float]) -> tuple[list[float], Array, list[_Finalist]]:
+        """Candidates that do well on the linearised model, and the predictor to judge them by: with the best of them in."""
+        linear = model.linear
+        smoothness, deviation = linear.choose((), smoothness)
+        variants = self._variants(model)
+        _, ranked = self._ranked(linear, variants, smoothness, deviation)
+        if not ranked:
+            return smoothness, deviation, []
+        # a predictor that makes up for what is missing hides it: the best ones are tried with predictors of their own
+        leaders = [linear.choose([variants[one.found.which[0]]]) for one in ranked[:_LEADERS]]
+        few = {one.name for one in ranked[: 2 * _FINALISTS]}
+        variants = [one for one in variants if one.name in few]
+        smoothness, deviation = min(leaders, key=lambda one: float(np.sum(np.log(one[1]))))
+        # beside the model without them under the same predictor: what they earn in truth, models that have them tell
+        base, ranked = self._ranked(linear, variants, smoothness, deviation)
+        finalists = [
+            _Finalist(one.name, one.found.numbers[0], one.found.own[: len(self.free)], self._gain(base, one))
+            for one in ranked[:_FINALISTS]
+        ]
+        finalists = sorted((one for one in finalists if one.gain > _LEAST_GAIN), key=lambda one: -one.gain)
+        if finalists:
+            (best,) = (variants[one.found.which[0]] for one in ranked if one.name == finalists[0].name)
+            smoothness, deviation = linear.choose([best], smoothness)
+        return smoothness, deviation, finalists
+
+    def _variants(self, model: Model) -> list[Variant]:
+        """Effects that a model lacks, at what was chosen last for it."""
+        lacking = [name for name in self.lacking if name not in model.names and not _same(name, model.names)]
+        return variants_of(model.experiment, lacking, model.linear.grids(model.linear.frequencies()))
+
+    def _ranked(
+        self, linear: Linear, variants: Sequence[Candidate], smoothness: Sequence[float], noise: Array | Spectrum
+    ) -> tuple["_Scored", list["_Scored"]]:
+        """The model without candidates, and with the best variant of each, best first."""
+        scorer = Scorer(linear.columns(variants, smoothness, noise), variants)
+        # errors over their spectrum are of size 1
+        deviation = np.ones(len(linear.sides)) if isinstance(noise, Spectrum) else noise
+        none = scorer(())
+        assert none is not None
+        allowed = [one for i in range(len(variants)) if (one := scorer((i,))) is not None]
+        best: dict[str, _Scored] = {}
+        for one in sorted(allowed, key=lambda one: -one.log_evidence):
+            name = variants[one.which[0]].name
+            best.setdefault(name, _Scored(name, one, linear.count, deviation))
+        return _Scored("", none, linear.count, deviation), list(best.values())
+
+
+_DRY = "coulomb_friction", "stribeck_friction"
+
+
+def _same(name: str, others: Iterable[str]) -> bool:
+    """Whether an effect is of a kind with one that is there: of dry friction a side has one law."""
+    place, kind = name.split(".")
+    return kind in _DRY and any(f"{place}.{one}" in others for one in _DRY)
+
+
+def _verdict(left: float, findings: Sequence[Finding]) -> Verdict:
+    return "unknown_effect" if left > CLEAR else "explained" if findings else "no_discrepancy"
+
+
+def _most(rest: Mapping[str, tuple[float, float]]) -> float:
+    """What the best free function earns of those that are large enough for an effect."""
+    return max((gain for gain, share in rest.values() if share > LEAST), default=0.0)
+
+
+def _key(values: Mapping[str, Numbers], theta: Array) -> tuple:
+    return (*((name, *numbers.items()) for name, numbers in values.items()), theta.tobytes())
+
+
+def _finding(tried: Sequence[_Tried], model: Model, left: float) -> Finding:
+    """The first of those tried, with its confidence: structure that is left over makes differences mean less."""
+    heat = left if left > CLEAR else 1.0
+    # or nothing is missing
+    *chances, _ = _softmax(np.array([*(one.gain for one in tried), 0.0]) / heat)
+    others = tuple((one.name, float(chance)) for one, chance in zip(tried[1:], chances[1:], strict=True))
+    name = tried[0].name
+    others = tuple(one for one in others if one[1] > _LEAST_CHANCE)
+    return Finding(name, float(chances[0]), model.numbers[name], others)
+
+
+def _softmax(values: Array) -> Array:
+    weights = np.exp(values - np.max(values))
+    return weights / weights.sum()
+
+
+_AMPLITUDES = frozenset(
+    ("torque", "breakaway_torque", "viscous", "drag", "inertia", "amplitude", "cubic_stiffness", "damping", "relative")
+)
+_FIXED = frozenset(("harmonic",))
+"""Whole numbers of a turn."""
+
+
+def paths_of(names: Iterable[str]) -> list[str]:
+    """Dotted paths of the free numbers of effects."""
+    return [
+        f"effects.{name}.{field.name}"
+        for name in names
+        for field, _ in parameters(effect_class(name))
+        if field.name not in _FIXED and not field.metadata.get("static")
+    ]
+
+
+def _width(path: str) -> float:
+    return 1.8 if path.endswith(".phase") else 1.0
+
+
+def with_effects(experiment: Experiment, values: Mapping[str, Numbers]) -> Experiment:
+    """A model with all effects, some of them with these numbers."""
+    return set_leaves(
+        experiment,
+        {
+            f"effects.{name}.{leaf}": jnp.asarray(value, float)
+            for name, numbers in values.items()
+            for leaf, value in numbers.items()
+        },
+    )

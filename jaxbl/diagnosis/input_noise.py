@@ -1,0 +1,105 @@
+"""Noise of the channel that recorded the input: noise that the drive never felt.
+
+The model is driven by the recorded torque. Where that carries noise of its own the model shakes, and the machine did not;
+fits then choose whatever shakes less: a lag, a larger motor inertia. A recorded input is smoothed between its jumps
+(penalised third differences, generalised cross-validation); which of the two drove the machine, its motion tells.
+References: P. Eilers, A perfect smoother, Analytical Chemistry 75 (2003); P. Craven, G. Wahba, Smoothing noisy data with
+spline functions, Numerische Mathematik 31 (1979).
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.linalg import solveh_banded
+
+from jaxbl.records import Record
+
+from .residuals import white_noise
+from .whittle import spectrum_of, weighted_products
+
+Array = np.ndarray
+
+_JUMP = 5.0
+"""Standard deviations of the noise that a jump must stand out by."""
+_FEWEST = 8
+"""Samples between two jumps that can be smoothed."""
+_ORDER = 3
+"""Of the differences that are penalised."""
+_CUTOFFS = np.geomspace(0.015, 2.0, 30)
+"""Corner frequencies tried, rad a sample."""
+
+
+def noise_of(record: Record) -> float:
+    """Standard deviation of the input's white noise, N m."""
+    assert record.torque is not None
+    return white_noise([record.torque[part] for part in record.segments])
+
+
+def unfelt(given: Sequence[Array], smooth: Sequence[Array]) -> float:
+    """Nats by which noise of the input did not drive the motion, rather than did.
+
+    What both inputs' prediction errors differ by is what that noise does to them. It is in the errors of the recorded input
+    if the drive has not felt it; each frequency counts by the power that is there, so that what the model lacks, which is
+    slow, does not matter.
+
+    Args:
+        given, smooth: prediction errors of one model and gain under the input as recorded and smoothed, part by part, rad;
+            shape (samples, sides).
+    """
+    spectrum = spectrum_of(given)
+    pairs = [np.stack([one, one - other], axis=2) for one, other in zip(given, smooth, strict=True)]
+    products = np.sum([weighted_products(pair, spectrum) for pair in pairs], axis=0)
+    return float(products[0, 1] - 0.5 * products[1, 1])
+
+
+def smoothed_input(record: Record, noise: float) -> Record:
+    """A record with its input smoothed between jumps; `noise`: its standard deviation, N m."""
+    assert record.torque is not None
+    torque = record.torque.copy()
+    for part in record.segments:
+        values = record.torque[part]
+        ends = [0, *jumps(values, noise), len(values)]
+        for first, last in itertools.pairwise(ends):
+            if last - first >= _FEWEST:
+                torque[part.start + first : part.start + last] = _smoothed(values[first:last])
+    return dataclasses.replace(record, torque=torque)
+
+
+def jumps(torque: Array, noise: float) -> list[int]:
+    """First samples after jumps: differences that stand out from those beside them."""
+    change = np.diff(torque)
+    beside = np.pad(change, 1, mode="edge")
+    beyond = np.abs(change - 0.5 * (beside[:-2] + beside[2:]))
+    highest = (beyond >= np.append(beyond[1:], 0.0)) & (beyond > np.insert(beyond[:-1], 0, 0.0))
+    return (1 + np.flatnonzero(highest & (beyond > _JUMP * np.sqrt(5.0) * noise))).tolist()
+
+
+def _smoothed(values: Array) -> Array:
+    """The smooth curve that generalised cross-validation chooses."""
+    count = len(values)
+    penalty = _penalty(count)
+    frequency = np.linspace(0.0, np.pi, 4096)
+    best, least = values, np.inf
+    for cutoff in _CUTOFFS:
+        # half of a wave of this frequency is let through
+        weight = (2.0 * np.sin(0.5 * cutoff)) ** (-2.0 * _ORDER)
+        matrix = weight * penalty
+        matrix[0] += 1.0
+        found = solveh_banded(matrix, values, lower=True)
+        freedom = np.mean(1.0 / (1.0 + weight * (2.0 * np.sin(0.5 * frequency)) ** (2 * _ORDER))) + _ORDER / count
+        score = np.mean((values - found) ** 2) / max(1.0 - freedom, 1e-3) ** 2
+        if score < least:
+            best, least = found, score
+    return best
+
+
+def _penalty(count: int) -> Array:
+    """Products of third differences, as lower bands."""
+    stencil = np.diff(np.eye(_ORDER + 1), n=_ORDER, axis=0)[0]
+    bands = np.zeros((_ORDER + 1, count))
+    for start in range(_ORDER + 1):
+        for other in range(start, _ORDER + 1):
+            bands[other - start, start : start + count - _ORDER] += stencil[start] * stencil[other]
+    return bands

@@ -1,0 +1,687 @@
+"""A model linearised about the measured motion: what any torque that it lacks would do to its prediction errors.
+
+The smoothed motion x_k is measured, the model's step F(x, u) is known. With x^_k = x_k + d_k the one-step predictor with
+gain L obeys, to first order,
+
+    d_{k+1} = A_k (d_k + L e_k) + F(x_k, u_k) - x_{k+1} + B_k w_k,   e_k = y_k - C x^_k,
+
+with A, B the derivatives of one step by state and torque, and w whatever torque is missing. Prediction errors are then
+linear in the initial state, in changes of the model's numbers and in all amplitudes of missing effects, exactly as those of
+the simulated predictor to first order; errors of the smoothed motion cancel. Nothing diverges, as a free run over a whole
+record would, and a thousand candidate torques cost one recursion with a thousand columns.
+References: L. Ljung, System Identification (1999), 7.4; M. Basseville, Detecting changes in signals and systems,
+Automatica 24 (1988), for the local approach.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Float
+
+from jaxbl.drive.effects import ConstantTorque
+from jaxbl.drive.parameters import get_leaf
+from jaxbl.drive.plant import PlantState
+from jaxbl.fused.single_plant import Direction, slopes
+from jaxbl.identification.prediction import kalman_gain
+from jaxbl.identification.regression import lasting_path
+from jaxbl.identification.smoother import Smoothed
+from jaxbl.identification.trajectory import Free, with_values
+from jaxbl.records import Record
+from jaxbl.simulate import Experiment
+
+from .candidates import SHARE, SPACING, Candidate, Grids, Signals, all_of_the_input, forces_of, rms
+from .evidence import Columns
+from .linearised_segment import Part
+from .neutral_effects import bucket
+from .whittle import Spectrum, spectrum_of, weighted_products
+
+_SAMPLES, _BLOCK, _NUMBERS = 1024, 128, 4
+"""Least padded length of a part, so that records of about one length share their compiled programs; a block of it; multiple
+to which the number of free numbers is padded."""
+
+
+def linearise(
+    experiment: Experiment,
+    free: Sequence[Free],
+    theta: Float[np.ndarray, " numbers"],
+    record: Record,
+    smoothed: Mapping[str, Sequence[Smoothed]],
+) -> list[Part]:
+    """The model along each part of a record.
+
+    Args:
+        experiment: the model with all effects (:func:`.complete.complete`); its sample period is that of the record.
+        free: its own numbers.
+        theta: their values, which the model has.
+        record: the log.
+        smoothed: its positions, part by part.
+    """
+    assert record.torque is not None
+    sides = experiment.sides
+    added = tuple(_AddedTorque(side=side, torque=jnp.zeros(())) for side in sides)  # type: ignore[arg-type]
+    extended = eqx.tree_at(lambda e: e.effects, experiment, (*experiment.effects, *added))
+    parts = []
+    for i, rows in enumerate(record.segments):
+        one = {side: smoothed[side][i] for side in sides}
+        time = record.time[rows] - record.time[0]
+        readings = {side: record.positions[side][rows] for side in sides}
+        parts.append(_part(extended, free, theta, time, record.torque[rows], readings, one))
+    return parts
+
+
+class _AddedTorque(ConstantTorque):
+    """By which the derivatives by a torque on a side are found; a name of its own, beside what the model has."""
+
+    kind: ClassVar[str] = "added_torque"
+
+
+def _part(
+    experiment: Experiment,
+    free: Sequence[Free],
+    theta: np.ndarray,
+    time: np.ndarray,
+    torque: np.ndarray,
+    readings: dict[str, np.ndarray],
+    smoothed: dict[str, Smoothed],
+) -> Part:
+    count = len(time)
+    size = bucket(count, _SAMPLES)
+
+    def padded(values: np.ndarray) -> np.ndarray:
+        return np.concatenate([values, np.repeat(values[-1:], size - count, axis=0)])
+
+    sides = experiment.sides
+    states = {side: padded(np.asarray(smoothed[side].state)) for side in sides}
+    deviation = {side: padded(np.asarray(smoothed[side].deviation(1))) for side in sides}
+    period = float(experiment.run.sample_period)
+    held = {side: padded(np.asarray(smoothed[side].held(period), float)) for side in sides}
+    read = np.stack([padded(readings[side]) - states[side][:, 0] for side in sides], axis=1)
+    time, torque = padded(time), padded(torque)
+    effects, _ = lasting_path(experiment, jnp.asarray(torque))
+    smooth: list[Any] = [{side: states[side][:, i] for side in sides} for i in range(3)]
+    motion = PlantState(smooth[0], smooth[1], jax.tree.map(np.asarray, effects))
+    # by side, not by name
+    names, each = sorted(sides), len(sides)
+    order = [names.index(side) + i * each for i in range(2) for side in sides]
+    order += range(2 * each, len(jax.tree.leaves(motion)))
+    slope, value = slopes(experiment, motion, torque, time, _directions(experiment, free, theta, motion, order))
+    slope, value = slope[:, order].transpose(2, 1, 0), value[order].T
+    vectors = np.stack(jax.tree.leaves(motion), axis=1)[:, order]
+    defect = np.zeros_like(value)
+    # a path along which a model diverges has nothing finite
+    with np.errstate(invalid="ignore", over="ignore"):
+        modelled = {side: (value[:, each + i] - vectors[:, each + i]) / period for i, side in enumerate(sides)}
+        # nothing happens from the last reading on
+        defect[: count - 1] = value[: count - 1] - vectors[1:count]
+    a, b, own = np.split(slope, (len(order), len(order) + each + 1), axis=2)
+    own = np.concatenate([own, np.zeros((*own.shape[:2], -len(free) % _NUMBERS))], axis=2)
+    weight = (np.arange(size) < count).astype(float)
+    given = time, torque, read, *smooth, modelled, deviation, held, a, b, own, defect, weight
+    return Part(*jax.tree.map(jnp.asarray, given))
+
+
+def _directions(
+    experiment: Experiment, free: Sequence[Free], theta: np.ndarray, motion: PlantState, order: Sequence[int]
+) -> list[Direction]:
+    """Each state, torque on each side, input, each free number."""
+    leaves, structure = jax.tree.flatten(experiment)
+    places, shape = structure.unflatten(range(len(leaves))), jax.tree.structure(motion)
+
+    def direction(number: tuple[int, float] = (0, 0.0), state: int = -1, torque: float = 0.0) -> Direction:
+        numbers = np.zeros(len(leaves))
+        numbers[number[0]] = number[1]
+        states = [float(i == state) for i in range(shape.num_leaves)]
+        return Direction(structure.unflatten(list(numbers)), shape.unflatten(states), torque)
+
+    added = places.effects[-len(experiment.sides) :]
+    numbers = [(get_leaf(places, one.path), float(one.slope(at))) for one, at in zip(free, theta, strict=True)]
+    return [
+        *(direction(state=i) for i in order),
+        *(direction((one.torque, -1.0)) for one in added),
+        direction(torque=1.0),
+        *(direction(one) for one in numbers),
+    ]
+
+
+def gain_matrix(gain: Array, states: int) -> Array:
+    """Gain of the whole state, shape (states, sides): positions, velocities, and nothing on the effects' own states."""
+    sides = len(gain)
+    gains = jnp.zeros((states, sides)).at[jnp.arange(sides), jnp.arange(sides)].set(gain[:, 0])
+    return gains.at[sides + jnp.arange(sides), jnp.arange(sides)].set(gain[:, 1])
+
+
+def _known(part: Part, forces: Array) -> Array:
+    """What drives the state's change at each sample; columns: constant, own numbers, forces, initial states."""
+    samples, states = part.defect.shape
+    none = jnp.zeros((samples, states, states))
+    forced = jnp.einsum("tni,cti->tnc", part.force, forces)
+    return jnp.concatenate([part.defect[:, :, None], part.own, forced, none], axis=2)
+
+
+def _closed(part: Part, gains: Array) -> tuple[Array, Array]:
+    """Step of the predictor's errors under a gain, A (1 - K C), and A K; by sample."""
+    fed = part.step @ gains
+    return part.step.at[:, :, : gains.shape[1]].add(-fed), fed
+
+
+def _product(matrix: Array, columns: Array) -> Array:
+    """Of small matrices: written out, it takes less time than a call of what is made for large ones."""
+    if columns.shape[1] > _MANY:
+        return matrix @ columns
+    return sum((matrix[:, k, None] * columns[None, k] for k in range(len(columns))), jnp.zeros((1, 1)))
+
+
+def _recursion(part: Part, gains: Array, change: Array, known: Array) -> tuple[Array, Array]:
+    """Prediction errors along some samples, rad; shape (samples, sides, columns)."""
+    closed, fed = _closed(part, gains)
+
+    def first(values: Array) -> Array:
+        """Of the first column alone."""
+        return jnp.pad(values[..., None], [*[(0, 0)] * values.ndim, (0, known.shape[2] - 1)])
+
+    def sample(change: Array, given: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        closed, known, read = given
+        return _product(closed, change) + known + first(read), change[: gains.shape[1]]
+
+    change, seen = jax.lax.scan(sample, change, (closed, known, jnp.einsum("tis,ts->ti", fed, part.readings)))
+    return change, (first(part.readings) - seen) * part.weight[:, None, None]
+
+
+def _start(states: int, width: int) -> Array:
+    return jnp.zeros((states, width)).at[:, width - states :].set(jnp.eye(states))
+
+
+@jax.jit
+def _errors(part: Part, gain: Array, forces: Array) -> Array:
+    """Prediction errors, rad, by side; columns as of :func:`_known`; shape (samples, sides, columns)."""
+    known = _known(part, forces)
+    states, width = known.shape[1:]
+    return _recursion(part, gain_matrix(gain, states), _start(states, width), known)[1]
+
+
+@jax.jit
+def _grams(part: Part, gains: Array, forces: Array) -> Array:
+    """Products of the columns of the prediction errors with one another, rad^2, for several gains, by side;
+    shape (gains, sides, columns, columns)."""
+    states, sides = part.defect.shape[1], part.readings.shape[1]
+    width = 1 + part.own.shape[2] + len(forces) + states
+    count = len(part.time) // _BLOCK
+    blocks = jax.tree.map(lambda x: x.reshape(count, _BLOCK, *x.shape[1:]), part)
+
+    def some(gains: Array, blocks: Part, forces: Array) -> Array:
+        matrices = jax.vmap(lambda gain: gain_matrix(gain, states))(gains)
+
+        def block(carry: tuple[Array, Array], given: tuple[Part, Array]) -> tuple[tuple[Array, Array], None]:
+            change, total = carry
+            one, i = given
+            known = _known(one, jax.lax.dynamic_slice_in_dim(forces, i * _BLOCK, _BLOCK, 1))
+            change, errors = jax.vmap(lambda gain, change: _recursion(one, gain, change, known))(matrices, change)
+            return (change, total + jnp.einsum("gtsc,gtsd->gscd", errors, errors)), None
+
+        start = jnp.broadcast_to(_start(states, width), (len(gains), states, width))
+        none = jnp.zeros((len(gains), sides, width, width))
+        return jax.lax.scan(block, (start, none), (blocks, jnp.arange(count)))[0][1]
+
+    # devices share the gains
+    devices = jax.local_devices()
+    mesh = Mesh(np.array(devices[: math.gcd(len(devices), len(gains))]), ("gains",))
+    own, every = PartitionSpec("gains"), PartitionSpec()
+    shared = jax.shard_map(some, mesh=mesh, in_specs=(own, every, every), out_specs=own, check_vma=False)
+    return shared(gains, blocks, forces)
+
+
+@jax.jit
+def _gradient(part: Part, gain: Array, left: Array) -> Array:
+    """Derivative of the sum of products of errors with `left` by the torque at each sample, shape (samples, sides + 1)."""
+    states, sides = part.defect.shape[1], left.shape[1]
+    closed, _ = _closed(part, gain_matrix(gain, states))
+    added = jnp.zeros((len(left), states)).at[:, :sides].set(-left * part.weight[:, None])
+
+    def sample(adjoint: Array, given: tuple[Array, Array]) -> tuple[Array, Array]:
+        closed, added = given
+        return _product(closed.T, adjoint[:, None])[:, 0] + added, adjoint
+
+    _, adjoints = jax.lax.scan(sample, jnp.zeros(states), (closed, added), reverse=True)
+    return jnp.einsum("tij,ti->tj", part.force, adjoints)
+
+
+_COARSE_SMOOTHNESS = 10.0 ** np.arange(-11.0, 1.0)
+_FINE_SMOOTHNESS = 10.0 ** np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
+_LEAST = 1e-11
+OFF = 0.5
+"""Prior size of the error of an inertia or a viscous friction, relative."""
+_FREQUENCIES, _COARSE, _HARMONICS = 8, 16, 40
+_ARC = 0.5 * np.pi
+"""Of a wave of cogging, rad, that the motion must cover for it to be tried."""
+_NO_INPUT = 1e-3
+DIVERGED = 1e30
+"""Products of prediction errors, over their variance or in rad^2, from which on a model is one that diverges."""
+_SILENT = 1e-20
+"""Influence of an initial state over that of others below which it has none: that of an effect that does nothing."""
+_LOST = 0.01
+"""Nats that rounding may take: under too low a gain an initial state's influence may grow from sample to sample."""
+_COLUMNS, _MANY = 16, 80
+"""Least padded number of candidate columns; number from which on they are many."""
+
+
+class Predictor:
+    """Prediction errors under one gain: sums of squares, and the coefficients that leave the least.
+
+    Attributes:
+        smoothness: of each side.
+        given: sum of squared errors of each side as the model stands, the effects' own initial states at their best, rad^2;
+            shape (sides,).
+        squares: the least that changes of all numbers leave; as `given`.
+        coefficients: of all columns, part by part; 1 first.
+    """
+
+    def __init__(self, linear: "Linear", smoothness: list[float], grams: list[np.ndarray]):
+        self.smoothness, self.count = smoothness, linear.count
+        own_states = linear.states - 2 * len(linear.sides)
+        self.given = np.sum([_as_it_stands(one, own_states) for one in grams], axis=0)
+        sides, own, states, count = len(linear.sides), len(linear.free), linear.states, linear.count
+        width = grams[0].shape[1] - 1 - states
+        if not np.max([np.max(np.abs(one)) for one in grams]) < DIVERGED:
+            self._nothing(grams)
+            return
+        weight = np.ones(sides)
+        prior, centre = np.full(width, np.inf), np.zeros(width)
+        prior[:own], centre[:own] = linear.prior, linear.centre
+        bound = np.concatenate([linear.bound, np.full(width - own, np.inf)])
+        for turn in range(2):
+            weighted = [np.einsum("s,scd->cd", weight, one) for one in grams]
+            total = np.sum([_eliminated(one, states) for one in weighted], axis=0)
+            variance = 1.0 if turn else max(total[0, 0] / (count * sides), 1e-300)
+            lost = sum(_lost(one, states) for one in weighted) / variance
+            if lost > _LOST or total[0, 0] < 0.0 or np.min(np.diag(total)[1:], initial=0.0) < 0.0:
+                self._nothing(grams)
+                return
+            found = _least_squares(total, variance / prior**2, centre, bound * prior)
+            free = np.concatenate([[1.0], found])
+            self.coefficients = [np.concatenate([free, -_response(one, states) @ free]) for one in weighted]
+            self.squares = np.sum(
+                [np.einsum("c,scd,d->s", at, one, at) for at, one in zip(self.coefficients, grams, strict=True)], axis=0
+            )
+            if not (self.squares > 0.0).all():
+                self._nothing(grams)
+                return
+            weight = count / self.squares
+
+    def _nothing(self, grams: list[np.ndarray]) -> None:
+        """Of a gain under which errors diverge, or all but: what is left is smaller than the rounding of their products."""
+        self.squares = np.full(len(self.smoothness), np.inf)
+        self.coefficients = [np.zeros(one.shape[1]) for one in grams]
+
+    def cost(self, theta: np.ndarray, width: np.ndarray) -> float:
+        """Minus twice the log-likelihood, with the prior's, that a step from theta promises."""
+        moved = theta + self.coefficients[0][1 : 1 + len(theta)]
+        return float(self.count * np.sum(np.log(self.squares)) + np.sum((moved / width) ** 2))
+
+
+class Linear:
+    """A model along a record, linear in everything that may change."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        free: Sequence[Free],
+        theta: Float[np.ndarray, " numbers"],
+        prior: np.ndarray,
+        centre: np.ndarray,
+        record: Record,
+        smoothed: Mapping[str, Sequence[Smoothed]],
+        bound: np.ndarray | None = None,
+    ):
+        """Args as of :func:`linearise`; `prior` and `centre` are of the change of each number from theta, `bound` says how
+        many standard deviations it may be from `centre` (left out: any number)."""
+        self.bound = np.full(len(free), np.inf) if bound is None else bound
+        self.free, self.theta, self.prior, self.centre = tuple(free), np.asarray(theta), prior, centre
+        self.experiment = with_values(experiment, free, jnp.asarray(self.theta))
+        self.period, self.sides = record.sample_period, experiment.sides
+        self.parts = linearise(self.experiment, free, self.theta, record, smoothed)
+        self.signals = [Signals(self.experiment, part) for part in self.parts]
+        self.count = sum(int(np.asarray(one.weight).sum()) for one in self.parts)
+        self.states = self.parts[0].defect.shape[1]
+        self.drive, self.driven = self._drive()
+        # what the last search chose, and what the one without candidates did, which is asked for again and again
+        self._last: tuple[Predictor, list[np.ndarray]] | None = None
+        self._alone: tuple[Predictor, list[np.ndarray]] | None = None
+
+    def _drive(self) -> tuple[float, bool]:
+        """Size of the torques, N m rms at the motor: the input's; where there is none, what the motion takes. And which."""
+        driving = rms(np.concatenate([one.torque[one.real] for one in self.signals]))
+        taken = [
+            float(self.experiment.plant.inertia(side)) / one.over(side) * np.asarray(one.part.acceleration[side])[one.real]
+            for one in self.signals
+            for side in self.sides
+        ]
+        inertial = rms(np.concatenate(taken))
+        return (driving, True) if driving > _NO_INPUT * inertial else (inertial, False)
+
+    def grids(self, frequencies: Sequence[float]) -> Grids:
+        """Values to be tried of numbers that are not linear."""
+
+        def joined(of) -> np.ndarray:
+            return np.concatenate([np.asarray(of(one))[np.asarray(one.weight) > 0.0] for one in self.parts])
+
+        speed = {side: rms(joined(lambda part, side=side: part.velocity[side])) for side in self.sides}
+        travel = {side: float(np.ptp(joined(lambda part, side=side: part.position[side]))) for side in self.sides}
+        twist = np.zeros(1)
+        if len(self.sides) == 2:
+            ratio = float(self.experiment.drive.ratio("load"))
+            twist = joined(lambda part: part.position["motor"] - ratio * part.position["load"])
+        return Grids(
+            float(np.max(np.abs(joined(lambda part: part.torque)))),
+            self.period,
+            (rms(twist), float(np.max(np.abs(twist)))),
+            speed,
+            tuple(frequencies),
+            tuple(float(n) for n in range(1, _HARMONICS + 1) if n * travel["motor"] > _ARC),
+            # once a turn is what eccentricity means; of others something must be seen
+            (1.0, *(float(n) for n in range(2, 9) if n * travel.get("load", 0.0) > 0.5)),
+        )
+
+    def choices(self, name: str) -> float:
+        """Logarithm of the number of values that an effect was sought with, where each could be told from the next."""
+        if name == "load.periodic_disturbance":
+            return float(np.log(max(self.count * self.period * min(0.25 / self.period, 50.0), 1.0)))
+        grids = self.grids(())
+        if name == "motor.cogging":
+            return float(np.log(max(len(grids.motor_harmonics), 1)))
+        if name == "transmission.eccentricity":
+            return float(np.log(max(len(grids.load_harmonics), 1)))
+        return 0.0
+
+    @staticmethod
+    def gain_of(smoothness: Sequence[float], period: float) -> Array:
+        """Steady-state gains of both sides, shape (sides, 2)."""
+        return jnp.asarray(np.stack([kalman_gain(q, period) for q in smoothness]))
+
+    def gain(self, smoothness: Sequence[float]) -> Array:
+        return self.gain_of(smoothness, self.period)
+
+    def predictor(self, smoothness: Sequence[float]) -> Predictor:
+        """Prediction errors under a given gain."""
+        (found,) = self._predictors([list(smoothness)], [self._forces((), signals) for signals in self.signals])
+        return found
+
+    def errors(self, smoothness: Sequence[float]) -> list[np.ndarray]:
+        """Prediction errors under a given gain, part by part, rad; shape (samples, sides, columns)."""
+        gain = self.gain(smoothness)
+        return [
+            np.asarray(_errors(part, gain, self._forces((), signals)))[:, :, self._some(0, 0)]
+            for part, signals in zip(self.parts, self.signals, strict=True)
+        ]
+
+    def _some(self, forces: int, width: int) -> np.ndarray:
+        """Columns that are not there to fill up, some of the forces among them."""
+        own, padded = len(self.free), self.parts[0].own.shape[2]
+        last = 1 + padded + width + np.arange(self.states)
+        return np.concatenate([np.arange(1 + own), 1 + padded + np.arange(forces), last])
+
+    def choose(self, variants: Sequence[Candidate], near: list[float] | None = None) -> tuple[list[float], np.ndarray]:
+        """The predictor with the least errors, some candidates taken in: smoothness of each side, and errors' rms, rad.
+
+        With `near`, the search begins there.
+        """
+        if not variants and near is None and self._alone is not None:
+            self._last = self._alone
+            return self._chosen(self._alone[0])
+        forces = [self._forces(variants, signals) for signals in self.signals]
+
+        def best(options: list[list[float]]) -> Predictor:
+            found = self._predictors(options, forces)
+            costs = [float(np.sum(np.log(one.squares))) if (one.squares > 0.0).all() else np.inf for one in found]
+            return found[int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))]
+
+        if near is None:
+            chosen = best([[float(q)] * len(self.sides) for q in _COARSE_SMOOTHNESS])
+        else:
+            (chosen,) = self._predictors([near], forces)
+        for i in range(len(self.sides)) if len(self.sides) > 1 or near is not None else ():
+            now = chosen.smoothness
+            options = [[max(float(q * f), _LEAST) if j == i else q for j, q in enumerate(now)] for f in _FINE_SMOOTHNESS]
+            other = best(options)
+            if np.sum(np.log(other.squares)) < np.sum(np.log(chosen.squares)):
+                chosen = other
+        self._last = chosen, forces
+        if not variants and near is None:
+            self._alone = self._last
+        return self._chosen(chosen)
+
+    def _chosen(self, predictor: Predictor) -> tuple[list[float], np.ndarray]:
+        return predictor.smoothness, np.sqrt(predictor.squares / self.count)
+
+    def _predictors(self, options: list[list[float]], forces: list[np.ndarray]) -> list[Predictor]:
+        # one compiled program for a few and for all
+        count = len(_COARSE_SMOOTHNESS) if 1 < len(options) < len(_COARSE_SMOOTHNESS) else len(options)
+        gains = jnp.stack([self.gain(options[min(i, len(options) - 1)]) for i in range(count)])
+        grams = []
+        for part, force in zip(self.parts, forces, strict=True):
+            some = self._some(len(force), len(force))
+            grams.append(np.asarray(_grams(part, gains, force))[:, :, some[:, None], some])
+        return [Predictor(self, one, [gram[i] for gram in grams]) for i, one in enumerate(options)]
+
+    def _forces(self, variants: Sequence[Candidate], signals: Signals) -> np.ndarray:
+        """Torques of candidates, padded with columns of zeros; shape (columns, samples, sides + 1)."""
+        width = sum(one.width + one.offset for one in variants)
+        return forces_of(variants, signals, bucket(width, _COLUMNS, 2) - width if width else 0)
+
+    def deviation(self, smoothness: Sequence[float]) -> np.ndarray:
+        """Rms of the prediction errors, rad, by side, with a given predictor."""
+        return np.sqrt(self.predictor(smoothness).squares / self.count)
+
+    def frequencies(self) -> list[float]:
+        """Frequencies (Hz) at which a disturbance of the load explains most, by the gradient of the errors' squares.
+
+        Of the longest part, under what the last call of :meth:`choose` chose, and at what it left over.
+        """
+        assert self._last is not None
+        i = int(np.argmax([float(one.weight.sum()) for one in self.parts]))
+        part, side = self.parts[i], self.sides.index(self.experiment.drive.place("load"))
+        predictor, forces = self._last
+        gain, deviation = self.gain(predictor.smoothness), np.sqrt(predictor.squares / self.count)
+        errors = np.asarray(_errors(part, gain, forces[i]))
+        left = errors[:, :, self._some(len(forces[i]), len(forces[i]))] @ predictor.coefficients[i]
+        time, real = np.asarray(part.time), int(np.asarray(part.weight).sum())
+        span, top = real * self.period, min(0.25 / self.period, 50.0)
+        few = np.geomspace(1.0 / span, top, _COARSE)
+        phase = 2.0 * np.pi * few[:, None] * time[None, :]
+        waves = np.zeros((2 * _COARSE, len(time), len(self.sides) + 1))
+        waves[:, :, side] = np.concatenate([np.sin(phase), np.cos(phase)])
+        responses = np.asarray(_errors(part, gain, waves))[:, :, 1 + part.own.shape[2] : -self.states]
+        power = np.sum((responses / deviation[None, :, None]) ** 2, axis=(0, 1)).reshape(2, -1).mean(axis=0)
+        slope = np.asarray(_gradient(part, gain, jnp.asarray(left / deviation[None, :] ** 2)))[:real, side]
+        size = 4 * 2 ** int(np.ceil(np.log2(real)))
+        frequency = np.fft.rfftfreq(size, self.period)
+        inside = (frequency >= 0.5 / span) & (frequency <= top)
+        expected = np.exp(np.interp(np.log(np.maximum(frequency, 1e-9)), np.log(few), np.log(power)))
+        score = np.where(inside, np.abs(np.fft.rfft(slope, size)) ** 2 / expected, 0.0)
+        peaks = np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:])) + 1
+        found: list[float] = []
+        for k in peaks[np.argsort(-score[peaks])]:
+            if all(abs(frequency[k] - known) > 1.0 / span for known in found):
+                found.append(float(frequency[k]))
+            if len(found) == _FREQUENCIES:
+                break
+        return found
+
+    def left(self, smoothness: Sequence[float]) -> list[np.ndarray]:
+        """Errors that are left under a given gain when all numbers are at their best, part by part, rad; shape
+        (samples, sides)."""
+        errors, predictor = self.errors(smoothness), self.predictor(smoothness)
+        left = [one @ at for one, at in zip(errors, predictor.coefficients, strict=True)]
+        return [one[signals.real] for one, signals in zip(left, self.signals, strict=True)]
+
+    def spectrum(self, smoothness: Sequence[float]) -> Spectrum:
+        """Of what is left."""
+        return spectrum_of(self.left(smoothness))
+
+    def columns(self, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray | Spectrum) -> Columns:
+        """Products of everything that the prediction errors are linear in, initial states eliminated.
+
+        Args:
+            variants: candidates, the columns of which are to be among them.
+            smoothness: of the predictor, by side.
+            noise: rms of its errors by side, rad, where they are white; or their spectrum.
+        """
+        gain, own = self.gain(smoothness), len(self.free)
+        places, offsets, at = [], [], 1 + own
+        for one in variants:
+            places.append(tuple(range(at, at + one.width)))
+            at += one.width
+            offsets.append(at if one.offset else -1)
+            at += one.offset
+        total, power = np.zeros((at, at)), np.zeros(at - 1 - own)
+        for part, signals in zip(self.parts, self.signals, strict=True):
+            forces = self._forces(variants, signals)
+            power += self._power(forces[: at - 1 - own], signals)
+            some = self._some(at - 1 - own, len(forces))
+            if isinstance(noise, Spectrum):
+                errors = np.asarray(_errors(part, gain, forces))[signals.real][:, :, some]
+                gram = weighted_products(errors, noise)
+            else:
+                gram = np.asarray(_grams(part, gain[None], forces))[0][:, some[:, None], some]
+                gram = np.einsum("s,scd->cd", noise**-2.0, gram)
+            total += _eliminated(gram, self.states)
+        with np.errstate(divide="ignore"):
+            # what has no torque along this motion cannot be found
+            size = SHARE * self.drive / np.sqrt(power / self.count)
+        scale = np.concatenate([[np.inf], self.prior, size])
+        for one, place in zip(variants, places, strict=True):
+            if one.offset:
+                scale[list(place)] = SPACING
+            elif (nominal := self.nominal(one.name)) is not None:
+                scale[list(place)] = np.minimum(scale[list(place)], OFF * nominal)
+        centre = np.zeros(at)
+        centre[1 : 1 + own] = self.centre
+        return Columns(total, own, tuple(places), tuple(offsets), scale, centre, self.bound, self._twins(variants, places))
+
+    def _twins(self, variants: Sequence[Candidate], places: Sequence[tuple[int, ...]]) -> dict[int, tuple[int, float]]:
+        """Columns that are those of other numbers: the error of a number that is free acts as that number does."""
+        slopes = [float(one.slope(self.theta[i])) for i, one in enumerate(self.free)]
+        found = {}
+        for one, place in zip(variants, places, strict=True):
+            if (i := self.same(one.name)) is not None:
+                found[place[0]] = 1 + i, 1.0 / slopes[i]
+        for j, one in enumerate(self.free):
+            name, _, leaf = one.path.removeprefix("effects.").rpartition(".")
+            if leaf in ("inertia", "viscous") and (i := self.same(name)) is not None:
+                found[1 + j] = 1 + i, slopes[j] / slopes[i]
+        return found
+
+    def _power(self, torques: np.ndarray, signals: Signals) -> np.ndarray:
+        """Sums of squares of torques, referred to the motor."""
+        over = np.array([*(signals.over(side) for side in self.sides), 1.0])
+        return np.einsum("cts,cts->cs", torques, torques) @ over**-2.0
+
+    def shown(self, smoothness: Sequence[float], noise: np.ndarray) -> float:
+        """Standard deviations by which the errors show the input: a part of it is seen where that part of them is.
+
+        Args:
+            smoothness: of the predictor, by side.
+            noise: rms of its errors, by side, rad.
+        """
+        products = self.columns([all_of_the_input()], smoothness, noise).products
+        return float(np.sqrt(products[-1, -1]))
+
+    def share(self, name: str) -> float:
+        """Torque of an effect that the model has, rms over the driving torque's."""
+        effect = get_leaf(self.experiment, f"effects.{name}")
+        power = sum(self._power(signals.of([effect])[0][None], signals)[0] for signals in self.signals)
+        return float(np.sqrt(power / self.count)) / self.drive
+
+    def sizes(self, names: Sequence[str]) -> dict[str, float]:
+        """Prior relative standard deviation of the amplitudes of effects that the model has."""
+        found = {}
+        for name in names:
+            found[name] = SHARE / max(self.share(name), 1e-150)
+            if (nominal := self.nominal(name)) is not None:
+                effect = get_leaf(self.experiment, f"effects.{name}")
+                (value,) = (abs(float(getattr(effect, leaf))) for leaf in ("inertia", "viscous") if hasattr(effect, leaf))
+                found[name] = min(found[name], OFF * nominal / max(value, 1e-300))
+        return found
+
+    def same(self, name: str) -> int | None:
+        """Index of the model's own number that an effect is the error of."""
+        side, _, kind = name.partition(".")
+        path = f"drive.{side}_{kind.removesuffix('_friction')}" if kind in ("inertia", "viscous_friction") else ""
+        return next((i for i, one in enumerate(self.free) if one.path == path), None)
+
+    def nominal(self, name: str) -> float | None:
+        """The number of the drive that an effect is the error of, if it is one and is not zero."""
+        side, _, kind = name.partition(".")
+        if kind not in ("inertia", "viscous_friction"):
+            return None
+        drive = self.experiment.drive
+        value = float(drive.inertia(side) if kind == "inertia" else drive.viscous(side))
+        return value if value > 0.0 else None
+
+
+def _least_squares(total: np.ndarray, precision: np.ndarray, centre: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Coefficients of the columns behind the first with a prior; none is further from its centre than `reach`."""
+    fixed = np.zeros(len(centre), bool)
+    at = centre.copy()
+    while True:
+        matrix = total[1:, 1:] + np.diag(precision)
+        size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        towards = total[1:, 0] - precision * centre + matrix[:, fixed] @ at[fixed]
+        free = ~fixed
+        unit = (matrix / np.outer(size, size))[np.ix_(free, free)]
+        found = at.copy()
+        found[free] = -np.linalg.lstsq(unit, (towards / size)[free], rcond=1e-12)[0] / size[free]
+        over = free & (np.abs(found - centre) > reach)
+        if not over.any():
+            return found
+        at[over] = centre[over] + np.sign(found - centre)[over] * reach[over]
+        fixed |= over
+
+
+def _scaled(gram: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse of the products of the last columns, the initial states, which may be all but alike; and their size."""
+    inner = gram[-states:, -states:]
+    if not np.isfinite(inner).all():  # of a model that diverges
+        return np.zeros_like(inner), np.ones(states)
+    size = np.sqrt(np.maximum(np.diag(inner), 0.0))
+    size = np.where(size > _SILENT * np.max(size), size, np.inf)
+    return np.linalg.pinv(inner / np.outer(size, size), rcond=1e-12, hermitian=True), size
+
+
+def _as_it_stands(grams: np.ndarray, states: int) -> np.ndarray:
+    """Squares of the first column by side, some last states at their best."""
+    if states == 0 or not np.isfinite(grams).all():
+        return grams[:, 0, 0]
+    weight = 1.0 / np.maximum(grams[:, 0, 0], 1e-300)
+    total = np.einsum("s,scd->cd", weight, grams)
+    at = np.zeros(total.shape[0])
+    at[0] = 1.0
+    at[-states:] = -_response(total, states)[:, 0]
+    return np.einsum("c,scd,d->s", at, grams, at)
+
+
+def _lost(gram: np.ndarray, states: int) -> float:
+    """What rounding may take off the square of the first column when the initial states are eliminated."""
+    inner = gram[-states:, -states:]
+    size = np.sqrt(np.maximum(np.diag(inner), 0.0))
+    real = size > _SILENT * np.max(size)
+    if not real.any() or not np.isfinite(inner).all():
+        return 0.0
+    spread = np.abs(np.linalg.eigvalsh(inner[np.ix_(real, real)] / np.outer(size[real], size[real])))
+    return float(np.finfo(float).eps * gram[0, 0] * spread[-1] / max(spread[0], 1e-300))
+
+
+def _response(gram: np.ndarray, states: int) -> np.ndarray:
+    """What the initial states take off the other columns."""
+    inverse, size = _scaled(gram, states)
+    return (inverse @ (gram[-states:, :-states] / size[:, None])) / size[:, None]
+
+
+def _eliminated(gram: np.ndarray, states: int) -> np.ndarray:
+    """Products of columns without what the last of them, the initial states, explain."""
+    return gram[:-states, :-states] - gram[:-states, -states:] @ _response(gram, states)

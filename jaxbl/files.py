@@ -1,0 +1,58 @@
+"""Files and folders that commands write: whole or not at all, as JSON that any program reads."""
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .errors import InputError
+
+
+def plain(value: Any) -> Any:
+    """A value that JSON can hold: arrays and tables of numbers become lists, what is not finite becomes None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    value = np.asarray(value)
+    if value.ndim:
+        return [plain(item) for item in value.tolist()]
+    value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """An object from a file of ours."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError(f"{path}: is damaged ({error}); remove it, or choose another folder with --out") from None
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: is not one of jaxbl's files; choose another folder with --out")
+    return data
+
+
+def write_atomic(path: Path, content: str | bytes) -> None:
+    """Write a file so that it is either there whole or not at all."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    draft.write_bytes(content.encode() if isinstance(content, str) else content)
+    draft.replace(path)
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder that can be written to. Raises `InputError` where that is not possible."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / f".probe.{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+    except FileExistsError:
+        raise InputError(f"{path}: is a file; --out should name a folder") from None
+    except NotADirectoryError:
+        raise InputError(f"{path}: lies under a file; --out should name a folder") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written to ({error.strerror}); choose another folder with --out") from None

@@ -1,0 +1,1 @@
+"""Which gains, and which theory to trust: verification of the conditions, tuning, pilot runs, accuracy laws."""

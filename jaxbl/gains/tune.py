@@ -1,0 +1,347 @@
+"""Gains chosen for a drive: the function behind `jaxbl tune`.
+
+A pilot run finds the bound f⁺ of each side. Gains are then searched on a map over alpha / f⁺ and lambda / √f⁺, both
+observers in the same runs (they do not influence each other), and on zooms around each side's best point. Every stage is a
+study of its own, kept in the folder's `tune/`: an interrupted search goes on where it stopped, a finished one is only read.
+"""
+
+# pandas' own annotations are wider than what its methods return
+# pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false, reportReturnType=false
+# pyright: reportGeneralTypeIssues=false
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from jaxbl.config import TUNE_NAMES, Config, TuneTable, read_config
+from jaxbl.errors import NoResult
+from jaxbl.files import make_folder, write_atomic
+from jaxbl.sweeps.metrics import undisturbed
+from jaxbl.sweeps.programs import Backend, backend_of
+from jaxbl.sweeps.store import backend_kept, claim, mark
+from jaxbl.sweeps.sweep import sweep
+from jaxbl.workers import Progress
+
+from .pilot import Scenarios, pilot, scenarios_of
+from .tune_summary import FIGURES, figures_of, summarise
+
+Gains = dict[str, tuple[float, float]]
+"""lambda (rad^0.5/s) and alpha (rad/s^2) of each side."""
+
+USUAL_LAMBDA, USUAL_ALPHA = 1.5, 1.1
+"""The usual rule (Levant 1998): lambda = 1.5 sqrt(f_plus), alpha = 1.1 f_plus."""
+
+_FINEST = 1e-6  # relative steps below this are no longer worth a run
+
+
+@dataclasses.dataclass(frozen=True)
+class Tuning:
+    """Chosen gains, and how they were found.
+
+    Attributes:
+        config: the study.
+        summary: plain data, as in `tuning.json`.
+        candidates: for each side, one row for each pair of gains tried: `stage` (0 is the coarse map), `lambda`, `alpha`,
+            `lambda_ratio`, `alpha_ratio`, whether all runs `converged` and are `finite`, largest `velocity_rmse`,
+            `torque_rmse`, `convergence_time`, `convergence_time_worst` and `f_plus`, least `margin_alpha` and
+            `margin_exact`, `error` (the objective) and `feasible`.
+        cost: seconds of compilation and of computing, and lanes computed in this call.
+        scanned: what the fused loop did not know of runs that this call scanned in its place.
+    """
+
+    config: Config
+    summary: dict[str, Any]
+    candidates: dict[str, pd.DataFrame]
+    cost: dict[str, float]
+    scanned: tuple[str, ...] = ()
+
+
+def tune(
+    study: str | Path | Mapping[str, Any] | Config,
+    out: str | Path | None = None,
+    *,
+    progress: Progress | None = None,
+    devices: list[Any] | None = None,
+    overwrite: bool = False,
+    backend: Backend | None = None,
+) -> Tuning:
+    """Choose lambda and alpha of both observers for a study.
+
+    Args:
+        study: TOML file, mapping or config; its `[tune]` table says what is asked of the gains, its axes are not used.
+        out: folder to keep the runs in; a search that was interrupted there goes on where it stopped. Without it nothing
+            is written.
+        progress: called with finished and total lanes of all stages.
+        devices: JAX devices to use; left out, all local ones.
+        overwrite: remove the results of another study from `out`.
+        backend: `fused` or `scan` (:func:`jaxbl.sweep`); left out, the faster one here.
+
+    Raises:
+        InputError: wrong config, a folder that holds something else, or a backend that cannot run the study.
+        NoResult: no gains in the range meet the constraints, or the drive diverges.
+    """
+    config, backend = read_config(study), backend_of(backend)
+    table = config.tune or TuneTable()
+    config = config.model_copy(update={"tune": table})
+    scenarios = scenarios_of(config, table)
+    stages, found = None, None
+    if out is not None:
+        claim(Path(out), config, "tune", overwrite=overwrite)
+        stages = Path(out) / "tune"
+        backend = backend_kept(stages / "manifest.json", backend)
+        if (stages / "manifest.json").exists():
+            found = json.loads((stages / "manifest.json").read_text(encoding="utf-8")).get("pilot")
+    search = Search(scenarios, table, found or pilot(scenarios, table), stages, devices, overwrite, backend)
+    if stages is not None and found is None:
+        # before the stages: it is what makes the folder this study's
+        make_folder(stages)
+        write_atomic(
+            stages / "manifest.json",
+            json.dumps(mark(config, "tune") | {"pilot": search.pilot, "backend": backend}, indent=2),
+        )
+    search.progress = progress
+    search.run()
+    summary = summarise(search, search.compare(held_out=False), search.compare(held_out=True))
+    return Tuning(config, summary, search.candidates, search.cost, tuple(search.scanned))
+
+
+class Window(NamedTuple):
+    """Ends of the ratios searched on one side."""
+
+    alpha: tuple[float, float]
+    lambda_: tuple[float, float]
+
+    def around(self, alpha: float, lambda_: float, num: int, limits: "Window") -> "Window":
+        """One cell each way about a point, inside of `limits`."""
+        ends = []
+        for (low, high), centre, (least, largest) in zip(self, (alpha, lambda_), limits, strict=True):
+            cell = _cell((low, high), num)
+            ends.append((max(centre / cell, least), min(centre * cell, largest)))
+        return Window(*ends)
+
+    def plain(self) -> dict[str, list[float]]:
+        """The ends as JSON has them."""
+        return {"alpha_ratio": list(self.alpha), "lambda_ratio": list(self.lambda_)}
+
+
+def _cell(ends: tuple[float, float], num: int) -> float:
+    """Ratio of neighbouring values."""
+    return (ends[1] / ends[0]) ** (1.0 / (num - 1))
+
+
+class Search:
+    """The stages of a search: coarse map, zooms, comparison."""
+
+    def __init__(
+        self,
+        scenarios: Scenarios,
+        table: TuneTable,
+        pilot: dict[str, Any],
+        folder: Path | None,
+        devices: list[Any] | None,
+        overwrite: bool,
+        backend: Backend | None,
+    ):
+        self.scenarios, self.table, self.pilot = scenarios, table, pilot
+        self.folder, self.devices, self.overwrite, self.backend = folder, devices, overwrite, backend
+        self.sides = tuple(pilot)
+        self.progress: Progress | None = None
+        self.metric = f"{table.objective}_rmse"
+        self.f_plus = {side: float(found["f_plus"]) for side, found in pilot.items()}
+        for side, bound in self.f_plus.items():
+            if not bound > 0.0:
+                raise undisturbed(side)
+        self.limits = Window(
+            (table.alpha_ratio.start, table.alpha_ratio.stop), (table.lambda_ratio.start, table.lambda_ratio.stop)
+        )
+        self.windows = [dict.fromkeys(self.sides, self.limits)]
+        self.candidates: dict[str, pd.DataFrame] = {}
+        self.cost = {"compile_seconds": 0.0, "run_seconds": 0.0, "lanes": 0.0}
+        self.scanned: dict[str, None] = {}
+        self._done = 0
+        seeds, lanes = scenarios.config.sweep.seeds, len(scenarios.names)
+        self._total = seeds * lanes * (table.num**2 * (1 + table.refine) + 2 * len(self.gains_to_compare({})))
+
+    def run(self) -> None:
+        """Search. Raises `NoResult` where nothing is feasible."""
+        for stage in range(self.table.refine + 1):
+            if stage:
+                last = self.windows[-1]
+                if all(_cell(ends, self.table.num) - 1.0 < _FINEST for w in last.values() for ends in w):
+                    break
+                best = {side: self.best(side) for side in self.sides}
+                self.windows.append(
+                    {
+                        side: last[side].around(
+                            best[side]["alpha_ratio"], best[side]["lambda_ratio"], self.table.num, self.limits
+                        )
+                        for side in self.sides
+                    }
+                )
+            self._map(stage)
+
+    def best(self, side: str) -> dict[str, Any]:
+        """The feasible candidate with the least error; of equals, the one that converges first."""
+        frame = self.candidates[side]
+        return frame[frame["feasible"]].sort_values(["error", "convergence_time"], kind="stable").iloc[0].to_dict()
+
+    def cells(self, side: str) -> dict[str, float]:
+        """Ratio of neighbouring values of each gain in the last stage."""
+        return {
+            key: _cell(ends, self.table.num) for key, ends in zip(("alpha", "lambda"), self.windows[-1][side], strict=True)
+        }
+
+    def _map(self, stage: int) -> None:
+        """Run the points of a stage and judge them."""
+        alphas, lambdas = {}, {}
+        for side, window in self.windows[stage].items():
+            bound, num = self.f_plus[side], self.table.num
+            alphas[f"observer.{side}.alpha"] = (bound * np.geomspace(*window.alpha, num)).tolist()
+            lambdas[f"observer.{side}.lambda"] = (math.sqrt(bound) * np.geomspace(*window.lambda_, num)).tolist()
+        frame = self._sweep("coarse" if stage == 0 else f"refine-{stage}", [("alpha", alphas), ("lambda", lambdas)])
+        for side in self.sides:
+            new = self._judge(side, _worst(frame, side)).assign(stage=stage)
+            old = self.candidates.get(side)
+            self.candidates[side] = new if old is None else pd.concat([old, new], ignore_index=True)
+            if not self.candidates[side]["feasible"].any():
+                raise NoResult(self._why_none(side))
+
+    def _judge(self, side: str, found: pd.DataFrame) -> pd.DataFrame:
+        bound = self.f_plus[side]
+        return found.assign(
+            alpha_ratio=found["alpha"] / bound,
+            lambda_ratio=found["lambda"] / math.sqrt(bound),
+            error=found[f"{self.table.objective}_rmse"],
+            feasible=np.logical_and.reduce(list(self.kept(found).values())),
+        )
+
+    def kept(self, found: pd.DataFrame) -> dict[str, np.ndarray]:
+        """Which candidates keep which constraint, by its key in `[tune]`, and `converged`."""
+        table = self.table
+        kept = {
+            "converged": found["converged"],
+            "margin_alpha": found["margin_alpha"] >= table.margin_alpha,
+            "margin_exact": found["margin_exact"] >= table.margin_exact,
+        }
+        if table.longest_convergence is not None:
+            kept["longest_convergence"] = found["convergence_time"] <= table.longest_convergence
+        return {name: values.to_numpy(bool) for name, values in kept.items()}
+
+    def _why_none(self, side: str) -> str:
+        found, limits = self.candidates[side], self.limits
+        run = self.scenarios.config.run
+        least = {
+            "converged": f" (least velocity error {found['velocity_rmse'].min():.3g} rad/s rms, "
+            f"run.velocity_tolerance = {run.velocity_tolerance:g}, run.position_tolerance = {run.position_tolerance:g})",
+            "margin_alpha": f" (largest {found['margin_alpha'].max():.3g})",
+            "margin_exact": f" (largest {found['margin_exact'].max():.3g})",
+            "longest_convergence": f" (fastest {found['convergence_time'].min():.3g} s)",
+        }
+        counts = "; ".join(
+            f"{'converged' if key == 'converged' else f'{key} = {getattr(self.table, key):g}'}: "
+            f"{int(values.sum())}{least.get(key, '')}"
+            for key, values in self.kept(found).items()
+        )
+        return (
+            f"{side}: none of the {len(found)} gains with alpha / f⁺ in {limits.alpha[0]:g} ... {limits.alpha[1]:g} and "
+            f"lambda / √f⁺ in {limits.lambda_[0]:g} ... {limits.lambda_[1]:g} (f⁺ = {self.f_plus[side]:.3g} rad/s²) keeps "
+            f"all constraints in all runs; how many keep each: {counts}"
+        )
+
+    def usual(self) -> Gains:
+        """Levant's usual rule at the pilot's f_plus."""
+        return {side: (USUAL_LAMBDA * math.sqrt(bound), USUAL_ALPHA * bound) for side, bound in self.f_plus.items()}
+
+    def gains_to_compare(self, tuned: Gains) -> dict[str, Gains]:
+        """Gains of both sides by name."""
+        observers = {side: getattr(self.scenarios.config.observer, side) for side in self.sides}
+        own = {side: (float(observer.lambda_), float(observer.alpha)) for side, observer in observers.items()}
+        others = {
+            other.name: {side: (getattr(other, side).lambda_, getattr(other, side).alpha) for side in self.sides}
+            for other in self.table.compare
+        }
+        return dict(zip(TUNE_NAMES, (tuned, self.usual(), own), strict=True)) | others
+
+    def compare(self, *, held_out: bool) -> list[dict[str, Any]]:
+        """Figures of all named gains, one row for each name and side: on the study's own runs, or on the held-out input with
+        noise that the search has not seen."""
+        best = {side: self.best(side) for side in self.sides}
+        named = self.gains_to_compare({side: (float(row["lambda"]), float(row["alpha"])) for side, row in best.items()})
+        # gains of two names may be the same, points of a study may not
+        unique = list({tuple(gains.values()): gains for gains in named.values()}.values())
+        columns = {
+            f"observer.{side}.{key}": [gains[side][i] for gains in unique]
+            for side in self.sides
+            for i, key in enumerate(("lambda", "alpha"))
+        }
+        frame = self._sweep("holdout" if held_out else "named", [("gains", columns)], held_out=held_out)
+        rows = []
+        for name, gains in named.items():
+            for side, (lambda_, alpha) in gains.items():
+                own = (frame[f"observer.{side}.lambda"] == lambda_) & (frame[f"observer.{side}.alpha"] == alpha)
+                # another pair may share this side's gains: its runs are the same
+                rows.append(
+                    figures_of(name, side, frame[own].drop_duplicates([*self.scenarios.columns, "seed"]), (lambda_, alpha))
+                )
+        return rows
+
+    def _sweep(self, name: str, axes: list[tuple[str, dict[str, list[float]]]], *, held_out: bool = False) -> pd.DataFrame:
+        """Run one stage over scenarios and some axes that advance together."""
+        config = self.scenarios.config
+        data = config.resolved()
+        for key in ("notes", "figures", "tune", "uncertainty", "axes"):
+            data.pop(key, None)
+        data["title"] = f"{config.title} ({name})" if config.title else name
+        for side in self.sides:
+            data["observer"][side]["velocity_error"] = self.pilot[side]["velocity_error"]
+        seeds, chunk = config.sweep.seeds, config.sweep.chunk
+        data["sweep"] = {"seeds": seeds, "first_seed": config.sweep.first_seed + (seeds if held_out else 0)}
+        data["sweep"] |= {} if chunk is None else {"chunk": chunk}
+        if held_out and self.table.holdout is not None:
+            data["excitation"] = self.table.holdout.model_dump(by_alias=True, exclude_none=True)
+        together = [("scenario", self.scenarios.columns), *axes]
+        data["axes"] = [
+            {"path": path, "values": values, **({"zip": label} if len(columns) > 1 else {})}
+            for label, columns in together
+            for path, values in columns.items()
+        ]
+        done = self._done
+
+        def update(finished: int, total: int) -> None:
+            self._done = done + finished
+            if self.progress:
+                self.progress(self._done, max(self._total, self._done))
+
+        folder = None if self.folder is None else self.folder / name
+        result = sweep(data, folder, progress=update, devices=self.devices, overwrite=self.overwrite, backend=self.backend)
+        self.scanned |= dict.fromkeys(result.scanned)
+        self.cost = {key: value + result.cost[key] for key, value in self.cost.items()}
+        names = [f"{side}.{figure}" for side in self.sides for figure in FIGURES]
+        paths = [axis["path"] for axis in data["axes"]]
+        return result.read([*paths, "seed", "finite", *names])
+
+
+_LARGEST = ("velocity_rmse", "torque_rmse", "convergence_time", "convergence_time_worst", "f_plus")
+
+
+def _worst(frame: pd.DataFrame, side: str) -> pd.DataFrame:
+    """One row for each pair of gains: the worst over scenarios and seeds; NaN where a run diverged or did not converge."""
+    keys = [f"observer.{side}.lambda", f"observer.{side}.alpha"]
+    part = frame[[*keys, "finite"]].assign(**{name: frame[f"{side}.{name}"] for name in FIGURES})
+    groups = part.groupby(keys, sort=True)
+    worst = {name: groups[name].max() for name in _LARGEST}
+    least = {name: groups[name].min() for name in ("margin_alpha", "margin_exact", "converged", "finite")}
+    found = pd.DataFrame(worst | least)
+    found["converged"] = found["converged"].astype(bool)
+    found["finite"] = found["finite"].astype(bool)
+    # the largest of some is not the largest of all
+    found.loc[~found["converged"], "convergence_time"] = np.nan
+    numbers = [*worst, "margin_alpha", "margin_exact"]
+    found.loc[~found["finite"], numbers] = np.nan
+    return found.rename_axis(["lambda", "alpha"]).reset_index()

@@ -1,0 +1,248 @@
+"""What a search for gains found: the numbers of `tuning.json`, and what a reader of them should know."""
+
+# pandas' own annotations are wider than what its methods return
+# pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false, reportReturnType=false
+# pyright: reportGeneralTypeIssues=false
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from jaxbl.observer.conditions import peak_ratio
+from jaxbl.sweeps.metrics import SIDE_METRICS
+
+if TYPE_CHECKING:
+    from .tune import Search
+
+FIGURES = (
+    "converged",
+    "convergence_time",
+    "convergence_time_worst",
+    "velocity_rmse",
+    "torque_rmse",
+    "margin_alpha",
+    "margin_exact",
+    "f_plus",
+)
+"""Metrics of a side that gains are judged by."""
+
+_FLAT, _WORTH = 0.05, 0.01  # relative differences of errors
+
+
+def pareto_front(candidates: pd.DataFrame) -> pd.DataFrame:
+    """The feasible candidates that no other beats in both convergence time and error, fastest first."""
+    feasible = candidates[candidates["feasible"]].sort_values(["convergence_time", "error"], kind="stable")
+    before = feasible["error"].cummin().shift(fill_value=math.inf)
+    return feasible[feasible["error"] < before]
+
+
+def summarise(search: "Search", named: list[dict[str, Any]], held_out: list[dict[str, Any]]) -> dict[str, Any]:
+    """Plain data of a finished search, as in `tuning.json`.
+
+    Args:
+        search: with all its stages run.
+        named: a row for each of the gains compared and each side (:func:`figures_of`), on the study's own runs.
+        held_out: the same on the held-out ones.
+    """
+    return _Summary(search, named, held_out).plain()
+
+
+class _Summary:
+    def __init__(self, search: "Search", named: list[dict[str, Any]], held_out: list[dict[str, Any]]):
+        self.search, self.table, self.config = search, search.table, search.scenarios.config
+        self.best = {side: search.best(side) for side in search.sides}
+        self.named, self.rows = named, held_out
+        self.factors = {side: self._factors(side) for side in search.sides}
+
+    def plain(self) -> dict[str, Any]:
+        search, table, sides = self.search, self.table, self.search.sides
+        first, seeds = self.config.sweep.first_seed, self.config.sweep.seeds
+        unit = SIDE_METRICS[f"{table.objective}_rmse"].unit
+        keys = ("lambda", "alpha", "lambda_ratio", "alpha_ratio")
+        return {
+            "title": self.config.title,
+            "objective": table.objective,
+            "objective_metric": f"worst {table.objective}_rmse ({unit}) over seeds and scenarios",
+            "seeds": [first, first + seeds - 1],
+            "scenarios": search.scenarios.names,
+            "f_plus": search.f_plus,
+            "pilot": search.pilot,
+            "margins": {"exact": table.margin_exact, "alpha": table.margin_alpha},
+            "gains": {side: {key: float(self.best[side][key]) for key in keys} for side in sides},
+            "achieved": {side: self._achieved(side) for side in sides},
+            "range": search.limits.plain() | {"num": table.num},
+            "resolution": {side: {key: ratio - 1.0 for key, ratio in search.cells(side).items()} for side in sides},
+            "stages": [{side: window.plain() for side, window in windows.items()} for windows in search.windows],
+            "named": self.named,
+            "holdout": {
+                "excitation": (table.holdout or self.config.excitation).model_dump(by_alias=True, exclude_none=True),
+                "same_excitation": table.holdout is None,
+                "seeds": [first + seeds, first + 2 * seeds - 1],
+                "f_plus": {side: search.pilot[side]["holdout_f_plus"] for side in sides},
+                "rows": self.rows,
+                "factors": self.factors,
+            },
+            "pareto": {side: _records(pareto_front(search.candidates[side])) for side in sides},
+            "remarks": [*self.config.notes, *self._remarks()],
+        }
+
+    def _achieved(self, side: str) -> dict[str, Any]:
+        row = self.best[side]
+        names = [name for name in FIGURES if name != "converged"]
+        return {name: plain_number(row[name]) for name in names} | {
+            "peak_ratio": _peak_ratio(row["lambda"], row["alpha"], row["f_plus"])
+        }
+
+    def row(self, name: str, side: str) -> dict[str, Any]:
+        return next(row for row in self.rows if (row["name"], row["side"]) == (name, side))
+
+    def _factors(self, side: str) -> dict[str, Any]:
+        """Other gains' figures over the tuned ones', on the held-out input; none for gains that do not always converge."""
+        tuned, out = self.row("tuned", side), {}
+        for row in self.rows:
+            if row["side"] != side or row["name"] == "tuned":
+                continue
+            if row["converged"] < 1.0 or tuned["converged"] < 1.0:
+                who, share = min((row["name"], row["converged"]), ("tuned", tuned["converged"]), key=lambda pair: pair[1])
+                out[row["name"]] = {"why_none": f"{who}: converged in {100.0 * share:.3g} % of the runs"}
+                continue
+            out[row["name"]] = {
+                name: {how: _ratio(row[name][how], tuned[name][how]) for how in ("worst", "median")}
+                for name in ("velocity_rmse", "torque_rmse", "convergence_time")
+            }
+        return out
+
+    def _remarks(self) -> list[str]:
+        search, table = self.search, self.table
+        lines = []
+        if table.worst_over_uncertainty and len(search.scenarios.names) == 1:
+            lines.append("No inertia or viscous friction is uncertain (uncertainty.exact): only the nominal drive was run.")
+        elif table.worst_over_uncertainty:
+            lines.append(
+                f"All figures are the worst over {len(search.scenarios.names)} drives: {'; '.join(search.scenarios.names)}."
+            )
+        for side in search.sides:
+            pilot = search.pilot[side]
+            if pilot["starting_error_assumed"]:
+                lines.append(
+                    f"{side}: the study gives the observer no starting error, which a convergence time needs: it starts "
+                    f"with a velocity error of {pilot['velocity_error']:.3g} rad/s, the largest velocity of the pilot run."
+                )
+            lines.append(
+                f"{side}: f⁺ = {search.f_plus[side]:.4g} rad/s², the larger of two figures of the pilot run: the largest "
+                f"|acceleration - f(velocity)| along it, {pilot['disturbance']:.4g}, and that at the start with viscous "
+                f"friction times the starting error, {pilot['start']:.4g}."
+            )
+            lines += self._about_optimum(side)
+        if table.holdout is None:
+            lines.append(
+                "No tune.holdout is given: gains are compared on the study's own excitation, with noise that the search did "
+                "not see."
+            )
+        for side in search.sides:
+            lines += self._about_holdout(side)
+        return lines
+
+    def _about_optimum(self, side: str) -> list[str]:
+        search, row, lines = self.search, self.best[side], []
+        gains = (("alpha", "alpha / f⁺", search.limits.alpha), ("lambda", "lambda / √f⁺", search.limits.lambda_))
+        for gain, label, (low, high) in gains:
+            ratio, near = row[f"{gain}_ratio"], 1.01
+            if gain == "alpha" and row["margin_alpha"] < self.table.margin_alpha * near:
+                lines.append(f"{side}: the optimum lies at margin_alpha = {self.table.margin_alpha:g}.")
+                low = 0.0  # it is the margin that ends the range there
+            lines += [
+                f"{side}: the optimum lies at the end {label} = {end:g} of the range searched (tune.{gain}_ratio); "
+                "beyond it may be better gains."
+                for end, there in ((low, ratio <= low * near), (high, ratio >= high / near))
+                if there
+            ]
+        found = search.candidates[side]
+        kept = search.kept(found)
+        for key in kept:
+            # gains that miss this constraint alone
+            missed = found[~kept[key] & np.logical_and.reduce([values for name, values in kept.items() if name != key])]
+            if key != "converged" and len(missed) and missed["error"].min() < (1.0 - _WORTH) * row["error"]:
+                least = missed.loc[missed["error"].idxmin()]
+                lines.append(
+                    f"{side}: {key} = {getattr(self.table, key):g} holds the optimum back: of the gains tried, lambda = "
+                    f"{least['lambda']:.3g}, alpha = {least['alpha']:.3g} miss it alone, with an error of "
+                    f"{least['error']:.3g} instead of {row['error']:.3g}."
+                )
+        coarse = found.query("stage == 0 and feasible")
+        near = coarse[coarse["error"] <= (1.0 + _FLAT) * row["error"]]
+        if len(near) > 1:
+            ends = ", ".join(f"{gain} from {near[gain].min():.3g} to {near[gain].max():.3g}" for gain in ("alpha", "lambda"))
+            share = f"{len(near)} points of the coarse map are within {100 * _FLAT:.0f} % of it"
+            lines.append(f"{side}: the optimum is flat: {share}, {ends}.")
+        return lines
+
+    def _about_holdout(self, side: str) -> list[str]:
+        lines, tuned = [], self.row("tuned", side)
+        bound, own = self.search.pilot[side]["holdout_f_plus"], self.search.f_plus[side]
+        if bound > own:
+            lines.append(
+                f"{side}: the held-out excitation disturbs more than the study's (f⁺ = {bound:.3g} against {own:.3g} "
+                "rad/s²): the margins there are smaller than asked for."
+            )
+        if tuned["converged"] < 1.0:
+            lines.append(
+                f"{side}: the tuned gains converge in only {100 * tuned['converged']:.3g} % of the held-out runs: the "
+                "study's excitation is not representative of it."
+            )
+        for name, found in self.factors[side].items():
+            if "why_none" in found and tuned["converged"] == 1.0:
+                share = 100.0 * self.row(name, side)["converged"]
+                lines.append(
+                    f"{side}: {called_gains(name)} converge in only {share:.3g} % of the held-out runs: no factor is stated."
+                )
+        return lines
+
+
+def called_gains(name: str) -> str:
+    """How sentences call some gains of a comparison."""
+    return {"usual rule": "the usual rule's gains", "config": "the study's own gains"}.get(name, f"the gains '{name}'")
+
+
+def figures_of(name: str, side: str, runs: pd.DataFrame, gains: tuple[float, float]) -> dict[str, Any]:
+    """Figures of some gains over all runs of a side: a row of the comparison."""
+    figures = {figure: runs[f"{side}.{figure}"] for figure in FIGURES}
+    converged, finite = figures["converged"].astype(bool), runs["finite"].astype(bool)
+    bound = figures["f_plus"].max() if finite.all() else math.nan
+    row: dict[str, Any] = {
+        "name": name, "side": side, "lambda": gains[0], "alpha": gains[1], "runs": len(runs),
+        "converged": float(converged.mean()), "finite": float(finite.mean()),
+    }  # fmt: skip
+    for figure in ("velocity_rmse", "torque_rmse", "convergence_time"):
+        whole = converged.all() if figure == "convergence_time" else finite.all()
+        values = figures[figure]
+        row[figure] = {"worst": plain_number(values.max()) if whole else None, "median": plain_number(values.median())}
+    for figure in ("margin_alpha", "margin_exact"):
+        row[figure] = plain_number(figures[figure].min()) if finite.all() else None
+    # what a disturbance within f_plus could make of it
+    row["convergence_time_worst"] = plain_number(figures["convergence_time_worst"].max()) if finite.all() else None
+    return row | {"f_plus": plain_number(bound), "peak_ratio": _peak_ratio(*gains, bound)}
+
+
+def _records(front: pd.DataFrame) -> list[dict[str, Any]]:
+    names = ["lambda", "alpha", "lambda_ratio", "alpha_ratio", "convergence_time", "error"]
+    return [{name: plain_number(row[name]) for name in names} for _, row in front.iterrows()]
+
+
+def _peak_ratio(lambda_: float, alpha: float, f_plus: float) -> float | None:
+    with jax.enable_x64(True):
+        return plain_number(peak_ratio(*(jnp.asarray(float(x)) for x in (lambda_, alpha, f_plus))))
+
+
+def _ratio(value: float | None, other: float | None) -> float | None:
+    return None if value is None or not other else value / other
+
+
+def plain_number(value: Any) -> float | None:
+    """A number that JSON knows: what is not finite becomes None."""
+    value = float(value)
+    return value if math.isfinite(value) else None

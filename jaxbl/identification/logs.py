@@ -1,0 +1,154 @@
+"""What commands on measured logs share: reading, the study's experiment at a log's period, kinematics, gains, units."""
+
+# arrays of numpy go where those of jax are asked for
+# pyright: reportArgumentType=false
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbl.config import Config, prepare
+from jaxbl.drive.parameters import get_leaf, leaf_paths
+from jaxbl.errors import InputError
+from jaxbl.identification.observer_gains import Gains, choose_gains
+from jaxbl.identification.regression import Kinematics, from_smoothed, shortest
+from jaxbl.identification.search import Channels
+from jaxbl.identification.trajectory import PHYSICAL, is_positive
+from jaxbl.records import Record, join, read_record
+from jaxbl.simulate import Experiment
+
+LOG_NAMES = {"motor": "theta_e", "load": "theta_s"}
+"""Channel of each side."""
+
+Logs = str | Path | Record | Sequence[str | Path | Record]
+
+
+def read_logs(config: Config, logs: Logs, gear_tolerance: float = 0.0) -> Record:
+    """Read logs as a study says, with the channels that its drive needs; `gear_tolerance` as of `read_record`."""
+    several = [logs] if isinstance(logs, str | Path | Record) else list(logs)
+    if not several:
+        raise InputError("no log: at least one is needed")
+    return join([one if isinstance(one, Record) else _read_one(config, one, gear_tolerance) for one in several])
+
+
+def _read_one(config: Config, log: str | Path, gear_tolerance: float) -> Record:
+    ratio = config.drive.gear_ratio if config.drive.kind == "two_inertia" else None
+    record = read_record(log, config.log, gear_ratio=ratio, gear_tolerance=gear_tolerance)
+    sides = ("motor", "load") if config.drive.kind == "two_inertia" else ("motor",)
+    for side in sides:
+        if side not in record.positions:
+            raise InputError(
+                f"{record.path}: no {side} position ({LOG_NAMES[side]}), which a {config.drive.kind} drive needs; "
+                f"the log has {', '.join(record.positions)}"
+            )
+    if record.torque is None:
+        notes = (*record.notes, "No input torque was recorded: the drive is taken to move freely, without one.")
+        record = dataclasses.replace(record, torque=np.zeros(len(record.time)), notes=notes)
+    return record
+
+
+def identity_of(config: Config, missing: frozenset[str], *records: Record | None) -> str:
+    """Hash of a study and logs: of everything that decides what is found in them."""
+    text = json.dumps([config.resolved(), sorted(missing), version("jaxbl")], sort_keys=True)
+    total = hashlib.sha256(text.encode())
+    for record in records:
+        if record is not None:
+            total.update(str(record.segments).encode())
+            for values in (record.time, record.torque, *record.positions.values(), record.transmitted):
+                total.update(b"" if values is None else np.ascontiguousarray(values).tobytes())
+    return total.hexdigest()[:16]
+
+
+def arrays(values: Mapping[str, float]) -> dict[str, jax.Array]:
+    """Numbers by path as arrays."""
+    return {path: jnp.asarray(value) for path, value in values.items()}
+
+
+def on_record(config: Config, record: Record) -> Experiment:
+    """The study's experiment at the record's period, with plant steps no longer than the study's."""
+    step = config.run.sample_period / config.run.substeps
+    substeps = max(int(np.ceil(record.sample_period / step * (1.0 - 1e-9))), 1)
+    experiment = prepare(config.model_copy(update={"run": config.run.model_copy(update={"precision": "float64"})}))
+    return eqx.tree_at(
+        lambda e: e.run,
+        experiment,
+        dataclasses.replace(
+            experiment.run,
+            sample_period=jnp.asarray(record.sample_period),
+            # along a log nothing asks for it; programs are compiled for one
+            steps=1,
+            substeps=substeps,
+        ),
+    )
+
+
+def default_paths(config: Config, experiment: Experiment) -> list[str]:
+    """All numbers of the plant that are not known exactly and have a value to start from."""
+    return [
+        path
+        for path, about in leaf_paths(experiment).items()
+        if path.split(".")[0] in PHYSICAL
+        and path not in config.uncertainty.exact
+        and not (is_positive(about) and float(get_leaf(experiment, path)) <= 0.0)
+    ]
+
+
+def decimation(config: Config, record: Record) -> int:
+    """Samples that become one where torques are compared."""
+    bandwidth = config.identify.bandwidth
+    if bandwidth is None:
+        return 10
+    return max(round(0.5 / (bandwidth * record.sample_period)), 1)
+
+
+def kinematics_of(record: Record, channels: Channels, factor: int) -> list[Kinematics]:
+    """The parts of a record that are long enough to be decimated."""
+    assert record.torque is not None
+    found = []
+    for i, part in enumerate(record.segments):
+        if part.stop - part.start >= max(2 * shortest(factor), 50):
+            smoothed = {side: parts[i] for side, parts in channels.smoothed.items()}
+            transmitted = None if record.transmitted is None else record.transmitted[part]
+            time = record.time[part] - record.time[0]
+            found.append(from_smoothed(time, record.torque[part], smoothed, transmitted))
+    return found
+
+
+def gains_for(
+    missing: frozenset[str], fitted: Experiment, record: Record, channels: Channels
+) -> tuple[dict[str, Gains], dict[str, float]]:
+    """Gains of the observers that the study leaves open, by side and by dotted path."""
+    sides = [side for side in fitted.sides if f"observer.{side}" in missing]
+    if not sides:
+        return {}, {}
+    i = int(np.argmax([part.stop - part.start for part in record.segments]))
+    part = record.segments[i]
+    assert record.torque is not None
+    smoothed = {side: parts[i] for side, parts in channels.smoothed.items()}
+    kinematics = from_smoothed(record.time[part] - record.time[part][0], record.torque[part], smoothed)
+    chosen = choose_gains(fitted, kinematics, {side: record.positions[side][part] for side in fitted.sides})
+    values = {}
+    for side in sides:
+        values |= {f"observer.{side}.lambda": chosen[side].lambda_, f"observer.{side}.alpha": chosen[side].alpha}
+    return {side: chosen[side] for side in sides}, values
+
+
+_LINEAR = (("kg m²", "kg"), ("N m", "N"), ("rad", "m"))
+
+
+def unit_on(record: Record, path: str, unit: str) -> str:
+    """The unit of a number on a log: N and m where its side moves in m."""
+    side = "load" if any(part.startswith("load") for part in path.split(".")) else "motor"
+    channels = record.findings.channels
+    if LOG_NAMES[side] in channels and channels[LOG_NAMES[side]].unit == "m":
+        for turning, linear in _LINEAR:
+            unit = unit.replace(turning, linear)
+    return unit

@@ -1,1 +1,0 @@
-"""A study: config, points, engine, store, metrics, single runs."""

@@ -1,0 +1,276 @@
+"""Runs the points of a study: chunks of one static shape over all local devices, one atomic file per chunk.
+
+A chunk is a block of seeds times a block of points. The lane function is vmapped over points inside and seeds outside, so
+that what depends on neither (the excitation, the plant in a gain map) is computed once, and noise once a seed.
+"""
+
+import dataclasses
+import math
+import time
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import pandas as pd
+
+from jaxbl.config import Config, precision, prepare
+
+from .metrics import metric_columns, with_conditions
+from .points import Points
+from .programs import Backend, Layout, Program, backend_of, compile_program, faster
+
+LANES_PER_DEVICE: dict[Backend, int] = {"scan": 4096, "fused": 16384}
+"""Default lanes a device computes at once: the scan's carry then stays in a core's cache, and what lanes of the fused loop
+share counts little (benchmarks/NOTES.md)."""
+LANES_ON_A_GPU = 2**18
+"""The same there, by either backend: some 2000 lanes for each of its processors, which is what keeps all of it busy."""
+
+
+class Chunk(NamedTuple):
+    """One call of a compiled program: every one of some seeds at every one of some points of a group.
+
+    Attributes:
+        index: number of the chunk in its study.
+        group: index of the group.
+        seeds: as many as the layout's, or fewer.
+        points: indices of points of the group, as many as the layout's, or fewer.
+    """
+
+    index: int
+    group: int
+    seeds: np.ndarray
+    points: np.ndarray
+
+
+REFINED_LANES_PER_DEVICE = 1024
+"""The same in a refined study: its batches are small, and fill larger chunks badly (benchmarks/NOTES.md)."""
+
+
+def layout_for(config: Config, points: Points, devices: list[Any], backend: Backend, chunk: int | None) -> Layout:
+    """Chunk shape: as many lanes as asked for, or as the devices want at once; whole rows of points before several seeds.
+
+    Every device gets two lanes or more: one alone is compiled to other roundings than a row of them.
+    """
+    count = len(devices)
+    if points.refinement is not None:
+        return _refined_layout(config, count, chunk)
+    capacity = chunk or count * (LANES_ON_A_GPU if devices[0].platform == "gpu" else LANES_PER_DEVICE[backend])
+    # chunks of equal size waste no padding on the last one; a multiple of the devices, along the longer side, suits them
+    per_chunk = math.ceil(points.lanes / math.ceil(points.lanes / capacity))
+    if points.lanes >= count and points.lanes > 1:
+        per_chunk = max(math.ceil(per_chunk / count), 2) * count
+    seeds = min(config.sweep.seeds, max(capacity // per_chunk, 1))
+    if points.lanes == 1:
+        seeds = max(math.ceil(seeds / count), 2) * count
+    elif points.lanes < count:
+        seeds = math.ceil(seeds / count) * count
+    return Layout(seeds, per_chunk)
+
+
+def _refined_layout(config: Config, devices: int, chunk: int | None) -> Layout:
+    """Several seeds before whole rows of points: a batch has few points, and needs all seeds of them."""
+    capacity = chunk or REFINED_LANES_PER_DEVICE * devices
+    seeds = min(config.sweep.seeds, max(capacity // (64 * devices), 1))
+    return Layout(seeds, max(math.ceil(capacity / seeds / devices), 2) * devices)
+
+
+class Engine:
+    """Compiles and runs the chunks of a study.
+
+    Args:
+        config: the study.
+        layout: chunk shape; left out, one that suits the devices.
+        devices: left out, all local ones.
+        backend: left out, the faster one here.
+        insist: refuse a study that the fused loop cannot run; else it is scanned.
+
+    Attributes:
+        scanned: what the fused loop did not know of groups that were scanned in its place.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        layout: Layout | None = None,
+        devices: list[Any] | None = None,
+        backend: Backend | None = None,
+        insist: bool = False,
+    ):
+        self.config = config
+        self.points = Points(config)
+        self.devices = devices or jax.local_devices()
+        self.backend: Backend = backend_of(backend) or self._faster()
+        self._insist = insist
+        self.layout = layout or layout_for(config, self.points, self.devices, self.backend, config.sweep.chunk)
+        self.compile_seconds = 0.0
+        self.run_seconds = 0.0
+        self.scanned: list[str] = []
+        self._compiled: tuple[int, tuple[Program, list[str]]] | None = None
+
+    def _faster(self) -> Backend:
+        """By the study, however it is cut: roundings differ between backends."""
+        if not self.points.columns(np.arange(1)):
+            # lanes that differ in nothing but their seed
+            return "scan"
+        return faster(layout_for(self.config, self.points, self.devices, "fused", None), self.devices)
+
+    def __len__(self) -> int:
+        """Number of chunks; of a refined study, those of its coarse grid."""
+        return len(self.points.groups) * self.chunks_for(self.points.coarse_lanes)
+
+    def chunks_for(self, points: int) -> int:
+        """Number of chunks that some points of a group take."""
+        return math.ceil(self.config.sweep.seeds / self.layout.seeds) * math.ceil(points / self.layout.points)
+
+    def chunks(self) -> Iterator[Chunk]:
+        """All chunks; of a refined study, those of its coarse grid."""
+        index = 0
+        for group in range(len(self.points.groups)):
+            for seeds in self._seeds():
+                for first in range(0, self.points.coarse_lanes, self.layout.points):
+                    last = min(first + self.layout.points, self.points.coarse_lanes)
+                    yield Chunk(index, group, seeds, self.points.coarse(np.arange(first, last)))
+                    index += 1
+
+    def split(self, group: int, points: np.ndarray, first_index: int = 0) -> list[Chunk]:
+        """Chunks for any points of a group, given by their indices `(points,)`, with all seeds; numbered from `first_index`.
+
+        They share the compiled program of all chunks. Points come in their order, all of them for some seeds first.
+        """
+        parts = [points[first : first + self.layout.points] for first in range(0, len(points), self.layout.points)]
+        crossed = [(seeds, part) for seeds in self._seeds() for part in parts]
+        return [Chunk(index, group, *both) for index, both in enumerate(crossed, first_index)]
+
+    def _seeds(self) -> Iterator[np.ndarray]:
+        """All seeds, as many at once as a chunk takes."""
+        end = self.config.sweep.first_seed + self.config.sweep.seeds
+        for first in range(self.config.sweep.first_seed, end, self.layout.seeds):
+            yield np.arange(first, min(first + self.layout.seeds, end))
+
+    @property
+    def rows(self) -> int:
+        """Rows of all chunks: points times seeds."""
+        return len(self.points.groups) * self.points.coarse_lanes * self.config.sweep.seeds
+
+    def run(self, chunk: Chunk) -> pd.DataFrame:
+        """Compute one chunk: a frame of one row for each seed and point, padding taken off."""
+        group = self.points.groups[chunk.group]
+        program, names = self._program(chunk.group)
+        with precision(group.config):
+            given = self._arguments(group.config, self.points.columns(chunk.points), chunk.seeds)
+            start = time.perf_counter()
+            figures = jax.block_until_ready(with_conditions(*program.run(*given)))
+            self.run_seconds += time.perf_counter() - start
+        data = self.labels(chunk)
+        for name in names:
+            data[name] = np.asarray(figures[name])[: len(chunk.seeds), : len(chunk.points)].ravel()
+        return pd.DataFrame(data)
+
+    def labels(self, chunk: Chunk) -> dict[str, np.ndarray]:
+        """What tells the rows of a chunk apart: values by axis path, and seeds."""
+        columns = self.points.columns(chunk.points)
+        structural = self.points.groups[chunk.group].structural
+        shape = (len(chunk.seeds), len(chunk.points))
+        data = {}
+        for path in self.points.paths:
+            if path in columns:
+                data[path] = np.broadcast_to(columns[path], shape).ravel()
+            else:
+                data[path] = np.full(shape, structural[path]).ravel()
+        data["seed"] = np.broadcast_to(chunk.seeds[:, None], shape).ravel()
+        return data
+
+    def _arguments(self, config: Config, columns: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[Any, Any]:
+        """Padded arrays for a compiled program: values by path, seeds."""
+
+        def pad(values: np.ndarray, size: int) -> np.ndarray:
+            return np.concatenate([values, np.repeat(values[-1:], size - len(values), axis=0)])
+
+        dtype = config.run.precision
+        padded = {path: pad(np.asarray(v, dtype), self.layout.points) for path, v in columns.items()}
+        return padded, pad(seeds.astype(np.uint32), self.layout.seeds)
+
+    def check(self) -> None:
+        """Compile the programs of all groups; the first one is kept. Raises `InputError` if the backend cannot be had."""
+        for group in reversed(range(len(self.points.groups))):
+            self._program(group)
+
+    def _program(self, group: int) -> tuple[Program, list[str]]:
+        """The compiled program of a group and the names of its figures; the last one is kept."""
+        if self._compiled is None or self._compiled[0] != group:
+            self._compiled = (group, self._compile(self.points.groups[group].config))
+        return self._compiled[1]
+
+    def _compile(self, config: Config) -> tuple[Program, list[str]]:
+        with precision(config):
+            experiment = prepare(config)
+            columns, _ = self._arguments(config, self.points.columns(np.arange(1)), np.arange(1))
+            start = time.perf_counter()
+            program = compile_program(experiment, self.layout, self.devices, self.backend, columns, insist=self._insist)
+            self.compile_seconds += time.perf_counter() - start
+            if program.instead is not None and program.instead not in self.scanned:
+                self.scanned.append(program.instead)
+            return program, metric_columns(experiment)
+
+    def estimate(self) -> "Estimate":
+        """Memory and time of all chunks, from a compilation and a short run at the same chunk shape."""
+        config = self.points.groups[0].config
+        # long enough for what a run costs once not to count
+        short = min(config.run.steps, 2000)
+        brief = config.model_copy(
+            update={"run": config.run.model_copy(update={"duration": short * config.run.sample_period})}
+        )
+        with precision(config):
+            program, _ = self._compile(brief)
+            compiling = self.compile_seconds
+            given = self._arguments(brief, self.points.columns(np.arange(1)), np.arange(1))
+            seconds = []
+            for _ in range(3):
+                start = time.perf_counter()
+                jax.block_until_ready(program.run(*given))
+                seconds.append(time.perf_counter() - start)
+        lane_steps = short * math.prod(self.layout)
+        steps = [group.config.run.steps for group in self.points.groups]
+        chunks_a_group = len(self) // len(steps)
+        return Estimate(
+            points=len(self.points.groups) * self.points.coarse_lanes,
+            rows=self.rows,
+            most_points=len(self.points),
+            chunks=len(self),
+            lanes_a_chunk=math.prod(self.layout),
+            compile_seconds=compiling * len(steps),
+            run_seconds=min(seconds) / short * sum(steps) * chunks_a_group,
+            lane_steps_per_second=lane_steps / min(seconds),
+            megabytes=program.megabytes,
+            backend="scan" if program.instead is not None else self.backend,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """What a study will cost; a refined one, what its coarse grid will cost.
+
+    Attributes:
+        points: points that are simulated in any case.
+        rows: these with all seeds.
+        most_points: points of the study; of a refined one, those of its fine grid.
+        chunks: chunks for `rows`.
+        lanes_a_chunk: lanes of each.
+        compile_seconds: time of all compilations.
+        run_seconds: time of all chunks.
+        lane_steps_per_second: measured rate.
+        megabytes: memory of a chunk, MB.
+        backend: that was measured.
+    """
+
+    points: int
+    rows: int
+    most_points: int
+    chunks: int
+    lanes_a_chunk: int
+    compile_seconds: float
+    run_seconds: float
+    lane_steps_per_second: float
+    megabytes: float
+    backend: Backend

@@ -1,0 +1,256 @@
+"""The points of a study: axes crossed, zipped or sampled quasi-randomly, computed a slice at a time.
+
+Axes over leaves of the experiment become lanes of one compiled program. Axes over what is fixed at compile time (sampling
+period, substeps, discretisation, ...) are outermost and split the study into groups, each compiled once.
+
+A refined study has the points of its fine grid; those of the coarse grid, where it begins, are among them.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxbl.config import TOLERANCE, AxisTable, Config, nearest, with_values
+from jaxbl.drive.parameters import leaf_paths
+from jaxbl.errors import InputError
+
+from .metrics import metric_columns
+from .refine import Criterion, Grid
+
+Columns = dict[str, np.ndarray]
+
+_MOST_RUNS = 1e10
+_MOST_VALUES = 10_000_000
+"""Of one axis: its values are kept."""
+
+
+class Block(NamedTuple):
+    """Axes that advance together: columns of equal length by path."""
+
+    columns: Columns
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+
+class Group(NamedTuple):
+    """Points that share one compiled program: the config with its structural values set, and those values."""
+
+    config: Config
+    structural: dict[str, Any]
+
+
+class Refinement(NamedTuple):
+    """How a study is refined: the axes, their grid with all lane axes, and when neighbours disagree."""
+
+    paths: list[str]
+    grid: Grid
+    criterion: Criterion
+
+
+class Points:
+    """All points of a study, first axis slowest, structural axes outermost.
+
+    Attributes:
+        paths: axis paths in the order of the config.
+        groups: one for each combination of structural values.
+        lanes: points of each group.
+        coarse_lanes: points of each group that are always simulated: all of them, or the coarse grid of a refined study.
+        refinement: how the study is refined, if it is.
+    """
+
+    def __init__(self, config: Config):
+        self.paths = [axis.path for axis in config.axes]
+        for i, path in enumerate(self.paths):
+            if path in self.paths[:i]:
+                raise InputError(f"axes[{i}]: path '{path}' has an axis already; each path may have one")
+        base, self.leaves = self._check(config)
+        refined = self._refined(config)
+        depth = config.sweep.refine or 0
+        blocks = self._blocks(config, dict.fromkeys(refined, depth))
+        structural = [b for b in blocks if not all(path in self.leaves for path in b.columns)]
+        self._blocks_of_leaves = [b for b in blocks if all(path in self.leaves for path in b.columns)]
+        self.lanes = math.prod(len(b) for b in self._blocks_of_leaves)
+        self.refinement: Refinement | None = None
+        self.coarse_lanes = self.lanes
+        if refined:
+            halved = [next(iter(b.columns)) in refined for b in self._blocks_of_leaves]
+            sizes = [(len(b) - 1 >> depth) + 1 if h else len(b) for b, h in zip(self._blocks_of_leaves, halved, strict=True)]
+            self.coarse_lanes = math.prod(sizes)
+            self.refinement = Refinement(refined, Grid(sizes, halved, depth), _criterion(config, base, refined))
+        outside = math.prod(len(b) for b in structural) * config.sweep.seeds
+        if (runs := outside * self.coarse_lanes) > _MOST_RUNS:
+            raise InputError(f"axes: {runs:.2g} runs are more than {_MOST_RUNS:.0e}; fewer values, or a quasi-random design")
+        if (runs := outside * self.lanes) > _MOST_RUNS:
+            raise InputError(
+                f"sweep.refine: {depth} makes a fine grid of {runs:.2g} runs, more than {_MOST_RUNS:.0e}; "
+                "it should be less, or the axes should have fewer values"
+            )
+        self.groups = []
+        for index in range(math.prod(len(b) for b in structural)):
+            values = {path: column[0] for path, column in _take(structural, np.array([index])).items()}
+            values = {path: v.item() if isinstance(v, np.generic) else v for path, v in values.items()}
+            self.groups.append(Group(with_values(base, values), values))
+
+    def __len__(self) -> int:
+        return len(self.groups) * self.lanes
+
+    def columns(self, indices: np.ndarray) -> Columns:
+        """Values of the lane axes at some points of a group, by path; float64 arrays of the shape of `indices`."""
+        return _take(self._blocks_of_leaves, indices)
+
+    def coarse(self, positions: np.ndarray) -> np.ndarray:
+        """Points of a group that are always simulated, by their positions 0 ... coarse_lanes - 1 among these."""
+        return positions if self.refinement is None else self.refinement.grid.coarse(positions)
+
+    def values(self, path: str) -> np.ndarray:
+        """All values of a lane axis in their order, those of the fine grid if it is refined."""
+        return next(block.columns[path] for block in self._blocks_of_leaves if path in block.columns)
+
+    def always_simulated(self, columns: Mapping[str, Any]) -> np.ndarray:
+        """Which rows of a frame, or of its columns by name, are on points that are always simulated."""
+        if self.refinement is None:
+            return np.ones(len(columns["seed"]), bool)
+        stride = 1 << self.refinement.grid.depth
+        on_axes = [np.isin(columns[path], self.values(path)[::stride]) for path in self.refinement.paths]
+        return np.logical_and.reduce(on_axes)
+
+    def _refined(self, config: Config) -> list[str]:
+        """Paths of the refined axes."""
+        depth = config.sweep.refine
+        if depth is None:
+            return []
+        axes = [axis for axis in config.axes if axis.num and axis.zip is None and axis.path in self.leaves]
+        if not axes:
+            raise InputError(
+                "sweep.refine: no axis can be refined; one is needed with start, stop and num, not zipped, and not fixed at "
+                "compile time"
+            )
+        for axis in axes:
+            assert axis.num is not None
+            most = ((_MOST_VALUES - 1) // (axis.num - 1)).bit_length() - 1
+            if depth > most:
+                limit = f"should be at most {most}" if most > 0 else "does not fit here: num is too large"
+                raise InputError(
+                    f"sweep.refine: {depth} makes more than {_MOST_VALUES:.0e} values of '{axis.path}'; it {limit}"
+                )
+        return [axis.path for axis in axes]
+
+    @staticmethod
+    def _check(config: Config) -> tuple[Config, set[str]]:
+        """The config with every axis at its first value (so that optional numbers exist), and the paths that are leaves."""
+        first = {}
+        for i, axis in enumerate(config.axes):
+            ends = axis.values if axis.values is not None else [axis.start, axis.stop]
+            for value in _extremes(ends):
+                try:
+                    with_values(config, {axis.path: value})
+                except InputError as error:
+                    raise InputError(f"axes[{i}]: {error}") from None
+            first[axis.path] = ends[0]
+        base = with_values(config, first)
+        return base, set(leaf_paths(base.build()))
+
+    def _blocks(self, config: Config, depths: Mapping[str, int]) -> list[Block]:
+        sampled = [axis for axis in config.axes if axis.values is None and axis.num is None]
+        if sampled and config.sweep.design == "grid":
+            i = config.axes.index(sampled[0])
+            raise InputError(f"axes[{i}]: num is missing for '{sampled[0].path}'; how many values should the grid have?")
+        if config.sweep.design != "grid":
+            if not sampled:
+                raise InputError(
+                    f"sweep.design: '{config.sweep.design}' needs an axis with start and stop and without num and values"
+                )
+            if config.sweep.points is None:
+                raise InputError("sweep.points is missing: how many quasi-random points?")
+        elif config.sweep.points is not None:
+            raise InputError("sweep.points belongs to design = 'sobol' or 'latin_hypercube'; a grid has num on its axes")
+        for axis in sampled:
+            if axis.path not in self.leaves:
+                raise InputError(f"axes: '{axis.path}' is fixed at compile time; list its values instead of sampling it")
+            if axis.zip is not None:
+                raise InputError(f"axes: '{axis.path}' is sampled quasi-randomly and cannot be zipped")
+        blocks: list[Block] = []
+        labels: dict[str, int] = {}
+        for axis in config.axes:
+            if axis in sampled:
+                if axis is sampled[0]:
+                    blocks.append(Block(_quasi_random(sampled, config)))
+            elif axis.zip is None:
+                blocks.append(Block({axis.path: axis.grid(depths.get(axis.path, 0))}))
+            elif axis.zip not in labels:
+                labels[axis.zip] = len(blocks)
+                blocks.append(Block({axis.path: axis.grid()}))
+            else:
+                block, values = blocks[labels[axis.zip]], axis.grid()
+                if len(values) != len(block):
+                    raise InputError(
+                        f"axes: '{axis.path}' has {len(values)} values, the others zipped as '{axis.zip}' have {len(block)}"
+                    )
+                block.columns[axis.path] = values
+        for label, index in labels.items():
+            columns = blocks[index].columns
+            if len(columns) < 2 or label in (*self.paths, "seed"):
+                raise InputError(
+                    f"axes: zip = '{label}' should be a word of its own, the same on all axes that advance together"
+                )
+            if len(set(zip(*(column.tolist() for column in columns.values()), strict=True))) < len(blocks[index]):
+                raise InputError(f"axes: the axes zipped as '{label}' list a point twice; their points should differ")
+        return blocks
+
+
+def _extremes(values: list[Any]) -> list[Any]:
+    """The first, least and largest of many numbers: what a key may be is an interval. Other lists as they are."""
+    if len(values) <= 16 or any(isinstance(value, str) for value in values):
+        return values
+    return [values[0], min(values), max(values)]
+
+
+def _take(blocks: list[Block], indices: np.ndarray) -> Columns:
+    """Columns of a product of blocks at some flat indices, last block fastest."""
+    out: Columns = {}
+    remaining = indices
+    for block in reversed(blocks):
+        for path, column in block.columns.items():
+            out[path] = column[remaining % len(block)]
+        remaining = remaining // len(block)
+    return out
+
+
+def _criterion(config: Config, base: Config, refined: list[str]) -> Criterion:
+    """When neighbours disagree: in the metric that the study names, or in what converges."""
+    metrics = metric_columns(base.build())
+    metric, tolerance = config.sweep.refine_metric, config.sweep.refine_tolerance
+    if metric is None:
+        converged = [name for name in metrics if name.endswith(".converged")]
+        of_gains = [
+            name for name in converged if any(path.startswith(f"observer.{name.partition('.')[0]}.") for path in refined)
+        ]
+        return Criterion.of(of_gains or converged, TOLERANCE)
+    if metric not in metrics:
+        raise InputError(f"sweep.refine_metric: '{metric}' is no metric; {nearest(metric, metrics)}")
+    return Criterion.of([metric], TOLERANCE if tolerance is None else tolerance)
+
+
+def _quasi_random(axes: list[AxisTable], config: Config) -> Columns:
+    """Sobol or Latin hypercube points over the ranges of some axes, uniform in their scale."""
+    from scipy.stats import qmc  # a third of a second that only these designs need
+
+    assert config.sweep.points is not None
+    rng = np.random.default_rng(config.sweep.design_seed)
+    if config.sweep.design == "sobol":
+        # the first 2^m points are balanced; any number of them is a prefix
+        power = max(math.ceil(math.log2(config.sweep.points)), 0)
+        unit = qmc.Sobol(len(axes), rng=rng).random_base2(power)[: config.sweep.points]
+    else:
+        unit = qmc.LatinHypercube(len(axes), rng=rng).random(config.sweep.points)
+    columns = {}
+    for axis, u in zip(axes, unit.T, strict=True):
+        assert axis.start is not None and axis.stop is not None
+        if axis.scale == "log":
+            columns[axis.path] = axis.start * (axis.stop / axis.start) ** u
+        else:
+            columns[axis.path] = axis.start + (axis.stop - axis.start) * u
+    return columns

@@ -1,0 +1,164 @@
+"""Compiled programs for the chunks of a study: the scan by XLA, or the fused loop."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+from jaxbl.drive.parameters import set_leaves
+from jaxbl.errors import InputError
+from jaxbl.fused.split import Unsupported
+from jaxbl.simulate import Experiment, scan
+
+from .metrics import METRICS, Gains, metric_columns, observer_gains
+
+if TYPE_CHECKING:
+    from jaxbl.fused.passage import Passage
+
+Backend = Literal["fused", "scan"]
+BACKENDS: tuple[Backend, ...] = ("fused", "scan")
+
+
+def backend_of(name: str | None, given: str = "backend") -> Backend | None:
+    """A backend by its name, None for none. Raises `InputError` for another; `given` is what it was given as."""
+    for backend in BACKENDS:
+        if backend == name:
+            return backend
+    if name is not None:
+        raise InputError(f"{given}: there is no {name!r}; one of {', '.join(BACKENDS)}")
+    return None
+
+
+class Layout(NamedTuple):
+    """Shape of a chunk: seeds and points."""
+
+    seeds: int
+    points: int
+
+
+class Program(NamedTuple):
+    """What runs a chunk.
+
+    Attributes:
+        run: from values by path `(points,)` and seeds `(seeds,)` to figures `(seeds, points)` and gains, which have these
+            axes or fit them.
+        megabytes: of memory that it takes.
+        instead: what the fused loop does not know, where the scan takes its place.
+    """
+
+    run: Callable[[dict[str, np.ndarray], np.ndarray], tuple[dict[str, Any], dict[str, Gains]]]
+    megabytes: float
+    instead: str | None = None
+
+
+_FUSED, _SCAN = (0.5, 0.9e-3), (1.5, 3.1e-3)
+"""Microseconds that a sample costs, and each of its lanes, on one core (benchmarks/NOTES.md)."""
+
+
+_GPU_SEEDS = 8
+"""Seeds a chunk up to which a GPU gets the fused loop: some 1 us a sample each, where a step of the scan takes 8 (published
+for a scan by XLA; not measured here)."""
+
+
+def faster(layout: Layout, devices: list[Any]) -> Backend:
+    """The backend that takes less time for a chunk.
+
+    The fused loop runs seed after seed, and pays for each what its lanes share; the scan has all lanes side by side. On a
+    GPU the scan starts several kernels a time step, and waits for them.
+    """
+    if devices[0].platform == "gpu" and len(devices) == 1:
+        return "fused" if layout.seeds <= _GPU_SEEDS else "scan"
+    if devices[0].platform != "cpu":
+        return "scan"
+    fused = layout.seeds * (_FUSED[0] + _FUSED[1] * layout.points)
+    return "fused" if fused < _SCAN[0] + _SCAN[1] * layout.seeds * layout.points else "scan"
+
+
+def compile_program(
+    experiment: Experiment,
+    layout: Layout,
+    devices: list[Any],
+    backend: Backend,
+    columns: dict[str, np.ndarray],
+    *,
+    insist: bool = False,
+) -> Program:
+    """Compile one. Call inside :func:`jaxbl.sweeps.engine.precision`.
+
+    Args:
+        experiment: with array leaves.
+        layout: of its chunks.
+        devices: that share a chunk.
+        backend: where the fused loop cannot run the step, or no lane differs from another, the scan takes its place.
+        columns: example of the values, `(points,)` by path.
+        insist: refuse that in place of it.
+
+    Raises:
+        InputError: the fused loop was insisted on and cannot be had.
+    """
+    if backend == "fused":
+        try:
+            return _fused(experiment, layout, devices, tuple(columns))
+        except Unsupported as why:
+            if insist:
+                raise InputError(f"--backend fused: the fused loop does not know {why}; use --backend scan") from None
+            return _scanned(experiment, layout, devices, columns)._replace(instead=str(why))
+    return _scanned(experiment, layout, devices, columns)
+
+
+def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tuple[str, ...]) -> Program:
+    if not paths:
+        raise Unsupported("lanes that differ in nothing but their seed")
+    try:
+        from jaxbl.fused.passage import DevicePassage, HostPassage
+    except ImportError as error:
+        raise Unsupported(f"how to compile here ({error})") from None
+    if devices[0].platform == "cpu":
+        passage: Passage = HostPassage(experiment, (METRICS,), paths, layout.points, len(devices))
+    elif devices[0].platform == "gpu" and len(devices) == 1:
+        with jax.default_device(devices[0]):
+            passage = DevicePassage(experiment, (METRICS,), paths, layout.points)
+    else:
+        raise Unsupported(f"{len(devices)} devices of platform {devices[0].platform}")
+
+    def run(values: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[dict[str, Any], dict[str, Gains]]:
+        with jax.default_device(devices[0]):
+            # seeds that only fill up the last chunk are copies of one
+            found = {seed: passage(values, seed) for seed in dict.fromkeys(int(seed) for seed in seeds)}
+        stacked = {name: np.stack([found[int(seed)][name] for seed in seeds]) for name in found[int(seeds[0])]}
+        return stacked, observer_gains(set_leaves(experiment, values))
+
+    size = jnp.result_type(experiment.run.sample_period).itemsize
+    figures = len(metric_columns(experiment)) * layout.seeds
+    return Program(run, (passage.carried + len(paths) + figures) * layout.points * size / 1e6)
+
+
+def _scanned(experiment: Experiment, layout: Layout, devices: list[Any], columns: dict[str, np.ndarray]) -> Program:
+    def lane(values: dict[str, Any], seed: Any) -> tuple[dict[str, Any], Any]:
+        experiment_of_lane = set_leaves(experiment, values)
+        figures, _ = scan(experiment_of_lane, seed, (METRICS,))
+        return figures, observer_gains(experiment_of_lane)
+
+    # shards along the longer side that divides evenly; one device does the rest
+    seeds, points = layout
+    count = len(devices)
+    by_points, by_seeds = points % count == 0, points % count != 0 and seeds % count == 0
+    mesh = Mesh(np.array(devices if by_points or by_seeds else devices[:1]), ("lanes",))
+    over_points = PartitionSpec("lanes" if by_points else None)
+    over_seeds = PartitionSpec("lanes" if by_seeds else None)
+    local_points = points // count if by_points else points
+    chunk = jax.shard_map(
+        jax.vmap(jax.vmap(lane, in_axes=(0, None), axis_size=local_points), in_axes=(None, 0)),
+        mesh=mesh,
+        in_specs=(over_points, over_seeds),
+        out_specs=PartitionSpec(*over_seeds, *over_points),
+        check_vma=False,
+    )
+    example = {path: np.zeros(points, column.dtype) for path, column in columns.items()}, np.zeros(seeds, np.uint32)
+    program = jax.jit(chunk).lower(*example).compile()
+    memory = program.memory_analysis()
+    size = 0 if memory is None else memory.temp_size_in_bytes + memory.output_size_in_bytes
+    return Program(program, size / 1e6)

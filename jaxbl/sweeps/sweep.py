@@ -1,0 +1,230 @@
+"""A whole study, from config to frame: the function behind `jaxbl sweep`."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from jaxbl.config import Config, read_config
+from jaxbl.errors import InputError
+from jaxbl.workers import Progress
+
+from .engine import Chunk, Engine, Estimate
+from .metrics import describe
+from .programs import Backend
+from .refine import refine
+from .store import Store, claim
+
+if TYPE_CHECKING:
+    import xarray
+
+
+_MOST_NUMBERS = 2e8
+"""Of a dataset that is mostly empty."""
+
+
+@dataclasses.dataclass(frozen=True)
+class StudyResult:
+    """Points of a study with their metrics.
+
+    Attributes:
+        config: the study.
+        cost: seconds of compilation and of computing, and lanes computed in this call.
+        source: where the rows are: a folder, or memory.
+        scanned: what the fused loop did not know of groups that this call scanned in its place.
+    """
+
+    config: Config
+    source: Store | pd.DataFrame
+    cost: dict[str, float] = dataclasses.field(default_factory=dict)
+    scanned: tuple[str, ...] = ()
+
+    @functools.cached_property
+    def frame(self) -> pd.DataFrame:
+        """One row a point and seed: axis paths, `seed`, metrics (columns and units: docs/reference.md)."""
+        return self.read()
+
+    @property
+    def columns(self) -> list[str]:
+        """Names of all columns."""
+        return self.source.columns() if isinstance(self.source, Store) else list(self.source.columns)
+
+    def read(self, columns: Iterable[str] | None = None) -> pd.DataFrame:
+        """Some columns of the frame, read for this call: a large study need not fit into memory whole."""
+        names = None if columns is None else list(dict.fromkeys(columns))
+        if isinstance(self.source, Store):
+            return self.source.read(names)
+        return self.source if names is None else self.source.loc[:, names]
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """The frame as a dataset over the axes and `seed` (zipped axes share one dimension); needs xarray.
+
+        Of a refined study it has every value of an axis that occurs, and NaN where no point was simulated (`converged` and
+        `finite` are then 1, 0 or NaN).
+
+        Raises:
+            ValueError: a quasi-random design, which has no grid; a refined study with too large a one.
+        """
+        import xarray
+
+        if self.config.sweep.design != "grid":
+            raise ValueError(f"a {self.config.sweep.design} design has no grid; use the frame")
+        along: dict[str, list[str]] = {}
+        for axis in self.config.axes:
+            along.setdefault(axis.zip or axis.path, []).append(axis.path)
+        zipped = {dim: paths for dim, paths in along.items() if paths != [dim]}
+        frame = self.frame.copy(deep=False)
+        for dim, paths in zipped.items():
+            frame[dim] = frame.groupby(paths, sort=False).ngroup()
+        if self.config.sweep.refine is not None:
+            size = math.prod(len(frame[dim].unique()) for dim in [*along, "seed"]) * len(frame.columns)
+            if size > _MOST_NUMBERS:
+                raise ValueError(f"the whole grid would have {size:.2g} numbers, most of them NaN; use the frame")
+            frame = frame.astype(dict.fromkeys(frame.select_dtypes(bool).columns, float))
+        dataset = frame.set_index([*along, "seed"]).to_xarray()
+        for dim, paths in zipped.items():
+            first = {other: 0 for other in dataset.dims if other != dim}
+            dataset = dataset.assign_coords({path: dataset[path].isel(first, drop=True) for path in paths}).drop_vars(dim)
+        for name in dataset.data_vars:
+            about = describe(str(name))
+            dataset[name].attrs = {"units": about.unit, "long_name": about.doc}
+        assert isinstance(dataset, xarray.Dataset)
+        return dataset
+
+
+def sweep(
+    study: str | Path | Mapping[str, Any] | Config,
+    out: str | Path | None = None,
+    *,
+    progress: Progress | None = None,
+    devices: list[Any] | None = None,
+    overwrite: bool = False,
+    backend: Backend | None = None,
+) -> StudyResult:
+    """Run all points of a study.
+
+    Args:
+        study: TOML file, mapping or config.
+        out: folder to keep the results in, chunk by chunk; a study that was interrupted there goes on where it stopped,
+            one that is finished is only read. Without it nothing is written.
+        progress: called with finished and total lanes after each chunk; the total of a refined study grows.
+        devices: JAX devices to use; left out, all local ones.
+        overwrite: remove the results of another study from `out`.
+        backend: `fused` or `scan`; left out, the faster one here. A study that goes on keeps to that of its first chunks.
+
+    Raises:
+        InputError: wrong config, a folder that holds something else, or a backend that cannot run the study.
+    """
+    config = read_config(study)
+    engine = Engine(config, devices=devices, backend=backend, insist=backend is not None)
+    if backend == "fused" and (out is None or not (Path(out) / "manifest.json").exists()):
+        # refused, if it is, before anything is written
+        engine.check()
+    store = None
+    if out is not None:
+        folder = Path(out)
+        claim(folder, config, overwrite=overwrite)
+        store = Store.create(folder, config, engine.layout, engine.backend, len(engine), engine.rows)
+        if backend not in (None, store.backend) and not store.manifest["finished"]:
+            raise InputError(
+                f"{folder}: was begun with --backend {store.backend}; go on with that, or choose another folder with --out"
+            )
+        if (store.layout, store.backend) != (engine.layout, engine.backend):
+            # taken up on another machine: the chunks must stay what they were
+            engine = Engine(config, store.layout, devices, store.backend, backend is not None)
+    run = _Run(engine, store, progress)
+    run.all()
+    if store is None:
+        source = pd.concat(run.frames, ignore_index=True)
+    else:
+        source = store
+        if not store.manifest["finished"]:
+            store.update(finished=True, seconds={"compile": engine.compile_seconds, "run": engine.run_seconds})
+    cost = {"compile_seconds": engine.compile_seconds, "run_seconds": engine.run_seconds, "lanes": run.computed}
+    return StudyResult(config, source, cost, tuple(engine.scanned))
+
+
+class _Run:
+    """Chunk after chunk of a study, those that are stored already left out."""
+
+    def __init__(self, engine: Engine, store: Store | None, progress: Progress | None):
+        self.engine, self.store, self.progress = engine, store, progress
+        self.frames: list[pd.DataFrame] = []
+        self.computed = self.done = 0
+        self.chunks, self.total = len(engine), engine.rows
+        self._next = 0
+
+    def all(self) -> None:
+        """Run the whole study."""
+        if self.engine.points.refinement is None:
+            for chunk in self.engine.chunks():
+                self._take(chunk)
+            return
+        for group in range(len(self.engine.points.groups)):
+            self._refine(group)
+        if self.store is not None:
+            self.store.trim(self.chunks, self.total)
+
+    def _refine(self, group: int) -> None:
+        """The coarse grid of a group, and what its boundaries need."""
+        assert self.engine.points.refinement is not None
+        _, grid, criterion = self.engine.points.refinement
+        columns, seeds = list(criterion.columns), self.engine.config.sweep.seeds
+        expected = self.engine.points.coarse_lanes
+
+        def evaluate(points: np.ndarray) -> np.ndarray:
+            nonlocal expected
+            # the coarse grid is counted from the start
+            self.total += (len(points) - expected) * seeds
+            self.chunks += self.engine.chunks_for(len(points)) - self.engine.chunks_for(expected)
+            expected = 0
+            if self.store is not None:
+                self.store.grow(self.chunks, self.total)
+            values = np.empty((seeds, len(points), len(columns)))
+            row = column = 0
+            for chunk in self.engine.split(group, points, self._next):
+                shape = (len(chunk.seeds), len(chunk.points), len(columns))
+                found = self._take(chunk, columns)[columns].to_numpy(float).reshape(shape)
+                values[row : row + shape[0], column : column + shape[1]] = found
+                column += shape[1]
+                if column == len(points):
+                    row, column = row + shape[0], 0
+            return values.swapaxes(0, 1)
+
+        refine(grid, evaluate, criterion.differ)
+
+    def _take(self, chunk: Chunk, columns: list[str] | None = None) -> pd.DataFrame:
+        """Compute a chunk, or read some columns of it where it is stored; with no columns, nothing is read."""
+        frame = None
+        if self.store is not None and self.store.has(chunk.index):
+            frame = (
+                pd.DataFrame() if columns is None else self.store.read_part(chunk.index, self.engine.labels(chunk), columns)
+            )
+        if frame is None:
+            frame = self.engine.run(chunk)
+            self.computed += len(frame)
+            if self.store is None:
+                self.frames.append(frame)
+            else:
+                self.store.write(chunk.index, frame)
+        self._next = chunk.index + 1
+        self.done += len(chunk.seeds) * len(chunk.points)
+        if self.progress:
+            self.progress(self.done, self.total)
+        return frame
+
+
+def load(folder: str | Path) -> StudyResult:
+    """Read a study's folder. Raises `InputError` where there is none."""
+    store = Store.open(Path(folder))
+    return StudyResult(store.config(), store)
+
+
+def dry_run(study: str | Path | Mapping[str, Any] | Config, *, backend: Backend | None = None) -> Estimate:
+    """What a study will cost, from a compilation and a short calibration run; of a refined one, its coarse grid."""
+    return Engine(read_config(study), backend=backend, insist=backend is not None).estimate()

@@ -1,0 +1,202 @@
+"""One experiment with its whole trace: the function behind `jaxbl simulate` (`jaxbl.run` in Python)."""
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import pandas as pd
+
+from jaxbl.config import Config, precision, prepare, read_config
+from jaxbl.errors import InputError
+from jaxbl.files import plain
+from jaxbl.fused.single_run import recorded
+from jaxbl.observer.conditions import CONDITIONS, peak_ratio
+from jaxbl.simulate import Experiment, Reducer, Signals, State
+
+from .metrics import METRICS, observer_gains, with_conditions
+from .store import identity
+
+
+class Trial(NamedTuple):
+    """One run.
+
+    Attributes:
+        config: the study (its axes are not used).
+        trace: one row a sample; `t`, `u`, `theta_e`, `theta_s` as a measured log has them, true values and estimates by
+            side, path of the identified parameters (columns and units: README).
+        summary: metrics, identified parameters, gain conditions and remarks, as in `summary.json`.
+    """
+
+    config: Config
+    trace: pd.DataFrame
+    summary: dict[str, Any]
+
+
+def run(study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every: int = 1) -> Trial:
+    """Run the experiment of a study once, without its axes.
+
+    Args:
+        study: TOML file, mapping or config.
+        seed: seed of the encoder noise.
+        every: keep every N-th sample of the trace.
+
+    Raises:
+        InputError: wrong config.
+    """
+    config = read_config(study)
+    if not 1 <= every <= config.run.steps:
+        raise InputError(f"every: should be between 1 and the number of samples {config.run.steps}, not {every}")
+    with precision(config):
+        experiment = prepare(config)
+        figures, kept = recorded(experiment, seed, (METRICS, _LAST), partial(_row, experiment), every)
+        figures = with_conditions(figures, observer_gains(experiment))
+        trace = pd.DataFrame({name: column.astype(float) for name, column in kept.items()})
+    last = {name: plain(figures.pop(name)) for name in list(figures) if name.startswith("last.")}
+    metrics = {name: plain(value) for name, value in figures.items()}
+    return Trial(config, trace, _summary(config, last, metrics, seed))
+
+
+def _last(experiment: Experiment, largest: Any, state: State) -> dict[str, Any]:
+    figures = {"last.largest_torque": largest}
+    if state.identifier is not None:
+        assert experiment.identifier is not None and experiment.transmission is not None
+        for side, found in experiment.identifier.estimate(state.identifier, experiment.transmission).items():
+            figures |= {f"last.{side}.{name}": value for name, value in found.items()}
+    return figures
+
+
+# over all samples, whatever the trace keeps of them
+_LAST = Reducer(
+    lambda experiment: jnp.zeros_like(experiment.run.sample_period),
+    lambda experiment, largest, index, signals: jnp.maximum(largest, jnp.abs(signals.torque)),
+    _last,
+)
+
+
+_LOG_NAMES = {"motor": "theta_e", "load": "theta_s"}
+
+
+def _row(experiment: Experiment, state: State, signals: Signals) -> dict[str, Any]:
+    """Columns of the trace at one sample."""
+    row = {"t": signals.time, "u": signals.input}
+    row |= {_LOG_NAMES[side]: signals.side(side).measured for side in experiment.sides}
+    if signals.twist is not None:
+        row["z"] = signals.twist
+    row["torque"] = signals.torque
+    for side in experiment.sides:
+        s = signals.side(side)
+        assert s.true is not None
+        row |= {
+            f"{side}.position": s.true.position,
+            f"{side}.velocity": s.true.velocity,
+            f"{side}.acceleration": s.true.acceleration,
+            f"{side}.position_estimate": s.position_estimate,
+            f"{side}.velocity_estimate": s.velocity_estimate,
+            f"{side}.equivalent_control": s.equivalent_control,
+            f"{side}.torque_estimate": s.torque_estimate,
+        }
+    if state.identifier is not None:
+        assert experiment.identifier is not None and experiment.transmission is not None
+        identified = experiment.identifier.estimate(state.identifier, experiment.transmission)
+        for side in experiment.sides:
+            row |= {f"{side}.{name}": value for name, value in identified[side].items()}
+    return row
+
+
+def _summary(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed: int) -> dict[str, Any]:
+    experiment = config.build()
+    identified: dict[str, Any] = {}
+    if experiment.transmission is not None:
+        for name, true in experiment.transmission.truth().items():
+            sides = {side: last[f"last.{side}.{name}"] for side in experiment.sides}
+            identified[name] = {"true": true, **sides}
+    conditions = {}
+    for side in experiment.sides:
+        f_plus = metrics[f"{side}.f_plus"]
+        if f_plus is not None:
+            conditions[side] = _conditions(getattr(experiment.observer, side), f_plus)
+    return {
+        "title": config.title,
+        "single_run": identity(config, "simulate"),
+        "seed": seed,
+        "metrics": metrics,
+        "identified": identified,
+        "conditions": conditions,
+        "remarks": [*config.notes, *_remarks(experiment, last, metrics, conditions)],
+    }
+
+
+@jax.jit
+def _asked(lambda_: jax.Array, alpha: jax.Array, f_plus: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+    """What each condition asks of lambda, and the ratio of peaks."""
+    least = {name: condition.least_lambda(alpha, f_plus) for name, condition in CONDITIONS.items()}
+    return least, peak_ratio(lambda_, alpha, f_plus)
+
+
+def _conditions(observer: Any, f_plus: float) -> dict[str, Any]:
+    """Gains of an observer against what each condition asks at a bound f_plus (rad/s^2)."""
+    with jax.enable_x64(True):
+        lambda_, alpha, bound = (jnp.asarray(x) for x in (float(observer.lambda_), float(observer.alpha), f_plus))
+        found, rho = _asked(lambda_, alpha, bound)
+    least = {name: plain(found[name]) for name in CONDITIONS}
+    return {
+        "lambda": float(observer.lambda_),
+        "alpha": float(observer.alpha),
+        "f_plus": f_plus,
+        "alpha_exceeds_f_plus": float(observer.alpha) > f_plus,
+        "least_lambda": least,
+        "holds": {name: value is not None and float(observer.lambda_) > value for name, value in least.items()},
+        "peak_ratio": plain(rho),
+    }
+
+
+def _remarks(experiment: Experiment, last: dict[str, Any], metrics: dict[str, Any], conditions: dict[str, Any]) -> list[str]:
+    """What a reader of the figures should know, in sentences."""
+    if not metrics["finite"]:
+        return ["The run diverged: its figures are not finite."]
+    remarks = []
+    what = "the disturbance torque" if experiment.transmission is None else "the transmitted torque |C|"
+    largest = last["last.largest_torque"]
+    for side, found in conditions.items():
+        inertia = float(experiment.drive.inertia(side))
+        limit = found["alpha"] * inertia / abs(float(experiment.drive.torque_gain(side)))
+        verdict = "holds" if largest < limit else "fails"
+        remarks.append(
+            f"{side}: alpha = {found['alpha']:g} rad/s² covers {what} while it is below {limit:.3g} N m; "
+            f"the largest here is {largest:.3g} N m, so that this {verdict}. The true bound along the run, with the "
+            f"observer's own velocity error in it, is f⁺ = {found['f_plus']:.3g} rad/s²; twice the largest acceleration "
+            f"would be {metrics[f'{side}.f_plus_acceleration']:.3g} rad/s²."
+        )
+        if not found["alpha_exceeds_f_plus"]:
+            remarks.append(f"{side}: alpha is below the true f⁺, so that no condition on lambda can hold.")
+            # what lambda would have to be where alpha does cover the torque
+            torque_bound = largest * abs(float(experiment.drive.torque_gain(side))) / inertia
+            if found["alpha"] > torque_bound:
+                found["torque_bound"] = _conditions(getattr(experiment.observer, side), torque_bound)
+        for label, values in (("the true f⁺", found), ("f⁺ = max |C| / J", found.get("torque_bound"))):
+            if values is None or values["least_lambda"]["exact"] is None:
+                continue
+            missed = [
+                f"{CONDITIONS[name].title} by a factor of {least / found['lambda']:.3g} (more than {least:.3g})"
+                for name, least in values["least_lambda"].items()
+                if found["lambda"] <= least
+            ]
+            if missed:
+                remarks.append(f"{side}: lambda = {found['lambda']:g} misses, at {label}: {'; '.join(missed)}.")
+        converged = metrics[f"{side}.converged"]
+        if converged and not found["holds"]["exact"]:
+            remarks.append(
+                f"{side}: the observer converged all the same: the conditions are for the worst disturbance, which this run "
+                "need not contain, and they leave out viscous friction, which can shrink the error asymptotically."
+            )
+        if not converged:
+            run, ratio = experiment.run, float(experiment.drive.ratio(side))
+            remarks.append(
+                f"{side}: the observer did not stay within {run.position_tolerance / ratio:.2g} rad and "
+                f"{run.velocity_tolerance / ratio:.2g} rad/s over the last quarter of the run "
+                "(run.position_tolerance, run.velocity_tolerance; on the load divided by the gear ratio)."
+            )
+    return remarks

@@ -1,0 +1,303 @@
+"""From a log to what is missing: the truth comes from a simulator that shares nothing with the package."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+from hidden_log import FRICTION, driven, logged, model
+
+import jaxbl.diagnosis.diagnose as under_test
+import jaxbl.diagnosis.effect_search as explain
+from jaxbl.config import read_config
+from jaxbl.diagnosis.diagnose import diagnose, read_task, run_task
+from jaxbl.diagnosis.next_experiment import Limits, next_experiment, tied, write_next_experiment
+from jaxbl.drive.parameters import get_leaf, set_leaves
+from jaxbl.errors import InputError
+from jaxbl.identification.trajectory import Free
+from jaxbl.records import read_record
+from jaxbl.report.diagnosed import diagnosis_lines, write_diagnosis_report
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("logs")
+    logged().write(folder / "axis.csv")
+    logged(seed=2).write(folder / "other.csv")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(logs):
+    return diagnose(logs / "axis.csv", model())
+
+
+@pytest.mark.slow
+def test_the_missing_effect_is_named_with_its_number(found):
+    summary = found.summary
+    assert summary["verdict"] == "explained"
+    (one,) = summary["findings"]
+    assert one["effect"] == "motor.coulomb_friction" and one["confidence"] > 0.5
+    torque = one["parameters"]["torque"]
+    assert torque["value"] == pytest.approx(FRICTION["torque"], rel=0.02)
+    assert abs(torque["value"] - FRICTION["torque"]) < 5.0 * torque["standard_error"]
+    assert torque["unit"] == "N m"
+    assert one["where"]["place"] == "motor" and "motor side" in one["where"]["sentences"]["motor"]
+    for path, true in (("drive.motor_inertia", 0.02), ("drive.motor_viscous", 0.03)):
+        assert summary["parameters"][path]["value"] == pytest.approx(true, rel=0.02)
+
+
+def test_noise_of_the_input_that_was_not_felt_does_not_drive_the_model(tmp_path):
+    log = logged(torque_noise=0.02)
+    log.write(tmp_path / "axis.csv")
+    found = diagnose(tmp_path / "axis.csv", model())
+    (one,) = found.summary["findings"]
+    assert one["effect"] == "motor.coulomb_friction"
+    assert one["parameters"]["torque"]["value"] == pytest.approx(FRICTION["torque"], rel=0.02)
+    (note,) = (note for note in found.summary["notes"] if "does not feel" in note)
+    assert note.startswith("The channel u carries noise of 0.02")
+    np.testing.assert_allclose(found.trace["u"], log.u, rtol=1e-9)
+
+
+@pytest.mark.parametrize("felt", [False, True])
+def test_the_motion_tells_whether_noise_of_the_input_was_felt(felt, tmp_path):
+    logged(torque_noise=0.02, felt=felt).write(tmp_path / "axis.csv")
+    task = read_task(tmp_path / "axis.csv", model())
+    with jax.enable_x64(True):
+        setting = under_test._setting(task)
+    assert setting.torque_noise == (0.0 if felt else pytest.approx(0.02, rel=0.1))
+    for ground, record in ((setting.seen, task.record), (setting.other, task.holdout)):
+        assert np.array_equal(ground.record.torque, record.torque) is felt
+
+
+def test_the_gap_shrinks_to_the_noise_on_what_was_held_out(found):
+    gap = found.summary["gap"]
+    assert gap["holdout"]["separate"] is False and gap["holdout"]["from"] == pytest.approx(3.0)
+    before, after, floor = (gap[key] for key in ("holdout_rmse_before", "holdout_rmse_after", "noise_floor"))
+    assert set(before) == set(after) == set(floor) == {"theta_e", "velocity_motor", "torque_motor"}
+    assert before["theta_e"] > 20.0 * floor["theta_e"]
+    assert after["theta_e"] < 1.5 * floor["theta_e"]
+    assert after["torque_motor"] < 0.5 * before["torque_motor"]
+    assert gap["controls"]["permuted"]["rmse"]["theta_e"] > 0.5 * before["theta_e"]
+    assert gap["free_run"]["after"]["theta_e"] < 0.1 * gap["free_run"]["before"]["theta_e"]
+
+
+def test_what_is_held_out_keeps_its_times_and_is_not_fitted(logs, found):
+    whole = read_record(logs / "axis.csv")
+    task = read_task(logs / "axis.csv", model())
+    assert len(task.record.time) == 1500 and task.record.segments == (slice(0, 1500),)
+    assert task.holdout.segments == (slice(1500, 2000),)
+    np.testing.assert_array_equal(task.holdout.time, whole.time)
+    parts = dataclasses.replace(whole, segments=(slice(0, 700), slice(800, 1200), slice(1300, 2000)))
+    first, last = under_test._split(parts)
+    assert first.segments == (slice(0, 700), slice(800, 1200), slice(1300, 1550))
+    assert last.segments == (slice(1550, 2000),) and len(first.time) == 1550
+    trace = found.trace
+    assert trace["held_out"].sum() == 500 and trace["motor.missing_before"].notna().all()
+    assert trace["motor.missing_after"].std() < trace["motor.missing_before"].std()
+
+
+def test_the_observers_are_a_second_witness(found):
+    about = found.summary["where"]["motor"]["observed"]
+    assert about["converged"] is True and about["correlation"] > 0.95
+    assert about["rms"] == pytest.approx(about["smoother_rms"], rel=0.05) and about["rms"] > 5.0 * about["noise"]
+    assert set(about["gains"]) == {"lambda", "alpha"} and about["time_constant"] == 0.01 and about["bandwidth"] < 16.0
+    trace, (one,) = found.trace, found.observed["motor"]
+    known = trace["motor.observed_before"].notna()
+    # the beginnings of both parts are left out
+    assert not known[: one.skipped].any() and known[one.skipped : 1500].all()
+    assert not known[1500 : 1500 + one.skipped].any() and known[1500 + one.skipped :].all()
+    assert (trace["motor.observed_noise"].notna() == known).all()
+    np.testing.assert_array_equal(trace["motor.observed_before"][one.skipped : 1500], one.residual.torque)
+    assert trace["motor.observed_before"][known].std() == pytest.approx(trace["motor.missing_before"].std(), rel=0.1)
+    assert not any("observer" in note for note in found.summary["notes"])
+
+
+def test_an_observer_that_does_not_converge_is_noted(logs):
+    task = read_task(logs / "axis.csv", model(observer={"motor": {"lambda": 2.0, "alpha": 1.0}}))
+    assert "observer.motor" not in task.missing
+    with jax.enable_x64(True):
+        nominal = under_test.on_record(task.config, task.record)
+        seen, other = (
+            dataclasses.replace(under_test._ground(nominal, one, False), bandwidth={"motor": 30.0})
+            for one in (task.record, task.holdout)
+        )
+        witness = under_test._Witness(task, nominal, seen, other)
+        summary = {"where": {"motor": {}}, "notes": []}
+        witness.tell(summary, seen.torques(nominal))
+    assert summary["where"]["motor"]["observed"]["converged"] is False
+    assert summary["where"]["motor"]["observed"]["rms"] is None
+    (note,) = summary["notes"]
+    assert note.startswith("The motor's observer does not converge on this log (alpha = 1)")
+
+
+def test_the_extended_model_runs_and_the_report_says_what_was_found(found, tmp_path):
+    lines = write_diagnosis_report(found, tmp_path)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"diagnosis.json", "model.toml", "trace.parquet", "figures", "report.html"}
+    assert lines[0].startswith("Explained: the model lacks motor.coulomb_friction;")
+    assert any(line.startswith("motor.coulomb_friction (confidence") and "± " in line for line in lines)
+    again = read_config(tmp_path / "model.toml")
+    assert [one.kind for one in again.effects] == ["motor.coulomb_friction"]
+    summary = json.loads((tmp_path / "diagnosis.json").read_text())
+    assert summary == found.summary and diagnosis_lines(summary) == lines
+    assert again.effects[0].torque == summary["findings"][0]["parameters"]["torque"]["value"]
+
+
+@pytest.mark.slow
+def test_the_model_that_was_found_lacks_nothing_on_another_log(logs, found, tmp_path):
+    """As written, with the record of the first log for its excitation."""
+    write_diagnosis_report(found, tmp_path)
+    again = diagnose(logs / "other.csv", tmp_path / "model.toml")
+    assert again.config.excitation.kind == "recorded"
+    assert again.summary["verdict"] == "no_discrepancy" and again.summary["findings"] == []
+    (friction,) = again.model.effects
+    assert friction.torque == pytest.approx(FRICTION["torque"], rel=0.02)
+
+
+def test_a_number_that_ends_far_from_what_is_known_of_it_is_told():
+    own = [Free("drive.motor_inertia", "kg m²", 0.02, 0.02, True), Free("drive.motor_viscous", "N m s/rad", 0.0, 1.0, False)]
+    assert under_test._far_off(own, {"drive.motor_inertia": 0.021, "drive.motor_viscous": 0.1}, 0.02) == []
+    (note,) = under_test._far_off(own, {"drive.motor_inertia": 0.01, "drive.motor_viscous": 0.0}, 0.02)
+    assert note.startswith("drive.motor_inertia had to change by -50%, 25 times its [uncertainty]")
+
+
+def test_new_numbers_are_better_all_in_all():
+    def better(before, after):
+        proving = under_test._Proving.__new__(under_test._Proving)
+        proving.before = under_test.Proof({"theta_e": before, "torque_motor": 1.0}, {})
+        return proving.better(under_test.Proof({"theta_e": after, "torque_motor": 1.1}, {}))
+
+    assert better(1.0, 0.9) and not better(1.0, 0.95)
+    # a model that diverges, or errs by nothing, is no error
+    assert better(np.inf, 1.0) and better(1.0, 0.0)
+    assert not better(1.0, np.inf) and not better(np.inf, np.inf) and not better(0.0, 1.0)
+
+
+@pytest.mark.slow
+def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
+    """The fit is made to end at a number that is far off."""
+    real = explain.refined
+
+    def spoilt(experiment, free, *rest):
+        found = real(experiment, free, *rest)
+        if not any(one.path.startswith("effects.") for one in free):
+            return found
+        path = "effects.motor.coulomb_friction.torque"
+        wrong = set_leaves(found.experiment, {path: 4.0 * get_leaf(found.experiment, path)})
+        return found._replace(experiment=wrong)
+
+    monkeypatch.setattr(explain, "refined", spoilt)
+    task = read_task(logs / "axis.csv", model(), holdout=logs / "other.csv")
+    stages = []
+    found = run_task(task, lambda *at: stages.append(at))
+    assert stages == [(i, 6) for i in range(1, 7)]
+    summary = found.summary
+    assert summary["withdrawn"] == ["motor.coulomb_friction"] and summary["findings"] == []
+    assert summary["verdict"] == "unknown_effect"
+    assert any("was found, and withdrawn" in note for note in summary["notes"])
+    gap = summary["gap"]
+    assert gap["holdout"]["separate"] is True
+    for name in ("theta_e", "torque_motor"):
+        assert gap["holdout_rmse_after"][name] <= 1.02 * gap["holdout_rmse_before"][name]
+    # new numbers alone take the model's place only where they are better
+    after, before = gap["holdout_rmse_after"], gap["holdout_rmse_before"]
+    assert sum(np.log(after[name] / before[name]) for name in before) <= 0.0
+    assert found.model.effects == []
+
+
+def test_a_tie_has_an_experiment(logs, found, tmp_path):
+    record = read_record(logs / "axis.csv")
+    assert tied({"findings": []}) is None
+    told = write_next_experiment(tmp_path, {"findings": []}, record, tmp_path / "next.csv")
+    assert told[0].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
+    other = [{"kind": "motor.quadratic_drag", "drag": 0.004}]
+    rival = {"effect": "motor.quadratic_drag", "drive": model()["drive"], "effects": other}
+    finding = {"effect": "motor.coulomb_friction", "alternatives": [{"effect": "motor.quadratic_drag", "confidence": 0.3}]}
+    summary = {"findings": [finding], "rival": rival}
+    largest = np.max(np.abs(record.torque))
+    best = next_experiment(summary, found.model, record)
+    assert best is not None and best.apart > 10.0
+    assert np.max(np.abs(best.torque)) <= largest + 1e-12
+    less = next_experiment(summary, found.model, record, Limits(torque=0.1 * largest, travel=0.5))
+    assert less is not None and less.apart < best.apart and np.max(np.abs(less.torque)) <= 0.1 * largest + 1e-12
+    assert next_experiment(summary, found.model, record, Limits(travel=1e-9)) is None
+    write_diagnosis_report(found, tmp_path)
+    (line,) = write_next_experiment(tmp_path, summary, record, tmp_path / "new" / "next.csv")
+    assert line.startswith(f"To part motor.coulomb_friction from motor.quadratic_drag: {best.kind} of ")
+    columns = np.genfromtxt(tmp_path / "new" / "next.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(columns["u"], best.torque, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_what_is_tied_is_parted_by_the_experiment_that_is_asked_for(tmp_path):
+    """At 5 Hz and under that noise dry friction of 1 % of the torque looks viscous; a slower motion tells them apart."""
+    friction = {"kind": "motor.coulomb_friction", "torque": 0.004}
+    fast = 0.3 * np.sin(2.0 * np.pi * 5.0 * 2e-3 * np.arange(2000))
+    log, other, holdout = (tmp_path / name for name in ("log.csv", "next_log.csv", "holdout.csv"))
+    driven(fast, [friction], 1e-3, 1).write(log)
+    driven(0.8 * fast, [friction], 1e-3, 2).write(holdout)
+    task = read_task(log, model(), holdout=holdout)
+    found = run_task(task)
+    pair = tied(found.summary)
+    assert pair is not None and set(pair) == {"motor.coulomb_friction", "motor.viscous_friction"}
+    best = next_experiment(found.summary, found.model, task.record, Limits(travel=6.0))
+    assert best is not None and best.apart > 100.0
+    driven(best.torque, [friction], 1e-3, 3).write(other)
+    (one,) = diagnose([log, other], model(), holdout=holdout).summary["findings"]
+    assert one["effect"] == "motor.coulomb_friction" and one["confidence"] > 0.99
+    assert one["parameters"]["torque"]["value"] == pytest.approx(0.004, rel=0.05)
+
+
+def refused(logs, *arguments, **keywords):
+    with pytest.raises(InputError) as error:
+        read_task(*arguments, **keywords)
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+def test_a_holdout_of_another_machine_is_refused(logs, tmp_path):
+    axis = logs / "axis.csv"
+    assert "is the log itself" in refused(logs, axis, model(), holdout=axis)
+    log = logged(seed=2)
+    coarse = tmp_path / "coarse.csv"
+    dataclasses.replace(log, t=log.t * 2.0).write(coarse)
+    assert "is sampled every 0.004 s" in refused(logs, axis, model(), holdout=coarse)
+    logged(seed=2, inertia=0.1).write(tmp_path / "heavy.csv")
+    assert "shows an inertia of 0.1" in refused(logs, axis, model(), holdout=tmp_path / "heavy.csv")
+    dataclasses.replace(log, theta_e=-log.theta_e).write(tmp_path / "sign.csv")
+    assert "sign" in refused(logs, axis, model(), holdout=tmp_path / "sign.csv")
+
+
+def test_a_log_that_is_too_short_is_refused(logs, tmp_path):
+    log = logged()
+    short = dataclasses.replace(log, **{name: getattr(log, name)[:150] for name in ("t", "u", "theta_e")})
+    short.write(tmp_path / "short.csv")
+    assert "too few to hold a quarter of them out" in refused(logs, tmp_path / "short.csv", model())
+
+
+def test_a_log_whose_noise_hides_everything_is_refused(tmp_path):
+    """And not called complete: friction of a third of the input goes unseen."""
+    torque = 2e-3 * logged().u
+    driven(torque, [FRICTION | {"torque": 0.3 * float(np.std(torque))}], 3e-2, 1).write(tmp_path / "axis.csv")
+    told = (
+        r"axis\.csv: noise hides everything: with readings as noisy as 0\.03 rad \(theta_e\), no torque of less than "
+        r"2\d\d % of the input would be seen; noise 6\.9 times smaller, or torques as many times larger, are needed$"
+    )
+    with pytest.raises(InputError, match=told):
+        diagnose(tmp_path / "axis.csv", model())
+
+
+def test_effects_of_one_name_behind_an_actuator_are_refused(logs):
+    """They are called by their positions, which effects that are tried before that of the actuator would shift."""
+    waves = [{"kind": "motor.cogging", "amplitude": 1e-4, "harmonic": n} for n in (3.0, 5.0)]
+    with pytest.raises(InputError, match=r"effects: two are motor\.cogging; list them before those of the actuator"):
+        diagnose(logs / "axis.csv", model() | {"effects": [{"kind": "actuator.lag", "time_constant": 1e-3}, *waves]})
+
+
+def test_a_model_that_diverges_is_refused(logs):
+    unstable = model(effects=[{"kind": "motor.viscous_friction", "viscous": -2.0}])
+    with pytest.raises(InputError, match=r"axis\.csv: the model diverges under this log's input"):
+        diagnose(logs / "axis.csv", unstable)

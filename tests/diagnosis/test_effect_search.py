@@ -1,0 +1,76 @@
+"""Effects hidden by the bench's own simulator are named; nothing is named where nothing or something unknown is hidden."""
+
+import numpy as np
+import pytest
+from hidden.cases import cases
+from hidden_log import logged, model
+
+from jaxbl.diagnosis.effect_search import CLEAR, Explainer
+from jaxbl.identification.identify import read_task
+from jaxbl.identification.logs import default_paths, on_record
+from jaxbl.identification.search import smoothed_channels
+from jaxbl.identification.trajectory import free_parameters
+
+SEED, DURATION = 21, 6.0
+_SIZES = {"torque", "drag", "inertia", "viscous", "relative", "amplitude", "damping", "half_gap", "limit", "time_constant"}
+
+
+def explained(case, tmp_path):
+    log = tmp_path / "log.csv"
+    case.log.write(log)
+    task = read_task(log, case.model)
+    nominal = on_record(task.config, task.record)
+    free = free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
+    prior = [task.config.uncertainty.relative] * len(free)
+    smoothed = smoothed_channels(task.record, nominal.sides).smoothed
+    return Explainer(nominal, free, prior, task.record, smoothed).run()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("i", range(4))
+def test_a_hidden_effect_is_named_with_its_numbers(i, tmp_path):
+    case = cases(SEED, 4, "single", DURATION)[i]
+    found = explained(case, tmp_path)
+    (name,) = case.hidden
+    assert found.verdict == "explained"
+    assert [one.effect for one in found.findings] == [name]
+    for key, value in case.truth["effects"][name].items():
+        if key in _SIZES:
+            # errors of nominal numbers are known no better than these are
+            side, _, kind = name.partition(".")
+            nominal = case.model["drive"].get(f"{side}_{key}", 1.0 if kind == "gain_error" else 0.0)
+            open_to = 0.15 * abs(value) + 2.5 * case.conditions["uncertainty"] * nominal
+            assert abs(found.findings[0].numbers[key]) == pytest.approx(abs(value), abs=open_to)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("i", range(2))
+def test_nothing_is_named_on_a_clean_machine(i, tmp_path):
+    found = explained(cases(SEED, 2, "none", DURATION)[i], tmp_path)
+    assert found.verdict == "no_discrepancy"
+    assert found.findings == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("i", range(2))
+def test_what_no_effect_explains_is_said_to_be_unknown(i, tmp_path):
+    found = explained(cases(SEED, 2, "unknown", DURATION)[i], tmp_path)
+    assert found.verdict == "unknown_effect"
+    assert max(gain for gain, _ in found.rest.values()) > CLEAR
+
+
+@pytest.mark.slow
+def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
+    """Free functions have knots where there are no samples."""
+    log = logged()
+    keep = (log.t < 1.2) | (log.t > 2.0)
+    table = np.column_stack([log.t, log.u, log.theta_e])[keep]
+    np.savetxt(tmp_path / "log.csv", table, "%.10g", ",", header="t,u,theta_e", comments="")
+    task = read_task(tmp_path / "log.csv", model())
+    assert len(task.record.segments) == 2
+    nominal = on_record(task.config, task.record)
+    free = free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
+    smoothed = smoothed_channels(task.record, nominal.sides).smoothed
+    found = Explainer(nominal, free, [task.config.uncertainty.relative] * len(free), task.record, smoothed).run()
+    assert found.verdict == "explained"
+    assert [one.effect for one in found.findings] == ["motor.coulomb_friction"]

@@ -1,0 +1,176 @@
+"""The linearised model: its columns are what changes of numbers and effects do to the prediction errors."""
+
+import functools
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_study import rigid, small
+
+from jaxbl.config import prepare, read_config
+from jaxbl.diagnosis import linearised_model as module
+from jaxbl.diagnosis.candidates import Grids, forces_of, variants_of
+from jaxbl.diagnosis.linearised_model import Linear
+from jaxbl.drive.effects import effect_kinds
+from jaxbl.drive.parameters import as_arrays
+from jaxbl.identification.smoother import smooth
+from jaxbl.identification.trajectory import free_parameters
+from jaxbl.records import read_record
+from jaxbl.sweeps.trial import run
+
+OBSERVER = {"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}}
+SHAFT = {"law": "linear_shaft", "stiffness": 60.0}
+PATHS = {1: ["drive.motor_inertia", "drive.motor_viscous"], 2: ["drive.load_inertia", "transmission.stiffness"]}
+
+
+@functools.cache
+def setting(sides):
+    settings = {"run.duration": 2.0, "run.substeps": 5}
+    excitation = {"kind": "multisine", "amplitude": 5.0 if sides == 2 else 1.0, "frequency": 0.7}
+    if sides == 2:
+        data = small(settings, excitation=excitation, transmission=SHAFT, observer=OBSERVER)
+    else:
+        data = rigid(settings, excitation=excitation, observer={"motor": OBSERVER["motor"]})
+    experiment = prepare(read_config(data))
+    return experiment, run(data, seed=1).trace
+
+
+def linear(tmp_path, sides, change=lambda e: e, theta=0.0, disturbed=0.0):
+    experiment, trace = setting(sides)
+    log = tmp_path / "log.csv"
+    trace[["t", "u", "theta_e", *(["theta_s"] if sides == 2 else [])]].to_csv(log, index=False)
+    record = read_record(log)
+    free = free_parameters(experiment, PATHS[sides], 1.0)
+    smoothed = {side: [smooth(jnp.asarray(record.positions[side]), record.sample_period)] for side in experiment.sides}
+    rng = np.random.default_rng(3)
+    for side, (one,) in smoothed.items():
+        wave = disturbed * np.cumsum(rng.standard_normal((len(record.time), 3)), axis=0)
+        smoothed[side] = [one._replace(state=one.state + wave * np.array([1e-7, 1e-6, 1e-5]))]
+    at = np.full(len(free), theta)
+    prior, centre = np.full(len(free), 0.02), np.zeros(len(free))
+    return Linear(change(experiment), free, at, prior, centre, record, smoothed)
+
+
+def errors(model, forces=None):
+    """Prediction errors over the noise, initial states eliminated: constant, own numbers, forces."""
+    (signals,) = model.signals
+    none = np.zeros((0, signals.count, len(model.sides) + 1)) if forces is None else forces
+    found = np.asarray(module._errors(model.parts[0], model.gain([1e-6] * len(model.sides)), jnp.asarray(none)))
+    found = found[:, :, model._some(len(none), len(none))]
+    flat = found.reshape(-1, found.shape[2])
+    basis = np.linalg.qr(flat[:, -model.states :])[0]
+    rest = flat[:, : -model.states]
+    return rest - basis @ (basis.T @ rest)
+
+
+def size(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.mark.parametrize("sides", [1, 2])
+def test_errors_of_the_smoothed_motion_cancel(tmp_path, sides):
+    plain, disturbed = (errors(linear(tmp_path, sides, disturbed=x))[:, 0] for x in (0.0, 1.0))
+    assert size(disturbed - plain) < 1e-3 * size(plain)
+
+
+@pytest.mark.parametrize("sides", [1, 2])
+def test_own_columns_are_derivatives(tmp_path, sides):
+    step = 1e-4
+    above, below = (errors(linear(tmp_path, sides, theta=x))[:, 0] for x in (step, -step))
+    columns = errors(linear(tmp_path, sides))[:, 1 : 1 + len(PATHS[sides])]
+    expected = (above - below) / (2.0 * step)
+    assert size(columns.sum(axis=1) - expected) < 1e-3 * size(expected)
+
+
+SMALL = {
+    "motor.coulomb_friction": {"torque": 1e-3},
+    "motor.viscous_friction": {"viscous": 1e-4},
+    "motor.inertia": {"inertia": 1e-5},
+    "load.constant_torque": {"torque": 1e-3},
+    "load.gravity": {"torque": 1e-2, "phase": 0.3},
+    "load.periodic_disturbance": {"amplitude": 1e-2, "frequency": 2.0, "phase": 0.4},
+    "motor.cogging": {"amplitude": 1e-3, "harmonic": 8.0, "phase": 0.2},
+    "transmission.damping": {"damping": 1e-4},
+    "transmission.hardening": {"cubic_stiffness": 1.0},
+    "transmission.eccentricity": {"amplitude": 1e-5, "harmonic": 2.0, "phase": 0.1},
+    "actuator.gain_error": {"relative": 1e-3},
+    "actuator.lag": {"time_constant": 1e-4},
+}
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_candidates_torque_does_what_the_effect_does(tmp_path, name):
+    """The effect in the simulated step, against its torque along the measured motion through the linear recursion."""
+    effect = as_arrays(effect_kinds()[name](**SMALL[name]), float)
+
+    def with_effect(experiment):
+        return eqx.tree_at(lambda e: e.effects, experiment, (*experiment.effects, effect))
+
+    base = linear(tmp_path, 2)
+    torque = base.signals[0].of([effect])[0][None]
+    columns = errors(base, torque)
+    expected = errors(linear(tmp_path, 2, with_effect))[:, 0] - columns[:, 0]
+    found = columns[:, -1]
+    assert size(expected) > 0.0
+    assert size(found - expected) < 0.03 * size(expected)
+
+
+def test_numbers_of_waves_are_those_of_the_effect(tmp_path):
+    """A wave's two columns make up the effect that its numbers describe."""
+    base = linear(tmp_path, 2)
+    grids = Grids(5.0, 1e-3, (0.1, 0.3), {"motor": 1.0, "load": 0.2}, (2.0,), (8.0,), (2.0,))
+    values = (0.3e-3, -0.4e-3)
+    waves = ("load.gravity", "load.periodic_disturbance", "motor.cogging", "transmission.eccentricity")
+    seen = set()
+    for one in variants_of(base.experiment, waves, grids):
+        if one.name in waves:
+            columns = forces_of([one], base.signals[0])
+            effect = as_arrays(effect_kinds()[one.name](**one.numbers(values)), float)
+            (expected,) = base.signals[0].of([effect])
+            assert size(np.tensordot(values, columns, 1) - expected) < 0.02 * size(expected)
+            seen.add(one.name)
+    assert seen == set(waves)
+
+
+@pytest.mark.parametrize("sides", [1, 2])
+def test_products_are_those_of_the_errors(tmp_path, sides):
+    """Summed block by block, initial states eliminated, against a decomposition of all errors at once."""
+    model = linear(tmp_path, sides)
+    found = model.columns((), [1e-6] * sides, np.ones(sides)).products
+    every = errors(model)
+    assert found == pytest.approx(every.T @ every, rel=1e-6, abs=1e-9 * np.max(found))
+
+
+@pytest.mark.parametrize("growth", [0.0, 5.0, 10.0, 15.0, 20.0, 25.0])
+def test_what_rounding_takes_is_known(growth):
+    """Initial states whose influence grows e-fold `growth` times, eliminated from products and by a QR of the columns."""
+    count, states = 2000, 4
+    rng = np.random.default_rng(5)
+    time = np.linspace(0.0, 1.0, count)[:, None]
+    # what grows is one motion, which all states take part in
+    mixed = np.exp(growth * time) * rng.standard_normal(states) + rng.standard_normal((count, states))
+    columns = np.concatenate([rng.standard_normal((count, 3)) + np.exp(growth * time), mixed], axis=1)
+    gram = columns.T @ columns
+    basis = np.linalg.qr(mixed / np.linalg.norm(mixed, axis=0))[0]
+    left = columns[:, :3] - basis @ (basis.T @ columns[:, :3])
+    true = float(left[:, 0] @ left[:, 0])
+    error, told = abs(module._eliminated(gram, states)[0, 0] - true), module._lost(gram, states)
+    assert error < max(30.0 * told, 1e-9 * true)
+    assert told < module._LOST or growth > 5.0
+    assert told > module._LOST or growth < 20.0
+
+
+def test_a_gain_under_which_rounding_would_decide_is_left_out(tmp_path, monkeypatch):
+    model = linear(tmp_path, 1)
+    smoothness, _ = model.choose(())
+    assert np.isfinite(model.predictor(smoothness).squares).all()
+    monkeypatch.setattr(module, "_LOST", 0.0)
+    assert not np.isfinite(model.predictor(smoothness).squares).any()
+
+
+def test_eccentricity_is_tried_once_a_turn_however_small_the_motion(tmp_path):
+    model = linear(tmp_path, 2)
+    travel = float(np.ptp(np.asarray(model.parts[0].position["load"])))
+    least = int(np.floor(0.5 / travel)) + 1
+    assert model.grids(()).load_harmonics == (1.0, *(float(n) for n in range(max(least, 2), 9)))

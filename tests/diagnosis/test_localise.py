@@ -1,0 +1,211 @@
+"""Where a residual lives: what is there is found where it is, and noise, correlated or not, is found nowhere."""
+
+import dataclasses
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from small_study import rigid, small
+
+from jaxbl.config import prepare, read_config
+from jaxbl.diagnosis.localise import SIGNIFICANT, Values, as_json, coordinates_of, describe, half_gap, locate, where
+from jaxbl.diagnosis.residuals import Residual, residual_torques
+from jaxbl.identification.regression import from_smoothed
+from jaxbl.identification.smoother import smooth
+from jaxbl.sweeps.trial import run
+
+PERIOD, COUNT = 5e-3, 4000
+TIME = PERIOD * np.arange(COUNT)
+RATE = 2.0 * np.pi * np.array([0.31, 0.53, 0.97])
+SIZE = np.array([6.0, 2.0, 0.7])
+POSITION = np.sum(SIZE * np.sin(RATE * TIME[:, None] + [0.0, 1.0, 2.0]), axis=1)
+VELOCITY = np.sum(SIZE * RATE * np.cos(RATE * TIME[:, None] + [0.0, 1.0, 2.0]), axis=1)
+POLE = 0.9
+
+
+def coordinates(**more):
+    crossing = np.flatnonzero(np.diff(np.sign(VELOCITY)))
+    near = np.zeros(COUNT, int)
+    for at in crossing:
+        near[max(at - 12, 0) : at + 12] = 1 if VELOCITY[at + 1] > 0.0 else 2
+    found = {
+        "all": Values(np.zeros(COUNT, int), classes=("everywhere",)),
+        "direction": Values((VELOCITY > 0.0).astype(int), classes=("backward", "forward")),
+        "reversals": Values(near, classes=("away from reversals", "reversals to forward", "reversals to backward")),
+        "|speed|": Values(np.abs(VELOCITY), "rad/s", symbol="|ω|"),
+        "speed": Values(VELOCITY, "rad/s", symbol="ω"),
+        "turn": Values(np.mod(POSITION, 2.0 * np.pi), "rad", symbol="θe mod 2π"),
+        "position": Values(POSITION, "rad", symbol="θe"),
+        "time": Values(TIME, "s", symbol="t"),
+    }
+    return found | more
+
+
+def noise(seed, pole=0.0):
+    random = np.random.default_rng(seed)
+    white = random.standard_normal(COUNT + 500)
+    return lfilter([np.sqrt(1.0 - pole**2)], [1.0, -pole], white)[500:]
+
+
+def residual(torque, pole=0.0, level=0.1):
+    correlation = pole ** np.arange(120.0) if pole else np.ones(1)
+    return Residual("motor", TIME, torque, np.full(COUNT, level), correlation, 0.5 / PERIOD)
+
+
+def found(torque, seed=0, pole=0.0, **more):
+    return locate([residual(torque + 0.1 * noise(seed, pole), pole)], [coordinates(**more)])
+
+
+@pytest.mark.parametrize("pole", [0.0, POLE], ids=["white", "correlated"])
+def test_noise_is_found_nowhere(pole):
+    """One false region in all of sixty logs would be chance; z-scores have the spread that they claim."""
+    false, z, excess, explained = 0, [], [], []
+    for seed in range(60):
+        one = found(np.zeros(COUNT), seed, pole)
+        false += one.significant
+        for name in ("speed", "position", "time"):
+            z += [region.mean_z for region in one.coordinates[name].regions]
+            excess += [region.excess_z for region in one.coordinates[name].regions]
+        explained += [coordinate.explained for coordinate in one.coordinates.values()]
+        assert one.significant or describe(one).startswith("motor side: nothing beyond noise")
+    assert false <= 1
+    assert 0.75 < np.std(z) < 1.1
+    assert 0.7 < np.std(excess) < 1.15 and abs(np.mean(excess)) < 0.2
+    assert max(explained) == 0.0
+
+
+def test_a_slow_disturbance_is_no_function_of_the_motion():
+    """Noise that the stated level does not know of, over half a second: power is missing, but at no place of the motion."""
+    false = 0
+    for seed in range(20):
+        one = found(0.2 * noise(100 + seed, 0.99), seed)
+        assert one.significant and one.excess_z > SIGNIFICANT
+        for name in ("direction", "reversals", "|speed|", "speed", "turn"):
+            assert one.coordinates[name].explained < 0.25
+            false += any(abs(region.mean_z) > SIGNIFICANT for region in one.coordinates[name].regions)
+    assert false <= 1
+
+
+CASES = {
+    "everywhere": ("all", np.full(COUNT, 0.2), "alike everywhere"),
+    "coulomb": ("direction", -0.3 * np.sign(VELOCITY), "by the direction of motion"),
+    "viscous": ("speed", -0.03 * VELOCITY, "a function of speed"),
+    "fast": ("|speed|", 0.05 * np.abs(VELOCITY), "by the size of the speed"),
+    "cogging": ("turn", 0.3 * np.sin(6.0 * POSITION), "a function of the position within a turn"),
+    "spring": ("position", -0.05 * POSITION, "a function of position"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_each_coordinate_is_found_for_what_lives_there(case):
+    name, torque, words = CASES[case]
+    one = found(torque)
+    assert one.significant
+    assert one.coordinates[name].explained > 0.9
+    assert words in describe(one)
+    assert one.missing == pytest.approx(np.sqrt(np.mean(torque**2)), rel=0.1)
+    assert sum(region.power_share for region in one.coordinates[name].regions) == pytest.approx(1.0, abs=0.05)
+
+
+def test_reversals_low_speed_places_and_times_are_told():
+    slow = np.where(np.abs(VELOCITY) < 1.0, -0.6 * np.sign(VELOCITY), 0.0)
+    one = found(slow)
+    near = [region for region in one.coordinates["reversals"].regions if region.label.startswith("reversals")]
+    assert sum(region.power_share for region in near) > 0.6 and sum(region.time_share for region in near) < 0.3
+    sentence = describe(one)
+    assert sentence.startswith("motor side, at ") and "of the residual power lies" in sentence
+    dent = np.where(np.abs(POSITION - 2.0) < 0.3, 0.8, 0.0)
+    assert "< θe <" in describe(found(dent))
+    knock = np.where(np.abs(TIME - 12.0) < 0.4, 1.0, 0.0) * np.sin(40.0 * TIME)
+    assert "for a while" in describe(found(knock))
+
+
+def test_the_gap_is_told():
+    inside = (np.abs(np.sin(3.0 * TIME)) < 0.2).astype(int)
+    gap = Values(inside, classes=("outside", "inside of the gap"))
+    one = found(0.4 * inside * np.sign(np.sin(7.3 * TIME)), gap=gap)
+    assert "inside of the gap" in describe(one)
+
+
+def test_a_disturbance_of_its_own_frequency_is_a_narrow_peak():
+    one = found(0.2 * np.sin(2.0 * np.pi * 7.3 * TIME))
+    peak = one.peaks[0]
+    assert peak.frequency == pytest.approx(7.3, abs=0.05)
+    assert peak.amplitude == pytest.approx(0.2, rel=0.1)
+    assert not peak.in_motion and "7.3 Hz" in describe(one)
+    # friction has peaks, too, but where the motion has them
+    friction = found(-0.3 * np.sign(VELOCITY))
+    assert friction.peaks[0].in_motion and "Hz" not in describe(friction)
+
+
+def test_weak_torques_are_found_below_the_noise_of_a_sample():
+    one = found(-0.03 * np.sign(VELOCITY))
+    assert one.significant and one.coordinates["direction"].explained > 0.7
+    backward, forward = one.coordinates["direction"].regions
+    assert backward.mean == pytest.approx(0.03, abs=4.0 * backward.mean_error)
+    assert forward.mean == pytest.approx(-0.03, abs=4.0 * forward.mean_error)
+    # a torque below the floor is not spoken of
+    torque = -0.03 * np.sign(VELOCITY) + 0.1 * noise(0)
+    assert not locate([residual(torque)], [coordinates()], floor=0.1).significant
+
+
+def test_parts_of_a_record_are_counted_together():
+    torque = -0.1 * np.sign(VELOCITY) + 0.1 * noise(3)
+    whole = residual(torque)
+    rows = slice(0, 1500), slice(1700, COUNT)
+    parts = [
+        dataclasses.replace(whole, time=TIME[r], torque=torque[r], deviation=whole.deviation[r]) for r in rows
+    ]  # fmt: skip
+    each = [{name: one._replace(values=one.values[r]) for name, one in coordinates().items()} for r in rows]
+    one = locate(parts, each)
+    assert one.coordinates["direction"].explained > 0.85
+    assert sum(region.time_share for region in one.coordinates["speed"].regions) == pytest.approx(1.0)
+
+
+SETTINGS = {"run.duration": 4.0, "run.substeps": 5}
+LAW = {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08}
+GEARED = {
+    "transmission": LAW,
+    "excitation": {"kind": "multisine", "amplitude": 5.0, "frequency": 0.5},
+    "observer": {"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}},
+}
+
+
+def residuals_of(true, model):
+    trace = run(true).trace
+    columns = {"motor": "theta_e", "load": "theta_s"}
+    smoothed = {side: smooth(trace[name].to_numpy(), 1e-3) for side, name in columns.items() if name in trace}
+    part = from_smoothed(trace["t"].to_numpy(), trace["u"].to_numpy(), smoothed)
+    experiment = prepare(read_config(model))
+    return experiment, residual_torques(experiment, [part], [smoothed]), part, smoothed
+
+
+def test_a_geared_drive_with_hidden_friction_on_its_load():
+    hidden = [{"kind": "load.coulomb_friction", "torque": 0.8}]
+    experiment, residuals, part, smoothed = residuals_of(
+        small(SETTINGS, effects=hidden, **GEARED), small(SETTINGS, **GEARED)
+    )
+    found = where(experiment, residuals, [part], [smoothed])
+    assert not found["motor"].significant
+    assert "by the direction of motion" in describe(found["load"])
+    backward, *_, forward = found["load"].coordinates["direction"].regions
+    assert backward.mean == pytest.approx(0.8, rel=0.15) and forward.mean == pytest.approx(-0.8, rel=0.15)
+    assert {"gap", "load sign", "twist", "twist rate"} <= set(found["motor"].coordinates)
+    told = as_json(found)
+    assert json.loads(json.dumps(told))["load"]["sentence"] == describe(found["load"])
+
+
+def test_coordinates_know_turning_from_sliding():
+    moving = rigid(SETTINGS, excitation={"kind": "multisine", "amplitude": 3.0, "frequency": 0.2})
+    experiment, residuals, part, smoothed = residuals_of(moving, moving)
+    turning = coordinates_of(experiment, part, smoothed, residuals["motor"][0])
+    sliding = coordinates_of(experiment, part, smoothed, residuals["motor"][0], rotating=False)
+    assert turning["speed"].unit == "rad/s" and sliding["speed"].unit == "m/s"
+    assert "turn" in turning and "turn" not in sliding and "gap" not in turning
+    assert np.ptp(turning["turn"].values) <= 2.0 * np.pi
+    assert half_gap(experiment) == 0.0
+    added = [{"kind": "transmission.backlash", "half_gap": 0.02}]
+    assert half_gap(prepare(read_config(small(SETTINGS, effects=added, **GEARED)))) == pytest.approx(0.1)
+    assert jnp.asarray(part.time).shape == turning["time"].values.shape

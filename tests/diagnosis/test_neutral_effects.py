@@ -1,0 +1,75 @@
+"""A model with all effects at neutral numbers moves as the model without them does."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_study import rigid, small
+
+from jaxbl.config import prepare, read_config
+from jaxbl.diagnosis.neutral_effects import bucket, candidates, complete
+from jaxbl.drive.effects import effect_class, effect_kinds
+from jaxbl.drive.parameters import as_arrays, parameters
+from jaxbl.simulate import trajectory
+
+KNOWN = [{"kind": "motor.coulomb_friction", "torque": 0.05}]
+
+
+def model(sides):
+    data = small() if sides == 2 else rigid()
+    return as_arrays(prepare(read_config({**data, "effects": KNOWN})), float)
+
+
+@pytest.mark.parametrize("sides", [1, 2])
+def test_neutral_effects_do_nothing(sides):
+    bare = model(sides)
+    every = complete(bare)
+    torque = jnp.asarray(np.random.default_rng(1).normal(0.0, 2.0, 300))
+    runs = []
+    for one in (bare, every):
+        start = one.plant.init(one.initial)
+        runs.append(eqx.filter_jit(trajectory)(one, start, torque))
+    for side in bare.sides:
+        assert np.ptp(runs[0].position[side]) > 0.0
+        for name in ("position", "velocity"):
+            found, expected = (np.asarray(getattr(one, name)[side]) for one in (runs[1], runs[0]))
+            assert found == pytest.approx(expected, rel=1e-12, abs=1e-14)
+
+
+@pytest.mark.parametrize("sides", [1, 2])
+def test_all_effects_are_there_once(sides):
+    bare = model(sides)
+    lacking = candidates(bare)
+    names = [one.name for one in complete(bare).effects]
+    assert len(set(names)) == len(names)
+    assert set(names) == {*lacking, "motor.coulomb_friction"}
+    if sides == 2:
+        assert set(names) == set(effect_kinds())
+    # a second time there is nothing to add
+    assert candidates(complete(bare)) == []
+
+
+@pytest.mark.parametrize("name", effect_kinds())
+def test_every_effect_has_neutral_numbers(name):
+    neutral = effect_class(name).neutral
+    assert {field.name for field, _ in parameters(effect_kinds()[name](**neutral))} == set(neutral)
+
+
+def test_buckets_are_few_and_large_enough():
+    sizes = [bucket(count, 1024) for count in range(1, 100_000, 77)]
+    assert all(size >= count for size, count in zip(sizes, range(1, 100_000, 77), strict=True))
+    assert all(size <= max(1.26 * count, 1024) for size, count in zip(sizes, range(1, 100_000, 77), strict=True))
+    assert len(set(sizes)) < 32
+    assert all(size % 256 == 0 for size in sizes)
+    assert [bucket(count, 1) for count in (1, 2, 3, 5, 9, 17)] == [1, 2, 3, 5, 10, 20]
+
+
+def test_given_effects_keep_their_order():
+    data = small()
+    saturated = [{"kind": "actuator.saturation", "limit": 4.0}, {"kind": "actuator.gain_error", "relative": 0.1}]
+    every = complete(as_arrays(prepare(read_config({**data, "effects": saturated})), float))
+    acting = [one.name for one in every.effects if one.place == "actuator"]
+    assert acting == ["actuator.saturation", "actuator.gain_error", "actuator.lag"]
+    late = complete(as_arrays(prepare(read_config({**data, "effects": saturated[:1]})), float))
+    acting = [one.name for one in late.effects if one.place == "actuator"]
+    assert acting == ["actuator.gain_error", "actuator.saturation", "actuator.lag"]

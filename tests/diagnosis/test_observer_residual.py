@@ -1,0 +1,130 @@
+"""The observers' equivalent control beside the smoother: the same missing torque, with noise of the size that is told."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hidden_log import DRIVE, FRICTION, FRICTIONS, GAP, GEARED, geared, logged, model
+from scipy.signal import lfilter
+
+import jaxbl.diagnosis.observer_residual as under_test
+from jaxbl.diagnosis.diagnose import _ground, read_task
+from jaxbl.diagnosis.observer_residual import compared, observed_torques
+from jaxbl.diagnosis.residuals import narrowed
+from jaxbl.drive.parameters import set_leaves
+from jaxbl.identification.logs import on_record
+
+GAINS = {
+    "direct": {"motor": (2.0, 6.3)},
+    "geared": {"motor": (15.0, 345.0), "load": (2.85, 12.3)},
+}
+"""lambda and alpha, as chosen on these logs."""
+LOW = 0.01
+"""Time constant of the equivalent control, s."""
+
+
+@pytest.fixture(autouse=True)
+def _double():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """Logs of a direct drive and of a geared one, and the speeds of the latter."""
+    folder = tmp_path_factory.mktemp("logs")
+    logged().write(folder / "direct.csv")
+    log, speeds = geared()
+    log.write(folder / "geared.csv")
+    return folder, speeds
+
+
+def seen(logs, which, study, gains=None):
+    """The experiment with gains, the smoother's residuals of its log, and the observers'."""
+    task = read_task(logs[0] / f"{which}.csv", study)
+    nominal = on_record(task.config, task.record)
+    ground = _ground(nominal, task.record, False)
+    values = {
+        f"observer.{side}.{name}": jnp.asarray(value)
+        for side, pair in (gains or GAINS[which]).items()
+        for name, value in zip(("lambda", "alpha"), pair, strict=True)
+    }
+    nominal = set_leaves(nominal, values)
+    return nominal, ground.torques(nominal), observed_torques(nominal, task.record, ground.parts, ground.smoothed)
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def late(torque, period):
+    """A torque as it is behind the equivalent control's low-pass."""
+    share = -np.expm1(-period / LOW)
+    return lfilter([share], [1.0, share - 1.0], torque)
+
+
+def test_observers_see_what_the_smoother_sees_on_both_sides(logs):
+    experiment, residuals, found = seen(logs, "geared", model(drive=GEARED, transmission=GAP))
+    for side, friction in zip(("motor", "load"), FRICTIONS, strict=True):
+        (one,) = found[side]
+        assert one.converged and one.stuck < 0.02
+        assert len(one.residual.time) + one.skipped == 1500 and 50 <= one.skipped < 60
+        about = compared(experiment, found[side], residuals[side], 30.0)
+        assert about["correlation"] > 0.99
+        assert about["rms"] == pytest.approx(about["smoother_rms"], rel=0.03) and about["rms"] > 10.0 * about["noise"]
+        assert about["bandwidth"] == pytest.approx(1.0 / (2.0 * np.pi * LOW))
+        # what is missing, with its sign and late by the low-pass: the truth that neither of them knows
+        missing = late(-friction["torque"] * np.sign(logs[1][side]), 2e-3)[one.skipped : 1500]
+        low, _ = narrowed(one.residual, 10.0)
+        true, _ = narrowed(replace(one.residual, torque=missing), 10.0)
+        assert np.corrcoef(low.torque, true.torque)[0, 1] > 0.99
+        assert rms(low.torque) == pytest.approx(rms(true.torque), rel=0.05)
+
+
+@pytest.mark.parametrize("discretisation", ["implicit", "explicit"])
+@pytest.mark.parametrize("which", ["direct", "geared"])
+def test_a_complete_model_leaves_noise_of_the_stated_size(logs, which, discretisation):
+    tables = {"drive": DRIVE, "effects": [FRICTION]}
+    if which == "geared":
+        tables = {"drive": GEARED, "transmission": GAP, "effects": FRICTIONS}
+    _, _, found = seen(logs, which, model(observer={"discretisation": discretisation}, **tables))
+    for side, (one,) in found.items():
+        scores = [rms(one.residual.torque / one.residual.deviation)]
+        for cutoff in (40.0, 20.0, 10.0):
+            low, _ = narrowed(one.residual, cutoff)
+            scores.append(rms(low.torque / low.deviation))
+        # the explicit one has a lag of its own, which shows behind narrow low-passes
+        if discretisation == "implicit":
+            np.testing.assert_allclose(scores, 1.0, atol=0.3, err_msg=side)
+        else:
+            np.testing.assert_allclose(scores[:2], 1.0, atol=0.45, err_msg=side)
+
+
+def test_a_rigid_drive_has_one_witness(logs):
+    experiment, residuals, found = seen(logs, "direct", model())
+    assert list(found) == ["motor"]
+    about = compared(experiment, found["motor"], residuals["motor"], 30.0)
+    assert about["correlation"] > 0.98 and about["rms"] == pytest.approx(FRICTION["torque"], rel=0.1)
+
+
+@pytest.mark.parametrize("alpha", [1.0, 2.5])
+def test_an_observer_with_too_little_gain_is_told_apart(logs, alpha):
+    """What is missing is 3 rad/s^2."""
+    experiment, residuals, found = seen(logs, "direct", model(), {"motor": (2.0, alpha)})
+    (one,) = found["motor"]
+    assert one.stuck > 0.5 and not one.converged
+    about = compared(experiment, found["motor"], residuals["motor"], 30.0)
+    assert about["converged"] is False and {about[name] for name in ("rms", "noise", "correlation")} == {None}
+
+
+def test_an_observer_that_overflows_says_nothing(logs, monkeypatch):
+    real = under_test._controls
+
+    def controls(*given):
+        return {side: values.at[0, -1].set(np.inf) for side, values in real(*given).items()}
+
+    monkeypatch.setattr(under_test, "_controls", controls)
+    _, _, found = seen(logs, "direct", model())
+    assert not found["motor"][0].converged and np.isnan(found["motor"][0].residual.deviation).all()

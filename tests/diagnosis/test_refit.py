@@ -1,0 +1,94 @@
+"""Refined numbers are those of least prediction errors: against an optimiser that knows nothing of the linearisation."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hidden_log import FRICTION, logged, model
+from scipy.optimize import minimize
+
+from jaxbl.diagnosis.diagnose import read_task
+from jaxbl.diagnosis.effect_search import paths_of, with_effects
+from jaxbl.diagnosis.linearised_model import Linear
+from jaxbl.diagnosis.neutral_effects import complete
+from jaxbl.diagnosis.refit import _Refiner, refined
+from jaxbl.drive.plant import PlantState
+from jaxbl.identification.logs import default_paths, on_record
+from jaxbl.identification.regression import lasting
+from jaxbl.identification.search import smoothed_channels
+from jaxbl.identification.trajectory import free_parameters, with_values
+from jaxbl.simulate import trajectory
+
+NAME = "motor.coulomb_friction"
+
+
+@pytest.fixture(scope="module")
+def setting(tmp_path_factory):
+    log = tmp_path_factory.mktemp("log") / "axis.csv"
+    logged().write(log)
+    task = read_task(log, model())
+    bare = on_record(task.config, task.record)
+    experiment = with_effects(complete(bare), {NAME: {"torque": 1.1 * FRICTION["torque"]}})
+    torque = float(np.std(task.record.torque))
+    own = free_parameters(bare, default_paths(task.config, bare), torque)
+    free = (*own, *free_parameters(experiment, paths_of([NAME]), torque))
+    width = np.array([*[task.config.uncertainty.relative] * len(own), 3.0])
+    return experiment, free, width, task.record, smoothed_channels(task.record, bare.sides).smoothed
+
+
+def test_prediction_errors_are_least(setting):
+    """Of the same predictor, by a search without derivatives that begins elsewhere."""
+    experiment, free, width, record, smoothed = setting
+    found = refined(experiment, free, np.zeros(len(free)), width, record, smoothed)
+    gain = {"motor": Linear.gain_of(found.smoothness, record.sample_period)[0]}
+    torque, reading = jnp.asarray(record.torque), jnp.asarray(record.positions["motor"])
+
+    @eqx.filter_jit
+    def predicted(given):
+        one = with_values(experiment, free, given[2:] * 0.01)
+        start = PlantState({"motor": given[0]}, {"motor": given[1]}, lasting(one, torque[0]))
+        return trajectory(one, start, torque, 0.0, {"motor": reading}, gain).position["motor"]
+
+    def cost(given):
+        errors = np.asarray(reading - predicted(jnp.asarray(given)))
+        return len(errors) * np.log(np.sum(errors**2)) + np.sum((given[2:] * 0.01 / width) ** 2)
+
+    here = np.concatenate([found.start[0], 100.0 * found.theta])
+    options = {"xatol": 1e-5, "fatol": 1e-4, "maxfev": 2000, "adaptive": True}
+    best = minimize(cost, here + np.array([1e-6, 1e-4, 0.3, -0.3, 0.3]), method="Nelder-Mead", options=options)
+    # twice the logarithm of the likelihood: far less than what the noise leaves open
+    assert cost(here) - best.fun < 0.1
+    assert cost(here) < cost(here + np.array([0.0, 0.0, 0.1, -0.1, 0.1])) - 1.0
+
+
+def test_deviations_are_those_of_repetitions(tmp_path):
+    """The friction's error over many noise realisations, against what is said of each."""
+    values, stated = [], []
+    for seed in range(12):
+        log = tmp_path / f"{seed}.csv"
+        logged(seed=seed).write(log)
+        task = read_task(log, model())
+        bare = on_record(task.config, task.record)
+        experiment = with_effects(complete(bare), {NAME: {"torque": FRICTION["torque"]}})
+        torque = float(np.std(task.record.torque))
+        own = free_parameters(bare, default_paths(task.config, bare), torque)
+        free = (*own, *free_parameters(experiment, paths_of([NAME]), torque))
+        width = np.array([*[task.config.uncertainty.relative] * len(own), 3.0])
+        smoothed = smoothed_channels(task.record, bare.sides).smoothed
+        found = refined(experiment, free, np.zeros(len(free)), width, task.record, smoothed)
+        values.append(found.theta[-1])
+        stated.append(found.deviation[-1])
+    errors = np.array(values) / np.array(stated)
+    assert 0.6 < np.sqrt(np.mean(errors**2)) < 1.5
+    assert np.max(np.abs(errors)) < 3.5
+
+
+def test_numbers_under_which_the_predictor_diverges_are_not_taken(setting):
+    """Without a word: what is not finite has no likelihood."""
+    experiment, free, width, record, smoothed = setting
+    wild = with_effects(experiment, {"motor.viscous_friction": {"viscous": -5.0}})
+    refiner = _Refiner(wild, free, width, record, smoothed)
+    theta = np.zeros(len(free))
+    path = refiner._path(theta, refiner.start(), [1e-11])
+    assert not np.isfinite(path["motor"][0].state[:, :2]).all()
+    assert refiner.at(theta, refiner.start(), [1e-11]).cost == np.inf

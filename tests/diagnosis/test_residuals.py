@@ -1,0 +1,126 @@
+"""Residual torques: a known missing torque is found within its stated noise, and a complete model leaves only noise."""
+
+import functools
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_study import rigid, small
+
+from jaxbl.config import prepare, read_config
+from jaxbl.diagnosis.residuals import Residual, low_passed, narrowed, noise_spectrum, residual_torques
+from jaxbl.identification.regression import balance, from_smoothed
+from jaxbl.identification.smoother import smooth
+from jaxbl.sweeps.trial import run
+
+SETTINGS = {"run.duration": 4.0, "run.substeps": 5}
+OBSERVER = {"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}}
+GAP = {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08}
+FRICTION = {"kind": "motor.coulomb_friction", "torque": 0.1}
+
+
+def study(sides, effects=()):
+    tables = {"effects": list(effects), "observer": OBSERVER if sides == 2 else {"motor": OBSERVER["motor"]}}
+    if sides == 1:
+        return rigid(SETTINGS, excitation={"kind": "multisine", "amplitude": 1.0, "frequency": 0.5}, **tables)
+    excitation = {"kind": "multisine", "amplitude": 5.0, "frequency": 0.5}
+    return small(SETTINGS, excitation=excitation, transmission=GAP, **tables)
+
+
+@functools.cache
+def _trace(data, seed):
+    return run(json.loads(data), seed=seed).trace
+
+
+def record(data, seed=0, transmitted=None):
+    """Trace, kinematics and smoothed channels of a run."""
+    trace = _trace(json.dumps(data), seed)
+    columns = {"motor": "theta_e", "load": "theta_s"}
+    smoothed = {side: smooth(trace[name].to_numpy(), 1e-3) for side, name in columns.items() if name in trace}
+    measured = None if transmitted is None else trace["torque"].to_numpy() + transmitted
+    return trace, from_smoothed(trace["t"].to_numpy(), trace["u"].to_numpy(), smoothed, measured), smoothed
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def scores(residual, cutoff=None):
+    if cutoff is not None:
+        residual, _ = narrowed(residual, cutoff)
+    return rms(residual.torque / residual.deviation)
+
+
+@pytest.mark.parametrize("sides", [1, 2])
+@pytest.mark.parametrize("effects", [[], [FRICTION]], ids=["smooth", "friction"])
+def test_a_complete_model_leaves_noise_of_the_stated_size_in_every_band(sides, effects):
+    found = {}
+    experiment = prepare(read_config(study(sides, effects)))
+    for seed in range(3):
+        _, part, smoothed = record(study(sides, effects), seed)
+        for name, (one,) in residual_torques(experiment, [part], [smoothed]).items():
+            found.setdefault(name, []).append([scores(one), scores(one, 20.0), scores(one, 8.0)])
+    assert set(found) == set(experiment.sides)
+    for each in found.values():
+        np.testing.assert_allclose(np.mean(each, axis=0), [1.0, 1.0, 1.05], atol=0.15)
+
+
+def test_the_missing_torque_is_found_within_its_noise_and_with_its_sign():
+    trace, part, smoothed = record(study(1, [FRICTION]))
+    experiment = prepare(read_config(study(1)))
+    (one,) = residual_torques(experiment, [part], [smoothed])["motor"]
+    missing = -0.1 * np.sign(trace["motor.velocity"].to_numpy())
+    seen = np.asarray(low_passed(jnp.asarray(missing), smoothed["motor"], 1e-3))
+    assert rms((one.torque - seen) / one.deviation) == pytest.approx(1.0, abs=0.1)
+    assert scores(one) > 3.0
+    # the other way round as the balance
+    left = -np.asarray(balance(experiment, part)["motor"].residual)
+    assert np.corrcoef(left[200:-200], one.torque[200:-200])[0, 1] > 0.97
+
+
+def test_a_measured_torque_has_its_own_equation():
+    noise = 0.02 * np.random.default_rng(0).standard_normal(4000)
+    _, part, smoothed = record(study(2), transmitted=noise)
+    experiment = prepare(read_config(study(2)))
+    found = residual_torques(experiment, [part], [smoothed])
+    assert list(found) == ["transmission", "motor", "load"]
+    for parts in found.values():
+        assert scores(parts[0]) == pytest.approx(1.0, abs=0.12)
+    stiffer = prepare(read_config(study(2) | {"transmission": GAP | {"stiffness": 50.0}}))
+    found = residual_torques(stiffer, [part], [smoothed])
+    assert scores(found["transmission"][0]) > 5.0
+    assert scores(found["motor"][0]) == pytest.approx(1.0, abs=0.12)
+
+
+def test_noise_of_the_input_is_counted():
+    trace, part, smoothed = record(study(1))
+    noisy = trace["u"].to_numpy() + 0.3 * np.random.default_rng(1).standard_normal(len(trace))
+    part = from_smoothed(trace["t"].to_numpy(), noisy, smoothed)
+    experiment = prepare(read_config(study(1)))
+    assert scores(residual_torques(experiment, [part], [smoothed])["motor"][0]) > 1.5
+    assert scores(residual_torques(experiment, [part], [smoothed], torque_noise=0.3)["motor"][0]) == pytest.approx(
+        1.0, abs=0.1
+    )
+
+
+def test_narrowing_keeps_the_noise_level_and_what_is_slow():
+    random = np.random.default_rng(2)
+    time = 1e-3 * np.arange(20000)
+    slow = np.sin(2.0 * np.pi * 0.7 * time)
+    white = Residual("motor", time, slow + random.standard_normal(20000), np.ones(20000), np.ones(1), 500.0)
+    low, at = narrowed(white, 5.0)
+    assert len(low.time) < 2000 and low.bandwidth == 5.0
+    np.testing.assert_array_equal(low.time, time[at])
+    assert rms((low.torque - slow[at]) / low.deviation) == pytest.approx(1.0, abs=0.1)
+    again, _ = narrowed(low, 2.5)
+    direct, _ = narrowed(white, 2.3)
+    assert again.deviation[50] == pytest.approx(direct.deviation[50], rel=0.1)
+
+
+def test_noise_spectrum_is_the_transform_of_the_correlation():
+    correlation = 0.8 ** np.arange(60)
+    spectrum = noise_spectrum(correlation, 512)
+    frequency = np.linspace(0.0, np.pi, 257)
+    expected = (1.0 - 0.64) / (1.0 + 0.64 - 1.6 * np.cos(frequency))
+    np.testing.assert_allclose(spectrum, expected, rtol=1e-3)

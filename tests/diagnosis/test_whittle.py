@@ -1,0 +1,59 @@
+"""Spectra of noise that is known, and what columns are worth beside it."""
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_toeplitz
+from scipy.signal import lfilter
+
+from jaxbl.diagnosis.whittle import Spectrum, spectrum_of, weighted_products
+
+POLE = 0.8
+
+
+def correlated(samples, seed):
+    """First-order noise in its steady state, of one side."""
+    noise = np.random.default_rng(seed).standard_normal(samples + 500)
+    return lfilter([1.0], [1.0, -POLE], noise)[500:, None]
+
+
+@pytest.mark.parametrize("samples", [99, 1000, 4001])
+def test_white_noise_has_no_colour(samples):
+    coloured = [spectrum_of([np.random.default_rng(i).standard_normal((samples, 2))]).coloured for i in range(20)]
+    assert not any(coloured)
+
+
+def test_the_spectrum_of_first_order_noise():
+    found = spectrum_of([correlated(20000, 1), correlated(7001, 2)])
+    assert found.coloured
+    at = found.at(1000)[:, 0]
+    frequency = np.fft.rfftfreq(1000)
+    expected = 1.0 / np.abs(1.0 - POLE * np.exp(-2j * np.pi * frequency)) ** 2
+    np.testing.assert_allclose(at[2:], expected[2:], rtol=0.25)
+    # worth what the innovations' variance is less than the noise's own
+    assert found.gain == pytest.approx(-0.5 * 27001 * np.log(1.0 - POLE**2), rel=0.05)
+
+
+def test_a_flat_spectrum_gives_sums_of_products():
+    errors = np.random.default_rng(3).standard_normal((301, 2, 4))
+    flat = spectrum_of([errors[:, :, 0]])._replace(frequency=np.array([0.1, 0.4]), power=np.array([[4.0, 9.0], [4.0, 9.0]]))
+    expected = np.einsum("tsc,s,tsd->cd", errors, [0.25, 1.0 / 9.0], errors)
+    np.testing.assert_allclose(weighted_products(errors, flat), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_products_are_those_of_generalised_least_squares():
+    """Against the inverse of the noise's own covariance."""
+    samples = 4000
+    time = np.arange(samples)
+    columns = np.stack([np.sin(0.01 * time), np.sign(np.sin(0.02 * time)), np.ones(samples)], axis=1)
+    frequency = np.geomspace(1e-4, 0.5, 400)
+    spectrum = Spectrum(frequency, 1.0 / np.abs(1.0 - POLE * np.exp(-2j * np.pi * frequency))[:, None] ** 2, 0.0)
+    covariance = POLE**time / (1.0 - POLE**2)
+    expected = columns.T @ solve_toeplitz(covariance, columns)
+    found = weighted_products(columns[:, None], spectrum)
+    np.testing.assert_allclose(found, expected, rtol=0.05, atol=0.01 * expected.max())
+
+
+def test_a_log_in_many_short_parts():
+    found = spectrum_of([np.random.default_rng(i).standard_normal((100, 1)) for i in range(30)])
+    assert np.isfinite(found.at(100)).all()
+    assert not found.coloured

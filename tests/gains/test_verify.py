@@ -1,0 +1,392 @@
+"""Verification of the conditions: its counts done again from the frames, causes that are known, and what is kept."""
+
+import json
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.integrate import quad
+from scipy.optimize import brentq
+from small_study import ALPHA, LAMBDA, listed, rigid
+
+from jaxbl.config import read_config
+from jaxbl.errors import InputError
+from jaxbl.gains import verify as module
+from jaxbl.gains.verify import verify
+from jaxbl.sweeps.engine import Engine
+from jaxbl.sweeps.sweep import load, sweep
+
+ATLAS = {
+    "q": 0.3,
+    "alpha_ratio": {"start": 1.05, "stop": 12.0, "num": 7},
+    "lambda_ratio": {"start": 0.05, "stop": 12.0, "num": 9},
+    "damping": [],
+}
+GAINS = [listed(LAMBDA, 0.05, 5.0, 12.0), listed(ALPHA, 1.8, 8.0)]
+AMPLITUDE, FREQUENCY, PERIOD = "excitation.amplitude", "excitation.frequency", "run.sample_period"
+INPUTS = [listed(AMPLITUDE, 0.02, 0.1, zip="input"), listed(FREQUENCY, 2.0, 5.0, zip="input")]
+STUDY = rigid(
+    {
+        "observer.discretisation": "explicit",
+        "observer.motor.velocity_error": 0.5,
+        "encoders.noise": 3e-5,
+        "run.duration": 0.192,
+    },
+    axes=[*INPUTS, *GAINS, listed(PERIOD, 1e-3, 16e-3)],
+    sweep={"seeds": 2},
+    verify=ATLAS,
+)
+KEYS = {
+    "drive": [AMPLITUDE, FREQUENCY, LAMBDA, ALPHA, "seed"],
+    "sampled": [AMPLITUDE, FREQUENCY, LAMBDA, ALPHA, PERIOD, "seed"],
+}
+BOUNDS = {"true": "motor.f_plus", "claimed": "motor.f_plus_acceleration"}
+CAUSES = {"run too short", "period too long", "noise", "quantisation", "explicit discretisation"}
+WHOLE = {"several", "f_plus underestimated", "unexplained"}
+
+
+@pytest.fixture(scope="module")
+def checked(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("verified")
+    return verify(STUDY, folder), folder
+
+
+def exact(ratio):
+    """Least lambda at f_plus = 1 from the integrals of docs/theory.md."""
+    c1, c2 = 2.0 * (ratio - 1.0), 2.0 * (ratio + 1.0)
+
+    def arc(lambda_, c):
+        return quad(lambda a: 1.0 / (np.sin(a) ** 2 + lambda_ * np.sin(a) * np.cos(a) + c * np.cos(a) ** 2), 0.0, np.pi / 2)[
+            0
+        ]
+
+    def log_peaks(lambda_):
+        return 0.5 * np.log(c2 / c1) - 0.5 * lambda_ * (arc(lambda_, c1) + arc(-lambda_, c2))
+
+    return brentq(log_peaks, 0.0, 1.9 * np.sqrt(c2))
+
+
+def demanded(alpha, f_plus):
+    """Least lambda by condition for one pair."""
+    names = ("davila_fridman", "levant", "seeber_horn", "moreno_osorio", "exact")
+    if not alpha > f_plus:
+        return dict.fromkeys(names, np.nan if np.isnan(f_plus) else np.inf)
+    values = (
+        np.sqrt(2.0 / (alpha - f_plus)) * (alpha + f_plus) * 1.3 / 0.7,
+        np.sqrt(4.0 * f_plus * (alpha + f_plus) / (alpha - f_plus)),
+        np.sqrt(alpha + f_plus),
+        np.sqrt(4.0 * (alpha - np.sqrt(alpha**2 - f_plus**2))),
+        np.sqrt(f_plus) * exact(alpha / f_plus),
+    )
+    return dict(zip(names, values, strict=True))
+
+
+def entries(summary, level):
+    (found,) = [entry for entry in summary["levels"] if entry["level"] == level]
+    return found
+
+
+@pytest.mark.slow
+def test_normalised_level_counted_again(checked):
+    verdict, _ = checked
+    found, plane = entries(verdict.summary, "normalised"), verdict.normalised
+    np.testing.assert_allclose(plane.alpha, np.geomspace(1.05, 12.0, 7))
+    np.testing.assert_allclose(plane.lambda_, np.geomspace(0.05, 12.0, 9))
+    assert plane.ratio.shape == (9, 7)
+    assert found["cells"] == 63
+    least = [demanded(alpha, 1.0) for alpha in plane.alpha]
+    np.testing.assert_allclose(plane.boundary, [column["exact"] for column in least], atol=1e-6)
+    worked = np.array([[lambda_ > column["exact"] for column in least] for lambda_ in plane.lambda_])
+    np.testing.assert_array_equal(plane.ratio < 1.0, worked)
+    assert found["converged"] == worked.sum()
+    for entry in found["conditions"]:
+        column = np.array([one[entry["name"]] for one in least])
+        holds = plane.lambda_[:, None] > column
+        assert 0 < entry["holds"] == holds.sum() < 63
+        assert entry["counterexamples"] == 0
+        assert entry["fails_but_converged"] == (~holds & worked).sum()
+        ratios = column / [one["exact"] for one in least]
+        kept = entry["conservatism"]
+        np.testing.assert_allclose((kept["median"], kept["max"]), (np.median(ratios), ratios.max()), rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def judged(checked):
+    """By level and bound, the rows of the frame as dicts, each with what the conditions demand."""
+    verdict, _ = checked
+    return {
+        (level, bound): [
+            row | {"demanded": demanded(row[ALPHA], row[column])} for row in verdict.levels[level].to_dict("records")
+        ]
+        for level in KEYS
+        for bound, column in BOUNDS.items()
+    }
+
+
+@pytest.mark.parametrize(("level", "cells"), [("drive", 12), ("sampled", 48)])
+def test_levels_of_the_drive_counted_again(level, cells, checked, judged):
+    verdict, _ = checked
+    found = entries(verdict.summary, level)
+    rows = judged[level, "true"]
+    keys = {tuple(row[key] for key in KEYS[level]) for row in rows}
+    assert found["side"] == "motor"
+    assert found["cells"] == len(rows) == len(keys) == cells
+    assert found["converged"] == sum(row["motor.converged"] for row in rows)
+    assert found["diverged"] == sum(not row["finite"] for row in rows)
+    assert found["converged"] > 0
+    for bound, listing in (("true", found["conditions"]), ("claimed", found["claimed_bound"]["conditions"])):
+        rows = judged[level, bound]
+        for entry in listing:
+            name = entry["name"]
+            holds = [row[LAMBDA] > row["demanded"][name] for row in rows]
+            assert entry["holds"] == sum(holds) > 0
+            assert entry["counterexamples"] == sum(
+                h and not row["motor.converged"] for h, row in zip(holds, rows, strict=True)
+            )
+            worked = sum(not h and row["motor.converged"] for h, row in zip(holds, rows, strict=True))
+            assert entry["fails_but_converged"] == worked
+    # the least lambda that worked, everything else being equal
+    first = {}
+    for row in judged[level, "true"]:
+        if row["motor.converged"]:
+            rest = tuple(row[key] for key in KEYS[level] if key != LAMBDA)
+            if rest not in first or row[LAMBDA] < first[rest][LAMBDA]:
+                first[rest] = row
+    for entry in found["conditions"]:
+        ratios = np.array([row["demanded"][entry["name"]] / row[LAMBDA] for row in first.values()])
+        least = np.array([row[LAMBDA] == 0.05 for row in first.values()])
+        strict = np.isfinite(ratios) & (ratios > 1.0)
+        kept = entry["conservatism"]
+        if strict.any():
+            np.testing.assert_allclose((kept["median"], kept["max"]), (np.median(ratios[strict]), ratios[strict].max()))
+        else:
+            assert kept["median"] is None and kept["max"] is None
+        assert (kept["columns"], kept["at_least"]) == (strict.sum(), (strict & least).sum())
+    if level == "drive":
+        assert found["conditions"][0]["name"] == "davila_fridman" and found["conditions"][0]["conservatism"]["columns"] > 0
+    small = [row[BOUNDS["true"]] > row[BOUNDS["claimed"]] for row in judged[level, "true"] if row["motor.converged"]]
+    assert found["claimed_bound"]["too_small"] == pytest.approx(np.mean(small))
+
+
+def test_counterexamples_are_the_runs_that_failed_where_a_condition_held(checked, judged):
+    verdict, _ = checked
+    listed_ = verdict.counterexamples
+    assert set(listed_["side"]) == {"motor"}
+    sizes = []
+    for (level, bound), rows in judged.items():
+        keys = KEYS[level]
+        for name in rows[0]["demanded"]:
+            failed = {
+                tuple(row[key] for key in keys)
+                for row in rows
+                if row[LAMBDA] > row["demanded"][name] and not row["motor.converged"]
+            }
+            part = listed_[(listed_["level"] == level) & (listed_["bound"] == bound) & (listed_["condition"] == name)]
+            found = list(part[keys].itertuples(index=False, name=None))
+            assert len(found) == len(failed)
+            assert set(found) == failed
+            sizes.append(len(failed))
+    assert sum(sizes) == len(listed_)
+    assert np.sum(np.array(sizes) > 0) >= 5
+
+
+def test_every_counterexample_carries_its_point_and_a_cause(checked):
+    listed_ = checked[0].counterexamples
+    for level, part in listed_.groupby("level"):
+        assert part[KEYS[level]].notna().all(axis=None)
+    assert listed_.loc[listed_["level"] == "drive", PERIOD].isna().all()
+    for cause in listed_["cause"]:
+        assert cause in WHOLE or set(cause.split(" or ")) <= CAUSES, cause
+    # what is not there is no cause
+    assert not listed_["cause"].str.contains("quantisation").any()
+    # of one run, one cause at the true bound
+    true = listed_[listed_["bound"] == "true"]
+    # half a rad/s takes longer than there is time
+    assert set(true.loc[true["level"] == "drive", "cause"]) == {"run too short"}
+    assert (true.groupby(["level", *KEYS["sampled"]], dropna=False)["cause"].nunique() == 1).all()
+
+
+def test_causes_in_the_summary_count_runs(checked):
+    verdict, _ = checked
+    for level, keys in KEYS.items():
+        part = verdict.counterexamples[verdict.counterexamples["level"] == level]
+        counted = entries(verdict.summary, level).get("causes", {})
+        assert set(counted) == set(part["bound"])
+        for bound, causes in counted.items():
+            runs = part[part["bound"] == bound].drop_duplicates(keys)
+            assert sum(causes.values()) == len(runs)
+
+
+def test_verdict_on_disk(checked):
+    verdict, folder = checked
+    found = json.loads((folder / "verdict.json").read_text())
+    assert found == verdict.summary
+    assert [level["level"] for level in found["levels"]] == ["normalised", "drive", "sampled"]
+    for level in found["levels"]:
+        assert isinstance(level["cells"], int)
+        assert [entry["name"] for entry in level["conditions"]] == list(module.CONDITIONS)
+        for entry in level["conditions"]:
+            assert isinstance(entry["holds"], int) and isinstance(entry["counterexamples"], int)
+            assert {"median", "max"} <= set(entry["conservatism"])
+    kept = pd.read_parquet(folder / "counterexamples.parquet")
+    pd.testing.assert_frame_equal(kept, verdict.counterexamples, check_dtype=False)
+    true = verdict.counterexamples[verdict.counterexamples["bound"] == "true"]
+    assert found["counterexamples_in_all"] == len(true)
+    assert [entry["cause"] for entry in found["counterexamples"]] == true["cause"].tolist()[:200]
+
+
+def contents(folder):
+    return {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.rglob("*") if path.is_file()}
+
+
+def test_second_call_simulates_nothing_and_says_the_same(checked, monkeypatch):
+    verdict, folder = checked
+    results = {path: kept for path, kept in contents(folder).items() if path.parent.name == "points"}
+    assert len(results) > 5
+    monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished level is simulated"))
+    monkeypatch.setattr(module, "_plane", lambda *_: pytest.fail("the plane is simulated again"))
+    again = verify(STUDY, folder)
+    assert again.summary == verdict.summary
+    for level, frame in verdict.levels.items():
+        pd.testing.assert_frame_equal(again.levels[level], frame)
+    pd.testing.assert_frame_equal(again.counterexamples, verdict.counterexamples)
+    after = contents(folder)
+    assert all(after[path] == kept for path, kept in results.items())
+
+
+def test_another_studys_folder_is_left_as_it_is(checked):
+    _, folder = checked
+    before = contents(folder)
+    with pytest.raises(InputError, match="holds another study"):
+        verify(rigid({"run.duration": 0.1}, axes=GAINS, verify=ATLAS), folder)
+    assert contents(folder) == before
+
+
+def test_another_q_and_other_marks_go_on_with_what_is_there(checked, monkeypatch, tmp_path):
+    verdict, folder = checked
+    shutil.copytree(folder, tmp_path / "copy")
+    monkeypatch.setattr(module, "_plane", lambda *_: pytest.fail("the plane is simulated again"))
+    twice = [{"name": name, "lambda": 5.0, "alpha": 8.0} for name in ("one", "the same")]
+    again = verify(STUDY | {"verify": ATLAS | {"q": 0.6, "marks": twice}}, tmp_path / "copy")
+    titles = [level["conditions"][0]["title"] for level in again.summary["levels"]]
+    assert titles == ["Davila-Fridman (32), q = 0.6"] * 3
+    least, before = (v.summary["levels"][0]["conditions"][0]["conservatism"]["median"] for v in (again, verdict))
+    # (1 + q) / (1 - q) at 0.6 and at 0.3
+    assert least / before == pytest.approx(4.0 / (13.0 / 7.0))
+    one, same = again.summary["marks"]
+    assert one | {"name": "the same"} == same
+
+
+def test_a_verification_keeps_to_its_backend(checked):
+    _, folder = checked
+    with pytest.raises(InputError, match="was begun without --backend; go on without it, or choose another folder"):
+        verify(STUDY, folder, backend="scan")
+
+
+def test_a_folder_of_other_files_is_left_as_it_is(tmp_path):
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(InputError, match="is not empty and holds no study"):
+        verify(STUDY, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize("q", [-0.1, 0.0, 1.0, 1.5, float("nan")])
+def test_q_outside_of_its_range(q, tmp_path):
+    with pytest.raises(InputError, match=r"^config: verify\.q: should be "):
+        verify(rigid(axes=GAINS, verify={"q": q}), tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("axes", [[], GAINS[:1], GAINS[1:], INPUTS])
+def test_a_study_without_gain_axes(axes, tmp_path):
+    with pytest.raises(InputError, match=r"^axes: verify needs axes over both gains of an observer, such as"):
+        verify(rigid(axes=axes), tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("study", "message"),
+    [
+        (
+            rigid(axes=[listed(LAMBDA, 1.0, 2.0, zip="g"), listed(ALPHA, 2.0, 3.0, zip="g")]),
+            r"axes\[0\]\.zip: verify seeks the least lambda",
+        ),
+        (
+            rigid(
+                axes=[{"path": path, "start": 1.0, "stop": 9.0} for path in (LAMBDA, ALPHA)],
+                sweep={"design": "sobol", "points": 4},
+            ),
+            r"sweep\.design: .* whole grid; remove it",
+        ),
+        (
+            rigid(
+                axes=[{"path": path, "start": 1.0, "stop": 9.0, "num": 3} for path in (LAMBDA, ALPHA)],
+                sweep={"refine": 1},
+            ),
+            r"sweep\.refine: .* whole grid; remove it",
+        ),
+        (
+            rigid(axes=GAINS, verify={"marks": [{"name": "m", "side": "load", "lambda": 1.0, "alpha": 2.0}]}),
+            r"verify\.marks\[0\]\.side: 'load' has no meaning on a rigid drive; it should be 'motor'",
+        ),
+        (rigid(axes=GAINS, verify={"damping": [3000.0]}), r"verify\.damping\[0\]: should be less than or equal to 1000"),
+    ],
+    ids=["zipped lambda", "sobol", "refined", "load mark on a rigid drive", "damping"],
+)
+def test_what_cannot_be_judged_is_refused_before_anything_runs(study, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        verify(study, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_without_anything_unknown_there_is_nothing_to_check():
+    study = rigid({"drive.motor_viscous": 0.0, "encoders.noise": 0.0}, axes=GAINS, verify=ATLAS)
+    with pytest.raises(InputError, match=r"motor: nothing acts on it that its observer does not know \(f⁺ = 0\)"):
+        verify(study)
+
+
+def test_a_long_period_is_the_cause_and_a_quarter_of_the_runs_own_mends_it(checked):
+    """Forward Euler chatters with period times alpha: a quarter of 16 ms would do, or no Euler."""
+    verdict, folder = checked
+    found = verdict.counterexamples
+    chosen = found[(found["level"] == "sampled") & (found[ALPHA] == 8.0) & (found[LAMBDA] == 12.0)]
+    assert set(chosen[PERIOD]) == {16e-3}
+    assert set(chosen["cause"]) == {"explicit discretisation", "period too long or explicit discretisation"}
+    periods = [
+        load(place).config.run.sample_period for place in (folder / "verify/causes").glob("sampled-*-period_too_long")
+    ]
+    assert sorted(periods) == [0.25e-3, 4e-3]
+
+
+def test_runs_repeated_for_their_cause_keep_their_noise():
+    study = read_config(rigid(axes=GAINS, sweep={"seeds": 2, "first_seed": 5}))
+    frame = sweep(study).frame
+    again = module._again(study, frame.iloc[[1, 5]], {}, {"run.substeps": 2})
+    repeated = sweep(again.study).frame
+    rows = repeated.iloc[again.positions(repeated)]
+    keys = [LAMBDA, ALPHA, "seed"]
+    pd.testing.assert_frame_equal(rows[keys].reset_index(drop=True), frame.iloc[[1, 5]][keys].reset_index(drop=True))
+    assert set(rows["seed"]) <= {5, 6}
+
+
+@pytest.mark.slow
+def test_claimed_bound_that_misses_friction_at_rest(tmp_path):
+    """A torque below break-away moves nothing: no acceleration, but friction acts all the same."""
+    study = rigid(
+        {"encoders.noise": 0.0, "observer.motor.velocity_error": 0.0},
+        excitation={"kind": "sine", "amplitude": 0.1, "frequency": 2.0},
+        effects=[{"kind": "motor.coulomb_friction", "torque": 0.2}],
+        axes=[listed(LAMBDA, 0.1, 6.0), listed(ALPHA, 0.5, 9.0)],
+        verify=ATLAS,
+    )
+    verdict = verify(study)
+    frame = verdict.levels["drive"]
+    np.testing.assert_allclose(frame["motor.f_plus_acceleration"], 0.0, atol=1e-12)
+    np.testing.assert_allclose(frame["motor.f_plus"][frame[ALPHA] == 9.0], 0.1 / 0.05, rtol=0.01)
+    found = verdict.counterexamples
+    assert set(found["level"]) == {"drive", "sampled"}
+    assert set(found["bound"]) == {"claimed"}
+    assert set(found[ALPHA]) == {0.5}
+    assert set(found["cause"]) == {"f_plus underestimated"}
+    assert entries(verdict.summary, "drive")["claimed_bound"]["too_small"] == 1.0

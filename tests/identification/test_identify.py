@@ -1,0 +1,302 @@
+"""From a log to numbers with intervals: made logs whose truth is known, and a real machine."""
+
+import numpy as np
+import pytest
+from measured import EMPS, XL330, real
+from small_study import rigid, small
+
+from jaxbl.config import read_config
+from jaxbl.errors import InputError
+from jaxbl.identification.identify import identify
+from jaxbl.report.identified import write_identification_report
+from jaxbl.sweeps.trial import run
+
+LAW = {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08}
+FRICTION = [{"kind": "load.coulomb_friction", "torque": 0.4}]
+OBSERVER = {"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}}
+SETTINGS = {"equivalent_control.time_constant": 0.01, "run.duration": 3.0, "run.sample_period": 2e-3, "run.substeps": 4}
+TRUTH = {
+    "drive.motor_inertia": 0.05,
+    "drive.motor_viscous": 0.15,
+    "drive.load_inertia": 7.0,
+    "drive.load_viscous": 16.0,
+    "transmission.stiffness": 60.0,
+    "transmission.half_gap": 0.08,
+    "effects.load.coulomb_friction.torque": 0.4,
+}
+
+
+def geared(changes=None, **tables):
+    tables = {
+        "transmission": LAW,
+        "effects": FRICTION,
+        "excitation": {"kind": "multisine", "amplitude": 5.0, "frequency": 0.5},
+        "identify": {"starts": 2, "window": 0.5},
+        "observer": OBSERVER,
+    } | tables
+    return small(SETTINGS | (changes or {}), **tables)
+
+
+NOMINAL = geared(
+    {
+        "drive.motor_inertia": 0.055,
+        "drive.load_viscous": 14.0,
+        "transmission": LAW | {"stiffness": 50.0, "half_gap": 0.07},
+    },
+    effects=[{"kind": "load.coulomb_friction", "torque": 0.6}],
+)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    file = tmp_path_factory.mktemp("log") / "axis.csv"
+    run(geared()).trace[["t", "u", "theta_e", "theta_s"]].to_csv(file, index=False)
+    return file
+
+
+@pytest.fixture(scope="module")
+def found(log):
+    return identify(log, NOMINAL)
+
+
+@pytest.mark.slow
+def test_numbers_are_those_of_the_machine_within_their_errors(found):
+    parameters = found.summary["parameters"]
+    assert list(parameters) == list(TRUTH)
+    for path, true in TRUTH.items():
+        one = parameters[path]
+        assert abs(one["value"] - true) < 4.0 * one["standard_error"], path
+        assert one["interval"][0] < one["value"] < one["interval"][1]
+        assert one["standard_error"] < 0.02 * true
+    assert found.summary["refused"] == [] and found.summary["held"] == []
+    for side, noise in (("motor", 1e-4), ("load", 2e-5)):
+        residual = found.summary["residual"][side]
+        assert residual["noise"] == pytest.approx(noise, rel=0.1)
+        assert residual["rms"] == pytest.approx(noise, rel=0.1)
+    assert found.summary["method"]["trajectory"]["window"] == pytest.approx(0.5)
+
+
+def test_recursive_identifier_ends_nearby(found):
+    recursive = found.summary["method"]["recursive"]
+    for side in ("motor", "load"):
+        assert recursive["stiffness"][side] == pytest.approx(60.0, rel=0.1)
+        assert recursive["half_gap"][side] == pytest.approx(0.08, rel=0.1)
+        assert found.trace[f"{side}.stiffness"].iloc[-1] == pytest.approx(recursive["stiffness"][side])
+
+
+def test_trace_holds_what_the_log_says(found):
+    trace = found.trace
+    assert len(trace) == 1500
+    truth = run(geared()).trace
+    errors = (trace["motor.velocity"] - truth["motor.velocity"]) / trace["motor.velocity_deviation"]
+    assert 0.5 < np.sqrt(np.mean(errors**2)) < 1.5
+    assert np.sqrt(np.nanmean(trace["motor.residual"] ** 2)) == pytest.approx(1e-4, rel=0.1)
+
+
+def test_model_runs_with_the_numbers_found(found, tmp_path):
+    for path in ("motor_inertia", "load_viscous"):
+        assert getattr(found.model.drive, path) == found.summary["parameters"][f"drive.{path}"]["value"]
+    (tmp_path / "model.toml").write_text(found.model.to_toml())
+    again = read_config(tmp_path / "model.toml")
+    assert again == found.model
+    assert again.effects[0].torque == found.summary["parameters"]["effects.load.coulomb_friction.torque"]["value"]
+
+
+def test_report_has_every_number_and_figure(found, tmp_path):
+    lines = write_identification_report(found, tmp_path)
+    assert lines[0].startswith("drive.motor_inertia = 0.05")
+    assert any("the model leaves nothing but noise" in line for line in lines)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"identification.json", "model.toml", "trace.parquet", "figures", "report.html"}
+    drawn = {path.stem for path in (tmp_path / "figures").iterdir()}
+    assert drawn == {"intervals", "residuals", "velocities", "torque", "hysteresis", "limit_cycle", "recursive"}
+    page = (tmp_path / "report.html").read_text()
+    assert all(path in page for path in TRUTH)
+
+
+@pytest.mark.slow
+def test_a_direction_that_the_log_does_not_show_is_refused(log):
+    """Torque, inertias, frictions and stiffness scaled alike."""
+    effects = [*FRICTION, {"kind": "actuator.gain_error", "relative": 0.0}]
+    found = identify(log, geared(effects=effects)).summary
+    (refusal,) = found["refused"]
+    assert "effects.actuator.gain_error.relative" in refusal["direction"]
+    assert "transmission.stiffness" in refusal["direction"]
+    assert "transmission.half_gap" not in refusal["direction"]
+    assert "what would help: " in refusal["why"] and "a load or an inertia that is known" in refusal["why"]
+    assert len(found["held"]) == 1
+    assert found["held"][0] not in found["parameters"]
+    half_gap = found["parameters"]["transmission.half_gap"]
+    assert abs(half_gap["value"] - 0.08) < 4.0 * half_gap["standard_error"]
+
+
+def open_ended(study):
+    """The study without excitation and observers."""
+    return {key: value for key, value in study.items() if key not in ("excitation", "observer")}
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    """Two logs of the drive with a torque sensor, the second one with another input."""
+    folder = tmp_path_factory.mktemp("measured")
+    for i, frequency in enumerate((0.5, 0.37)):
+        trace = run(
+            geared({"run.duration": 2.0}, excitation={"kind": "multisine", "amplitude": 5.0, "frequency": frequency})
+        )
+        sensor = 0.02 * np.random.default_rng(i).standard_normal(len(trace.trace))
+        frame = trace.trace[["t", "u", "theta_e", "theta_s"]].assign(sensor=trace.trace["torque"] + sensor)
+        frame.to_csv(folder / f"log{i}.csv", index=False)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def everything(measured):
+    """All that can be asked for at once: no excitation, no gains, measured torque, prediction errors, profiles, hold-out."""
+    study = open_ended(NOMINAL)
+    study["log"] = {"transmitted": "sensor", "initial_state": "rest"}
+    study["identify"] = {"starts": 2, "window": 0.5, "method": "prediction_error", "parameters": list(TRUTH)[4:]}
+    study["drive"] = geared()["drive"]
+    return identify(measured / "log0.csv", study, holdout=measured / "log1.csv", profile=True)
+
+
+@pytest.mark.slow
+def test_a_measured_torque_is_regressed_directly(everything):
+    regression = everything.summary["method"]["regression"]
+    assert regression["measured_transmitted_torque"]
+    for path in ("transmission.stiffness", "transmission.half_gap"):
+        one = regression["parameters"][path]
+        assert abs(one["value"] - TRUTH[path]) < 4.0 * one["standard_error"], path
+        assert one["standard_error"] < 0.01 * TRUTH[path]
+    assert regression["torque"]["transmission"]["rms"] < 0.02
+    assert np.array_equal(everything.trace["transmitted"], everything.record.transmitted)
+
+
+def test_prediction_errors_find_the_numbers_too(everything):
+    assert everything.summary["method"]["trajectory"]["kind"] == "prediction_error"
+    for path, one in everything.summary["parameters"].items():
+        assert abs(one["value"] - TRUTH[path]) < 4.0 * one["standard_error"], path
+        low, high = one["interval"]
+        np.testing.assert_allclose(one["profile_interval"], one["interval"], atol=0.1 * (high - low), rtol=0.0)
+        assert len(one["profile"]) == 9
+
+
+def test_gains_are_chosen_on_the_log_where_the_study_has_none(everything):
+    for side, tolerance in (("motor", 0.3), ("load", 0.03)):
+        gains, table = everything.summary["gains"][side], getattr(everything.model.observer, side)
+        assert (table.lambda_, table.alpha) == (gains["lambda_"], gains["alpha"])
+        assert table.alpha > gains["f_plus"]
+        difference = (everything.trace[f"{side}.velocity_estimate"] - everything.trace[f"{side}.velocity"])[250:]
+        assert np.sqrt(np.mean(difference**2)) == pytest.approx(gains["velocity_error"], rel=0.01)
+        assert gains["velocity_error"] < tolerance
+
+
+def test_numbers_are_tried_out_on_another_log(everything):
+    holdout = everything.summary["holdout"]
+    assert holdout["file"].endswith("log1.csv")
+    for side, noise in (("motor", 1e-4), ("load", 2e-5)):
+        one = holdout["position"][side]
+        assert one["rms"] == pytest.approx(noise, rel=0.1)
+        assert one["nominal_rms"] > 5.0 * noise
+    torque = holdout["torque"]["transmission"]
+    assert torque["relative"] < 0.3 * torque["nominal_relative"]
+
+
+def test_model_replays_the_log_where_the_study_has_no_excitation(everything, tmp_path):
+    lines = "\n".join(write_identification_report(everything, tmp_path))
+    assert "On log1.csv, motor: positions over 0.5 s are met to" in lines
+    assert "motor observer: lambda = " in lines
+    assert "(transmission)" in lines
+    again = run(tmp_path / "model.toml")
+    np.testing.assert_allclose(again.trace["u"][:1000], everything.trace["u"], atol=1e-12)
+    page = (tmp_path / "report.html").read_text()
+    assert "by profile from" in page
+    assert "with the measured transmitted torque" in page
+
+
+@pytest.mark.slow
+def test_several_logs_are_one_record(measured):
+    study = open_ended(geared())
+    study["identify"] = {"starts": 1, "window": 0.5, "parameters": ["transmission.half_gap"]}
+    logs = [measured / "log0.csv", measured / "log1.csv"]
+    both, one = identify(logs, study), identify(logs[0], study)
+    assert len(both.trace) == 2000
+    assert both.summary["method"]["trajectory"]["windows"] == 8
+    errors = [x.summary["parameters"]["transmission.half_gap"]["standard_error"] for x in (both, one)]
+    assert errors[0] < 0.9 * errors[1]
+    with pytest.raises(InputError, match="no log: at least one is needed"):
+        identify([], study)
+
+
+BAD = {
+    "no load encoder": (geared(log={"absent": ["theta_s"]}), "no load position .theta_s., which a two_inertia drive needs"),
+    "unknown number": (
+        geared(identify={"parameters": ["drive.mass"]}),
+        "'drive.mass' is no number of the plant; fitted can be: drive.motor_inertia",
+    ),
+    "window": (geared(identify={"window": 60.0}), r"identify.window: 60 s are 30000 samples; it should be between 20 "),
+    "starts": (geared(identify={"starts": 0}), "identify.starts: should be greater than or equal to 1"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_line(case, log):
+    study, message = BAD[case]
+    with pytest.raises(InputError, match=message) as error:
+        identify(log, study)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.slow
+def test_emps_agrees_with_what_was_published():
+    """A real axis in closed loop, by a rigid model; values of Janot, Gautier, Brunot (2019)."""
+    study = rigid(
+        {"drive.motor_inertia": 80.0, "drive.motor_viscous": 150.0, "run.substeps": 2},
+        effects=[{"kind": "motor.coulomb_friction", "torque": 15.0}, {"kind": "motor.constant_torque", "torque": 0.0}],
+        log=EMPS,
+        identify={"starts": 3},
+    )
+    found = identify(real("emps/DATA_EMPS.mat"), study, holdout=real("emps/DATA_EMPS_PULSES.mat")).summary
+    parameters = found["parameters"]
+    published = {
+        "drive.motor_inertia": 95.109,
+        "drive.motor_viscous": 203.50,
+        "effects.motor.coulomb_friction.torque": 20.394,
+        "effects.motor.constant_torque.torque": -3.165,
+    }
+    assert set(parameters) == set(published)
+    for path, value in published.items():
+        low, high = parameters[path]["interval"]
+        assert low <= value <= high, (path, low, high)
+        assert high - low < 0.25 * abs(value)
+    torque = found["torque"]["motor"]
+    assert torque["relative"] < 0.042
+    assert torque["unit"] == "N"
+    assert found["holdout"]["torque"]["motor"]["relative"] < 0.054
+
+
+@pytest.mark.slow
+def test_xl330_pendulum_swings_freely():
+    """Gravity and friction from two free swings with uneven stamps; better than the published 0.018 rad rms."""
+    study = rigid(
+        {"drive.motor_inertia": 0.0049, "drive.motor_viscous": 0.005, "run.substeps": 2, "run.sample_period": 3.5e-3},
+        effects=[{"kind": "load.gravity", "torque": 0.4}, {"kind": "motor.coulomb_friction", "torque": 0.02}],
+        uncertainty={"exact": ["drive.motor_inertia"]},
+        log={key: XL330[key] for key in ("t", "theta_e")}
+        | {"absent": ["u"], "where": {"torque_enable": False}, "resample": 3.5e-3},
+        identify={"starts": 2, "window": 3.9},
+    )
+    logs = [real(f"bam_xl330/2026-01-15_{time}.json") for time in ("10h28m17", "10h29m21")]
+    found = identify(logs, study)
+    assert found.summary["residual"]["motor"]["rms"] < 0.019
+    parameters = found.summary["parameters"]
+    assert set(parameters) == {
+        "drive.motor_viscous",
+        "effects.load.gravity.torque",
+        "effects.load.gravity.phase",
+        "effects.motor.coulomb_friction.torque",
+    }
+    low, high = parameters["effects.motor.coulomb_friction.torque"]["interval"]
+    assert 0.0 < low < high < 0.02
+    assert any("taken to move freely" in note for note in found.summary["notes"])
+    # of the inertia m l² = 0.0049 kg m², a mass point: gravity pulls less, as the servo's own inertia adds to it
+    assert 0.3 < parameters["effects.load.gravity.torque"]["value"] < 0.49 * 0.1 * 9.81

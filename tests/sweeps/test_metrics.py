@@ -1,0 +1,154 @@
+"""The streaming metrics against NumPy on a full trace."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from paper_drive import paper
+
+from jaxbl.drive import DeadZone, LinearShaft, Rigid, SigmoidBacklash
+from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, Observers, conditions
+from jaxbl.simulate import scan
+from jaxbl.sweeps.metrics import (
+    METRICS,
+    SIDE_METRICS,
+    describe,
+    metric_columns,
+    observer_gains,
+    window_start,
+    with_conditions,
+)
+
+H = 1e-3
+
+
+@eqx.filter_jit
+def run(experiment):
+    figures, kept = scan(experiment, jnp.asarray(2), (METRICS,), lambda state, signals: (signals, state.identifier))
+    return figures, kept
+
+
+def by_numpy(experiment, signals, identifier):
+    """All columns again, from the whole trace and the last state of the identifier."""
+    steps = experiment.run.steps
+    late = slice(steps - steps // 4, None)
+    time = np.asarray(signals.time)
+    expected = {"finite": True}
+    for side in experiment.sides:
+        s, observer = signals.side(side), getattr(experiment.observer, side)
+        ratio = float(experiment.drive.ratio(side))
+        position = np.asarray(s.true.position - s.position_estimate)
+        velocity = np.asarray(s.true.velocity - s.velocity_estimate)
+        torque = np.asarray(signals.torque - s.torque_estimate)
+        outside = (np.abs(position) > experiment.run.position_tolerance / ratio) | (
+            np.abs(velocity) > experiment.run.velocity_tolerance / ratio
+        )
+        f_plus = np.abs(s.true.perturbation).max()
+        last = np.flatnonzero(outside)[-1] if outside.any() else -1
+        out = {
+            "converged": not outside[late].any(),
+            "convergence_time": time[last + 1] if last + 1 < steps else np.nan,
+            "position_rmse": np.sqrt(np.mean(position[late] ** 2)),
+            "velocity_rmse": np.sqrt(np.mean(velocity[late] ** 2)),
+            "torque_rmse": np.sqrt(np.mean(torque[late] ** 2)),
+            "position_size": np.sqrt(np.mean(np.asarray(s.true.position)[late] ** 2)),
+            "velocity_size": np.sqrt(np.mean(np.asarray(s.true.velocity)[late] ** 2)),
+            "chatter": np.sqrt(np.mean(np.diff(velocity[late.start - 1 :]) ** 2) / 2.0),
+            "f_plus": f_plus,
+            "f_plus_acceleration": 2.0 * np.abs(s.true.acceleration).max(),
+            "margin_alpha": observer.alpha / f_plus,
+            "convergence_time_bound": conditions.convergence_time_bound(
+                observer.lambda_, observer.alpha, f_plus, np.abs(position[0]), np.abs(velocity[0])
+            ),
+            "convergence_time_worst": conditions.convergence_time_worst(
+                observer.lambda_, observer.alpha, f_plus, observer.position_error, observer.velocity_error
+            ),
+        }
+        for name, (_, least) in conditions.CONDITIONS.items():
+            out[f"margin_{name}"] = observer.lambda_ / least(observer.alpha, f_plus)
+        if identifier is not None:
+            law = experiment.transmission
+            information = np.array([float(total.value(identifier.weight)[-1]) for total in identifier.information])
+            right = np.array([float(total.value(identifier.weight)[-1]) for total in identifier.right[side]])
+            if right.size == 1:
+                out["stiffness_error"] = right[0] / information[0] / law.stiffness - 1.0
+                out["excitation"] = 1.0
+            else:
+                matrix = np.array([[information[0], information[1]], [information[1], information[2]]])
+                theta = np.linalg.solve(matrix, right)
+                out["stiffness_error"] = theta[0] / law.stiffness - 1.0
+                amplitude = law.dead_zone if isinstance(law, SigmoidBacklash) else law.half_gap
+                out["dead_zone_error"] = theta[1] / theta[0] / amplitude - 1.0
+                scale = np.sqrt(np.diag(matrix))
+                out["excitation"] = np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0]
+        expected |= {f"{side}.{name}": value for name, value in out.items()}
+    return expected
+
+
+CASES = {
+    "converges": {"velocity_error": 0.5, "noise": 1e-5},
+    "never leaves tolerance": {},
+    "never converges": {"noise": 1e-2},
+    "explicit, load off": {
+        "noise": 1e-5,
+        "observer": Observers(
+            ExplicitSuperTwisting(4.0, 9.0, position_error=0.02), ExplicitSuperTwisting(0.5, 0.2, velocity_error=-0.05)
+        ),
+    },
+    "linear shaft": {"transmission": LinearShaft(1.2), "velocity_error": 0.2},
+    "hard gap": {"transmission": DeadZone(1.2, 1e-4), "velocity_error": 0.2},
+    "rigid": {
+        "drive": Rigid(0.05, 0.15),
+        "transmission": None,
+        "identifier": None,
+        "observer": Observers(ImplicitSuperTwisting(4.0, 9.0, velocity_error=0.3)),
+    },
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_columns_against_numpy_on_the_whole_trace(case):
+    # steps that no block length and no quarter divides
+    experiment = paper(time_constant=0.01, start=0.3, steps=1023, **CASES[case])
+    figures, (signals, identifier) = run(experiment)
+    expected = by_numpy(experiment, signals, identifier)
+    figures = with_conditions(figures, observer_gains(experiment))
+    assert set(figures) == set(expected) == set(metric_columns(experiment))
+    for name, value in expected.items():
+        np.testing.assert_allclose(figures[name], value, rtol=1e-7, atol=1e-12, err_msg=name)
+    if case == "converges":
+        assert figures["motor.converged"]
+        assert 0.0 < figures["motor.convergence_time"] < 0.2
+    elif case == "never leaves tolerance":
+        assert figures["motor.convergence_time"] == 0.0
+    elif case == "never converges":
+        assert not figures["motor.converged"]
+        assert np.isnan(figures["motor.convergence_time"])
+    elif case == "explicit, load off":
+        assert figures["motor.convergence_time"] > 0.0
+        assert figures["load.convergence_time"] > 0.0
+
+
+def test_converged_needs_the_whole_last_quarter():
+    """A tolerance that the velocity error leaves for the last time within the last quarter."""
+    experiment = paper(time_constant=0.01, steps=800, noise=1e-4)
+    _, (signals, _) = run(experiment)
+    error = np.abs(np.asarray(signals.motor.true.velocity - signals.motor.velocity_estimate))
+    peak = 600 + int(np.argmax(error[600:]))
+    for factor, converged in ((0.999, False), (1.001, True)):
+        tight = eqx.tree_at(lambda e: e.run.velocity_tolerance, experiment, jnp.asarray(factor * error[peak]))
+        figures, _ = run(tight)
+        assert figures["motor.converged"] == converged
+
+
+@pytest.mark.parametrize(("steps", "first"), [(1, 0), (3, 2), (4, 3), (1023, 768), (20_000, 15_000)])
+def test_last_quarter(steps, first):
+    assert window_start(steps) == first
+
+
+def test_every_column_has_unit_and_meaning():
+    columns = metric_columns(paper())
+    assert len(columns) == 1 + 2 * len(SIDE_METRICS)
+    for column in columns:
+        assert describe(column).doc
+    assert describe("load.torque_rmse").unit == "N m"

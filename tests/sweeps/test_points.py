@@ -1,0 +1,103 @@
+"""Points of a study: order, spacing, zipped and quasi-random axes, structural groups."""
+
+import numpy as np
+import pytest
+from small_study import ALPHA, LAMBDA, NOISE, listed, small, spaced
+
+from jaxbl.config import read_config
+from jaxbl.sweeps.points import Points
+
+
+def points(*axes, **sweep):
+    return Points(read_config(small(axes=list(axes), sweep=sweep)))
+
+
+def columns(study):
+    return study.columns(np.arange(study.lanes))
+
+
+def test_grid_has_the_last_axis_fastest():
+    study = points(listed(NOISE, 1e-5, 1e-4), spaced(ALPHA, 1.0, 100.0, 3), spaced(LAMBDA, 1.0, 2.0, 3, "linear"))
+    assert study.paths == [NOISE, ALPHA, LAMBDA]
+    assert len(study) == study.lanes == 18
+    expected = np.meshgrid([1e-5, 1e-4], [1.0, 10.0, 100.0], [1.0, 1.5, 2.0], indexing="ij")
+    for path, values in zip(study.paths, expected, strict=True):
+        np.testing.assert_allclose(columns(study)[path], values.ravel(), rtol=1e-14)
+
+
+def test_zipped_axes_advance_together_and_may_repeat_a_value():
+    study = points(listed(ALPHA, 1.0, 1.0, 3.0, zip="g"), listed(NOISE, 0.0, 1e-3), listed(LAMBDA, 4.0, 5.0, 5.0, zip="g"))
+    found = columns(study)
+    np.testing.assert_array_equal(found[ALPHA], [1.0, 1.0, 1.0, 1.0, 3.0, 3.0])
+    np.testing.assert_array_equal(found[LAMBDA], [4.0, 4.0, 5.0, 5.0, 5.0, 5.0])
+    np.testing.assert_array_equal(found[NOISE], [0.0, 1e-3] * 3)
+
+
+def test_slices_are_parts_of_the_whole():
+    study = points(listed(NOISE, 1e-5, 1e-4), spaced(ALPHA, 1.0, 100.0, 7), spaced(LAMBDA, 1.0, 2.0, 5))
+    whole = columns(study)
+    for first in range(0, study.lanes, 11):
+        part = study.columns(np.arange(first, min(first + 11, study.lanes)))
+        for path, values in part.items():
+            np.testing.assert_array_equal(values, whole[path][first : first + 11])
+
+
+@pytest.mark.parametrize("design", ["sobol", "latin_hypercube"])
+def test_quasi_random_points_fill_the_ranges_evenly_and_repeat(design):
+    axes = [spaced(ALPHA, 1.0, 100.0), spaced(LAMBDA, 2.0, 4.0, scale="linear")]
+    study = points(*axes, design=design, points=64)
+    found = columns(study)
+    unit = [np.log(found[ALPHA]) / np.log(100.0), (found[LAMBDA] - 2.0) / 2.0]
+    for u in unit:
+        # one point in each of 64 slices of either axis, in its own scale
+        assert sorted(np.floor(64 * u).astype(int)) == list(range(64))
+    again = columns(points(*axes, design=design, points=64))
+    other = columns(points(*axes, design=design, points=64, design_seed=1))
+    for path, values in found.items():
+        np.testing.assert_array_equal(values, again[path])
+        assert (values != other[path]).all()
+
+
+def test_fewer_sobol_points_are_the_first_of_more():
+    axis = spaced(ALPHA, 1.0, 100.0)
+    few, many = (columns(points(axis, design="sobol", points=n)) for n in (11, 16))
+    np.testing.assert_array_equal(few[ALPHA], many[ALPHA][:11])
+
+
+def test_a_design_is_crossed_with_the_axes_that_are_listed():
+    study = points(spaced(ALPHA, 1.0, 9.0), listed(NOISE, 0.0, 1e-3), spaced(LAMBDA, 2.0, 4.0), design="sobol", points=5)
+    found = columns(study)
+    assert len(study) == 10
+    np.testing.assert_array_equal(found[NOISE], [0.0, 1e-3] * 5)
+    for path in (ALPHA, LAMBDA):
+        np.testing.assert_array_equal(found[path][::2], found[path][1::2])
+        assert len(set(found[path])) == 5
+
+
+def test_axes_over_structure_are_groups_outside_of_the_lanes():
+    study = points(
+        spaced(ALPHA, 1.0, 9.0, 3),
+        listed("run.sample_period", 1e-3, 2e-3),
+        listed("observer.discretisation", "explicit", "implicit"),
+    )
+    assert (len(study.groups), study.lanes, len(study)) == (4, 3, 12)
+    assert list(columns(study)) == [ALPHA]
+    chosen = [(g.config.run.sample_period, g.config.observer.discretisation) for g in study.groups]
+    assert chosen == [(1e-3, "explicit"), (1e-3, "implicit"), (2e-3, "explicit"), (2e-3, "implicit")]
+    assert [tuple(g.structural.values()) for g in study.groups] == [pair[::-1] for pair in chosen]
+
+
+def test_a_leaf_zipped_with_structure_goes_with_its_group():
+    study = points(listed(ALPHA, 1.0, 2.0, zip="g"), spaced("run.substeps", 1, 3, 2, "linear", zip="g"))
+    assert (len(study.groups), study.lanes) == (2, 1)
+    assert [(g.config.observer.motor.alpha, g.config.run.substeps) for g in study.groups] == [(1.0, 1), (2.0, 3)]
+
+
+def test_a_number_that_is_left_out_may_be_an_axis():
+    study = points(listed("encoders.load_noise", 0.0, 1e-3))
+    assert list(columns(study)) == ["encoders.load_noise"]
+    assert study.groups[0].config.encoders.load_noise == 0.0
+
+
+def test_no_axes_is_one_point():
+    assert len(points()) == 1

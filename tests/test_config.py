@@ -1,0 +1,601 @@
+"""The TOML study: what is valid, what the messages about the rest say, and what it builds."""
+
+import tomllib
+
+import hypothesis.strategies as st
+import numpy as np
+import pandas as pd
+import pytest
+import tomli_w
+from hypothesis import HealthCheck, given, settings
+from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
+
+from jaxbl.config import numeric_paths, read_config, with_values
+from jaxbl.drive import EXCITATIONS, TRANSMISSIONS, effect_class, effect_kinds, get_leaf, key_of, leaf_paths, parameters
+from jaxbl.drive.plant import DRIVES
+from jaxbl.errors import InputError
+from jaxbl.sweeps.points import Points
+from jaxbl.sweeps.sweep import sweep
+
+# the config of the design, all of its tables
+EXAMPLE = """
+title = "Motor observer gains, three noise levels"
+[drive]
+kind = "two_inertia"
+motor_inertia = 0.05
+motor_viscous = 0.15
+load_inertia = 7.0
+load_viscous = 16.0
+gear_ratio = 5.0
+[transmission]
+law = "sigmoid_backlash"
+stiffness = 1.0
+dead_zone = 0.02
+slope = 20.0
+[[effects]]
+kind = "motor.coulomb_friction"
+torque = 0.02
+[excitation]
+kind = "sine"
+amplitude = 0.1
+frequency = 0.16
+[encoders]
+noise = 1e-4
+motor_resolution = 0.0
+load_resolution = 0.0
+[observer]
+discretisation = "implicit"
+motor = { lambda = 4.0, alpha = 9.0 }
+load = { lambda = 0.5, alpha = 0.2 }
+[equivalent_control]
+time_constant = 0.01
+[identifier]
+start = 2.0
+regressor_filter = "matched"
+forgetting = 1.0
+[run]
+duration = 20.0
+sample_period = 1e-3
+substeps = 10
+precision = "float64"
+[sweep]
+seeds = 4
+[uncertainty]
+relative = 0.02
+exact = ["drive.gear_ratio"]
+[log]
+hold = "zoh"
+initial_state = "unknown"
+[[axes]]
+path = "observer.motor.alpha"
+start = 2.0
+stop = 40.0
+num = 64
+scale = "log"
+[[axes]]
+path = "observer.motor.lambda"
+values = [1.0, 2.0]
+[[axes]]
+path = "encoders.noise"
+values = [1e-5, 1e-4]
+[[figures]]
+kind = "heatmap"
+x = "observer.motor.alpha"
+y = "observer.motor.lambda"
+value = "motor.velocity_rmse"
+facet = "encoders.noise"
+overlays = ["davila_fridman", "seeber_horn", "exact"]
+"""
+
+# a value in range for every parameter that has no default
+NUMBERS = {"amplitude": 0.1, "frequency": 0.3, "start_frequency": 0.1, "stop_frequency": 2.0, "relative": 0.05}
+
+# effects by kind with every parameter given
+EFFECTS = {
+    name: {"kind": name} | {key_of(f.name): NUMBERS.get(f.name, 0.2) for f, _ in parameters(effect_class(name))}
+    for name in effect_kinds()
+}
+
+
+def test_the_example_of_the_design_is_valid_and_comes_back_from_toml(tmp_path):
+    (tmp_path / "a.toml").write_text(EXAMPLE)
+    config = read_config(tmp_path / "a.toml")
+    assert config.observer.motor.lambda_ == 4.0
+    assert config.effects[0].torque == 0.02
+    (tmp_path / "b.toml").write_text(config.to_toml())
+    again = read_config(tmp_path / "b.toml")
+    assert again.resolved() == config.resolved()
+    # defaults are filled in
+    assert tomllib.loads(config.to_toml())["run"]["position_tolerance"] == 1e-3
+
+
+def test_byte_order_mark(tmp_path):
+    (tmp_path / "a.toml").write_bytes(b"\xef\xbb\xbf" + EXAMPLE.encode())
+    assert read_config(tmp_path / "a.toml").sweep.seeds == 4
+
+
+A = ALPHA
+BAD = {
+    "unknown table": (small(drives={}), "unknown key 'drives'; did you mean 'drive'?"),
+    "unknown key": (
+        small({"drive.motor_inertai": 1.0}),
+        "drive: unknown key 'motor_inertai'; did you mean 'motor_inertia'?",
+    ),
+    "unknown gain": (
+        small({"observer.motor.lambda_": 1.0}),
+        "observer.motor: unknown key 'lambda_'; did you mean 'lambda'?",
+    ),
+    "unknown key, none near": (small({"log.zzz": 1}), "log: unknown key 'zzz'; valid: hold, initial_state"),
+    "line break in a key": (small({"drive.a\nb": 1}), r"drive: unknown key 'a\nb'"),
+    "line break in a tag": (small({"drive.kind": "a\nb"}), r"drive.kind: unknown kind 'a\nb'; valid: two_inertia, rigid"),
+    "key of another law": (small({"transmission.half_gap": 0.1}), "transmission: unknown key 'half_gap'"),
+    "missing table": (small({"drive": None}), "drive: this key is missing"),
+    "missing key": (small({"observer.motor.alpha": None}), "observer.motor.alpha: this key is missing"),
+    "missing kind": (small({"excitation.kind": None}), "excitation: the key 'kind' is missing"),
+    "unknown law": (small({"transmission.law": "sigmoid"}), "unknown law 'sigmoid'; did you mean 'sigmoid_backlash'?"),
+    "unknown effect": (small(effects=[{"kind": "load.coulumb_friction"}]), "did you mean 'load.coulomb_friction'?"),
+    "effect's key": (small(effects=[{"kind": "actuator.lag", "time": 1.0}]), "effects[0]: unknown key 'time'"),
+    "effect's range": (
+        small(effects=[EFFECTS["motor.cogging"], EFFECTS["actuator.lag"] | {"time_constant": 0.0}]),
+        "effects[1].time_constant: should be greater than 0, not 0.0",
+    ),
+    "effects as a table": (small(effects=EFFECTS["actuator.lag"]), "effects: should be an array, not {"),
+    "text for a number": (small({"drive.motor_inertia": "0.05"}), "motor_inertia: should be a valid number, not '0.05'"),
+    "truth for a number": (small({"drive.motor_inertia": True}), "motor_inertia: should be a valid number, not True"),
+    "number for a table": (small(run=3), "run: should be a table, not 3"),
+    "number for a text": (small(title=3), "title: should be a valid string, not 3"),
+    "text for an array": (small(notes="a"), "notes: should be an array, not 'a'"),
+    "part of a step": (small({"run.substeps": 2.5}), "run.substeps: should be a valid integer, not 2.5"),
+    "nan": (small({"encoders.noise": float("nan")}), "encoders.noise: should be a finite number, not nan"),
+    "inf": (small({"encoders.noise": float("inf")}), "encoders.noise: should be a finite number, not inf"),
+    "endless integer": (small({"drive.motor_inertia": 10**400}), "should be a valid number, not 1000"),
+    "negative inertia": (small({"drive.motor_inertia": -1.0}), "drive.motor_inertia: should be greater than 0, not -1.0"),
+    "negative noise": (
+        small({"encoders.noise": -1e-4}),
+        "encoders.noise: should be greater than or equal to 0, not -0.0001",
+    ),
+    "forgetting": (small({"identifier.forgetting": 1.1}), "forgetting: should be less than or equal to 1, not 1.1"),
+    "choice": (small({"run.precision": "float16"}), "run.precision: should be 'float64' or 'float32', not 'float16'"),
+    "period over duration": (small({"run.sample_period": 0.5}), "sample_period 0.5 s is longer than duration 0.2 s"),
+    "few samples": (small({"run.duration": 5e-3}), "holds only 5 samples of 0.001 s; at least 8 are needed"),
+    "too many samples": (small({"run.duration": 1e308}), "holds more than 2e+09 samples of 0.001 s"),
+    "rigid with transmission": (
+        rigid(transmission={"law": "linear_shaft", "stiffness": 1.0}),
+        "[transmission] has no meaning on a rigid drive; remove it, or use drive.kind = 'two_inertia'",
+    ),
+    "rigid with load observer": (rigid({"observer.load": {"lambda": 1.0, "alpha": 1.0}}), "observer.load has no meaning"),
+    "rigid with load effect": (rigid(effects=[EFFECTS["load.inertia"]]), "effects[0]: load.inertia has no meaning"),
+    "no transmission": (small({"transmission": None}), "[transmission] is missing"),
+    "no load observer": (small({"observer.load": None}), "observer.load is missing"),
+    "exact path": (small({"uncertainty.exact": ["drive.gear_rati"]}), "nearest valid path: 'drive.gear_ratio'"),
+    "start >= stop": (small(axes=[spaced(A, 3.0, 2.0, 4)]), "axes[0]: axis observer.motor.alpha: start 3.0 should be less"),
+    "log through zero": (small(axes=[spaced(A, 0.0, 2.0, 4)]), "a log scale needs start > 0, not 0.0"),
+    "no values": (small(axes=[listed(A)]), "axis observer.motor.alpha is empty"),
+    "neither": (small(axes=[{"path": A, "num": 4}]), "should have values, or start and stop"),
+    "both": (small(axes=[listed(A, 1.0, num=4)]), "has both values and start/stop/num"),
+    "one of two ends": (small(axes=[spaced(A, 1.0, 2.0, 1)]), "num = 1 cannot span start ... stop"),
+    "value twice": (small(axes=[listed(A, 1, 1.0)]), "lists a value twice"),
+    "truth among values": (small(axes=[listed(A, True)]), "axes[0].values[0]: should be a valid number, not True"),
+    "values of no kind": (small(axes=[listed(A, [1.0])]), "axes[0].values[0]: should be a valid number, not [1.0]"),
+    "two axes on one path": (
+        small(axes=[listed(A, 1.0), listed(A, 2.0)]),
+        "axes[1]: path 'observer.motor.alpha' has an axis",
+    ),
+    "unknown path": (
+        small(axes=[listed("observer.motor.alfa", 1.0)]),
+        "axes[0]: unknown path 'observer.motor.alfa'; nearest valid path: 'observer.motor.alpha'",
+    ),
+    "path of a table": (small(axes=[listed("observer.motor", 1.0)]), "nearest valid path: 'observer.motor.alpha'"),
+    "path of a choice": (small(axes=[listed("drive.kind", "rigid")]), "axes[0]: unknown path 'drive.kind'"),
+    "path of two effects": (
+        small(effects=[EFFECTS["actuator.lag"]] * 2, axes=[listed("effects.actuator.lag.time_constant", 1.0)]),
+        "unknown path 'effects.actuator.lag.time_constant'; nearest valid path: 'effects.1.time_constant'",
+    ),
+    "axis out of range": (
+        small(axes=[spaced(A, -3.0, 2.0, 4, "linear")]),
+        "axes[0]: observer.motor.alpha: should be greater",
+    ),
+    "axis value out of range": (small(axes=[listed(A, 2.0, -1.0)]), "should be greater than or equal to 0, not -1.0"),
+    "words on a numeric axis": (small(axes=[listed(A, "a")]), "observer.motor.alpha: should be a valid number, not 'a'"),
+    "parts of a step": (
+        small(axes=[spaced("run.substeps", 1, 4, 3, "linear")]),
+        "run.substeps: should be a valid integer, not 2.5",
+    ),
+    "num missing": (small(axes=[spaced(A, 1.0, 2.0)]), "axes[0]: num is missing for 'observer.motor.alpha'"),
+    "endless grid": (
+        small(axes=[spaced(f"observer.{p}", 1.0, 2.0, 10**5) for p in ("motor.alpha", "motor.lambda", "load.alpha")]),
+        "axes: 1e+15 runs are more than 1e+10",
+    ),
+    "zip of unequal length": (
+        small(axes=[listed(A, 1.0, 2.0, zip="g"), listed(LAMBDA, 1.0, zip="g")]),
+        "'observer.motor.lambda' has 1 values, the others zipped as 'g' have 2",
+    ),
+    "zip alone": (small(axes=[listed(A, 1.0), listed(LAMBDA, 1.0, zip=A)]), "zip = 'observer.motor.alpha' should be a word"),
+    "zipped point twice": (
+        small(axes=[listed(A, 1.0, 1.0, zip="g"), listed(LAMBDA, 2.0, 2.0, zip="g")]),
+        "the axes zipped as 'g' list a point twice",
+    ),
+    "points of a grid": (small(sweep={"points": 4}), "sweep.points belongs to design"),
+    "design without points": (small(sweep={"design": "sobol"}, axes=[spaced(A, 1.0, 2.0)]), "sweep.points is missing"),
+    "design without range": (
+        small(sweep={"design": "sobol", "points": 4}, axes=[listed(A, 1.0)]),
+        "sweep.design: 'sobol' needs",
+    ),
+    "design over structure": (
+        small(sweep={"design": "sobol", "points": 4}, axes=[spaced("run.duration", 1.0, 2.0)]),
+        "'run.duration' is fixed at compile time; list its values",
+    ),
+    "design with zip": (
+        small(sweep={"design": "sobol", "points": 4}, axes=[spaced(A, 1.0, 2.0, zip="g")]),
+        "is sampled quasi-randomly and cannot be zipped",
+    ),
+    "heatmap without y": (small(figures=[{"kind": "heatmap", "x": A, "value": "finite"}]), "figures[0]: a heatmap needs y"),
+    "line with y": (
+        small(figures=[{"kind": "line", "x": A, "y": LAMBDA, "value": "finite"}]),
+        "a line has no y; use series",
+    ),
+    "heatmap with series": (
+        small(figures=[{"kind": "heatmap", "x": A, "y": LAMBDA, "series": "a", "value": "finite"}]),
+        "a heatmap has no series; use facet",
+    ),
+    "axis used twice": (
+        small(figures=[{"kind": "heatmap", "x": A, "y": A, "value": "finite"}]),
+        "observer.motor.alpha is used twice",
+    ),
+    "overlays over two observers": (
+        small(figures=[{"kind": "heatmap", "x": A, "y": "observer.load.lambda", "value": "finite", "overlays": ["exact"]}]),
+        "overlays need a map over alpha and lambda of one observer",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_config_gets_one_line_that_says_where_and_what(case):
+    data, message = BAD[case]
+    with pytest.raises(InputError) as error:
+        Points(read_config(data))
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+FILES = {
+    "missing": (None, "no such file"),
+    "binary": (b"\xff\xfe\x00", "is not text in UTF-8"),
+    "no TOML": (b"[drive\nkind=1", "not valid TOML: Expected ']' at the end of a table declaration (at line 1, column 7)"),
+    "wrong key": (b"[drvie]", "unknown key 'drvie'; did you mean 'drive'?"),
+}
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_bad_file_is_named(tmp_path, case):
+    content, message = FILES[case]
+    path = tmp_path / "study.toml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError) as error:
+        read_config(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_folder_instead_of_a_file(tmp_path):
+    with pytest.raises(InputError, match="is a folder; a TOML file is needed"):
+        read_config(tmp_path)
+
+
+# ---------------------------------------------------------------- recorded excitation
+
+
+def recorded(path, **keys):
+    return read_config(small(excitation={"kind": "recorded", "file": str(path), **keys}))
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_recorded_excitation_is_found_beside_the_config_and_starts_at_zero(tmp_path, suffix):
+    frame = pd.DataFrame({"time": [5.0, 5.1, 5.2], "torque": [1.0, 2.0, 3.0]})
+    (tmp_path / "sub").mkdir()
+    file = tmp_path / "sub" / f"drive{suffix}"
+    frame.to_csv(file) if suffix == ".csv" else frame.to_parquet(file)
+    names = {"time_column": "time", "torque_column": "torque", "gain": 0.5}
+    config = read_config(small(excitation={"kind": "recorded", "file": f"sub/drive{suffix}", **names}))
+    (tmp_path / "study.toml").write_text(config.to_toml())
+    excitation = read_config(tmp_path / "study.toml").build().excitation
+    np.testing.assert_allclose(excitation.times, [0.0, 0.1, 0.2], atol=1e-12)
+    np.testing.assert_array_equal(excitation.torques, [1.0, 2.0, 3.0])
+    assert excitation.gain == 0.5
+
+
+RECORDS = {
+    "missing": (None, {}, "cannot be read as CSV or Parquet"),
+    "empty": ("", {}, "cannot be read as CSV or Parquet"),
+    "no rows": ("t,u\n", {}, "column 't', row 0: should be a finite number"),
+    "no column": ("t,torqe\n0,1\n", {"torque_column": "torque"}, "no column 'torque'; did you mean 'torqe'?"),
+    "text": ("t,u\n0,1\n1,abc\n", {}, "column 'u', row 1: should be a finite number"),
+    "gap": ("t,u\n0,1\n1,\n", {}, "column 'u', row 1: should be a finite number"),
+    "time stands": ("t,u\n0,1\n1,1\n1,2\n", {}, "column 't', row 2: times should increase"),
+}
+
+
+@pytest.mark.parametrize("case", RECORDS)
+def test_bad_record_is_named_with_column_and_row(tmp_path, case):
+    content, keys, message = RECORDS[case]
+    path = tmp_path / "record.csv"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(InputError) as error:
+        recorded(path, **keys).build()
+    assert str(error.value).startswith(f"{path}: ")
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_binary_file_is_no_parquet(tmp_path):
+    (tmp_path / "record.parquet").write_bytes(b"nothing")
+    with pytest.raises(InputError, match="cannot be read as CSV or Parquet"):
+        recorded(tmp_path / "record.parquet").build()
+
+
+# ---------------------------------------------------------------- generated tables
+
+
+def table(section, tag, name, module):
+    """A table with every parameter of a module given."""
+    numbers = {}
+    for field, known in parameters(module):
+        default = field.default if isinstance(field.default, int | float | str) else NUMBERS.get(field.name, 0.2)
+        numbers[key_of(field.name)] = default
+        assert known.doc
+    return {tag: name, **numbers}
+
+
+@pytest.mark.parametrize(
+    ("section", "tag", "name", "module"),
+    [("drive", "kind", name, module) for name, module in DRIVES.items()]
+    + [("transmission", "law", name, module) for name, module in TRANSMISSIONS.items()]
+    + [("excitation", "kind", name, module) for name, module in EXCITATIONS.items() if name != "recorded"],
+)
+def test_every_module_has_the_table_of_its_parameters(section, tag, name, module):
+    given = table(section, tag, name, module)
+    data = (rigid if name == "rigid" else small)(**{section: given})
+    config = read_config(data)
+    built = getattr(config.build(), section)
+    assert type(built) is module
+    for field, _ in parameters(module):
+        assert getattr(built, field.name) == given[key_of(field.name)]
+        low = parameters_by_name(module)[field.name]
+        if low.above is not None or low.minimum is not None:
+            wrong = low.above if low.above is not None else low.minimum - 1
+            with pytest.raises(InputError, match=f"{section}.{key_of(field.name)}: should be"):
+                read_config(data | {section: given | {key_of(field.name): wrong}})
+
+
+def parameters_by_name(module):
+    return {field.name: known for field, known in parameters(module)}
+
+
+@pytest.mark.parametrize("name", effect_kinds())
+def test_every_effect_is_built_with_its_numbers_and_its_name(name):
+    config = read_config(small(effects=[EFFECTS[name]]))
+    (effect,) = config.build().effects
+    assert isinstance(effect, effect_class(name))
+    assert effect.name == name
+    for key, value in EFFECTS[name].items():
+        if key != "kind":
+            assert getattr(effect, key) == value
+            moved = with_values(config, {f"effects.{name}.{key}": 0.7})
+            assert getattr(moved.build().effects[0], key) == 0.7
+
+
+@pytest.mark.parametrize("data", [small(effects=[EFFECTS["motor.cogging"], *[EFFECTS["load.gravity"]] * 2]), rigid()])
+def test_leaves_of_the_experiment_have_the_paths_of_the_config(data):
+    config = read_config(data)
+    experiment = config.build()
+    known, leaves = numeric_paths(config), leaf_paths(experiment)
+    if data["drive"]["kind"] == "rigid":  # what one inertia has no use for
+        leaves = {path: about for path, about in leaves.items() if "load" not in path}
+    assert set(leaves) <= set(known)
+    for path, about in leaves.items():
+        assert known[path].unit == about.unit
+        assert known[path].doc
+        moved = with_values(config, {path: 0.625})
+        assert get_leaf(moved.build(), path) == 0.625, path
+    structural = {"observer.discretisation", "run.duration", "run.sample_period", "run.substeps"}
+    absent = {"encoders.load_noise", "identifier.regressor_filter"} if experiment.identifier else set()
+    assert set(known) - set(leaves) == structural | absent
+
+
+def test_with_values_names_the_nearest_path_and_takes_whole_numbers():
+    config = read_config(small())
+    assert with_values(config, {"run.substeps": 4.0}).run.substeps == 4
+    assert with_values(config, {"encoders.load_noise": 1e-5}).build().encoders.load_noise == 1e-5
+    assert config.run.substeps == 1
+    with pytest.raises(InputError, match=r"unknown path 'motor\.alpha'; nearest valid path: 'observer\.motor\.alpha'"):
+        with_values(config, {"motor.alpha": 1.0})
+
+
+# ---------------------------------------------------------------- anything else
+
+JUNK = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.floats(),
+    st.text(max_size=5),
+    st.sampled_from(["grid", "sobol", "rigid", "linear_shaft", "float32", "motor.inertia", A, "log", "line", "finite"]),
+    st.lists(st.floats(), max_size=3),
+    st.dictionaries(st.sampled_from(["kind", "path", "values", "alpha", "x", "y\n"]), st.floats() | st.text(max_size=3)),
+)
+COMPLETE = read_config(tomllib.loads(EXAMPLE)).resolved()
+
+
+def places(data, prefix=()):
+    """Every key and index of a nested config."""
+    for key, value in data.items() if isinstance(data, dict) else enumerate(data):
+        yield (*prefix, key)
+        if isinstance(value, dict | list):
+            yield from places(value, (*prefix, key))
+
+
+@settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(list(places(COMPLETE))), JUNK, st.none() | st.text(max_size=3)), min_size=1, max_size=3
+    )
+)
+def test_any_mutation_is_valid_or_an_input_error_of_one_line(mutations):
+    data = read_config(COMPLETE).resolved()
+    for place, junk, new_key in mutations:
+        target = data
+        for key in place[:-1]:
+            try:
+                target = target[key]
+            except (KeyError, IndexError, TypeError):
+                break
+        else:
+            if isinstance(target, dict):
+                target[place[-1] if new_key is None else new_key] = junk
+            elif isinstance(target, list) and place[-1] in range(len(target)):
+                target[place[-1]] = junk
+    try:
+        config = read_config(data)
+        Points(config)
+    except InputError as error:
+        message = str(error)
+    else:
+        message = ""
+        assert read_config(tomllib.loads(config.to_toml())).resolved() == config.resolved()
+    assert message.isprintable()
+
+
+def test_inertia_effects_must_leave_some():
+    with pytest.raises(InputError, match=r"motor.inertia leaves a total of .* on the motor"):
+        read_config(rigid(effects=[{"kind": "motor.inertia", "inertia": -1e3}]))
+
+
+def files(folder, **texts):
+    """TOML files by name; `base` has the rigid drive without gains."""
+    data = rigid({"observer": None})
+    for name, text in {"base": tomli_w.dumps(data), **texts}.items():
+        path = folder / f"{name}.toml"
+        path.parent.mkdir(exist_ok=True, parents=True)
+        path.write_text(text)
+    return folder
+
+
+def test_included_tables_are_merged_key_by_key(tmp_path):
+    files(
+        tmp_path,
+        gains="[observer.motor]\nlambda = 1.0\nalpha = 2.0\n[run]\nduration = 0.3\n",
+        later="[observer.motor]\nalpha = 3.0\n",
+        main='include = ["base.toml", "gains.toml", "later.toml"]\n[observer.motor]\nvelocity_error = 0.25\n',
+    )
+    config = read_config(tmp_path / "main.toml")
+    observer = config.observer.motor
+    assert (observer.lambda_, observer.alpha, observer.velocity_error) == (1.0, 3.0, 0.25)
+    assert (config.run.duration, config.run.substeps) == (0.3, 1)
+    assert "include" not in config.resolved() and "include" not in config.to_toml()
+    (tmp_path / "resolved.toml").write_text(config.to_toml())
+    assert read_config(tmp_path / "resolved.toml").resolved() == config.resolved()
+
+
+def test_keys_of_the_including_file_win_and_tables_of_another_kind_replace(tmp_path):
+    files(
+        tmp_path,
+        main='include = "base.toml"\n[observer.motor]\nlambda = 1.0\nalpha = 2.0\n'
+        '[excitation]\nkind = "prbs"\namplitude = 0.3\nhold = 0.01\n[run]\nduration = 0.4\n',
+        same='include = "main.toml"\n[excitation]\namplitude = 0.5\n',
+    )
+    config = read_config(tmp_path / "main.toml")
+    assert config.run.duration == 0.4
+    assert (config.excitation.kind, config.excitation.hold) == ("prbs", 0.01)
+    # a file may include one that includes
+    config = read_config(tmp_path / "same.toml")
+    assert (config.excitation.kind, config.excitation.amplitude, config.excitation.hold) == ("prbs", 0.5, 0.01)
+
+
+def test_files_of_an_included_file_are_relative_to_it(tmp_path, monkeypatch):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "log.csv").write_text("t,u\n0,0\n1,1\n")
+    recorded = 'kind = "recorded"\nfile = "log.csv"\n'
+    files(
+        tmp_path,
+        **{"parts/input": f"[excitation]\n{recorded}[tune.holdout]\n{recorded}"},
+        main='include = ["base.toml", "parts/input.toml"]\n[observer.motor]\nlambda = 1.0\nalpha = 2.0\n',
+    )
+    config = read_config(tmp_path / "main.toml")
+    for excitation in (config.excitation, config.tune.holdout):
+        assert excitation.file == str(tmp_path / "parts" / "log.csv")
+    # of a mapping: relative to the working directory
+    monkeypatch.chdir(tmp_path)
+    given = {"include": ["base.toml", "parts/input.toml"], "observer": {"motor": {"lambda": 1.0, "alpha": 2.0}}}
+    assert read_config(given).excitation.file == str(tmp_path / "parts" / "log.csv")
+    assert given["include"] == ["base.toml", "parts/input.toml"]
+
+
+GAINS = "[observer.motor]\nlambda = 1.0\nalpha = 2.0\n"
+BAD_INCLUDES = {
+    "missing": ({"main": 'include = "none.toml"\n'}, "main.toml: include: {0}/none.toml: no such file"),
+    "missing, nested": (
+        {"main": 'include = "a.toml"\n', "a": 'include = "none.toml"\n'},
+        "a.toml: include: {0}/none.toml: no such file",
+    ),
+    "itself": ({"main": 'include = "main.toml"\n'}, "main.toml: include: {0}/main.toml includes this file in turn"),
+    "cycle": (
+        {"main": 'include = "a.toml"\n', "a": 'include = "main.toml"\n'},
+        "a.toml: include: {0}/main.toml includes this file in turn; files should not include one another",
+    ),
+    "no name": ({"main": "include = 3\n"}, "main.toml: include: should be a file name or an array of them, not 3"),
+    "no names": ({"main": "include = [3]\n"}, "main.toml: include: should be a file name or an array of them, not [3]"),
+    "a folder": ({"main": 'include = "."\n'}, "{0}: is a folder; a TOML file is needed"),
+    "unknown key": (
+        {"main": f'include = ["base.toml", "a.toml"]\n{GAINS}', "a": "[run]\ndurations = 1.0\n"},
+        "a.toml: run: unknown key 'durations'; did you mean 'duration'?",
+    ),
+    "unknown table": (
+        {"main": f'include = ["base.toml", "a.toml"]\n{GAINS}', "a": "[runs]\nduration = 1.0\n"},
+        "a.toml: unknown key 'runs'; did you mean 'run'?",
+    ),
+    "value, nested": (
+        {
+            "main": f'include = "a.toml"\n{GAINS}',
+            "a": 'include = ["base.toml", "b.toml"]\n',
+            "b": "[run]\nduration = -1.0\n",
+        },
+        "b.toml: run.duration: should be greater than 0, not -1.0",
+    ),
+    "value that is overruled by a wrong one": (
+        {"main": f'include = ["base.toml", "a.toml"]\n{GAINS}[run]\nduration = -2.0\n', "a": "[run]\nduration = 1.0\n"},
+        "main.toml: run.duration: should be greater than 0, not -2.0",
+    ),
+    "value in an array": (
+        {
+            "main": f'include = ["base.toml", "a.toml"]\n{GAINS}',
+            "a": '[[axes]]\npath = "drive.motor_inertia"\nvalues = []\n',
+        },
+        "a.toml: axes[0]: axis drive.motor_inertia is empty",
+    ),
+    "incomplete": (
+        {"main": 'include = "base.toml"\n[observer.motor]\nlambda = 1.0\n'},
+        "main.toml: observer.motor.alpha: this key is missing",
+    ),
+    "bad TOML": ({"main": 'include = "a.toml"\n', "a": "a b"}, "a.toml: not valid TOML"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_INCLUDES)
+def test_bad_includes_are_one_line_that_names_the_file(case, tmp_path):
+    texts, message = BAD_INCLUDES[case]
+    files(tmp_path, **texts)
+    with pytest.raises(InputError) as error:
+        read_config(tmp_path / "main.toml")
+    assert message.format(tmp_path) in str(error.value)
+    assert str(error.value).startswith(str(tmp_path))
+    assert "\n" not in str(error.value)
+
+
+def test_first_seed_shifts_the_noise():
+    early, late = (sweep(rigid(sweep={"seeds": seeds, "first_seed": first})).frame for seeds, first in ((4, 0), (2, 2)))
+    assert list(late["seed"]) == [2, 3]
+    for column in late.columns:
+        np.testing.assert_array_equal(late[column], early[column].iloc[2:])
