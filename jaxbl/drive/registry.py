@@ -1,0 +1,76 @@
+"""Classes by name: those of this package, and those that installed packages add through entry points."""
+
+import inspect
+import logging
+import multiprocessing
+from collections.abc import Callable, Iterator, Mapping
+from importlib.metadata import entry_points
+from typing import Any, TypeVar
+
+Kind = TypeVar("Kind", bound=type)
+
+
+class Registry(Mapping[str, Any]):
+    """Name -> class. Entry points are loaded once, when names are first listed or one is not of this package.
+
+    An entry that cannot be imported, or that the check refuses, is left out with one warning line (logger `jaxbl`): a
+    broken add-on never ends a command.
+
+    Args:
+        group: entry-point group, e.g. `jaxbl.transmissions`.
+        check: is given the name and the object of an entry, and raises an exception that says what is wrong with it.
+    """
+
+    def __init__(self, group: str, check: Callable[[str, Any], None]):
+        self.group = group
+        self._check = check
+        self._found: dict[str, Any] = {}
+        self._loaded = False
+
+    def add(self, cls: Kind) -> Kind:
+        """Add a class of this package under its `name`; a decorator."""
+        self._found[cls.name] = cls  # type: ignore[attr-defined]
+        return cls
+
+    def __getitem__(self, name: str) -> Any:
+        return self._found[name] if name in self._found else self._all()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._all())
+
+    def __len__(self) -> int:
+        return len(self._all())
+
+    def _all(self) -> dict[str, Any]:
+        if not self._loaded:
+            self._loaded = True
+            for entry in entry_points(group=self.group):
+                try:
+                    if entry.name in self._found:
+                        raise ValueError("the name is taken")
+                    found = entry.load()
+                    self._check(entry.name, found)
+                    self._found[entry.name] = found
+                except (Exception, SystemExit) as error:
+                    # one line a command: worker processes load the same entries again
+                    if multiprocessing.parent_process() is None:
+                        text = " ".join(f"{type(error).__name__}: {error}".split())
+                        logging.getLogger("jaxbl").warning(
+                            f"warning: {self.group}: '{entry.name}' ({entry.value}) is left out: {text}"
+                        )
+        return self._found
+
+
+def check_subclass(name: str, found: Any, base: type) -> None:
+    """Check that an entry is a class that can be used in place of `base`, under the name that it was entered with.
+
+    Raises:
+        TypeError: it is no class, not derived from `base`, lacks a method, or has another name.
+    """
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise TypeError(f"should be a class derived from {base.__name__}")
+    if inspect.isabstract(found):
+        missing = ", ".join(sorted(found.__abstractmethods__))  # type: ignore[attr-defined]
+        raise TypeError(f"should define {missing}")
+    if (own := getattr(found, "name", None)) != name:
+        raise TypeError(f"its name should be '{name}' as in the entry point, not {own!r}")

@@ -1,0 +1,88 @@
+"""Classes of installed packages: found by name, and left out with one line where something is wrong with them."""
+
+import abc
+import sys
+
+import pytest
+from plugin import install_package
+
+from jaxbl.drive.registry import Registry, check_subclass
+
+SOURCE = """
+import test_registry
+
+class Good(test_registry.Base):
+    name = "good"
+    def answer(self): return 1
+
+class Renamed(Good):
+    name = "other"
+
+class Half(test_registry.Base):
+    name = "half"
+
+number = 3
+"""
+
+
+class Base(abc.ABC):
+    name = "base"
+
+    @abc.abstractmethod
+    def answer(self):
+        raise NotImplementedError
+
+
+def registry():
+    known = Registry("jaxbl.tests", lambda name, found: check_subclass(name, found, Base))
+
+    @known.add
+    class BuiltIn(Base):
+        name = "built_in"
+
+    return known, BuiltIn
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(sys.modules, "test_registry", sys.modules[__name__])
+    yield lambda **entries: install_package(tmp_path, "some_addon", SOURCE, {"jaxbl.tests": entries})
+    sys.modules.pop("some_addon", None)
+
+
+def test_built_in_classes_come_first_and_entry_points_after_them(install, caplog):
+    install(good="Good")
+    known, built_in = registry()
+    assert list(known) == ["built_in", "good"]
+    assert known["built_in"] is built_in
+    assert known["good"].__module__ == "some_addon"
+    assert len(known) == 2 and "nothing" not in known
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    ("name", "member", "said"),
+    [
+        ("gone", "Missing", "AttributeError: module 'some_addon' has no attribute 'Missing'"),
+        ("gone", "number", "TypeError: should be a class derived from Base"),
+        ("half", "Half", "TypeError: should define answer"),
+        ("gone", "Renamed", "TypeError: its name should be 'gone' as in the entry point, not 'other'"),
+        ("built_in", "Good", "ValueError: the name is taken"),
+    ],
+)
+def test_a_wrong_entry_is_left_out_with_one_line(install, caplog, name, member, said):
+    install(**{name: member})
+    known, built_in = registry()
+    assert dict(known) == {"built_in": built_in}
+    assert caplog.messages == [f"warning: jaxbl.tests: '{name}' (some_addon:{member}) is left out: {said}"]
+    assert list(known) == ["built_in"] and len(caplog.messages) == 1  # said once
+
+
+@pytest.mark.parametrize("statement", ["import nothing_of_this_name", "syntax error", "raise SystemExit(3)"])
+def test_an_entry_that_cannot_be_imported_is_left_out(tmp_path, monkeypatch, caplog, statement):
+    monkeypatch.syspath_prepend(tmp_path)
+    install_package(tmp_path, "broken_addon", statement, {"jaxbl.tests": {"one": "One"}})
+    known, _ = registry()
+    assert "one" not in known
+    assert len(caplog.messages) == 1 and "\n" not in caplog.messages[0]
