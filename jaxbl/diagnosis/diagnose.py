@@ -32,7 +32,6 @@ from jaxbl.drive.parameters import get_leaf, leaf_paths, parameters, set_leaves
 from jaxbl.errors import InputError
 from jaxbl.files import plain
 from jaxbl.identification.logs import (
-    LOG_NAMES,
     Logs,
     arrays,
     default_paths,
@@ -46,7 +45,7 @@ from jaxbl.identification.logs import (
 from jaxbl.identification.regression import Kinematics
 from jaxbl.identification.search import smoothed_channels
 from jaxbl.identification.trajectory import Free, free_parameters
-from jaxbl.records import Record
+from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress
 
@@ -445,7 +444,7 @@ def _check_shown(setting: _Setting, shown: float) -> None:
     if shown * _HIDDEN >= SIGNIFICANT:
         return
     noise = ", ".join(
-        f"{value:.2g} {record.findings.channels[LOG_NAMES[side]].unit} ({LOG_NAMES[side]})"
+        f"{value:.2g} {record.findings.channels[POSITION_CHANNELS[side]].unit} ({POSITION_CHANNELS[side]})"
         for side, value in setting.seen.channels.noise.items()
     )
     least = SIGNIFICANT / max(shown, 1e-12)
@@ -473,7 +472,7 @@ def _driven(ground: Ground, record: Record) -> Ground:
 
 
 def _rotating(record: Record, nominal: Experiment) -> dict[str, bool]:
-    return {side: record.findings.channels[LOG_NAMES[side]].unit != "m" for side in nominal.sides}
+    return {side: record.findings.channels[POSITION_CHANNELS[side]].unit != "m" for side in nominal.sides}
 
 
 def _coordinates(
@@ -676,7 +675,7 @@ def _trace(
 ) -> pd.DataFrame:
     """One row a sample of the log; of another one that was held out there is nothing."""
     whole = task.record if task.separate else task.holdout
-    names = {side: LOG_NAMES[side] for side in ("motor", "load") if side in whole.positions}
+    names = {side: POSITION_CHANNELS[side] for side in ("motor", "load") if side in whole.positions}
     columns: dict[str, Any] = {"t": whole.time, "u": whole.torque}
     columns |= {name: whole.positions[side] for side, name in names.items()}
     columns["held_out"] = np.arange(len(whole.time)) >= len(task.record.time)

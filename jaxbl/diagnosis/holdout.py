@@ -21,7 +21,7 @@ from jaxbl.fused.single_plant import path
 from jaxbl.identification.regression import Kinematics
 from jaxbl.identification.search import Channels, windows_of
 from jaxbl.identification.trajectory import Windows, projected_residual
-from jaxbl.records import Record
+from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment, trajectory
 
 from .neutral_effects import bucket
@@ -33,7 +33,6 @@ _BLOCK = 0.5
 """Length of the blocks that a permuted residual is made of, s."""
 _FORETOLD = 0.02
 """Share of the motion that the initial speed's uncertainty may grow to where a free run is to say anything."""
-POSITIONS = {"motor": "theta_e", "load": "theta_s"}
 
 
 class Proof(NamedTuple):
@@ -74,7 +73,7 @@ class Ground:
 
     def floor(self, torques: Mapping[str, Sequence[Residual]]) -> dict[str, float]:
         """Noise of each channel: what a perfect model would leave."""
-        found = {POSITIONS[side]: noise for side, noise in self.channels.noise.items()}
+        found = {POSITION_CHANNELS[side]: noise for side, noise in self.channels.noise.items()}
         for side, pieces in self.channels.smoothed.items():
             found[f"velocity_{side}"] = _rms([np.asarray(one.deviation(1)) for one in pieces])
         for side, pieces in torques.items():
@@ -159,7 +158,7 @@ class Ground:
             }
         found = {}
         for i, side in enumerate(experiment.sides):
-            found[POSITIONS[side]] = self.channels.noise[side] * _rms([residual[:, :, i]])
+            found[POSITION_CHANNELS[side]] = self.channels.noise[side] * _rms([residual[:, :, i]])
         for side in experiment.sides:
             smoothed = np.full(len(self.record.time), np.nan)
             for part, one in zip(self.record.segments, self.channels.smoothed[side], strict=True):

@@ -213,7 +213,7 @@ def coordinates_of(
         if torque is None:
             torque = jax.vmap(lambda x, v: plant.transmitted(x, v)[0])(part.position, part.velocity)
         torque = np.asarray(torque)
-        gap = half_gap(experiment)
+        gap = experiment.plant.half_gap
         if gap > 0.0:
             inside = np.where(np.abs(twist) < gap, 1, np.where(twist > 0.0, 2, 0))
             found["gap"] = Values(inside, classes=("outside, z < 0", "inside of the gap", "outside, z > 0"))
@@ -247,13 +247,6 @@ def coordinates_of(
     found["acceleration"] = Values(acceleration, f"{length}/s²", symbol="a")
     found["time"] = Values(np.asarray(part.time), "s", symbol="t")
     return found
-
-
-def half_gap(experiment: Experiment) -> float:
-    """Half of the model's gap, motor side; 0 where it has none."""
-    law = experiment.transmission
-    gap = 0.0 if law is None else float(law.truth().get("half_gap", 0.0))
-    return gap + sum(float(getattr(one, "half_gap", 0.0)) for one in experiment.effects if one.place == "transmission")
 
 
 def _reversals(part: Kinematics, velocity: Array, still: Array, bandwidth: float) -> Values:

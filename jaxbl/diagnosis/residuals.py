@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from scipy.ndimage import gaussian_filter1d
 
 from jaxbl.identification.regression import Kinematics, actuated
-from jaxbl.identification.smoother import Smoothed, running_sum, smooth
+from jaxbl.identification.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, running_sum, smooth
 from jaxbl.simulate import Experiment
 
 _REACH = 60.0
@@ -76,11 +76,10 @@ def _response(smoothness: float, size: int) -> _Response:
     frequency = np.linspace(0.0, np.pi, size // 2 + 1)
     frequency[0] = 1e-3 * frequency[1]
     d = np.expm1(1j * frequency)
-    q = np.array([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1.0]])
-    n = np.array([[0.0, 1.0, 0.5], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
+    n = np.array(TRANSITION) - np.eye(3)
     # (dI - N)^-1 d^3, as N^3 = 0
     inverse = d[:, None, None] ** 2 * np.eye(3) + d[:, None, None] * n + n @ n
-    spectrum = smoothness * np.einsum("wij,jk,wk->iw", inverse, q, inverse[:, 0].conj())
+    spectrum = smoothness * np.einsum("wij,jk,wk->iw", inverse, np.array(JERK_COVARIANCE), inverse[:, 0].conj())
     square = np.abs(d) ** 2
     gain = spectrum / (spectrum[0].real + square**3)
     return _Response(frequency, gain, -gain[2].real / square, _corner(smoothness))

@@ -231,6 +231,12 @@ class Plant(eqx.Module):
             new[side] = free
         return new
 
+    @property
+    def half_gap(self) -> float:
+        """Half of the free play that law and effects describe together, rad at the motor; 0 where there is none."""
+        gap = 0.0 if self.transmission is None else float(self.transmission.truth().get("half_gap", 0.0))
+        return gap + sum(float(getattr(one, "half_gap", 0.0)) for one in self.effects if one.place == "transmission")
+
     def _at(self, place: str) -> list[AbstractEffect]:
         return [effect for effect in self.effects if self.drive.place(effect.place) == place]
 

@@ -27,12 +27,11 @@ from jaxbl.identification.profile import Profile, profile
 from jaxbl.identification.regression import Kinematics, errors, from_smoothed, model_torques, regress
 from jaxbl.identification.search import Channels, Found, Search, Settings, smoothed_channels, windows_of
 from jaxbl.identification.trajectory import Fit, Free, free_parameters, projected_residual
-from jaxbl.records import Record
+from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment, Signals, State, replay
 from jaxbl.workers import Progress
 
 from .logs import (
-    LOG_NAMES,
     Logs,
     arrays,
     decimation,
@@ -182,7 +181,7 @@ def run_task(task: Task, progress: Progress | None = None) -> Identification:
         noise = {side: float(one) for side, one in found.windows.noise.items()}
         trace = pd.DataFrame(
             {"t": record.time, "u": record.torque}
-            | {LOG_NAMES[side]: record.positions[side] for side in nominal.sides}
+            | {POSITION_CHANNELS[side]: record.positions[side] for side in nominal.sides}
             | ({} if record.transmitted is None else {"transmitted": record.transmitted})
             | _smoothed_columns(channels)
             | _residual_columns(found, record, noise, nominal.sides)
@@ -237,7 +236,7 @@ def _on_holdout(task: Task, nominal: Experiment, fitted: Experiment, samples: in
     position = {}
     for i, side in enumerate(nominal.sides):
         before, after = (channels.noise[side] * float(jnp.sqrt(jnp.mean(one[:, :, i] ** 2))) for one in left)
-        unit = record.findings.channels[LOG_NAMES[side]].unit
+        unit = record.findings.channels[POSITION_CHANNELS[side]].unit
         position[side] = {"rms": after, "nominal_rms": before, "noise": channels.noise[side], "unit": unit}
     factor = decimation(config, record)
     parts = kinematics_of(record, channels, factor)
@@ -399,7 +398,7 @@ def _summary(
         side: {
             "rms": noise[side] * float(jnp.sqrt(jnp.mean(found.fit.residual[:, :, i] ** 2))),
             "noise": noise[side],
-            "unit": record.findings.channels[LOG_NAMES[side]].unit,
+            "unit": record.findings.channels[POSITION_CHANNELS[side]].unit,
         }
         for i, side in enumerate(fitted.sides)
     }

@@ -22,11 +22,8 @@ from jaxbl.identification.observer_gains import Gains, choose_gains
 from jaxbl.identification.regression import Kinematics, from_smoothed, shortest
 from jaxbl.identification.search import Channels
 from jaxbl.identification.trajectory import PHYSICAL, is_positive
-from jaxbl.records import Record, join, read_record
+from jaxbl.records import POSITION_CHANNELS, Record, join, read_record
 from jaxbl.simulate import Experiment
-
-LOG_NAMES = {"motor": "theta_e", "load": "theta_s"}
-"""Channel of each side."""
 
 Logs = str | Path | Record | Sequence[str | Path | Record]
 
@@ -46,7 +43,7 @@ def _read_one(config: Config, log: str | Path, gear_tolerance: float) -> Record:
     for side in sides:
         if side not in record.positions:
             raise InputError(
-                f"{record.path}: no {side} position ({LOG_NAMES[side]}), which a {config.drive.kind} drive needs; "
+                f"{record.path}: no {side} position ({POSITION_CHANNELS[side]}), which a {config.drive.kind} drive needs; "
                 f"the log has {', '.join(record.positions)}"
             )
     if record.torque is None:
@@ -148,7 +145,7 @@ def unit_on(record: Record, path: str, unit: str) -> str:
     """The unit of a number on a log: N and m where its side moves in m."""
     side = "load" if any(part.startswith("load") for part in path.split(".")) else "motor"
     channels = record.findings.channels
-    if LOG_NAMES[side] in channels and channels[LOG_NAMES[side]].unit == "m":
+    if POSITION_CHANNELS[side] in channels and channels[POSITION_CHANNELS[side]].unit == "m":
         for turning, linear in _LINEAR:
             unit = unit.replace(turning, linear)
     return unit

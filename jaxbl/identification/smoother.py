@@ -78,15 +78,16 @@ class _Forward(NamedTuple):
     variance: Float[Array, " samples"]
 
 
-# of [x, h v, h^2 a] over one period
-_F = ((1.0, 1.0, 0.5), (0.0, 1.0, 1.0), (0.0, 0.0, 1.0))
-_Q = ((1 / 20, 1 / 8, 1 / 6), (1 / 8, 1 / 3, 1 / 2), (1 / 6, 1 / 2, 1.0))
+TRANSITION = ((1.0, 1.0, 0.5), (0.0, 1.0, 1.0), (0.0, 0.0, 1.0))
+"""Of [x, h v, h^2 a] over one period h, by a Taylor series."""
+JERK_COVARIANCE = ((1 / 20, 1 / 8, 1 / 6), (1 / 8, 1 / 3, 1 / 2), (1 / 6, 1 / 2, 1.0))
+"""What white jerk of spectral density 1 / h^5 adds to the covariance of [x, h v, h^2 a] in one period h."""
 
 
 def _filter(
     position: Float[Array, " samples"], smoothness: Float[Array, ""], start: tuple[Array, Array] | None = None
 ) -> _Forward:
-    f, q = jnp.asarray(_F, position.dtype), smoothness * jnp.asarray(_Q, position.dtype)
+    f, q = jnp.asarray(TRANSITION, position.dtype), smoothness * jnp.asarray(JERK_COVARIANCE, position.dtype)
     if start is None:
         # nothing is known at first but the size of things
         largest = jnp.max(jnp.abs(jnp.diff(position)))
@@ -149,7 +150,7 @@ def _fit(position: Array, unit: Array, known: bool) -> tuple[Array, Array]:
 def _smoothed(position: Array, smoothness: Array, noise: Array, period: Array) -> Smoothed:
     scaled = (position - position[0]) / noise
     forward = _filter(scaled, smoothness, _first_state(scaled, smoothness))
-    f = jnp.asarray(_F, position.dtype)
+    f = jnp.asarray(TRANSITION, position.dtype)
     zero = jnp.zeros(3, position.dtype)
 
     def sample(carry: tuple[Array, Array], given: _Forward) -> tuple[tuple[Array, Array], tuple[Array, Array]]:

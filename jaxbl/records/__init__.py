@@ -8,4 +8,5 @@ from .reader import Findings as Findings
 from .reader import Record as Record
 from .reader import read_log_table as read_log_table
 from .reader import read_record as read_record
+from .table import POSITION_CHANNELS as POSITION_CHANNELS
 from .table import LogTable as LogTable

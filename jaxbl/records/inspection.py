@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from . import quality
 from .gearing import Gearing, seen
 from .quality import Array
-from .reader import SIDES, Record, read_log_table, read_record
-from .table import LogTable
+from .reader import Record, read_log_table, read_record
+from .table import POSITION_CHANNELS, LogTable
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def velocity(record: Record, side: str | None = None) -> Array:
         side: motor or load; left out: the motor if it has an encoder.
     """
     side = side or ("motor" if "motor" in record.positions else "load")
-    width = record.findings.channels[SIDES[side]].bandwidth
+    width = record.findings.channels[POSITION_CHANNELS[side]].bandwidth
     speed = np.zeros(len(record.time))
     for s in record.segments:
         smooth = record.positions[side][s]

@@ -16,7 +16,7 @@ from . import quality
 from .files import Columns, read_columns
 from .gearing import UNLIKE, Gearing, gearing, seen
 from .quality import SHORTEST, Array, Dynamics, Sampling, Slices
-from .table import LogTable, PositionTable, TimeTable, TorqueTable, describe, nearest
+from .table import POSITION_CHANNELS, LogTable, PositionTable, TimeTable, TorqueTable, describe, nearest
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ class _Reader:
             if skew:
                 self.notes.append(f"{name}: moved by its skew of {1e3 * skew:.4g} ms.")
         if len(positions) == 2:
-            self.check_gearing(geared, *(values[name] for name in SIDES.values()))
+            self.check_gearing(geared, *(values[name] for name in POSITION_CHANNELS.values()))
         side = "theta_e" if "theta_e" in values else "theta_s"
         dynamics = quality.dynamics(time, values["u"], values[side], segments, step) if "u" in values else None
         if dynamics is not None:
@@ -187,7 +187,7 @@ class _Reader:
             time=time - time[0],
             sample_period=step,
             torque=values.get("u"),
-            positions={side: values[name] for side, name in SIDES.items() if name in values},
+            positions={side: values[name] for side, name in POSITION_CHANNELS.items() if name in values},
             transmitted=values.get("transmitted"),
             closed_loop=self.table.closed_loop,
             start=start + float(time[0]),
@@ -759,10 +759,6 @@ class _Reader:
             saturated=saturated,
             jumps=jumps,
         )
-
-
-SIDES = {"motor": "theta_e", "load": "theta_s"}
-"""Side -> the channel of its encoder."""
 
 
 def _length(part: slice) -> int:

@@ -204,6 +204,9 @@ class TorqueTable(_ChannelTable):
 
 
 Channel = Literal["u", "theta_e", "theta_s"]
+POSITION_CHANNELS = {"motor": "theta_e", "load": "theta_s"}
+"""Side of the drive -> the channel of its encoder."""
+
 _Plain = Annotated[bool | int | float | str, BeforeValidator(_is_plain)]
 
 

@@ -24,6 +24,7 @@ from jaxbl.drive.plant import Plant
 from jaxbl.identification.identify import Identification
 from jaxbl.identification.logs import unit_on
 from jaxbl.identification.search import NOISE_ALONE
+from jaxbl.records import POSITION_CHANNELS
 from jaxbl.simulate import Experiment
 
 from .maps import SIDES, Drawn
@@ -47,7 +48,6 @@ _COLOUR = {"motor": COLOURS[0], "load": COLOURS[1]}
 _MODEL, _MEASURED, _GAP, _FAINT = COLOURS[6], COLOURS[2], "#F3E3A1", "#8C8C8C"
 _GROWING, _FALLING = COLOURS[2], COLOURS[3]
 _DENSITY = ListedColormap(mpl.colormaps["Greys"](np.linspace(0.25, 0.75, 64)))
-_CHANNEL = {"motor": "theta_e", "load": "theta_s"}
 _ABOVE: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1, "columnspacing": 1.2}
 
 
@@ -156,7 +156,7 @@ class _View:
         self.sides = [side for side in SIDES if f"{side}.velocity" in self.trace]
         self.geared = "twist" in self.trace
         channels = self.record.findings.channels
-        self.unit = {side: channels[_CHANNEL[side]].unit for side in self.sides}
+        self.unit = {side: channels[POSITION_CHANNELS[side]].unit for side in self.sides}
         self.torque_unit = "N" if self.unit["motor"] == "m" else "N m"
         self.experiment: Experiment = found.model.build()
         self.plant: Plant = self.experiment.plant
@@ -233,13 +233,6 @@ class _View:
                 jnp.asarray(twist)
             )
         return np.asarray(found)
-
-    @cached_property
-    def half_gap(self) -> float:
-        """Half of the fitted gap, motor side; 0 where the model has none."""
-        law = self.experiment.transmission
-        gap = 0.0 if law is None else float(law.truth().get("half_gap", 0.0))
-        return gap + sum(float(getattr(one, "half_gap", 0.0)) for one in self.plant.effects if one.place == "transmission")
 
     def effects(self, side: str) -> Array | None:
         """Torque that the model's effects on a side (for the motor: on the input, too) add to its nominal equation.
@@ -509,14 +502,14 @@ def _cloud(view: _View, ax: Axes, x: Array, y: Array, limits: tuple[tuple[float,
 
 def _gap(view: _View, ax: Axes) -> None:
     """The fitted gap, shaded, with its edges."""
-    if not view.half_gap:
+    if not view.plant.half_gap:
         return
     one = view.found.summary["parameters"].get("transmission.half_gap")
     error = f" ± {1.96 * one['standard_error']:.1g}" if one else ""
-    label = f"fitted gap: half width {view.half_gap:.4g}{error} {view.unit['motor']}"
-    ax.axvspan(-view.half_gap, view.half_gap, color=_GAP, alpha=0.6, lw=0.0, zorder=0, label=label)
+    label = f"fitted gap: half width {view.plant.half_gap:.4g}{error} {view.unit['motor']}"
+    ax.axvspan(-view.plant.half_gap, view.plant.half_gap, color=_GAP, alpha=0.6, lw=0.0, zorder=0, label=label)
     for sign in (-1.0, 1.0):
-        ax.axvline(sign * view.half_gap, color=COLOURS[4], lw=1.0, zorder=0.5)
+        ax.axvline(sign * view.plant.half_gap, color=COLOURS[4], lw=1.0, zorder=0.5)
 
 
 def _plane_note(view: _View) -> str:
@@ -591,11 +584,11 @@ def _limit_cycle(view: _View) -> Drawn:
     ax.plot(twist[rows], view.rate[rows], color=COLOURS[3], lw=1.4, zorder=3)
     ax.axhline(0.0, color=_FAINT, lw=0.8, zorder=0.6)
     ax.set(xlabel=f"twist θe − N₀ θs ({unit})", ylabel=f"twist rate by the smoother ({unit}/s)")
-    if view.half_gap:
+    if view.plant.half_gap:
         ax.legend(**_ABOVE)
     caption = (
         "Limit cycle: rate of the twist over the twist (cf. Fig. 28), run through clockwise. "
-        + ("Free flight crosses the shaded gap; outside of it the gear is in contact. " if view.half_gap else "")
+        + ("Free flight crosses the shaded gap; outside of it the gear is in contact. " if view.plant.half_gap else "")
         + _plane_note(view)
     )
     return Drawn("limit_cycle", figure, caption)

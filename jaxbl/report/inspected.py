@@ -9,9 +9,8 @@ import tomli_w
 from matplotlib.figure import Figure
 
 from jaxbl.files import plain, write_atomic
-from jaxbl.records import quality
+from jaxbl.records import POSITION_CHANNELS, Record, quality
 from jaxbl.records.inspection import Inspection, velocity
-from jaxbl.records.reader import SIDES, Record
 
 from .maps import Drawn
 from .page import TableOf, html
@@ -100,7 +99,7 @@ def draw_inspection(inspection: Inspection) -> list[Drawn]:
 
 def _values(record: Record) -> dict[str, np.ndarray]:
     found = {} if record.torque is None else {"u": record.torque}
-    found |= {SIDES[side]: values for side, values in record.positions.items()}
+    found |= {POSITION_CHANNELS[side]: values for side, values in record.positions.items()}
     return found if record.transmitted is None else found | {"transmitted": record.transmitted}
 
 
@@ -116,7 +115,7 @@ def _side(record: Record) -> str:
 def _channels(record: Record) -> Drawn:
     values = _values(record)
     side = _side(record)
-    unit = record.findings.channels[SIDES[side]].unit
+    unit = record.findings.channels[POSITION_CHANNELS[side]].unit
     rows = [(_LABELS[n], record.findings.channels[n].unit, v, _COLOUR[n]) for n, v in values.items()]
     rows.append((f"{side} velocity", f"{unit}/s", velocity(record, side), COLOURS[3]))
     figure = Figure(figsize=(7.0, 1.5 * len(rows) + 0.6), layout="constrained")
@@ -162,7 +161,7 @@ def _spectra(record: Record) -> Drawn:
 def _torque_over_velocity(record: Record) -> Drawn:
     assert record.torque is not None
     side = _side(record)
-    channel = record.findings.channels[SIDES[side]]
+    channel = record.findings.channels[POSITION_CHANNELS[side]]
     dynamics = record.findings.dynamics
     speed = velocity(record, side)
     torque, label = record.torque.copy(), "torque u"

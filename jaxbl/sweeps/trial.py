@@ -14,6 +14,7 @@ from jaxbl.errors import InputError
 from jaxbl.files import plain
 from jaxbl.fused.single_run import recorded
 from jaxbl.observer.conditions import CONDITIONS, peak_ratio
+from jaxbl.records import POSITION_CHANNELS
 from jaxbl.simulate import Experiment, Reducer, Signals, State
 
 from .metrics import METRICS, observer_gains, with_conditions
@@ -76,13 +77,10 @@ _LAST = Reducer(
 )
 
 
-_LOG_NAMES = {"motor": "theta_e", "load": "theta_s"}
-
-
 def _row(experiment: Experiment, state: State, signals: Signals) -> dict[str, Any]:
     """Columns of the trace at one sample."""
     row = {"t": signals.time, "u": signals.input}
-    row |= {_LOG_NAMES[side]: signals.side(side).measured for side in experiment.sides}
+    row |= {POSITION_CHANNELS[side]: signals.side(side).measured for side in experiment.sides}
     if signals.twist is not None:
         row["z"] = signals.twist
     row["torque"] = signals.torque

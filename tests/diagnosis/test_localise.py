@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from small_study import rigid, small
 
 from jaxbl.config import prepare, read_config
-from jaxbl.diagnosis.localise import SIGNIFICANT, Values, as_json, coordinates_of, describe, half_gap, locate, where
+from jaxbl.diagnosis.localise import SIGNIFICANT, Values, as_json, coordinates_of, describe, locate, where
 from jaxbl.diagnosis.residuals import Residual, residual_torques
 from jaxbl.identification.regression import from_smoothed
 from jaxbl.identification.smoother import smooth
@@ -205,7 +205,7 @@ def test_coordinates_know_turning_from_sliding():
     assert turning["speed"].unit == "rad/s" and sliding["speed"].unit == "m/s"
     assert "turn" in turning and "turn" not in sliding and "gap" not in turning
     assert np.ptp(turning["turn"].values) <= 2.0 * np.pi
-    assert half_gap(experiment) == 0.0
+    assert experiment.plant.half_gap == 0.0
     added = [{"kind": "transmission.backlash", "half_gap": 0.02}]
-    assert half_gap(prepare(read_config(small(SETTINGS, effects=added, **GEARED)))) == pytest.approx(0.1)
+    assert prepare(read_config(small(SETTINGS, effects=added, **GEARED))).plant.half_gap == pytest.approx(0.1)
     assert jnp.asarray(part.time).shape == turning["time"].values.shape
