@@ -1,16 +1,31 @@
-"""The documentation says what the code does."""
+"""The documentation says what the code does: names that exist, commands and Python that run as written."""
 
+import importlib
 import importlib.util
+import os
 import re
+import shutil
+import subprocess
+import sys
 import tomllib
+from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
+from typer.main import get_command
 
+from jaxbl.cli import app
 from jaxbl.config import read_config
 from jaxbl.records import read_log_table
 
 ROOT = Path(__file__).parents[1]
+TEXTS = [*sorted(ROOT.glob("*.md")), *sorted(ROOT.glob("docs/*.md")), ROOT / "benchmarks" / "NOTES.md"]
+SCRIPTS = [ROOT / "docs" / "generate.py", *sorted(ROOT.glob("benchmarks/**/*.py"))]
+
+
+def name(path):
+    return str(path.relative_to(ROOT))
 
 
 def test_reference_is_generated_from_this_code():
@@ -34,7 +49,126 @@ def test_log_examples_are_valid():
         read_log_table(tomllib.loads(block)["log"])
 
 
-@pytest.mark.parametrize("page", [*sorted(ROOT.glob("docs/*.md")), ROOT / "README.md"], ids=lambda p: p.name)
+@pytest.mark.parametrize("page", TEXTS, ids=name)
 def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
-        assert (page.parent / target).exists(), target
+        assert "://" in target or (page.parent / target).exists(), target
+
+
+# names
+
+
+def resolve(dotted):
+    """The object of a dotted name in the package."""
+    parts = dotted.split(".")
+    for i in range(len(parts), 0, -1):
+        try:
+            found = importlib.import_module(".".join(parts[:i]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[i:]:
+            found = getattr(found, part)
+        return found
+    raise AssertionError(dotted)
+
+
+# the entry-point group that packages with effects of their own use
+NO_MODULES = {"jaxbl.effects"}
+
+
+@pytest.mark.parametrize("page", TEXTS + SCRIPTS, ids=name)
+def test_names_of_modules_and_files_exist(page):
+    text = page.read_text(encoding="utf-8")
+    paths = re.findall(r"(?<![\w./-])(?:jaxbl|benchmarks|docs|sweeps|tests)/[\w./-]*\w/?", text)
+    paths += re.findall(r"(?<![\w./-])(?!my_package|results)\w[\w-]*/[\w./-]+\.(?:py|cu|md|toml)\b", text)
+    for path in paths:
+        assert (ROOT / path).exists() or (page.parent / path).exists(), path
+    for dotted in set(re.findall(r"(?<![\w./-])jaxbl(?:\.[A-Za-z_]\w*)+", text)) - NO_MODULES:
+        resolve(dotted)
+
+
+@pytest.mark.parametrize("page", TEXTS, ids=name)
+def test_commands_in_text_exist_with_their_options(page):
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
+    commands = get_command(app).commands
+    for line in re.findall(r"`jaxbl ([a-z]+[^`]*)`", text):
+        command, *words = line.replace("\n", " ").split()
+        known = set(chain.from_iterable(option.opts for option in commands[command].params))
+        assert {word.strip("[]") for word in words if word.strip("[").startswith("--")} <= known, line
+    for script, rest in re.findall(r"`python (\S+\.py)([^`]*)`", text):
+        source = (ROOT / script).read_text(encoding="utf-8")
+        assert all(f'"{word}"' in source for word in rest.split() if word.startswith("--")), f"{script}{rest}"
+
+
+# pages, run as written
+
+# what a block cannot do in a test, and what stands in for it
+INSTEAD = {
+    "make demo": "jaxbl sweep sweeps/gain_map.toml",  # test_demo_is_this_command; the environment is imitated below
+    "make test": "",  # this is it
+}
+
+
+class Block(NamedTuple):
+    """A fenced block of a page: its language and its text."""
+
+    language: str
+    text: str
+
+
+def blocks_of(page):
+    return [Block(*found) for found in re.findall(r"^```(\w+)\n(.*?)^```", page.read_text(encoding="utf-8"), re.S | re.M)]
+
+
+PAGES = [page for page in TEXTS if any(block.language in ("sh", "python") for block in blocks_of(page))]
+
+
+def imports_of(requirement):
+    """A requirement's import name: of those that only development needs."""
+    return {"pytest-xdist": "xdist"}.get(found := re.match(r"[\w-]+", requirement)[0], found)
+
+
+def environment(folder):
+    """That of the README's `make demo`: what only tests and benchmarks need cannot be imported."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    optional = chain.from_iterable(project["optional-dependencies"].values())
+    hidden = sorted({imports_of(one) for one in optional} - {"jaxbl"})
+    site = folder / "site"
+    site.mkdir()
+    (site / "sitecustomize.py").write_text(f"import sys\nsys.modules.update(dict.fromkeys({hidden!r}))\n")
+    cache = {
+        "JAX_COMPILATION_CACHE_DIR": str(ROOT / ".cache" / "jax"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05",
+    }
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    return os.environ | cache | {"PATH": path, "PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])}
+
+
+def test_demo_is_this_command():
+    recipe = re.search(r"^demo:.*\n\t(.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M)[1]
+    assert recipe.replace("$(BIN)/", "") == INSTEAD["make demo"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_page_runs_as_written(page, tmp_path):
+    """Blocks of one page in order, in a folder with the studies of a clone; TOML blocks of the tutorial make `axis.toml`."""
+    env = environment(tmp_path)
+    folder = tmp_path / "clone"
+    folder.mkdir()
+    shutil.copytree(ROOT / "sweeps", folder / "sweeps")
+    for language, text in blocks_of(page):
+        if language == "toml" and page.name == "tutorial.md":
+            with (folder / "axis.toml").open("a", encoding="utf-8") as file:
+                file.write(text)
+        elif language == "python":
+            run([sys.executable, "-c", text], folder, env)
+        elif language == "sh":
+            for command, other in INSTEAD.items():
+                text = re.sub(rf"^{command}", other, text, flags=re.M)
+            run(["sh", "-e", "-c", text], folder, env)
+
+
+def run(words, folder, env):
+    done = subprocess.run(words, cwd=folder, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{words[-1]}\n{done.stdout}\n{done.stderr}"

@@ -10,7 +10,7 @@ What counts as right:
 Gap of a case: the mean over channels of 1 - e(after) / e(before), where e² = rmse² - floor² on held-out data, nought where
 that is negative; only channels with e(before) of at least the floor. Worse: some channel's rmse after is more than 5 % above
 the larger of before and floor. Ratio to the oracle: the median over channels of rmse after over the oracle's. That is by
-the tool's own account; by the bench's, where the extended model is given, see hidden/proof.py. Calibration:
+the tool's own account; by the bench's, where the extended model is given, see benchmarks/hidden/proof.py. Calibration:
 every finding of an `explained` verdict is a bet that pays where the effect was really hidden.
 """
 
