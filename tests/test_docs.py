@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from test_public import FLOORS
 from typer.main import get_command
 
 from jaxbl.cli import app
@@ -72,8 +73,12 @@ def resolve(dotted):
     raise AssertionError(dotted)
 
 
-# the entry-point group that packages with effects of their own use
-NO_MODULES = {"jaxbl.effects"}
+# names of entry-point groups, which packages with effects of their own use
+GROUPS = {
+    group
+    for file in (ROOT / "jaxbl").rglob("*.py")
+    for group in re.findall(r'[(=]"(jaxbl\.\w+)"', file.read_text(encoding="utf-8"))
+}
 
 
 @pytest.mark.parametrize("page", TEXTS + SCRIPTS, ids=name)
@@ -83,7 +88,7 @@ def test_names_of_modules_and_files_exist(page):
     paths += re.findall(r"(?<![\w./-])(?!my_package|results)\w[\w-]*/[\w./-]+\.(?:py|cu|md|toml)\b", text)
     for path in paths:
         assert (ROOT / path).exists() or (page.parent / path).exists(), path
-    for dotted in set(re.findall(r"(?<![\w./-])jaxbl(?:\.[A-Za-z_]\w*)+", text)) - NO_MODULES:
+    for dotted in set(re.findall(r"(?<![\w./-])jaxbl(?:\.[A-Za-z_]\w*)+", text)) - GROUPS:
         resolve(dotted)
 
 
@@ -98,6 +103,14 @@ def test_commands_in_text_exist_with_their_options(page):
     for script, rest in re.findall(r"`python (\S+\.py)([^`]*)`", text):
         source = (ROOT / script).read_text(encoding="utf-8")
         assert all(f'"{word}"' in source for word in rest.split() if word.startswith("--")), f"{script}{rest}"
+
+
+def test_architecture_shows_the_floors():
+    """The diagram names the parts of each floor, top floor first."""
+    diagram = re.search(r"```text\n(cli.*?)```", (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"), re.S)[1]
+    parts = set().union(*FLOORS)
+    shown = [set(line[:29].split()) & parts for line in diagram.splitlines()]
+    assert shown == FLOORS[::-1]
 
 
 # pages, run as written
@@ -120,7 +133,12 @@ def blocks_of(page):
     return [Block(*found) for found in re.findall(r"^```(\w+)\n(.*?)^```", page.read_text(encoding="utf-8"), re.S | re.M)]
 
 
-PAGES = [page for page in TEXTS if any(block.language in ("sh", "python") for block in blocks_of(page))]
+# CONTRIBUTING.md's commands run tests
+PAGES = [
+    page
+    for page in (ROOT / "README.md", *sorted(ROOT.glob("docs/*.md")))
+    if any(block.language in ("sh", "python") for block in blocks_of(page))
+]
 
 
 def imports_of(requirement):
