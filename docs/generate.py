@@ -73,8 +73,8 @@ def page() -> str:
         "their side: a positive number resists a positive drive torque.\n\n"
         "| kind | meaning | key | unit | default |\n|---|---|---|---|---|"
     )
-    for name in sorted(effect_kinds()):
-        cls = effect_class(name)
+    for name in sorted(EFFECTS):
+        cls = EFFECTS[name]
         doc = " ".join((cls.__doc__ or "").strip().split("\n\n")[0].split()).replace("|", "\\|")
         for i, (field, known) in enumerate(parameters(cls)):
             default = "required" if repr(field.default).startswith("<") else f"`{field.default}`"

@@ -10,6 +10,7 @@ import difflib
 import math
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Union
 
@@ -20,7 +21,7 @@ import tomli_w
 from pydantic import Field, ValidationError, create_model, model_validator
 from pydantic_core import PydanticCustomError
 
-from jaxbl.drive.effects import effect_class, effect_kinds
+from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.encoders import Encoders
 from jaxbl.drive.excitation import EXCITATIONS, Recorded
 from jaxbl.drive.parameters import Parameter, as_arrays, key_of, parameters
@@ -120,7 +121,7 @@ _Transmission = _tagged([table_for(cls, law=name) for name, cls in TRANSMISSIONS
 _Excitation = _tagged(
     [RecordedTable if name == "recorded" else table_for(cls, kind=name) for name, cls in EXCITATIONS.items()], "kind"
 )
-_Effect = _tagged([table_for(effect_class(name), kind, kind=name) for name, kind in effect_kinds().items()], "kind")
+_Effect = _tagged([table_for(cls, partial(make_effect, name), kind=name) for name, cls in EFFECTS.items()], "kind")
 _Gains = table_for(AbstractSuperTwisting)
 _Initial = table_for(Initial)
 _Encoders = table_for(Encoders)
@@ -588,8 +589,8 @@ class Config(Table):
             if rigid and mark.side == "load":
                 raise wrong("verify.marks[{i}].side: 'load' has no meaning on a rigid drive; it should be 'motor'", i=i)
         for i, effect in enumerate(self.effects):
-            place, _, kind = effect.kind.partition(".")
-            if rigid and (place == "transmission" or (place == "load" and f"motor.{kind}" in effect_kinds())):
+            place = effect.kind.partition(".")[0]
+            if rigid and (place == "transmission" or (place == "load" and "motor" in EFFECTS[effect.kind].places)):
                 raise wrong(
                     "effects[{i}]: {kind} has no meaning on a rigid drive; motor.* and actuator.* effects act on it",
                     i=i,
@@ -597,10 +598,12 @@ class Config(Table):
                 )
         for side in ("motor",) if rigid else ("motor", "load"):
             nominal = getattr(self.drive, f"{side}_inertia")
-            total = nominal + sum(effect.inertia for effect in self.effects if effect.kind == f"{side}.inertia")
+            heavier = [effect for effect in self.effects if effect.kind.partition(".")[0] == side]
+            total = nominal + sum(float(effect.build().added_inertia()) for effect in heavier)
             if total <= 0.0:
                 raise wrong(
-                    "effects: {side}.inertia leaves a total of {total} on the {side}; it should stay above -{nominal}",
+                    "effects: {kind} leaves a total inertia of {total} on the {side}; it should stay above -{nominal}",
+                    kind=next(one.kind for one in heavier if float(one.build().added_inertia()) < 0.0),
                     side=side,
                     total=f"{total:g}",
                     nominal=f"{nominal:g}",

@@ -67,6 +67,11 @@ class Experiment(eqx.Module):
         return self.drive.sides
 
 
+def with_effects(experiment: Experiment, effects: tuple[AbstractEffect, ...]) -> Experiment:
+    """The experiment with other effects."""
+    return eqx.tree_at(lambda e: e.effects, experiment, effects)
+
+
 class State(eqx.Module):
     """What the loop over time carries."""
 
@@ -199,7 +204,7 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
     if moved is not None:
         assert state.plant is not None
         if experiment.transmission is not None:
-            torque, _ = plant.transmitted(state.plant.position, state.plant.velocity)
+            torque, _ = plant.transmitted(state.plant.position, state.plant.velocity, state.plant.effects)
         else:
             expected = drive.acceleration("motor", state.plant.velocity["motor"], torque_in)
             torque = drive.inertia("motor") * (expected - sides["motor"].true.acceleration)

@@ -6,24 +6,24 @@ the only number is of that kind, the effect at a trial value is taken as it is, 
 """
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Callable, Collection, Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Collection, Iterator, Sequence
+from typing import ClassVar, Protocol
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.drive.effects import AbstractEffect, Motion, effect_class, effect_kinds
-from jaxbl.drive.parameters import as_arrays, parameters
-from jaxbl.identification.regression import lasting_path
-from jaxbl.simulate import Experiment
+from jaxbl.drive.effects import EFFECTS, AbstractEffect, ActuatorEffect, Motion, Numbers, Scales, make_effect
+from jaxbl.drive.parameters import Scalar, as_arrays
+from jaxbl.identification.regression import Path, effect_path
+from jaxbl.simulate import Experiment, with_effects
 
 from .linearised_segment import Part
 
 Array = np.ndarray
-Numbers = dict[str, float]
 
 
 class Candidate(Protocol):
@@ -97,33 +97,8 @@ class Variant:
         return np.stack([(above - below) / (2.0 * _STEP), at])
 
 
-class Grids(NamedTuple):
-    """Values tried, and the size of things.
-
-    Attributes:
-        torque: largest input, N m.
-        period: s.
-        twist: rms of the twist z, rad; largest twist.
-        speed: rms, of each side, rad/s.
-        frequencies: of a periodic disturbance, Hz.
-        motor_harmonics, load_harmonics: of a turn.
-    """
-
-    torque: float
-    period: float
-    twist: tuple[float, float]
-    speed: dict[str, float]
-    frequencies: tuple[float, ...] = ()
-    motor_harmonics: tuple[float, ...] = ()
-    load_harmonics: tuple[float, ...] = ()
-
-
 SHARE = 0.3
 """Prior size of an effect: share of the driving torque's rms."""
-_STRIBECK = 0.05, 0.1, 0.2, 0.3, 0.45, 0.7, 1.0
-_LIMITS = 0.98, 0.95, 0.92, 0.88, 0.84, 0.8, 0.75, 0.7, 0.65, 0.6, 0.55, 0.5, 0.45, 0.4, 0.35, 0.3
-_LAGS = 0.3, 0.6, 1.2, 2.4, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0
-_GAPS = 0.01, 0.02, 0.04, 0.08, 0.12, 0.18, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.92
 _STEP = 0.02
 SPACING = 0.3
 """Prior standard deviation of the logarithm of a number about its trial value."""
@@ -134,95 +109,87 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def variants_of(experiment: Experiment, lacking: Collection[str], grids: Grids) -> list[Variant]:
-    """Effects that a model lacks, variant by variant."""
-    sides = experiment.sides
+def variants_of(experiment: Experiment, lacking: Collection[str], scales: Callable[[str], Scales]) -> list[Variant]:
+    """Effects that a model lacks, variant by variant.
+
+    Args:
+        experiment: the model.
+        lacking: names of the effects.
+        scales: of the log, as an effect of a given name sees them.
+    """
     found: list[Variant] = []
-    for side in sides:
-        for kind, leaf in _LINEAR:
-            found.append(_single(f"{side}.{kind}", leaf))
-        for share in _STRIBECK:
-            found.append(_stribeck(side, share * grids.speed[side]))
-    found.append(_wave("load.gravity", "torque", {}, -1.0))
-    for frequency in grids.frequencies:
-        found.append(_wave("load.periodic_disturbance", "amplitude", {"frequency": frequency}))
-    for harmonic in grids.motor_harmonics:
-        found.append(_wave("motor.cogging", "amplitude", {"harmonic": harmonic}))
-    if experiment.transmission is not None:
-        for harmonic in grids.load_harmonics:
-            found.append(_wave("transmission.eccentricity", "amplitude", {"harmonic": harmonic}, size=0.02 * grids.twist[0]))
-        found.append(_single("transmission.damping", "damping"))
-        found.append(_single("transmission.hardening", "cubic_stiffness"))
-        if "half_gap" not in experiment.transmission.truth():
-            found += [_trial("transmission.backlash", "half_gap", share * grids.twist[1]) for share in _GAPS]
-    if grids.torque > 0.0:
-        found.append(_single("actuator.gain_error", "relative"))
-        found += [_trial("actuator.saturation", "limit", share * grids.torque) for share in _LIMITS]
-        found += [_trial("actuator.lag", "time_constant", samples * grids.period) for samples in _LAGS]
-    return [one for one in found if one.name in lacking]
+    for name in lacking:
+        log = scales(name)
+        # without an input nothing acts on it
+        if EFFECTS[name].suits(experiment.transmission) and (log.torque > 0.0 or not name.startswith("actuator.")):
+            found += _variants(name, log)
+    return found
 
 
-_LINEAR = (
-    ("coulomb_friction", "torque"),
-    ("viscous_friction", "viscous"),
-    ("quadratic_drag", "drag"),
-    ("constant_torque", "torque"),
-    ("inertia", "inertia"),
-)
+def _variants(name: str, log: Scales) -> Iterator[Variant]:
+    """An effect at all values tried of the numbers that its torque is not proportional to."""
+    roles = EFFECTS[name].roles()
+    tried = [leaf for leaf, role in roles.items() if role.kind in ("harmonic", "frequency", "shape")]
+    for values in itertools.product(*(roles[leaf].trials(log) for leaf in tried)):
+        known = dict(zip(tried, values, strict=True))
+        yield _proportional(name, known, log) if EFFECTS[name].sizes() else _trial(name, known)
+
+
+def _proportional(name: str, known: Numbers, log: Scales) -> Variant:
+    """An effect with sizes: a column for each direction of them, two a quarter turn apart where its phase is not known."""
+    cls = EFFECTS[name]
+    roles, directions = cls.roles(), cls.directions()
+    phase = next((leaf for leaf, role in roles.items() if role.kind == "angle"), None)
+    unit = []
+    for direction in directions:
+        (size,) = {float(next(iter(roles[leaf].trials(log)))) for leaf in direction}
+        numbers = dict.fromkeys(cls.sizes(), 0.0) | {leaf: size * share for leaf, share in direction.items()} | known
+        turns = [{}] if phase is None else [{phase: 0.0}, {phase: 0.5 * math.pi}]
+        unit += [(_effect(name, numbers | turn), size) for turn in turns]
+
+    def numbers_of(values: Sequence[float]) -> Numbers | None:
+        if phase is not None:
+            sine, cosine = values
+            return {cls.sizes()[0]: math.hypot(sine, cosine)} | known | {phase: math.atan2(cosine, sine)}
+        numbers = dict.fromkeys(cls.sizes(), 0.0)
+        for value, direction in zip(values, directions, strict=True):
+            for leaf, share in direction.items():
+                numbers[leaf] += value * share
+        return numbers | known if cls.possible(numbers) else None
+
+    return Variant(name, tuple(unit), None, numbers_of)
+
+
+def _trial(name: str, known: Numbers) -> Variant:
+    """An effect without sizes: the first of its numbers about the value tried."""
+    leaf, value = next(iter(known.items()))
+    below, at, above = (_effect(name, known | {leaf: value * math.exp(step)}) for step in (-_STEP, 0.0, _STEP))
+
+    def numbers_of(values: Sequence[float]) -> Numbers | None:
+        (change,) = values
+        return known | {leaf: value * math.exp(change)} if abs(change) < 4.0 * SPACING else None
+
+    return Variant(name, (), (below, at, above), numbers_of)
 
 
 def _effect(name: str, numbers: Numbers) -> AbstractEffect:
-    return as_arrays(effect_kinds()[name](**numbers), float)
+    return as_arrays(make_effect(name, **numbers), float)
 
 
-def _single(name: str, leaf: str) -> Variant:
-    (about,) = (about for field, about in parameters(effect_class(name)) if field.name == leaf)
+class _InputGain(ActuatorEffect):
+    """The input times a gain."""
 
-    def numbers(values: Sequence[float]) -> Numbers | None:
-        (value,) = values
-        return None if about.minimum is not None and value <= about.minimum else {leaf: value}
+    kind: ClassVar[str] = "input_gain"
+    gain: Scalar
 
-    return Variant(name, ((_effect(name, {leaf: 1.0}), 1.0),), None, numbers)
+    def actuate(self, state, torque, step):
+        return state, self.gain * torque
 
 
 def all_of_the_input() -> Variant:
     """The torque of the input once more."""
-    return _single("actuator.gain_error", "relative")
-
-
-def _stribeck(side: str, speed: float) -> Variant:
-    name = f"{side}.stribeck_friction"
-    sliding = _effect(name, {"torque": 1.0, "breakaway_torque": 1.0, "stribeck_velocity": speed})
-    excess = _effect(name, {"torque": 0.0, "breakaway_torque": 1.0, "stribeck_velocity": speed})
-
-    def numbers(values: Sequence[float]) -> Numbers | None:
-        low, more = values
-        if low < 0.0 or more <= 0.0:
-            return None
-        return {"torque": low, "breakaway_torque": low + more, "stribeck_velocity": speed}
-
-    return Variant(name, ((sliding, 1.0), (excess, 1.0)), None, numbers)
-
-
-def _wave(name: str, leaf: str, known: Numbers, turn: float = 1.0, size: float = 1.0) -> Variant:
-    """A sinusoid of unknown phase: two of them, a quarter of a period apart."""
-    pair = tuple((_effect(name, known | {leaf: size, "phase": phase}), size) for phase in (0.0, 0.5 * turn * math.pi))
-
-    def numbers(values: Sequence[float]) -> Numbers:
-        sine, cosine = values
-        return {leaf: math.hypot(sine, cosine), "phase": turn * math.atan2(cosine, sine)} | known
-
-    return Variant(name, pair, None, numbers)
-
-
-def _trial(name: str, leaf: str, value: float) -> Variant:
-    effects = tuple(_effect(name, {leaf: value * math.exp(step)}) for step in (-_STEP, 0.0, _STEP))
-
-    def numbers(values: Sequence[float]) -> Numbers | None:
-        (change,) = values
-        return {leaf: value * math.exp(change)} if abs(change) < 4.0 * SPACING else None
-
-    return Variant(name, (), effects, numbers)  # type: ignore[arg-type]
+    twice = _InputGain(jnp.asarray(2.0))
+    return Variant(twice.name, ((twice, 1.0),), None, lambda values: {})
 
 
 class Signals:
@@ -305,18 +272,21 @@ def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direct
     def one(effect: AbstractEffect) -> jax.Array:
         found = jnp.zeros((len(part.time), len(sides) + 1))
         place = drive.place(effect.place)
-        if place == "actuator":
-            alone = eqx.tree_at(lambda e: e.effects, experiment, (effect,))
-            found = found.at[:, -1].set(lasting_path(alone, part.torque)[1] - part.torque)
-        elif place == "transmission":
-            others = tuple(one for one in experiment.effects if one.name != effect.name)
-            both = (eqx.tree_at(lambda e: e.effects, experiment, some) for some in (others, (*others, effect)))
-            before, after = (one.plant.transmitted(part.position, part.velocity) for one in both)
+        if place == "transmission":
+            gear = tuple(one for one in experiment.effects if one.place == place and one.name != effect.name)
+            both = (with_effects(experiment, some) for some in (gear, (*gear, effect)))
+            before, after = (
+                one.plant.transmitted(part.position, part.velocity, effect_path(one, Path.of(part))[0]) for one in both
+            )
             found = found.at[:, 0].set(before[0] - after[0])
             found = found.at[:, 1].set(after[1] * after[0] - before[1] * before[0])
+            return found * part.weight[:, None]
+        (state,), acting = effect_path(with_effects(experiment, (effect,)), Path.of(part))
+        if place == "actuator":
+            found = found.at[:, -1].set(acting - part.torque)
         else:
             motion = Motion(part.time, part.position[place], part.velocity[place])
-            torque = effect.resist(motion) + effect.dry_friction(motion.velocity) * direction
+            torque = effect.resist(state, motion) + effect.dry_friction(state, motion.velocity) * direction
             torque = torque + effect.added_inertia() * part.modelled[place]
             found = found.at[:, sides.index(place)].set(-torque)
         return found * part.weight[:, None]
@@ -328,7 +298,8 @@ def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direct
 def _needed(experiment: Experiment, part: Part) -> dict[str, jax.Array]:
     """Torque on each side that its motion does not take up, dry friction left out, N m."""
     plant = experiment.plant
-    acting = plant.torques(part.position, part.velocity, lasting_path(experiment, part.torque)[1], part.time)
+    states, torque = effect_path(experiment, Path.of(part))
+    acting = plant.torques(part.position, part.velocity, states, torque, part.time)
     found = {}
     for side in experiment.sides:
         rest = acting[side][0] - experiment.drive.viscous(side) * part.velocity[side]

@@ -27,7 +27,7 @@ from jaxbl.diagnosis.localise import SIGNIFICANT, Localised, Values, as_json, co
 from jaxbl.diagnosis.neutral_effects import complete, joined
 from jaxbl.diagnosis.observer_residual import Observed, compared, observed_torques
 from jaxbl.diagnosis.residuals import Residual
-from jaxbl.drive.effects import effect_class, effect_kinds
+from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import get_leaf, leaf_paths, parameters, set_leaves
 from jaxbl.errors import InputError
 from jaxbl.files import plain
@@ -706,8 +706,9 @@ def _summary(
     if task.separate:
         notes += [f"{task.holdout.path.name}: {note}" for note in task.holdout.notes if note not in record.notes]
     notes += [f"{name} was found, and withdrawn: with it the held-out data are met no better." for name in withdrawn]
-    if task.separate and any(one.effect == "load.periodic_disturbance" for one in found.findings):
-        notes.append("The phase of load.periodic_disturbance is taken to be the same at the start of both logs.")
+    timed = [one.effect for one in found.findings if any(r.kind == "frequency" for r in EFFECTS[one.effect].roles().values())]
+    if task.separate:
+        notes += [f"The phase of {name} is taken to be the same at the start of both logs." for name in timed]
     if found.verdict == "no_discrepancy":
         notes += _least_seen(record, located)
     own = [one for one in fitted.free if not any(one.path.startswith(f"effects.{name}.") for name in fitted.names)]
@@ -745,7 +746,7 @@ def _finding(
     located: Mapping[str, Localised],
 ) -> dict[str, Any]:
     prefix, known = f"effects.{one.effect}", dict.fromkeys(one.numbers)
-    units = {field.name: about.unit for field, about in parameters(effect_class(one.effect))}
+    units = {field.name: about.unit for field, about in parameters(EFFECTS[one.effect])}
     numbers = {
         leaf: {
             "value": values.get(f"{prefix}.{leaf}", one.numbers[leaf]),
@@ -754,7 +755,7 @@ def _finding(
         }
         for leaf in known
     }
-    place = effect_kinds()[one.effect](**one.numbers).place
+    place = one.effect.partition(".")[0]
     sides = {"motor": ["motor"], "actuator": ["motor"]}.get(place, ["load"] if place == "load" else list(located))
     sides = [side for side in sides if side in located] or list(located)
     return {

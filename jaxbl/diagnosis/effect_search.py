@@ -14,8 +14,8 @@ from typing import Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.drive.effects import effect_class
-from jaxbl.drive.parameters import parameters, set_leaves
+from jaxbl.drive.effects import EFFECTS
+from jaxbl.drive.parameters import set_leaves
 from jaxbl.identification.smoother import Smoothed
 from jaxbl.identification.trajectory import WIDE, Free, free_parameters
 from jaxbl.records import Record
@@ -225,7 +225,7 @@ class Explainer:
         """The model with some effects, with the numbers of least prediction errors (:mod:`.polish`)."""
         key = _key(values, theta)
         if self._polished is None or self._polished[0] != key:
-            experiment = with_effects(self.nominal, values)
+            experiment = with_numbers(self.nominal, values)
             added = free_parameters(experiment, paths_of(values), self._torque)
             free, width = (*self.free, *added), np.concatenate([self.prior, np.full(len(added), WIDE)])
             start = np.concatenate([theta, np.zeros(len(added))])
@@ -243,7 +243,7 @@ class Explainer:
         if key not in self._recent:
             if len(self._recent) == _RECENT:
                 self._recent.pop(next(iter(self._recent)))
-            self._recent[key] = self._linear(with_effects(self.nominal, values), tuple(values), theta)
+            self._recent[key] = self._linear(with_numbers(self.nominal, values), tuple(values), theta)
         return self._recent[key]
 
     @property
@@ -254,7 +254,8 @@ class Explainer:
     def _linear(self, experiment: Experiment, names: Names, theta: Array) -> Linear:
         paths = paths_of(names)
         own = (*self.free, *free_parameters(experiment, paths, self._torque))
-        prior = np.concatenate([self.prior, [_width(path) for path in paths]])
+        widths = [EFFECTS[name].roles()[leaf].width for name in names for leaf in _fitted(name)]
+        prior = np.concatenate([self.prior, widths])
         centre = np.concatenate([-theta, np.zeros(len(paths))])
         at = np.concatenate([theta, np.zeros(len(paths))])
         bound = np.concatenate([np.full(len(self.free), self.bound), np.full(len(paths), np.inf)])
@@ -281,8 +282,7 @@ class Explainer:
         if best is None:
             return Model(names, point.experiment, values, theta, -np.inf, -np.inf, point.linear)
         experiment, linear, found, values, theta = best.experiment, best.linear, best.found, best.values, best.theta
-        if any(one.get("breakaway_torque", np.inf) <= one.get("torque", 0.0) for one in values.values()):
-            # then it is Coulomb's
+        if not all(EFFECTS[name].possible(one) for name, one in values.items()):
             return Model(names, experiment, values, theta, -np.inf, -np.inf, linear)
         scored = _Scored("", found, linear.count, deviation)
         evidence = scored.log_evidence + len(names) * ODDS - sum(linear.choices(name) for name in names)
@@ -297,14 +297,13 @@ class Explainer:
         deviation: Array,
     ) -> _Point:
         """Cost at some numbers, and where the linear step leads."""
-        experiment = with_effects(self.nominal, values)
+        experiment = with_numbers(self.nominal, values)
         linear = self.linear(values, theta)
         columns = linear.columns((), smoothness, deviation)
         scale, sizes = columns.scale.copy(), linear.sizes(names)
-        for i, path in enumerate(paths_of(names), 1 + len(self.free)):
-            name, leaf = path.removeprefix("effects.").rsplit(".", 1)
-            if leaf in _AMPLITUDES:
-                scale[i] = sizes[name]
+        for i, one in enumerate(linear.free[len(self.free) :], 1 + len(self.free)):
+            if one.role == "size":
+                scale[i] = sizes[_owner(one)[0]]
         found = None
         if np.max(np.abs(columns.products)) < DIVERGED and np.isfinite(scale[1:]).all():
             found = Scorer(dataclasses.replace(columns, scale=scale), ())(())
@@ -317,7 +316,7 @@ class Explainer:
         count = len(self.free)
         values = {name: dict(numbers) for name, numbers in point.values.items()}
         for one, by in zip(point.linear.free[count:], change[count:], strict=True):
-            name, leaf = one.path.removeprefix("effects.").rsplit(".", 1)
+            name, leaf = _owner(one)
             values[name][leaf] = float(one.value(by))
         return point.theta + change[:count], values
 
@@ -434,9 +433,9 @@ class Explainer:
         numbers = {name: dict(one) for name, one in model.numbers.items()}
         weak: set[str] = set()
         for one, at, by in zip(free[count:], best.theta[count:], best.deviation[count:], strict=True):
-            name, leaf = one.path.removeprefix("effects.").rsplit(".", 1)
+            name, leaf = _owner(one)
             numbers[name][leaf] = float(one.value(at))
-            if leaf in _AMPLITUDES and abs(numbers[name][leaf]) < _WEAK * float(one.slope(at)) * by:
+            if one.role == "size" and abs(numbers[name][leaf]) < _WEAK * float(one.slope(at)) * by:
                 weak.add(name)
         theta = best.theta[:count]
         for name in sorted(weak, key=model.names.index, reverse=True):
@@ -449,20 +448,21 @@ class Explainer:
         return model
 
     def _simplified(self, model: Model, smoothness: Sequence[float]) -> tuple[Model, dict[str, str]]:
-        """A model in which friction that need not fall with speed does not, and the effects' new names."""
+        """A model in which simpler effects take the place of those that contain them and gain nothing over them, and the
+        effects' new names."""
         renamed: dict[str, str] = {}
         for name in model.names:
-            place, kind = name.split(".")
-            if kind != "stribeck_friction":
-                continue
-            plain = f"{place}.coulomb_friction"
-            deviation = model.linear.deviation(smoothness)
-            full = self.refit(model.names, model.numbers, model.theta, smoothness, deviation)
-            numbers = {plain if a == name else a: b for a, b in full.numbers.items()}
-            numbers[plain] = {"torque": full.numbers[name]["torque"]}
-            less = self.refit(tuple(numbers), numbers, full.theta, smoothness, deviation)
-            if self._gain(less, full) <= 0.0:
-                model, renamed = less, renamed | {name: plain}
+            for kind, reduced in EFFECTS[name].special_cases.items():
+                plain = f"{name.partition('.')[0]}.{kind}"
+                if plain not in self.lacking or plain in model.names or name in renamed:
+                    continue
+                deviation = model.linear.deviation(smoothness)
+                full = self.refit(model.names, model.numbers, model.theta, smoothness, deviation)
+                numbers = {plain if a == name else a: b for a, b in full.numbers.items()}
+                numbers[plain] = reduced(full.numbers[name])
+                less = self.refit(tuple(numbers), numbers, full.theta, smoothness, deviation)
+                if self._gain(less, full) <= 0.0:
+                    model, renamed = less, renamed | {name: plain}
         return model, renamed
 
     def _round(self, current: Model) -> tuple[list[float], list[tuple[float, Model]]]:
@@ -567,7 +567,7 @@ class Explainer:
     def _variants(self, model: Model) -> list[Variant]:
         """Effects that a model lacks, at what was chosen last for it."""
         lacking = [name for name in self.lacking if name not in model.names and not _same(name, model.names)]
-        return variants_of(model.experiment, lacking, model.linear.grids(model.linear.frequencies()))
+        return variants_of(model.experiment, lacking, model.linear.scales)
 
     def _ranked(
         self, linear: Linear, variants: Sequence[Candidate], smoothness: Sequence[float], noise: Array | Spectrum
@@ -586,13 +586,10 @@ class Explainer:
         return _Scored("", none, linear.count, deviation), list(best.values())
 
 
-_DRY = "coulomb_friction", "stribeck_friction"
-
-
 def _same(name: str, others: Iterable[str]) -> bool:
-    """Whether an effect is of a kind with one that is there: of dry friction a side has one law."""
-    place, kind = name.split(".")
-    return kind in _DRY and any(f"{place}.{one}" in others for one in _DRY)
+    """Whether an effect cannot stand beside one that is there: of dry friction a side has one law."""
+    word, place = EFFECTS[name].exclusive, name.partition(".")[0]
+    return word is not None and any(EFFECTS[one].exclusive == word and one.partition(".")[0] == place for one in others)
 
 
 def _verdict(left: float, findings: Sequence[Finding]) -> Verdict:
@@ -624,28 +621,23 @@ def _softmax(values: Array) -> Array:
     return weights / weights.sum()
 
 
-_AMPLITUDES = frozenset(
-    ("torque", "breakaway_torque", "viscous", "drag", "inertia", "amplitude", "cubic_stiffness", "damping", "relative")
-)
-_FIXED = frozenset(("harmonic",))
-"""Whole numbers of a turn."""
+def _fitted(name: str) -> list[str]:
+    """The numbers of an effect that are fitted: a harmonic is a whole number."""
+    return [leaf for leaf, role in EFFECTS[name].roles().items() if role.kind != "harmonic"]
 
 
 def paths_of(names: Iterable[str]) -> list[str]:
     """Dotted paths of the free numbers of effects."""
-    return [
-        f"effects.{name}.{field.name}"
-        for name in names
-        for field, _ in parameters(effect_class(name))
-        if field.name not in _FIXED and not field.metadata.get("static")
-    ]
+    return [f"effects.{name}.{leaf}" for name in names for leaf in _fitted(name)]
 
 
-def _width(path: str) -> float:
-    return 1.8 if path.endswith(".phase") else 1.0
+def _owner(one: Free) -> tuple[str, str]:
+    """The effect that a number is of, and its name there."""
+    name, _, leaf = one.path.removeprefix("effects.").rpartition(".")
+    return name, leaf
 
 
-def with_effects(experiment: Experiment, values: Mapping[str, Numbers]) -> Experiment:
+def with_numbers(experiment: Experiment, values: Mapping[str, Numbers]) -> Experiment:
     """A model with all effects, some of them with these numbers."""
     return set_leaves(
         experiment,

@@ -24,18 +24,18 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
-from jaxbl.drive.effects import ConstantTorque
+from jaxbl.drive.effects import EFFECTS, ConstantTorque, Scales
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import Direction, slopes
 from jaxbl.identification.prediction import kalman_gain
-from jaxbl.identification.regression import lasting_path
+from jaxbl.identification.regression import Path, effect_path
 from jaxbl.identification.smoother import Smoothed
 from jaxbl.identification.trajectory import Free, with_values
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
-from .candidates import SHARE, SPACING, Candidate, Grids, Signals, all_of_the_input, forces_of, rms
+from .candidates import SHARE, SPACING, Candidate, Signals, all_of_the_input, forces_of, rms
 from .evidence import Columns
 from .linearised_segment import Part
 from .neutral_effects import bucket
@@ -103,8 +103,9 @@ def _part(
     held = {side: padded(np.asarray(smoothed[side].held(period), float)) for side in sides}
     read = np.stack([padded(readings[side]) - states[side][:, 0] for side in sides], axis=1)
     time, torque = padded(time), padded(torque)
-    effects, _ = lasting_path(experiment, jnp.asarray(torque))
     smooth: list[Any] = [{side: states[side][:, i] for side in sides} for i in range(3)]
+    along = Path(*jax.tree.map(jnp.asarray, (time, torque, *smooth[:2])))
+    effects, _ = effect_path(experiment, along)
     motion = PlantState(smooth[0], smooth[1], jax.tree.map(np.asarray, effects))
     # by side, not by name
     names, each = sorted(sides), len(sides)
@@ -256,9 +257,9 @@ _FINE_SMOOTHNESS = 10.0 ** np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
 _LEAST = 1e-11
 OFF = 0.5
 """Prior size of the error of an inertia or a viscous friction, relative."""
-_FREQUENCIES, _COARSE, _HARMONICS = 8, 16, 40
-_ARC = 0.5 * np.pi
-"""Of a wave of cogging, rad, that the motion must cover for it to be tried."""
+_FREQUENCIES, _COARSE = 8, 16
+_HIGHEST = 50.0
+"""Hz: a torque of a higher frequency hardly moves a drive."""
 _NO_INPUT = 1e-3
 DIVERGED = 1e30
 """Products of prediction errors, over their variance or in rad^2, from which on a model is one that diverges."""
@@ -349,6 +350,7 @@ class Linear:
         self.count = sum(int(np.asarray(one.weight).sum()) for one in self.parts)
         self.states = self.parts[0].defect.shape[1]
         self.drive, self.driven = self._drive()
+        self._scales: dict[str, Scales] = {}
         # what the last search chose, and what the one without candidates did, which is asked for again and again
         self._last: tuple[Predictor, list[np.ndarray]] | None = None
         self._alone: tuple[Predictor, list[np.ndarray]] | None = None
@@ -364,39 +366,48 @@ class Linear:
         inertial = rms(np.concatenate(taken))
         return (driving, True) if driving > _NO_INPUT * inertial else (inertial, False)
 
-    def grids(self, frequencies: Sequence[float]) -> Grids:
-        """Values to be tried of numbers that are not linear."""
+    def scales(self, name: str) -> Scales:
+        """How large things are on the record, as an effect sees them; frequencies are sought anew each time."""
+        place = self.experiment.drive.place(name.partition(".")[0])
+        if place not in self._scales:
+            self._scales[place] = self._scales_at(place)
+        found = self._scales[place]
+        if any(role.kind == "frequency" for role in EFFECTS[name].roles().values()):
+            found = found._replace(frequencies=tuple(self.frequencies(place)))
+        return found
 
+    def _scales_at(self, place: str) -> Scales:
         def joined(of) -> np.ndarray:
             return np.concatenate([np.asarray(of(one))[np.asarray(one.weight) > 0.0] for one in self.parts])
 
-        speed = {side: rms(joined(lambda part, side=side: part.velocity[side])) for side in self.sides}
-        travel = {side: float(np.ptp(joined(lambda part, side=side: part.position[side]))) for side in self.sides}
-        twist = np.zeros(1)
-        if len(self.sides) == 2:
-            ratio = float(self.experiment.drive.ratio("load"))
-            twist = joined(lambda part: part.position["motor"] - ratio * part.position["load"])
-        return Grids(
-            float(np.max(np.abs(joined(lambda part: part.torque)))),
-            self.period,
-            (rms(twist), float(np.max(np.abs(twist)))),
-            speed,
-            tuple(frequencies),
-            tuple(float(n) for n in range(1, _HARMONICS + 1) if n * travel["motor"] > _ARC),
-            # once a turn is what eccentricity means; of others something must be seen
-            (1.0, *(float(n) for n in range(2, 9) if n * travel.get("load", 0.0) > 0.5)),
+        side = place if place in self.sides else "motor"
+        position = joined(lambda part: part.position["load" if place == "transmission" else side])
+        twist = joined(lambda part: self.experiment.plant.twist(part.position)) if len(self.sides) == 2 else np.zeros(1)
+        return Scales(
+            torque=float(np.max(np.abs(joined(lambda part: part.torque)))),
+            period=self.period,
+            duration=self.count * self.period,
+            twist=rms(twist),
+            largest_twist=float(np.max(np.abs(twist))),
+            speed=rms(joined(lambda part: part.velocity[side])),
+            spread=float(np.std(position)),
+            travel=float(np.ptp(position)),
         )
 
     def choices(self, name: str) -> float:
         """Logarithm of the number of values that an effect was sought with, where each could be told from the next."""
-        if name == "load.periodic_disturbance":
-            return float(np.log(max(self.count * self.period * min(0.25 / self.period, 50.0), 1.0)))
-        grids = self.grids(())
-        if name == "motor.cogging":
-            return float(np.log(max(len(grids.motor_harmonics), 1)))
-        if name == "transmission.eccentricity":
-            return float(np.log(max(len(grids.load_harmonics), 1)))
-        return 0.0
+        count = 1.0
+        for role in EFFECTS[name].roles().values():
+            if role.kind == "frequency":
+                count *= max(self.count * self.period * self._highest, 1.0)
+            elif role.kind == "harmonic":
+                count *= max(len(role.trials(self.scales(name))), 1)
+        return float(np.log(count))
+
+    @property
+    def _highest(self) -> float:
+        """Frequency up to which a disturbance is sought, Hz: half of what the samples show, and what a drive passes on."""
+        return min(0.25 / self.period, _HIGHEST)
 
     @staticmethod
     def gain_of(smoothness: Sequence[float], period: float) -> Array:
@@ -477,20 +488,20 @@ class Linear:
         """Rms of the prediction errors, rad, by side, with a given predictor."""
         return np.sqrt(self.predictor(smoothness).squares / self.count)
 
-    def frequencies(self) -> list[float]:
-        """Frequencies (Hz) at which a disturbance of the load explains most, by the gradient of the errors' squares.
+    def frequencies(self, place: str) -> list[float]:
+        """Frequencies (Hz) at which a disturbance of a side explains most, by the gradient of the errors' squares.
 
         Of the longest part, under what the last call of :meth:`choose` chose, and at what it left over.
         """
         assert self._last is not None
         i = int(np.argmax([float(one.weight.sum()) for one in self.parts]))
-        part, side = self.parts[i], self.sides.index(self.experiment.drive.place("load"))
+        part, side = self.parts[i], self.sides.index(place)
         predictor, forces = self._last
         gain, deviation = self.gain(predictor.smoothness), np.sqrt(predictor.squares / self.count)
         errors = np.asarray(_errors(part, gain, forces[i]))
         left = errors[:, :, self._some(len(forces[i]), len(forces[i]))] @ predictor.coefficients[i]
         time, real = np.asarray(part.time), int(np.asarray(part.weight).sum())
-        span, top = real * self.period, min(0.25 / self.period, 50.0)
+        span, top = real * self.period, self._highest
         few = np.geomspace(1.0 / span, top, _COARSE)
         phase = 2.0 * np.pi * few[:, None] * time[None, :]
         waves = np.zeros((2 * _COARSE, len(time), len(self.sides) + 1))
@@ -572,7 +583,7 @@ class Linear:
                 found[place[0]] = 1 + i, 1.0 / slopes[i]
         for j, one in enumerate(self.free):
             name, _, leaf = one.path.removeprefix("effects.").rpartition(".")
-            if leaf in ("inertia", "viscous") and (i := self.same(name)) is not None:
+            if leaf and (i := self.same(name)) is not None:
                 found[1 + j] = 1 + i, slopes[j] / slopes[i]
         return found
 
@@ -604,24 +615,25 @@ class Linear:
             found[name] = SHARE / max(self.share(name), 1e-150)
             if (nominal := self.nominal(name)) is not None:
                 effect = get_leaf(self.experiment, f"effects.{name}")
-                (value,) = (abs(float(getattr(effect, leaf))) for leaf in ("inertia", "viscous") if hasattr(effect, leaf))
+                value = abs(float(getattr(effect, EFFECTS[name].sizes()[0])))
                 found[name] = min(found[name], OFF * nominal / max(value, 1e-300))
         return found
 
     def same(self, name: str) -> int | None:
         """Index of the model's own number that an effect is the error of."""
-        side, _, kind = name.partition(".")
-        path = f"drive.{side}_{kind.removesuffix('_friction')}" if kind in ("inertia", "viscous_friction") else ""
+        path = f"drive.{name.partition('.')[0]}_{_corrected(name)}"
         return next((i for i, one in enumerate(self.free) if one.path == path), None)
 
     def nominal(self, name: str) -> float | None:
         """The number of the drive that an effect is the error of, if it is one and is not zero."""
-        side, _, kind = name.partition(".")
-        if kind not in ("inertia", "viscous_friction"):
-            return None
-        drive = self.experiment.drive
-        value = float(drive.inertia(side) if kind == "inertia" else drive.viscous(side))
+        number = _corrected(name)
+        value = 0.0 if number is None else float(getattr(self.experiment.drive, number)(name.partition(".")[0]))
         return value if value > 0.0 else None
+
+
+def _corrected(name: str) -> str | None:
+    """The drive's number that an effect is the error of, if any."""
+    return EFFECTS[name].corrects if name in EFFECTS else None
 
 
 def _least_squares(total: np.ndarray, precision: np.ndarray, centre: np.ndarray, reach: np.ndarray) -> np.ndarray:

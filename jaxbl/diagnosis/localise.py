@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from jaxbl.identification import regression
-from jaxbl.identification.regression import Kinematics
+from jaxbl.identification.regression import Kinematics, transmitted
 from jaxbl.identification.smoother import Smoothed
 from jaxbl.simulate import Experiment
 
@@ -211,7 +211,7 @@ def coordinates_of(
         rate = np.asarray(plant.twist(part.velocity))  # type: ignore[arg-type]
         torque = part.transmitted
         if torque is None:
-            torque = jax.vmap(lambda x, v: plant.transmitted(x, v)[0])(part.position, part.velocity)
+            torque = transmitted(experiment, part)
         torque = np.asarray(torque)
         gap = experiment.plant.half_gap
         if gap > 0.0:

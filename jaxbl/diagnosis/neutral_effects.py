@@ -9,15 +9,11 @@ from typing import TypeVar
 
 import equinox as eqx
 
-from jaxbl.drive.effects import effect_class, effect_kinds
+from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.simulate import Experiment
 
 Effect = TypeVar("Effect")
-
-ACTUATOR_ORDER = ("actuator.gain_error", "actuator.saturation", "actuator.lag")
-"""In which effects of the actuator act, unless the config says otherwise."""
-
 
 def candidates(experiment: Experiment) -> list[str]:
     """Names of the effects that a model's drive can have and that the model lacks."""
@@ -26,20 +22,20 @@ def candidates(experiment: Experiment) -> list[str]:
     if experiment.transmission is not None:
         places.add("transmission")
     names = []
-    for name in effect_kinds():
-        place, _, kind = name.partition(".")
+    for name, cls in EFFECTS.items():
+        place = name.partition(".")[0]
         # on a rigid drive the motor has all that both sides may have; only a load has the others
-        twice = place == "load" and place not in experiment.sides and f"motor.{kind}" in effect_kinds()
-        if effect_class(name).neutral and place in places and name not in known and not twice:
+        twice = place == "load" and place not in experiment.sides and "motor" in cls.places
+        if cls.neutral() and place in places and name not in known and not twice:
             names.append(name)
     return names
 
 
 def complete(experiment: Experiment) -> Experiment:
     """A model with all effects that it lacks at neutral numbers; array leaves."""
-    added = [as_arrays(effect_kinds()[name](**effect_class(name).neutral), float) for name in candidates(experiment)]
+    added = [as_arrays(make_effect(name, **EFFECTS[name].neutral()), float) for name in candidates(experiment)]
     effects = joined(experiment.effects, added, lambda one: one.name)
-    kinds = list(effect_kinds())
+    kinds = list(EFFECTS)
     if len({one.name for one in effects}) == len(effects):
         # one order whatever was given, so that models share their programs; that of the actuator's matters
         effects.sort(key=lambda one: len(kinds) if one.place == "actuator" else kinds.index(one.name))
@@ -47,12 +43,15 @@ def complete(experiment: Experiment) -> Experiment:
 
 
 def joined(given: Iterable[Effect], added: Iterable[Effect], name_of: Callable[[Effect], str]) -> list[Effect]:
-    """Effects that a model has, in their order, and others behind them; effects of the actuator before those given that
-    come later in :data:`ACTUATOR_ORDER`."""
+    """Effects that a model has, in their order, and others behind them; effects of the actuator before those given of a
+    higher rank (:class:`jaxbl.drive.effects.ActuatorEffect`)."""
+
+    def rank(one: Effect) -> int:
+        return getattr(EFFECTS[name_of(one)], "rank", -1)
+
     effects = list(given)
     for one in added:
-        later = ACTUATOR_ORDER[ACTUATOR_ORDER.index(name_of(one)) + 1 :] if name_of(one) in ACTUATOR_ORDER else ()
-        at = next((i for i, other in enumerate(effects) if name_of(other) in later), len(effects))
+        at = next((i for i, other in enumerate(effects) if 0 <= rank(one) < rank(other)), len(effects))
         effects.insert(at, one)
     return effects
 

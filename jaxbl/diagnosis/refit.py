@@ -17,7 +17,7 @@ import numpy as np
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import path
 from jaxbl.identification.intervals import spread
-from jaxbl.identification.regression import lasting
+from jaxbl.identification.regression import settled
 from jaxbl.identification.smoother import Smoothed
 from jaxbl.identification.trajectory import Fit, Free, with_values
 from jaxbl.records import Record
@@ -108,7 +108,7 @@ class _Refiner:
             torque, first = record.torque[rows], record.time[rows.start] - record.time[0]
             readings = {side: record.positions[side][rows] for side in sides}
             position, velocity = (dict(zip(sides, half, strict=True)) for half in np.split(start[i], 2))
-            begun = PlantState(position, velocity, lasting(experiment, torque[0]))
+            begun = PlantState(position, velocity, settled(experiment, torque[0]))
             states = path(experiment, begun, torque, first, readings, gains)
             for side in sides:
                 own = self.smoothed[side][i]

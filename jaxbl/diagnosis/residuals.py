@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.ndimage import gaussian_filter1d
 
-from jaxbl.identification.regression import Kinematics, actuated
+from jaxbl.drive.plant import States
+from jaxbl.identification.regression import Kinematics, Path, effect_path
 from jaxbl.identification.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, running_sum, smooth
 from jaxbl.simulate import Experiment
 
@@ -116,10 +117,17 @@ def _mean_around(values: Float[Array, " samples"]) -> Float[Array, " samples"]:
 
 
 def _torque(
-    experiment: Experiment, side: str, position: dict, velocity: dict, torque: Array, time: Array, transmitted: Array | None
+    experiment: Experiment,
+    side: str,
+    position: dict,
+    velocity: dict,
+    states: States,
+    torque: Array,
+    time: Array,
+    transmitted: Array | None,
 ) -> tuple[Array, Array]:
     """All modelled torques on a side but for set-valued friction, and the level of that, N m."""
-    total, level = experiment.plant.torques(position, velocity, torque, time, transmitted)[side]
+    total, level = experiment.plant.torques(position, velocity, states, torque, time, transmitted)[side]
     return total - experiment.drive.viscous(side) * velocity[side], jnp.asarray(level, torque.dtype)
 
 
@@ -144,8 +152,8 @@ class _Acting(NamedTuple):
 
 
 def _acting(experiment: Experiment, side: str, part: Kinematics, smoothed: Smoothed) -> _Acting:
-    torque = actuated(experiment, part.torque)
-    given = part.position, part.velocity, torque, part.time, part.transmitted
+    states, torque = effect_path(experiment, Path.of(part), from_rest=True)
+    given = part.position, part.velocity, states, torque, part.time, part.transmitted
     total, level = jax.vmap(lambda *at: _torque(experiment, side, *at))(*given)
     inertia, velocity, acceleration = experiment.plant.inertia(side), part.velocity[side], part.acceleration[side]
     period = (part.time[-1] - part.time[0]) / (len(part.time) - 1)
@@ -180,8 +188,8 @@ def _side(
     experiment: Experiment, side: str, part: Kinematics, smoothed: dict[str, Smoothed]
 ) -> tuple[Array, dict[str, Array], dict[str, Array]]:
     """Missing torque, and the derivatives of the modelled torque by the positions and velocities, along a part."""
-    torque = actuated(experiment, part.torque)
-    given = part.position, part.velocity, torque, part.time, part.transmitted
+    states, torque = effect_path(experiment, Path.of(part), from_rest=True)
+    given = part.position, part.velocity, states, torque, part.time, part.transmitted
     acting = _acting(experiment, side, part, smoothed[side])
     period = (part.time[-1] - part.time[0]) / (len(part.time) - 1)
     # the input is a mean around the sample already; of the rest, the mean that the position's second differences see
@@ -206,11 +214,12 @@ def _transmission(
 ) -> tuple[Array, dict[str, Array], dict[str, Array]]:
     assert part.transmitted is not None
 
-    def of(position: dict, velocity: dict) -> Array:
-        return experiment.plant.transmitted(position, velocity)[0]
+    def of(position: dict, velocity: dict, states: States) -> Array:
+        return experiment.plant.transmitted(position, velocity, states)[0]
 
-    slopes = jax.vmap(jax.jacfwd(of, argnums=(0, 1)))(part.position, part.velocity)
-    return part.transmitted - jax.vmap(of)(part.position, part.velocity), *slopes
+    given = part.position, part.velocity, effect_path(experiment, Path.of(part), from_rest=True)[0]
+    slopes = jax.vmap(jax.jacfwd(of, argnums=(0, 1)))(*given)
+    return part.transmitted - jax.vmap(of)(*given), *slopes
 
 
 def white_noise(parts: Sequence[np.ndarray]) -> float:

@@ -1,8 +1,8 @@
 """What is simulated: plant, transmission laws, effects, excitation, encoders."""
 
 from .effects import AbstractEffect as AbstractEffect
-from .effects import effect_class as effect_class
-from .effects import effect_kinds as effect_kinds
+from .effects import EFFECTS as EFFECTS
+from .effects import make_effect as make_effect
 from .encoders import Encoders as Encoders
 from .excitation import EXCITATIONS as EXCITATIONS
 from .excitation import AbstractExcitation as AbstractExcitation

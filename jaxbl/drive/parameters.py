@@ -21,25 +21,27 @@ Tree = TypeVar("Tree")
 
 
 class Parameter(NamedTuple):
-    """What is known of one number: SI unit, description, and the range in which it makes sense."""
+    """What is known of one number: SI unit, description, the range in which it makes sense, and the part that it plays in
+    an effect (:class:`jaxbl.drive.effects.Role`)."""
 
     unit: str
     doc: str
     minimum: float | None = None
     above: float | None = None
     maximum: float | None = None
+    role: Any = None
 
 
-def parameter(unit: str, doc: str, *, default: Any = dataclasses.MISSING, **limits: float) -> Any:
+def parameter(unit: str, doc: str, *, default: Any = dataclasses.MISSING, **about: Any) -> Any:
     """Declare a number of a module as an `equinox` field.
 
     Args:
         unit: SI unit as printed on axes; "" where dimensionless.
         doc: one line for the reference.
         default: value where the config gives none; without it the key is required.
-        **limits: `minimum` (inclusive), `above` (exclusive), `maximum` (inclusive).
+        **about: `minimum` (inclusive), `above` (exclusive), `maximum` (inclusive), `role`.
     """
-    metadata = {"parameter": Parameter(unit, doc, **limits)}
+    metadata = {"parameter": Parameter(unit, doc, **about)}
     if default is dataclasses.MISSING:
         return eqx.field(metadata=metadata)
     return eqx.field(default=default, metadata=metadata)

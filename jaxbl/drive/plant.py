@@ -24,6 +24,8 @@ from .transmission import AbstractTransmission
 
 Sides = dict[str, Float[Array, ""]]
 """One number for each side of the drive: keys "motor" and, on two inertias, "load"."""
+States = tuple[Any, ...]
+"""Each effect's own state, in the order of the effects."""
 
 
 class AbstractDrive(eqx.Module):
@@ -123,7 +125,7 @@ class PlantState(eqx.Module):
 
     position: Sides
     velocity: Sides
-    effects: tuple[Any, ...]
+    effects: States
 
 
 class Plant(eqx.Module):
@@ -143,55 +145,100 @@ class Plant(eqx.Module):
 
     def inertia(self, side: str) -> Scalar:
         """True inertia of a side, kg m^2."""
-        return self.drive.inertia(side) + sum(e.added_inertia() for e in self._at(side))
+        return self.drive.inertia(side) + sum(e.added_inertia() for e in self.effects if self.drive.place(e.place) == side)
+
+    @property
+    def half_gap(self) -> float:
+        """Half of the free play that law and effects describe together, rad at the motor; 0 where there is none."""
+        gap = 0.0 if self.transmission is None else float(self.transmission.truth().get("half_gap", 0.0))
+        return gap + sum(float(effect.free_play()) for effect in self.effects)
 
     def twist(self, position: Sides) -> Float[Array, ""]:
         """z = theta_e - N_0 theta_s in rad."""
         return position["motor"] - self.drive.ratio("load") * position["load"]
 
-    def transmitted(self, position: Sides, velocity: Sides) -> tuple[Float[Array, ""], Scalar]:
+    def transmitted(self, position: Sides, velocity: Sides, states: States) -> tuple[Float[Array, ""], Scalar]:
         """Transmitted torque C (N m) and the motor angle that one unit of load angle takes up (N_0 without effects)."""
         assert self.transmission is not None
-        effects = self._at("transmission")
+        deflection, rate, ratio = self._strained(position, velocity, states)
+        torque = self.transmission.torque(deflection)
+        for effect, own in self._at("transmission", states):
+            torque = torque + effect.transmit(own, deflection, rate)
+        return torque, ratio
+
+    def _strained(self, position: Sides, velocity: Sides, states: States) -> tuple[Float[Array, ""], Scalar, Scalar]:
+        """Elastic deflection of the gear (rad), its rate (rad/s), and the motor angle that one unit of load angle takes up."""
+        effects = self._at("transmission", states)
         ratio = self.drive.ratio("load")
         z = self.twist(position)
         rate = velocity["motor"] - ratio * velocity["load"]
-        for effect in effects:
+        for effect, own in effects:
             error, slope = jax.jvp(
-                lambda angle, effect=effect: jnp.asarray(effect.transmission_error(angle), angle.dtype),
+                lambda angle, effect=effect, own=own: jnp.asarray(effect.transmission_error(own, angle), angle.dtype),
                 (position["load"],),
                 (jnp.ones_like(position["load"]),),
             )
             z, rate, ratio = z + error, rate + slope * velocity["load"], ratio - slope
 
         def contact(z):
-            for effect in effects:
-                z = effect.deflect(z)
+            for effect, own in effects:
+                z = effect.deflect(own, z)
             assert self.transmission is not None
             return self.transmission.deflection(z)
 
         deflection, rate = jax.jvp(contact, (z,), (rate,))
-        torque = self.transmission.torque(deflection)
-        for effect in effects:
-            torque = torque + effect.transmit(deflection, rate)
-        return torque, ratio
+        return deflection, rate, ratio
 
     def advance(self, state: PlantState, torque: Scalar, time: Scalar, step: Scalar) -> PlantState:
-        """One step of Moreau's midpoint rule under a commanded torque (N m) held over `step` seconds from `time`."""
-        states = list(state.effects)
-        for i, effect in enumerate(self.effects):
-            states[i], torque = effect.actuate(states[i], torque, step)
+        """One step of Moreau's midpoint rule under a commanded torque (N m) held over `step` seconds from `time`.
+
+        Effects with a memory move on with the positions: half a step before the kick and half a step after it.
+        """
+        states, torque = self.actuate(state.effects, torque, step)
+        states = self.remember(states, state.position, state.velocity, time, 0.5 * step)
         middle = {side: state.position[side] + 0.5 * step * state.velocity[side] for side in self.drive.sides}
         middle_time = time + 0.5 * step
-        velocity = self._kick(state.velocity, middle, state.velocity, torque, middle_time, step)
+        velocity = self._kick(state.velocity, middle, state.velocity, states, torque, middle_time, step)
         if any(effect.velocity_dependent for effect in self.effects):
             mean = {side: 0.5 * (state.velocity[side] + velocity[side]) for side in self.drive.sides}
-            velocity = self._kick(state.velocity, middle, mean, torque, middle_time, step)
+            velocity = self._kick(state.velocity, middle, mean, states, torque, middle_time, step)
         position = {side: middle[side] + 0.5 * step * velocity[side] for side in self.drive.sides}
-        return PlantState(position, velocity, tuple(states))
+        return PlantState(position, velocity, self.remember(states, middle, velocity, middle_time, 0.5 * step))
+
+    def actuate(self, states: States, torque: Scalar, step: Scalar) -> tuple[States, Scalar]:
+        """What the effects make of a commanded torque (N m) held over `step` seconds: their states, and the torque."""
+        new = []
+        for effect, own in zip(self.effects, states, strict=True):
+            own, torque = effect.actuate(own, torque, step)
+            new.append(own)
+        return tuple(new), torque
+
+    @property
+    def memory(self) -> bool:
+        """Whether some effect's own state depends on how the drive moves."""
+        return any(type(effect).advance is not AbstractEffect.advance for effect in self.effects)
+
+    def remember(self, states: States, position: Sides, velocity: Sides, time: Scalar, step: Scalar) -> States:
+        """The effects' own states after `step` seconds at steady velocities (rad/s), from positions (rad) at `time` (s)."""
+        if not self.memory:
+            return states
+        motions = {side: Motion(time, position[side], velocity[side]) for side in self.drive.sides}
+        motions["actuator"] = motions["motor"]
+        if self.transmission is not None:
+            motions["transmission"] = Motion(time, *self._strained(position, velocity, states)[:2])
+        return tuple(
+            effect.advance(own, motions[self.drive.place(effect.place)], step)
+            for effect, own in zip(self.effects, states, strict=True)
+        )
 
     def torques(
-        self, position: Sides, velocity: Sides, torque: Scalar, time: Scalar, transmitted: Scalar | None = None
+        self,
+        position: Sides,
+        velocity: Sides,
+        states: States,
+        torque: Scalar,
+        time: Scalar,
+        transmitted: Scalar | None = None,
     ) -> dict[str, tuple[Scalar, Scalar]]:
         """What acts on each side but for its nominal viscous friction, N m: the sum of all torques, and the level of
         set-valued dry friction that opposes motion beside it (the Python number 0.0 without any).
@@ -199,6 +246,7 @@ class Plant(eqx.Module):
         Args:
             position: rad.
             velocity: rad/s, at which velocity-dependent effects are evaluated.
+            states: of the effects.
             torque: that acts on the motor, N m.
             time: s.
             transmitted: transmitted torque, N m, where it is known; left out, the transmission's.
@@ -206,23 +254,25 @@ class Plant(eqx.Module):
         gains: dict[str, Scalar] = {"motor": -1.0}
         through: Scalar = 0.0
         if self.transmission is not None:
-            through, gains["load"] = self.transmitted(position, velocity)
+            through, gains["load"] = self.transmitted(position, velocity, states)
         if transmitted is not None:
             through = transmitted
         found = {}
         for side in self.drive.sides:
             total = gains[side] * through + (torque if side == "motor" else 0.0)
             level: Scalar = 0.0
-            for effect in self._at(side):
-                total = total - effect.resist(Motion(time, position[side], velocity[side]))
-                level = level + effect.dry_friction(velocity[side])
+            for effect, own in self._at(side, states):
+                total = total - effect.resist(own, Motion(time, position[side], velocity[side]))
+                level = level + effect.dry_friction(own, velocity[side])
             found[side] = total, level
         return found
 
-    def _kick(self, velocity: Sides, position: Sides, seen: Sides, torque: Scalar, time: Scalar, step: Scalar) -> Sides:
+    def _kick(
+        self, velocity: Sides, position: Sides, seen: Sides, states: States, torque: Scalar, time: Scalar, step: Scalar
+    ) -> Sides:
         """Velocities after `step`; `seen` are the velocities at which velocity-dependent effects are evaluated."""
         new = {}
-        for side, (total, level) in self.torques(position, seen, torque, time).items():
+        for side, (total, level) in self.torques(position, seen, states, torque, time).items():
             mass = self.inertia(side) / step
             drag = 0.5 * self.drive.viscous(side)
             free = ((mass - drag) * velocity[side] + total) / (mass + drag)
@@ -231,14 +281,10 @@ class Plant(eqx.Module):
             new[side] = free
         return new
 
-    @property
-    def half_gap(self) -> float:
-        """Half of the free play that law and effects describe together, rad at the motor; 0 where there is none."""
-        gap = 0.0 if self.transmission is None else float(self.transmission.truth().get("half_gap", 0.0))
-        return gap + sum(float(getattr(one, "half_gap", 0.0)) for one in self.effects if one.place == "transmission")
-
-    def _at(self, place: str) -> list[AbstractEffect]:
-        return [effect for effect in self.effects if self.drive.place(effect.place) == place]
+    def _at(self, place: str, states: States) -> list[tuple[AbstractEffect, Any]]:
+        """Effects of a place, each with its own state."""
+        pairs = zip(self.effects, states, strict=True)
+        return [(effect, own) for effect, own in pairs if self.drive.place(effect.place) == place]
 
 
 def _rubbed(before: Float[Array, ""], free: Scalar, stop: Scalar) -> Float[Array, ""]:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.config import Config, TuneTable, precision, prepare, read_config
+from jaxbl.drive.effects import correction_of
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError, NoResult
 from jaxbl.simulate import Experiment, Reducer, Signals, scan
@@ -33,22 +34,22 @@ def scenarios_of(config: Config, table: TuneTable) -> Scenarios:
     data, relative = config.resolved(), config.uncertainty.relative
     effects: list[dict[str, Any]] = data.setdefault("effects", [])
     found: dict[str, list[tuple[int, str, float]]] = {}
-    for number, kind, key in (("inertia", "inertia", "inertia"), ("viscous", "viscous_friction", "viscous")):
-        for side in config.build().sides:
-            nominal = getattr(config.drive, f"{side}_{number}")
-            if f"drive.{side}_{number}" in config.uncertainty.exact or nominal == 0.0:
-                continue
-            places = [i for i, effect in enumerate(effects) if effect["kind"] == f"{side}.{kind}"]
-            total = nominal + sum(effects[i][key] for i in places)
-            if number == "inertia" and total - relative * nominal <= 0.0:
-                raise InputError(
-                    f"uncertainty.relative: {relative:g} leaves no inertia on the {side} at its lower corner; "
-                    "it should be smaller, or tune.worst_over_uncertainty false"
-                )
-            if not places:
-                effects.append({"kind": f"{side}.{kind}", key: 0.0})
-                places = [len(effects) - 1]
-            found.setdefault(number, []).append((places[0], key, relative * nominal))
+    for number, side in itertools.product(("inertia", "viscous"), config.build().sides):
+        nominal = getattr(config.drive, f"{side}_{number}")
+        if f"drive.{side}_{number}" in config.uncertainty.exact or nominal == 0.0:
+            continue
+        kind, key = correction_of(number, side)
+        places = [i for i, effect in enumerate(effects) if effect["kind"] == kind]
+        total = nominal + sum(effects[i][key] for i in places)
+        if number == "inertia" and total - relative * nominal <= 0.0:
+            raise InputError(
+                f"uncertainty.relative: {relative:g} leaves no inertia on the {side} at its lower corner; "
+                "it should be smaller, or tune.worst_over_uncertainty false"
+            )
+        if not places:
+            effects.append({"kind": kind, key: 0.0})
+            places = [len(effects) - 1]
+        found.setdefault(number, []).append((places[0], key, relative * nominal))
     if not found:
         return Scenarios(config, ["nominal"], {})
     corners = [

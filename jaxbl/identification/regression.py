@@ -17,8 +17,8 @@ import optimistix as optx
 from jaxtyping import Array, Float
 from scipy import signal
 
-from jaxbl.drive.plant import Plant, PlantState
-from jaxbl.simulate import Experiment
+from jaxbl.drive.plant import Plant, PlantState, States
+from jaxbl.simulate import Experiment, with_effects
 
 from .smoother import Smoothed
 from .trajectory import WIDE, Fit, Free, with_values
@@ -108,14 +108,14 @@ def balance(experiment: Experiment, kinematics: Kinematics) -> dict[str, Balance
     A side's residual is the torque that the model has too much there: all torques less inertia times acceleration.
     """
     plant, drive, k = experiment.plant, experiment.drive, kinematics
-    torque = actuated(experiment, k.torque)
+    states, torque = effect_path(experiment, Path.of(k), from_rest=True)
     found = {}
     if k.transmitted is not None and plant.transmission is not None:
-        found["transmission"] = Balance(k.transmitted - _transmitted(plant, k), k.transmitted)
-    acting = jax.vmap(plant.torques)(k.position, k.velocity, torque, k.time, k.transmitted)
+        found["transmission"] = Balance(k.transmitted - _transmitted(plant, k, states), k.transmitted)
+    acting = jax.vmap(plant.torques)(k.position, k.velocity, states, torque, k.time, k.transmitted)
     through = k.transmitted
     if through is None and plant.transmission is not None:
-        through = _transmitted(plant, k)
+        through = _transmitted(plant, k, states)
     for side, (total, level) in acting.items():
         resisting = drive.viscous(side) * k.velocity[side] + level * jnp.sign(k.velocity[side])
         driving = torque if side == "motor" or through is None else drive.torque_gain(side) * through
@@ -135,61 +135,81 @@ def model_torques(
         deviation: standard deviation of the velocities, rad/s: dry friction goes through zero within it.
     """
     plant, k, found = experiment.plant, kinematics, {}
+    states, torque = effect_path(experiment, Path.of(k), from_rest=True)
     if plant.transmission is not None:
-        found["transmission"] = _transmitted(plant, k)
+        found["transmission"] = _transmitted(plant, k, states)
     none = jnp.zeros_like(k.torque)
-    acting = jax.vmap(plant.torques)(k.position, k.velocity, none, k.time, none)
+    acting = jax.vmap(plant.torques)(k.position, k.velocity, states, none, k.time, none)
     places = {plant.drive.place(effect.place) for effect in plant.effects}
     for side, (total, level) in acting.items():
         if side in places or (side == "motor" and "actuator" in places):
             direction = jnp.clip(k.velocity[side] / jnp.maximum(3.0 * deviation[side], jnp.finfo(float).tiny), -1.0, 1.0)
             added = (plant.inertia(side) - plant.drive.inertia(side)) * k.acceleration[side]
-            lost = k.torque - actuated(experiment, k.torque) if side == "motor" else 0.0
+            lost = k.torque - torque if side == "motor" else 0.0
             found[side] = level * direction - total + added + lost
     return found
 
 
-def _transmitted(plant: Plant, k: Kinematics) -> Float[Array, " samples"]:
-    return jax.vmap(lambda position, velocity: plant.transmitted(position, velocity)[0])(k.position, k.velocity)
+def transmitted(experiment: Experiment, k: Kinematics) -> Float[Array, " samples"]:
+    """Transmitted torque by a model at known kinematics, N m."""
+    gear = with_effects(experiment, tuple(one for one in experiment.effects if one.place == "transmission"))
+    return _transmitted(gear.plant, k, effect_path(gear, Path.of(k), from_rest=True)[0])
 
 
-def actuated(experiment: Experiment, torque: Float[Array, " samples"]) -> Float[Array, " samples"]:
-    """The torque that acts, of the one that was commanded; from rest."""
-    effects = experiment.effects
-    if not any(effect.place == "actuator" for effect in effects):
-        return torque
-    start = jax.tree.map(lambda x: jnp.asarray(x, torque.dtype), tuple(effect.init() for effect in effects))
-    return actuator_path(experiment, torque, start)[1]
+def _transmitted(plant: Plant, k: Kinematics, states: States) -> Float[Array, " samples"]:
+    return jax.vmap(plant.transmitted)(k.position, k.velocity, states)[0]
 
 
-def lasting(experiment: Experiment, torque: Float[Array, ""]) -> tuple[Any, ...]:
-    """The effects' own states after an input that has lasted."""
-    init = tuple(effect.init() for effect in experiment.effects)
-    return jax.tree.map(lambda x: jnp.asarray(x, torque.dtype) * 0.0 + torque, init)
+class Path(NamedTuple):
+    """What effects see along a log.
+
+    Attributes:
+        time: s, shape (samples,).
+        torque: commanded, N m, shape (samples,).
+        position, velocity: of each side, rad and rad/s, shape (samples,).
+    """
+
+    time: Float[Array, " samples"]
+    torque: Float[Array, " samples"]
+    position: dict[str, Float[Array, " samples"]]
+    velocity: dict[str, Float[Array, " samples"]]
+
+    @classmethod
+    def of(cls, along: Any) -> "Path":
+        """Of anything that has these."""
+        return cls(along.time, along.torque, along.position, along.velocity)
+
+
+def settled(experiment: Experiment, torque: Float[Array, ""]) -> States:
+    """The effects' own states after an input (N m) that has lasted."""
+    return tuple(effect.settled(torque) for effect in experiment.effects)
 
 
 @eqx.filter_jit
-def lasting_path(
-    experiment: Experiment, torque: Float[Array, " samples"]
-) -> tuple[tuple[Any, ...], Float[Array, " samples"]]:
-    """As :func:`actuator_path`, of a torque that had lasted before its first sample."""
-    return actuator_path(experiment, torque, lasting(experiment, torque[0]))
+def effect_path(experiment: Experiment, path: Path, from_rest: bool = False) -> tuple[States, Float[Array, " samples"]]:
+    """The effects' own states at each sample of a known motion, and the torque (N m) that acts.
 
+    Before the first sample its torque had lasted, or with `from_rest` nothing had happened.
+    """
+    plant, period, dtype = experiment.plant, experiment.run.sample_period, path.torque.dtype
+    start = tuple(effect.init() for effect in plant.effects) if from_rest else settled(experiment, path.torque[0])
+    start = jax.tree.map(lambda x: jnp.asarray(x, dtype), start)
+    moving = any(effect.place == "actuator" for effect in plant.effects) or plant.memory
+    if not moving:
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (len(path.torque), *x.shape)), start), path.torque
+    # memory follows the way covered
+    steps = {side: jnp.diff(x, append=x[-1:]) / period for side, x in path.position.items()} if plant.memory else {}
+    motion = (path.time, path.position, steps) if plant.memory else None
 
-def actuator_path(
-    experiment: Experiment, torque: Float[Array, " samples"], start: tuple[Any, ...]
-) -> tuple[tuple[Any, ...], Float[Array, " samples"]]:
-    """The effects' own states at each sample of a commanded torque (N m), from given ones, and the torque that acts."""
-    period = experiment.run.sample_period
+    def sample(states: States, given: tuple[Any, Any]) -> tuple[States, tuple[States, Array]]:
+        torque, motion = given
+        new, acting = plant.actuate(states, torque, period)
+        if motion is not None:
+            time, position, rate = motion
+            new = plant.remember(new, position, rate, time, period)
+        return new, (states, acting)
 
-    def sample(states: tuple[Any, ...], torque: Array) -> tuple[tuple[Any, ...], tuple[tuple[Any, ...], Array]]:
-        new, acting = [], torque
-        for effect, state in zip(experiment.effects, states, strict=True):
-            state, acting = effect.actuate(state, acting, period)
-            new.append(state)
-        return tuple(new), (states, acting)
-
-    return jax.lax.scan(sample, start, torque)[1]
+    return jax.lax.scan(sample, start, (path.torque, motion))[1]
 
 
 def decimate(values: Float[Array, " samples"], factor: int) -> Float[Array, " less"]:

@@ -14,7 +14,7 @@ from jaxbl.simulate import Experiment
 
 from .intervals import Refusal, Spread, refusals, spread
 from .prediction import predictor
-from .regression import lasting_path
+from .regression import Path, effect_path
 from .smoother import Smoothed, smooth
 from .trajectory import Fit, Free, Windows, cut, fits, with_values
 
@@ -66,10 +66,13 @@ def windows_of(
         if count < samples:
             continue
         found = {side: parts[i] for side, parts in channels.smoothed.items()}
+        position = {side: one.position for side, one in found.items()}
+        velocity = {side: one.velocity for side, one in found.items()}
+        along = Path(jnp.asarray(record.time[part]), jnp.asarray(record.torque[part]), position, velocity)
         start = PlantState(
-            {side: one.position for side, one in found.items()},
-            {side: one.velocity for side, one in found.items()},
-            lasting_path(experiment, jnp.asarray(record.torque[part]))[0],
+            position,
+            velocity,
+            effect_path(experiment, along)[0],
         )
         measured = {side: record.positions[side][part] for side in found}
         first = float(record.time[part.start] - record.time[0])
@@ -149,7 +152,7 @@ class _Whole(NamedTuple):
 
 def _nearest_turn(free: Sequence[Free], theta: np.ndarray) -> np.ndarray:
     """Theta with phases within half a turn of their nominal values."""
-    turns = np.array([2.0 * np.pi / one.scale if one.path.endswith(".phase") else 0.0 for one in free])
+    turns = np.array([2.0 * np.pi / one.scale if one.role == "angle" else 0.0 for one in free])
     return theta - turns * np.round(theta / np.where(turns > 0.0, turns, 1.0))
 
 

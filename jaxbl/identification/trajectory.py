@@ -42,7 +42,8 @@ WIDE = 3.0
 class Free(NamedTuple):
     """A number to be fitted: value = scale exp(theta) where it must stay positive, nominal + scale theta elsewhere.
 
-    theta is 0 at the nominal value, and a change of theta is a relative change.
+    theta is 0 at the nominal value, and a change of theta is a relative change; of an angle, it is in rad. `role` is the
+    part that the number plays in its effect (:class:`jaxbl.drive.effects.Role`), if it is one of an effect.
     """
 
     path: str
@@ -50,6 +51,7 @@ class Free(NamedTuple):
     nominal: float
     scale: float
     positive: bool
+    role: str = ""
 
     def value(self, theta: Any) -> Any:
         return self.scale * jnp.exp(theta) if self.positive else self.nominal + self.scale * theta
@@ -81,9 +83,10 @@ def free_parameters(experiment: Experiment, paths: Sequence[str], torque: float)
         positive = is_positive(about)
         if positive and nominal <= 0.0:
             raise InputError(f"'{path}' must stay positive, and its nominal value is {nominal:g}; give one to start from")
+        role = about.role.kind if about.role else ""
         # an angle has no relative size
-        scale = 1.0 if path.endswith(".phase") else abs(nominal) or (torque if about.unit == "N m" else 0.0) or 1.0
-        free.append(Free(path, about.unit, nominal, scale, positive))
+        scale = 1.0 if role == "angle" else abs(nominal) or (torque if about.unit == "N m" else 0.0) or 1.0
+        free.append(Free(path, about.unit, nominal, scale, positive, role))
     return tuple(free)
 
 

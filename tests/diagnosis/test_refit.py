@@ -14,7 +14,7 @@ from jaxbl.diagnosis.neutral_effects import complete
 from jaxbl.diagnosis.refit import _Refiner, refined
 from jaxbl.drive.plant import PlantState
 from jaxbl.identification.logs import default_paths, on_record
-from jaxbl.identification.regression import lasting
+from jaxbl.identification.regression import settled
 from jaxbl.identification.search import smoothed_channels
 from jaxbl.identification.trajectory import free_parameters, with_values
 from jaxbl.simulate import trajectory
@@ -46,7 +46,7 @@ def test_prediction_errors_are_least(setting):
     @eqx.filter_jit
     def predicted(given):
         one = with_values(experiment, free, given[2:] * 0.01)
-        start = PlantState({"motor": given[0]}, {"motor": given[1]}, lasting(one, torque[0]))
+        start = PlantState({"motor": given[0]}, {"motor": given[1]}, settled(one, torque[0]))
         return trajectory(one, start, torque, 0.0, {"motor": reading}, gain).position["motor"]
 
     def cost(given):
