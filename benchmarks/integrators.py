@@ -43,14 +43,15 @@ HALF_GAP = 0.08
 
 def accelerations(plant, position, velocity, torque, smoothing):
     """Acceleration of each side in rad/s^2, dry friction regularised."""
-    transmitted, ratio = plant.transmitted(position, velocity) if plant.transmission is not None else (0.0, 0.0)
+    states = tuple(effect.init() for effect in plant.effects)
+    transmitted, ratio = (0.0, 0.0) if plant.transmission is None else plant.transmitted(position, velocity, states)
     result = {}
     for side in plant.drive.sides:
         total = torque - transmitted if side == "motor" else ratio * transmitted
         total = total - plant.drive.viscous(side) * velocity[side]
-        for effect in plant.effects:
+        for effect, own in zip(plant.effects, states, strict=True):
             if effect.place == side:
-                total = total - effect.dry_friction(velocity[side]) * jnp.tanh(velocity[side] / smoothing)
+                total = total - effect.dry_friction(own, velocity[side]) * jnp.tanh(velocity[side] / smoothing)
         result[side] = total / plant.inertia(side)
     return result
 

@@ -6,7 +6,7 @@ from typing import Any, get_args, get_origin
 from pydantic import BaseModel
 
 from jaxbl import config
-from jaxbl.drive.effects import effect_class, effect_kinds
+from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import parameters
 from jaxbl.sweeps.metrics import SIDE_METRICS
 

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
 
 from jaxbl.config import numeric_paths, read_config, with_values
-from jaxbl.drive import EXCITATIONS, TRANSMISSIONS, effect_class, effect_kinds, get_leaf, key_of, leaf_paths, parameters
+from jaxbl.drive import EFFECTS, EXCITATIONS, TRANSMISSIONS, get_leaf, key_of, leaf_paths, parameters
 from jaxbl.drive.plant import DRIVES
 from jaxbl.errors import InputError
 from jaxbl.sweeps.points import Points
@@ -92,8 +92,8 @@ NUMBERS = {"amplitude": 0.1, "frequency": 0.3, "start_frequency": 0.1, "stop_fre
 
 # effects by kind with every parameter given
 EFFECTS = {
-    name: {"kind": name} | {key_of(f.name): NUMBERS.get(f.name, 0.2) for f, _ in parameters(effect_class(name))}
-    for name in effect_kinds()
+    name: {"kind": name} | {key_of(f.name): NUMBERS.get(f.name, 0.2) for f, _ in parameters(EFFECTS[name])}
+    for name in EFFECTS
 }
 
 
@@ -374,11 +374,11 @@ def parameters_by_name(module):
     return {field.name: known for field, known in parameters(module)}
 
 
-@pytest.mark.parametrize("name", effect_kinds())
+@pytest.mark.parametrize("name", EFFECTS)
 def test_every_effect_is_built_with_its_numbers_and_its_name(name):
     config = read_config(small(effects=[EFFECTS[name]]))
     (effect,) = config.build().effects
-    assert isinstance(effect, effect_class(name))
+    assert isinstance(effect, EFFECTS[name])
     assert effect.name == name
     for key, value in EFFECTS[name].items():
         if key != "kind":

@@ -706,7 +706,9 @@ def _summary(
     if task.separate:
         notes += [f"{task.holdout.path.name}: {note}" for note in task.holdout.notes if note not in record.notes]
     notes += [f"{name} was found, and withdrawn: with it the held-out data are met no better." for name in withdrawn]
-    timed = [one.effect for one in found.findings if any(r.kind == "frequency" for r in EFFECTS[one.effect].roles().values())]
+    timed = [
+        one.effect for one in found.findings if any(r.kind == "frequency" for r in EFFECTS[one.effect].roles().values())
+    ]
     if task.separate:
         notes += [f"The phase of {name} is taken to be the same at the start of both logs." for name in timed]
     if found.verdict == "no_discrepancy":

@@ -207,7 +207,7 @@ class _KnownTorque(SideEffect):
     first: Scalar
     period: Scalar
 
-    def resist(self, motion: Any) -> Any:
+    def resist(self, state: Any, motion: Any) -> Any:
         at = jnp.floor((motion.time - self.first) / self.period + 1e-6).astype(jnp.int32)
         return -self.torque[jnp.clip(at, 0, len(self.torque) - 1)]
 

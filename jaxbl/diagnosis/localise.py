@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import numpy as np
 
 from jaxbl.identification import regression

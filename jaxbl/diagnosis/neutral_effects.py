@@ -15,6 +15,7 @@ from jaxbl.simulate import Experiment
 
 Effect = TypeVar("Effect")
 
+
 def candidates(experiment: Experiment) -> list[str]:
     """Names of the effects that a model's drive can have and that the model lacks."""
     known = {effect.name for effect in experiment.effects}

@@ -10,7 +10,7 @@ Sign: the torque that is missing from the model, J a less all modelled torques; 
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -197,7 +197,7 @@ def _side(
     modelled = driving + _mean_around(acting.total - driving) - acting.friction
     missing = experiment.plant.inertia(side) * part.acceleration[side] - low_passed(modelled, smoothed[side], period)
 
-    def of(position: dict, velocity: dict, *rest: Array) -> Array:
+    def of(position: dict, velocity: dict, *rest: Any) -> Array:
         total, level = _torque(experiment, side, position, velocity, *rest)
         return total - level * jnp.sign(velocity[side])
 

@@ -1,7 +1,7 @@
 """What is simulated: plant, transmission laws, effects, excitation, encoders."""
 
-from .effects import AbstractEffect as AbstractEffect
 from .effects import EFFECTS as EFFECTS
+from .effects import AbstractEffect as AbstractEffect
 from .effects import make_effect as make_effect
 from .encoders import Encoders as Encoders
 from .excitation import EXCITATIONS as EXCITATIONS

@@ -167,7 +167,7 @@ class Plant(eqx.Module):
         return torque, ratio
 
     def _strained(self, position: Sides, velocity: Sides, states: States) -> tuple[Float[Array, ""], Scalar, Scalar]:
-        """Elastic deflection of the gear (rad), its rate (rad/s), and the motor angle that one unit of load angle takes up."""
+        """Elastic deflection of the gear (rad), its rate (rad/s), and the motor angle for one unit of load angle."""
         effects = self._at("transmission", states)
         ratio = self.drive.ratio("load")
         z = self.twist(position)
@@ -205,7 +205,7 @@ class Plant(eqx.Module):
         position = {side: middle[side] + 0.5 * step * velocity[side] for side in self.drive.sides}
         return PlantState(position, velocity, self.remember(states, middle, velocity, middle_time, 0.5 * step))
 
-    def actuate(self, states: States, torque: Scalar, step: Scalar) -> tuple[States, Scalar]:
+    def actuate(self, states: States, torque: Any, step: Scalar) -> tuple[States, Any]:
         """What the effects make of a commanded torque (N m) held over `step` seconds: their states, and the torque."""
         new = []
         for effect, own in zip(self.effects, states, strict=True):

@@ -16,8 +16,7 @@ from hidden.simulator import Machine
 from hidden_effects import left
 
 from jaxbl.config import read_model
-from jaxbl.drive import Initial, Plant, as_arrays
-from jaxbl.drive.effects import effect_kinds
+from jaxbl.drive import Initial, Plant, as_arrays, effects
 from jaxbl.records import read_record
 
 DURATION = 0.6
@@ -48,7 +47,7 @@ def oracle(found):
 
 
 def test_all_effects_of_the_package_are_hidden_at_all_sizes():
-    assert set(EFFECTS) == set(effect_kinds())
+    assert set(EFFECTS) == set(effects.EFFECTS)
     targets = _targets(0, 66, "single")
     assert {(effect, level) for _, ((effect, level),) in targets} == {(e, s) for e in EFFECTS for s in LEVELS}
     assert all(on_rigid(effect) for plant, hidden in _targets(1, 200, "pairs") for effect, _ in hidden if plant == "direct")

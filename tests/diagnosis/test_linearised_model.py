@@ -12,7 +12,7 @@ from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis import linearised_model as module
 from jaxbl.diagnosis.candidates import Grids, forces_of, variants_of
 from jaxbl.diagnosis.linearised_model import Linear
-from jaxbl.drive.effects import effect_kinds
+from jaxbl.drive.effects import make_effect
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.identification.smoother import smooth
 from jaxbl.identification.trajectory import free_parameters
@@ -102,7 +102,7 @@ SMALL = {
 @pytest.mark.parametrize("name", SMALL)
 def test_a_candidates_torque_does_what_the_effect_does(tmp_path, name):
     """The effect in the simulated step, against its torque along the measured motion through the linear recursion."""
-    effect = as_arrays(effect_kinds()[name](**SMALL[name]), float)
+    effect = as_arrays(make_effect(name, **SMALL[name]), float)
 
     def with_effect(experiment):
         return eqx.tree_at(lambda e: e.effects, experiment, (*experiment.effects, effect))
@@ -126,7 +126,7 @@ def test_numbers_of_waves_are_those_of_the_effect(tmp_path):
     for one in variants_of(base.experiment, waves, grids):
         if one.name in waves:
             columns = forces_of([one], base.signals[0])
-            effect = as_arrays(effect_kinds()[one.name](**one.numbers(values)), float)
+            effect = as_arrays(make_effect(one.name, **one.numbers(values)), float)
             (expected,) = base.signals[0].of([effect])
             assert size(np.tensordot(values, columns, 1) - expected) < 0.02 * size(expected)
             seen.add(one.name)

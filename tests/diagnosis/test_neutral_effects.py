@@ -8,7 +8,7 @@ from small_study import rigid, small
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.neutral_effects import bucket, candidates, complete
-from jaxbl.drive.effects import effect_class, effect_kinds
+from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.parameters import as_arrays, parameters
 from jaxbl.simulate import trajectory
 
@@ -44,15 +44,15 @@ def test_all_effects_are_there_once(sides):
     assert len(set(names)) == len(names)
     assert set(names) == {*lacking, "motor.coulomb_friction"}
     if sides == 2:
-        assert set(names) == set(effect_kinds())
+        assert set(names) == set(EFFECTS)
     # a second time there is nothing to add
     assert candidates(complete(bare)) == []
 
 
-@pytest.mark.parametrize("name", effect_kinds())
+@pytest.mark.parametrize("name", EFFECTS)
 def test_every_effect_has_neutral_numbers(name):
-    neutral = effect_class(name).neutral
-    assert {field.name for field, _ in parameters(effect_kinds()[name](**neutral))} == set(neutral)
+    neutral = EFFECTS[name].neutral()
+    assert {field.name for field, _ in parameters(make_effect(name, **neutral))} == set(neutral)
 
 
 def test_buckets_are_few_and_large_enough():

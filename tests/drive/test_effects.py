@@ -1,23 +1,27 @@
 """Every effect against equations written out independently; dry friction against closed forms; other packages' effects."""
 
+import ast
 import inspect
+import re
 import types
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from drive_reference import START, block, plant, reference, trajectory
 from effect_values import VALUES
+from scipy.integrate import solve_ivp
 
-from jaxbl.drive import LinearShaft, Plant, TwoInertia, as_arrays, effect_class, effect_kinds, effects, parameters
-from jaxbl.drive.effects import CoulombFriction, Motion, SideEffect, StribeckFriction
+from jaxbl.drive import EFFECTS, LinearShaft, Plant, TwoInertia, as_arrays, make_effect, parameters, registry
+from jaxbl.drive.effects import CoulombFriction, Motion, SideEffect, StribeckFriction, angle, base, size
 from jaxbl.drive.parameters import parameter
 
 DTYPES = pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 
 
 def made(values):
-    return [effect_kinds()[name](**numbers) for name, numbers in values.items()]
+    return [make_effect(name, **numbers) for name, numbers in values.items()]
 
 
 def errors(values, substeps):
@@ -27,10 +31,10 @@ def errors(values, substeps):
 
 
 def test_the_names_are_the_contract():
-    assert set(effect_kinds()) == set(VALUES)
+    assert set(EFFECTS) == set(VALUES)
     for name, effect in zip(VALUES, made(VALUES), strict=True):
         assert effect.name == name
-        assert inspect.getdoc(effect_class(name)) and list(parameters(effect))
+        assert inspect.getdoc(EFFECTS[name]) and list(parameters(effect))
 
 
 @pytest.mark.parametrize("name", VALUES)
@@ -71,7 +75,7 @@ def test_float32_stays_float32_and_close(name):
 @pytest.mark.parametrize("name", ["motor.viscous_friction", "load.quadratic_drag"])
 def test_drags_are_odd(name):
     (effect,) = made({name: VALUES[name]})
-    assert effect.resist(Motion(0.0, 0.0, 2.0)) == -effect.resist(Motion(0.0, 0.0, -2.0)) != 0.0
+    assert effect.resist((), Motion(0.0, 0.0, 2.0)) == -effect.resist((), Motion(0.0, 0.0, -2.0)) != 0.0
 
 
 # Dry friction. A block is the rigid drive, J = 0.05, without viscous friction.
@@ -182,9 +186,9 @@ class TorsionSpring(SideEffect):
     """A spring to the housing."""
 
     kind = "torsion_spring"
-    spring_stiffness: float = parameter("N m/rad", "stiffness", above=0.0)
+    spring_stiffness: float = size("N m/rad", "stiffness", minimum=0.0)
 
-    def resist(self, motion):
+    def resist(self, state, motion):
         return self.spring_stiffness * motion.position
 
 
@@ -195,20 +199,23 @@ def installed(monkeypatch):
     def install(**found):
         def entry_points(*, group):
             assert group == "jaxbl.effects"
-            return [types.SimpleNamespace(name=name, load=lambda value=value: value) for name, value in found.items()]
+            return [types.SimpleNamespace(name=name, value="a:b", load=lambda v=value: v) for name, value in found.items()]
 
-        monkeypatch.setattr(effects, "entry_points", entry_points)
-        effect_kinds.cache_clear()
+        monkeypatch.setattr(registry, "entry_points", entry_points)
+        monkeypatch.setattr(EFFECTS, "_found", dict(BUILT_IN))
+        monkeypatch.setattr(EFFECTS, "_loaded", False)
 
-    yield install
-    effect_kinds.cache_clear()
+    return install
+
+
+BUILT_IN = {name: EFFECTS[name] for name in VALUES}
 
 
 def test_other_packages_add_effects_through_entry_points(installed):
     installed(**{"motor.torsion_spring": TorsionSpring})
-    assert effect_class("motor.torsion_spring") is TorsionSpring
-    assert set(effect_kinds()) == {*VALUES, "motor.torsion_spring"}
-    spring = effect_kinds()["motor.torsion_spring"](side="motor", spring_stiffness=0.8)
+    assert EFFECTS["motor.torsion_spring"] is TorsionSpring
+    assert set(EFFECTS) == {*VALUES, "motor.torsion_spring"}
+    spring = make_effect("motor.torsion_spring", spring_stiffness=0.8)
     assert spring.name == "motor.torsion_spring"
     # omega = 4 rad/s
     states = trajectory(block(spring), 10, REST | {"motor_position": 0.5}, np.zeros(1000), 1e-3)
@@ -217,4 +224,108 @@ def test_other_packages_add_effects_through_entry_points(installed):
 
 def test_other_packages_cannot_replace_a_built_in_effect(installed):
     installed(**{"motor.coulomb_friction": TorsionSpring})
-    assert effect_class("motor.coulomb_friction") is CoulombFriction
+    assert set(EFFECTS) == set(VALUES)
+    assert EFFECTS["motor.coulomb_friction"] is CoulombFriction
+
+
+class Without(SideEffect):
+    kind = "without"
+    torque: float = size("N m", "torque")
+    speed: float = parameter("rad/s", "no role")
+
+
+class Forgetful(TorsionSpring):
+    kind = "forgetful"
+
+    def resist(self, motion):
+        return 0.0
+
+
+class NotNeutral(SideEffect):
+    kind = "not_neutral"
+    torque: float = size("N m", "torque")
+
+    def resist(self, state, motion):
+        return 1.0 + self.torque
+
+
+class TwoAngles(SideEffect):
+    kind = "two_angles"
+    a: float = angle("one")
+    b: float = angle("another")
+
+
+@pytest.mark.parametrize(
+    ("name", "found", "wrong"),
+    [
+        ("load.spring", TorsionSpring, "acts as motor.torsion_spring or load.torsion_spring"),
+        ("actuator.torsion_spring", TorsionSpring, "acts as motor.torsion_spring or load"),
+        ("motor.thing", 3, "derived from AbstractEffect"),
+        ("motor.without", Without, "either all numbers or none should have a role"),
+        ("motor.forgetful", Forgetful, r"resist should take \(self, state, motion\), not \(self, motion\)"),
+        ("motor.not_neutral", NotNeutral, "not neutral: resist adds 1"),
+        ("motor.two_angles", TwoAngles, "an angle should stand beside one size"),
+    ],
+)
+def test_what_is_wrong_with_an_effect_is_one_line_and_it_is_left_out(name, found, wrong, installed, caplog):
+    installed(**{name: found})
+    assert set(EFFECTS) == set(VALUES)
+    (record,) = caplog.records
+    assert re.search(wrong, record.message) and name in record.message and "\n" not in record.message
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_built_in_effects_would_pass_the_check_of_other_packages(name):
+    base._check_entry(name, EFFECTS[name])
+
+
+def test_no_other_module_holds_the_name_of_an_effect():
+    """All that others need to know of an effect it says itself."""
+    package = Path(base.__file__).parents[2]
+    names = {*VALUES, *(name.split(".")[1] for name in VALUES)} - ORDINARY
+    for file in package.rglob("*.py"):
+        if "effects" in file.parts:
+            continue
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        docs = {id(node.body[0].value) for node in ast.walk(tree) if isinstance(getattr(node, "body", None), list)
+                and node.body and isinstance(node.body[0], ast.Expr)}  # fmt: skip
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs:
+                assert not any(re.search(rf"\b{re.escape(one)}\b", node.value) for one in names), (file, node.value)
+
+
+ORDINARY = {"inertia", "damping", "gravity", "backlash", "lag", "hardening", "saturation"}
+"""Kinds that are plain words, too: of nominal numbers, and of what a sentence or a tuned observer may speak of."""
+
+
+def test_memory_moves_with_the_positions_to_second_order():
+    """A Maxwell element, a spring behind a damper: it yields, so that its force depends on the way, not on the place."""
+
+    class Maxwell(SideEffect):
+        kind = "maxwell"
+        torque: float = size("N m/rad", "stiffness")
+        rate: float = parameter("1/s", "stiffness over damping")
+
+        def init(self):
+            return (jnp.zeros_like(self.torque),)
+
+        def advance(self, state, motion, step):
+            keep = jnp.exp(-self.rate * step)
+            return (state[0] * keep + motion.velocity * -jnp.expm1(-self.rate * step) / self.rate,)
+
+        def resist(self, state, motion):
+            return self.torque * state[0]
+
+    def rates(t, y):
+        _, v, stretch = y
+        return [v, (0.1 - 2.0 * stretch) / 0.05, v - 3.0 * stretch]
+
+    expected = solve_ivp(rates, (0.0, 2.0), [0.2, 0.0, 0.0], rtol=1e-11, atol=1e-12).y[:2, -1]
+    drive = block(Maxwell(side="motor", torque=2.0, rate=3.0))
+    errors = []
+    for samples in (100, 200, 400):
+        start = REST | {"motor_position": 0.2}
+        found = trajectory(drive, 1, start, np.full(samples, 0.1), 2.0 / samples)[-1]
+        errors.append(np.abs(found - expected).max())
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
+    assert np.log2(errors[1] / errors[2]) == pytest.approx(2.0, abs=0.1)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from jaxbl.drive import (
     DRIVES,
+    EFFECTS,
     EXCITATIONS,
     TRANSMISSIONS,
     Encoders,
@@ -17,8 +18,6 @@ from jaxbl.drive import (
     SigmoidBacklash,
     TwoInertia,
     as_arrays,
-    effect_class,
-    effect_kinds,
     get_leaf,
     key_of,
     leaf_paths,
@@ -114,7 +113,7 @@ def test_every_number_of_the_package_is_declared_with_a_text():
         *TRANSMISSIONS.values(),
         *EXCITATIONS.values(),
         Encoders,
-        *map(effect_class, effect_kinds()),
+        *EFFECTS.values(),
     }
     for module in modules:
         declared = {field.name: what for field, what in parameters(module)}

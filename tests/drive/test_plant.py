@@ -9,7 +9,7 @@ from drive_reference import HOLD, LAWS, SIGMOID, START, TORQUES, plant, referenc
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxbl.drive import DRIVES, Initial, LinearShaft, Plant, Rigid, SigmoidBacklash, TwoInertia, as_arrays, effect_kinds
+from jaxbl.drive import DRIVES, Initial, LinearShaft, Plant, Rigid, SigmoidBacklash, TwoInertia, as_arrays, make_effect
 
 REST = dict.fromkeys(START, 0.0)
 PAPER = {"motor_inertia": 0.05, "motor_viscous": 0.15, "load_inertia": 7.0, "load_viscous": 16.0, "gear_ratio": 5.0}
@@ -51,7 +51,7 @@ def potential(law, z):
 def test_energy_drifts_less_than_a_millionth_in_20_s(law, twist, eccentric):
     """On the paper's inertias at the default step, without friction and input, relative to the energy above the minimum."""
     error = {"amplitude": 0.2, "harmonic": 40.0, "phase": 0.5} if eccentric else {"amplitude": 0.0, "harmonic": 1.0}
-    drive = plant(effect_kinds()["transmission.eccentricity"](**error), law=LAWS[law][0], **FREE)
+    drive = plant(make_effect("transmission.eccentricity", **error), law=LAWS[law][0], **FREE)
     start = REST | {"motor_position": twist, "load_velocity": 0.05}
     states = np.vstack([[twist, 0.0, 0.0, 0.05], trajectory(drive, 10, start, np.zeros(20_000), 1e-3)])
     motor, load, motor_velocity, load_velocity = states.T
@@ -99,7 +99,7 @@ def test_the_scheme_is_symmetric_in_time(initial, torque):
         "transmission.eccentricity": {"amplitude": 0.05, "harmonic": 3.0},
         "transmission.hardening": {"cubic_stiffness": 20.0},
     }
-    drive = plant(*(effect_kinds()[name](**numbers) for name, numbers in values.items()), **PAPER)
+    drive = plant(*(make_effect(name, **numbers) for name, numbers in values.items()), **PAPER)
     before = drive.init(as_arrays(initial, jnp.float64))
     there = advance(drive, before, 1e-2, torque)
     back = advance(drive, there, -1e-2, torque)
@@ -125,7 +125,7 @@ def test_effects_and_drive_parameters_are_differentiable():
     """Forward derivatives of the whole motion, which the fits need, against differences."""
 
     def end(stiffness, drag):
-        drive = plant(effect_kinds()["load.quadratic_drag"](drag=0.05), law=LinearShaft(3.0))
+        drive = plant(make_effect("load.quadratic_drag", drag=0.05), law=LinearShaft(3.0))
         drive = eqx.tree_at(lambda p: (p.transmission.stiffness, p.effects[0].drag), drive, (stiffness, drag))
         return _end(drive)
 
@@ -140,7 +140,7 @@ def test_effects_and_drive_parameters_are_differentiable():
 
 def test_a_batch_of_drives_moves_as_each_alone():
     frictions = jnp.asarray([0.0, 0.05, 0.2])
-    drive = plant(effect_kinds()["motor.coulomb_friction"](torque=0.0))
+    drive = plant(make_effect("motor.coulomb_friction", torque=0.0))
 
     def end(level):
         return _end(eqx.tree_at(lambda p: p.effects[0].torque, drive, level))
@@ -173,13 +173,13 @@ def test_what_the_observers_know_of_a_drive():
         assert drive.torque_gain("motor") == -1.0 and drive.ratio("motor") == 1.0
     assert two.acceleration("load", 2.0, 0.5) == pytest.approx(-16.0 * 2.0 / 7.0)  # the input does not act there
     assert two.torque_gain("load") == two.ratio("load") == 5.0
-    heavier = Plant(two, LinearShaft(1.0), (effect_kinds()["load.inertia"](inertia=0.5),))
+    heavier = Plant(two, LinearShaft(1.0), (make_effect("load.inertia", inertia=0.5),))
     assert (heavier.inertia("motor"), heavier.inertia("load")) == (0.05, 7.5)
 
 
 def test_initial_state_has_the_sides_of_the_drive():
     initial = as_arrays(Initial(motor_position=1.0, motor_velocity=2.0, load_position=3.0, load_velocity=4.0), jnp.float64)
-    two = plant(effect_kinds()["actuator.lag"](time_constant=0.1)).init(initial)
+    two = plant(make_effect("actuator.lag", time_constant=0.1)).init(initial)
     assert (two.position, two.velocity, two.effects) == ({"motor": 1.0, "load": 3.0}, {"motor": 2.0, "load": 4.0}, ((0.0,),))
     one = Plant(Rigid(0.05, 0.15), None).init(initial)
     assert (one.position, one.velocity) == ({"motor": 1.0}, {"motor": 2.0})

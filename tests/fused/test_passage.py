@@ -8,7 +8,7 @@ from effect_values import VALUES
 from jax.extend.core import jaxpr_as_fun
 
 from jaxbl.drive import Encoders, Initial, LinearShaft, Rigid, TwoInertia, as_arrays, get_leaf, set_leaves
-from jaxbl.drive.effects import effect_kinds
+from jaxbl.drive.effects import make_effect
 from jaxbl.drive.excitation import Chirp, Sine
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.drive.transmission import DeadZone
@@ -34,7 +34,7 @@ def experiment(names, law=None, observer="implicit", rigid=False, substeps=2, st
         Experiment(
             drive=Rigid(0.02, 0.03) if rigid else TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0),
             transmission=law,
-            effects=tuple(effect_kinds()[name](**VALUES[name]) for name in names),
+            effects=tuple(make_effect(name, **VALUES[name]) for name in names),
             initial=Initial(),
             excitation=Chirp(5.0, 0.5, 3.0, 0.5) if rigid else Sine(5.0, 0.8),
             encoders=Encoders(1e-4, motor_resolution=1e-5),

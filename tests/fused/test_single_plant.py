@@ -10,7 +10,7 @@ import pytest
 from effect_values import VALUES
 
 from jaxbl.drive import Initial, LinearShaft, Rigid, SigmoidBacklash, TwoInertia, as_arrays, leaf_paths, set_leaves
-from jaxbl.drive.effects import SideEffect, effect_kinds
+from jaxbl.drive.effects import SideEffect, make_effect
 from jaxbl.drive.excitation import Recorded, Sine
 from jaxbl.fused import single_plant as module
 from jaxbl.fused.single_plant import Direction, path, slopes
@@ -22,7 +22,7 @@ OTHERS = ["transmission.backlash", "motor.stribeck_friction", "load.quadratic_dr
 
 def experiment(names, rigid=False, substeps=1, extra=()):
     drive = Rigid(0.02, 0.03) if rigid else TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0)
-    effects = (*(effect_kinds()[name](**VALUES[name]) for name in names), *extra)
+    effects = (*(make_effect(name, **VALUES[name]) for name in names), *extra)
     law = LinearShaft(60.0) if "transmission.backlash" in names else SigmoidBacklash(1.0, 0.02, 20.0)
     found = Experiment(
         drive, None if rigid else law, effects, Initial(), Sine(1.0, 1.0), None, None, None, None, Run(1e-3, STEPS, substeps)

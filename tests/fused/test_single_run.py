@@ -7,7 +7,7 @@ import pytest
 from effect_values import VALUES
 
 from jaxbl.drive import Encoders, Initial, TwoInertia, as_arrays
-from jaxbl.drive.effects import effect_kinds
+from jaxbl.drive.effects import make_effect
 from jaxbl.drive.excitation import Multisine, Prbs
 from jaxbl.drive.transmission import DeadZone
 from jaxbl.fused.single_run import recorded
@@ -28,7 +28,7 @@ def experiment(excitation, steps, precision):
         Experiment(
             drive=TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0),
             transmission=DeadZone(60.0, 0.05),
-            effects=tuple(effect_kinds()[name](**VALUES[name]) for name in NAMES),
+            effects=tuple(make_effect(name, **VALUES[name]) for name in NAMES),
             initial=Initial(),
             excitation=excitation,
             encoders=Encoders(1e-4, motor_resolution=1e-5),

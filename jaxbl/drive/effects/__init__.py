@@ -4,14 +4,25 @@ One file a family. Further packages add effects through the entry-point group `j
 effect's name, its object a subclass of :class:`SideEffect`, :class:`TransmissionEffect` or :class:`ActuatorEffect`.
 """
 
-# ruff: noqa: I001, F401
+# ruff: noqa: I001
 # families in the order in which a model with all effects has them
-from .base import EFFECTS as EFFECTS
 from .friction import CoulombFriction as CoulombFriction
 from .friction import StribeckFriction as StribeckFriction
+from .friction import ViscousFriction as ViscousFriction
+from .friction import QuadraticDrag as QuadraticDrag
 from .loads import ConstantTorque as ConstantTorque
+from .loads import Inertia as Inertia
+from .loads import Gravity as Gravity
+from .loads import PeriodicDisturbance as PeriodicDisturbance
+from .loads import Cogging as Cogging
 from .gear import Backlash as Backlash
+from .gear import Hardening as Hardening
+from .gear import Damping as Damping
+from .gear import Eccentricity as Eccentricity
+from .actuator import GainError as GainError
+from .actuator import Saturation as Saturation
 from .actuator import Lag as Lag
+from .base import EFFECTS as EFFECTS
 from .base import AbstractEffect as AbstractEffect
 from .base import ActuatorEffect as ActuatorEffect
 from .base import Motion as Motion

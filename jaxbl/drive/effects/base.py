@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import equinox as eqx
 import numpy as np
 
-from ..parameters import Parameter, Scalar, parameter, parameters
+from ..parameters import Parameter, parameter, parameters
 from ..registry import Registry
 
 Side = Literal["motor", "load"]
