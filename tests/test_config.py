@@ -91,7 +91,7 @@ overlays = ["davila_fridman", "seeber_horn", "exact"]
 NUMBERS = {"amplitude": 0.1, "frequency": 0.3, "start_frequency": 0.1, "stop_frequency": 2.0, "relative": 0.05}
 
 # effects by kind with every parameter given
-EFFECTS = {
+TABLES = {
     name: {"kind": name} | {key_of(f.name): NUMBERS.get(f.name, 0.2) for f, _ in parameters(EFFECTS[name])}
     for name in EFFECTS
 }
@@ -136,10 +136,10 @@ BAD = {
     "unknown effect": (small(effects=[{"kind": "load.coulumb_friction"}]), "did you mean 'load.coulomb_friction'?"),
     "effect's key": (small(effects=[{"kind": "actuator.lag", "time": 1.0}]), "effects[0]: unknown key 'time'"),
     "effect's range": (
-        small(effects=[EFFECTS["motor.cogging"], EFFECTS["actuator.lag"] | {"time_constant": 0.0}]),
+        small(effects=[TABLES["motor.cogging"], TABLES["actuator.lag"] | {"time_constant": 0.0}]),
         "effects[1].time_constant: should be greater than 0, not 0.0",
     ),
-    "effects as a table": (small(effects=EFFECTS["actuator.lag"]), "effects: should be an array, not {"),
+    "effects as a table": (small(effects=TABLES["actuator.lag"]), "effects: should be an array, not {"),
     "text for a number": (small({"drive.motor_inertia": "0.05"}), "motor_inertia: should be a valid number, not '0.05'"),
     "truth for a number": (small({"drive.motor_inertia": True}), "motor_inertia: should be a valid number, not True"),
     "number for a table": (small(run=3), "run: should be a table, not 3"),
@@ -164,7 +164,7 @@ BAD = {
         "[transmission] has no meaning on a rigid drive; remove it, or use drive.kind = 'two_inertia'",
     ),
     "rigid with load observer": (rigid({"observer.load": {"lambda": 1.0, "alpha": 1.0}}), "observer.load has no meaning"),
-    "rigid with load effect": (rigid(effects=[EFFECTS["load.inertia"]]), "effects[0]: load.inertia has no meaning"),
+    "rigid with load effect": (rigid(effects=[TABLES["load.inertia"]]), "effects[0]: load.inertia has no meaning"),
     "no transmission": (small({"transmission": None}), "[transmission] is missing"),
     "no load observer": (small({"observer.load": None}), "observer.load is missing"),
     "exact path": (small({"uncertainty.exact": ["drive.gear_rati"]}), "nearest valid path: 'drive.gear_ratio'"),
@@ -188,7 +188,7 @@ BAD = {
     "path of a table": (small(axes=[listed("observer.motor", 1.0)]), "nearest valid path: 'observer.motor.alpha'"),
     "path of a choice": (small(axes=[listed("drive.kind", "rigid")]), "axes[0]: unknown path 'drive.kind'"),
     "path of two effects": (
-        small(effects=[EFFECTS["actuator.lag"]] * 2, axes=[listed("effects.actuator.lag.time_constant", 1.0)]),
+        small(effects=[TABLES["actuator.lag"]] * 2, axes=[listed("effects.actuator.lag.time_constant", 1.0)]),
         "unknown path 'effects.actuator.lag.time_constant'; nearest valid path: 'effects.1.time_constant'",
     ),
     "axis out of range": (
@@ -374,20 +374,20 @@ def parameters_by_name(module):
     return {field.name: known for field, known in parameters(module)}
 
 
-@pytest.mark.parametrize("name", EFFECTS)
+@pytest.mark.parametrize("name", TABLES)
 def test_every_effect_is_built_with_its_numbers_and_its_name(name):
-    config = read_config(small(effects=[EFFECTS[name]]))
+    config = read_config(small(effects=[TABLES[name]]))
     (effect,) = config.build().effects
     assert isinstance(effect, EFFECTS[name])
     assert effect.name == name
-    for key, value in EFFECTS[name].items():
+    for key, value in TABLES[name].items():
         if key != "kind":
             assert getattr(effect, key) == value
             moved = with_values(config, {f"effects.{name}.{key}": 0.7})
             assert getattr(moved.build().effects[0], key) == 0.7
 
 
-@pytest.mark.parametrize("data", [small(effects=[EFFECTS["motor.cogging"], *[EFFECTS["load.gravity"]] * 2]), rigid()])
+@pytest.mark.parametrize("data", [small(effects=[TABLES["motor.cogging"], *[TABLES["load.gravity"]] * 2]), rigid()])
 def test_leaves_of_the_experiment_have_the_paths_of_the_config(data):
     config = read_config(data)
     experiment = config.build()
@@ -469,7 +469,7 @@ def test_any_mutation_is_valid_or_an_input_error_of_one_line(mutations):
 
 
 def test_inertia_effects_must_leave_some():
-    with pytest.raises(InputError, match=r"motor.inertia leaves a total of .* on the motor"):
+    with pytest.raises(InputError, match=r"motor.inertia leaves a total inertia of .* on the motor"):
         read_config(rigid(effects=[{"kind": "motor.inertia", "inertia": -1e3}]))
 
 

@@ -10,9 +10,9 @@ from small_study import rigid, small
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis import linearised_model as module
-from jaxbl.diagnosis.candidates import Grids, forces_of, variants_of
+from jaxbl.diagnosis.candidates import forces_of, variants_of
 from jaxbl.diagnosis.linearised_model import Linear
-from jaxbl.drive.effects import make_effect
+from jaxbl.drive.effects import EFFECTS, Scales, make_effect
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.identification.smoother import smooth
 from jaxbl.identification.trajectory import free_parameters
@@ -119,11 +119,11 @@ def test_a_candidates_torque_does_what_the_effect_does(tmp_path, name):
 def test_numbers_of_waves_are_those_of_the_effect(tmp_path):
     """A wave's two columns make up the effect that its numbers describe."""
     base = linear(tmp_path, 2)
-    grids = Grids(5.0, 1e-3, (0.1, 0.3), {"motor": 1.0, "load": 0.2}, (2.0,), (8.0,), (2.0,))
+    log = Scales(5.0, 1e-3, 10.0, 0.1, 0.3, 1.0, 0.2, travel=2.0, frequencies=(2.0,))
     values = (0.3e-3, -0.4e-3)
     waves = ("load.gravity", "load.periodic_disturbance", "motor.cogging", "transmission.eccentricity")
     seen = set()
-    for one in variants_of(base.experiment, waves, grids):
+    for one in variants_of(base.experiment, waves, lambda name: log):
         if one.name in waves:
             columns = forces_of([one], base.signals[0])
             effect = as_arrays(make_effect(one.name, **one.numbers(values)), float)
@@ -173,4 +173,5 @@ def test_eccentricity_is_tried_once_a_turn_however_small_the_motion(tmp_path):
     model = linear(tmp_path, 2)
     travel = float(np.ptp(np.asarray(model.parts[0].position["load"])))
     least = int(np.floor(0.5 / travel)) + 1
-    assert model.grids(()).load_harmonics == (1.0, *(float(n) for n in range(max(least, 2), 9)))
+    tried = EFFECTS["transmission.eccentricity"].roles()["harmonic"].trials(model.scales("transmission.eccentricity"))
+    assert tuple(tried) == (1.0, *(float(n) for n in range(max(least, 2), 9)))

@@ -122,7 +122,7 @@ class _Tabled(SideEffect):
     kind = "tabled"
     table: jax.Array
 
-    def resist(self, motion):
+    def resist(self, state, motion):
         return self.table[jnp.clip(jnp.floor(motion.time * 100.0).astype(int), 0, len(self.table) - 1)]
 
 
