@@ -1,0 +1,99 @@
+"""The example of docs/effects.md as written: installed as a package, then used by every command."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+from hidden_log import driven, model
+from small_study import rigid
+
+ROOT = Path(__file__).parents[1]
+NAME = "motor.hysteretic_friction"
+TORQUE, LENGTH = 0.06, 0.2
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """Environment of a process that has the package."""
+    text = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
+    folder, site = tmp_path_factory.mktemp("package"), tmp_path_factory.mktemp("site")
+    for name, content in re.findall(r"```(?:python|toml)\n# (\S+)\n(.*?)```", text, re.S):
+        (folder / name).write_text(content, encoding="utf-8")
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
+    subprocess.run([*pip, "--no-build-isolation", "--target", site, folder], check=True)
+    return os.environ | {"PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])}
+
+
+def jaxbl(installed, *arguments):
+    """Run a command in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, "-m", "jaxbl.cli", *map(str, arguments)], env=installed, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert "warning" not in done.stderr
+    return done.stdout
+
+
+def study_block():
+    text = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```toml\n(\[\[effects\]\].*?)```", text, re.S)
+    return block
+
+
+def logs(folder):
+    """Two logs of a machine that has such friction, by the bench's simulator, which shares nothing with the package."""
+    t = 2e-3 * np.arange(3000)
+    hidden = [{"kind": "unknown.hysteresis", "side": "motor", "torque": TORQUE, "length": LENGTH}]
+    for seed, name in enumerate(("log.csv", "other.csv")):
+        random = np.random.default_rng(seed)
+        rates, phases = 0.5 * np.arange(1, 7), random.uniform(-np.pi, np.pi, 6)
+        torque = 0.3 * np.sum(np.sin(2.0 * np.pi * rates[:, None] * t + phases[:, None]), axis=0)
+        driven(torque, hidden, 3e-5, seed).write(folder / name)
+    return folder / "log.csv", folder / "other.csv"
+
+
+def test_it_is_simulated_and_swept_over(installed, tmp_path):
+    study = tmp_path / "study.toml"
+    study.write_text(tomli_w.dumps(rigid()) + study_block(), encoding="utf-8")
+    jaxbl(installed, "simulate", study, "--out", tmp_path / "run")
+    jaxbl(installed, "sweep", study, "--out", tmp_path / "sweep")
+    assert (tmp_path / "run" / "report.html").exists()
+    assert f"effects.{NAME}.torque" in (tmp_path / "sweep" / "report.html").read_text(encoding="utf-8")
+
+
+def test_its_numbers_are_identified(installed, tmp_path):
+    log, _ = logs(tmp_path)
+    known = model(effects=[{"kind": NAME, "torque": 0.04, "length": 0.15}])
+    (tmp_path / "model.toml").write_text(tomli_w.dumps(known), encoding="utf-8")
+    jaxbl(installed, "identify", log, "--model", tmp_path / "model.toml", "--out", tmp_path / "found")
+    found = json.loads((tmp_path / "found" / "identification.json").read_text(encoding="utf-8"))["parameters"]
+    assert found[f"effects.{NAME}.torque"]["value"] == pytest.approx(TORQUE, rel=0.02)
+    assert found[f"effects.{NAME}.length"]["value"] == pytest.approx(LENGTH, rel=0.05)
+
+
+def test_it_is_named_where_it_is_missing(installed, tmp_path):
+    log, other = logs(tmp_path)
+    (tmp_path / "model.toml").write_text(tomli_w.dumps(model()), encoding="utf-8")
+    out = tmp_path / "found"
+    jaxbl(installed, "diagnose", log, "--model", tmp_path / "model.toml", "--holdout", other, "--out", out)
+    found = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
+    assert found["verdict"] == "explained"
+    (finding,) = found["findings"]
+    assert finding["effect"] == NAME and finding["confidence"] > 0.99
+    assert finding["parameters"]["torque"]["value"] == pytest.approx(TORQUE, rel=0.02)
+    assert finding["parameters"]["length"]["value"] == pytest.approx(LENGTH, rel=0.05)
+    assert NAME in (out / "model.toml").read_text(encoding="utf-8")
+
+
+def test_the_reference_lists_it(installed):
+    code = "import docs.generate as g; print(g.page())"
+    done = subprocess.run([sys.executable, "-c", code], env=installed, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert f"| `{NAME}` | Friction that builds up over a sliding length" in done.stdout
