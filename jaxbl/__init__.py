@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from .records import Record as Record
     from .records import inspect as inspect
     from .records import read_record as read_record
-    from .report.atlas import write_verify_report as write_verify_report
-    from .report.diagnosed import write_diagnosis_report as write_diagnosis_report
-    from .report.identified import write_identification_report as write_identification_report
-    from .report.inspected import write_inspection_report as write_inspection_report
-    from .report.reports import write_sweep_report as write_sweep_report
-    from .report.reports import write_trial_report as write_trial_report
-    from .report.tuning import write_tune_report as write_tune_report
+    from .report.diagnose import write_diagnosis_report as write_diagnosis_report
+    from .report.identify import write_identification_report as write_identification_report
+    from .report.inspect import write_inspection_report as write_inspection_report
+    from .report.simulate import write_trial_report as write_trial_report
+    from .report.sweep import write_sweep_report as write_sweep_report
+    from .report.tune import write_tune_report as write_tune_report
+    from .report.verify import write_verify_report as write_verify_report
     from .sweeps.sweep import StudyResult as StudyResult
     from .sweeps.sweep import dry_run as dry_run
     from .sweeps.sweep import load as load
@@ -48,13 +48,13 @@ _WHERE = {
     "Record": "records",
     "inspect": "records",
     "read_record": "records",
-    "write_diagnosis_report": "report.diagnosed",
-    "write_identification_report": "report.identified",
-    "write_inspection_report": "report.inspected",
-    "write_sweep_report": "report.reports",
-    "write_trial_report": "report.reports",
-    "write_tune_report": "report.tuning",
-    "write_verify_report": "report.atlas",
+    "write_diagnosis_report": "report.diagnose",
+    "write_identification_report": "report.identify",
+    "write_inspection_report": "report.inspect",
+    "write_sweep_report": "report.sweep",
+    "write_trial_report": "report.simulate",
+    "write_tune_report": "report.tune",
+    "write_verify_report": "report.verify",
     "Config": "config",
     "read_config": "config",
     "Diagnosis": "diagnosis.diagnose",

@@ -3,13 +3,17 @@
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .errors import InputError
+
+LOG_RESULTS = ("inspection.json", "identification.json", "diagnosis.json")
+"""What `inspect`, `identify` and `diagnose` write into a folder; each names the log that the results are of."""
 
 
 def plain(value: Any) -> Any:
@@ -56,3 +60,49 @@ def make_folder(path: Path) -> None:
         raise InputError(f"{path}: lies under a file; --out should name a folder") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be written to ({error.strerror}); choose another folder with --out") from None
+
+
+def claim_log_folder(folder: Path, log: Path, *, overwrite: bool) -> None:
+    """Make the folder for the results of a log.
+
+    Raises:
+        InputError: it holds other files, or (unless `overwrite`) the results of another log, or cannot be written to.
+    """
+    make_folder(folder)
+    found = [folder / name for name in LOG_RESULTS if (folder / name).exists()]
+    if not found and any(folder.iterdir()):
+        raise InputError(f"{folder}: is not empty and holds no results of a log; choose another folder with --out")
+    for file in found:
+        other = log_named_in(file)
+        if other != str(log.resolve()) and not overwrite:
+            name = other or "an unreadable one"
+            raise InputError(f"{folder}: holds results of another log ({name}); choose another with --out, or --overwrite")
+
+
+def log_named_in(file: Path) -> str | None:
+    """The log that the results in a file are of; None where the file is damaged."""
+    try:
+        return str(read_json(file)["file"])
+    except (InputError, KeyError):
+        return None
+
+
+def finished_summary(file: Path, identity: str) -> dict[str, Any] | None:
+    """What an earlier call found for the same question; None where there is none."""
+    try:
+        found = read_json(file)
+    except (OSError, InputError):
+        return None
+    return found if found.get("identity") == identity else None
+
+
+@contextmanager
+def removed_if_empty(folder: Path) -> Iterator[None]:
+    """Remove a folder that is still empty when something goes wrong."""
+    try:
+        yield
+    except BaseException:
+        # suppressed: it is not empty
+        with suppress(OSError):
+            folder.rmdir()
+        raise

@@ -20,7 +20,7 @@ from measured import EMPS, made, real
 from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
 from typer.testing import CliRunner
 
-from jaxbl import cli
+from jaxbl import cli, terminal
 from jaxbl.errors import InputError
 from jaxbl.sweeps.engine import Engine
 
@@ -385,17 +385,17 @@ def test_results_of_another_study_stay_until_overwriting_is_asked_for(call, tmp_
 
 
 def test_progress_bar_on_a_terminal_only(monkeypatch, capsys):
-    with cli._progress("runs") as progress:
+    with terminal.progress_bar("runs") as progress:
         assert progress is None
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    with cli._progress("runs") as progress:
+    with terminal.progress_bar("runs") as progress:
         progress(2, 3)
     assert capsys.readouterr().out == ""
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0.04, "0.0 s"), (99.0, "99.0 s"), (600.0, "10 min"), (7200.0, "2.0 h")])
 def test_durations(seconds, text):
-    assert cli._duration(seconds) == text
+    assert terminal.duration(seconds) == text
 
 
 def test_default_folder():
@@ -546,7 +546,7 @@ def axis(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", ["jaxbl.identification.identify.run_task", "jaxbl.report.identified.html"])
+@pytest.mark.parametrize("place", ["jaxbl.identification.identify.run_task", "jaxbl.report.page.html"])
 def test_an_interrupted_identification_writes_nothing_and_says_how_to_start_again(place, axis, call, tmp_path, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
@@ -628,13 +628,13 @@ def quick(monkeypatch):
         return _Found(task)
 
     def report(found, folder):
-        from jaxbl.report.diagnosed import diagnosis_lines
+        from jaxbl.report.diagnose import diagnosis_lines
 
         (folder / "diagnosis.json").write_text(json.dumps(found.summary))
         return diagnosis_lines(found.summary)
 
     monkeypatch.setattr("jaxbl.diagnosis.diagnose.run_task", run_task)
-    monkeypatch.setattr("jaxbl.report.diagnosed.write_diagnosis_report", report)
+    monkeypatch.setattr("jaxbl.report.diagnose.write_diagnosis_report", report)
     return tasks
 
 

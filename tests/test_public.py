@@ -29,6 +29,7 @@ FLOORS = [
     {"gains", "diagnosis"},
     {"throughput"},
     {"report"},
+    {"batch", "terminal"},
     {"cli"},
 ]
 BELOW = {part: set().union(*FLOORS[:i]) for i, floor in enumerate(FLOORS) for part in floor}
@@ -71,7 +72,7 @@ def test_imports_run_downward(file):
 
 def test_the_import_check_sees_imports():
     assert "jaxbl.errors.InputError" in set(imported(ROOT / "jaxbl" / "sweeps" / "store.py"))
-    assert "jaxbl.sweeps.sweep.StudyResult" in set(imported(ROOT / "jaxbl" / "report" / "reports.py"))
+    assert "jaxbl.sweeps.sweep.StudyResult" in set(imported(ROOT / "jaxbl" / "report" / "sweep.py"))
 
 
 @pytest.mark.parametrize("name", MODULES)

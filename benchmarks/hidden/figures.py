@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxbl.report.style import COLOURS, save, style
+from jaxbl.report.figures import save
+from jaxbl.report.style import COLOURS, style
 
 from .effects import LEVELS
 from .scoring import TARGETS, Outcome, calibration, calibration_error, confusion, wilson

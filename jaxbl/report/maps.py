@@ -1,4 +1,4 @@
-"""Figures of a study: heatmaps with gain conditions over them, and lines over one axis."""
+"""Figures of a sweep: heatmaps with gain conditions over them, and lines over one axis."""
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
@@ -6,7 +6,7 @@
 
 import re
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,8 @@ from jaxbl.sweeps.metrics import describe
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 
-from .refined import Filling, on_coarse_values
+from .figures import SIDES, Drawn
+from .refined_maps import Filling, on_coarse_values
 from .style import COLOURS, HATCH, MAP, MISSING, style, with_unit
 
 _CURVES = {
@@ -38,15 +39,6 @@ _CURVES = {
     "moreno_osorio": ((0, (5, 1, 1, 1)), "#B6F09C"),
     "exact": (":", "#FFD400"),
 }
-SIDES = ("motor", "load")
-
-
-class Drawn(NamedTuple):
-    """A figure, the file name it should have, and a sentence that says what it shows."""
-
-    name: str
-    figure: Figure
-    caption: str
 
 
 def default_figures(config: Config) -> list[FigureTable]:

@@ -1,9 +1,14 @@
 """A plain HTML page in one file: headline, remarks, figures, tables, config."""
 
 import base64
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import NamedTuple
+
+from jaxbl.files import write_atomic
+
+from .figures import Drawn, save
 
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 2rem auto; max-width: 72rem; padding: 0 1rem; }
@@ -16,7 +21,7 @@ pre { background: #f5f5f5; padding: 1rem; overflow-x: auto; font-size: 0.85rem; 
 """
 
 
-class TableOf(NamedTuple):
+class PageTable(NamedTuple):
     """A table of a report: heading, column names, rows of cells."""
 
     heading: str
@@ -24,25 +29,53 @@ class TableOf(NamedTuple):
     rows: list[list[object]]
 
 
-class Picture(NamedTuple):
-    """A figure file and its caption."""
+def write_report(
+    folder: Path,
+    title: str,
+    lead: Sequence[str],
+    drawn: Sequence[Drawn],
+    tables: Sequence[PageTable],
+    config: str,
+    remarks: Sequence[str] = (),
+) -> list[str]:
+    """Write figures into `figures/` and `report.html`. Returns lead and remarks, the lines for the terminal.
 
-    path: Path
-    caption: str
+    Args:
+        folder: exists.
+        title: of the page.
+        lead: what was found, in sentences.
+        drawn: figures, in the order of the page.
+        tables: below the figures.
+        config: the study as TOML.
+        remarks: what else there is to know, in sentences.
+    """
+    page = html(title, lead, remarks, save_all(drawn, folder), tables, config)
+    write_atomic(folder / "report.html", page)
+    return [*lead, *remarks]
+
+
+def save_all(drawn: Sequence[Drawn], folder: Path) -> list[tuple[Path, str]]:
+    """Write figures into the folder's `figures/`. Returns their files and captions."""
+    return [(save(one.figure, folder / "figures" / f"{one.name}.png"), one.caption) for one in drawn]
 
 
 def html(
-    title: str, lead: list[str], remarks: list[str], pictures: list[Picture], tables: list[TableOf], config: str
+    title: str,
+    lead: Sequence[str],
+    remarks: Sequence[str],
+    pictures: Sequence[tuple[Path, str]],
+    tables: Sequence[PageTable],
+    config: str,
 ) -> str:
-    """The whole page; figures are embedded, so that the file can be passed on by itself."""
+    """The whole page; figures (files and captions) are embedded, so that the page is one file."""
     parts = [f"<h1>{escape(title)}</h1>", *(f'<p class="lead">{escape(line)}</p>' for line in lead)]
     if remarks:
         parts += ["<h2>Remarks</h2><ul>", *(f"<li>{escape(line)}</li>" for line in remarks), "</ul>"]
     if pictures:
         parts.append("<h2>Figures</h2>")
-        for picture in pictures:
-            data = base64.b64encode(picture.path.read_bytes()).decode()
-            caption = escape(picture.caption)
+        for path, caption in pictures:
+            data = base64.b64encode(path.read_bytes()).decode()
+            caption = escape(caption)
             image = f'<img src="data:image/png;base64,{data}" alt="{caption}">'
             parts.append(f"<figure>{image}<figcaption>{caption}</figcaption></figure>")
     for table in tables:

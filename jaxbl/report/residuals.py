@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from textwrap import fill
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,13 +11,12 @@ from jaxbl.diagnosis.localise import SIGNIFICANT, Coordinate, Localised, Values,
 from jaxbl.diagnosis.observer_residual import Observed
 from jaxbl.diagnosis.residuals import Residual, narrowed
 
-from .maps import Drawn
-from .style import COLOURS, style, with_unit
+from .figures import Drawn, outline, stacked_axes
+from .style import COLOURS, FAINT, LEGEND_ABOVE, MISSING, SIDE_COLOURS, style, with_unit
 
-_POINTS, _CLOUD = 2400, 4000
-_COLOUR = {"motor": COLOURS[0], "load": COLOURS[1], "transmission": COLOURS[2]}
-_BAND, _MEAN, _FAINT = "#BDBDBD", COLOURS[6], "#8C8C8C"
-_ABOVE: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1, "columnspacing": 1.2}
+_CLOUD = 4000
+"""Dots of a cloud; more would cover each other."""
+_MEAN = COLOURS[6]
 _SHOWN = ("speed", "turn", "load turn", "position", "load position", "twist", "acceleration")
 _PANELS = 3
 _WIDTH = 118
@@ -61,26 +59,26 @@ def _over_time(
     unit: str,
     observed: Mapping[str, Sequence[Observed]],
 ) -> Drawn:
-    figure = Figure(figsize=(9.0, 2.3 * len(residuals) + 0.6), layout="constrained")
-    axes = figure.subplots(len(residuals), 1, sharex=True, squeeze=False).ravel()
+    figure, axes = stacked_axes(len(residuals), 2.3)
     for ax, (name, parts) in zip(axes, residuals.items(), strict=True):
         one = found[name]
         for i, part in enumerate(parts):
             low, _ = _shown(part, one)
-            time, torque, band = outline(low.time, low.torque, 2.0 * low.deviation)
-            ax.plot(time, torque, color=_COLOUR[name], lw=0.9, label="missing" if i == 0 else None, zorder=2)
-            ax.fill_between(time, -band, band, color=_BAND, alpha=0.75, lw=0.0, zorder=3, label=None if i else "± 2 noise")
+            at = outline(low.torque)
+            time, band = low.time[at], 2.0 * low.deviation[at]
+            ax.plot(time, low.torque[at], color=SIDE_COLOURS[name], lw=0.9, label="missing" if i == 0 else None, zorder=2)
+            ax.fill_between(time, -band, band, color=MISSING, alpha=0.75, lw=0.0, zorder=3, label=None if i else "± 2 noise")
         witnesses = observed.get(name, ())
         if all(part.converged for part in witnesses):
             for i, part in enumerate(witnesses):
                 low, _ = _shown(part.residual, one)
-                time, torque, _ = outline(low.time, low.torque, low.deviation)
+                at = outline(low.torque)
                 label = None if i else f"by its observer (noise {low.deviation[0]:.2g} {unit})"
-                ax.plot(time, torque, color=_MEAN, lw=0.5, label=label, zorder=4)
-        ax.axhline(0.0, color=_FAINT, lw=0.8, zorder=1)
-        ax.set_ylabel(with_unit(f"{name}:\nmissing {_what(unit)}", unit))
+                ax.plot(low.time[at], low.torque[at], color=_MEAN, lw=0.5, label=label, zorder=4)
+        ax.axhline(0.0, color=FAINT, lw=0.8, zorder=1)
+        ax.set_ylabel(with_unit(f"{name}:\nmissing {missing_quantity(unit)}", unit))
         ax.set_title(f"{fill(describe(one, unit), _WIDTH)}\n", loc="left", fontsize=9)
-        ax.legend(ncols=3, **_ABOVE)
+        ax.legend(ncols=3, **LEGEND_ABOVE)
     axes[-1].set_xlabel("time (s)")
     caption = (
         "Torque that the model lacks (inertia times acceleration less all modelled torques, positive forward), behind the "
@@ -96,19 +94,9 @@ def _over_time(
     return Drawn("residual_torque", figure, caption)
 
 
-def _what(unit: str) -> str:
+def missing_quantity(unit: str) -> str:
+    """What a residual in this unit is."""
     return "force" if unit == "N" else "torque"
-
-
-def outline(time: np.ndarray, torque: np.ndarray, band: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fewer points that draw the same line: least and largest of each of many bins; time, torque and its band there."""
-    size = len(time) // (_POINTS // 2)
-    if size < 3:
-        return time, torque, band
-    bins = torque[: len(time) // size * size].reshape(-1, size)
-    at = np.arange(len(bins)) * size + np.sort([np.argmin(bins, axis=1), np.argmax(bins, axis=1)], axis=0)
-    at = at.T.ravel()
-    return time[at], torque[at], band[at]
 
 
 def _panels(found: Localised) -> list[Coordinate]:
@@ -131,9 +119,9 @@ def _over_coordinates(
     best = max(shown, key=lambda one: one.explained)
     for ax, one in zip(axes, shown, strict=True):
         values = np.concatenate([part[one.name].values[at] for part, (_, at) in zip(coordinates, lows, strict=True)])
-        ax.axhspan(-2.0 * noise, 2.0 * noise, color=_BAND, alpha=0.6, lw=0.0, zorder=0, label="± 2 noise")
+        ax.axhspan(-2.0 * noise, 2.0 * noise, color=MISSING, alpha=0.6, lw=0.0, zorder=0, label="± 2 noise")
         ax.plot(
-            values[::every], torque[::every], ".", ms=2.0, mew=0.0, color=_COLOUR[found.name], alpha=0.45, zorder=1,
+            values[::every], torque[::every], ".", ms=2.0, mew=0.0, color=SIDE_COLOURS[found.name], alpha=0.45, zorder=1,
             rasterized=True,
         )  # fmt: skip
         _means(ax, one)
@@ -144,7 +132,7 @@ def _over_coordinates(
             f"explains {100.0 * one.explained:.0f} %", loc="left", fontsize=10,
             fontweight="bold" if one is best and one.explained > 0.0 else "normal",
         )  # fmt: skip
-    axes[0].set_ylabel(with_unit(f"{found.name}: missing {_what(unit)}", unit))
+    axes[0].set_ylabel(with_unit(f"{found.name}: missing {missing_quantity(unit)}", unit))
     limit = 1.15 * max(float(np.quantile(np.abs(torque), 0.998)), 2.5 * noise)
     axes[0].set_ylim(-limit, limit)
     handles = axes[0].get_legend_handles_labels()
@@ -169,8 +157,7 @@ def _means(ax: Axes, one: Coordinate) -> None:
 
 
 def _spectra(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, Localised], unit: str) -> Drawn:
-    figure = Figure(figsize=(9.0, 2.5 * len(residuals) + 0.6), layout="constrained")
-    axes = figure.subplots(len(residuals), 1, sharex=False, squeeze=False).ravel()
+    figure, axes = stacked_axes(len(residuals), 2.5, sharex=False)
     for ax, (name, parts) in zip(axes, residuals.items(), strict=True):
         longest = max(parts, key=lambda part: len(part.time))
         frequency, power, floor = spectrum_of(longest)
@@ -178,10 +165,10 @@ def _spectra(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, Lo
         frequency, power, floor = frequency[seen], power[seen], floor[seen]
         # of each line: amplitude of a sine with its power
         size = np.sqrt(2.0 / len(longest.time))
-        ax.loglog(frequency, size * np.sqrt(power), color=_COLOUR[name], lw=0.9, label="missing")
+        ax.loglog(frequency, size * np.sqrt(power), color=SIDE_COLOURS[name], lw=0.9, label="missing")
         ax.loglog(frequency, size * np.sqrt(floor), color=_MEAN, lw=1.2, ls="--", label="noise")
         ax.set_ylim(0.2 * size * np.sqrt(np.min(floor)), 3.0 * size * np.sqrt(np.max([np.max(power), np.max(floor)])))
-        ax.axvline(found[name].bandwidth, color=_FAINT, lw=0.9, ls=":", label="looked at up to here")
+        ax.axvline(found[name].bandwidth, color=FAINT, lw=0.9, ls=":", label="looked at up to here")
         for peak in [one for one in found[name].peaks if not one.in_motion and one.excess_z > SIGNIFICANT][:3]:
             if peak.power_share < _WORTH:
                 continue
@@ -191,7 +178,7 @@ def _spectra(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, Lo
             )  # fmt: skip
             ax.plot(peak.frequency, peak.amplitude, "v", ms=5, color=_MEAN)
         ax.set_ylabel(with_unit(f"{name}:\namplitude per line", unit))
-        ax.legend(ncols=3, **_ABOVE)
+        ax.legend(ncols=3, **LEGEND_ABOVE)
     axes[-1].set_xlabel("frequency (Hz)")
     caption = (
         "Spectrum of the missing torque and of its noise. The noise of an acceleration grows with the square of the "

@@ -2,18 +2,21 @@
 
 import contextlib
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 from cycler import cycler
-from matplotlib.figure import Figure
 
 # Okabe and Ito, in an order that also parts in grey
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+SIDE_COLOURS = {"motor": COLOURS[0], "load": COLOURS[1], "transmission": COLOURS[2]}
 MAP = "viridis"
 MISSING = "#BDBDBD"
+FAINT = "#8C8C8C"
+"""Grey of zero lines, arrows and clouds of points behind a line."""
 HATCH = (1.0, 1.0, 1.0, 0.45)
+LEGEND_ABOVE: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1, "columnspacing": 1.2}
+"""Where a legend hides no line."""
 
 _SETTINGS: Any = {
     "font.size": 10,
@@ -39,14 +42,6 @@ def style() -> Iterator[None]:
     """The settings that figures are made under."""
     with mpl.rc_context(_SETTINGS):
         yield
-
-
-def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG, making its folder. Returns the path."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with style():
-        figure.savefig(path)
-    return path
 
 
 def with_unit(label: str, unit: str) -> str:

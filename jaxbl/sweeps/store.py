@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
-from jaxbl.files import make_folder, read_json, write_atomic
+from jaxbl.files import LOG_RESULTS, log_named_in, make_folder, read_json, write_atomic
 
 from .programs import Backend, Layout
 
@@ -30,8 +30,6 @@ _COMMANDS = {
     "tune": ("tune/manifest.json", ("gains.toml", "tuning.json", "tune"), ("axes", "verify")),
 }
 _COMMON = ("figures", "report.html")
-LOG_MARKERS = ("inspection.json", "identification.json", "diagnosis.json")
-"""What `inspect`, `identify` and `diagnose` leave, which says whose log the folder is for."""
 
 
 def identity(config: Config, command: str = "sweep") -> str:
@@ -107,8 +105,9 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
     if all(same) and (found or not any(folder.iterdir())):
         return
     if not found:
-        log = next((_log_of(folder / name) for name in LOG_MARKERS if (folder / name).exists()), None)
-        if log is not None:
+        for file in (folder / name for name in LOG_RESULTS if (folder / name).exists()):
+            log = log_named_in(file)
+            log = f"see {file.name}" if log is None else f"'{Path(log).name}'"
             raise InputError(f"{folder}: holds the results of a log ({log}); choose another folder with --out")
         raise InputError(f"{folder}: is not empty and holds no study; choose another folder with --out")
     if not overwrite:
@@ -121,14 +120,6 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
             _remove(folder / name)
     for name in _COMMON:
         _remove(folder / name)
-
-
-def _log_of(marker: Path) -> str:
-    """Name of the log that results are of, quoted."""
-    try:
-        return f"'{Path(read_json(marker)['file']).name}'"
-    except (InputError, KeyError, TypeError):
-        return f"see {marker.name}"
 
 
 def _remove(path: Path) -> None:

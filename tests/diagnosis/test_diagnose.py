@@ -17,7 +17,7 @@ from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.errors import InputError
 from jaxbl.identification.trajectory import Free
 from jaxbl.records import read_record
-from jaxbl.report.diagnosed import diagnosis_lines, write_diagnosis_report
+from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
 
 
 @pytest.fixture(scope="module")

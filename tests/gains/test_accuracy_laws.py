@@ -12,7 +12,7 @@ import jaxbl
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
 from jaxbl.gains.accuracy_laws import LEAST_POINTS, accuracy_laws, fit_power_law
-from jaxbl.report.reports import write_sweep_report
+from jaxbl.report.sweep import write_sweep_report
 from jaxbl.sweeps.sweep import sweep
 
 PERIOD, WORDS = "run.sample_period", "observer.discretisation"

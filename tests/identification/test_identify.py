@@ -8,7 +8,7 @@ from small_study import rigid, small
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
 from jaxbl.identification.identify import identify
-from jaxbl.report.identified import write_identification_report
+from jaxbl.report.identify import write_identification_report
 from jaxbl.sweeps.trial import run
 
 LAW = {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08}
@@ -105,7 +105,7 @@ def test_model_runs_with_the_numbers_found(found, tmp_path):
 def test_report_has_every_number_and_figure(found, tmp_path):
     lines = write_identification_report(found, tmp_path)
     assert lines[0].startswith("drive.motor_inertia = 0.05")
-    assert any("the model leaves nothing but noise" in line for line in lines)
+    assert any("times the noise: noise alone." in line for line in lines)
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"identification.json", "model.toml", "trace.parquet", "figures", "report.html"}
     drawn = {path.stem for path in (tmp_path / "figures").iterdir()}

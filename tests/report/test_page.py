@@ -6,8 +6,9 @@ from html.parser import HTMLParser
 import pandas as pd
 from small_study import ALPHA, LAMBDA, listed, made, rigid, small, spaced
 
-from jaxbl.report.page import Picture, TableOf, html
-from jaxbl.report.reports import write_sweep_report, write_trial_report
+from jaxbl.report.page import PageTable, html
+from jaxbl.report.simulate import write_trial_report
+from jaxbl.report.sweep import write_sweep_report
 from jaxbl.sweeps.trial import run
 
 VOID = {"meta", "img"}
@@ -41,8 +42,8 @@ HOSTILE = "<script>alert('a')</script> & \"b\" <b>"
 
 def test_everything_is_escaped_and_in_its_place(tmp_path):
     (tmp_path / "a.png").write_bytes(b"png")
-    table = TableOf(HOSTILE, [HOSTILE, "n"], [[HOSTILE, 1.23456789], [None, True], ["x", float("nan")], ["y", 3]])
-    text = html(HOSTILE, [HOSTILE], [HOSTILE], [Picture(tmp_path / "a.png", HOSTILE)], [table], f'title = "{HOSTILE}"')
+    table = PageTable(HOSTILE, [HOSTILE, "n"], [[HOSTILE, 1.23456789], [None, True], ["x", float("nan")], ["y", 3]])
+    text = html(HOSTILE, [HOSTILE], [HOSTILE], [(tmp_path / "a.png", HOSTILE)], [table], f'title = "{HOSTILE}"')
     page = Page(text)
     assert "script" not in page.tags
     assert "b" not in page.tags

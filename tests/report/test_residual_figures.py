@@ -6,8 +6,8 @@ import pytest
 from jaxbl.diagnosis.localise import Values, describe, locate
 from jaxbl.diagnosis.observer_residual import Observed
 from jaxbl.diagnosis.residuals import Residual
+from jaxbl.report.figures import save
 from jaxbl.report.residuals import draw_residuals
-from jaxbl.report.style import save
 
 
 def made(name, torque, time):

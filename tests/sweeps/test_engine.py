@@ -10,7 +10,7 @@ from small_study import ALPHA, LAMBDA, NOISE, listed, rigid, small, spaced
 
 from jaxbl.config import read_config, with_values
 from jaxbl.errors import InputError
-from jaxbl.report.reports import headline
+from jaxbl.report.sweep import headline
 from jaxbl.sweeps.engine import Engine, Layout
 from jaxbl.sweeps.programs import faster
 from jaxbl.sweeps.sweep import StudyResult, dry_run, sweep

@@ -14,7 +14,7 @@ from small_study import ALPHA, LAMBDA, NOISE, listed, rigid, small, spaced
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
-from jaxbl.report.reports import headline
+from jaxbl.report.sweep import headline
 from jaxbl.sweeps.engine import Engine, Layout
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.programs import BACKENDS

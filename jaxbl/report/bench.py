@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 from jaxbl.files import make_folder, write_atomic
 from jaxbl.throughput.run import CEILING, OURS, PRECISIONS, SCAN, Result
 
-from .maps import Drawn
-from .reports import save_all
+from .figures import Drawn
+from .page import save_all
 from .style import COLOURS, style
 
 _COLUMNS: list[str] = ["", "bits", "lanes", "lane-steps/s", "median", "of C++", "first call", "deviation"]

@@ -15,8 +15,8 @@ from jaxbl.identification.identify import Identification
 from jaxbl.identification.logs import unit_on
 from jaxbl.identification.regression import Kinematics, model_torques
 from jaxbl.records import read_record
-from jaxbl.report.identified import draw_identification, write_identification_report
-from jaxbl.report.style import save
+from jaxbl.report.figures import save
+from jaxbl.report.identify import draw_identification, write_identification_report
 from jaxbl.sweeps.trial import run
 
 GEARED = ["intervals", "residuals", "velocities", "torque", "hysteresis", "limit_cycle", "recursive"]
@@ -146,7 +146,7 @@ def test_all_figures_are_drawn_with_units(case, tmp_path):
     if case == "effects":
         assert any("half width 0.09" in text for text in labels(shown["hysteresis"]))
     if case == "gap":
-        assert [text.get_text() for text in shown["intervals"].axes[0].texts][-1] == "held: not shown by this log"
+        assert [text.get_text() for text in shown["intervals"].axes[0].texts][-1] == "held at nominal: not seen in this log"
 
 
 def labels(figure: Figure) -> list[str]:
@@ -159,7 +159,7 @@ def test_a_linear_axis_has_newtons_and_metres(tmp_path):
     words = "\n".join(write_identification_report(found, tmp_path))
     assert "drive.motor_inertia = 0.05 ± 0.001 kg," in words
     assert "drive.motor_viscous = 0.15 ± 0.001 N s/m," in words
-    assert "met to 0.0001 m rms" in words
+    assert "position residual 0.0001 m rms" in words
     figures = {one.name: one.figure for one in draw_identification(found)}
     assert figures["velocities"].axes[0].get_ylabel() == "motor velocity (m/s)"
     assert figures["resistance"].axes[0].get_ylabel() == "resisting force (N)"
@@ -189,20 +189,6 @@ def test_long_log_shows_its_largest_motion_in_full(tmp_path):
     low, high = above.get_xlim()
     assert 5.9 < low < high < 8.1
     assert below.get_xlim() == pytest.approx((0.0, 10.0), abs=0.01)
-
-
-def test_outline_keeps_the_extremes_and_the_order():
-    from jaxbl.report.identified import _outline
-
-    values = np.random.default_rng(0).standard_normal(100_003)
-    values[7] = 50.0
-    values[99_999] = -60.0
-    values[2000:9000] = np.nan
-    at = _outline(values, 2400)
-    assert len(at) < 2500
-    assert np.all(np.diff(at) >= 0)
-    assert np.nanmax(values[at]) == 50.0 and np.nanmin(values[at]) == -60.0
-    assert np.isnan(values[at]).any()
 
 
 def test_observers_that_diverged_leave_figures(tmp_path):

@@ -1,12 +1,10 @@
-"""What `jaxbl diagnose` leaves to be read: what is missing, how surely, where, and the gap before and after."""
+"""What `jaxbl diagnose` leaves to be read: missing effects, their probability, and model errors before and after."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -14,14 +12,13 @@ from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.diagnosis.residuals import narrowed
 from jaxbl.identification.logs import unit_on
 
-from .maps import Drawn
-from .page import TableOf, html
-from .reports import drafted, save_all, write_model
-from .residuals import draw_residuals, outline
-from .style import COLOURS, style, with_unit
+from .figures import Drawn, outline, stacked_axes
+from .log_results import write_log_results
+from .page import PageTable
+from .residuals import draw_residuals, missing_quantity
+from .style import COLOURS, FAINT, LEGEND_ABOVE, MISSING, style, with_unit
 
-_BEFORE, _AFTER, _FLOOR, _FAINT = COLOURS[1], COLOURS[0], COLOURS[6], "#8C8C8C"
-_SHADE, _HELD = "#BDBDBD", COLOURS[4]
+_BEFORE, _AFTER, _FLOOR, _HELD = COLOURS[1], COLOURS[0], COLOURS[6], COLOURS[4]
 _CHANNELS = {
     "theta_e": "motor position", "theta_s": "load position", "velocity_motor": "motor speed", "velocity_load": "load speed",
     "torque_motor": "motor: missing torque", "torque_load": "load: missing torque",
@@ -33,20 +30,10 @@ def write_diagnosis_report(found: Diagnosis, folder: Path) -> list[str]:
 
     They are put there together when all are drawn. Returns the lines for the terminal.
     """
-    return drafted(folder, "diagnosis.json", lambda draft: _write(found, draft))
-
-
-def _write(found: Diagnosis, folder: Path) -> list[str]:
-    pictures = save_all(draw_diagnosis(found), folder)
-    found.trace.to_parquet(folder / "trace.parquet", index=False)
-    text = write_model(found.model, folder, replays=found.replays)
-    lead, remarks = _headline(found.summary), _remarks(found.summary)
     tables = [*_finding_tables(found.summary), _gap_table(found.summary["gap"]), _number_table(found.summary)]
     title = found.config.title or f"Diagnosis of {found.record.path.name}"
-    (folder / "report.html").write_text(html(title, lead, remarks, pictures, tables, text), encoding="utf-8")
-    content = json.dumps(found.summary, indent=1, ensure_ascii=False)
-    (folder / "diagnosis.json").write_text(content, encoding="utf-8")
-    return [*lead, *remarks]
+    lead, remarks = _headline(found.summary), _remarks(found.summary)
+    return write_log_results(found, folder, "diagnosis.json", title, lead, draw_diagnosis(found), tables, remarks)
 
 
 def diagnosis_lines(summary: dict[str, Any]) -> list[str]:
@@ -58,9 +45,9 @@ def _headline(summary: dict[str, Any]) -> list[str]:
     lines = [verdict_sentence(summary)]
     for one in summary["findings"]:
         numbers = ", ".join(_number(leaf, number) for leaf, number in one["parameters"].items())
-        lines.append(f"{one['effect']} (confidence {_chance(one['confidence'])}): {numbers}.")
+        lines.append(f"{one['effect']} (confidence {probability(one['confidence'])}): {numbers}.")
         if one["alternatives"]:
-            others = ", ".join(f"{other['effect']} ({_chance(other['confidence'])})" for other in one["alternatives"])
+            others = ", ".join(f"{other['effect']} ({probability(other['confidence'])})" for other in one["alternatives"])
             lines.append(f"  This log does not rule out in its place: {others}.")
     return [*lines, *_gap_lines(summary["gap"])]
 
@@ -84,7 +71,8 @@ def _number(leaf: str, one: Mapping[str, Any]) -> str:
     return f"{leaf} = {one['value']:.5g}{error}{unit}"
 
 
-def _chance(value: float) -> str:
+def probability(value: float) -> str:
+    """A probability in text: more digits near 1."""
     return "> 0.999" if value > 0.999 else f"{value:.3f}" if value > 0.99 else f"{value:.2f}"
 
 
@@ -95,7 +83,7 @@ def _gap_lines(gap: Mapping[str, Any]) -> list[str]:
     else:
         place = f"On the last part of the log ({gap['holdout']['from']:.4g} to {gap['holdout']['to']:.4g} s), held out"
     told = [
-        f"{name} {_value(before[name])} -> {_value(after[name])} {units[name]} (floor {_value(floor[name])})"
+        f"{name} {rms_text(before[name])} -> {rms_text(after[name])} {units[name]} (floor {rms_text(floor[name])})"
         for name in before
         if not name.startswith("velocity")
     ]
@@ -103,7 +91,7 @@ def _gap_lines(gap: Mapping[str, Any]) -> list[str]:
     run = gap["free_run"]
     if "after" in run:
         parts = [
-            f"{name} {_value(run['before'][name])} -> {_value(one)} {units[name]}"
+            f"{name} {rms_text(run['before'][name])} -> {rms_text(one)} {units[name]}"
             for name, one in run["after"].items()
             if not name.startswith("velocity")
         ]
@@ -113,7 +101,8 @@ def _gap_lines(gap: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _value(value: float | None) -> str:
+def rms_text(value: float | None) -> str:
+    """An rms value in text; None is a run that diverged."""
     return "diverges" if value is None else f"{value:.3g}"
 
 
@@ -136,7 +125,7 @@ def _remarks(summary: dict[str, Any]) -> list[str]:
         channel = next(iter(control["rmse"]))
         what = {"wrong": "the best model with another effect", "permuted": "the missing torque in the wrong order"}[name]
         left = control["rmse"][channel]
-        told = "diverges" if left is None else f"leaves {_value(left)} {summary['gap']['units'][channel]} in {channel}"
+        told = "diverges" if left is None else f"leaves {rms_text(left)} {summary['gap']['units'][channel]} in {channel}"
         lines.append(f"Control: {what}{effect} {told}.")
     return [*lines, *summary["notes"]]
 
@@ -148,9 +137,9 @@ def _witness(side: str, where: Mapping[str, Any], units: Mapping[str, str]) -> s
         return ""
     unit = units[f"torque_{side}"]
     if one["rms"] < _BEYOND * one["noise"]:
-        return f"{side} side, nothing beyond its noise ({_value(one['noise'])} {unit} rms)"
+        return f"{side} side, nothing beyond its noise ({rms_text(one['noise'])} {unit} rms)"
     return (
-        f"{side} side, {_value(one['rms'])} {unit} rms (its noise {_value(one['noise'])}), correlation "
+        f"{side} side, {rms_text(one['rms'])} {unit} rms (its noise {rms_text(one['noise'])}), correlation "
         f"{one['correlation']:.2f} with the smoother's"
     )
 
@@ -163,7 +152,7 @@ _FREE = {
 }  # fmt: skip
 
 
-def _finding_tables(summary: Mapping[str, Any]) -> list[TableOf]:
+def _finding_tables(summary: Mapping[str, Any]) -> list[PageTable]:
     rows: list[list[object]] = []
     for one in summary["findings"]:
         for leaf, number in one["parameters"].items():
@@ -171,36 +160,36 @@ def _finding_tables(summary: Mapping[str, Any]) -> list[TableOf]:
             rows.append([one["effect"], one["confidence"], leaf, number["value"], error, number["unit"]])
         rows += [[f"or {other['effect']}", other["confidence"], "", "", "", ""] for other in one["alternatives"]]
     columns = ["effect", "confidence", "number", "value", "standard error", "unit"]
-    return [TableOf("What is missing", columns, rows)] if rows else []
+    return [PageTable("What is missing", columns, rows)] if rows else []
 
 
-def _gap_table(gap: Mapping[str, Any]) -> TableOf:
+def _gap_table(gap: Mapping[str, Any]) -> PageTable:
     controls = gap["controls"]
     rows: list[list[object]] = []
     for name, before in gap["holdout_rmse_before"].items():
         others = [one["rmse"].get(name) for one in controls.values()]
         rows.append([_CHANNELS[name], gap["units"][name], before, gap["holdout_rmse_after"][name], gap["noise_floor"][name]])
         rows[-1] += others
-    return TableOf("Held-out data, rms", ["channel", "unit", "before", "after", "noise", *controls], rows)
+    return PageTable("Held-out data, rms", ["channel", "unit", "before", "after", "noise", *controls], rows)
 
 
-def _number_table(summary: Mapping[str, Any]) -> TableOf:
+def _number_table(summary: Mapping[str, Any]) -> PageTable:
     rows: list[list[object]] = [
         [path, one["nominal"], one["value"], one["standard_error"], one["unit"]]
         for path, one in summary["parameters"].items()
     ]
-    return TableOf("The model's own numbers", ["number", "as given", "fitted", "standard error", "unit"], rows)
+    return PageTable("The model's own numbers", ["number", "as given", "fitted", "standard error", "unit"], rows)
 
 
 def draw_diagnosis(found: Diagnosis) -> list[Drawn]:
     """All figures of a diagnosis."""
     unit = unit_on(found.record, "motor.torque", "N m")
     with style():
-        drawn = [_story(found.summary), _over_time(found)]
+        drawn = [_verdict(found.summary), _over_time(found)]
     return [*drawn, *draw_residuals(found.residuals, found.coordinates, found.located, unit, found.observed)]
 
 
-def _story(summary: Mapping[str, Any]) -> Drawn:
+def _verdict(summary: Mapping[str, Any]) -> Drawn:
     """Each channel's error over its noise: before, after, floor, controls; and what is missing, how surely."""
     gap = summary["gap"]
     names = list(gap["holdout_rmse_before"])
@@ -230,7 +219,7 @@ def _gap_panel(ax: Axes, gap: Mapping[str, Any], names: list[str]) -> None:
     for row, start, stop in zip(rows, before, after, strict=True):
         # a hardly changed error needs no arrow
         if np.isfinite([start, stop]).all() and abs(np.log(start / stop)) > 0.25:
-            ax.annotate("", (stop, row), (start, row), arrowprops={"arrowstyle": "-|>", "color": _FAINT, "lw": 1.2})
+            ax.annotate("", (stop, row), (start, row), arrowprops={"arrowstyle": "-|>", "color": FAINT, "lw": 1.2})
     markers = {"wrong": ("x", "another effect"), "permuted": ("+", "wrong order in time")}
     every = [before, after]
     for name, control in gap["controls"].items():
@@ -238,7 +227,7 @@ def _gap_panel(ax: Axes, gap: Mapping[str, Any], names: list[str]) -> None:
         if "effect" in control:
             label = f"{label} ({control['effect']})"
         every.append(over(control["rmse"]))
-        ax.plot(every[-1], rows + 0.24, marker, color=_FAINT, ms=7, mew=1.6, ls="none", label=f"control: {label}")
+        ax.plot(every[-1], rows + 0.24, marker, color=FAINT, ms=7, mew=1.6, ls="none", label=f"control: {label}")
     ax.plot(before, rows, "D", color=_BEFORE, ms=7, ls="none", label="before", zorder=4)
     ax.plot(after, rows, "o", color=_AFTER, ms=7, ls="none", label="after", zorder=5)
     ax.axvline(1.0, color=_FLOOR, lw=1.6, label="noise")
@@ -248,7 +237,7 @@ def _gap_panel(ax: Axes, gap: Mapping[str, Any], names: list[str]) -> None:
     ax.set_xlim(0.5 * min(float(values.min(initial=1.0)), 1.0), 2.0 * max(float(values.max(initial=1.0)), 3.0))
     ax.set_ylim(len(names) - 0.4, -0.6)
     labels = [
-        f"{_CHANNELS[name]}\n{_value(gap['holdout_rmse_before'][name])} → {_value(gap['holdout_rmse_after'][name])} "
+        f"{_CHANNELS[name]}\n{rms_text(gap['holdout_rmse_before'][name])} → {rms_text(gap['holdout_rmse_after'][name])} "
         f"{gap['units'][name]}"
         for name in names
     ]
@@ -276,12 +265,12 @@ def _chances_panel(ax: Axes, bars: list[tuple[str, float, bool]]) -> None:
     ax.set_xlabel("confidence")
     if not bars:
         ax.set_yticks([])
-        ax.text(0.5, 0.5, "no effect named", transform=ax.transAxes, ha="center", va="center", color=_FAINT)
+        ax.text(0.5, 0.5, "no effect named", transform=ax.transAxes, ha="center", va="center", color=FAINT)
         return
     rows = np.arange(len(bars))
-    ax.barh(rows, [chance for _, chance, _ in bars], 0.3, color=[_AFTER if sure else _SHADE for _, _, sure in bars])
+    ax.barh(rows, [chance for _, chance, _ in bars], 0.3, color=[_AFTER if sure else MISSING for _, _, sure in bars])
     for row, (name, chance, _) in zip(rows, bars, strict=True):
-        ax.text(0.0, row - 0.22, f" {name}: {_chance(chance)}", ha="left", va="bottom", fontsize=9)
+        ax.text(0.0, row - 0.22, f" {name}: {probability(chance)}", ha="left", va="bottom", fontsize=9)
     ax.set_yticks([])
     ax.set_ylim(max(len(bars), 3) - 0.4, -0.8)
     ax.grid(visible=False, axis="y")
@@ -289,8 +278,7 @@ def _chances_panel(ax: Axes, bars: list[tuple[str, float, bool]]) -> None:
 
 def _over_time(found: Diagnosis) -> Drawn:
     """Torque that the model lacks, before and after."""
-    figure = Figure(figsize=(9.0, 2.4 * len(found.pairs) + 0.6), layout="constrained")
-    axes = figure.subplots(len(found.pairs), 1, sharex=True, squeeze=False).ravel()
+    figure, axes = stacked_axes(len(found.pairs), 2.4)
     for ax, (side, pieces) in zip(axes, found.pairs.items(), strict=True):
         unit = unit_on(found.record, f"{side}.torque", "N m")
         cutoff = found.located[side].bandwidth
@@ -299,11 +287,12 @@ def _over_time(found: Diagnosis) -> Drawn:
             low, _ = narrowed(before, cutoff)
             rest, _ = narrowed(after, cutoff)
             for one, colour, label in ((low, _BEFORE, "before"), (rest, _AFTER, "after")):
-                time, torque, band = outline(one.time, one.torque, 2.0 * one.deviation)
-                ax.plot(time, torque, color=colour, lw=0.9, label=None if label in labelled else label)
+                at = outline(one.torque)
+                time, band = one.time[at], 2.0 * one.deviation[at]
+                ax.plot(time, one.torque[at], color=colour, lw=0.9, label=None if label in labelled else label)
                 labelled.add(label)
             ax.fill_between(
-                time, -band, band, color=_SHADE, alpha=0.6, lw=0.0, zorder=3,
+                time, -band, band, color=MISSING, alpha=0.6, lw=0.0, zorder=3,
                 label=None if "noise" in labelled else "± 2 noise",
             )  # fmt: skip
             labelled.add("noise")
@@ -313,8 +302,8 @@ def _over_time(found: Diagnosis) -> Drawn:
                     label=None if "held" in labelled else "held out",
                 )  # fmt: skip
                 labelled.add("held")
-        ax.set_ylabel(with_unit(f"{side}:\nmissing {'force' if unit == 'N' else 'torque'}", unit))
-        ax.legend(ncols=4, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, columnspacing=1.2)
+        ax.set_ylabel(with_unit(f"{side}:\nmissing {missing_quantity(unit)}", unit))
+        ax.legend(ncols=4, **LEGEND_ABOVE)
     axes[-1].set_xlabel("time (s)")
     which = f"Held-out log {found.holdout.path.name}: t" if found.summary["gap"]["holdout"]["separate"] else "T"
     caption = (
@@ -322,35 +311,3 @@ def _over_time(found: Diagnosis) -> Drawn:
         "it stands out. A complete model stays within the grey band."
     )
     return Drawn("before_after", figure, caption)
-
-
-_SAID = {"explained": "explained", "no_discrepancy": "no discrepancy", "unknown_effect": "unknown effect"}
-
-
-def batch_row(log: Path, summary: Mapping[str, Any] | None, refused: str = "") -> dict[str, Any]:
-    """A row of `batch.csv`: what a log's diagnosis says, or why there is none."""
-    row: dict[str, Any] = {"log": log.name, "verdict": "", "findings": "", "confidence": None, "refused": refused}
-    if summary is None:
-        return row
-    row["verdict"] = summary["verdict"]
-    row["findings"] = "; ".join(one["effect"] for one in summary["findings"])
-    row["confidence"] = min((one["confidence"] for one in summary["findings"]), default=None)
-    for name in summary["gap"]["holdout_rmse_before"]:
-        for key, column in (("holdout_rmse_before", "before"), ("holdout_rmse_after", "after"), ("noise_floor", "floor")):
-            row[f"{name}_{column}"] = summary["gap"][key][name]
-    return row
-
-
-def write_batch(rows: list[dict[str, Any]], folder: Path) -> list[str]:
-    """Write `batch.csv`; returns a table for the terminal."""
-    pd.DataFrame(rows).to_csv(folder / "batch.csv", index=False)
-    width = max(len(row["log"]) for row in rows)
-    lines = []
-    for row in rows:
-        if row["refused"]:
-            lines.append(f"{row['log']:<{width}}  refused         {row['refused']}")
-            continue
-        named = f"{row['findings']} ({_chance(row['confidence'])})" if row["findings"] else ""
-        gap = f"{_value(row['theta_e_before'])} -> {_value(row['theta_e_after'])} ({_value(row['theta_e_floor'])})"
-        lines.append(f"{row['log']:<{width}}  {_SAID[row['verdict']]:<14}  {named}  theta_e {gap}")
-    return lines

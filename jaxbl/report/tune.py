@@ -18,9 +18,9 @@ from jaxbl.gains.tune_summary import called_gains
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
-from .maps import SIDES, Drawn, cell_edges, color_norm, condition_curves
-from .page import TableOf, html
-from .reports import save_all
+from .figures import SIDES, Drawn
+from .maps import cell_edges, color_norm, condition_curves
+from .page import PageTable, write_report
 from .style import COLOURS, HATCH, MAP, MISSING, style, with_unit
 
 _MARKS = ("o", "s", "^", "D", "v", "P", "X")
@@ -198,22 +198,14 @@ def write_tune_report(tuning: Tuning, folder: Path) -> list[str]:
     lead = _tune_headline(summary)
     write_atomic(folder / "gains.toml", gains_toml(summary))
     write_atomic(folder / "tuning.json", json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False))
-    pictures = save_all(draw_tuning(tuning), folder)
-    page = html(
-        tuning.config.title or "Gains",
-        lead,
-        summary["remarks"],
-        pictures,
-        [
-            _gains_table(summary),
-            _comparison_table(f"{_holdout_title(summary)}, worst and median of all runs", summary["holdout"]["rows"]),
-            _comparison_table("On the study's own excitation, worst and median of all runs", summary["named"]),
-            *_pareto_tables(summary),
-        ],
-        tuning.config.to_toml(),
-    )
-    write_atomic(folder / "report.html", page)
-    return [*lead, *summary["remarks"]]
+    tables = [
+        _gains_table(summary),
+        _comparison_table(f"{_holdout_title(summary)}, worst and median of all runs", summary["holdout"]["rows"]),
+        _comparison_table("On the study's own excitation, worst and median of all runs", summary["named"]),
+        *_pareto_tables(summary),
+    ]
+    title, config = tuning.config.title or "Gains", tuning.config.to_toml()
+    return write_report(folder, title, lead, draw_tuning(tuning), tables, config, summary["remarks"])
 
 
 def gains_toml(summary: dict[str, Any]) -> str:
@@ -287,7 +279,7 @@ def _tune_headline(summary: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _gains_table(summary: dict[str, Any]) -> TableOf:
+def _gains_table(summary: dict[str, Any]) -> PageTable:
     rows: list[list[object]] = []
     for side, gains in summary["gains"].items():
         found, step = summary["achieved"][side], summary["resolution"][side]
@@ -298,10 +290,10 @@ def _gains_table(summary: dict[str, Any]) -> TableOf:
         )  # fmt: skip
     columns = ["side", "λ (√rad/s)", "α (rad/s²)", "λ/√f⁺", "α/f⁺", "f⁺ (rad/s²)", "velocity error (rad/s)",
                "torque error (N m)", "convergence (s)", "margin α", "margin exact", "ρ", "last step (%)"]  # fmt: skip
-    return TableOf("Chosen gains, worst of all runs", columns, rows)
+    return PageTable("Chosen gains, worst of all runs", columns, rows)
 
 
-def _comparison_table(heading: str, found: list[dict[str, Any]]) -> TableOf:
+def _comparison_table(heading: str, found: list[dict[str, Any]]) -> PageTable:
     rows: list[list[object]] = [
         [row["side"], row["name"], row["lambda"], row["alpha"], 100.0 * row["converged"],
          *(row[name][how] for name in ("velocity_rmse", "torque_rmse") for how in ("worst", "median")),
@@ -310,14 +302,14 @@ def _comparison_table(heading: str, found: list[dict[str, Any]]) -> TableOf:
     ]  # fmt: skip
     columns = ["side", "gains", "λ", "α", "converged (%)", "velocity error (rad/s)", "median", "torque error (N m)",
                "median", "convergence (s)", "margin α", "margin exact", "ρ"]  # fmt: skip
-    return TableOf(heading, columns, rows)
+    return PageTable(heading, columns, rows)
 
 
-def _pareto_tables(summary: dict[str, Any]) -> list[TableOf]:
+def _pareto_tables(summary: dict[str, Any]) -> list[PageTable]:
     unit = SIDE_METRICS[f"{summary['objective']}_rmse"].unit
     columns = ["λ", "α", "λ/√f⁺", "α/f⁺", "convergence time (s)", f"{summary['objective']} error ({unit})"]
     return [
-        TableOf(
+        PageTable(
             f"No gains beat these in both convergence time and error: {side}", columns, [list(row.values()) for row in rows]
         )
         for side, rows in summary["pareto"].items()

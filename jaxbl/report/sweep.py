@@ -1,31 +1,24 @@
-"""What the commands leave behind: figures, summary and report of a sweep and of a single run."""
+"""What `jaxbl sweep` and `jaxbl plot` leave to be read: maps and lines, accuracy laws, tables."""
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
 # pyright: reportReturnType=false
 
 import json
-import os
-from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pandas as pd
-import tomli_w
 
-from jaxbl.config import Config
 from jaxbl.files import write_atomic
 from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law, accuracy_laws
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.store import Store
 from jaxbl.sweeps.sweep import StudyResult
-from jaxbl.sweeps.trial import Trial
 
-from .maps import SIDES, Drawn, draw
-from .page import Picture, TableOf, html
-from .style import save
-from .traces import draw_trial
+from .figures import SIDES
+from .maps import draw
+from .page import PageTable, write_report
 
 
 def write_sweep_report(result: StudyResult, folder: Path) -> list[str]:
@@ -33,22 +26,16 @@ def write_sweep_report(result: StudyResult, folder: Path) -> list[str]:
 
     Returns the headline's lines.
     """
-    pictures = save_all(draw(result), folder)
+    drawn = draw(result)
     laws = accuracy_laws(result)
     if laws:
         write_atomic(folder / "laws.json", json.dumps([law.to_dict() for law in laws], indent=2, ensure_ascii=False))
     else:
         (folder / "laws.json").unlink(missing_ok=True)
     lead = [*headline(result), *_law_lines(laws)]
-    page = html(
-        result.config.title or "Study",
-        lead,
-        result.config.notes,
-        pictures,
-        [*([_law_table(laws)] if laws else []), _axes_table(result), _metric_table(result)],
-        result.config.to_toml(),
-    )
-    write_atomic(folder / "report.html", page)
+    tables = [*([_law_table(laws)] if laws else []), _axes_table(result), _metric_table(result)]
+    config = result.config
+    write_report(folder, config.title or "Study", lead, drawn, tables, config.to_toml(), config.notes)
     return lead
 
 
@@ -124,7 +111,7 @@ def _place(law: Law) -> str:
     return ", ".join(value if isinstance(value, str) else f"{path} = {value:g}" for path, value in pairs) or "all points"
 
 
-def _law_table(laws: list[Law]) -> TableOf:
+def _law_table(laws: list[Law]) -> PageTable:
     rows: list[list[object]] = []
     for law in laws:
         fit = law.fit
@@ -136,84 +123,19 @@ def _law_table(laws: list[Law]) -> TableOf:
         line = f"{law.value} over {law.x}"
         rows.append([line, _place(law), law.theory, slope, halves, law.agrees, ends, _why(law)])
     columns = ["error", "where", "theory", "slope", "halves", "agrees", "range (points)", "why it ends there"]
-    return TableOf("Accuracy laws", columns, rows)
+    return PageTable("Accuracy laws", columns, rows)
 
 
-def write_trial_report(trial: Trial, folder: Path) -> list[str]:
-    """Write trace, summary, figures and report of a run into a folder that exists. Returns the lines for the terminal."""
-    # the summary first: it is what makes the folder this study's
-    write_atomic(folder / "summary.json", json.dumps(trial.summary, indent=2, ensure_ascii=False))
-    draft = folder / f".trace.{os.getpid()}.draft"
-    trial.trace.to_parquet(draft, index=False)
-    draft.replace(folder / "trace.parquet")
-    pictures = save_all(draw_trial(trial), folder)
-    metrics = trial.summary["metrics"]
-    sides = [side for side in SIDES if f"{side}.converged" in metrics]
-    tables = [
-        TableOf(
-            "Metrics",
-            ["", *sides, "unit", "meaning"],
-            [
-                [name, *(metrics.get(f"{side}.{name}") for side in sides), about.unit, about.doc]
-                for name, about in SIDE_METRICS.items()
-                if f"motor.{name}" in metrics
-            ],
-        )
-    ]
-    lead = []
-    if identified := trial.summary["identified"]:
-        rows = [[name, values["true"], *(values[side] for side in sides)] for name, values in identified.items()]
-        tables.insert(0, TableOf("Identified", ["", "true", *sides], rows))
-        for name, values in identified.items():
-            found = ", ".join(f"{_number(values[side])} ({side})" for side in sides)
-            lead.append(f"{name}: {found}; true {values['true']:.4g}")
-    remarks = trial.summary["remarks"]
-    page = html(trial.config.title or "Run", lead, remarks, pictures, tables, trial.config.to_toml())
-    write_atomic(folder / "report.html", page)
-    return [*lead, *remarks]
-
-
-def _number(value: float | None) -> str:
-    return "undetermined" if value is None else f"{value:.4g}"
-
-
-def save_all(drawn: list[Drawn], folder: Path) -> list[Picture]:
-    """Write figures into the folder's `figures/`; with their captions, for the page."""
-    return [Picture(save(d.figure, folder / "figures" / f"{d.name}.png"), d.caption) for d in drawn]
-
-
-def drafted(folder: Path, marker: str, write: Callable[[Path], list[str]]) -> list[str]:
-    """Put files into a folder that exists, together when all are written; `marker` last, which says that it is finished."""
-    with TemporaryDirectory(dir=folder, prefix=".draft.") as draft:
-        lines = write(Path(draft))
-        for file in sorted(Path(draft).rglob("*"), key=lambda one: one.name == marker):
-            if file.is_file():
-                place = folder / file.relative_to(draft)
-                place.parent.mkdir(exist_ok=True)
-                file.replace(place)
-    return lines
-
-
-def write_model(model: Config, folder: Path, *, replays: bool) -> str:
-    """Write `model.toml`; where it `replays`, its excitation is that of `trace.parquet` beside it. Returns the text."""
-    data = model.resolved()
-    if replays:
-        data["excitation"] = {"kind": "recorded", "file": "trace.parquet", "time_column": "t", "torque_column": "u"}
-    text = tomli_w.dumps(data)
-    (folder / "model.toml").write_text(text, encoding="utf-8")
-    return text
-
-
-def _axes_table(result: StudyResult) -> TableOf:
+def _axes_table(result: StudyResult) -> PageTable:
     rows: list[list[object]] = []
     for axis in result.config.axes:
         column = result.read([axis.path])[axis.path]
         ends = ["–", "–"] if not pd.api.types.is_numeric_dtype(column) else [column.min(), column.max()]
         rows.append([axis.path, int(column.nunique()), *ends])
-    return TableOf("Axes", ["path", "values", "least", "largest"], rows)
+    return PageTable("Axes", ["path", "values", "least", "largest"], rows)
 
 
-def _metric_table(result: StudyResult) -> TableOf:
+def _metric_table(result: StudyResult) -> PageTable:
     rows: list[list[object]] = []
     for side in SIDES:
         for name, about in SIDE_METRICS.items():
@@ -223,4 +145,4 @@ def _metric_table(result: StudyResult) -> TableOf:
                 values = values[values.abs() < float("inf")]
                 quantiles = [values.quantile(q) if len(values) else None for q in (0.05, 0.5, 0.95)]
                 rows.append([column, *quantiles, about.unit, about.doc])
-    return TableOf("Metrics over all runs", ["metric", "5 %", "median", "95 %", "unit", "meaning"], rows)
+    return PageTable("Metrics over all runs", ["metric", "5 %", "median", "95 %", "unit", "meaning"], rows)

@@ -7,7 +7,7 @@ import pytest
 from small_study import ALPHA, LAMBDA, listed, rigid, spaced
 
 from jaxbl.gains.verify import verify
-from jaxbl.report.atlas import draw_verdict, write_verify_report
+from jaxbl.report.verify import draw_verdict, write_verify_report
 
 ATLAS = {
     "alpha_ratio": {"start": 1.02, "stop": 20.0, "num": 24},

@@ -1,23 +1,66 @@
-"""Figures of one run: the analogues of Figs. 7 to 17 of the paper, and its limit cycle (Fig. 28)."""
+"""What `jaxbl simulate` leaves to be read. The figures are the analogues of Figs. 7 to 17 and 28 of the paper."""
+
+import json
+import os
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from jaxbl.drive.parameters import parameters
+from jaxbl.files import write_atomic
+from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.trial import Trial
 
-from .maps import Drawn
-from .style import COLOURS, style
+from .figures import SIDES, Drawn
+from .page import PageTable, write_report
+from .style import COLOURS, FAINT, LEGEND_ABOVE, SIDE_COLOURS, style, with_unit
 
-_TRUE, _MOTOR, _LOAD = COLOURS[6], COLOURS[0], COLOURS[1]
+_TRUE, _OBSERVED = COLOURS[6], COLOURS[1]
 _POINTS = 6000
+"""Points of a line: a page is about 1000 pixels wide."""
+
+
+def write_trial_report(trial: Trial, folder: Path) -> list[str]:
+    """Write trace, summary, figures and report of a run into a folder that exists. Returns the lines for the terminal."""
+    # the summary first: it is what makes the folder this study's
+    write_atomic(folder / "summary.json", json.dumps(trial.summary, indent=2, ensure_ascii=False))
+    draft = folder / f".trace.{os.getpid()}.draft"
+    trial.trace.to_parquet(draft, index=False)
+    draft.replace(folder / "trace.parquet")
+    metrics = trial.summary["metrics"]
+    sides = [side for side in SIDES if f"{side}.converged" in metrics]
+    tables = [
+        PageTable(
+            "Metrics",
+            ["", *sides, "unit", "meaning"],
+            [
+                [name, *(metrics.get(f"{side}.{name}") for side in sides), about.unit, about.doc]
+                for name, about in SIDE_METRICS.items()
+                if f"motor.{name}" in metrics
+            ],
+        )
+    ]
+    lead = []
+    if identified := trial.summary["identified"]:
+        rows = [[name, values["true"], *(values[side] for side in sides)] for name, values in identified.items()]
+        tables.insert(0, PageTable("Identified", ["", "true", *sides], rows))
+        for name, values in identified.items():
+            found = ", ".join(f"{_number(values[side])} ({side})" for side in sides)
+            lead.append(f"{name}: {found}; true {values['true']:.4g}")
+    title, text = trial.config.title or "Run", trial.config.to_toml()
+    return write_report(folder, title, lead, draw_trial(trial), tables, text, trial.summary["remarks"])
+
+
+def _number(value: float | None) -> str:
+    return "undetermined" if value is None else f"{value:.4g}"
 
 
 def draw_trial(trial: Trial) -> list[Drawn]:
     """All figures of a run."""
-    # more points than this no page shows
     trace = trial.trace.iloc[:: max(len(trial.trace) // _POINTS, 1)]
-    sides = [side for side in ("motor", "load") if f"{side}.position" in trace]
+    sides = [side for side in SIDES if f"{side}.position" in trace]
     with style():
         drawn = [_input(trace)]
         for side in sides:
@@ -52,12 +95,12 @@ _FIGURES = {
 def _observed(trace: pd.DataFrame, side: str, quantity: str, unit: str) -> Drawn:
     figure, (above, below) = _axes(rows=2, height=4.4)
     true, estimate = trace[f"{side}.{quantity}"], trace[f"{side}.{quantity}_estimate"]
-    above.plot(trace["t"], estimate, color=_LOAD, lw=2.4, alpha=0.8, label="observer")
+    above.plot(trace["t"], estimate, color=_OBSERVED, lw=2.4, alpha=0.8, label="observer")
     above.plot(trace["t"], true, color=_TRUE, lw=1.0, label="true")
     above.set(ylabel=f"{side} {quantity} ({unit})")
-    above.legend(ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
-    below.plot(trace["t"], true - estimate, color=_MOTOR)
-    below.axhline(0.0, color="#888888", lw=0.8)
+    above.legend(ncols=2, **LEGEND_ABOVE)
+    below.plot(trace["t"], true - estimate, color=COLOURS[0])
+    below.axhline(0.0, color=FAINT, lw=0.8)
     below.set(xlabel="time (s)", ylabel=f"error ({unit})")
     return Drawn(
         f"{side}_{quantity}", figure,
@@ -67,56 +110,54 @@ def _observed(trace: pd.DataFrame, side: str, quantity: str, unit: str) -> Drawn
 
 def _torque(trace: pd.DataFrame, sides: list[str]) -> Drawn:
     figure, (above, below) = _axes(rows=2, height=4.4)
-    for side, colour in zip(sides, (_MOTOR, _LOAD), strict=False):
-        estimate = trace[f"{side}.torque_estimate"]
+    for side in sides:
+        estimate, colour = trace[f"{side}.torque_estimate"], SIDE_COLOURS[side]
         above.plot(trace["t"], estimate, color=colour, lw=2.0, alpha=0.75, label=f"from the {side} observer")
         below.plot(trace["t"], trace["torque"] - estimate, color=colour, lw=1.0, alpha=0.75)
     above.plot(trace["t"], trace["torque"], color=_TRUE, lw=1.0, label="true")
     name = "transmitted torque C" if len(sides) == 2 else "disturbance torque"
     above.set(ylabel=f"{name} (N m)")
-    above.legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
-    below.axhline(0.0, color="#888888", lw=0.8)
+    above.legend(ncols=3, **LEGEND_ABOVE)
+    below.axhline(0.0, color=FAINT, lw=0.8)
     below.set(xlabel="time (s)", ylabel="error (N m)")
     return Drawn("torque", figure, f"The {name}, true and by the equivalent controls (17) (analogue of Fig. 16).")
 
 
 def _identified(trial: Trial, trace: pd.DataFrame, sides: list[str]) -> Drawn:
-    labels = {"stiffness": "stiffness K (N m/rad)", "dead_zone": "dead zone j₀ (rad)", "half_gap": "half gap (rad)"}
-    names = [name for name in trial.summary["identified"] if name != "half_gap" or len(trial.summary["identified"]) == 2]
+    names = list(trial.summary["identified"])
+    # what a law derives from its own parameters is an angle, as they are
+    units = {field.name: about.unit for field, about in parameters(trial.config.build().transmission)}
     figure, axes = _axes(rows=len(names), height=2.0 * len(names) + 0.6)
     for ax, name in zip(axes, names, strict=True):
         true = trial.summary["identified"][name]["true"]
-        for side, colour in zip(sides, (_MOTOR, _LOAD), strict=True):
-            ax.plot(trace["t"], trace[f"{side}.{name}"], color=colour, label=f"{side} identifier")
+        for side in sides:
+            ax.plot(trace["t"], trace[f"{side}.{name}"], color=SIDE_COLOURS[side], label=f"{side} identifier")
         ax.axhline(true, color=_TRUE, lw=1.0, ls="--", label="true")
-        # the first few samples say nothing yet: keep them from setting the scale
+        # the estimates of the first half still converge: the second half sets the scale
         late = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]][[f"{side}.{name}" for side in sides]]
         largest = float((late - true).abs().max(axis=None))
         reach = max(2.0 * largest if np.isfinite(largest) else 0.0, 0.02 * abs(true), 1e-12)
-        ax.set(ylabel=labels[name], ylim=(true - reach, true + reach))
-        if name == "dead_zone":
-            right = ax.secondary_yaxis("right", functions=(lambda j: 4.0 * j, lambda gap: gap / 4.0))
-            right.set_ylabel("half gap 4 j₀ (rad)")
-    axes[0].legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
+        ax.set(ylabel=with_unit(name.replace("_", " "), units.get(name, "rad")), ylim=(true - reach, true + reach))
+    axes[0].legend(ncols=3, **LEGEND_ABOVE)
     axes[-1].set_xlabel("time (s)")
-    return Drawn("dead_zone", figure, "Identified stiffness and dead zone over time (27)-(28) (analogue of Fig. 16).")
+    return Drawn("dead_zone", figure, "Identified transmission parameters over time (27)-(28) (analogue of Fig. 16).")
 
 
 def _hysteresis(trace: pd.DataFrame) -> Drawn:
     figure, (left, right) = _axes(columns=2, height=3.4, sharex=False)
     last = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]]
-    for side, colour in (("motor", _MOTOR), ("load", _LOAD)):
-        left.plot(last["z"], last[f"{side}.torque_estimate"], color=colour, lw=1.6, alpha=0.75, label=f"{side}")
+    for side in SIDES:
+        left.plot(last["z"], last[f"{side}.torque_estimate"], color=SIDE_COLOURS[side], lw=1.6, alpha=0.75, label=side)
     left.plot(last["z"], last["torque"], ".", ms=1.5, color=_TRUE, label="true")
     left.set(xlabel="twist z = θe − N₀ θs (rad)", ylabel="transmitted torque C (N m)")
     left.legend(ncols=3, loc="lower left", bbox_to_anchor=(-0.1, 1.0), borderaxespad=0.1, columnspacing=0.8)
-    right.plot(last["theta_e"], last["theta_s"], color=_LOAD, lw=1.8, label="measured")
+    right.plot(last["theta_e"], last["theta_s"], color=_OBSERVED, lw=1.8, label="measured")
     right.plot(last["motor.position_estimate"], last["load.position_estimate"], color=_TRUE, lw=0.8, label="observed")
     right.set(xlabel="motor position θe (rad)", ylabel="load position θs (rad)")
-    right.legend(ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
+    right.legend(ncols=2, **LEGEND_ABOVE)
     caption = (
-        "Torque over twist (its band is chatter and lag of the estimates), and load over motor position: the hysteresis of "
-        "the drive. Second half of the run (analogue of Fig. 17)."
+        "Torque over twist (chatter and lag of the estimates widen the loop), and load over motor position. Second half of "
+        "the run (analogue of Fig. 17)."
     )
     return Drawn("hysteresis", figure, caption)
 
@@ -126,7 +167,7 @@ def _limit_cycle(trace: pd.DataFrame) -> Drawn:
     last = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]]
     for ax, side, angle in ((left, "motor", "θe"), (right, "load", "θs")):
         observed = (last[f"{side}.position_estimate"], last[f"{side}.velocity_estimate"])
-        ax.plot(*observed, color=_LOAD, lw=2.2, alpha=0.8, label="observed")
+        ax.plot(*observed, color=_OBSERVED, lw=2.2, alpha=0.8, label="observed")
         ax.plot(last[f"{side}.position"], last[f"{side}.velocity"], color=_TRUE, lw=0.9, label="true")
         ax.set(xlabel=f"{side} position {angle} (rad)", ylabel=f"{side} velocity (rad/s)")
     left.legend(ncols=2, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.1)

@@ -1,4 +1,4 @@
-"""What `jaxbl verify` leaves to be read: the atlas of the error system, the levels of the drive, the page."""
+"""What `jaxbl verify` leaves to be read: maps of the error system and of the drive, counterexamples, tables."""
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
@@ -15,13 +15,12 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxbl.files import write_atomic
 from jaxbl.gains.verify import Verdict, conditions_of, judged_sides
 from jaxbl.observer.conditions import CONDITIONS
 
-from .maps import Drawn, condition_curves
-from .page import TableOf, html
-from .reports import save_all
+from .figures import Drawn
+from .maps import condition_curves
+from .page import PageTable, write_report
 from .style import COLOURS, MAP, MISSING, style
 
 _USUAL = ("usual pair (1.5, 1.1)", 1.1, 1.5)
@@ -230,10 +229,8 @@ def write_verify_report(verdict: Verdict, folder: Path) -> list[str]:
         tables.append(_mark_table(verdict))
     if len(verdict.counterexamples):
         tables.append(_counterexample_table(verdict))
-    pictures = save_all(draw_verdict(verdict), folder)
-    page = html(verdict.config.title or "Gain conditions", lead, remarks, pictures, tables, verdict.config.to_toml())
-    write_atomic(folder / "report.html", page)
-    return [*lead, *remarks]
+    title, config = verdict.config.title or "Gain conditions", verdict.config.to_toml()
+    return write_report(folder, title, lead, draw_verdict(verdict), tables, config, remarks)
 
 
 def _headline(verdict: Verdict) -> list[str]:
@@ -300,7 +297,7 @@ def _mark_lines(verdict: Verdict) -> list[str]:
     return lines
 
 
-def _level_table(level: dict[str, Any]) -> TableOf:
+def _level_table(level: dict[str, Any]) -> PageTable:
     name = "Normalised error system, worst disturbance"
     if level["level"] != "normalised":
         name = f"{_LEVELS[level['level']].capitalize()}; {level['side']} observer"
@@ -328,10 +325,10 @@ def _level_table(level: dict[str, Any]) -> TableOf:
         "largest",
         "at least",
     ]
-    return TableOf(heading, head, rows)
+    return PageTable(heading, head, rows)
 
 
-def _claimed_tables(level: dict[str, Any]) -> list[TableOf]:
+def _claimed_tables(level: dict[str, Any]) -> list[PageTable]:
     if not (inputs := level.get("claimed_bound", {}).get("by_input")):
         return []
     keys = list(inputs[0]["input"])
@@ -339,10 +336,10 @@ def _claimed_tables(level: dict[str, Any]) -> list[TableOf]:
         [*row["input"].values(), row["converged_runs"], row["true"], row["claimed"], row["too_small"]] for row in inputs
     ]
     heading = f"True and claimed bound by input: {level['level']}, {level['side']}"
-    return [TableOf(heading, [*keys, "runs", "median true f⁺", "2 max |acceleration|", "share too small"], rows)]
+    return [PageTable(heading, [*keys, "runs", "median true f⁺", "2 max |acceleration|", "share too small"], rows)]
 
 
-def _mark_table(verdict: Verdict) -> TableOf:
+def _mark_table(verdict: Verdict) -> PageTable:
     keys = {
         "lambda": "λ",
         "alpha": "α",
@@ -360,10 +357,10 @@ def _mark_table(verdict: Verdict) -> TableOf:
         "convergence_time": "after (s)",
     }
     rows: list[list[object]] = [[mark["name"], *(mark[key] for key in keys)] for mark in verdict.summary["marks"]]
-    return TableOf("Marked gains, run on the study's drive with ideal encoders", ["", *keys.values()], rows)
+    return PageTable("Marked gains, run on the study's drive with ideal encoders", ["", *keys.values()], rows)
 
 
-def _counterexample_table(verdict: Verdict) -> TableOf:
+def _counterexample_table(verdict: Verdict) -> PageTable:
     found = verdict.counterexamples[verdict.counterexamples["bound"] == "true"]
     paths = [axis.path for axis in verdict.config.axes if axis.path in found]
     counts = found.groupby(["level", "side", "condition", "cause"], sort=False).size().sort_values(ascending=False)
@@ -375,7 +372,7 @@ def _counterexample_table(verdict: Verdict) -> TableOf:
         example = examples.loc[key]
         rows.append([*key, int(count), *(_plain(example[path]) for path in paths)])
     head = ["level", "side", "condition", "cause", "runs", *(f"e.g. {path}" for path in paths)]
-    return TableOf("Counterexamples by cause (all of them, with all figures: counterexamples.parquet)", head, rows)
+    return PageTable("Counterexamples by cause (all of them, with all figures: counterexamples.parquet)", head, rows)
 
 
 def _plain(value: Any) -> object:

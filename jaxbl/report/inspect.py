@@ -12,16 +12,20 @@ from jaxbl.files import plain, write_atomic
 from jaxbl.records import POSITION_CHANNELS, Record, quality
 from jaxbl.records.inspection import Inspection, velocity
 
-from .maps import Drawn
-from .page import TableOf, html
-from .reports import save_all
-from .style import COLOURS, style
+from .figures import Drawn, stacked_axes
+from .page import PageTable, write_report
+from .style import COLOURS, FAINT, LEGEND_ABOVE, style
 
 _POINTS = 6000
 _LINES = 25
 """Lines that the terminal gets at most."""
 _LABELS = {"u": "input u", "theta_e": "motor θe", "theta_s": "load θs", "transmitted": "transmitted"}
-_COLOUR = {"u": COLOURS[6], "theta_e": COLOURS[0], "theta_s": COLOURS[1], "transmitted": COLOURS[2]}
+_COLOUR = {
+    "u": COLOURS[6],
+    "theta_e": COLOURS[0],
+    "theta_s": COLOURS[1],
+    "transmitted": COLOURS[2],
+}
 
 
 def write_inspection_report(inspection: Inspection, folder: Path) -> list[str]:
@@ -29,18 +33,16 @@ def write_inspection_report(inspection: Inspection, folder: Path) -> list[str]:
     record = inspection.record
     text = json.dumps(plain(inspection.to_dict()), indent=2, ensure_ascii=False)
     write_atomic(folder / "inspection.json", text)
-    pictures = save_all(draw_inspection(inspection), folder)
     tables = [
-        TableOf(
+        PageTable(
             "What the log can identify",
             ["quantity", "", "why"],
             [[j.quantity, j.answer, j.why] for j in inspection.judgements],
         ),
-        TableOf("Channels", list(_CHANNEL_COLUMNS), [list(row) for row in _channel_rows(record)]),
+        PageTable("Channels", list(_CHANNEL_COLUMNS), [list(row) for row in _channel_rows(record)]),
     ]
     table = tomli_w.dumps({"log": inspection.log.model_dump(exclude_none=True)})
-    page = html(record.path.name, [_headline(record)], list(record.notes), pictures, tables, table)
-    write_atomic(folder / "report.html", page)
+    write_report(folder, record.path.name, [_headline(record)], draw_inspection(inspection), tables, table, record.notes)
     return summary(inspection)
 
 
@@ -118,8 +120,7 @@ def _channels(record: Record) -> Drawn:
     unit = record.findings.channels[POSITION_CHANNELS[side]].unit
     rows = [(_LABELS[n], record.findings.channels[n].unit, v, _COLOUR[n]) for n, v in values.items()]
     rows.append((f"{side} velocity", f"{unit}/s", velocity(record, side), COLOURS[3]))
-    figure = Figure(figsize=(7.0, 1.5 * len(rows) + 0.6), layout="constrained")
-    axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False).ravel()
+    figure, axes = stacked_axes(len(rows), 1.5, width=7.0)
     for ax, (label, unit, signal, colour) in zip(axes, rows, strict=True):
         for segment in record.segments:
             at = _shown(record, segment)
@@ -135,8 +136,7 @@ def _channels(record: Record) -> Drawn:
 def _spectra(record: Record) -> Drawn:
     values = {n: v for n, v in _values(record).items() if np.ptp(v)}
     longest = max(record.segments, key=lambda s: s.stop - s.start)
-    figure = Figure(figsize=(7.0, 2.1 * len(values) + 0.6), layout="constrained")
-    axes = figure.subplots(len(values), 1, sharex=True, squeeze=False).ravel()
+    figure, axes = stacked_axes(len(values), 2.1, width=7.0)
     for ax, (name, signal) in zip(axes, values.items(), strict=True):
         channel = record.findings.channels[name]
         frequency, density = quality.spectrum(signal[longest], record.sample_period)
@@ -150,7 +150,7 @@ def _spectra(record: Record) -> Drawn:
             ax.axvline(channel.bandwidth, color="#555555", lw=1.0, ls=":", label=label)
         ax.set_ylabel(f"{_LABELS[name]}\n({channel.unit}/√Hz)")
         if channel.noise or channel.bandwidth:
-            ax.legend(loc="lower right", ncols=2, bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
+            ax.legend(ncols=2, **LEGEND_ABOVE)
     axes[-1].set_xlabel("frequency (Hz)")
     figure.align_ylabels()
     return Drawn(
@@ -181,8 +181,8 @@ def _torque_over_velocity(record: Record) -> Drawn:
     inner = [slice(s.start + edge, s.stop - edge) for s in record.segments if s.stop - s.start > 4 * edge]
     at = np.concatenate([np.arange(len(record.time))[_shown(record, s)] for s in inner or record.segments])
     ax.plot(speed[at], torque[at], ".", ms=1.6, color=COLOURS[0], alpha=0.5)
-    ax.axhline(0.0, color="#888888", lw=0.8)
-    ax.axvline(0.0, color="#888888", lw=0.8)
+    ax.axhline(0.0, color=FAINT, lw=0.8)
+    ax.axvline(0.0, color=FAINT, lw=0.8)
     # a few samples at sharp corners of the motion would set the scale
     low, high = np.quantile(torque[at], [0.002, 0.998])
     margin = 0.15 * (high - low)
@@ -221,7 +221,7 @@ def _twist(inspection: Inspection) -> Drawn:
             ax.plot(x[at][chosen], twist[at][chosen], ".", ms=1.8, color=colour, alpha=0.6, label=name)
         ax.set_xlabel(label)
     axes[0].set_ylabel(f"θe − N₀ θs about its median ({unit})")
-    axes[-1].legend(ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, markerscale=5)
+    axes[-1].legend(ncols=2, markerscale=5, **LEGEND_ABOVE)
     told = "the side that the load pulls to" if by_load else "the direction of motion"
     caption = (
         f"Twist θe − N₀ θs with N₀ = {inspection.gear_ratio:.5g}, by {told}. Over torque: hysteresis, its "
@@ -240,7 +240,7 @@ def _intervals(record: Record) -> Drawn:
     left.plot(ends, intervals, ".", ms=2.0, color=COLOURS[0])
     left.axhline(1e3 * record.findings.sampling.median_period, color=COLOURS[1], lw=1.0, ls="--", label="median")
     left.set(xlabel="time (s)", ylabel="interval\n(ms)")
-    left.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
+    left.legend(**LEGEND_ABOVE)
     right.hist(intervals, bins=60, orientation="horizontal", color=COLOURS[0])
     right.set(xlabel="samples (1)")
     return Drawn("intervals", figure, "Intervals between raw time stamps, before resampling; gaps are left out.")

@@ -8,8 +8,8 @@ from measured import GEAR_RATIO, SERVO, made, real
 from test_page import Page
 
 from jaxbl.records import inspect
-from jaxbl.report.inspected import draw_inspection, summary, write_inspection_report
-from jaxbl.report.style import save
+from jaxbl.report.figures import save
+from jaxbl.report.inspect import draw_inspection, summary, write_inspection_report
 
 UNEVEN = np.cumsum(1e-3 * np.random.default_rng(1).uniform(0.7, 1.4, 3000))
 BOTH = ["channels", "spectra", "torque_over_velocity", "twist"]

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from jaxbl.report.throughput import throughput_lines, write_bench_report
+from jaxbl.report.bench import throughput_lines, write_bench_report
 from jaxbl.throughput.run import CEILING, OURS, SCAN, Result, Row
 
 

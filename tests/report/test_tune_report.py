@@ -14,7 +14,7 @@ from test_page import Page
 from jaxbl.config import read_config
 from jaxbl.gains.tune import tune
 from jaxbl.observer.conditions import CONDITIONS
-from jaxbl.report.tuning import draw_tuning, write_tune_report
+from jaxbl.report.tune import draw_tuning, write_tune_report
 from jaxbl.sweeps.trial import run
 
 SLOW = {"lambda": 1e-3, "alpha": 0.05}

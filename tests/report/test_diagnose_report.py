@@ -4,12 +4,11 @@ import copy
 import dataclasses
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from jaxbl.diagnosis.residuals import Residual
-from jaxbl.report.diagnosed import _over_time, _story, batch_row, diagnosis_lines, write_batch
-from jaxbl.report.style import save
+from jaxbl.report.diagnose import _over_time, _verdict, diagnosis_lines
+from jaxbl.report.figures import save
 
 ERRORS = {
     "theta_e": 0.1,
@@ -105,7 +104,7 @@ def test_other_verdicts_say_what_is_left():
 
 @pytest.mark.parametrize("findings", [SUMMARY["findings"], []], ids=["some", "none"])
 def test_the_story_is_drawn(findings, tmp_path):
-    drawn = _story(changed(findings=findings, verdict="explained" if findings else "no_discrepancy"))
+    drawn = _verdict(changed(findings=findings, verdict="explained" if findings else "no_discrepancy"))
     left, right = drawn.figure.axes
     assert left.get_xlabel() == "rms error on held-out data over noise" and left.get_xscale() == "log"
     assert left.get_yticklabels()[0].get_text() == "motor position\n0.1 → 0.0011 rad"
@@ -147,13 +146,3 @@ def test_missing_torque_is_drawn_before_and_after(tmp_path):
     assert ax.get_ylabel() == "motor:\nmissing torque (N m)"
     assert ax.get_legend_handles_labels()[1] == ["before", "after", "± 2 noise", "held out"]
     assert save(drawn.figure, tmp_path / "before_after.png").stat().st_size > 10_000
-
-
-def test_a_batch_is_a_table(tmp_path):
-    rows = [batch_row(tmp_path / "a.csv", SUMMARY), batch_row(tmp_path / "long.csv", None, "long.csv: holds nothing")]
-    lines = write_batch(rows, tmp_path)
-    assert lines[0] == "a.csv     explained       load.coulomb_friction (0.93)  theta_e 0.1 -> 0.0011 (0.001)"
-    assert lines[1] == "long.csv  refused         long.csv: holds nothing"
-    table = pd.read_csv(tmp_path / "batch.csv")
-    assert list(table["log"]) == ["a.csv", "long.csv"]
-    assert table["theta_s_before"][0] == 0.02 and np.isnan(table["theta_s_before"][1])

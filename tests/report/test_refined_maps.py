@@ -8,10 +8,10 @@ from matplotlib.collections import QuadMesh
 from small_study import ALPHA, LAMBDA, NOISE, listed, rigid, spaced
 
 from jaxbl.config import read_config
+from jaxbl.report.figures import save
 from jaxbl.report.maps import draw
-from jaxbl.report.refined import Filling
-from jaxbl.report.reports import headline
-from jaxbl.report.style import save
+from jaxbl.report.refined_maps import Filling
+from jaxbl.report.sweep import headline
 from jaxbl.sweeps.metrics import metric_columns
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.refine import refine

@@ -1,0 +1,115 @@
+"""Diagnosis of all logs of a folder: `jaxbl diagnose --batch`."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from .errors import InputError
+from .files import claim_log_folder, finished_summary, make_folder, removed_if_empty
+from .report.diagnose import probability, rms_text, write_diagnosis_report
+from .workers import Progress, each, forget_programs, worth
+
+_LOGS = (".csv", ".parquet", ".mat")
+_VERDICTS = {"explained": "explained", "no_discrepancy": "no discrepancy", "unknown_effect": "unknown effect"}
+
+
+class LogJob(NamedTuple):
+    """A log of a batch, its model and its hold-out log, and the folder of its results."""
+
+    log: Path
+    model: Path
+    holdout: Path | None
+    folder: Path
+    overwrite: bool
+
+
+def read_batch(source: Path, model: Path | None, out: Path, *, overwrite: bool) -> list[LogJob]:
+    """The logs of a folder, each with its model and a folder for its results.
+
+    Args:
+        source: folder of the logs; `NAME.toml` beside a log is its model, `holdout/NAME.*` its hold-out log.
+        model: of the logs that have none of their own.
+        out: folder for the results.
+        overwrite: whether results of other logs may be replaced.
+
+    Raises:
+        InputError: there is no log, a log has no model, or two logs have one name.
+    """
+    if not source.is_dir():
+        raise InputError(f"{source}: no such folder; --batch needs one with logs ({', '.join(_LOGS)})")
+    logs = sorted(file for file in source.iterdir() if file.suffix.lower() in _LOGS)
+    if not logs:
+        raise InputError(f"{source}: holds no log ({', '.join(_LOGS)})")
+    stems = [file.stem for file in logs]
+    for name in stems:
+        if stems.count(name) > 1:
+            raise InputError(f"{source}: two logs are called {name}; each needs a name of its own for its results")
+    held = {file.stem: file for file in (source / "holdout").glob("*") if file.suffix.lower() in _LOGS}
+    jobs = []
+    for file in logs:
+        own = file.with_suffix(".toml") if file.with_suffix(".toml").exists() else model
+        if own is None:
+            raise InputError(f"{file}: no model; give --model TOML, or {file.with_suffix('.toml').name} beside it")
+        jobs.append(LogJob(file, own, held.get(file.stem), out / file.stem, overwrite))
+    return jobs
+
+
+def run_batch(work: list[LogJob], out: Path, processes: int | None, progress: Progress) -> list[dict[str, Any]]:
+    """Diagnose logs that are not diagnosed yet, and write `batch.csv`. Returns its rows."""
+    make_folder(out)
+    progress(0, len(work))
+    rows = []
+    for row in each(_diagnosed, work, worth(len(work)) if processes is None else min(processes, len(work))):
+        rows.append(row)
+        progress(len(rows), len(work))
+    pd.DataFrame(rows).to_csv(out / "batch.csv", index=False)
+    return rows
+
+
+def _diagnosed(job: LogJob) -> dict[str, Any]:
+    """Row of a batch: a log's diagnosis, or why there is none."""
+    from .diagnosis.diagnose import read_task, run_task
+
+    forget_programs()
+    try:
+        task = read_task(job.log, job.model, holdout=job.holdout)
+        claim_log_folder(job.folder, job.log, overwrite=job.overwrite)
+        summary = finished_summary(job.folder / "diagnosis.json", task.identity)
+        if summary is None:
+            with removed_if_empty(job.folder):
+                found = run_task(task)
+                write_diagnosis_report(found, job.folder)
+            summary = found.summary
+        return batch_row(job.log, summary)
+    except InputError as error:
+        return batch_row(job.log, None, str(error))
+
+
+def batch_row(log: Path, summary: Mapping[str, Any] | None, refused: str = "") -> dict[str, Any]:
+    """A row of `batch.csv`: a log's diagnosis, or why there is none."""
+    row: dict[str, Any] = {"log": log.name, "verdict": "", "findings": "", "confidence": None, "refused": refused}
+    if summary is None:
+        return row
+    row["verdict"] = summary["verdict"]
+    row["findings"] = "; ".join(one["effect"] for one in summary["findings"])
+    row["confidence"] = min((one["confidence"] for one in summary["findings"]), default=None)
+    for name in summary["gap"]["holdout_rmse_before"]:
+        for key, column in (("holdout_rmse_before", "before"), ("holdout_rmse_after", "after"), ("noise_floor", "floor")):
+            row[f"{name}_{column}"] = summary["gap"][key][name]
+    return row
+
+
+def batch_lines(rows: list[dict[str, Any]]) -> list[str]:
+    """The rows of a batch as a table for the terminal."""
+    width = max(len(row["log"]) for row in rows)
+    lines = []
+    for row in rows:
+        if row["refused"]:
+            lines.append(f"{row['log']:<{width}}  refused         {row['refused']}")
+            continue
+        named = f"{row['findings']} ({probability(row['confidence'])})" if row["findings"] else ""
+        gap = f"{rms_text(row['theta_e_before'])} -> {rms_text(row['theta_e_after'])} ({rms_text(row['theta_e_floor'])})"
+        lines.append(f"{row['log']:<{width}}  {_VERDICTS[row['verdict']]:<14}  {named}  theta_e {gap}")
+    return lines

@@ -1,0 +1,132 @@
+"""What `jaxbl identify` leaves to be read: numbers with intervals, and what the log shows of motion, torque and gap."""
+
+from pathlib import Path
+from typing import Any
+
+from jaxbl.identification.identify import Identification
+from jaxbl.identification.search import NOISE_ALONE
+
+from .figures import SIDES
+from .identify_figures import draw_identification
+from .log_results import write_log_results
+from .page import PageTable
+
+
+def write_identification_report(found: Identification, folder: Path) -> list[str]:
+    """Write `identification.json`, `model.toml`, `trace.parquet`, figures and report into a folder that exists.
+
+    They are put there together when all are drawn. Returns the lines for the terminal.
+    """
+    tables = [_parameter_table(found.summary)]
+    if "regression" in found.summary["method"]:
+        tables.append(_regression_table(found.summary["method"]["regression"]))
+    if found.summary["method"]["recursive"]:
+        tables.append(_recursive_table(found))
+    title = found.config.title or f"Identification from {found.record.path.name}"
+    lead, remarks = _headline(found.summary), _remarks(found.summary)
+    return write_log_results(found, folder, "identification.json", title, lead, draw_identification(found), tables, remarks)
+
+
+def identification_lines(summary: dict[str, Any]) -> list[str]:
+    """The lines for the terminal, from an `identification.json`."""
+    return [*_headline(summary), *_remarks(summary)]
+
+
+def _headline(summary: dict[str, Any]) -> list[str]:
+    lines = []
+    for path, one in summary["parameters"].items():
+        low, high = one["interval"]
+        if None in (one["value"], one["standard_error"], low, high):
+            lines.append(f"{path}: not identifiable from this log.")
+            continue
+        unit = f" {one['unit']}" if one.get("unit") else ""
+        lines.append(f"{path} = {one['value']:.5g} ± {one['standard_error']:.2g}{unit}, 95 %: {low:.5g} to {high:.5g}.")
+    return lines
+
+
+def _remarks(summary: dict[str, Any]) -> list[str]:
+    lines = []
+    for refusal in summary["refused"]:
+        shares = ", ".join(f"{path} {share:+.2f}" for path, share in refusal["direction"].items())
+        lines.append(f"Not identifiable: {shares}: {refusal['why']}.")
+    if summary["held"]:
+        lines.append(f"Held at the nominal value, which the other numbers depend on: {', '.join(summary['held'])}.")
+    for side, residual in summary["residual"].items():
+        ratio = residual["rms"] / residual["noise"]
+        meaning = "noise alone" if ratio < NOISE_ALONE else "the model is incomplete"
+        size = f"{residual['rms']:.2g} {residual['unit']} rms"
+        lines.append(f"{side}: position residual {size}, {ratio:.3g} times the noise: {meaning}.")
+    fit = summary["method"]["trajectory"]
+    lines.append(
+        f"{fit['windows']} windows of {fit['window']:.3g} s with free initial states; {fit['starts_agreeing']} of "
+        f"{fit['starts']} starts agree."
+    )
+    if not fit["converged"]:
+        lines.append("The fit stopped before it reached its tolerance.")
+    if summary["torque"]:
+        lines.append(f"Torque error of the model, rms: {_shares(summary['torque'])}.")
+    for side, one in summary.get("gains", {}).items():
+        lines.append(
+            f"{side} observer: lambda = {one['lambda_']:.3g}, alpha = {one['alpha']:.3g}, chosen on the log for "
+            f"f⁺ = {one['f_plus']:.3g}; its velocity differs from the smoothed one by {one['velocity_error']:.2g} rms."
+        )
+    if "holdout" in summary:
+        lines += _on_holdout(summary["holdout"])
+    return [*lines, *summary["notes"]]
+
+
+def _shares(torque: dict[str, Any]) -> str:
+    return ", ".join(f"{_share(one)} ({name})" for name, one in torque.items())
+
+
+def _share(one: dict[str, Any], which: str = "") -> str:
+    """A torque error as a share of the driving torque, or in its unit where nothing drives."""
+    relative = one[f"{which}relative"]
+    return f"{one[f'{which}rms']:.2g} {one['unit']} rms" if relative is None else f"{100.0 * relative:.2g} %"
+
+
+def _on_holdout(holdout: dict[str, Any]) -> list[str]:
+    name = Path(holdout["file"]).name
+    lines = [
+        f"On {name}, {side}: position residual over {holdout['window']:.3g} s {one['rms']:.2g} {one['unit']} rms, "
+        f"{one['rms'] / one['noise']:.3g} times the noise; with the nominal numbers {one['nominal_rms']:.2g}."
+        for side, one in holdout["position"].items()
+    ]
+    if holdout["torque"]:
+        before = ", ".join(_share(one, "nominal_") for one in holdout["torque"].values())
+        lines.append(f"On {name}, torque error rms: {_shares(holdout['torque'])}; with the nominal numbers {before}.")
+    return lines
+
+
+_COLUMNS = ["path", "value", "standard error", "95 % from", "to"]
+
+
+def _rows(parameters: dict[str, Any]) -> list[list[object]]:
+    return [[path, one["value"], one["standard_error"], *one["interval"]] for path, one in parameters.items()]
+
+
+def _parameter_table(summary: dict[str, Any]) -> PageTable:
+    parameters = summary["parameters"]
+    rows = [
+        [*row, one.get("unit", ""), one.get("nominal")]
+        for row, one in zip(_rows(parameters), parameters.values(), strict=True)
+    ]
+    columns = [*_COLUMNS, "unit", "nominal"]
+    if any("profile_interval" in one for one in parameters.values()):
+        columns += ["by profile from", "to"]
+        for row, one in zip(rows, parameters.values(), strict=True):
+            row += one.get("profile_interval", [None, None])
+    return PageTable("Parameters", columns, rows)
+
+
+def _regression_table(regression: dict[str, Any]) -> PageTable:
+    by = "with the measured transmitted torque" if regression["measured_transmitted_torque"] else "at smoothed motion"
+    title = f"Least squares on the equations of motion, {by}, up to {regression['bandwidth']:.3g} Hz"
+    return PageTable(title, _COLUMNS, _rows(regression["parameters"]))
+
+
+def _recursive_table(found: Identification) -> PageTable:
+    rows: list[list[object]] = [
+        [name, *(sides[side] for side in SIDES)] for name, sides in found.summary["method"]["recursive"].items()
+    ]
+    return PageTable("Recursive identification, at the end of the log", ["", *(f"by the {side}" for side in SIDES)], rows)

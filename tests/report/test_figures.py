@@ -1,0 +1,37 @@
+"""What figures share: thinned lines, ends of axes, and a base that is loaded without JAX."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from jaxbl.report.figures import limits, outline
+
+
+def test_the_base_and_the_report_of_inspect_need_no_jax():
+    modules = ["page", "style", "figures", "inspect"]
+    code = f"import sys, {', '.join('jaxbl.report.' + name for name in modules)}; print('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
+
+
+def test_outline_keeps_the_extremes_and_the_order():
+    values = np.random.default_rng(0).standard_normal(100_003)
+    values[7] = 50.0
+    values[99_999] = -60.0
+    values[2000:9000] = np.nan
+    at = outline(values, 2400)
+    assert len(at) < 2500
+    assert np.all(np.diff(at) >= 0)
+    assert np.nanmax(values[at]) == 50.0 and np.nanmin(values[at]) == -60.0
+    assert np.isnan(values[at]).any()
+
+
+def test_a_few_outliers_do_not_set_the_ends_of_an_axis():
+    values = np.sin(np.arange(10_000))
+    values[5] = 1e6
+    ends = limits(values, shown=[2.0])
+    assert ends is not None
+    assert -1.5 < ends[0] < -1.0 and 2.0 < ends[1] < 2.5
+    assert limits(np.array([np.nan])) is None
+    assert limits(np.array([3.0, 3.0])) == pytest.approx((2.7, 3.3))
