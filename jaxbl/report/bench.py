@@ -41,8 +41,8 @@ def _bars(result: Result) -> Drawn:
     axes.set_xlim(right=12.0 * top)
     axes.set_xlabel("lane-steps per second (log scale); upper bar float32, lower bar float64")
     caption = (
-        "The paper's chain on many lanes, by everyone: one step of one lane is one plant, two observers, filter and both "
-        "identifiers for one sample. Longer is faster, a factor of ten from line to line."
+        "The paper's chain on many lanes by each program. A lane-step is one sample of one lane: plant, two observers, "
+        "filter and both identifiers. Longer bars are faster; from one grid line to the next is a factor of ten."
     )
     return Drawn("throughput", figure, caption)
 
@@ -62,8 +62,8 @@ def _curve(result: Result) -> Drawn:
     axes.set_ylabel("lane-steps per second")
     axes.legend()
     caption = (
-        "Throughput against the number of lanes: what a call and a block of samples cost whatever their lanes shows on the "
-        "left, caches and memory on the right."
+        "Throughput over the number of lanes. On the left the fixed cost of a call and of a block of samples limits it, on "
+        "the right caches and memory."
     )
     return Drawn("lanes", figure, caption)
 

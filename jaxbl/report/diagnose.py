@@ -37,7 +37,7 @@ def write_diagnosis_report(found: Diagnosis, folder: Path) -> list[str]:
 
 
 def diagnosis_lines(summary: dict[str, Any]) -> list[str]:
-    """What the terminal says of a `diagnosis.json`."""
+    """The lines for the terminal, from a `diagnosis.json`."""
     return [*_headline(summary), *_remarks(summary)]
 
 
@@ -48,7 +48,7 @@ def _headline(summary: dict[str, Any]) -> list[str]:
         lines.append(f"{one['effect']} (confidence {probability(one['confidence'])}): {numbers}.")
         if one["alternatives"]:
             others = ", ".join(f"{other['effect']} ({probability(other['confidence'])})" for other in one["alternatives"])
-            lines.append(f"  This log does not rule out in its place: {others}.")
+            lines.append(f"  Not ruled out by this log: {others}.")
     return [*lines, *_gap_lines(summary["gap"])]
 
 
@@ -56,13 +56,14 @@ def verdict_sentence(summary: Mapping[str, Any]) -> str:
     """The verdict in one sentence."""
     names = " and ".join(one["effect"] for one in summary["findings"])
     if summary["verdict"] == "explained":
-        return f"Explained: the model lacks {names}; with {'it' if len(summary['findings']) == 1 else 'them'} noise is left."
+        them = "it" if len(summary["findings"]) == 1 else "them"
+        return f"Explained: the model lacks {names}; with {them} only noise remains."
     if summary["verdict"] == "no_discrepancy":
-        return "No discrepancy: the model leaves nothing but noise."
+        return "No discrepancy: the residual of the model is noise."
     where = "; ".join(one["sentence"] for one in summary.get("where_after", summary["where"]).values())
     if names:
-        return f"Unknown effect: {names} is missing, but does not explain all of it. What is left: {where}."
-    return f"Unknown effect: something is missing that is none of the effects known. It lives: {where}."
+        return f"Unknown effect: the model lacks {names}, which explains a part only. The residual that remains: {where}."
+    return f"Unknown effect: no known effect explains the residual: {where}."
 
 
 def _number(leaf: str, one: Mapping[str, Any]) -> str:
@@ -82,12 +83,12 @@ def _gap_lines(gap: Mapping[str, Any]) -> list[str]:
         place = f"On {Path(gap['holdout']['file']).name}"
     else:
         place = f"On the last part of the log ({gap['holdout']['from']:.4g} to {gap['holdout']['to']:.4g} s), held out"
-    told = [
-        f"{name} {rms_text(before[name])} -> {rms_text(after[name])} {units[name]} (floor {rms_text(floor[name])})"
+    errors = [
+        f"{name} {rms_text(before[name])} -> {rms_text(after[name])} {units[name]} (noise {rms_text(floor[name])})"
         for name in before
         if not name.startswith("velocity")
     ]
-    lines = [f"{place}, over windows of {gap['holdout']['window']:.2g} s, rms: {'; '.join(told)}."]
+    lines = [f"{place}, over windows of {gap['holdout']['window']:.2g} s, rms: {'; '.join(errors)}."]
     run = gap["free_run"]
     if "after" in run:
         parts = [
@@ -97,7 +98,7 @@ def _gap_lines(gap: Mapping[str, Any]) -> list[str]:
         ]
         lines.append(f"In one free run: {'; '.join(parts)}.")
     elif run:
-        lines.append(f"A free run says nothing here: {run['why_not']}.")
+        lines.append(f"No free run is compared: {run['why_not']}.")
     return lines
 
 
@@ -109,35 +110,35 @@ def rms_text(value: float | None) -> str:
 def _remarks(summary: dict[str, Any]) -> list[str]:
     lines = []
     if summary["verdict"] != "unknown_effect" or summary["findings"]:
-        lines += [f"The model as given leaves: {one['sentence']}." for one in summary["where"].values()]
-    witnesses = [told for name, one in summary["where"].items() if (told := _witness(name, one, summary["gap"]["units"]))]
-    if witnesses:
-        lines.append(f"By the observers' equivalent control: {'; '.join(witnesses)}.")
+        lines += [f"Residual of the model as given: {one['sentence']}." for one in summary["where"].values()]
+    observed = [text for name, one in summary["where"].items() if (text := _by_observer(name, one, summary["gap"]["units"]))]
+    if observed:
+        lines.append(f"By the observers' equivalent control: {'; '.join(observed)}.")
     left = {name: one for name, one in summary["rest"].items() if one["evidence"] is not None and one["evidence"] > 0.0}
     for name, one in sorted(left.items(), key=lambda pair: -pair[1]["evidence"]):
         side, _, kind = name.partition(".")
         lines.append(
-            f"Left over: {_FREE.get(kind, kind)} on the {side} side ({100.0 * one['share']:.2g} % of the driving torque, "
+            f"Remaining: {_FREE.get(kind, kind)} on the {side} side ({100.0 * one['share']:.2g} % of the driving torque, "
             f"evidence {one['evidence']:.3g} nats)."
         )
     for name, control in summary["gap"]["controls"].items():
         effect = f" ({control['effect']})" if "effect" in control else ""
         channel = next(iter(control["rmse"]))
-        what = {"wrong": "the best model with another effect", "permuted": "the missing torque in the wrong order"}[name]
+        what = {"wrong": "the best model with another effect", "permuted": "the missing torque shuffled in time"}[name]
         left = control["rmse"][channel]
-        told = "diverges" if left is None else f"leaves {rms_text(left)} {summary['gap']['units'][channel]} in {channel}"
-        lines.append(f"Control: {what}{effect} {told}.")
+        error = "diverges" if left is None else f"leaves {rms_text(left)} {summary['gap']['units'][channel]} in {channel}"
+        lines.append(f"Control: {what}{effect} {error}.")
     return [*lines, *summary["notes"]]
 
 
-def _witness(side: str, where: Mapping[str, Any], units: Mapping[str, str]) -> str:
-    """What the observer of a side says; nothing where there is none or it does not converge."""
+def _by_observer(side: str, where: Mapping[str, Any], units: Mapping[str, str]) -> str:
+    """The residual by a side's observer; empty where there is none or it does not converge."""
     one = where.get("observed")
     if not one or not one["converged"]:
         return ""
     unit = units[f"torque_{side}"]
     if one["rms"] < _BEYOND * one["noise"]:
-        return f"{side} side, nothing beyond its noise ({rms_text(one['noise'])} {unit} rms)"
+        return f"{side} side, no more than its noise ({rms_text(one['noise'])} {unit} rms)"
     return (
         f"{side} side, {rms_text(one['rms'])} {unit} rms (its noise {rms_text(one['noise'])}), correlation "
         f"{one['correlation']:.2f} with the smoother's"
@@ -145,10 +146,10 @@ def _witness(side: str, where: Mapping[str, Any], units: Mapping[str, str]) -> s
 
 
 _BEYOND = 1.5
-"""Times its noise that an observer's residual must be to be more than that."""
+"""Ratio of an observer's residual to its noise up to which it counts as noise: above 1, as that noise is an estimate."""
 _FREE = {
-    "time": "a torque over time", "drift": "a friction that drifts", "position": "a torque over position",
-    "place": "a friction over position", "velocity": "a torque over velocity", "memory": "a friction with a memory",
+    "time": "a torque over time", "drift": "a drifting friction", "position": "a torque over position",
+    "place": "a friction over position", "velocity": "a torque over velocity", "memory": "a presliding friction",
 }  # fmt: skip
 
 
@@ -159,8 +160,8 @@ def _finding_tables(summary: Mapping[str, Any]) -> list[PageTable]:
             error = number["standard_error"] or None
             rows.append([one["effect"], one["confidence"], leaf, number["value"], error, number["unit"]])
         rows += [[f"or {other['effect']}", other["confidence"], "", "", "", ""] for other in one["alternatives"]]
-    columns = ["effect", "confidence", "number", "value", "standard error", "unit"]
-    return [PageTable("What is missing", columns, rows)] if rows else []
+    columns = ["effect", "confidence", "parameter", "value", "standard error", "unit"]
+    return [PageTable("Missing effects", columns, rows)] if rows else []
 
 
 def _gap_table(gap: Mapping[str, Any]) -> PageTable:
@@ -178,7 +179,7 @@ def _number_table(summary: Mapping[str, Any]) -> PageTable:
         [path, one["nominal"], one["value"], one["standard_error"], one["unit"]]
         for path, one in summary["parameters"].items()
     ]
-    return PageTable("The model's own numbers", ["number", "as given", "fitted", "standard error", "unit"], rows)
+    return PageTable("Parameters of the model", ["parameter", "as given", "fitted", "standard error", "unit"], rows)
 
 
 def draw_diagnosis(found: Diagnosis) -> list[Drawn]:
@@ -190,7 +191,7 @@ def draw_diagnosis(found: Diagnosis) -> list[Drawn]:
 
 
 def _verdict(summary: Mapping[str, Any]) -> Drawn:
-    """Each channel's error over its noise: before, after, floor, controls; and what is missing, how surely."""
+    """Each channel's error over its noise, before and after, with the controls; and the probability of each effect."""
     gap = summary["gap"]
     names = list(gap["holdout_rmse_before"])
     bars = _bars(summary)
@@ -201,9 +202,9 @@ def _verdict(summary: Mapping[str, Any]) -> Drawn:
     _chances_panel(right, bars)
     caption = (
         f"{verdict_sentence(summary)} Left: rms error on held-out data over the channel's noise; arrows lead from the model "
-        "as given to the model with the missing effects. Black line: noise, which a perfect model would leave. Controls: "
-        "the best model with another effect, and the added torque in the wrong order of time, which must not help. Right: "
-        "probability of each effect, with what this log does not rule out in its place."
+        "as given to the model with the missing effects. Black line: noise, the error of a perfect model. Controls, which "
+        "must not help: the best model with another effect, and the added torque shuffled in time. Right: probability of "
+        "each effect, and of the effects that this log does not rule out instead."
     )
     return Drawn("gap", figure, caption)
 
@@ -217,10 +218,10 @@ def _gap_panel(ax: Axes, gap: Mapping[str, Any], names: list[str]) -> None:
     rows = np.arange(len(names))
     before, after = over(gap["holdout_rmse_before"]), over(gap["holdout_rmse_after"])
     for row, start, stop in zip(rows, before, after, strict=True):
-        # a hardly changed error needs no arrow
+        # an arrow for a change of less than 25 % would be shorter than its head
         if np.isfinite([start, stop]).all() and abs(np.log(start / stop)) > 0.25:
             ax.annotate("", (stop, row), (start, row), arrowprops={"arrowstyle": "-|>", "color": FAINT, "lw": 1.2})
-    markers = {"wrong": ("x", "another effect"), "permuted": ("+", "wrong order in time")}
+    markers = {"wrong": ("x", "another effect"), "permuted": ("+", "shuffled in time")}
     every = [before, after]
     for name, control in gap["controls"].items():
         marker, label = markers[name]
@@ -277,7 +278,7 @@ def _chances_panel(ax: Axes, bars: list[tuple[str, float, bool]]) -> None:
 
 
 def _over_time(found: Diagnosis) -> Drawn:
-    """Torque that the model lacks, before and after."""
+    """Missing torque of each side, before and after."""
     figure, axes = stacked_axes(len(found.pairs), 2.4)
     for ax, (side, pieces) in zip(axes, found.pairs.items(), strict=True):
         unit = unit_on(found.record, f"{side}.torque", "N m")
@@ -307,7 +308,7 @@ def _over_time(found: Diagnosis) -> Drawn:
     axes[-1].set_xlabel("time (s)")
     which = f"Held-out log {found.holdout.path.name}: t" if found.summary["gap"]["holdout"]["separate"] else "T"
     caption = (
-        f"{which}orque that the model lacks as it was given and with the missing effects, behind the low-pass behind which "
-        "it stands out. A complete model stays within the grey band."
+        f"{which}orque that the model lacks, as given and with the missing effects added, after the low-pass that shows it "
+        "most clearly. A complete model stays within the grey band."
     )
     return Drawn("before_after", figure, caption)

@@ -41,7 +41,9 @@ def stacked_axes(rows: int, height: float, width: float = 9.0, margin: float = 0
         sharex: one time axis for all.
     """
     figure = Figure(figsize=(width, height * rows + margin), layout="constrained")
-    return figure, figure.subplots(rows, 1, sharex=sharex, squeeze=False).ravel()
+    axes = figure.subplots(rows, 1, sharex=sharex, squeeze=False).ravel()
+    figure.align_ylabels(axes)
+    return figure, axes
 
 
 def outline(values: np.ndarray, points: int = LINE_POINTS) -> np.ndarray:

@@ -17,8 +17,9 @@ from .page import PageTable, write_report
 from .style import COLOURS, FAINT, LEGEND_ABOVE, style
 
 _POINTS = 6000
+"""Points of a line: a page is about 1000 pixels wide."""
 _LINES = 25
-"""Lines that the terminal gets at most."""
+"""Lines printed at most: a terminal shows about that many."""
 _LABELS = {"u": "input u", "theta_e": "motor θe", "theta_s": "load θs", "transmitted": "transmitted"}
 _COLOUR = {
     "u": COLOURS[6],
@@ -127,7 +128,6 @@ def _channels(record: Record) -> Drawn:
             ax.plot(record.time[at], signal[at], color=colour, lw=0.9)
         ax.set_ylabel(f"{label}\n({unit})")
     axes[-1].set_xlabel("time (s)")
-    figure.align_ylabels()
     return Drawn(
         "channels", figure, f"The channels over time, and the velocity by differences of the low-passed {side} position."
     )
@@ -152,7 +152,6 @@ def _spectra(record: Record) -> Drawn:
         if channel.noise or channel.bandwidth:
             ax.legend(ncols=2, **LEGEND_ABOVE)
     axes[-1].set_xlabel("frequency (Hz)")
-    figure.align_ylabels()
     return Drawn(
         "spectra", figure, "Amplitude spectral densities (Welch), the noise floor, and the bandwidth of each channel."
     )
@@ -170,11 +169,11 @@ def _torque_over_velocity(record: Record) -> Drawn:
     if sure:
         assert dynamics is not None
         for s in record.segments:
-            # the acceleration holds nothing above this frequency, so the torque shall not either
+            # the same low-pass as that of the acceleration
             torque[s] = quality.low_passed(torque[s], 4.0 * channel.bandwidth, record.sample_period)
             torque[s] -= dynamics.values[0] * np.gradient(speed[s], record.sample_period)
-        label = "u less inertia"
-        # the ends of a segment are the filter's
+        label = "u less inertia torque"
+        # transients of the filter
         edge = round(1.0 / (4.0 * channel.bandwidth * record.sample_period))
     figure = Figure(figsize=(7.0, 3.4), layout="constrained")
     ax = figure.subplots()
@@ -189,7 +188,7 @@ def _torque_over_velocity(record: Record) -> Drawn:
     ax.set(xlabel=f"{side} velocity ({channel.unit}/s)", ylabel=f"{label} ({record.findings.channels['u'].unit})",
            ylim=(low - margin, high + margin))  # fmt: skip
     less = (
-        f" The torque that accelerates {dynamics.values[0]:.4g} is taken off: a rough fit, not an identification."
+        f" Less the torque of an inertia of {dynamics.values[0]:.4g}: a rough estimate, not an identification."
         if sure and dynamics
         else ""
     )
@@ -222,10 +221,10 @@ def _twist(inspection: Inspection) -> Drawn:
         ax.set_xlabel(label)
     axes[0].set_ylabel(f"θe − N₀ θs about its median ({unit})")
     axes[-1].legend(ncols=2, markerscale=5, **LEGEND_ABOVE)
-    told = "the side that the load pulls to" if by_load else "the direction of motion"
+    split = "the side that the load pulls to" if by_load else "the direction of motion"
     caption = (
-        f"Twist θe − N₀ θs with N₀ = {inspection.gear_ratio:.5g}, by {told}. Over torque: hysteresis, its "
-        "width is lost motion and friction, its slope compliance. Over position: what repeats with it is eccentricity of "
+        f"Twist θe − N₀ θs with N₀ = {inspection.gear_ratio:.5g}, by {split}. Over torque: the loop's "
+        "width shows lost motion and friction, its slope compliance. Over position: a periodic twist shows eccentricity of "
         "encoders or gears."
     )
     return Drawn("twist", figure, caption)

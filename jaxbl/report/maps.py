@@ -210,7 +210,7 @@ def _grid_of_axes(count: int, width: float, height: float, extra: float = 0.0) -
 
 
 def _table(part: pd.DataFrame, keys: list[str], value: str) -> pd.Series:
-    """What a map draws; empty where any run diverged, for the others alone would look too good."""
+    """The values of a map; empty where any run diverged: an average of the other runs would hide that."""
     table = _reduce(part.assign(**{value: _shown(part, value)}), keys, value)
     return table if value == "finite" else table.where(_reduce(part, keys, "finite") == 1.0)
 
@@ -238,28 +238,8 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable, points: Poi
         gridded = config.sweep.design == "grid"
         missing = diverged = 0
         for ax, (title, part), table in zip(axes, panels, tables, strict=True):
-            ax.grid(False)
-            ax.set_facecolor(MISSING if gridded else "white")
-            if filling is None:
-                xs, ys = (np.sort(part[path].unique()).astype(float) for path in (spec.x, spec.y))
-            else:
-                xs, ys, grid = filling.dense(table)
-            logs = [_is_log(config, path, v) for path, v in ((spec.x, xs), (spec.y, ys))]
-            if logs[0]:
-                ax.set_xscale("log")
-            if logs[1]:
-                ax.set_yscale("log")
-            if gridded:
-                if filling is None:
-                    grid = table.unstack().to_numpy(float)
-                ax.pcolormesh(cell_edges(xs, logs[0]), cell_edges(ys, logs[1]), grid, cmap=MAP, norm=norm, rasterized=True)
-                outline = _outline(ax, part, spec, (xs, ys), logs, filling)
-                handles = handles or ([] if outline is None else [outline])
-            else:
-                shown = _shown(part, spec.value)
-                there, gone = part[shown.notna()], part[shown.isna()]
-                ax.scatter(there[spec.x], there[spec.y], c=shown[shown.notna()], cmap=MAP, norm=norm, s=16, linewidths=0)
-                ax.plot(gone[spec.x], gone[spec.y], "x", ms=4, color=MISSING)
+            xs, ys, hatch = _map_panel(ax, config, part, table, spec, norm, filling)
+            handles = handles or hatch
             missing += int(table.isna().sum())
             diverged += int((_reduce(part, keys, "finite")[table.isna()] < 1.0).sum())
             under = []
@@ -267,16 +247,11 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable, points: Poi
                 ax.plot(best[0], best[1], "*", ms=13, mfc="white", mec="black", mew=1.0, clip_on=False, zorder=5)
                 under.append(f"best ★ {best[2]:.2g} {describe(spec.value).unit}".rstrip())
             if spec.overlays:
-                # most points of a refined study lie at its boundary, and would count for more than others
+                # most points of a refined study lie at its boundary: the median is that of the coarse grid
                 bound = _bound(part if points is None else part[points.always_simulated(part)], spec)
                 curves = _overlay(ax, bound, spec, xs, ys)
                 under.append(f"f⁺ = {bound:.3g} rad/s²")
             ax.set_title("\n".join(line for line in (title, ",  ".join(under)) if line))
-            ax.set_xlim(*cell_edges(xs, logs[0])[[0, -1]])
-            ax.set_ylim(*cell_edges(ys, logs[1])[[0, -1]])
-            if ax.get_subplotspec().is_first_col():  # type: ignore[union-attr]
-                ax.set_ylabel(_label(config, spec.y))
-            ax.set_xlabel(_label(config, spec.x))
         if missing:
             word = "diverged" if diverged == missing else "not converged" if "time" in spec.value else "undefined"
             label = f"{word} ({missing} points)"
@@ -289,6 +264,77 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable, points: Poi
             figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), columns))
     caption = f"{_value_label(spec.value)} over {spec.x} and {spec.y}{_over(config, frame, spec)}."
     return Drawn(_file_name(spec), figure, caption)
+
+
+def _map_panel(
+    ax: Axes,
+    config: Config,
+    part: pd.DataFrame,
+    table: pd.Series,
+    spec: FigureTable,
+    norm: Normalize,
+    filling: Filling | None,
+) -> tuple[np.ndarray, np.ndarray, list[Patch]]:
+    """Cells of a grid, or dots of a quasi-random design. Returns the values of both axes and the legend's handles."""
+    assert spec.y is not None
+    ax.grid(False)
+    if filling is None:
+        xs, ys = (np.sort(part[path].unique()).astype(float) for path in (spec.x, spec.y))
+    else:
+        xs, ys, grid = filling.dense(table)
+    logs = [_is_log(config, path, values) for path, values in ((spec.x, xs), (spec.y, ys))]
+    ax.set(xscale="log" if logs[0] else "linear", yscale="log" if logs[1] else "linear")
+    edges = cell_edges(xs, logs[0]), cell_edges(ys, logs[1])
+    handles = []
+    if config.sweep.design == "grid":
+        if filling is None:
+            grid = table.unstack().to_numpy(float)
+        ax.set_facecolor(MISSING)
+        ax.pcolormesh(*edges, grid, cmap=MAP, norm=norm, rasterized=True)
+        side = spec.value.partition(".")[0]
+        column = f"{side}.converged"
+        if column in part and spec.value != column:
+            shares = _reduce(part, [spec.y, spec.x], column)
+            share = shares.unstack().to_numpy(float) if filling is None else filling.dense(shares)[2]
+            handles = hatch_failures(ax, (xs, ys), edges, share, f"{side} not converged")
+    else:
+        shown = _shown(part, spec.value)
+        there, gone = part[shown.notna()], part[shown.isna()]
+        ax.scatter(there[spec.x], there[spec.y], c=shown[shown.notna()], cmap=MAP, norm=norm, s=16, linewidths=0)
+        ax.plot(gone[spec.x], gone[spec.y], "x", ms=4, color=MISSING)
+    ax.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]], xlabel=_label(config, spec.x))
+    if ax.get_subplotspec().is_first_col():  # type: ignore[union-attr]
+        ax.set_ylabel(_label(config, spec.y))
+    return xs, ys, handles
+
+
+def hatch_failures(
+    ax: Axes,
+    centres: tuple[np.ndarray, np.ndarray],
+    edges: tuple[np.ndarray, np.ndarray],
+    share: np.ndarray,
+    label: str,
+) -> list[Patch]:
+    """Hatch the cells of a map in which less than half of the runs pass. Returns the legend's handles.
+
+    Args:
+        ax: of the map.
+        centres: of the cells, along x `(columns,)` and y `(rows,)`.
+        edges: of the cells, along x `(columns + 1,)` and y `(rows + 1,)`.
+        share: of the runs that pass `(rows, columns)`.
+        label: of the hatching.
+    """
+    if not share.min() < 0.5:
+        return []
+    # out to the edges of the outer cells
+    share = np.pad(share, 1, mode="edge")
+    xs, ys = (np.concatenate([e[:1], c, e[-1:]]) for c, e in zip(centres, edges, strict=True))
+    hatched = ax.contourf(xs, ys, share, levels=[-1.0, 0.5], colors="none", hatches=["//"])
+    hatched.set(edgecolor=HATCH, linewidth=0.0)
+    if share.max() >= 0.5:
+        lines = ax.contour(xs, ys, share, levels=[0.5], colors="white", linewidths=1.8)
+        lines.set_path_effects([path_effects.Stroke(linewidth=3.2, foreground="black"), path_effects.Normal()])
+    return [Patch(facecolor="#808080", edgecolor="white", hatch="///", label=label)]
 
 
 def _shown(part: pd.DataFrame, value: str) -> pd.Series:
@@ -318,35 +364,6 @@ def _best(table: pd.Series, part: pd.DataFrame, spec: FigureTable) -> tuple[floa
         return None
     y, x = kept.idxmin()
     return float(x), float(y), float(kept[(y, x)])
-
-
-def _outline(
-    ax: Axes,
-    part: pd.DataFrame,
-    spec: FigureTable,
-    centres: tuple[np.ndarray, np.ndarray],
-    logs: list[bool],
-    filling: Filling | None,
-) -> Patch | None:
-    """Mark where the observer does not keep its tolerance."""
-    side = spec.value.partition(".")[0]
-    column = f"{side}.converged"
-    if column not in part or spec.value == column:
-        return None
-    assert spec.y is not None
-    shares = _reduce(part, [spec.y, spec.x], column)
-    share = shares.unstack().to_numpy(float) if filling is None else filling.dense(shares)[2]
-    if not share.min() < 0.5:
-        return None
-    # out to the edges of the outer cells
-    share = np.pad(share, 1, mode="edge")
-    xs, ys = (np.concatenate([e[:1], c, e[-1:]]) for c, e in zip(centres, map(cell_edges, centres, logs), strict=True))
-    hatched = ax.contourf(xs, ys, share, levels=[-1.0, 0.5], colors="none", hatches=["//"])
-    hatched.set(edgecolor=HATCH, linewidth=0.0)
-    if share.max() >= 0.5:
-        lines = ax.contour(xs, ys, share, levels=[0.5], colors="white", linewidths=1.8)
-        lines.set_path_effects([path_effects.Stroke(linewidth=3.2, foreground="black"), path_effects.Normal()])
-    return Patch(facecolor="#808080", edgecolor="white", hatch="///", label=f"{side} not converged")
 
 
 def _bound(part: pd.DataFrame, spec: FigureTable) -> float:

@@ -1,4 +1,4 @@
-"""Drawing of residual torques: over time with the noise band, over speed, position and twist, and their spectrum."""
+"""Figures of residual torques: over time with the noise band, over speed, position and twist, and their spectrum."""
 
 from collections.abc import Mapping, Sequence
 from textwrap import fill
@@ -19,10 +19,11 @@ _CLOUD = 4000
 _MEAN = COLOURS[6]
 _SHOWN = ("speed", "turn", "load turn", "position", "load position", "twist", "acceleration")
 _PANELS = 3
+"""Coordinates that are drawn: as many as are wide enough side by side."""
 _WIDTH = 118
-"""Characters of a line above a figure."""
-_WORTH = 0.1
-"""Share of the power from which on a peak is named."""
+"""Characters of a line above a figure of 9 inches."""
+_LABELLED = 0.1
+"""Least share of the power of a peak with a label; labels of smaller ones would cover each other."""
 
 
 def draw_residuals(
@@ -37,7 +38,7 @@ def draw_residuals(
     Args:
         residuals: by equation, of each part of the record.
         coordinates: by equation, of each part (:func:`jaxbl.diagnosis.localise.coordinates_of`).
-        found: where they live, by equation.
+        found: where they occur, by equation.
         unit: of the torques.
         observed: the same torques by the observers, of each part; those of an observer that does not converge are not drawn.
     """
@@ -49,7 +50,7 @@ def draw_residuals(
 
 
 def _shown(residual: Residual, found: Localised) -> tuple[Residual, np.ndarray]:
-    """A residual behind the low-pass behind which it was looked at."""
+    """A residual after the low-pass that the analysis used, and the indices of its samples."""
     return narrowed(residual, found.bandwidth)
 
 
@@ -68,9 +69,9 @@ def _over_time(
             time, band = low.time[at], 2.0 * low.deviation[at]
             ax.plot(time, low.torque[at], color=SIDE_COLOURS[name], lw=0.9, label="missing" if i == 0 else None, zorder=2)
             ax.fill_between(time, -band, band, color=MISSING, alpha=0.75, lw=0.0, zorder=3, label=None if i else "± 2 noise")
-        witnesses = observed.get(name, ())
-        if all(part.converged for part in witnesses):
-            for i, part in enumerate(witnesses):
+        estimates = observed.get(name, ())
+        if all(part.converged for part in estimates):
+            for i, part in enumerate(estimates):
                 low, _ = _shown(part.residual, one)
                 at = outline(low.torque)
                 label = None if i else f"by its observer (noise {low.deviation[0]:.2g} {unit})"
@@ -81,15 +82,13 @@ def _over_time(
         ax.legend(ncols=3, **LEGEND_ABOVE)
     axes[-1].set_xlabel("time (s)")
     caption = (
-        "Torque that the model lacks (inertia times acceleration less all modelled torques, positive forward), behind the "
-        "low-pass behind which it stands out. The grey band is twice the noise's standard deviation: what stays within it "
-        "is noise."
+        "Torque that the model lacks (inertia times acceleration less all modelled torques, positive forward), after the "
+        "low-pass that shows it most clearly. The grey band is twice the standard deviation of the noise."
     )
     if observed:
         caption += (
-            " Thin dark line: the same by the side's super-twisting observer, whose equivalent control stands for what the "
-            "model lacks once it is told of all that the model has, late by the time constant of its low-pass: a second "
-            "witness with noise of its own, on which nothing depends."
+            " Thin dark line: the same torque by the side's super-twisting observer (its equivalent control less the "
+            "modelled torques), late by the time constant of its low-pass. Its noise is of its own; no result depends on it."
         )
     return Drawn("residual_torque", figure, caption)
 
@@ -139,8 +138,8 @@ def _over_coordinates(
     figure.legend(*handles, ncols=2, loc="outside lower right")
     caption = (
         f"{describe(found, unit)[:1].upper()}{describe(found, unit)[1:]}. Dots are samples, black marks the means of bins "
-        "with twice their standard errors; hollow where a mean is not told from zero. Above: share of the power beyond the "
-        "noise that a function of this coordinate alone explains, on stretches of time that it was not made from."
+        "with twice their standard errors; hollow where a mean does not differ significantly from zero. Above: share of the "
+        "power beyond the noise that a function of this coordinate alone explains, on data that it was not fitted to."
     )
     return Drawn(f"residual_{found.name}", figure, caption)
 
@@ -163,14 +162,14 @@ def _spectra(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, Lo
         frequency, power, floor = spectrum_of(longest)
         seen = (frequency > 0.0) & (frequency <= min(1.5 * longest.bandwidth, frequency[-1]))
         frequency, power, floor = frequency[seen], power[seen], floor[seen]
-        # of each line: amplitude of a sine with its power
+        # amplitude of a sine with the power of the line
         size = np.sqrt(2.0 / len(longest.time))
         ax.loglog(frequency, size * np.sqrt(power), color=SIDE_COLOURS[name], lw=0.9, label="missing")
         ax.loglog(frequency, size * np.sqrt(floor), color=_MEAN, lw=1.2, ls="--", label="noise")
         ax.set_ylim(0.2 * size * np.sqrt(np.min(floor)), 3.0 * size * np.sqrt(np.max([np.max(power), np.max(floor)])))
-        ax.axvline(found[name].bandwidth, color=FAINT, lw=0.9, ls=":", label="looked at up to here")
+        ax.axvline(found[name].bandwidth, color=FAINT, lw=0.9, ls=":", label="end of the band analysed")
         for peak in [one for one in found[name].peaks if not one.in_motion and one.excess_z > SIGNIFICANT][:3]:
-            if peak.power_share < _WORTH:
+            if peak.power_share < _LABELLED:
                 continue
             ax.annotate(
                 f"{peak.frequency:.4g} Hz\n{peak.amplitude:.2g} {unit}", (peak.frequency, peak.amplitude),
@@ -182,7 +181,7 @@ def _spectra(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, Lo
     axes[-1].set_xlabel("frequency (Hz)")
     caption = (
         "Spectrum of the missing torque and of its noise. The noise of an acceleration grows with the square of the "
-        "frequency, up to the smoother's bandwidth; what stands above the dashed line is missing from the model. Marked: "
-        "narrow peaks that the motion does not have."
+        "frequency, up to the smoother's bandwidth; power above the dashed line is missing from the model. Marked: narrow "
+        "peaks that the motion does not have."
     )
     return Drawn("residual_spectrum", figure, caption)

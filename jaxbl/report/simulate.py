@@ -74,7 +74,9 @@ def draw_trial(trial: Trial) -> list[Drawn]:
 
 def _axes(rows: int = 1, columns: int = 1, height: float = 3.2, sharex: bool = True):
     figure = Figure(figsize=(7.0, height), layout="constrained")
-    return figure, figure.subplots(rows, columns, sharex=sharex, squeeze=False).ravel()
+    axes = figure.subplots(rows, columns, sharex=sharex, squeeze=False).ravel()
+    figure.align_ylabels(axes)
+    return figure, axes
 
 
 def _input(trace: pd.DataFrame) -> Drawn:

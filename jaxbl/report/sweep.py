@@ -22,9 +22,9 @@ from .page import PageTable, write_report
 
 
 def write_sweep_report(result: StudyResult, folder: Path) -> list[str]:
-    """Draw the figures of a study and write `report.html` into its folder, and `laws.json` if figures ask for laws.
+    """Write figures, `report.html`, and `laws.json` if figures ask for laws, into a study's folder.
 
-    Returns the headline's lines.
+    Returns the lines for the terminal.
     """
     drawn = draw(result)
     laws = accuracy_laws(result)
@@ -44,7 +44,7 @@ def headline(result: StudyResult) -> list[str]:
     sides = [side for side in SIDES if f"{side}.converged" in result.columns]
     figures = [f"{side}.{name}" for side in sides for name in ("converged", "velocity_rmse")]
     frame = result.read([*(axis.path for axis in result.config.axes), "seed", "finite", *figures])
-    # a refined study has most of its runs at the boundary: shares of them all would say nothing
+    # a refined study has most of its runs at the boundary: a share of all runs would depend on the refinement
     refined = result.config.sweep.refine is not None
     points = Points(result.config) if refined else None
     even = frame if points is None else frame[points.always_simulated(frame)]
@@ -65,7 +65,7 @@ def headline(result: StudyResult) -> list[str]:
             lines.append(f"The study is not finished: it has {manifest['rows']} runs{more}. Go on with 'jaxbl sweep'.")
     diverged = int((~frame["finite"].astype(bool)).sum())
     if diverged:
-        lines.append(f"{diverged} runs diverged: they are in the table with finite = false, and grey in the figures.")
+        lines.append(f"{diverged} runs diverged: finite = false in the table, grey in the figures.")
     for side in sides:
         best = frame[frame[f"{side}.converged"].astype(bool)]
         varied = [
@@ -79,7 +79,7 @@ def headline(result: StudyResult) -> list[str]:
 
 
 def _law_lines(laws: list[Law]) -> list[str]:
-    """What was found of the laws: how many agree, and each that does not."""
+    """How many laws agree with theory, and each that does not."""
     if not laws:
         return []
     count = sum(law.agrees for law in laws)
@@ -92,7 +92,7 @@ def _law_lines(laws: list[Law]) -> list[str]:
 
 
 def _why(law: Law) -> str:
-    """The reasons at the ends; the end of the sweep only where nothing else ends the law."""
+    """Why a law ends below and above; the end of the sweep is named only where both ends are that."""
     below, above = law.stops["below"], law.stops["above"]
     if below == above:
         return below
@@ -106,7 +106,7 @@ def _slope_of(law: Law) -> str:
 
 
 def _place(law: Law) -> str:
-    """What a law's line fixes; a word speaks for itself."""
+    """The values that a line of a law is for; a word stands without its path."""
     pairs = {**law.series, **law.where}.items()
     return ", ".join(value if isinstance(value, str) else f"{path} = {value:g}" for path, value in pairs) or "all points"
 

@@ -1,4 +1,4 @@
-"""What `jaxbl tune` leaves to be read: the objective over normalised gains, error against convergence time, comparison."""
+"""What `jaxbl tune` leaves to be read: the objective over the gains, error over convergence time, comparisons."""
 
 import json
 from pathlib import Path
@@ -19,9 +19,9 @@ from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
 from .figures import SIDES, Drawn
-from .maps import cell_edges, color_norm, condition_curves
+from .maps import cell_edges, color_norm, condition_curves, hatch_failures
 from .page import PageTable, write_report
-from .style import COLOURS, HATCH, MAP, MISSING, style, with_unit
+from .style import COLOURS, MAP, MISSING, style, with_unit
 
 _MARKS = ("o", "s", "^", "D", "v", "P", "X")
 _CONDITIONS = {name: CONDITIONS[name] for name in ("davila_fridman", "seeber_horn", "exact")}
@@ -68,14 +68,7 @@ def _map(tuning: Tuning, side: str) -> Drawn:
     ax.set(xscale="log", yscale="log")
     edges = cell_edges(xs, True), cell_edges(ys, True)
     ax.pcolormesh(*edges, grid, cmap=MAP, norm=norm, rasterized=True)
-    handles: list[Any] = []
-    share = np.pad(feasible.to_numpy(float), 1, mode="edge")
-    if share.min() < 0.5:
-        padded = [np.concatenate([e[:1], centres, e[-1:]]) for e, centres in zip(edges, (xs, ys), strict=True)]
-        hatched = ax.contourf(*padded, share, levels=[-1.0, 0.5], colors="none", hatches=["//"])
-        hatched.set(edgecolor=HATCH, linewidth=0.0)
-        ax.contour(*padded, share, levels=[0.5], colors="white", linewidths=1.4)
-        handles.append(Patch(facecolor="#808080", edgecolor="white", hatch="///", label="constraints not kept"))
+    handles: list[Any] = [*hatch_failures(ax, (xs, ys), edges, feasible.to_numpy(float), "constraints not met")]
     handles += condition_curves(ax, _CONDITIONS, 1.0, (edges[0][0], edges[0][-1]))
     for window in summary["stages"][1:2]:
         (left, right), (low, high) = window[side]["alpha_ratio"], window[side]["lambda_ratio"]
@@ -100,7 +93,7 @@ def _map(tuning: Tuning, side: str) -> Drawn:
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     caption = (
         f"{side}: {_label(tuning)} over all runs, on the coarse map of normalised gains. Hatched: not converged, or a "
-        "margin not kept. Curves: least λ of the gain conditions. The other gains are compared below."
+        "margin not met. Curves: least λ of the gain conditions. The other gains are compared below."
     )
     return Drawn(f"tuning_{side}", figure, caption)
 
@@ -120,7 +113,7 @@ def _front(tuning: Tuning, side: str) -> Drawn:
     figure = Figure(figsize=(6.6, 4.4), layout="constrained")
     ax = figure.subplots()
     ax.plot(
-        feasible["convergence_time"], feasible["error"], ".", ms=3.5, color=MISSING, label="gains that keep all constraints"
+        feasible["convergence_time"], feasible["error"], ".", ms=3.5, color=MISSING, label="gains that meet all constraints"
     )
     ax.step(front["convergence_time"], front["error"], "o-", where="post", ms=3.5, color=COLOURS[0],
             label="none better in both")  # fmt: skip
@@ -133,7 +126,7 @@ def _front(tuning: Tuning, side: str) -> Drawn:
             handles.append(Line2D([], [], ls="", marker="", label=f"{name}: {100 * row['converged']:.3g} % converge"))
             continue
         kept = row["margin_alpha"] >= margins["alpha"] and row["margin_exact"] >= margins["exact"]
-        handles.append(_mark(ax, (time, error), mark, 8, name if kept else f"{name}, margins not kept"))
+        handles.append(_mark(ax, (time, error), mark, 8, name if kept else f"{name}, margins not met"))
         times.append(time)
         errors.append(error)
     found = summary["achieved"][side]
@@ -209,7 +202,7 @@ def write_tune_report(tuning: Tuning, folder: Path) -> list[str]:
 
 
 def gains_toml(summary: dict[str, Any]) -> str:
-    """The chosen gains as TOML that a study can `include`; what they were chosen for stands in comments."""
+    """The chosen gains as TOML that a study can `include`; comments say what they were chosen for."""
     margins, lines = summary["margins"], []
     title = " ".join(summary["title"].split())
     lines.append(f"# Gains chosen by 'jaxbl tune'{f' for: {title}' if title else ''}")
@@ -247,7 +240,7 @@ def _holdout_title(summary: dict[str, Any]) -> str:
 
 
 def _tune_headline(summary: dict[str, Any]) -> list[str]:
-    """Gains, and what they are worth on the held-out runs, in sentences."""
+    """The chosen gains and their errors on the held-out runs, in sentences."""
     lines, metric = [], f"{summary['objective']}_rmse"
     unit = SIDE_METRICS[metric].unit
     for side, gains in summary["gains"].items():

@@ -45,7 +45,7 @@ def draw_verdict(verdict: Verdict) -> list[Drawn]:
 
 
 def _mark(ax: Axes, verdict: Verdict, dark: bool = False) -> list[Line2D]:
-    """Marks at the usual pair and at the study's marks; those beyond the axes stand on the edge. Returns the legend."""
+    """Mark the usual pair and the study's marks, those off the map on its edge. Returns the legend's handles."""
     handles = []
     (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
     marks = [mark for mark in verdict.summary["marks"] if mark["alpha_ratio"] is not None]
@@ -107,7 +107,7 @@ def _damping(verdict: Verdict) -> Drawn:
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
     caption = (
         "Least λ at which the worst disturbance no longer enlarges a velocity error v, simulated with viscous friction. "
-        "The friction number is (friction / inertia) v / f⁺: large errors are shrunk by friction, small ones are not."
+        "The friction number is (friction / inertia) v / f⁺: friction shrinks large errors, not small ones."
     )
     return Drawn("friction", figure, caption)
 
@@ -157,8 +157,8 @@ def _levels(verdict: Verdict, side: str) -> Drawn:
     bar.set_label(f"share of runs in which the {side} observer converged")
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     caption = (
-        f"Runs of the drive, {side} observer, each in units of its own true f⁺: they fall onto the plane of the atlas. A "
-        "real input is not the worst disturbance, so that runs converge below the curves as well; grey: no run."
+        f"Runs of the drive, {side} observer, each in units of its own true f⁺, on the axes of the atlas. A real input is "
+        "not the worst disturbance: runs converge below the curves as well. Grey: no run."
     )
     return Drawn(f"levels_{side}", figure, caption)
 
@@ -185,8 +185,8 @@ def _conservatism(verdict: Verdict) -> Drawn:
     ax.grid(axis="y", visible=False)
     figure.legend(loc="outside lower center", ncols=3)
     caption = (
-        "How much more λ each condition demands than works: dot median, line to the largest. An arrow head: the least λ on "
-        "the study's axis worked as well, so that the true ratio is larger still."
+        "λ that each condition demands over the least λ that works: dot median, line to the largest. Arrow head: the least "
+        "λ on the study's axis worked as well, so that the true ratio is larger."
     )
     return Drawn("conservatism", figure, caption)
 
@@ -214,8 +214,8 @@ def _claimed(verdict: Verdict) -> Drawn:
     else:
         ax.text(0.5, 0.5, "no run converged", ha="center", transform=ax.transAxes)
     caption = (
-        "The bound that the paper's text gives, twice the largest acceleration, against the true one: right of the line "
-        "it is too small, and gains chosen by it may miss every condition."
+        "The true bound over that of the paper's text, twice the largest acceleration. Right of the line the paper's bound "
+        "is too small, and gains chosen by it may meet none of the conditions."
     )
     return Drawn("claimed_bound", figure, caption)
 
@@ -244,10 +244,10 @@ def _headline(verdict: Verdict) -> list[str]:
             line += "with no counterexample to any condition."
         else:
             counts = ", ".join(f"{e['title']} {e['counterexamples']} of {e['holds']}" for e in wrong)
-            line += f"and the observer failed though the condition held: {counts}."
+            line += f"and the observer failed although a condition held: {counts}."
             causes = level["causes"].get("true", {})
-            told = ", ".join(f"{cause} ({count})" for cause, count in list(causes.items())[:4])
-            line += f" Causes, by experiment: {told}."
+            found = ", ".join(f"{cause} ({count})" for cause, count in list(causes.items())[:4])
+            line += f" Causes, by experiment: {found}."
         lines.append(line)
     first = verdict.summary["levels"][0]
     ratios = "; ".join(
@@ -255,7 +255,7 @@ def _headline(verdict: Verdict) -> list[str]:
         for e in first["conditions"]
         if e["name"] != "exact"
     )
-    lines.append(f"λ demanded over the least that works against the worst disturbance, median (largest): {ratios}.")
+    lines.append(f"λ demanded over the least λ that works against the worst disturbance, median (largest): {ratios}.")
     closed = verdict.summary["closed_form"]
     lines.append(f"Closed form of ρ and simulation differ by {closed['largest_difference']:.2g} at most.")
     for level in verdict.summary["levels"][1:]:
@@ -264,7 +264,7 @@ def _headline(verdict: Verdict) -> list[str]:
             # where nothing accelerates there is no factor
             most = claimed["true_over_claimed"]["max"]
             lines.append(
-                f"{level['side']}: twice the largest acceleration, the paper's text for f⁺, is too small in "
+                f"{level['side']}: the paper's bound f⁺, twice the largest acceleration, is too small in "
                 f"{100.0 * claimed['too_small']:.0f} % of the converged runs"
                 + ("." if most is None else f", by a factor of up to {most:.3g}.")
             )
@@ -285,9 +285,9 @@ def _mark_lines(verdict: Verdict) -> list[str]:
             line += f"ρ = {rho:.3g}: any disturbance within f⁺ dies out in finite time."
         else:
             line += (
-                f"ρ = {rho:.3g}: the worst disturbance enlarges the error until friction holds it, at "
-                f"{mark['upheld_velocity_error']:.3g} rad/s. A disturbance that stays the same lets each half cycle shrink "
-                f"to {mark['peak_ratio_constant']:.3g} of the last (friction number {mark['damping']:.2g})"
+                f"ρ = {rho:.3g}: the worst disturbance enlarges the velocity error to "
+                f"{mark['upheld_velocity_error']:.3g} rad/s, where friction balances it. Under a constant disturbance each "
+                f"peak is {mark['peak_ratio_constant']:.3g} times the last (friction number {mark['damping']:.2g})"
             )
             seconds = mark["convergence_time"]
             line += (
@@ -350,7 +350,7 @@ def _mark_table(verdict: Verdict) -> PageTable:
         "damping": "friction number",
         "peak_ratio_damped": "ρ with friction",
         "peak_ratio_constant": "ratio, constant disturbance",
-        "upheld_velocity_error": "upheld error (rad/s)",
+        "upheld_velocity_error": "sustained error (rad/s)",
         "margin_davila_fridman": "margin to (32)",
         "margin_exact": "margin to ρ < 1",
         "converged": "converged",

@@ -60,50 +60,48 @@ def changed(**keys):
 
 def test_the_headline_has_verdict_numbers_and_gap():
     lines = diagnosis_lines(SUMMARY)
-    assert lines[0] == "Explained: the model lacks load.coulomb_friction; with it noise is left."
+    assert lines[0] == "Explained: the model lacks load.coulomb_friction; with it only noise remains."
     assert lines[1] == "load.coulomb_friction (confidence 0.93): torque = 0.274 ± 0.0021 N m."
-    assert lines[2] == "  This log does not rule out in its place: load.stribeck_friction (0.07)."
-    assert lines[3].startswith("On other.csv, over windows of 0.5 s, rms: theta_e 0.1 -> 0.0011 rad (floor 0.001); theta_s ")
+    assert lines[2] == "  Not ruled out by this log: load.stribeck_friction (0.07)."
+    assert lines[3].startswith("On other.csv, over windows of 0.5 s, rms: theta_e 0.1 -> 0.0011 rad (noise 0.001); theta_s ")
     assert lines[4].startswith("In one free run: theta_e 0.1 -> 0.002 rad;")
     assert "Control: the best model with another effect (load.stribeck_friction) leaves 0.03 rad in theta_e." in lines
-    assert "Control: the missing torque in the wrong order diverges." in lines
+    assert "Control: the missing torque shuffled in time diverges." in lines
     assert lines[-1] == "A note."
 
 
-def test_the_second_witness_is_heard_where_it_says_anything():
+def test_the_observers_residual_is_given_where_they_converge():
     assert not any("observers" in line for line in diagnosis_lines(SUMMARY))
     seen = {"converged": True, "rms": 2.1, "noise": 0.2, "correlation": 0.987}
     nothing = {"converged": True, "rms": 0.021, "noise": 0.02, "correlation": 0.3}
     silent = {"converged": False, "rms": None, "noise": None, "correlation": None}
 
-    def told(**witnesses):
-        where = {side: SUMMARY["where"][side] | {"observed": one} for side, one in witnesses.items()}
+    def lines_of(**observed):
+        where = {side: SUMMARY["where"][side] | {"observed": one} for side, one in observed.items()}
         return [line for line in diagnosis_lines(changed(where=where)) if "observers" in line]
 
-    assert told(motor=nothing, load=seen) == [
-        "By the observers' equivalent control: motor side, nothing beyond its noise (0.02 N m rms); load side, 2.1 N m rms "
+    assert lines_of(motor=nothing, load=seen) == [
+        "By the observers' equivalent control: motor side, no more than its noise (0.02 N m rms); load side, 2.1 N m rms "
         "(its noise 0.2), correlation 0.99 with the smoother's."
     ]
-    assert told(motor=silent, load=seen)[0].startswith("By the observers' equivalent control: load side, 2.1 N m rms")
-    assert told(motor=silent) == []
+    assert lines_of(motor=silent, load=seen)[0].startswith("By the observers' equivalent control: load side, 2.1 N m rms")
+    assert lines_of(motor=silent) == []
 
 
 def test_other_verdicts_say_what_is_left():
     assert diagnosis_lines(changed(verdict="no_discrepancy", findings=[]))[0].startswith("No discrepancy: ")
     rest = {"load.drift": {"evidence": 30.0, "share": 0.01}}
     lines = diagnosis_lines(changed(verdict="unknown_effect", findings=[], rest=rest))
-    assert lines[0].startswith(
-        "Unknown effect: something is missing that is none of the effects known. It lives: motor side"
-    )
-    assert any(line.startswith("Left over: a friction that drifts on the load side (1 % of") for line in lines)
+    assert lines[0].startswith("Unknown effect: no known effect explains the residual: motor side")
+    assert any(line.startswith("Remaining: a drifting friction on the load side (1 % of") for line in lines)
     partly = changed(verdict="unknown_effect", where_after={"load": {"sentence": "load side, there"}})
-    assert diagnosis_lines(partly)[0].endswith("does not explain all of it. What is left: load side, there.")
+    assert diagnosis_lines(partly)[0].endswith("explains a part only. The residual that remains: load side, there.")
     gap = SUMMARY["gap"] | {"free_run": {"why_not": "it is chaotic"}}
-    assert "A free run says nothing here: it is chaotic." in diagnosis_lines(changed(gap=gap))
+    assert "No free run is compared: it is chaotic." in diagnosis_lines(changed(gap=gap))
 
 
 @pytest.mark.parametrize("findings", [SUMMARY["findings"], []], ids=["some", "none"])
-def test_the_story_is_drawn(findings, tmp_path):
+def test_the_verdict_is_drawn(findings, tmp_path):
     drawn = _verdict(changed(findings=findings, verdict="explained" if findings else "no_discrepancy"))
     left, right = drawn.figure.axes
     assert left.get_xlabel() == "rms error on held-out data over noise" and left.get_xscale() == "log"

@@ -80,7 +80,7 @@ def test_map_has_the_coarse_stage_its_optimum_and_the_others(tuned):
     star = next(line for line in ax.lines if line.get_marker() == "*")
     assert (star.get_xdata()[0], star.get_ydata()[0]) == (gains["alpha_ratio"], gains["lambda_ratio"])
     legend = [text.get_text() for legend in drawing.figure.legends for text in legend.get_texts()]
-    assert {"constraints not kept", CONDITIONS["exact"].title, "usual rule", "config", "slow, off the map", "tuned"} <= set(
+    assert {"constraints not met", CONDITIONS["exact"].title, "usual rule", "config", "slow, off the map", "tuned"} <= set(
         legend
     )
     # on the edge, not outside

@@ -63,7 +63,7 @@ def test_page_and_lines(checked):
     for text in ("Counterexamples by cause", "True and claimed bound by input", "small gains", "Moreno-Osorio"):
         assert text in page
     assert any("no counterexample to any condition" in line for line in lines)
-    assert any("failed though the condition held" in line and "Causes, by experiment" in line for line in lines)
+    assert any("failed although a condition held" in line and "Causes, by experiment" in line for line in lines)
     (marked,) = [line for line in lines if line.startswith("small gains")]
     assert "no condition can hold" in marked or "worst disturbance enlarges the error" in marked
     (marked,) = [line for line in lines if line.startswith("good gains")]
