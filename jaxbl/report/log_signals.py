@@ -119,7 +119,8 @@ class LogSignals:
         plant = dataclasses.replace(self.plant, effects=effects)
         with jax.enable_x64(True):
             rest = {side: jnp.asarray(0.0) for side in SIDES}
-            found = jax.vmap(lambda z: plant.transmitted({"motor": z, "load": jnp.zeros_like(z)}, rest)[0])(
+            states = tuple(effect.init() for effect in effects)
+            found = jax.vmap(lambda z: plant.transmitted({"motor": z, "load": jnp.zeros_like(z)}, rest, states)[0])(
                 jnp.asarray(twist)
             )
         return np.asarray(found)
