@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -167,24 +168,36 @@ def test_demo_is_this_command():
     assert recipe.replace("$(BIN)/", "") == INSTEAD["make demo"]
 
 
+@pytest.fixture(scope="module")
+def running(request, tmp_path_factory):
+    """The pages that are to be tested, run two at a time: one alone leaves a core idle for much of its time."""
+    chosen = [item.callspec.params["page"] for item in request.session.items if item.name.startswith("test_page_runs")]
+    with ThreadPoolExecutor(2) as pool:
+        yield {page: pool.submit(run_page, page, tmp_path_factory.mktemp(page.stem)) for page in chosen}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("page", PAGES, ids=name)
-def test_page_runs_as_written(page, tmp_path):
+@pytest.mark.parametrize("page", sorted(PAGES, key=lambda page: -len(blocks_of(page))), ids=name)
+def test_page_runs_as_written(page, running):
+    running[page].result()
+
+
+def run_page(page, folder):
     """Blocks of one page in order, in a folder with the studies of a clone; TOML blocks of the tutorial make `axis.toml`."""
-    env = environment(tmp_path)
-    folder = tmp_path / "clone"
-    folder.mkdir()
-    shutil.copytree(ROOT / "sweeps", folder / "sweeps")
+    env = environment(folder)
+    clone = folder / "clone"
+    clone.mkdir()
+    shutil.copytree(ROOT / "sweeps", clone / "sweeps")
     for language, text in blocks_of(page):
         if language == "toml" and page.name == "tutorial.md":
-            with (folder / "axis.toml").open("a", encoding="utf-8") as file:
+            with (clone / "axis.toml").open("a", encoding="utf-8") as file:
                 file.write(text)
         elif language == "python":
-            run([sys.executable, "-c", text], folder, env)
+            run([sys.executable, "-c", text], clone, env)
         elif language == "sh":
             for command, other in INSTEAD.items():
                 text = re.sub(rf"^{command}", other, text, flags=re.M)
-            run(["sh", "-e", "-c", text], folder, env)
+            run(["sh", "-e", "-c", text], clone, env)
 
 
 def run(words, folder, env):
