@@ -106,6 +106,12 @@ def test_commands_in_text_exist_with_their_options(page):
         assert all(f'"{word}"' in source for word in rest.split() if word.startswith("--")), f"{script}{rest}"
 
 
+def test_readme_lists_every_command_and_study():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert [one for one in get_command(app).commands if f"`jaxbl {one} " not in text] == []
+    assert [file.name for file in ROOT.glob("sweeps/*.toml") if f"`{file.name}`" not in text] == []
+
+
 def test_architecture_shows_the_floors():
     """The diagram names the parts of each floor, top floor first."""
     diagram = re.search(r"```text\n(cli.*?)```", (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"), re.S)[1]
