@@ -54,11 +54,20 @@ def package(logs: Sequence[Log], model: Mapping[str, Any], holdout: Log) -> Mapp
 
 def oracle(case: Case) -> Mapping[str, float]:
     """Held-out rmse by channel of the true effects, all numbers fitted from the true ones of the effects."""
-    from jaxbl.diagnosis.diagnose import read_task, with_known
+    import jax
+    import numpy as np
+
+    from jaxbl.diagnosis.diagnose import new_explainer, read_diagnosis_task
+    from jaxbl.diagnosis.proof import at_period, fit_model
+    from jaxbl.diagnosis.setup import set_up
 
     with tempfile.TemporaryDirectory() as folder:
         paths, other = _files([case.log], case.holdout, Path(folder))
-        return with_known(read_task(paths[0], case.model, holdout=other), case.truth["effects"])
+        task = read_diagnosis_task(paths[0], case.model, holdout=other)
+    with jax.enable_x64(True):
+        setup = set_up(task)
+        fitted = fit_model(new_explainer(setup), case.truth["effects"], np.zeros(len(setup.own)))
+        return setup.holdout.compare(at_period(fitted.experiment, setup.holdout.period)).errors
 
 
 def left(found: Sequence[Case], folder: Path) -> list[Outcome]:

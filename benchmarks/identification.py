@@ -26,19 +26,22 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
+from filtered_derivatives import differentiated  # noqa: E402
 from scipy.linalg import expm  # noqa: E402
 from scipy.optimize import brentq  # noqa: E402
 
-from jaxbl.config import read_model  # noqa: E402
+from jaxbl.config import prepare, read_model  # noqa: E402
 from jaxbl.drive.parameters import set_leaves  # noqa: E402
 from jaxbl.identification import identify as whole  # noqa: E402
+from jaxbl.identification import log_columns  # noqa: E402
 from jaxbl.identification.intervals import spread  # noqa: E402
-from jaxbl.identification.regression import differentiated, errors, regress  # noqa: E402
-from jaxbl.identification.search import Search, smoothed_channels  # noqa: E402
+from jaxbl.identification.logs import arrays, gains_for, on_record  # noqa: E402
+from jaxbl.identification.regression import errors, regress  # noqa: E402
+from jaxbl.identification.search import ParameterSearch  # noqa: E402
+from jaxbl.identification.segments import segments_of  # noqa: E402
 from jaxbl.identification.trajectory import free_parameters  # noqa: E402
 from jaxbl.records import read_record  # noqa: E402
 from jaxbl.simulate import trajectory  # noqa: E402
-from jaxbl.sweeps.engine import prepare  # noqa: E402
 
 PERIOD = 1e-3
 NOISE = {"motor": 1e-4, "load": 2e-5}
@@ -161,15 +164,15 @@ def by_trajectories(study, record):
 def by_observers(study, record):
     """The paper's chain, inertias and viscous frictions given as they are; the motor's side."""
     config, missing = read_model(study)
-    known = set_leaves(whole._on_record(config, record), {path: jnp.asarray(value) for path, value in SIX.items()})
-    channels = smoothed_channels(record, known.sides)
-    _, gains = whole._gains(missing, known, record, channels)
-    found = whole._chain(set_leaves(known, {path: jnp.asarray(x) for path, x in gains.items()}), record)[1]
+    known = set_leaves(on_record(config, record), arrays(SIX))
+    segments = segments_of(record, known.sides)
+    _, gains = gains_for(missing, known, segments)
+    found = log_columns.observer_chain(set_leaves(known, arrays(gains)), segments, len(record.time))[1]
     return {f"transmission.{name}": (value["motor"], np.nan) for name, value in found.items()}
 
 
 METHODS = {
-    "derivatives, least squares": lambda r: by_derivatives(whole._on_record(read_model(six())[0], r), list(SIX), r),
+    "derivatives, least squares": lambda r: by_derivatives(on_record(read_model(six())[0], r), list(SIX), r),
     "observers, recursive, explicit": lambda r: by_observers(six("explicit"), r),
     "observers, recursive, implicit": lambda r: by_observers(six(), r),
     "trajectories, output error": lambda r: by_trajectories(six(), r),
@@ -242,7 +245,7 @@ def emps_table():
     if not folder.exists():
         return ["EMPS: no recordings (the folder with them is named by JAXBL_DATA)."]
     estimation, validation = (read_record(folder / f"DATA_EMPS{x}.mat", EMPS_LOG) for x in ("", "_PULSES"))
-    experiment = whole._on_record(read_model(emps_study())[0], estimation)
+    experiment = on_record(read_model(emps_study())[0], estimation)
     parts = [differentiated(one.time, one.torque, one.positions, 100.0) for one in (estimation, validation)]
     found = {
         "published": {path: (value, np.nan) for path, value in PUBLISHED.items()},
@@ -374,14 +377,14 @@ class Stages:
 def stages():
     return Stages(
         [
-            (whole, "smoothed_channels", "smoother"),
-            (Search, "_coarse", "starts"),
-            (Search, "_whole", "fits"),
-            (whole, "_gains", "gains"),
-            (whole, "_chain", "chain"),
-            (whole, "_regression", "regression"),
-            (whole, "_torque_errors", "torque errors"),
-            (whole, "_model_columns", "model columns"),
+            (whole, "segments_of", "smoother"),
+            (ParameterSearch, "_coarse", "starts"),
+            (ParameterSearch, "_whole", "fits"),
+            (whole, "gains_for", "gains"),
+            (whole, "observer_chain", "chain"),
+            (whole, "by_regression", "regression"),
+            (whole, "torque_errors", "torque errors"),
+            (log_columns, "_model_columns", "model columns"),
         ]
     )
 

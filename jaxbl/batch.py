@@ -70,16 +70,16 @@ def run_batch(work: list[LogJob], out: Path, processes: int | None, progress: Pr
 
 def _diagnosed(job: LogJob) -> dict[str, Any]:
     """Row of a batch: a log's diagnosis, or why there is none."""
-    from .diagnosis.diagnose import read_task, run_task
+    from .diagnosis.diagnose import read_diagnosis_task, run_diagnosis
 
     forget_programs()
     try:
-        task = read_task(job.log, job.model, holdout=job.holdout)
+        task = read_diagnosis_task(job.log, job.model, holdout=job.holdout)
         claim_log_folder(job.folder, job.log, overwrite=job.overwrite)
         summary = finished_summary(job.folder / "diagnosis.json", task.identity)
         if summary is None:
             with removed_if_empty(job.folder):
-                found = run_task(task)
+                found = run_diagnosis(task)
                 write_diagnosis_report(found, job.folder)
             summary = found.summary
         return batch_row(job.log, summary)

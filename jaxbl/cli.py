@@ -229,15 +229,17 @@ def identify(
 ) -> None:
     """Fit a machine's parameters to its logs, with intervals: stiffness, gap, inertias, frictions."""
     _start_jax()
-    from jaxbl.identification.identify import read_task, run_task
+    from jaxbl.identification.identify import read_identification_task, run_identification
 
     from .report.identify import identification_lines, write_identification_report
 
-    task = read_task(log, model, holdout=holdout, profile=profile)
+    task = read_identification_task(log, model, holdout=holdout, profile=profile)
     folder = _folder(log[0], out)
     words = ["identify", *map(str, log), *_words({"--model": model, "--holdout": holdout, "--profile": profile})]
     result = folder / "identification.json"
-    lines, _ = _fit(words, task, run_task, model, result, overwrite, write_identification_report, identification_lines)
+    lines, _ = _fit(
+        words, task, run_identification, model, result, overwrite, write_identification_report, identification_lines
+    )
     _print(lines, folder)
 
 
@@ -331,11 +333,11 @@ def diagnose(
     if model is None:
         raise InputError("diagnose: no model; give a study with nominal parameters: --model TOML")
     _start_jax()
-    from jaxbl.diagnosis.diagnose import read_task, run_task
+    from jaxbl.diagnosis.diagnose import read_diagnosis_task, run_diagnosis
 
     from .report.diagnose import diagnosis_lines, write_diagnosis_report
 
-    task = read_task(log, model, holdout=holdout)
+    task = read_diagnosis_task(log, model, holdout=holdout)
     folder = _folder(log[0], out)
     options = {
         "--model": model, "--holdout": holdout, "--next-experiment": next_experiment, "--max-torque": max_torque,
@@ -343,7 +345,7 @@ def diagnose(
     }  # fmt: skip
     words = ["diagnose", *map(str, log), *_words(options)]
     result = folder / "diagnosis.json"
-    lines, summary = _fit(words, task, run_task, model, result, overwrite, write_diagnosis_report, diagnosis_lines)
+    lines, summary = _fit(words, task, run_diagnosis, model, result, overwrite, write_diagnosis_report, diagnosis_lines)
     if next_experiment is not None:
         from jaxbl.diagnosis.next_experiment import Limits, write_next_experiment
 

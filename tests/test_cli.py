@@ -546,7 +546,7 @@ def axis(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", ["jaxbl.identification.identify.run_task", "jaxbl.report.page.html"])
+@pytest.mark.parametrize("place", ["jaxbl.identification.identify.run_identification", "jaxbl.report.page.html"])
 def test_an_interrupted_identification_writes_nothing_and_says_how_to_start_again(place, axis, call, tmp_path, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
@@ -633,7 +633,7 @@ def quick(monkeypatch):
         (folder / "diagnosis.json").write_text(json.dumps(found.summary))
         return diagnosis_lines(found.summary)
 
-    monkeypatch.setattr("jaxbl.diagnosis.diagnose.run_task", run_task)
+    monkeypatch.setattr("jaxbl.diagnosis.diagnose.run_diagnosis", run_task)
     monkeypatch.setattr("jaxbl.report.diagnose.write_diagnosis_report", report)
     return tasks
 
@@ -686,7 +686,7 @@ def test_an_interrupted_diagnosis_writes_nothing_and_says_how_to_start_again(axi
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("jaxbl.diagnosis.diagnose.run_task", interrupt)
+    monkeypatch.setattr("jaxbl.diagnosis.diagnose.run_diagnosis", interrupt)
     told = "interrupted; nothing was written. Start again with: jaxbl diagnose 'an axis.csv' --model axis.toml --out out"
     assert call(*DIAGNOSE, "--out", "out") == (130, [], [told])
     assert not (tmp_path / "out").exists()

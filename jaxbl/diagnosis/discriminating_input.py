@@ -18,24 +18,26 @@ from jaxbl.drive.plant import PlantState
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment, trajectory
 
-KINDS = "sine", "multisine", "chirp", "steps"
+INPUT_KINDS = "sine", "multisine", "chirp", "steps"
 _SHARES = 0.01, 0.03, 0.1, 0.25, 0.5, 0.75, 1.0
 """Amplitudes, over the largest torque allowed."""
 _FREQUENCIES = 6
+"""Tried of each kind, evenly spaced in their logarithm."""
 _HARMONICS = 8
+"""Of a multisine, with Schroeder's phases (IEEE Trans. Information Theory 16, 1970)."""
 _LONGEST = 10.0
-"""s."""
+"""Duration at most, s."""
 
 
 class Input(NamedTuple):
     """An input that was tried.
 
     Attributes:
-        kind: one of :data:`KINDS`.
+        kind: one of :data:`INPUT_KINDS`.
         amplitude: largest torque, N m.
         frequency: Hz; of a multisine the lowest, of a chirp the first, of steps one over twice their length.
         torque: shape (samples,).
-        apart: nats by which readings of it tell one model from the other: half the sum of squares of the difference of
+        apart: nats by which readings of it favour one model over the other: half the sum of squares of the difference of
             their positions, over the variance of the readings' noise.
     """
 
@@ -55,7 +57,7 @@ def inputs(record: Record, largest: float) -> list[Input]:
     top = min(0.02 / period, 10.0)
     found = []
     for frequency in np.geomspace(min(2.0 / duration, 0.5 * top), top, _FREQUENCIES):
-        for kind in KINDS:
+        for kind in INPUT_KINDS:
             wave = _wave(kind, time, float(frequency))
             wave = wave / np.max(np.abs(wave))
             found += [Input(kind, share * largest, float(frequency), share * largest * wave, 0.0) for share in _SHARES]

@@ -16,9 +16,8 @@ import numpy as np
 
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import set_leaves
-from jaxbl.identification.smoother import Smoothed
+from jaxbl.identification.segments import Segment
 from jaxbl.identification.trajectory import WIDE, Free, free_parameters
-from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
 from .candidates import SHARE, Candidate, Numbers, Variant, variants_of
@@ -197,8 +196,7 @@ class Explainer:
         experiment: Experiment,
         free: Sequence[Free],
         prior: Sequence[float],
-        record: Record,
-        smoothed: Mapping[str, Sequence[Smoothed]],
+        segments: Sequence[Segment],
         bound: float = np.inf,
     ):
         """Prepare to explain a record.
@@ -208,16 +206,14 @@ class Explainer:
                 explanation have all effects, those that are not found at neutral numbers (:mod:`.complete`).
             free: its own numbers that are not exactly known.
             prior: relative standard deviation of each.
-            record: the log.
-            smoothed: its positions, part by part (:func:`jaxbl.identification.search.smoothed_channels`).
+            segments: of the log.
             bound: standard deviations that each number may be off while effects are sought.
         """
         self.bound = bound
         self.nominal, self.free, self.prior = complete(experiment), tuple(free), np.asarray(prior)
         self.lacking = candidates(experiment)
-        self.record, self.smoothed = record, smoothed
-        samples = sum(part.stop - part.start for part in record.segments)
-        self.floor = FLOOR * samples * len(experiment.sides)
+        self.segments = segments
+        self.floor = FLOOR * sum(map(len, segments)) * len(experiment.sides)
         self._recent: dict[tuple, Linear] = {}
         self._polished: tuple[tuple, Polished] | None = None
 
@@ -229,7 +225,7 @@ class Explainer:
             added = free_parameters(experiment, paths_of(values), self._torque)
             free, width = (*self.free, *added), np.concatenate([self.prior, np.full(len(added), WIDE)])
             start = np.concatenate([theta, np.zeros(len(added))])
-            self._polished = key, Polished(free, refined(experiment, free, start, width, self.record, self.smoothed))
+            self._polished = key, Polished(free, refined(experiment, free, start, width, self.segments))
         return self._polished[1]
 
     def plausible(self, found: Explanation) -> bool:
@@ -249,7 +245,7 @@ class Explainer:
     @property
     def _torque(self) -> float:
         """Size of the input, N m."""
-        return float(np.std(self.record.torque))  # type: ignore[arg-type]
+        return float(np.std(np.concatenate([one.torque for one in self.segments])))
 
     def _linear(self, experiment: Experiment, names: Names, theta: Array) -> Linear:
         paths = paths_of(names)
@@ -259,7 +255,7 @@ class Explainer:
         centre = np.concatenate([-theta, np.zeros(len(paths))])
         at = np.concatenate([theta, np.zeros(len(paths))])
         bound = np.concatenate([np.full(len(self.free), self.bound), np.full(len(paths), np.inf)])
-        return Linear(experiment, own, at, prior, centre, self.record, self.smoothed, bound)
+        return Linear(experiment, own, at, prior, centre, self.segments, bound)
 
     def refit(
         self, names: Names, numbers: Mapping[str, Numbers], theta: Array, smoothness: Sequence[float], deviation: Array

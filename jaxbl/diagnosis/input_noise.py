@@ -1,43 +1,31 @@
-"""Noise of the channel that recorded the input: noise that the drive never felt.
+"""Noise of the channel that recorded the input, which did not act on the drive.
 
 The model is driven by the recorded torque. Where that carries noise of its own the model shakes, and the machine did not;
-fits then choose whatever shakes less: a lag, a larger motor inertia. A recorded input is smoothed between its jumps
-(penalised third differences, generalised cross-validation); which of the two drove the machine, its motion tells.
+fits then prefer whatever shakes less: a lag, a larger motor inertia. A recorded input is smoothed between its jumps
+(penalised third differences, generalised cross-validation); its motion shows which of the two drove the machine.
 References: P. Eilers, A perfect smoother, Analytical Chemistry 75 (2003); P. Craven, G. Wahba, Smoothing noisy data with
 spline functions, Numerische Mathematik 31 (1979).
 """
 
-import dataclasses
 import itertools
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import solveh_banded
 
-from jaxbl.records import Record
-
-from .residuals import white_noise
 from .whittle import spectrum_of, weighted_products
-
-Array = np.ndarray
 
 _JUMP = 5.0
 """Standard deviations of the noise that a jump must stand out by."""
 _FEWEST = 8
 """Samples between two jumps that can be smoothed."""
 _ORDER = 3
-"""Of the differences that are penalised."""
+"""Of the differences that are penalised: what has no third difference, a parabola, stays as it is."""
 _CUTOFFS = np.geomspace(0.015, 2.0, 30)
 """Corner frequencies tried, rad a sample."""
 
 
-def noise_of(record: Record) -> float:
-    """Standard deviation of the input's white noise, N m."""
-    assert record.torque is not None
-    return white_noise([record.torque[part] for part in record.segments])
-
-
-def unfelt(given: Sequence[Array], smooth: Sequence[Array]) -> float:
+def unfelt(given: Sequence[np.ndarray], smooth: Sequence[np.ndarray]) -> float:
     """Nats by which noise of the input did not drive the motion, rather than did.
 
     What both inputs' prediction errors differ by is what that noise does to them. It is in the errors of the recorded input
@@ -54,20 +42,22 @@ def unfelt(given: Sequence[Array], smooth: Sequence[Array]) -> float:
     return float(products[0, 1] - 0.5 * products[1, 1])
 
 
-def smoothed_input(record: Record, noise: float) -> Record:
-    """A record with its input smoothed between jumps; `noise`: its standard deviation, N m."""
-    assert record.torque is not None
-    torque = record.torque.copy()
-    for part in record.segments:
-        values = record.torque[part]
-        ends = [0, *jumps(values, noise), len(values)]
-        for first, last in itertools.pairwise(ends):
-            if last - first >= _FEWEST:
-                torque[part.start + first : part.start + last] = _smoothed(values[first:last])
-    return dataclasses.replace(record, torque=torque)
+def smoothed_input(torque: np.ndarray, noise: float) -> np.ndarray:
+    """An input smoothed between jumps, N m, shape (samples,).
+
+    Args:
+        torque: input of a segment, N m.
+        noise: its standard deviation, N m.
+    """
+    smooth = torque.copy()
+    ends = [0, *input_jumps(torque, noise), len(torque)]
+    for first, last in itertools.pairwise(ends):
+        if last - first >= _FEWEST:
+            smooth[first:last] = _smooth_curve(torque[first:last])
+    return smooth
 
 
-def jumps(torque: Array, noise: float) -> list[int]:
+def input_jumps(torque: np.ndarray, noise: float) -> list[int]:
     """First samples after jumps: differences that stand out from those beside them."""
     change = np.diff(torque)
     beside = np.pad(change, 1, mode="edge")
@@ -76,7 +66,7 @@ def jumps(torque: Array, noise: float) -> list[int]:
     return (1 + np.flatnonzero(highest & (beyond > _JUMP * np.sqrt(5.0) * noise))).tolist()
 
 
-def _smoothed(values: Array) -> Array:
+def _smooth_curve(values: np.ndarray) -> np.ndarray:
     """The smooth curve that generalised cross-validation chooses."""
     count = len(values)
     penalty = _penalty(count)
@@ -95,7 +85,7 @@ def _smoothed(values: Array) -> Array:
     return best
 
 
-def _penalty(count: int) -> Array:
+def _penalty(count: int) -> np.ndarray:
     """Products of third differences, as lower bands."""
     stencil = np.diff(np.eye(_ORDER + 1), n=_ORDER, axis=0)[0]
     bands = np.zeros((_ORDER + 1, count))

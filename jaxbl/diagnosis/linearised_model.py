@@ -14,7 +14,7 @@ Automatica 24 (1988), for the local approach.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -30,9 +30,9 @@ from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import Direction, slopes
 from jaxbl.identification.prediction import kalman_gain
 from jaxbl.identification.regression import Path, effect_path
+from jaxbl.identification.segments import Segment
 from jaxbl.identification.smoother import Smoothed
-from jaxbl.identification.trajectory import Free, with_values
-from jaxbl.records import Record
+from jaxbl.identification.trajectory import Free, with_fitted
 from jaxbl.simulate import Experiment
 
 from .candidates import SHARE, SPACING, Candidate, Signals, all_of_the_input, forces_of, rms
@@ -50,8 +50,7 @@ def linearise(
     experiment: Experiment,
     free: Sequence[Free],
     theta: Float[np.ndarray, " numbers"],
-    record: Record,
-    smoothed: Mapping[str, Sequence[Smoothed]],
+    segments: Sequence[Segment],
 ) -> list[Part]:
     """The model along each part of a record.
 
@@ -59,20 +58,12 @@ def linearise(
         experiment: the model with all effects (:func:`.complete.complete`); its sample period is that of the record.
         free: its own numbers.
         theta: their values, which the model has.
-        record: the log.
-        smoothed: its positions, part by part.
+        segments: of the log.
     """
-    assert record.torque is not None
     sides = experiment.sides
     added = tuple(_AddedTorque(side=side, torque=jnp.zeros(())) for side in sides)  # type: ignore[arg-type]
     extended = eqx.tree_at(lambda e: e.effects, experiment, (*experiment.effects, *added))
-    parts = []
-    for i, rows in enumerate(record.segments):
-        one = {side: smoothed[side][i] for side in sides}
-        time = record.time[rows] - record.time[0]
-        readings = {side: record.positions[side][rows] for side in sides}
-        parts.append(_part(extended, free, theta, time, record.torque[rows], readings, one))
-    return parts
+    return [_part(extended, free, theta, one.time, one.torque, one.readings, one.smoothed) for one in segments]
 
 
 class _AddedTorque(ConstantTorque):
@@ -335,17 +326,16 @@ class Linear:
         theta: Float[np.ndarray, " numbers"],
         prior: np.ndarray,
         centre: np.ndarray,
-        record: Record,
-        smoothed: Mapping[str, Sequence[Smoothed]],
+        segments: Sequence[Segment],
         bound: np.ndarray | None = None,
     ):
         """Args as of :func:`linearise`; `prior` and `centre` are of the change of each number from theta, `bound` says how
         many standard deviations it may be from `centre` (left out: any number)."""
         self.bound = np.full(len(free), np.inf) if bound is None else bound
         self.free, self.theta, self.prior, self.centre = tuple(free), np.asarray(theta), prior, centre
-        self.experiment = with_values(experiment, free, jnp.asarray(self.theta))
-        self.period, self.sides = record.sample_period, experiment.sides
-        self.parts = linearise(self.experiment, free, self.theta, record, smoothed)
+        self.experiment = with_fitted(experiment, free, jnp.asarray(self.theta))
+        self.period, self.sides = segments[0].period, experiment.sides
+        self.parts = linearise(self.experiment, free, self.theta, segments)
         self.signals = [Signals(self.experiment, part) for part in self.parts]
         self.count = sum(int(np.asarray(one.weight).sum()) for one in self.parts)
         self.states = self.parts[0].defect.shape[1]

@@ -1,4 +1,4 @@
-"""Where a residual torque lives: over time, speed, position, reversals, gap, load and frequency, each with its significance.
+"""Where a model lacks torque: over time, speed, position, reversals, gap, load and frequency, each with its significance.
 
 Two questions are asked of each region. How much of the residual's power beyond the noise lies there: judged against the
 noise alone, with its deviation and correlation. And is the mean torque there other than zero: judged against the scatter
@@ -10,27 +10,25 @@ import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from jaxbl.identification import regression
-from jaxbl.identification.regression import Kinematics, transmitted
-from jaxbl.identification.smoother import Smoothed
+from jaxbl.identification.segments import Segment
 from jaxbl.simulate import Experiment
 
+from .coordinates import CoordinateValues, coordinates_of
 from .residuals import Residual, narrowed, noise_spectrum
 
-Array = np.ndarray
-
 _BINS = 24
+"""Of a coordinate: fine enough for a picture, each with a few per cent of the samples."""
 _COUNTS = (2, 4, 8, 16, 32, 64, 128)
 """Numbers of bins that functions of a coordinate are tried with."""
 _BLOCKS, _FOLDS = 40, 5
+"""Blocks of time, and sets of them that a function is made from and tried on in turn."""
 _FEWEST = 4
 """Blocks of time that a mean must come from to have a scatter."""
-_SAMPLES = 5
 _LEVEL_UNKNOWN = 0.05
 """Relative uncertainty of the noise's deviation."""
 SIGNIFICANT = 4.5
@@ -40,27 +38,7 @@ RESOLUTION = 5e-4
 _CLEAR = 10.0
 """Power over the noise's from which on no narrower low-pass is tried."""
 _PEAKS, _NARROW, _AROUND = 5, 10.0, 20
-_SIMPLER = 0.04
-"""Share of the power by which a later coordinate must explain more than an earlier one."""
-_TELLING = 0.5
-_CROWDED = 0.35
-_EVERYWHERE = "all"
-
-
-class Values(NamedTuple):
-    """A coordinate along a part of a record.
-
-    Attributes:
-        values: a number a sample, or the index of its class.
-        unit: of the number.
-        classes: names of the classes; empty for numbers.
-        symbol: for sentences.
-    """
-
-    values: Array
-    unit: str = ""
-    classes: tuple[str, ...] = ()
-    symbol: str = ""
+"""Peaks at most; power of one over the median of its neighbours; neighbours on each side."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,7 +125,7 @@ class Peak:
 
 @dataclasses.dataclass(frozen=True)
 class Localised:
-    """Where the missing torque of one equation lives. Numbers only: `dataclasses.asdict` makes it JSON.
+    """Where one equation lacks torque. Numbers only: `dataclasses.asdict` makes it JSON.
 
     Attributes:
         name: `motor`, `load` or `transmission`.
@@ -170,99 +148,6 @@ class Localised:
     coordinates: dict[str, Coordinate]
     bands: tuple[Band, ...]
     peaks: tuple[Peak, ...]
-
-
-def coordinates_of(
-    experiment: Experiment,
-    part: Kinematics,
-    smoothed: Mapping[str, Smoothed],
-    residual: Residual,
-    *,
-    rotating: bool | Mapping[str, bool] = True,
-) -> dict[str, Values]:
-    """Coordinates of a residual along its part of a record, the more telling of equals first.
-
-    Args:
-        experiment: the model.
-        part: of the record.
-        smoothed: its positions, by side.
-        residual: of that part.
-        rotating: whether positions are angles in rad; by side where they differ.
-    """
-    side = "motor" if residual.name == "transmission" else residual.name
-    turns = dict.fromkeys(part.position, rotating) if isinstance(rotating, bool) else rotating
-    length = "rad" if turns[side] else "m"
-    omega = "ω" if turns[side] else "v"
-    velocity = np.asarray(part.velocity[side])
-    deviation = np.asarray(smoothed[side].deviation(1))
-    still = np.abs(velocity) <= np.maximum(3.0 * deviation, 1e-3 * np.sqrt(np.mean(velocity**2)))
-    found = {
-        _EVERYWHERE: Values(np.zeros(len(velocity), int), classes=("everywhere",)),
-        "direction": Values(
-            np.where(still, 1, np.where(velocity > 0.0, 2, 0)), classes=("backward", "at rest", "forward"),
-        ),
-        "reversals": _reversals(part, velocity, still, residual.bandwidth),
-    }  # fmt: skip
-    geared = len(part.position) > 1 and experiment.transmission is not None
-    if geared:
-        plant = experiment.plant
-        twist = np.asarray(plant.twist(part.position))  # type: ignore[arg-type]
-        rate = np.asarray(plant.twist(part.velocity))  # type: ignore[arg-type]
-        torque = part.transmitted
-        if torque is None:
-            torque = transmitted(experiment, part)
-        torque = np.asarray(torque)
-        gap = experiment.plant.half_gap
-        if gap > 0.0:
-            inside = np.where(np.abs(twist) < gap, 1, np.where(twist > 0.0, 2, 0))
-            found["gap"] = Values(inside, classes=("outside, z < 0", "inside of the gap", "outside, z > 0"))
-        idle = np.abs(torque) < 0.02 * np.sqrt(np.mean(torque**2))
-        loaded = np.where(idle, 1, np.where(torque > 0.0, 2, 0))
-        found["load sign"] = Values(loaded, classes=("negative load", "no load", "positive load"))
-    found["|speed|"] = Values(np.abs(velocity), f"{length}/s", symbol=f"|{omega}|")
-    found["speed"] = Values(velocity, f"{length}/s", symbol=omega)
-    for one in part.position:
-        position = np.asarray(part.position[one])
-        if turns[one] and np.ptp(position) > 1.2 * 2.0 * np.pi and one in (side, "load"):
-            name = "turn" if one == side else f"{one} turn"
-            symbol = "θe mod 2π" if one == "motor" else "θs mod 2π"
-            found[name] = Values(np.mod(position, 2.0 * np.pi), "rad", symbol=symbol)
-    symbol = ("θe" if side == "motor" else "θs") if turns[side] else "x"
-    found["position"] = Values(np.asarray(part.position[side]), length, symbol=symbol)
-    if side != "load" and geared:
-        found["load position"] = Values(
-            np.asarray(part.position["load"]), "rad" if turns["load"] else "m", symbol="θs" if turns["load"] else "x"
-        )
-    if geared:
-        found["twist"] = Values(twist, "rad" if turns["motor"] else "m", symbol="z")
-        found["twist rate"] = Values(rate, "rad/s" if turns["motor"] else "m/s", symbol="ż")
-    unit = "N m" if turns["motor"] else "N"
-    if side == "motor":
-        found["input"] = Values(np.asarray(part.torque), unit, symbol="u")
-    acceleration = np.asarray(part.acceleration[side])
-    if residual.name in experiment.sides:
-        # by the model: the measured one's noise is the residual's, and would be found there
-        acceleration = acceleration - residual.torque / float(experiment.plant.inertia(side))
-    found["acceleration"] = Values(acceleration, f"{length}/s²", symbol="a")
-    found["time"] = Values(np.asarray(part.time), "s", symbol="t")
-    return found
-
-
-def _reversals(part: Kinematics, velocity: Array, still: Array, bandwidth: float) -> Values:
-    """Whether the motion reverses nearby, and to which direction: near is what the low-pass smears, and some more."""
-    time = np.asarray(part.time)
-    sign = np.where(still, 0.0, np.sign(velocity))
-    moving = np.flatnonzero(sign)
-    turning = np.flatnonzero(np.diff(sign[moving]))
-    near = np.zeros(len(time), int)
-    if len(turning):
-        first, last = moving[turning], moving[turning + 1]
-        between = np.median(np.diff(time[first])) if len(first) > 1 else 0.5 * (time[-1] - time[0])
-        window = min(max(0.3 / bandwidth, 0.05 * between), 0.2 * between)
-        for begin, end in zip(first, last, strict=True):
-            rows = slice(*np.searchsorted(time, (time[begin] - window, time[end] + window)))
-            near[rows] = 1 if sign[end] > 0.0 else 2
-    return Values(near, classes=("away from reversals", "reversals to forward", "reversals to backward"))
 
 
 class _Joined:
@@ -302,7 +187,7 @@ class _Joined:
         power, noise = np.array([np.sum(self.torque**2)]), np.array([np.sum(self.deviation**2)])
         return float(_excess_z(power, noise, self.variance(np.ones((1, self.count)), 2))[0])
 
-    def variance(self, masks: Array, power: int) -> Array:
+    def variance(self, masks: np.ndarray, power: int) -> np.ndarray:
         """Variance by noise of sums of residuals (1), or of their squares (2), over each of some sets of samples."""
         weights = self.deviation**power
         total = np.zeros(len(masks))
@@ -314,26 +199,28 @@ class _Joined:
         return power * total
 
 
-def _excess_z(power: Array, noise: Array, variance: Array) -> Array:
+def _excess_z(power: np.ndarray, noise: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Significance of sums of squares beyond the noise's, whose variance is given (Wilson and Hilferty)."""
     noise = np.where(noise > 0.0, noise, 1.0)
     small = (variance / noise**2 + (2.0 * _LEVEL_UNKNOWN) ** 2) / 9.0
     return (np.cbrt(power / noise) - (1.0 - small)) / np.sqrt(small)
 
 
-def locate(residuals: Sequence[Residual], coordinates: Sequence[Mapping[str, Values]], *, floor: float = 0.0) -> Localised:
-    """Where the missing torque of one equation lives.
+def locate(
+    residuals: Sequence[Residual], coordinates: Sequence[Mapping[str, CoordinateValues]], *, floor: float = 0.0
+) -> Localised:
+    """Where one equation lacks torque.
 
     Of several low-passes the one is taken behind which the power stands out most from the noise.
 
     Args:
         residuals: of each part of the record.
-        coordinates: of each, the more telling of equals first (:func:`coordinates_of`).
+        coordinates: of each, the simpler of equals first (:func:`coordinates_of`).
         floor: torque below which nothing is said to be missing, N m.
     """
     widest = max(one.bandwidth for one in residuals)
     shortest = min(one.time[-1] - one.time[0] for one in residuals)
-    best: tuple[float, _Joined, list[Array]] | None = None
+    best: tuple[float, _Joined, list[np.ndarray]] | None = None
     for octave in range(7):
         cutoff = widest / 2.0**octave
         if cutoff * shortest < 20.0 and best is not None:
@@ -357,7 +244,7 @@ def locate(residuals: Sequence[Residual], coordinates: Sequence[Mapping[str, Val
     }
     power, noise = float(np.sum(joined.torque**2)), float(np.sum(joined.deviation**2))
     excess = max(power - noise, _LEVEL_UNKNOWN * noise)
-    found = {name: _over(name, one, joined, excess) for name, one in values.items()}
+    found = {name: _over_coordinate(name, one, joined, excess) for name, one in values.items()}
     longest = int(np.argmax([len(one.time) for one in residuals]))
     motion = coordinates[longest]["speed"].values if "speed" in names else None
     bands, peaks = _spectrum(residuals[longest], motion, joined.parts[longest])
@@ -375,7 +262,7 @@ def locate(residuals: Sequence[Residual], coordinates: Sequence[Mapping[str, Val
     )  # fmt: skip
 
 
-def _edges(values: Array, count: int, by_time: bool) -> Array:
+def _bin_edges(values: np.ndarray, count: int, by_time: bool) -> np.ndarray:
     """Ends of bins: equal numbers of samples in each; for time and turns equal widths."""
     low, high = float(np.min(values)), float(np.max(values))
     if by_time or high <= low:
@@ -384,13 +271,13 @@ def _edges(values: Array, count: int, by_time: bool) -> Array:
     return edges if len(edges) > 1 else np.array([low, high])
 
 
-def _over(name: str, one: Values, joined: _Joined, excess: float) -> Coordinate:
+def _over_coordinate(name: str, one: CoordinateValues, joined: _Joined, excess: float) -> Coordinate:
     even = name == "time" or name.endswith("turn")
     if one.classes:
         labels, edges, index = list(one.classes), None, np.asarray(one.values)
         count = len(labels)
     else:
-        edges = _edges(one.values, _BINS, even)
+        edges = _bin_edges(one.values, _BINS, even)
         if name == "|speed|":
             # finer where it is slow
             shares = np.concatenate([[0.0, 0.01, 0.025, 0.05, 0.075], np.linspace(0.1, 1.0, 19)])
@@ -412,12 +299,12 @@ def _over(name: str, one: Values, joined: _Joined, excess: float) -> Coordinate:
         for i in range(count)
         if masks[i].any()
     )  # fmt: skip
-    return Coordinate(name, one.unit, one.symbol, regions, _explained(name, one, joined, excess, even))
+    return Coordinate(name, one.unit, one.symbol, regions, _explained_share(name, one, joined, excess, even))
 
 
 def _mean_error(
-    joined: _Joined, index: Array, count: int, mean: Array, number: Array, by_noise: Array, name: str
-) -> tuple[Array, Array]:
+    joined: _Joined, index: np.ndarray, count: int, mean: np.ndarray, number: np.ndarray, by_noise: np.ndarray, name: str
+) -> tuple[np.ndarray, np.ndarray]:
     """Standard errors of the means over bins, and how many of them each mean is away from zero."""
     if name == "time":
         # each moment comes but once
@@ -443,7 +330,7 @@ def _mean_error(
     return error, np.where(by_noise >= by_scatter, t, normal)
 
 
-def _folds(joined: _Joined, name: str, count: int) -> Array:
+def _folds(joined: _Joined, name: str, count: int) -> np.ndarray:
     """To which fold each sample belongs; over time, whose moments do not come again, each bin is parted among the folds."""
     if name != "time":
         return joined.block % _FOLDS
@@ -454,7 +341,7 @@ def _folds(joined: _Joined, name: str, count: int) -> Array:
     return fold
 
 
-def _explained(name: str, one: Values, joined: _Joined, excess: float, even: bool) -> float:
+def _explained_share(name: str, one: CoordinateValues, joined: _Joined, excess: float, even: bool) -> float:
     if joined.z < SIGNIFICANT:
         # nothing to be shared out
         return 0.0
@@ -466,7 +353,7 @@ def _explained(name: str, one: Values, joined: _Joined, excess: float, even: boo
         if one.classes:
             index, bins = np.asarray(one.values), count
         else:
-            edges = _edges(one.values, count, even)
+            edges = _bin_edges(one.values, count, even)
             bins = len(edges) - 1
             index = np.clip(np.searchsorted(edges, one.values, "right") - 1, 0, bins - 1)
         fold = _folds(joined, name, bins)
@@ -481,9 +368,9 @@ def _explained(name: str, one: Values, joined: _Joined, excess: float, even: boo
     return min(best / excess, 1.0)
 
 
-def _spectrum(one: Residual, speed: Array | None, low: Residual) -> tuple[tuple[Band, ...], tuple[Peak, ...]]:
+def _spectrum(one: Residual, speed: np.ndarray | None, low: Residual) -> tuple[tuple[Band, ...], tuple[Peak, ...]]:
     """Bands and narrow peaks in the spectrum of a part; shares are of the power that its low-passed version shows."""
-    frequency, power, floor = spectrum_of(one)
+    frequency, power, floor = residual_spectrum(one)
     count, resolution = len(one.time), frequency[1]
     seen = frequency <= 2.0 * one.bandwidth
     frequency, power, floor = frequency[seen], power[seen], np.maximum(floor[seen], 1e-12 * np.max(floor))
@@ -525,13 +412,13 @@ def _spectrum(one: Residual, speed: Array | None, low: Residual) -> tuple[tuple[
     return tuple(bands), tuple(peaks)
 
 
-def _around(power: Array, at: int) -> float:
+def _around(power: np.ndarray, at: int) -> float:
     low, high = max(at - _AROUND, 0), min(at + _AROUND + 1, len(power))
     rows = np.r_[low : max(at - 3, low), min(at + 4, high) : high]
     return float(np.median(power[rows])) if len(rows) else float("inf")
 
 
-def spectrum_of(residual: Residual) -> tuple[Array, Array, Array]:
+def residual_spectrum(residual: Residual) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Frequencies (Hz), power of a residual in each of them, and its noise's; the powers add up to the sum of squares."""
     count = len(residual.time)
     window = np.hanning(count)
@@ -547,148 +434,28 @@ def spectrum_of(residual: Residual) -> tuple[Array, Array, Array]:
     return frequency, power, floor
 
 
-_PLACE = {
-    _EVERYWHERE: "alike everywhere",
-    "direction": "by the direction of motion",
-    "reversals": "at speed reversals",
-    "gap": "by the gap",
-    "load sign": "by the sign of the load",
-    "speed": "a function of speed",
-    "|speed|": "by the size of the speed",
-    "turn": "a function of the position within a turn",
-    "load turn": "a function of the load's position within a turn",
-    "position": "a function of position",
-    "load position": "a function of the load's position",
-    "twist": "a function of the twist",
-    "twist rate": "a function of the twist's rate",
-    "input": "a function of the input",
-    "acceleration": "a function of acceleration",
-    "time": "it comes and goes with time",
-}
-
-
-def describe(found: Localised, unit: str = "N m") -> str:
-    """One sentence: which equation, where, and how much of the residual power lies there."""
-    side = found.name if found.name == "transmission" else f"{found.name} side"
-    if not found.significant:
-        return f"{side}: nothing beyond noise ({found.noise:.2g} {unit} rms up to {found.bandwidth:.3g} Hz)"
-    size = f"{found.missing:.2g} {unit} rms"
-    best = max((one.explained for one in found.coordinates.values()), default=0.0)
-    telling = next((one for one in found.coordinates.values() if one.explained >= best - _SIMPLER), None)
-    crowd = _crowded(found)
-    clauses = []
-    if crowd is not None and (best < _TELLING or crowd[0] > 0.6):
-        clauses.append(crowd[1])
-    own = [one for one in found.peaks if not one.in_motion]
-    if own and own[0].power_share > max(best, _TELLING) - _SIMPLER:
-        clauses.append(
-            f"at {own[0].frequency:.4g} Hz; {_percent(own[0].power_share)} of the residual power is a narrow peak there"
-        )
-    elif telling is not None and best >= _TELLING:
-        values = _values(telling, unit)
-        place = _PLACE.get(telling.name, f"a function of {telling.name}")
-        clauses.append(f"{place}{values}; {_percent(telling.explained)} of the residual power goes with it")
-    if not clauses and found.excess_z < SIGNIFICANT:
-        return f"{side}, {_faint(found, unit)}"
-    if not clauses:
-        hint = ""
-        if telling is not None and best > 0.1:
-            hint = f" (most: {_percent(best)}, {_PLACE.get(telling.name, telling.name)})"
-        clauses.append(f"nowhere in particular: neither speed nor position, load or time explains half of it{hint}")
-    return f"{side}, {'; '.join(clauses)} ({size})"
-
-
-def _faint(found: Localised, unit: str) -> str:
-    """The region that stands out most where the whole does not."""
-    each = [(one, region) for one in found.coordinates.values() for region in one.regions]
-    one, region = max(each, key=lambda pair: max(abs(pair[1].mean_z), pair[1].excess_z))
-    z = max(abs(region.mean_z), region.excess_z)
-    if found.peaks and found.peaks[0].excess_z > z:
-        peak = found.peaks[0]
-        return f"faint: a narrow peak of {peak.amplitude:.2g} {unit} at {peak.frequency:.4g} Hz"
-    place = region.label or f"where {region.low:.3g} < {one.symbol or one.name} < {region.high:.3g} {one.unit}".rstrip()
-    if abs(region.mean_z) >= region.excess_z:
-        return f"faint: {region.mean:+.2g} ± {region.mean_error:.1g} {unit} on average {place}"
-    return f"faint: {np.sqrt(max(region.excess, 0.0)):.2g} {unit} rms beyond noise {place}"
-
-
-def _percent(share: float) -> str:
-    return f"{100.0 * min(share, 1.0):.0f} %"
-
-
-def _values(coordinate: Coordinate, unit: str) -> str:
-    """Mean torques of the few classes of a coordinate."""
-    shown = [one for one in coordinate.regions if one.label and abs(one.mean_z) > 3.0]
-    return f" ({', '.join(f'{one.mean:+.2g} {unit} {one.label}' for one in shown)})" if shown else ""
-
-
-def _crowded(found: Localised) -> tuple[float, str] | None:
-    """The region that holds much of the power in little of the time, and how it is told."""
-    best: tuple[float, str] | None = None
-    for one in found.coordinates.values():
-        if one.name in (_EVERYWHERE, "direction", "input", "acceleration", "twist rate"):
-            continue
-        power, time = (np.array([getattr(r, key) for r in one.regions]) for key in ("power_share", "time_share"))
-        z = np.array([r.excess_z for r in one.regions])
-        if one.name == "reversals":
-            near = np.array([r.label.startswith("reversals") for r in one.regions])
-            groups = [near] if near.any() else []
-        elif any(r.label for r in one.regions):
-            groups = [np.arange(len(power)) == i for i in range(len(power))]
-        else:
-            numbers = np.arange(len(power))
-            groups = [(numbers >= i) & (numbers <= j) for i in range(len(power)) for j in range(i, len(power))]
-        for rows in groups:
-            held, spent = float(power[rows].sum()), float(time[rows].sum())
-            score = held - spent
-            if held < 0.6 or held < 2.0 * spent or score < _CROWDED or np.max(z[rows]) < SIGNIFICANT:
-                continue
-            # of regions that hold as much, the simpler coordinate's
-            if best is None or score > best[0] + _SIMPLER:
-                best = score, f"{_told(one, rows)}"
-    return best
-
-
-def _told(coordinate: Coordinate, rows: Array) -> str:
-    chosen = [one for one, taken in zip(coordinate.regions, rows, strict=True) if taken]
-    share = _percent(sum(one.power_share for one in chosen))
-    if chosen[0].label:
-        if coordinate.name == "reversals":
-            return f"at speed reversals; {share} of the residual power lies near them"
-        return f"{chosen[0].label}; {share} of the residual power lies there"
-    low, high = chosen[0].low, chosen[-1].high
-    unit = f" {coordinate.unit}" if coordinate.unit else ""
-    symbol = coordinate.symbol or coordinate.name
-    if coordinate.name == "|speed|" and rows[0]:
-        return f"at low speed; {share} of the residual power lies where {symbol} < {high:.2g}{unit}"
-    if coordinate.name == "|speed|" and rows[-1]:
-        return f"at high speed; {share} of the residual power lies where {symbol} > {low:.2g}{unit}"
-    if coordinate.name == "time":
-        return f"for a while; {share} of the residual power lies between {low:.4g} and {high:.4g} s"
-    return f"at a place; {share} of the residual power lies where {low:.3g} < {symbol} < {high:.3g}{unit}"
-
-
-def where(
+def localise(
     experiment: Experiment,
     residuals: Mapping[str, Sequence[Residual]],
-    parts: Sequence[Kinematics],
-    smoothed: Sequence[Mapping[str, Smoothed]],
+    segments: Sequence[Segment],
     *,
     rotating: bool | Mapping[str, bool] = True,
 ) -> dict[str, Localised]:
-    """Where each equation's missing torque lives, by equation (:func:`jaxbl.diagnosis.residuals.residual_torques`)."""
+    """Where each equation lacks torque, by equation.
+
+    Args:
+        experiment: the model.
+        residuals: of each equation, segment by segment (:func:`jaxbl.diagnosis.residuals.residual_torques`).
+        segments: of the log.
+        rotating: whether positions are angles in rad; by side where they differ.
+    """
     found = {}
     balance = eqx.filter_jit(regression.balance)
     for name, pieces in residuals.items():
         coordinates = [
-            coordinates_of(experiment, part, channels, one, rotating=rotating)
-            for part, channels, one in zip(parts, smoothed, pieces, strict=True)
+            coordinates_of(experiment, segment, one, rotating=rotating)
+            for segment, one in zip(segments, pieces, strict=True)
         ]
-        driving = np.concatenate([np.asarray(balance(experiment, part)[name].drive) for part in parts])
+        driving = np.concatenate([np.asarray(balance(experiment, one.kinematics)[name].drive) for one in segments])
         found[name] = locate(pieces, coordinates, floor=RESOLUTION * float(np.sqrt(np.mean(driving**2))))
     return found
-
-
-def as_json(found: Mapping[str, Localised]) -> dict[str, Any]:
-    """What was found, as plain dicts, lists and numbers, each with its sentence."""
-    return {name: dataclasses.asdict(one) | {"sentence": describe(one)} for name, one in found.items()}

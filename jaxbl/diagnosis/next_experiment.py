@@ -12,11 +12,11 @@ from jaxbl.config import Config, read_config
 from jaxbl.diagnosis.discriminating_input import Input, parting
 from jaxbl.errors import InputError
 from jaxbl.identification.logs import on_record
-from jaxbl.identification.search import smoothed_channels
+from jaxbl.identification.segments import reading_noise, segments_of
 from jaxbl.records import Record
 
 _CLEAR = 10.0
-"""Nats from which on an experiment tells: refitted numbers take some of them back."""
+"""Nats from which on an experiment decides between two effects: refitted numbers cost some of them."""
 
 
 class Limits(NamedTuple):
@@ -47,7 +47,7 @@ def next_experiment(summary: Mapping[str, Any], model: Config, record: Record, l
     data = model.resolved() | {key: rival[key] for key in ("drive", "transmission", "effects") if key in rival}
     with jax.enable_x64(True):
         one, other = (on_record(each, record) for each in (model, read_config(data)))
-        noise = smoothed_channels(record, one.sides).noise
+        noise = reading_noise(segments_of(record, one.sides))
         return parting(one, other, record, noise, limits.torque, limits.travel)
 
 
@@ -89,5 +89,5 @@ def write_next_experiment(
     clear = "" if found.apart > _CLEAR else ": too little; --max-torque and --max-travel allow for more"
     return [
         f"To part {pair[0]} from {pair[1]}: {found.kind} of {found.amplitude:.3g} N m, {found.frequency:.3g} Hz, "
-        f"{time[-1] + record.sample_period:.3g} s; it would tell them apart by up to {found.apart:.2g} nats{clear}: {path}"
+        f"{time[-1] + record.sample_period:.3g} s; it would separate them by up to {found.apart:.2g} nats{clear}: {path}"
     ]

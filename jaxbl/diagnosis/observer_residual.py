@@ -1,13 +1,13 @@
-"""The torques that a model lacks as the observers see them: a second witness beside the smoother's residual.
+"""The torques that a model lacks as the observers see them: a second estimate beside the smoother's residual.
 
 The paper's perturbation identification: once a super-twisting observer (7)-(8) has converged, its equivalent control (15)
-is the perturbation, all that the right-hand side it knows leaves out. Here that right-hand side is told of all that the
-model has, transmission and effects at the smoothed motion, besides its nominal equation: J z_2 is then what the model lacks.
-Were it not told, the whole transmitted torque would go through the observer, whose lag on it would be taken for missing.
+is the perturbation, all that the right-hand side it knows leaves out. Here that right-hand side holds all that the model
+has, transmission and effects at the smoothed motion, besides its nominal equation: J z_2 is then what the model lacks.
+Otherwise the whole transmitted torque would go through the observer, whose lag on it would be taken for missing torque.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,21 +20,23 @@ from scipy.signal import lfilter
 from scipy.signal.windows import parzen
 
 from jaxbl.identification.regression import Kinematics
+from jaxbl.identification.segments import Segment
 from jaxbl.identification.smoother import Smoothed
 from jaxbl.observer.super_twisting import ObserverState
-from jaxbl.records import Record
 from jaxbl.simulate import Experiment, Signals, State, initial_state, replay
 
 from .residuals import Residual, beyond_nominal, narrowed
 
 _DRAWS = 6
-"""Runs over the smoothed motion with other noise, which tell the observers' own."""
+"""Runs over the smoothed motion with drawn noise, by which the observers' own is measured: its deviation to a tenth."""
 _SETTLING = 10.0
 """Time constants of the equivalent control's low-pass that are left out at the beginning of a part."""
 _FEWEST = 20
+"""Samples that are left out at least, where there is no low-pass: the observer's own reaching phase."""
 _STUCK = 0.9
 """Share of alpha: a mean control beyond is a switching term that does not switch."""
 _OFTEN = 0.1
+"""Share of the time in which it does not switch from which on an observer counts as not converged."""
 _MEMORY = 60.0
 """Time constants over which the observers' noise is correlated: what is slow is a small rest of what is fast."""
 
@@ -59,9 +61,7 @@ class Observed(NamedTuple):
         return bool(np.isfinite(self.residual.torque).all()) and self.stuck < _OFTEN
 
 
-def observed_torques(
-    experiment: Experiment, record: Record, parts: Sequence[Kinematics], smoothed: Sequence[Mapping[str, Smoothed]]
-) -> dict[str, list[Observed]]:
+def observed_torques(experiment: Experiment, segments: Sequence[Segment]) -> dict[str, list[Observed]]:
     """Torques that a model lacks on each side by its observers' equivalent control, N m.
 
     The observers begin each part at the smoothed position and velocity. Their own noise is found by runs of the same
@@ -70,30 +70,28 @@ def observed_torques(
 
     Args:
         experiment: the model, with array leaves and the observers' gains; its sample period is that of the record.
-        record: the log.
-        parts: of it, one for each segment (:func:`jaxbl.identification.regression.from_smoothed`).
-        smoothed: positions of each part, by side.
+        segments: of the log.
     """
-    assert record.torque is not None
     found: dict[str, list[Observed]] = {side: [] for side in experiment.sides}
     bare = eqx.tree_at(lambda e: e.identifier, experiment, None, is_leaf=lambda x: x is None)
-    for i, (rows, part, channels) in enumerate(zip(record.segments, parts, smoothed, strict=True)):
-        random = np.random.default_rng(i)
+    for i, segment in enumerate(segments):
+        random, part = np.random.default_rng(i), segment.kinematics
         known, readings = {}, {}
         for side in experiment.sides:
-            known[side] = _told(experiment, side, part, channels[side])
-            drawn = float(channels[side].noise) * random.standard_normal((_DRAWS, len(part.time)))
-            measured = np.asarray(record.positions[side])[rows]
-            readings[side] = jnp.asarray(np.concatenate([measured[None], np.asarray(part.position[side]) + drawn]))
-        controls = _controls(bare, jnp.asarray(record.torque[rows]), readings, known, part)
+            smoothed = segment.smoothed[side]
+            known[side] = _known_acceleration(experiment, side, part, smoothed)
+            drawn = float(smoothed.noise) * random.standard_normal((_DRAWS, len(segment)))
+            runs = np.concatenate([segment.readings[side][None], np.asarray(part.position[side]) + drawn])
+            readings[side] = jnp.asarray(runs)
+        controls = _controls(bare, jnp.asarray(segment.torque), readings, known, part)
         for side in experiment.sides:
             found[side].append(_observed(experiment, side, part, np.asarray(controls[side])))
     return found
 
 
 @eqx.filter_jit
-def _told(experiment: Experiment, side: str, part: Kinematics, smoothed: Smoothed) -> Float[Array, " samples"]:
-    """Acceleration beyond the nominal one that a side's observer is told of, rad/s^2."""
+def _known_acceleration(experiment: Experiment, side: str, part: Kinematics, smoothed: Smoothed) -> Float[Array, " samples"]:
+    """Acceleration beyond the nominal one that a side's observer is given, rad/s^2."""
     return _held(*beyond_nominal(experiment, side, part, smoothed)) / experiment.drive.inertia(side)
 
 
@@ -102,7 +100,7 @@ def _held(smooth: Float[Array, " samples"], friction: Float[Array, " samples"]) 
 
     Held from sample k on, p_k moves the observer's positions by second differences of h^2 (p_{k-1} + p_k) / (2 J), where
     the true torque moves them by that of its mean around sample k, weighted by a triangle: tau + h^2 tau'' / 12. With the
-    mean of two samples for p_k the former is tau + h^2 tau'' / 4, hence the sixth that is taken off; not of friction,
+    mean of two samples for p_k the former is tau + h^2 tau'' / 4, hence the sixth that is subtracted; not of friction,
     which jumps. The explicit observer's own lag of half a period remains.
     """
     torque = smooth.at[1:-1].add(-jnp.diff(smooth, n=2) / 6.0) - friction

@@ -2,12 +2,13 @@
 
 What explains a record is sought with the model linearised about the smoothed motion, whose errors cancel to first order
 only. Here the predictor runs over the record with the model as it is, and the model is linearised about the predictor's own
-path: prediction errors, and their derivatives by all numbers and by the initial state, are then exact, and what is left is
+path: prediction errors, and their derivatives by all numbers and by the initial state, are then exact: plain
 Gauss-Newton with step control. Windows, or a free run that may diverge, are not needed.
 Reference: L. Ljung, System Identification (1999), 7.2, 10.2.
 """
 
-from collections.abc import Mapping, Sequence
+import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,16 +19,14 @@ from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import path
 from jaxbl.identification.intervals import spread
 from jaxbl.identification.regression import settled
-from jaxbl.identification.smoother import Smoothed
-from jaxbl.identification.trajectory import Fit, Free, with_values
-from jaxbl.records import Record
+from jaxbl.identification.segments import Segment
+from jaxbl.identification.trajectory import Fit, Free, with_fitted
 from jaxbl.simulate import Experiment
 
 from .linearised_model import Linear, Predictor
 
-Array = np.ndarray
-
 _STEPS = 25
+"""Of Gauss-Newton at most in a round, rejected ones among them."""
 _SETTLED = 0.02
 """Twice the logarithm of the likelihood that a further step may gain."""
 _ROUNDS = 2
@@ -47,48 +46,39 @@ class Refined(NamedTuple):
     """
 
     experiment: Experiment
-    theta: Array
-    deviation: Array
+    theta: np.ndarray
+    deviation: np.ndarray
     smoothness: list[float]
-    start: list[Array]
+    start: list[np.ndarray]
     linear: Linear
 
 
 class _Point(NamedTuple):
     """Numbers and initial states tried: the model there, and minus twice the log-likelihood."""
 
-    theta: Array
-    start: list[Array]
+    theta: np.ndarray
+    start: list[np.ndarray]
     linear: Linear
     predictor: Predictor
     cost: float
 
 
 class _Refiner:
-    def __init__(
-        self,
-        experiment: Experiment,
-        free: Sequence[Free],
-        width: Array,
-        record: Record,
-        smoothed: Mapping[str, Sequence[Smoothed]],
-    ):
-        self.experiment, self.free, self.width = experiment, tuple(free), width
-        self.record, self.smoothed = record, smoothed
+    """Gauss-Newton with step control."""
 
-    def start(self) -> list[Array]:
-        """Positions and velocities at the first sample of each part, as they were smoothed."""
-        count = len(self.record.segments)
+    def __init__(self, experiment: Experiment, free: Sequence[Free], width: np.ndarray, segments: Sequence[Segment]):
+        self.experiment, self.free, self.width, self.segments = experiment, tuple(free), width, segments
+
+    def start(self) -> list[np.ndarray]:
+        """Positions and velocities at the first sample of each segment, as they were smoothed."""
         sides = self.experiment.sides
-        first = [{side: np.asarray(self.smoothed[side][i].state[0]) for side in sides} for i in range(count)]
+        first = [{side: np.asarray(segment.smoothed[side].state[0]) for side in sides} for segment in self.segments]
         return [np.array([one[side][order] for order in (0, 1) for side in sides]) for one in first]
 
-    def at(self, theta: Array, start: list[Array], smoothness: Sequence[float] | None) -> _Point:
+    def at(self, theta: np.ndarray, start: list[np.ndarray], smoothness: Sequence[float] | None) -> _Point:
         """Prediction errors along the path of the predictor; of the best, where no smoothness is given."""
-        smoothed = self.smoothed
-        if smoothness is not None:
-            smoothed = self._path(theta, start, smoothness)
-        linear = Linear(self.experiment, self.free, theta, self.width, -theta, self.record, smoothed)
+        segments = self.segments if smoothness is None else self._path(theta, start, smoothness)
+        linear = Linear(self.experiment, self.free, theta, self.width, -theta, segments)
         if smoothness is None:
             smoothness, _ = linear.choose(())
             return self.at(theta, start, smoothness)
@@ -96,33 +86,32 @@ class _Refiner:
         cost = float(linear.count * np.sum(np.log(predictor.given)) + np.sum((theta / self.width) ** 2))
         return _Point(theta, start, linear, predictor, cost if np.isfinite(cost) else np.inf)
 
-    def _path(self, theta: Array, start: list[Array], smoothness: Sequence[float]) -> dict[str, list[Smoothed]]:
-        """The smoothed motion with the filtered one of a model in its place."""
-        record, sides = self.record, self.experiment.sides
-        assert record.torque is not None
-        experiment = with_values(self.experiment, self.free, jnp.asarray(theta))
-        gain = np.asarray(Linear.gain_of(smoothness, record.sample_period))
+    def _path(self, theta: np.ndarray, start: list[np.ndarray], smoothness: Sequence[float]) -> list[Segment]:
+        """The segments with the filtered motion of a model in place of the smoothed one."""
+        sides = self.experiment.sides
+        experiment = with_fitted(self.experiment, self.free, jnp.asarray(theta))
+        gain = np.asarray(Linear.gain_of(smoothness, self.segments[0].period))
         gains = {side: gain[j] for j, side in enumerate(sides)}
-        found: dict[str, list[Smoothed]] = {side: [] for side in sides}
-        for i, rows in enumerate(record.segments):
-            torque, first = record.torque[rows], record.time[rows.start] - record.time[0]
-            readings = {side: record.positions[side][rows] for side in sides}
-            position, velocity = (dict(zip(sides, half, strict=True)) for half in np.split(start[i], 2))
-            begun = PlantState(position, velocity, settled(experiment, torque[0]))
-            states = path(experiment, begun, torque, first, readings, gains)
+        found = []
+        for segment, first in zip(self.segments, start, strict=True):
+            position, velocity = (dict(zip(sides, half, strict=True)) for half in np.split(first, 2))
+            begun = PlantState(position, velocity, settled(experiment, segment.torque[0]))
+            states = path(experiment, begun, segment.torque, segment.time[0], segment.readings, gains)
+            filtered = {}
             for side in sides:
-                own = self.smoothed[side][i]
+                own = segment.smoothed[side]
                 # of numbers under which the predictor diverges nothing finite is left
                 with np.errstate(invalid="ignore", over="ignore"):
-                    error = readings[side] - states.position[side]
+                    error = segment.readings[side] - states.position[side]
                     # the first state is that of the predictor before it has seen anything
                     error[0] = 0.0
                     seen = np.stack([states.position[side], states.velocity[side]], axis=1) + error[:, None] * gains[side]
                 state = np.concatenate([seen, np.asarray(own.state)[:, 2:]], axis=1)
-                found[side].append(own._replace(state=state))  # type: ignore[arg-type]
+                filtered[side] = own._replace(state=state)  # type: ignore[arg-type]
+            found.append(dataclasses.replace(segment, smoothed=filtered))
         return found
 
-    def run(self, theta: Array) -> _Point:
+    def run(self, theta: np.ndarray) -> _Point:
         best = self.at(theta, self.start(), None)
         for i in range(_ROUNDS):
             if i:
@@ -142,7 +131,7 @@ class _Refiner:
                     share *= 0.25
         return best
 
-    def deviation(self, point: _Point) -> Array:
+    def deviation(self, point: _Point) -> np.ndarray:
         """Standard deviations of theta: of the errors, which may be correlated, and the prior together."""
         linear, own, sides = point.linear, len(self.free), len(self.experiment.sides)
         residual, jacobian = [], []
@@ -172,24 +161,18 @@ _spread = eqx.filter_jit(spread)
 
 
 def refined(
-    experiment: Experiment,
-    free: Sequence[Free],
-    theta: Array,
-    width: Array,
-    record: Record,
-    smoothed: Mapping[str, Sequence[Smoothed]],
+    experiment: Experiment, free: Sequence[Free], theta: np.ndarray, width: np.ndarray, segments: Sequence[Segment]
 ) -> Refined:
     """Refine the numbers of a model.
 
     Args:
-        experiment: the model with all effects (:func:`.complete.complete`); its sample period is that of the record.
+        experiment: the model with all effects (:func:`.neutral_effects.complete`); its sample period is that of the log.
         free: numbers to be refined.
         theta: where they start, shape (numbers,).
         width: standard deviation of the prior of each theta about 0.
-        record: the log.
-        smoothed: its positions, part by part.
+        segments: of the log.
     """
-    refiner = _Refiner(experiment, free, width, record, smoothed)
+    refiner = _Refiner(experiment, free, width, segments)
     best = refiner.run(np.asarray(theta))
-    model = with_values(experiment, free, jnp.asarray(best.theta))
+    model = with_fitted(experiment, free, jnp.asarray(best.theta))
     return Refined(model, best.theta, refiner.deviation(best), best.predictor.smoothness, best.start, best.linear)

@@ -21,12 +21,14 @@ from scipy.ndimage import gaussian_filter1d
 
 from jaxbl.drive.plant import States
 from jaxbl.identification.regression import Kinematics, Path, effect_path
+from jaxbl.identification.segments import Segment
 from jaxbl.identification.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, running_sum, smooth
 from jaxbl.simulate import Experiment
 
 _REACH = 60.0
 """Length of the noise's correlation, over 1 / w_c: what is slow is a small rest of what is fast, and needs all of it."""
 _LARGEST = 2**18
+"""Frequencies of a response at most, which bounds memory."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,7 +101,7 @@ def _mean(spectrum: np.ndarray) -> float:
     return float(np.trapezoid(spectrum) / (len(spectrum) - 1))
 
 
-def low_passed(
+def as_smoothed(
     values: Float[Array, " samples"], smoothed: Smoothed, period: float | Float[Array, ""]
 ) -> Float[Array, " samples"]:
     """Values as if they were accelerations seen through a smoother, its ends included."""
@@ -174,7 +176,7 @@ def beyond_nominal(
     """Modelled torque on a side less that of its nominal equation, in which the inertia is the nominal one, N m.
 
     What transmission and effects add to J dv/dt = (input) - B v, the right-hand side that an observer (7)-(8) knows; and,
-    on its own, the dry friction that is to be taken off it.
+    on its own, the dry friction that is to be subtracted.
     """
     drive, velocity = experiment.drive, part.velocity[side]
     acting = _acting(experiment, side, part, smoothed)
@@ -195,7 +197,7 @@ def _side(
     # the input is a mean around the sample already; of the rest, the mean that the position's second differences see
     driving = torque if side == "motor" else jnp.zeros_like(torque)
     modelled = driving + _mean_around(acting.total - driving) - acting.friction
-    missing = experiment.plant.inertia(side) * part.acceleration[side] - low_passed(modelled, smoothed[side], period)
+    missing = experiment.plant.inertia(side) * part.acceleration[side] - as_smoothed(modelled, smoothed[side], period)
 
     def of(position: dict, velocity: dict, *rest: Any) -> Array:
         total, level = _torque(experiment, side, position, velocity, *rest)
@@ -231,8 +233,7 @@ def white_noise(parts: Sequence[np.ndarray]) -> float:
 
 def residual_torques(
     experiment: Experiment,
-    parts: Sequence[Kinematics],
-    smoothed: Sequence[Mapping[str, Smoothed]],
+    segments: Sequence[Segment],
     *,
     torque_noise: float = 0.0,
     transmitted_noise: float | None = None,
@@ -244,23 +245,22 @@ def residual_torques(
 
     Args:
         experiment: the model, with array leaves; its sample period is that of the record.
-        parts: of the record, by :func:`jaxbl.identification.regression.from_smoothed`.
-        smoothed: the positions of each part, by side.
+        segments: of the record.
         torque_noise: standard deviation of the input's noise from sample to sample, N m.
         transmitted_noise: of the measured transmitted torque, N m; left out, by its fourth differences.
     """
     found: dict[str, list[Residual]] = {}
-    for part, channels in zip(parts, smoothed, strict=True):
-        sensor = 0.0
+    for segment in segments:
+        part, sensor = segment.kinematics, 0.0
         if part.transmitted is not None:
             sensor = white_noise([np.asarray(part.transmitted)]) if transmitted_noise is None else transmitted_noise
         if part.transmitted is not None and experiment.transmission is not None:
-            missing, by_position, by_velocity = _transmission(experiment, part, dict(channels))
-            noise = _Noise(part, channels, by_position, by_velocity)
+            missing, by_position, by_velocity = _transmission(experiment, part, segment.smoothed)
+            noise = _Noise(segment, by_position, by_velocity)
             found.setdefault("transmission", []).append(noise.of("transmission", missing, None, 0.0, sensor))
         for side in experiment.sides:
-            missing, by_position, by_velocity = _side(experiment, side, part, dict(channels))
-            noise = _Noise(part, channels, by_position, by_velocity)
+            missing, by_position, by_velocity = _side(experiment, side, part, segment.smoothed)
+            noise = _Noise(segment, by_position, by_velocity)
             inertia = float(experiment.plant.inertia(side))
             level = abs(float(experiment.drive.torque_gain(side))) * sensor
             driving = torque_noise if side == "motor" else 0.0
@@ -269,16 +269,11 @@ def residual_torques(
 
 
 class _Noise:
-    """Noise of torques along a part, from the derivatives by positions and velocities."""
+    """Noise of torques along a segment, from the derivatives by positions and velocities."""
 
-    def __init__(
-        self,
-        part: Kinematics,
-        smoothed: Mapping[str, Smoothed],
-        by_position: Mapping[str, Array],
-        by_velocity: Mapping[str, Array],
-    ):
-        self.time = np.asarray(part.time)
+    def __init__(self, segment: Segment, by_position: Mapping[str, Array], by_velocity: Mapping[str, Array]):
+        smoothed = segment.smoothed
+        self.time = segment.time
         self.period = float(self.time[-1] - self.time[0]) / (len(self.time) - 1)
         self.smoothed = smoothed
         self.slopes = {

@@ -12,8 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-Array = np.ndarray
-
 _BANDS, _FEWEST = 24, 12
 """Bands of a spectrum, evenly spaced in the logarithm of the frequency; frequencies in one of them."""
 
@@ -27,11 +25,11 @@ class Spectrum(NamedTuple):
         gain: what it is worth beside a flat one, nats.
     """
 
-    frequency: Array
-    power: Array
+    frequency: np.ndarray
+    power: np.ndarray
     gain: float
 
-    def at(self, samples: int) -> Array:
+    def at(self, samples: int) -> np.ndarray:
         """Power at the frequencies of that many samples, shape (frequencies, sides)."""
         where = np.log(np.maximum(np.fft.rfftfreq(samples), 0.5 / samples))
         known = np.log(self.frequency)
@@ -43,7 +41,7 @@ class Spectrum(NamedTuple):
         return self.gain > self.power.size
 
 
-def spectrum_of(errors: Sequence[Array]) -> Spectrum:
+def spectrum_of(errors: Sequence[np.ndarray]) -> Spectrum:
     """Spectrum of errors, part by part, each of shape (samples, sides)."""
     powers = [np.abs(_transformed(one)) ** 2 for one in errors]
     weights = [_weights(len(one)) for one in errors]
@@ -65,7 +63,7 @@ def spectrum_of(errors: Sequence[Array]) -> Spectrum:
     return found._replace(gain=gain)
 
 
-def weighted_products(errors: Array, spectrum: Spectrum) -> Array:
+def weighted_products(errors: np.ndarray, spectrum: Spectrum) -> np.ndarray:
     """Products of columns of errors with one another, each frequency over its power; shape (columns, columns).
 
     Args:
@@ -80,11 +78,11 @@ def weighted_products(errors: Array, spectrum: Spectrum) -> Array:
     return found
 
 
-def _transformed(errors: Array) -> Array:
+def _transformed(errors: np.ndarray) -> np.ndarray:
     return np.fft.rfft(errors, axis=0) / np.sqrt(len(errors))
 
 
-def _weights(samples: int) -> Array:
+def _weights(samples: int) -> np.ndarray:
     """How often each frequency counts: all but the first, and the last of an even number, stand for two."""
     found = np.full(samples // 2 + 1, 2.0)
     found[0] = 1.0

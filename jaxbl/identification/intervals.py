@@ -15,7 +15,7 @@ from scipy import stats
 from .smoother import running_sum
 from .trajectory import Fit, Free
 
-LIMIT = 0.5
+UNSEEN = 0.5
 """Relative standard deviation beyond which a direction counts as not shown by the record."""
 
 
@@ -106,7 +106,7 @@ class Refusal(NamedTuple):
 
 
 def refusals(free: Sequence[Free], found: Spread) -> tuple[list[Refusal], float]:
-    """Directions of theta with a standard deviation above :data:`LIMIT`, and the condition number of the information.
+    """Directions of theta with a standard deviation above :data:`UNSEEN`, and the condition number of the information.
 
     Directions are eigenvectors of the covariance, components below a tenth of the largest left out.
     """
@@ -117,7 +117,7 @@ def refusals(free: Sequence[Free], found: Spread) -> tuple[list[Refusal], float]
     refused = []
     for value, vector in zip(values, vectors.T, strict=True):
         deviation = max(inflation, 1.0) / np.sqrt(value) if value > 0.0 else float("inf")
-        if deviation > LIMIT:
+        if deviation > UNSEEN:
             vector = vector / vector[np.argmax(np.abs(vector))]
             shown = {one.path: float(x) for one, x in zip(free, vector, strict=True) if abs(x) >= 0.1}
             refused.append(Refusal(shown, float(deviation)))

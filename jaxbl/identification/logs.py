@@ -1,13 +1,10 @@
-"""What commands on measured logs share: reading, the study's experiment at a log's period, kinematics, gains, units."""
+"""What commands on measured logs share: reading, the study's experiment at a log's period, gains, units."""
 
 # arrays of numpy go where those of jax are asked for
 # pyright: reportArgumentType=false
 
 import dataclasses
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 
 import equinox as eqx
@@ -18,12 +15,12 @@ import numpy as np
 from jaxbl.config import Config, prepare
 from jaxbl.drive.parameters import get_leaf, leaf_paths
 from jaxbl.errors import InputError
-from jaxbl.identification.observer_gains import Gains, choose_gains
-from jaxbl.identification.regression import Kinematics, from_smoothed, shortest
-from jaxbl.identification.search import Channels
-from jaxbl.identification.trajectory import PHYSICAL, is_positive
 from jaxbl.records import POSITION_CHANNELS, Record, join, read_record
 from jaxbl.simulate import Experiment
+
+from .observer_gains import ChosenGains, choose_gains
+from .segments import Segment
+from .trajectory import PHYSICAL, is_positive
 
 Logs = str | Path | Record | Sequence[str | Path | Record]
 
@@ -50,18 +47,6 @@ def _read_one(config: Config, log: str | Path, gear_tolerance: float) -> Record:
         notes = (*record.notes, "No input torque was recorded: the drive is taken to move freely, without one.")
         record = dataclasses.replace(record, torque=np.zeros(len(record.time)), notes=notes)
     return record
-
-
-def identity_of(config: Config, missing: frozenset[str], *records: Record | None) -> str:
-    """Hash of a study and logs: of everything that decides what is found in them."""
-    text = json.dumps([config.resolved(), sorted(missing), version("jaxbl")], sort_keys=True)
-    total = hashlib.sha256(text.encode())
-    for record in records:
-        if record is not None:
-            total.update(str(record.segments).encode())
-            for values in (record.time, record.torque, *record.positions.values(), record.transmitted):
-                total.update(b"" if values is None else np.ascontiguousarray(values).tobytes())
-    return total.hexdigest()[:16]
 
 
 def arrays(values: Mapping[str, float]) -> dict[str, jax.Array]:
@@ -106,32 +91,15 @@ def decimation(config: Config, record: Record) -> int:
     return max(round(0.5 / (bandwidth * record.sample_period)), 1)
 
 
-def kinematics_of(record: Record, channels: Channels, factor: int) -> list[Kinematics]:
-    """The parts of a record that are long enough to be decimated."""
-    assert record.torque is not None
-    found = []
-    for i, part in enumerate(record.segments):
-        if part.stop - part.start >= max(2 * shortest(factor), 50):
-            smoothed = {side: parts[i] for side, parts in channels.smoothed.items()}
-            transmitted = None if record.transmitted is None else record.transmitted[part]
-            time = record.time[part] - record.time[0]
-            found.append(from_smoothed(time, record.torque[part], smoothed, transmitted))
-    return found
-
-
 def gains_for(
-    missing: frozenset[str], fitted: Experiment, record: Record, channels: Channels
-) -> tuple[dict[str, Gains], dict[str, float]]:
-    """Gains of the observers that the study leaves open, by side and by dotted path."""
+    missing: frozenset[str], fitted: Experiment, segments: Sequence[Segment]
+) -> tuple[dict[str, ChosenGains], dict[str, float]]:
+    """Gains of the observers that the study leaves open, by side and by dotted path, chosen on the longest segment."""
     sides = [side for side in fitted.sides if f"observer.{side}" in missing]
     if not sides:
         return {}, {}
-    i = int(np.argmax([part.stop - part.start for part in record.segments]))
-    part = record.segments[i]
-    assert record.torque is not None
-    smoothed = {side: parts[i] for side, parts in channels.smoothed.items()}
-    kinematics = from_smoothed(record.time[part] - record.time[part][0], record.torque[part], smoothed)
-    chosen = choose_gains(fitted, kinematics, {side: record.positions[side][part] for side in fitted.sides})
+    longest = max(segments, key=len)
+    chosen = choose_gains(fitted, longest.kinematics, longest.readings)
     values = {}
     for side in sides:
         values |= {f"observer.{side}.lambda": chosen[side].lambda_, f"observer.{side}.alpha": chosen[side].alpha}

@@ -20,11 +20,14 @@ from jaxbl.simulate import Experiment, Signals, State, replay
 from .regression import Kinematics
 
 _ALPHA = np.geomspace(1.1, 6.0, 10)
+"""Tried, over the largest disturbance: alpha must exceed it."""
 _LAMBDA = np.geomspace(1.1, 12.0, 12)
+"""Tried, over the least lambda that converges with that alpha."""
 _MOST = 20_000
+"""Samples that gains are tried on at most, which bounds time and memory."""
 
 
-class Gains(NamedTuple):
+class ChosenGains(NamedTuple):
     """Gains chosen for one observer.
 
     Attributes:
@@ -68,7 +71,7 @@ def _misses(
 
 def choose_gains(
     experiment: Experiment, kinematics: Kinematics, measured: dict[str, Float[Array, " samples"]]
-) -> dict[str, Gains]:
+) -> dict[str, ChosenGains]:
     """Choose the gains of all observers on a part of a record.
 
     Args:
@@ -94,5 +97,5 @@ def choose_gains(
         size = np.asarray(missed[side])
         best = int(np.argmin(np.where(np.isfinite(size), size, np.inf)))
         lambda_, alpha_ = (float(tried[f"observer.{side}.{name}"][best]) for name in ("lambda", "alpha"))
-        chosen[side] = Gains(lambda_, alpha_, f_plus[side], float(size[best]))
+        chosen[side] = ChosenGains(lambda_, alpha_, f_plus[side], float(size[best]))
     return chosen

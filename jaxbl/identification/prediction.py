@@ -22,8 +22,11 @@ from jaxbl.simulate import Experiment
 from .trajectory import Windows, projected_residual
 
 _COARSE = 10.0 ** np.arange(-12.0, 1.0)
+"""Smoothness q h^3 / sigma^2 tried for all sides alike, from a free run to following every reading."""
 _FINE = 10.0 ** np.arange(-2.0, 2.1, 0.5)
+"""Factors on it tried for each side."""
 _MOST_WINDOWS = 40
+"""Windows, spread over the record, that the choice is made on: which bounds its time."""
 
 
 @cache

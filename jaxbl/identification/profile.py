@@ -16,9 +16,11 @@ from .intervals import Spread
 from .trajectory import Fit, Free, Windows, fits
 
 _PASSES = 4
+"""Points on each side of the best value: as the root of the deviance is nearly straight, the last is close to the limit."""
 _FURTHEST = 3.0
 """Largest step of theta from the best value: a factor of e^3."""
 _MOST_STEPS = 15
+"""Of the solver at each point: it starts where the one before ended."""
 
 
 class Profile(NamedTuple):

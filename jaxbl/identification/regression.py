@@ -6,7 +6,7 @@ References: M. Gautier, Dynamic identification of robots with power model, ICRA 
 set and reference models of EMPS, Workshop on Nonlinear System Identification Benchmarks (2019).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,8 +20,7 @@ from scipy import signal
 from jaxbl.drive.plant import Plant, PlantState, States
 from jaxbl.simulate import Experiment, with_effects
 
-from .smoother import Smoothed
-from .trajectory import WIDE, Fit, Free, with_values
+from .trajectory import WIDE, Fit, Free, with_fitted
 
 _PASSES = 3
 """Fits, each with the weights of the residuals of the one before."""
@@ -45,43 +44,15 @@ class Kinematics(eqx.Module):
     transmitted: Float[Array, " samples"] | None = None
 
 
-def from_smoothed(
-    time: np.ndarray, torque: np.ndarray, smoothed: dict[str, Smoothed], transmitted: np.ndarray | None = None
-) -> Kinematics:
-    """Kinematics by the fixed-interval smoother; `torque` is the input held from each sample to the next."""
-    states = {side: one.state for side, one in smoothed.items()}
-    return _kinematics(time, torque, states, transmitted)
-
-
-def differentiated(
-    time: np.ndarray,
-    torque: np.ndarray,
-    positions: dict[str, np.ndarray],
-    cutoff: float,
-    transmitted: np.ndarray | None = None,
-) -> Kinematics:
-    """Kinematics as commonly found: Butterworth low-pass of 4th order forth and back, then central differences.
+def kinematics_from(time: np.ndarray, torque: np.ndarray, states: Mapping[str, Any], transmitted: Any = None) -> Kinematics:
+    """Kinematics of a part of a record.
 
     Args:
-        time: even, s.
-        torque: input held from each sample to the next, N m.
-        positions: of each side, rad.
-        cutoff: of the low-pass, Hz.
-        transmitted: measured transmitted torque, N m.
+        time: even, s, shape (samples,).
+        torque: input held from each sample to the next, N m, shape (samples,).
+        states: position, velocity and acceleration of each side, shape (samples, 3).
+        transmitted: measured transmitted torque, N m, shape (samples,), or None.
     """
-    period = (time[-1] - time[0]) / (len(time) - 1)
-    sections = signal.butter(4, min(2.0 * cutoff * period, 0.99), output="sos")
-    states = {}
-    for side, position in positions.items():
-        smooth = signal.sosfiltfilt(sections, position)
-        velocity = np.gradient(smooth, period)
-        states[side] = jnp.asarray(np.stack([smooth, velocity, np.gradient(velocity, period)], axis=1))
-    return _kinematics(time, torque, states, transmitted)
-
-
-def _kinematics(
-    time: np.ndarray, torque: np.ndarray, states: dict[str, Array], transmitted: np.ndarray | None
-) -> Kinematics:
     held = np.asarray(torque, float)
     before = np.concatenate([held[:1], held[:-1]])
     position, velocity, acceleration = ({side: state[:, i] for side, state in states.items()} for i in range(3))
@@ -271,7 +242,7 @@ def _regress(
     names = list(eqx.filter_eval_shape(balance, experiment, parts[0]))
 
     def left(theta: Array, _: None = None) -> Array:
-        at = with_values(experiment, free, theta)
+        at = with_fitted(experiment, free, theta)
         each = [balance(at, part) for part in parts]
         columns = [jnp.concatenate([decimate(one[name].residual, factor) for one in each]) for name in names]
         return jnp.stack(columns, axis=-1)

@@ -7,79 +7,26 @@ from typing import Any, Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
-from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
 from .intervals import Refusal, Spread, refusals, spread
 from .prediction import predictor
-from .regression import Path, effect_path
-from .smoother import Smoothed, smooth
-from .trajectory import Fit, Free, Windows, cut, fits, with_values
+from .segments import Segment, windows_of
+from .trajectory import Fit, Free, Windows, fits, with_fitted
 
 _LONG, _SHORT = 500, 50
 """Samples of the windows that are tried where no length is asked for."""
 _MOST_COARSE = 100
+"""Short windows, spread over the record, that the starts are compared on."""
 _FEW_STEPS = 30
 """Of the solver, from each start."""
 _FEWEST = 20
+"""Samples of a window at least: ten times the states that are fitted to it."""
 _PASSES = 2
 """Choices of the predictor's gain, each followed by a fit."""
 NOISE_ALONE = 1.1
 """Residuals over the noise, rms, up to which a model counts as explaining a record."""
-
-
-class Channels(NamedTuple):
-    """A record's positions smoothed, segment by segment, and the noise of their readings in rad."""
-
-    smoothed: dict[str, list[Smoothed]]
-    noise: dict[str, float]
-
-
-def smoothed_channels(record: Record, sides: Sequence[str]) -> Channels:
-    """Smooth the positions of each side."""
-    smoothed = {
-        side: [smooth(jnp.asarray(record.positions[side][part]), record.sample_period) for part in record.segments]
-        for side in sides
-    }
-    noise = {side: float(np.mean([float(one.noise) for one in parts])) for side, parts in smoothed.items()}
-    return Channels(smoothed, noise)
-
-
-def windows_of(
-    record: Record, channels: Channels, experiment: Experiment, samples: int, rest: bool = False
-) -> tuple[Windows, np.ndarray]:
-    """The record in windows, segment by segment, and the row that each begins with.
-
-    Args:
-        record: the log.
-        channels: of the record.
-        experiment: says how effects begin.
-        samples: length of a window; segments that are shorter are left out.
-        rest: whether each segment begins at rest.
-    """
-    assert record.torque is not None
-    pieces, firsts = [], []
-    for i, part in enumerate(record.segments):
-        count = part.stop - part.start
-        if count < samples:
-            continue
-        found = {side: parts[i] for side, parts in channels.smoothed.items()}
-        position = {side: one.position for side, one in found.items()}
-        velocity = {side: one.velocity for side, one in found.items()}
-        along = Path(jnp.asarray(record.time[part]), jnp.asarray(record.torque[part]), position, velocity)
-        start = PlantState(
-            position,
-            velocity,
-            effect_path(experiment, along)[0],
-        )
-        measured = {side: record.positions[side][part] for side in found}
-        first = float(record.time[part.start] - record.time[0])
-        torque = record.torque[part]
-        pieces.append(cut(torque, measured, record.sample_period, start, channels.noise, samples, first, rest))
-        firsts.append(part.start + samples * np.arange(count // samples))
-    return Windows.join(pieces), np.concatenate(firsts)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,25 +103,34 @@ def _nearest_turn(free: Sequence[Free], theta: np.ndarray) -> np.ndarray:
     return theta - turns * np.round(theta / np.where(turns > 0.0, turns, 1.0))
 
 
-class Search:
-    """Search of one record's numbers."""
+class ParameterSearch:
+    """Search of one log's numbers.
 
-    def __init__(self, experiment: Experiment, record: Record, channels: Channels, settings: Settings):
-        self.experiment, self.record, self.channels, self.settings = experiment, record, channels, settings
-        shortest = min(part.stop - part.start for part in record.segments)
-        longest = max(part.stop - part.start for part in record.segments)
+    Args:
+        experiment: the nominal model, with array leaves; its sample period is that of the log.
+        segments: of the log.
+        settings: how to search.
+        name: of the log, for messages.
+
+    Raises:
+        InputError: windows of a length that the log does not allow.
+    """
+
+    def __init__(self, experiment: Experiment, segments: Sequence[Segment], settings: Settings, name: str):
+        self.experiment, self.segments, self.settings, self.name = experiment, segments, settings, name
+        shortest, longest = min(map(len, segments)), max(map(len, segments))
+        period = segments[0].period
         if settings.window is None:
             short = min(_SHORT, shortest // 2)
             self.lengths = [short, min(_LONG, max(shortest // 2, short))]
             if settings.method == "prediction_error":
                 self.lengths = self.lengths[1:]
         else:
-            asked = round(settings.window / record.sample_period)
+            asked = round(settings.window / period)
             if not _FEWEST <= asked <= longest:
                 raise InputError(
                     f"identify.window: {settings.window:g} s are {asked} samples; it should be between {_FEWEST} samples "
-                    f"({_FEWEST * record.sample_period:g} s) and the log's longest part "
-                    f"({longest * record.sample_period:g} s)"
+                    f"({_FEWEST * period:g} s) and the log's longest part ({longest * period:g} s)"
                 )
             self.lengths = [asked]
 
@@ -201,21 +157,12 @@ class Search:
             kept &= np.array([one.path != out for one in free])
             theta = np.where(kept, theta, 0.0)
         return Found(
-            left,
-            found.fit,
-            found.spread,
-            found.windows,
-            found.firsts,
-            refused,
-            held,
-            first_condition,
-            starts,
-            found.smoothness,
-            found.between,
-        )
+            left, found.fit, found.spread, found.windows, found.firsts, refused, held, first_condition, starts,
+            found.smoothness, found.between,
+        )  # fmt: skip
 
     def _cut(self, samples: int) -> tuple[Windows, np.ndarray]:
-        return windows_of(self.record, self.channels, self.experiment, samples, self.settings.rest)
+        return windows_of(self.segments, self.experiment, samples, self.settings.rest)
 
     def _coarse(self, free: tuple[Free, ...]) -> tuple[np.ndarray, list[dict[str, Any]]]:
         """Best of several starts, on short windows from all over the record."""
@@ -232,9 +179,7 @@ class Search:
         cost = np.where(np.isfinite(cost), cost, np.inf)
         found = np.array([one.theta for one in tries])
         if not np.isfinite(cost).any():
-            raise InputError(
-                f"{self.record.path}: the model diverges from every start; its nominal numbers should be nearer"
-            )
+            raise InputError(f"{self.name}: the model diverges from every start; its nominal numbers should be nearer")
         best = int(np.argmin(cost))
         starts = [
             {"cost": float(c), "agrees": bool(c <= cost[best] * 1.01), "theta": t.tolist()}
@@ -254,7 +199,7 @@ class Search:
             smoothness: dict[str, float] = {}
             if self.settings.method == "prediction_error":
                 for _ in range(_PASSES):
-                    windows, smoothness = predictor(with_values(self.experiment, free, jnp.asarray(theta)), windows)
+                    windows, smoothness = predictor(with_fitted(self.experiment, free, jnp.asarray(theta)), windows)
                     theta = np.asarray(fitted(windows).theta)
             found = fitted(windows).only(np.flatnonzero(kept))
             width = spread(found)
@@ -262,7 +207,7 @@ class Search:
             if np.isfinite(size):
                 tried.append((size, _Whole(found, width, windows, firsts, smoothness)))
         if not tried:
-            raise InputError(f"{self.record.path}: the model diverges on this log; its nominal numbers should be nearer")
+            raise InputError(f"{self.name}: the model diverges on this log; its nominal numbers should be nearer")
         best, *others = [one for _, one in sorted(tried, key=lambda pair: pair[0])]
         return _between(best, others[0]) if others else best
 

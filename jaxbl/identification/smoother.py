@@ -14,9 +14,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 _SMOOTHNESS = 1e-14, 1e4
+"""Range of q h^5 / sigma^2 that is searched: time constants of the smoother from 200 periods to a fraction of one."""
 _GRID = 19
+"""Values in a round of the search: a decade apart in the first."""
 _ZOOMS = 3
+"""Rounds, each over a ninth of the range before: the last leaves 3 % of the smoothness open."""
 _SPREAD = 10.0
+"""Factor on what is known of the first state: it counts for a hundredth then."""
 _SHOWN = 3.0
 """Standard deviations from which on a velocity is shown."""
 

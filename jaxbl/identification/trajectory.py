@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
@@ -28,15 +29,21 @@ from jaxbl.simulate import Experiment, PlantState, trajectory
 _INNER = 2
 """Initial states tried at each step of the fit."""
 _RIDGE = 1e-10
+"""Least damping of a search for initial states, over the columns' squares: above rounding, below what it changes."""
 _INFLUENCE = 1e-20
 """Of a state, over that of the one with the most: what is below is none (an effect that does nothing)."""
 _ENOUGH = 2e-3
 """A fit has ended where a step takes less than this off the sum of squares, in units of the residuals' variance."""
 _MOST_REJECTED = 12
+"""Steps in a row that make the fit worse, after which no better one is expected: damping has grown 4^12 times."""
+_RTOL, _ATOL = 1e-6, 1e-4
+"""Changes of theta (relative changes of the numbers) and of residuals (over the noise) below which a fit has converged."""
 _AT_ONCE = 8
 """Fits that an accelerator does at once."""
 _GAINED = 1.0
+"""Residuals' variances that new initial states must gain in a window for the solver to start again."""
 WIDE = 3.0
+"""Prior standard deviation of theta: a factor of e^3, wider than any number is known."""
 
 
 class Free(NamedTuple):
@@ -175,7 +182,7 @@ class Fit(eqx.Module):
         return dataclasses.replace(self, theta=theta, jacobian=jacobian)
 
 
-def with_values(experiment: Experiment, free: Sequence[Free], theta: Float[Array, " parameters"]) -> Experiment:
+def with_fitted(experiment: Experiment, free: Sequence[Free], theta: Float[Array, " parameters"]) -> Experiment:
     """The experiment with fitted numbers."""
     return set_leaves(experiment, {one.path: one.value(theta[i]) for i, one in enumerate(free)})
 
@@ -280,11 +287,11 @@ def _sloped(
     """Projected residuals, initial states, and Kaufman's derivative of the residuals by theta."""
 
     def one(window: Windows) -> tuple[Array, PlantState, Array]:
-        found = _eliminate(with_values(experiment, free, theta), window, _INNER, False)
+        found = _eliminate(with_fitted(experiment, free, theta), window, _INNER, False)
         start = ravel_pytree(window.start)[1](found.start)
 
         def residual(theta: Array) -> tuple[Array, Array]:
-            value = _residual(with_values(experiment, free, theta), start, window)
+            value = _residual(with_fitted(experiment, free, theta), start, window)
             return value, value
 
         slope, value = jax.jacfwd(residual, has_aux=True)(theta)
@@ -293,61 +300,117 @@ def _sloped(
     return jax.vmap(one, in_axes=(_MAPPED,))(windows)
 
 
+class _Point(NamedTuple):
+    """Least squares at given numbers.
+
+    Attributes:
+        residual: shape (residuals,).
+        jacobian: its derivative by theta, shape (residuals, parameters).
+        start: the windows' initial states there.
+        squares: sum of squared residuals of each window, shape (windows,).
+    """
+
+    residual: Array
+    jacobian: Array
+    start: PlantState
+    squares: Array
+
+    @property
+    def cost(self) -> Array:
+        """Sum of squared residuals."""
+        return jnp.sum(self.residual**2)
+
+    @property
+    def info(self) -> optx.FunctionInfo:
+        """As the solver's parts take it."""
+        return optx.FunctionInfo.ResidualJac(self.residual, lx.MatrixLinearOperator(self.jacobian))
+
+
+def _reduced(
+    experiment: Experiment, free: Sequence[Free], windows: Windows, theta: Float[Array, " parameters"], moving: Array
+) -> _Point:
+    """As many residuals as numbers, and one, with the same cost, gradient and normal matrix as all of them.
+
+    All columns of the derivative in one run, nothing kept along the trajectories, no decomposition of tall matrices.
+
+    Args:
+        experiment: nominal.
+        free: what is fitted.
+        windows: the record.
+        theta: where, shape (parameters,).
+        moving: 1 for numbers that are fitted, 0 for those that are held; shape (parameters,).
+    """
+    value, start, slope = _sloped(experiment, free, windows, theta)
+    each = jnp.sum(value**2, axis=(1, 2))
+    total = jnp.sum(each) + jnp.sum((theta / WIDE) ** 2)
+    normal = jnp.outer(moving, moving) * jnp.einsum("wtsp,wtsq->pq", slope, slope) + jnp.diag(moving / WIDE**2)
+    towards = moving * (jnp.einsum("wtsp,wts->p", slope, value) + theta / WIDE**2)
+    size = jnp.sqrt(jnp.diag(normal)) + (1.0 - moving)
+    root = jnp.linalg.cholesky(normal / jnp.outer(size, size) + jnp.diag(1.0 - moving))
+    seen = jax.scipy.linalg.solve_triangular(root, towards / size, lower=True)
+    rest = jnp.sqrt(jnp.maximum(total - jnp.sum(seen**2), 0.0))
+    derivative = jnp.concatenate([root.T * (size * moving)[None, :], jnp.zeros((1, len(theta)))])
+    return _Point(jnp.concatenate([seen, rest[None]]), derivative, start, each)
+
+
 class _Solved(NamedTuple):
     theta: Array
-    guess: PlantState
-    left: Array
+    start: PlantState
+    squares: Array
     steps: Array
     converged: Array
 
 
+def _converged(new: tuple[Array, Array], old: tuple[Array, Array]) -> Array:
+    """Whether neither theta nor the residuals changed by more than the tolerances, absolute and relative."""
+    within = [jnp.abs(a - b) < _ATOL + _RTOL * jnp.abs(a) for a, b in zip(new, old, strict=True)]
+    return jnp.all(within[0]) & jnp.all(within[1])
+
+
 def _solve(
-    residual: Callable[[Array, PlantState], tuple[Array, tuple[PlantState, Array]]],
-    solver: Any,
-    theta: Array,
-    guess: PlantState,
-    most_steps: Array,
-    count: int,
+    point: Callable[[Array, PlantState], _Point], theta: Array, guess: PlantState, most_steps: Array, count: int
 ) -> _Solved:
-    """Least squares, step by step: the initial states of the best so far are the guess of the next.
+    """Levenberg-Marquardt: the initial states of the best numbers so far are the guess of the next.
+
+    Damped steps and trust region are optimistix's; the loop is our own, as each step needs those states and ends by the
+    residuals' variance.
 
     Args:
-        residual: function of theta and guess; beside residuals it gives the states and each window's sum of squares.
-        solver: of optimistix.
+        point: least squares at a theta, from a guess of the initial states.
         theta: the start.
         guess: of the initial states there.
-        most_steps: of the solver.
+        most_steps: tried at most.
         count: of the residuals that the sum of squares is of.
     """
-
-    def function(theta: Array, guess: PlantState) -> tuple[Array, tuple[PlantState, Array]]:
-        return residual(theta, guess)
-
-    shapes = jax.eval_shape(function, theta, guess)
-    first, static = eqx.partition(solver.init(function, theta, guess, {}, *shapes, frozenset()), eqx.is_array)
-
-    def cost_of(state: Any) -> Array:
-        return jnp.sum(state.f_info.residual**2)
+    descent, region = optx.DampedNewtonDescent(linear_solver=lx.QR()), optx.ClassicalTrustRegion()
+    shapes = jax.eval_shape(point, theta, guess)
+    none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
     def going(carry: Any) -> Array:
-        _, _, state, ended = carry
-        return (state.num_steps < most_steps) & ~ended
+        *_, steps, _, ended = carry
+        return (steps < most_steps) & ~ended
 
     def step(carry: Any) -> Any:
-        theta, guess, old, _ = carry
-        old = eqx.combine(old, static)
-        theta, new, _ = solver.step(function, theta, guess, {}, old, frozenset())
-        met, result = solver.terminate(function, theta, new.aux[0], {}, new, frozenset())
-        accepted, cost = new.num_steps_since_acceptance == 0, cost_of(new)
+        theta, best, tried, search, steps, rejected, _ = carry
+        first = steps == 0
+        new = point(tried, jax.tree.map(partial(jnp.where, first), guess, best.start))
+        size, accepted, searched, search = region.step(first, theta, tried, best.info, new.info, search)
+        met = accepted & _converged((tried, new.residual), (theta, best.residual))
         # a change of this size is small beside what residuals of this size leave open, on any record
-        small = accepted & ~old.first_step & (cost_of(old) - cost < _ENOUGH * cost / count)
-        lost = new.num_steps_since_acceptance >= _MOST_REJECTED
-        ended = met | small | lost | (result != optx.RESULTS.successful)
-        return theta, new.aux[0], eqx.filter(new, eqx.is_array), ended
+        small = accepted & ~first & (best.cost - new.cost < _ENOUGH * new.cost / count)
+        rejected = jnp.where(accepted, 0, rejected + 1)
+        theta, best = jax.tree.map(partial(jnp.where, accepted), (tried, new), (theta, best))
+        change, solved = descent.step(size, descent.query(theta, best.info, descent.init(theta, best.info)))
+        failed = (searched != optx.RESULTS.successful) | (solved != optx.RESULTS.successful)
+        ended = met | small | (rejected >= _MOST_REJECTED) | failed
+        return theta, best, theta + change, search, steps + 1, rejected, ended
 
-    start = theta, guess, first, jnp.asarray(False)
-    theta, guess, state, ended = jax.lax.while_loop(going, step, start)
-    return _Solved(theta, guess, state.aux[1], state.num_steps, ended & jnp.isfinite(cost_of(state)))
+    zero = jnp.zeros((), int)
+    start = theta, none, theta, region.init(theta, none.info), zero, zero, jnp.asarray(False)
+    theta, best, _, _, steps, _, ended = jax.lax.while_loop(going, step, start)
+    # where no step was asked for
+    states = jax.tree.map(partial(jnp.where, steps == 0), guess, best.start)
+    return _Solved(theta, states, best.squares, steps, ended & jnp.isfinite(best.cost))
 
 
 def fit(
@@ -376,38 +439,15 @@ def fit(
     given = theta
     moving = jnp.ones(len(theta)) if held is None else jnp.where(held, 0.0, 1.0)
 
-    def reduced(theta: Array, guess: PlantState) -> tuple[Array, Array, tuple[PlantState, Array]]:
-        """As many residuals as numbers, and one, with the same cost, gradient and normal matrix as all of them."""
-        theta = jnp.where(moving > 0.0, theta, given)
-        value, start, slope = _sloped(experiment, free, dataclasses.replace(windows, start=guess), theta)
-        each = jnp.sum(value**2, axis=(1, 2))
-        total = jnp.sum(each) + jnp.sum((theta / WIDE) ** 2)
-        normal = jnp.outer(moving, moving) * jnp.einsum("wtsp,wtsq->pq", slope, slope) + jnp.diag(moving / WIDE**2)
-        towards = moving * (jnp.einsum("wtsp,wts->p", slope, value) + theta / WIDE**2)
-        size = jnp.sqrt(jnp.diag(normal)) + (1.0 - moving)
-        root = jnp.linalg.cholesky(normal / jnp.outer(size, size) + jnp.diag(1.0 - moving))
-        seen = jax.scipy.linalg.solve_triangular(root, towards / size, lower=True)
-        rest = jnp.sqrt(jnp.maximum(total - jnp.sum(seen**2), 0.0))
-        derivative = jnp.concatenate([root.T * (size * moving)[None, :], jnp.zeros((1, len(theta)))])
-        return jnp.concatenate([seen, rest[None]]), derivative, (start, each)
+    def reduced(theta: Array, guess: PlantState) -> _Point:
+        at = jnp.where(moving > 0.0, theta, given)
+        return _reduced(experiment, free, dataclasses.replace(windows, start=guess), at, moving)
 
-    # all columns of the derivative in one run, nothing kept along the trajectories, and no decomposition of tall matrices
-    @jax.custom_jvp
-    def residual(theta: Array, guess: PlantState) -> tuple[Array, tuple[PlantState, Array]]:
-        value, _, beside = reduced(theta, guess)
-        return value, beside
-
-    @residual.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        value, derivative, beside = reduced(*primals)
-        return (value, beside), (derivative @ tangents[0], jax.tree.map(jnp.zeros_like, beside))
-
-    solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-4)
     count = windows.torque.size * len(windows.measured)
 
     def anew(theta: Array) -> tuple[Array, PlantState]:
         """Initial states that do not depend on those found before, and what is left over then in each window."""
-        value, start = projected_residual(with_values(experiment, free, theta), windows)
+        value, start = projected_residual(with_fitted(experiment, free, theta), windows)
         return jnp.sum(value**2, axis=(1, 2)), start
 
     def again(carry: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -419,10 +459,10 @@ def fit(
         guess = jax.tree.map(lambda new, old: jnp.where(better, new, old), start, guess)
         # the last time looks for initial states alone
         on = gained & (round < rounds)
-        found = _solve(residual, solver, theta, guess, jnp.where(on, most_steps, 0), count)
+        found = _solve(reduced, theta, guess, jnp.where(on, most_steps, 0), count)
         theta = jnp.where((moving > 0.0) & on, found.theta, theta)
-        left, converged = jnp.where(on, found.left, left), jnp.where(on, found.converged, converged)
-        return theta, found.guess, left, round + 1, steps + found.steps, converged, on & (rounds > 1)
+        left, converged = jnp.where(on, found.squares, left), jnp.where(on, found.converged, converged)
+        return theta, found.start, left, round + 1, steps + found.steps, converged, on & (rounds > 1)
 
     zero = jnp.zeros((), int)
     first = theta, windows.start, jnp.zeros(len(windows.time)), zero, zero, jnp.asarray(False), jnp.asarray(True)

@@ -7,9 +7,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxbl.diagnosis.localise import SIGNIFICANT, Coordinate, Localised, Values, describe, spectrum_of
+from jaxbl.diagnosis.coordinates import CoordinateValues
+from jaxbl.diagnosis.localise import SIGNIFICANT, Coordinate, Localised, residual_spectrum
 from jaxbl.diagnosis.observer_residual import Observed
 from jaxbl.diagnosis.residuals import Residual, narrowed
+from jaxbl.diagnosis.sentences import sentence_of
 
 from .figures import Drawn, outline, stacked_axes
 from .style import COLOURS, FAINT, LEGEND_ABOVE, MISSING, SIDE_COLOURS, style, with_unit
@@ -28,7 +30,7 @@ _LABELLED = 0.1
 
 def draw_residuals(
     residuals: Mapping[str, Sequence[Residual]],
-    coordinates: Mapping[str, Sequence[Mapping[str, Values]]],
+    coordinates: Mapping[str, Sequence[Mapping[str, CoordinateValues]]],
     found: Mapping[str, Localised],
     unit: str = "N m",
     observed: Mapping[str, Sequence[Observed]] | None = None,
@@ -78,7 +80,7 @@ def _over_time(
                 ax.plot(low.time[at], low.torque[at], color=_MEAN, lw=0.5, label=label, zorder=4)
         ax.axhline(0.0, color=FAINT, lw=0.8, zorder=1)
         ax.set_ylabel(with_unit(f"{name}:\nmissing {missing_quantity(unit)}", unit))
-        ax.set_title(f"{fill(describe(one, unit), _WIDTH)}\n", loc="left", fontsize=9)
+        ax.set_title(f"{fill(sentence_of(one, unit), _WIDTH)}\n", loc="left", fontsize=9)
         ax.legend(ncols=3, **LEGEND_ABOVE)
     axes[-1].set_xlabel("time (s)")
     caption = (
@@ -106,7 +108,7 @@ def _panels(found: Localised) -> list[Coordinate]:
 
 
 def _over_coordinates(
-    parts: Sequence[Residual], coordinates: Sequence[Mapping[str, Values]], found: Localised, unit: str
+    parts: Sequence[Residual], coordinates: Sequence[Mapping[str, CoordinateValues]], found: Localised, unit: str
 ) -> Drawn:
     shown = _panels(found)
     figure = Figure(figsize=(3.2 * len(shown) + 0.6, 3.5), layout="constrained")
@@ -136,8 +138,9 @@ def _over_coordinates(
     axes[0].set_ylim(-limit, limit)
     handles = axes[0].get_legend_handles_labels()
     figure.legend(*handles, ncols=2, loc="outside lower right")
+    sentence = sentence_of(found, unit)
     caption = (
-        f"{describe(found, unit)[:1].upper()}{describe(found, unit)[1:]}. Dots are samples, black marks the means of bins "
+        f"{sentence[:1].upper()}{sentence[1:]}. Dots are samples, black marks the means of bins "
         "with twice their standard errors; hollow where a mean does not differ significantly from zero. Above: share of the "
         "power beyond the noise that a function of this coordinate alone explains, on data that it was not fitted to."
     )
@@ -159,7 +162,7 @@ def _spectra(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, Lo
     figure, axes = stacked_axes(len(residuals), 2.5, sharex=False)
     for ax, (name, parts) in zip(axes, residuals.items(), strict=True):
         longest = max(parts, key=lambda part: len(part.time))
-        frequency, power, floor = spectrum_of(longest)
+        frequency, power, floor = residual_spectrum(longest)
         seen = (frequency > 0.0) & (frequency <= min(1.5 * longest.bandwidth, frequency[-1]))
         frequency, power, floor = frequency[seen], power[seen], floor[seen]
         # amplitude of a sine with the power of the line

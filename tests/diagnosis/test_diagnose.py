@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 from hidden_log import FRICTION, driven, logged, model
 
-import jaxbl.diagnosis.diagnose as under_test
+import jaxbl.diagnosis.diagnosis_summary as summary_module
 import jaxbl.diagnosis.effect_search as explain
 from jaxbl.config import read_config
-from jaxbl.diagnosis.diagnose import diagnose, read_task, run_task
+from jaxbl.diagnosis.diagnose import diagnose, run_diagnosis
+from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task, split
 from jaxbl.diagnosis.next_experiment import Limits, next_experiment, tied, write_next_experiment
+from jaxbl.diagnosis.observer_residual import observed_torques
+from jaxbl.diagnosis.proof import is_better
+from jaxbl.diagnosis.setup import set_up
 from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.errors import InputError
 from jaxbl.identification.trajectory import Free
@@ -63,12 +67,13 @@ def test_noise_of_the_input_that_was_not_felt_does_not_drive_the_model(tmp_path)
 @pytest.mark.parametrize("felt", [False, True])
 def test_the_motion_tells_whether_noise_of_the_input_was_felt(felt, tmp_path):
     logged(torque_noise=0.02, felt=felt).write(tmp_path / "axis.csv")
-    task = read_task(tmp_path / "axis.csv", model())
+    task = read_diagnosis_task(tmp_path / "axis.csv", model())
     with jax.enable_x64(True):
-        setting = under_test._setting(task)
-    assert setting.torque_noise == (0.0 if felt else pytest.approx(0.02, rel=0.1))
-    for ground, record in ((setting.seen, task.record), (setting.other, task.holdout)):
-        assert np.array_equal(ground.record.torque, record.torque) is felt
+        setup = set_up(task)
+    assert setup.torque_noise == (0.0 if felt else pytest.approx(0.02, rel=0.1))
+    for log, record in ((setup.fitted, task.record), (setup.holdout, task.holdout)):
+        ((segment,), (rows,)) = log.segments, record.segments
+        assert np.array_equal(segment.torque, record.torque[rows]) is felt
 
 
 def test_the_gap_shrinks_to_the_noise_on_what_was_held_out(found):
@@ -85,12 +90,12 @@ def test_the_gap_shrinks_to_the_noise_on_what_was_held_out(found):
 
 def test_what_is_held_out_keeps_its_times_and_is_not_fitted(logs, found):
     whole = read_record(logs / "axis.csv")
-    task = read_task(logs / "axis.csv", model())
+    task = read_diagnosis_task(logs / "axis.csv", model())
     assert len(task.record.time) == 1500 and task.record.segments == (slice(0, 1500),)
     assert task.holdout.segments == (slice(1500, 2000),)
     np.testing.assert_array_equal(task.holdout.time, whole.time)
     parts = dataclasses.replace(whole, segments=(slice(0, 700), slice(800, 1200), slice(1300, 2000)))
-    first, last = under_test._split(parts)
+    first, last = split(parts)
     assert first.segments == (slice(0, 700), slice(800, 1200), slice(1300, 1550))
     assert last.segments == (slice(1550, 2000),) and len(first.time) == 1550
     trace = found.trace
@@ -115,20 +120,13 @@ def test_the_observers_are_a_second_witness(found):
 
 
 def test_an_observer_that_does_not_converge_is_noted(logs):
-    task = read_task(logs / "axis.csv", model(observer={"motor": {"lambda": 2.0, "alpha": 1.0}}))
+    task = read_diagnosis_task(logs / "axis.csv", model(observer={"motor": {"lambda": 2.0, "alpha": 1.0}}))
     assert "observer.motor" not in task.missing
     with jax.enable_x64(True):
-        nominal = under_test.on_record(task.config, task.record)
-        seen, other = (
-            dataclasses.replace(under_test._ground(nominal, one, False), bandwidth={"motor": 30.0})
-            for one in (task.record, task.holdout)
-        )
-        witness = under_test._Witness(task, nominal, seen, other)
-        summary = {"where": {"motor": {}}, "notes": []}
-        witness.tell(summary, seen.torques(nominal))
-    assert summary["where"]["motor"]["observed"]["converged"] is False
-    assert summary["where"]["motor"]["observed"]["rms"] is None
-    (note,) = summary["notes"]
+        setup = set_up(task)
+        observed = observed_torques(setup.bare, setup.fitted.segments)
+        about, (note,) = summary_module.observers_say(setup.bare, observed, setup)
+    assert about["motor"]["converged"] is False and about["motor"]["rms"] is None
     assert note.startswith("The motor's observer does not converge on this log (alpha = 1)")
 
 
@@ -158,16 +156,14 @@ def test_the_model_that_was_found_lacks_nothing_on_another_log(logs, found, tmp_
 
 def test_a_number_that_ends_far_from_what_is_known_of_it_is_told():
     own = [Free("drive.motor_inertia", "kg m²", 0.02, 0.02, True), Free("drive.motor_viscous", "N m s/rad", 0.0, 1.0, False)]
-    assert under_test._far_off(own, {"drive.motor_inertia": 0.021, "drive.motor_viscous": 0.1}, 0.02) == []
-    (note,) = under_test._far_off(own, {"drive.motor_inertia": 0.01, "drive.motor_viscous": 0.0}, 0.02)
+    assert summary_module._far_off(own, {"drive.motor_inertia": 0.021, "drive.motor_viscous": 0.1}, 0.02) == []
+    (note,) = summary_module._far_off(own, {"drive.motor_inertia": 0.01, "drive.motor_viscous": 0.0}, 0.02)
     assert note.startswith("drive.motor_inertia had to change by -50%, 25 times its [uncertainty]")
 
 
 def test_new_numbers_are_better_all_in_all():
     def better(before, after):
-        proving = under_test._Proving.__new__(under_test._Proving)
-        proving.before = under_test.Proof({"theta_e": before, "torque_motor": 1.0}, {})
-        return proving.better(under_test.Proof({"theta_e": after, "torque_motor": 1.1}, {}))
+        return is_better({"theta_e": after, "torque_motor": 1.1}, {"theta_e": before, "torque_motor": 1.0})
 
     assert better(1.0, 0.9) and not better(1.0, 0.95)
     # a model that diverges, or errs by nothing, is no error
@@ -189,9 +185,9 @@ def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
         return found._replace(experiment=wrong)
 
     monkeypatch.setattr(explain, "refined", spoilt)
-    task = read_task(logs / "axis.csv", model(), holdout=logs / "other.csv")
+    task = read_diagnosis_task(logs / "axis.csv", model(), holdout=logs / "other.csv")
     stages = []
-    found = run_task(task, lambda *at: stages.append(at))
+    found = run_diagnosis(task, lambda *at: stages.append(at))
     assert stages == [(i, 6) for i in range(1, 7)]
     summary = found.summary
     assert summary["withdrawn"] == ["motor.coulomb_friction"] and summary["findings"] == []
@@ -238,8 +234,8 @@ def test_what_is_tied_is_parted_by_the_experiment_that_is_asked_for(tmp_path):
     log, other, holdout = (tmp_path / name for name in ("log.csv", "next_log.csv", "holdout.csv"))
     driven(fast, [friction], 1e-3, 1).write(log)
     driven(0.8 * fast, [friction], 1e-3, 2).write(holdout)
-    task = read_task(log, model(), holdout=holdout)
-    found = run_task(task)
+    task = read_diagnosis_task(log, model(), holdout=holdout)
+    found = run_diagnosis(task)
     pair = tied(found.summary)
     assert pair is not None and set(pair) == {"motor.coulomb_friction", "motor.viscous_friction"}
     best = next_experiment(found.summary, found.model, task.record, Limits(travel=6.0))
@@ -252,7 +248,7 @@ def test_what_is_tied_is_parted_by_the_experiment_that_is_asked_for(tmp_path):
 
 def refused(logs, *arguments, **keywords):
     with pytest.raises(InputError) as error:
-        read_task(*arguments, **keywords)
+        read_diagnosis_task(*arguments, **keywords)
     message = str(error.value)
     assert "\n" not in message
     return message

@@ -6,9 +6,9 @@ from hidden.cases import cases
 from hidden_log import logged, model
 
 from jaxbl.diagnosis.effect_search import CLEAR, Explainer
-from jaxbl.identification.identify import read_task
+from jaxbl.identification.identify import read_identification_task
 from jaxbl.identification.logs import default_paths, on_record
-from jaxbl.identification.search import smoothed_channels
+from jaxbl.identification.segments import segments_of
 from jaxbl.identification.trajectory import free_parameters
 
 SEED, DURATION = 21, 6.0
@@ -18,12 +18,11 @@ _SIZES = {"torque", "drag", "inertia", "viscous", "relative", "amplitude", "damp
 def explained(case, tmp_path):
     log = tmp_path / "log.csv"
     case.log.write(log)
-    task = read_task(log, case.model)
+    task = read_identification_task(log, case.model)
     nominal = on_record(task.config, task.record)
     free = free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
     prior = [task.config.uncertainty.relative] * len(free)
-    smoothed = smoothed_channels(task.record, nominal.sides).smoothed
-    return Explainer(nominal, free, prior, task.record, smoothed).run()
+    return Explainer(nominal, free, prior, segments_of(task.record, nominal.sides)).run()
 
 
 @pytest.mark.slow
@@ -66,11 +65,11 @@ def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
     keep = (log.t < 1.2) | (log.t > 2.0)
     table = np.column_stack([log.t, log.u, log.theta_e])[keep]
     np.savetxt(tmp_path / "log.csv", table, "%.10g", ",", header="t,u,theta_e", comments="")
-    task = read_task(tmp_path / "log.csv", model())
+    task = read_identification_task(tmp_path / "log.csv", model())
     assert len(task.record.segments) == 2
     nominal = on_record(task.config, task.record)
     free = free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
-    smoothed = smoothed_channels(task.record, nominal.sides).smoothed
-    found = Explainer(nominal, free, [task.config.uncertainty.relative] * len(free), task.record, smoothed).run()
+    prior = [task.config.uncertainty.relative] * len(free)
+    found = Explainer(nominal, free, prior, segments_of(task.record, nominal.sides)).run()
     assert found.verdict == "explained"
     assert [one.effect for one in found.findings] == ["motor.coulomb_friction"]

@@ -1,14 +1,11 @@
 """Noise of a recorded input: its size, and what is left of a known input when it is smoothed away."""
 
-import dataclasses
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from jaxbl.diagnosis.input_noise import _smoothed, jumps, noise_of, smoothed_input, unfelt
-from jaxbl.records.reader import Record
+from jaxbl.diagnosis.input_noise import _smooth_curve, input_jumps, smoothed_input, unfelt
+from jaxbl.diagnosis.residuals import white_noise
 
 PERIOD, SAMPLES = 1e-3, 8000
 TIME = PERIOD * np.arange(SAMPLES)
@@ -19,35 +16,29 @@ INPUTS = {
 }
 
 
-def record(torque: np.ndarray, *segments: slice) -> Record:
-    fields = {field.name: None for field in dataclasses.fields(Record)}
-    given = {"path": Path("log.csv"), "time": TIME, "sample_period": PERIOD, "torque": torque, "positions": {}}
-    return Record(**(fields | given | {"segments": segments or (slice(0, SAMPLES),)}))  # type: ignore[arg-type]
-
-
 @pytest.fixture(params=INPUTS)
 def true(request):
     return INPUTS[request.param]
 
 
 @pytest.mark.parametrize("noise", [3e-3, 1e-2, 3e-2])
-def test_noise_is_measured_and_taken_off(true, noise):
-    noisy = record(true + noise * np.random.default_rng(1).standard_normal(SAMPLES))
-    assert noise_of(noisy) == pytest.approx(noise, rel=0.05)
-    left = np.asarray(smoothed_input(noisy, noise_of(noisy)).torque) - true
+def test_noise_is_measured_and_smoothed_away(true, noise):
+    noisy = true + noise * np.random.default_rng(1).standard_normal(SAMPLES)
+    assert white_noise([noisy]) == pytest.approx(noise, rel=0.05)
+    left = smoothed_input(noisy, white_noise([noisy])) - true
     assert np.sqrt(np.mean(left**2)) < 0.3 * noise
 
 
 def test_an_input_without_noise_has_none(true):
-    assert noise_of(record(true)) < 1e-6
+    assert white_noise([true]) < 1e-6
 
 
 def test_jumps_stay_where_they_are():
     noise = 0.01
     noisy = INPUTS["steps"] + noise * np.random.default_rng(2).standard_normal(SAMPLES)
     true = (1 + np.flatnonzero(np.abs(np.diff(INPUTS["steps"])) > 10.0 * noise)).tolist()
-    assert [one for one in jumps(noisy, noise) if one in true] == true
-    smooth = np.asarray(smoothed_input(record(noisy), noise).torque)
+    assert [one for one in input_jumps(noisy, noise) if one in true] == true
+    smooth = smoothed_input(noisy, noise)
     for at in true:
         assert (
             abs(smooth[at] - INPUTS["steps"][at]) < 3.0 * noise
@@ -55,16 +46,10 @@ def test_jumps_stay_where_they_are():
         )
 
 
-def test_parts_are_smoothed_each_by_itself_and_what_is_between_them_stays():
+def test_an_input_without_jumps_is_one_curve_and_a_short_one_stays():
     noisy = INPUTS["sine"] + 0.01 * np.random.default_rng(3).standard_normal(SAMPLES)
-    parts = slice(100, 3000), slice(3005, 8000)
-    smooth = np.asarray(smoothed_input(record(noisy, *parts), 0.01).torque)
-    outside = np.r_[0:100, 3000:3005]
-    np.testing.assert_array_equal(smooth[outside], noisy[outside])
-    for part in parts:
-        np.testing.assert_array_equal(smooth[part], _smoothed(noisy[part]))
-    short = record(noisy, slice(0, 5))
-    np.testing.assert_array_equal(smoothed_input(short, 0.01).torque, noisy)
+    np.testing.assert_array_equal(smoothed_input(noisy[:3000], 0.01), _smooth_curve(noisy[:3000]))
+    np.testing.assert_array_equal(smoothed_input(noisy[:5], 0.01), noisy[:5])
 
 
 def test_the_smooth_curve_is_one_of_least_penalised_squares():
@@ -79,10 +64,10 @@ def test_the_smooth_curve_is_one_of_least_penalised_squares():
         return float(np.sqrt(np.mean((found - true) ** 2)))
 
     best = minimize_scalar(left, bounds=(0.0, 11.0), method="bounded").fun
-    assert np.sqrt(np.mean((_smoothed(noisy) - true) ** 2)) < 1.5 * best
+    assert np.sqrt(np.mean((_smooth_curve(noisy) - true) ** 2)) < 1.5 * best
     # what has no curvature is let through untouched
     line = 0.3 + 1e-3 * np.arange(count)
-    np.testing.assert_allclose(_smoothed(line), line, atol=1e-5)
+    np.testing.assert_allclose(_smooth_curve(line), line, atol=1e-5)
 
 
 @pytest.mark.parametrize("felt", [False, True])

@@ -1,5 +1,6 @@
 """The linearised model: its columns are what changes of numbers and effects do to the prediction errors."""
 
+import dataclasses
 import functools
 
 import equinox as eqx
@@ -14,7 +15,7 @@ from jaxbl.diagnosis.candidates import forces_of, variants_of
 from jaxbl.diagnosis.linearised_model import Linear
 from jaxbl.drive.effects import EFFECTS, Scales, make_effect
 from jaxbl.drive.parameters import as_arrays
-from jaxbl.identification.smoother import smooth
+from jaxbl.identification.segments import segments_of
 from jaxbl.identification.trajectory import free_parameters
 from jaxbl.records import read_record
 from jaxbl.sweeps.trial import run
@@ -42,14 +43,15 @@ def linear(tmp_path, sides, change=lambda e: e, theta=0.0, disturbed=0.0):
     trace[["t", "u", "theta_e", *(["theta_s"] if sides == 2 else [])]].to_csv(log, index=False)
     record = read_record(log)
     free = free_parameters(experiment, PATHS[sides], 1.0)
-    smoothed = {side: [smooth(jnp.asarray(record.positions[side]), record.sample_period)] for side in experiment.sides}
-    rng = np.random.default_rng(3)
-    for side, (one,) in smoothed.items():
+    (segment,) = segments_of(record, experiment.sides)
+    rng, smoothed = np.random.default_rng(3), {}
+    for side, one in segment.smoothed.items():
         wave = disturbed * np.cumsum(rng.standard_normal((len(record.time), 3)), axis=0)
-        smoothed[side] = [one._replace(state=one.state + wave * np.array([1e-7, 1e-6, 1e-5]))]
+        smoothed[side] = one._replace(state=one.state + wave * np.array([1e-7, 1e-6, 1e-5]))
+    segment = dataclasses.replace(segment, smoothed=smoothed)
     at = np.full(len(free), theta)
     prior, centre = np.full(len(free), 0.02), np.zeros(len(free))
-    return Linear(change(experiment), free, at, prior, centre, record, smoothed)
+    return Linear(change(experiment), free, at, prior, centre, [segment])
 
 
 def errors(model, forces=None):

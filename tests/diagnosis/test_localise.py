@@ -3,17 +3,17 @@
 import dataclasses
 import json
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 from small_study import rigid, small
+from trace_segment import segment_of
 
 from jaxbl.config import prepare, read_config
-from jaxbl.diagnosis.localise import SIGNIFICANT, Values, as_json, coordinates_of, describe, locate, where
+from jaxbl.diagnosis.coordinates import CoordinateValues, coordinates_of
+from jaxbl.diagnosis.localise import SIGNIFICANT, localise, locate
 from jaxbl.diagnosis.residuals import Residual, residual_torques
-from jaxbl.identification.regression import from_smoothed
-from jaxbl.identification.smoother import smooth
+from jaxbl.diagnosis.sentences import sentence_of
 from jaxbl.sweeps.trial import run
 
 PERIOD, COUNT = 5e-3, 4000
@@ -31,14 +31,16 @@ def coordinates(**more):
     for at in crossing:
         near[max(at - 12, 0) : at + 12] = 1 if VELOCITY[at + 1] > 0.0 else 2
     found = {
-        "all": Values(np.zeros(COUNT, int), classes=("everywhere",)),
-        "direction": Values((VELOCITY > 0.0).astype(int), classes=("backward", "forward")),
-        "reversals": Values(near, classes=("away from reversals", "reversals to forward", "reversals to backward")),
-        "|speed|": Values(np.abs(VELOCITY), "rad/s", symbol="|ω|"),
-        "speed": Values(VELOCITY, "rad/s", symbol="ω"),
-        "turn": Values(np.mod(POSITION, 2.0 * np.pi), "rad", symbol="θe mod 2π"),
-        "position": Values(POSITION, "rad", symbol="θe"),
-        "time": Values(TIME, "s", symbol="t"),
+        "all": CoordinateValues(np.zeros(COUNT, int), classes=("everywhere",)),
+        "direction": CoordinateValues((VELOCITY > 0.0).astype(int), classes=("backward", "forward")),
+        "reversals": CoordinateValues(
+            near, classes=("away from reversals", "reversals to forward", "reversals to backward")
+        ),
+        "|speed|": CoordinateValues(np.abs(VELOCITY), "rad/s", symbol="|ω|"),
+        "speed": CoordinateValues(VELOCITY, "rad/s", symbol="ω"),
+        "turn": CoordinateValues(np.mod(POSITION, 2.0 * np.pi), "rad", symbol="θe mod 2π"),
+        "position": CoordinateValues(POSITION, "rad", symbol="θe"),
+        "time": CoordinateValues(TIME, "s", symbol="t"),
     }
     return found | more
 
@@ -69,7 +71,7 @@ def test_noise_is_found_nowhere(pole):
             z += [region.mean_z for region in one.coordinates[name].regions]
             excess += [region.excess_z for region in one.coordinates[name].regions]
         explained += [coordinate.explained for coordinate in one.coordinates.values()]
-        assert one.significant or describe(one).startswith("motor side: nothing beyond noise")
+        assert one.significant or sentence_of(one).startswith("motor side: nothing beyond noise")
     assert false <= 1
     assert 0.75 < np.std(z) < 1.1
     assert 0.7 < np.std(excess) < 1.15 and abs(np.mean(excess)) < 0.2
@@ -104,7 +106,7 @@ def test_each_coordinate_is_found_for_what_lives_there(case):
     one = found(torque)
     assert one.significant
     assert one.coordinates[name].explained > 0.9
-    assert words in describe(one)
+    assert words in sentence_of(one)
     assert one.missing == pytest.approx(np.sqrt(np.mean(torque**2)), rel=0.1)
     assert sum(region.power_share for region in one.coordinates[name].regions) == pytest.approx(1.0, abs=0.05)
 
@@ -114,19 +116,19 @@ def test_reversals_low_speed_places_and_times_are_told():
     one = found(slow)
     near = [region for region in one.coordinates["reversals"].regions if region.label.startswith("reversals")]
     assert sum(region.power_share for region in near) > 0.6 and sum(region.time_share for region in near) < 0.3
-    sentence = describe(one)
+    sentence = sentence_of(one)
     assert sentence.startswith("motor side, at ") and "of the residual power lies" in sentence
     dent = np.where(np.abs(POSITION - 2.0) < 0.3, 0.8, 0.0)
-    assert "< θe <" in describe(found(dent))
+    assert "< θe <" in sentence_of(found(dent))
     knock = np.where(np.abs(TIME - 12.0) < 0.4, 1.0, 0.0) * np.sin(40.0 * TIME)
-    assert "for a while" in describe(found(knock))
+    assert "for a while" in sentence_of(found(knock))
 
 
 def test_the_gap_is_told():
     inside = (np.abs(np.sin(3.0 * TIME)) < 0.2).astype(int)
-    gap = Values(inside, classes=("outside", "inside of the gap"))
+    gap = CoordinateValues(inside, classes=("outside", "inside of the gap"))
     one = found(0.4 * inside * np.sign(np.sin(7.3 * TIME)), gap=gap)
-    assert "inside of the gap" in describe(one)
+    assert "inside of the gap" in sentence_of(one)
 
 
 def test_a_disturbance_of_its_own_frequency_is_a_narrow_peak():
@@ -134,10 +136,10 @@ def test_a_disturbance_of_its_own_frequency_is_a_narrow_peak():
     peak = one.peaks[0]
     assert peak.frequency == pytest.approx(7.3, abs=0.05)
     assert peak.amplitude == pytest.approx(0.2, rel=0.1)
-    assert not peak.in_motion and "7.3 Hz" in describe(one)
+    assert not peak.in_motion and "7.3 Hz" in sentence_of(one)
     # friction has peaks, too, but where the motion has them
     friction = found(-0.3 * np.sign(VELOCITY))
-    assert friction.peaks[0].in_motion and "Hz" not in describe(friction)
+    assert friction.peaks[0].in_motion and "Hz" not in sentence_of(friction)
 
 
 def test_weak_torques_are_found_below_the_noise_of_a_sample():
@@ -174,38 +176,32 @@ GEARED = {
 
 
 def residuals_of(true, model):
-    trace = run(true).trace
-    columns = {"motor": "theta_e", "load": "theta_s"}
-    smoothed = {side: smooth(trace[name].to_numpy(), 1e-3) for side, name in columns.items() if name in trace}
-    part = from_smoothed(trace["t"].to_numpy(), trace["u"].to_numpy(), smoothed)
+    segment = segment_of(run(true).trace)
     experiment = prepare(read_config(model))
-    return experiment, residual_torques(experiment, [part], [smoothed]), part, smoothed
+    return experiment, residual_torques(experiment, [segment]), segment
 
 
 def test_a_geared_drive_with_hidden_friction_on_its_load():
     hidden = [{"kind": "load.coulomb_friction", "torque": 0.8}]
-    experiment, residuals, part, smoothed = residuals_of(
-        small(SETTINGS, effects=hidden, **GEARED), small(SETTINGS, **GEARED)
-    )
-    found = where(experiment, residuals, [part], [smoothed])
+    experiment, residuals, segment = residuals_of(small(SETTINGS, effects=hidden, **GEARED), small(SETTINGS, **GEARED))
+    found = localise(experiment, residuals, [segment])
     assert not found["motor"].significant
-    assert "by the direction of motion" in describe(found["load"])
+    assert "by the direction of motion" in sentence_of(found["load"])
     backward, *_, forward = found["load"].coordinates["direction"].regions
     assert backward.mean == pytest.approx(0.8, rel=0.15) and forward.mean == pytest.approx(-0.8, rel=0.15)
     assert {"gap", "load sign", "twist", "twist rate"} <= set(found["motor"].coordinates)
-    told = as_json(found)
-    assert json.loads(json.dumps(told))["load"]["sentence"] == describe(found["load"])
+    assert json.loads(json.dumps(dataclasses.asdict(found["load"])))["name"] == "load"
 
 
 def test_coordinates_know_turning_from_sliding():
     moving = rigid(SETTINGS, excitation={"kind": "multisine", "amplitude": 3.0, "frequency": 0.2})
-    experiment, residuals, part, smoothed = residuals_of(moving, moving)
-    turning = coordinates_of(experiment, part, smoothed, residuals["motor"][0])
-    sliding = coordinates_of(experiment, part, smoothed, residuals["motor"][0], rotating=False)
+    experiment, residuals, segment = residuals_of(moving, moving)
+    turning = coordinates_of(experiment, segment, residuals["motor"][0])
+    sliding = coordinates_of(experiment, segment, residuals["motor"][0], rotating=False)
     assert turning["speed"].unit == "rad/s" and sliding["speed"].unit == "m/s"
     assert "turn" in turning and "turn" not in sliding and "gap" not in turning
     assert np.ptp(turning["turn"].values) <= 2.0 * np.pi
     assert experiment.plant.half_gap == 0.0
     added = [{"kind": "transmission.backlash", "half_gap": 0.02}]
     assert prepare(read_config(small(SETTINGS, effects=added, **GEARED))).plant.half_gap == pytest.approx(0.1)
-    assert jnp.asarray(part.time).shape == turning["time"].values.shape
+    assert segment.time.shape == turning["time"].values.shape

@@ -10,11 +10,12 @@ from hidden_log import DRIVE, FRICTION, FRICTIONS, GAP, GEARED, geared, logged, 
 from scipy.signal import lfilter
 
 import jaxbl.diagnosis.observer_residual as under_test
-from jaxbl.diagnosis.diagnose import _ground, read_task
+from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
 from jaxbl.diagnosis.observer_residual import compared, observed_torques
-from jaxbl.diagnosis.residuals import narrowed
+from jaxbl.diagnosis.residuals import narrowed, residual_torques
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.identification.logs import on_record
+from jaxbl.identification.segments import segments_of
 
 GAINS = {
     "direct": {"motor": (2.0, 6.3)},
@@ -43,16 +44,16 @@ def logs(tmp_path_factory):
 
 def seen(logs, which, study, gains=None):
     """The experiment with gains, the smoother's residuals of its log, and the observers'."""
-    task = read_task(logs[0] / f"{which}.csv", study)
+    task = read_diagnosis_task(logs[0] / f"{which}.csv", study)
     nominal = on_record(task.config, task.record)
-    ground = _ground(nominal, task.record, False)
+    segments = segments_of(task.record, nominal.sides)
     values = {
         f"observer.{side}.{name}": jnp.asarray(value)
         for side, pair in (gains or GAINS[which]).items()
         for name, value in zip(("lambda", "alpha"), pair, strict=True)
     }
     nominal = set_leaves(nominal, values)
-    return nominal, ground.torques(nominal), observed_torques(nominal, task.record, ground.parts, ground.smoothed)
+    return nominal, residual_torques(nominal, segments), observed_torques(nominal, segments)
 
 
 def rms(values):

@@ -5,11 +5,11 @@ import pytest
 from measured import EMPS, XL330, real
 from small_study import rigid
 
-from jaxbl.diagnosis.diagnose import diagnose, read_task
+from jaxbl.diagnosis.diagnose import diagnose, read_diagnosis_task
 from jaxbl.diagnosis.effect_search import Explainer
 from jaxbl.diagnosis.residuals import narrowed
 from jaxbl.identification.logs import default_paths, on_record
-from jaxbl.identification.search import smoothed_channels
+from jaxbl.identification.segments import segments_of
 from jaxbl.identification.trajectory import free_parameters
 
 COULOMB = {"kind": "motor.coulomb_friction", "torque": 20.0}
@@ -29,11 +29,11 @@ def emps(*effects):
 
 
 def explained(log, study):
-    task = read_task(log, study)
+    task = read_diagnosis_task(log, study)
     nominal = on_record(task.config, task.record)
     free = free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
-    smoothed = smoothed_channels(task.record, nominal.sides).smoothed
-    return Explainer(nominal, free, [task.config.uncertainty.relative] * len(free), task.record, smoothed).run()
+    prior = [task.config.uncertainty.relative] * len(free)
+    return Explainer(nominal, free, prior, segments_of(task.record, nominal.sides)).run()
 
 
 @pytest.mark.slow

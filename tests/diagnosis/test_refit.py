@@ -7,7 +7,7 @@ import pytest
 from hidden_log import FRICTION, logged, model
 from scipy.optimize import minimize
 
-from jaxbl.diagnosis.diagnose import read_task
+from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
 from jaxbl.diagnosis.effect_search import paths_of, with_effects
 from jaxbl.diagnosis.linearised_model import Linear
 from jaxbl.diagnosis.neutral_effects import complete
@@ -15,8 +15,8 @@ from jaxbl.diagnosis.refit import _Refiner, refined
 from jaxbl.drive.plant import PlantState
 from jaxbl.identification.logs import default_paths, on_record
 from jaxbl.identification.regression import settled
-from jaxbl.identification.search import smoothed_channels
-from jaxbl.identification.trajectory import free_parameters, with_values
+from jaxbl.identification.segments import segments_of
+from jaxbl.identification.trajectory import free_parameters, with_fitted
 from jaxbl.simulate import trajectory
 
 NAME = "motor.coulomb_friction"
@@ -26,26 +26,27 @@ NAME = "motor.coulomb_friction"
 def setting(tmp_path_factory):
     log = tmp_path_factory.mktemp("log") / "axis.csv"
     logged().write(log)
-    task = read_task(log, model())
+    task = read_diagnosis_task(log, model())
     bare = on_record(task.config, task.record)
     experiment = with_effects(complete(bare), {NAME: {"torque": 1.1 * FRICTION["torque"]}})
     torque = float(np.std(task.record.torque))
     own = free_parameters(bare, default_paths(task.config, bare), torque)
     free = (*own, *free_parameters(experiment, paths_of([NAME]), torque))
     width = np.array([*[task.config.uncertainty.relative] * len(own), 3.0])
-    return experiment, free, width, task.record, smoothed_channels(task.record, bare.sides).smoothed
+    return experiment, free, width, segments_of(task.record, bare.sides)
 
 
 def test_prediction_errors_are_least(setting):
     """Of the same predictor, by a search without derivatives that begins elsewhere."""
-    experiment, free, width, record, smoothed = setting
-    found = refined(experiment, free, np.zeros(len(free)), width, record, smoothed)
-    gain = {"motor": Linear.gain_of(found.smoothness, record.sample_period)[0]}
-    torque, reading = jnp.asarray(record.torque), jnp.asarray(record.positions["motor"])
+    experiment, free, width, segments = setting
+    (segment,) = segments
+    found = refined(experiment, free, np.zeros(len(free)), width, segments)
+    gain = {"motor": Linear.gain_of(found.smoothness, segment.period)[0]}
+    torque, reading = jnp.asarray(segment.torque), jnp.asarray(segment.readings["motor"])
 
     @eqx.filter_jit
     def predicted(given):
-        one = with_values(experiment, free, given[2:] * 0.01)
+        one = with_fitted(experiment, free, given[2:] * 0.01)
         start = PlantState({"motor": given[0]}, {"motor": given[1]}, settled(one, torque[0]))
         return trajectory(one, start, torque, 0.0, {"motor": reading}, gain).position["motor"]
 
@@ -67,15 +68,14 @@ def test_deviations_are_those_of_repetitions(tmp_path):
     for seed in range(12):
         log = tmp_path / f"{seed}.csv"
         logged(seed=seed).write(log)
-        task = read_task(log, model())
+        task = read_diagnosis_task(log, model())
         bare = on_record(task.config, task.record)
         experiment = with_effects(complete(bare), {NAME: {"torque": FRICTION["torque"]}})
         torque = float(np.std(task.record.torque))
         own = free_parameters(bare, default_paths(task.config, bare), torque)
         free = (*own, *free_parameters(experiment, paths_of([NAME]), torque))
         width = np.array([*[task.config.uncertainty.relative] * len(own), 3.0])
-        smoothed = smoothed_channels(task.record, bare.sides).smoothed
-        found = refined(experiment, free, np.zeros(len(free)), width, task.record, smoothed)
+        found = refined(experiment, free, np.zeros(len(free)), width, segments_of(task.record, bare.sides))
         values.append(found.theta[-1])
         stated.append(found.deviation[-1])
     errors = np.array(values) / np.array(stated)
@@ -85,10 +85,10 @@ def test_deviations_are_those_of_repetitions(tmp_path):
 
 def test_numbers_under_which_the_predictor_diverges_are_not_taken(setting):
     """Without a word: what is not finite has no likelihood."""
-    experiment, free, width, record, smoothed = setting
+    experiment, free, width, segments = setting
     wild = with_effects(experiment, {"motor.viscous_friction": {"viscous": -5.0}})
-    refiner = _Refiner(wild, free, width, record, smoothed)
+    refiner = _Refiner(wild, free, width, segments)
     theta = np.zeros(len(free))
-    path = refiner._path(theta, refiner.start(), [1e-11])
-    assert not np.isfinite(path["motor"][0].state[:, :2]).all()
+    (path,) = refiner._path(theta, refiner.start(), [1e-11])
+    assert not np.isfinite(path.smoothed["motor"].state[:, :2]).all()
     assert refiner.at(theta, refiner.start(), [1e-11]).cost == np.inf

@@ -1,5 +1,6 @@
 """Residual torques: a known missing torque is found within its stated noise, and a complete model leaves only noise."""
 
+import dataclasses
 import functools
 import json
 
@@ -7,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_study import rigid, small
+from trace_segment import segment_of
 
 from jaxbl.config import prepare, read_config
-from jaxbl.diagnosis.residuals import Residual, low_passed, narrowed, noise_spectrum, residual_torques
-from jaxbl.identification.regression import balance, from_smoothed
-from jaxbl.identification.smoother import smooth
+from jaxbl.diagnosis.residuals import Residual, as_smoothed, narrowed, noise_spectrum, residual_torques
+from jaxbl.identification.regression import balance
 from jaxbl.sweeps.trial import run
 
 SETTINGS = {"run.duration": 4.0, "run.substeps": 5}
@@ -34,12 +35,10 @@ def _trace(data, seed):
 
 
 def record(data, seed=0, transmitted=None):
-    """Trace, kinematics and smoothed channels of a run."""
+    """Trace and segment of a run."""
     trace = _trace(json.dumps(data), seed)
-    columns = {"motor": "theta_e", "load": "theta_s"}
-    smoothed = {side: smooth(trace[name].to_numpy(), 1e-3) for side, name in columns.items() if name in trace}
     measured = None if transmitted is None else trace["torque"].to_numpy() + transmitted
-    return trace, from_smoothed(trace["t"].to_numpy(), trace["u"].to_numpy(), smoothed, measured), smoothed
+    return trace, segment_of(trace, transmitted=measured)
 
 
 def rms(values):
@@ -58,8 +57,8 @@ def test_a_complete_model_leaves_noise_of_the_stated_size_in_every_band(sides, e
     found = {}
     experiment = prepare(read_config(study(sides, effects)))
     for seed in range(3):
-        _, part, smoothed = record(study(sides, effects), seed)
-        for name, (one,) in residual_torques(experiment, [part], [smoothed]).items():
+        _, segment = record(study(sides, effects), seed)
+        for name, (one,) in residual_torques(experiment, [segment]).items():
             found.setdefault(name, []).append([scores(one), scores(one, 20.0), scores(one, 8.0)])
     assert set(found) == set(experiment.sides)
     for each in found.values():
@@ -67,41 +66,39 @@ def test_a_complete_model_leaves_noise_of_the_stated_size_in_every_band(sides, e
 
 
 def test_the_missing_torque_is_found_within_its_noise_and_with_its_sign():
-    trace, part, smoothed = record(study(1, [FRICTION]))
+    trace, segment = record(study(1, [FRICTION]))
     experiment = prepare(read_config(study(1)))
-    (one,) = residual_torques(experiment, [part], [smoothed])["motor"]
+    (one,) = residual_torques(experiment, [segment])["motor"]
     missing = -0.1 * np.sign(trace["motor.velocity"].to_numpy())
-    seen = np.asarray(low_passed(jnp.asarray(missing), smoothed["motor"], 1e-3))
+    seen = np.asarray(as_smoothed(jnp.asarray(missing), segment.smoothed["motor"], 1e-3))
     assert rms((one.torque - seen) / one.deviation) == pytest.approx(1.0, abs=0.1)
     assert scores(one) > 3.0
     # the other way round as the balance
-    left = -np.asarray(balance(experiment, part)["motor"].residual)
+    left = -np.asarray(balance(experiment, segment.kinematics)["motor"].residual)
     assert np.corrcoef(left[200:-200], one.torque[200:-200])[0, 1] > 0.97
 
 
 def test_a_measured_torque_has_its_own_equation():
     noise = 0.02 * np.random.default_rng(0).standard_normal(4000)
-    _, part, smoothed = record(study(2), transmitted=noise)
+    _, segment = record(study(2), transmitted=noise)
     experiment = prepare(read_config(study(2)))
-    found = residual_torques(experiment, [part], [smoothed])
+    found = residual_torques(experiment, [segment])
     assert list(found) == ["transmission", "motor", "load"]
     for parts in found.values():
         assert scores(parts[0]) == pytest.approx(1.0, abs=0.12)
     stiffer = prepare(read_config(study(2) | {"transmission": GAP | {"stiffness": 50.0}}))
-    found = residual_torques(stiffer, [part], [smoothed])
+    found = residual_torques(stiffer, [segment])
     assert scores(found["transmission"][0]) > 5.0
     assert scores(found["motor"][0]) == pytest.approx(1.0, abs=0.12)
 
 
 def test_noise_of_the_input_is_counted():
-    trace, part, smoothed = record(study(1))
+    trace, segment = record(study(1))
     noisy = trace["u"].to_numpy() + 0.3 * np.random.default_rng(1).standard_normal(len(trace))
-    part = from_smoothed(trace["t"].to_numpy(), noisy, smoothed)
+    segment = dataclasses.replace(segment, torque=noisy)
     experiment = prepare(read_config(study(1)))
-    assert scores(residual_torques(experiment, [part], [smoothed])["motor"][0]) > 1.5
-    assert scores(residual_torques(experiment, [part], [smoothed], torque_noise=0.3)["motor"][0]) == pytest.approx(
-        1.0, abs=0.1
-    )
+    assert scores(residual_torques(experiment, [segment])["motor"][0]) > 1.5
+    assert scores(residual_torques(experiment, [segment], torque_noise=0.3)["motor"][0]) == pytest.approx(1.0, abs=0.1)
 
 
 def test_narrowing_keeps_the_noise_level_and_what_is_slow():

@@ -11,7 +11,7 @@ from jaxbl.drive.plant import PlantState
 from jaxbl.identification.intervals import spread
 from jaxbl.identification.prediction import kalman_gain, predictor
 from jaxbl.identification.smoother import smooth
-from jaxbl.identification.trajectory import cut, fit, free_parameters, with_values
+from jaxbl.identification.trajectory import cut, fit, free_parameters, with_fitted
 
 PERIOD, SAMPLES = 2e-3, 3000
 
@@ -86,5 +86,5 @@ def test_without_a_disturbance_the_predictor_runs_freely():
     predicted, smoothness = predictor(experiment, windows)
     assert smoothness["motor"] < 1e-9
     assert float(predicted.noise["motor"]) == pytest.approx(1e-4, rel=0.05)
-    found = fit(with_values(experiment, free, jnp.zeros(2)), free, predicted, jnp.zeros(2))
+    found = fit(with_fitted(experiment, free, jnp.zeros(2)), free, predicted, jnp.zeros(2))
     np.testing.assert_allclose(found.theta, 0.0, atol=0.005)

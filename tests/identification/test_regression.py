@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from filtered_derivatives import differentiated
 from measured import EMPS, real
 from scipy import signal
 from small_study import rigid, small
@@ -14,15 +15,14 @@ from jaxbl.identification.regression import (
     Kinematics,
     balance,
     decimate,
-    differentiated,
     errors,
-    from_smoothed,
+    kinematics_from,
     model_torques,
     regress,
     shortest,
 )
 from jaxbl.identification.smoother import smooth
-from jaxbl.identification.trajectory import free_parameters, with_values
+from jaxbl.identification.trajectory import free_parameters, with_fitted
 from jaxbl.records import read_record
 
 T = jnp.linspace(0.0, 2.0, 4001)
@@ -152,9 +152,10 @@ def test_emps_by_the_published_method_and_measure():
     found = regress(experiment, free, parts[:1], 10)
     values = [float(one.value(found.theta[i])) for i, one in enumerate(free)]
     np.testing.assert_allclose(values, [95.1, 205.7, 20.2, -3.17], rtol=0.03)
-    fitted = with_values(experiment, free, found.theta)
+    fitted = with_fitted(experiment, free, found.theta)
     assert errors(fitted, parts[:1], 10)["motor"]["relative"] < 0.042
     assert errors(fitted, parts[1:], 10)["motor"]["relative"] < 0.054
     # the smoother in place of the filter says the same
-    smoothed = from_smoothed(records[0].time, records[0].torque, {"motor": smooth(records[0].positions["motor"], 1e-3)})
+    states = {"motor": smooth(records[0].positions["motor"], 1e-3).state}
+    smoothed = kinematics_from(records[0].time, records[0].torque, states)
     assert errors(fitted, [smoothed], 10)["motor"]["relative"] < 0.042

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
@@ -14,7 +15,7 @@ from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
 from jaxbl.identification.intervals import refusals, spread
 from jaxbl.identification.smoother import smooth
-from jaxbl.identification.trajectory import Fit, cut, fit, free_parameters, with_values
+from jaxbl.identification.trajectory import Fit, _Point, _solve, cut, fit, free_parameters, with_fitted
 from jaxbl.simulate import replay, trajectory
 
 TRUE = {
@@ -82,7 +83,7 @@ def test_agrees_with_one_least_squares_problem_over_parameters_and_states():
 
     @jax.jit
     def residual(both):
-        at = with_values(experiment, free, both[:6])
+        at = with_fitted(experiment, free, both[:6])
         starts = both[6:].reshape(4, 4)
 
         def one(x, u, motor, load):
@@ -234,3 +235,24 @@ def test_what_cannot_be_fitted(paths, message):
     law = {"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.0}
     with pytest.raises(InputError, match=message):
         free_parameters(read_config(small(transmission=law)).build(), paths, 1.0)
+
+
+def test_the_solver_takes_the_steps_of_levenberg_and_marquardt():
+    """Those of optimistix, on Rosenbrock's valley; steps that are rejected are counted."""
+
+    def residual(theta, _=None):
+        return jnp.array([10.0 * (theta[1] - theta[0] ** 2), 1.0 - theta[0]])
+
+    def point(theta, guess):
+        return _Point(residual(theta), jax.jacfwd(residual)(theta), guess, jnp.sum(residual(theta) ** 2)[None])
+
+    start, nothing = jnp.array([-1.2, 1.0]), PlantState({}, {}, ())
+    for steps in (2, 5, 9):
+        solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-4)
+        other = optx.least_squares(residual, solver, start, max_steps=steps, throw=False)
+        found = _solve(point, start, nothing, jnp.asarray(steps), 2)
+        assert int(found.steps) == steps
+        np.testing.assert_allclose(found.theta, other.value, rtol=1e-12)
+    found = _solve(point, start, nothing, jnp.asarray(100), 2)
+    assert bool(found.converged) and int(found.steps) < 100
+    np.testing.assert_allclose(found.theta, 1.0, atol=1e-4)

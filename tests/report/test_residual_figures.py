@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
-from jaxbl.diagnosis.localise import Values, describe, locate
+from jaxbl.diagnosis.coordinates import CoordinateValues
+from jaxbl.diagnosis.localise import locate
 from jaxbl.diagnosis.observer_residual import Observed
 from jaxbl.diagnosis.residuals import Residual
+from jaxbl.diagnosis.sentences import sentence_of
 from jaxbl.report.figures import save
 from jaxbl.report.residuals import draw_residuals
 
@@ -15,10 +17,10 @@ def made(name, torque, time):
     count = len(time)
     residual = Residual(name, time, torque + noise, np.full(count, 0.05), np.ones(1), 100.0)
     values = {
-        "direction": Values((np.cos(time) > 0.0).astype(int), classes=("backward", "forward")),
-        "speed": Values(3.0 * np.cos(time), "rad/s", symbol="ω"),
-        "position": Values(3.0 * np.sin(time), "rad", symbol="θe"),
-        "time": Values(time, "s", symbol="t"),
+        "direction": CoordinateValues((np.cos(time) > 0.0).astype(int), classes=("backward", "forward")),
+        "speed": CoordinateValues(3.0 * np.cos(time), "rad/s", symbol="ω"),
+        "position": CoordinateValues(3.0 * np.sin(time), "rad", symbol="θe"),
+        "time": CoordinateValues(time, "s", symbol="t"),
     }
     return residual, values
 
@@ -49,7 +51,7 @@ def test_every_equation_is_drawn_with_what_was_found(tmp_path, unit):
     drawn = {one.name: one for one in draw_residuals(residuals, coordinates, found, unit)}
     assert list(drawn) == ["residual_torque", "residual_motor", "residual_load", "residual_spectrum"]
     above, below = drawn["residual_torque"].figure.axes
-    assert describe(found["motor"], unit) == " ".join(above.get_title("left").split())
+    assert sentence_of(found["motor"], unit) == " ".join(above.get_title("left").split())
     assert "nothing beyond noise" in below.get_title("left")
     assert above.get_ylabel().endswith(f"({unit})")
     assert drawn["residual_motor"].figure.axes[0].get_xlabel() == "speed ω (rad/s)"

@@ -1,4 +1,4 @@
-"""How well a model foretells a record that it was not fitted to: positions, speeds and missing torques, and their floors.
+"""How well a model predicts a log that it was not fitted to: positions, speeds and missing torques, and their noise.
 
 Positions by short windows and by one free run, each from the best initial state: what an initial state can explain is no
 error of the model. Torques by the equations of motion at the smoothed motion, behind one low-pass for all models.
@@ -6,6 +6,7 @@ error of the model. Torques by the equations of motion at the smoothed motion, b
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -18,64 +19,72 @@ from jaxbl.drive.effects import SideEffect
 from jaxbl.drive.parameters import Scalar
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import path
-from jaxbl.identification.regression import Kinematics
-from jaxbl.identification.search import Channels, windows_of
+from jaxbl.identification.segments import Segment, reading_noise, windows_of
 from jaxbl.identification.trajectory import Windows, projected_residual
-from jaxbl.records import POSITION_CHANNELS, Record
+from jaxbl.records import POSITION_CHANNELS
 from jaxbl.simulate import Experiment, trajectory
 
 from .neutral_effects import bucket
 from .residuals import Residual, narrowed, residual_torques
 
 WINDOW = 0.5
-"""s."""
+"""Length of the short windows, s: several periods of a drive's resonance, and too short to drift far."""
+_FEWEST = 20
+"""Samples of a window at least: ten times the states that are fitted to it."""
 _BLOCK = 0.5
-"""Length of the blocks that a permuted residual is made of, s."""
-_FORETOLD = 0.02
+"""Length of the blocks that a permuted residual is made of, s: longer than a torque's own changes last."""
+_PREDICTABLE = 0.02
 """Share of the motion that the initial speed's uncertainty may grow to where a free run is to say anything."""
+_STATES, _STATES_OF_ONE_RUN = 8, 3
+"""Initial states tried for each window, and for a free run, which determines its own much better."""
 
 
-class Proof(NamedTuple):
-    """Rms errors on a record: by channel (`theta_e`, `theta_s`, `velocity_motor`, ..., `torque_motor`, ...)."""
+class Comparison(NamedTuple):
+    """A model beside a log.
+
+    Attributes:
+        errors: rms, by channel (`theta_e`, `theta_s`, `velocity_motor`, ..., `torque_motor`, ...).
+        torques: that the model lacks, by side, segment by segment.
+    """
 
     errors: dict[str, float]
     torques: dict[str, list[Residual]]
 
 
 @dataclasses.dataclass(frozen=True)
-class Ground:
-    """A record that models are held against.
+class ReferenceLog:
+    """A log that models are compared with.
 
     Attributes:
-        record: the log.
-        channels: its positions smoothed.
-        parts: of it, for the equations of motion.
+        segments: of the log.
         bandwidth: of the low-pass that missing torques are looked at behind, Hz, by side.
         rest: whether each segment begins at rest.
     """
 
-    record: Record
-    channels: Channels
-    parts: Sequence[Kinematics]
+    segments: Sequence[Segment]
     bandwidth: Mapping[str, float]
     rest: bool = False
 
     @property
-    def smoothed(self) -> list[dict[str, Any]]:
-        """The smoothed positions of each part."""
-        return [{side: pieces[i] for side, pieces in self.channels.smoothed.items()} for i in range(len(self.parts))]
+    def period(self) -> float:
+        """Sampling period, s."""
+        return self.segments[0].period
+
+    @cached_property
+    def noise(self) -> dict[str, float]:
+        """Standard deviation of the readings' noise of each side, rad."""
+        return reading_noise(self.segments)
 
     @property
     def samples(self) -> int:
         """Length of a window."""
-        longest = max(part.stop - part.start for part in self.record.segments)
-        return min(max(round(WINDOW / self.record.sample_period), 20), longest)
+        return min(max(round(WINDOW / self.period), _FEWEST), max(map(len, self.segments)))
 
-    def floor(self, torques: Mapping[str, Sequence[Residual]]) -> dict[str, float]:
+    def noise_floor(self, torques: Mapping[str, Sequence[Residual]]) -> dict[str, float]:
         """Noise of each channel: what a perfect model would leave."""
-        found = {POSITION_CHANNELS[side]: noise for side, noise in self.channels.noise.items()}
-        for side, pieces in self.channels.smoothed.items():
-            found[f"velocity_{side}"] = _rms([np.asarray(one.deviation(1)) for one in pieces])
+        found = {POSITION_CHANNELS[side]: noise for side, noise in self.noise.items()}
+        for side in self.noise:
+            found[f"velocity_{side}"] = _rms([np.asarray(one.smoothed[side].deviation(1)) for one in self.segments])
         for side, pieces in torques.items():
             found[f"torque_{side}"] = _rms([narrowed(one, self.bandwidth[side])[0].deviation for one in pieces])
         return found
@@ -89,35 +98,34 @@ class Ground:
 
     def torques(self, experiment: Experiment) -> dict[str, list[Residual]]:
         """Torques that a model lacks on each side."""
-        found = residual_torques(experiment, self.parts, self.smoothed)
+        found = residual_torques(experiment, self.segments)
         return {side: found[side] for side in experiment.sides if side in found}
 
     def windows(self, experiment: Experiment, samples: int) -> tuple[Windows, np.ndarray]:
-        """The record in windows, some of them only to fill up, and the row that each of the others begins with."""
-        windows, firsts = windows_of(self.record, self.channels, experiment, samples, self.rest)
+        """The log in windows, some of them only to fill up, and the row that each of the others begins with."""
+        windows, firsts = windows_of(self.segments, experiment, samples, self.rest)
         return windows.padded(bucket(len(firsts), 1)), firsts
 
-    def strays(self, experiment: Experiment) -> dict[str, float]:
-        """How far a model leaves each side's motion on short windows from the smoothed states, at most, over its range."""
+    def largest_departures(self, experiment: Experiment) -> dict[str, float]:
+        """How far a model departs from each side's motion on short windows from the smoothed states, over its range."""
         windows, _ = self.windows(experiment, self.samples)
-        apart = _strays(experiment, windows)
-        ranges = {
-            side: max(float(np.ptp(self.record.positions[side][part])) for part in self.record.segments) for side in apart
-        }
+        apart = _largest_departures(experiment, windows)
+        ranges = {side: max(float(np.ptp(one.readings[side])) for one in self.segments) for side in apart}
         return {side: float(np.nan_to_num(float(one), nan=np.inf)) / ranges[side] for side, one in apart.items()}
 
-    def prove(self, experiment: Experiment) -> Proof:
+    def compare(self, experiment: Experiment) -> Comparison:
         """Errors of a model on short windows, and the torques that it lacks."""
         driven = self._driven(experiment, {})
         windows, firsts = self.windows(driven, self.samples)
         torques = self.torques(experiment)
-        errors = self._errors(driven, windows, firsts, 8)
-        return Proof(errors | self.torque_errors(torques), torques)
+        errors = self._errors(driven, windows, firsts, _STATES)
+        return Comparison(errors | self.torque_errors(torques), torques)
 
     def _driven(self, experiment: Experiment, tables: Mapping[str, np.ndarray]) -> Experiment:
         """A model with known torques on its sides, sample by sample; none where there is no table."""
-        period, first = (jnp.asarray(float(one)) for one in (self.record.sample_period, self.parts[0].time[0]))
-        count = round(float(self.parts[-1].time[-1] - self.parts[0].time[0]) / self.record.sample_period) + 1
+        begin, end = self.segments[0].time[0], self.segments[-1].time[-1]
+        period, first = (jnp.asarray(float(one)) for one in (self.period, begin))
+        count = round(float(end - begin) / self.period) + 1
         known = []
         for side in experiment.sides:
             table = np.zeros(bucket(count, 256))
@@ -129,26 +137,23 @@ class Ground:
     def free_run(self, experiment: Experiment) -> tuple[dict[str, float], float]:
         """Errors of one run over the longest segment, and what a standard deviation of the initial speed would do to it.
 
-        The latter over the motion's; large where a free run cannot be foretold. Up to a ninth at the end may be left out, so
-        that compiled programs serve records of several lengths.
+        The latter over the motion's; large where a free run cannot be predicted. Up to a ninth at the end may be left out,
+        so that compiled programs serve logs of several lengths.
         """
-        lengths = [part.stop - part.start for part in self.record.segments]
-        longest = max(lengths)
+        longest = max(map(len, self.segments))
         spare = max(longest.bit_length() - 4, 0)
-        windows, firsts = windows_of(self.record, self.channels, experiment, longest >> spare << spare, self.rest)
+        windows, firsts = windows_of(self.segments, experiment, longest >> spare << spare, self.rest)
         windows, firsts = windows.only(np.arange(1)).padded(1), firsts[:1]
-        errors = self._errors(experiment, windows, firsts, 3, alone=True)
-        first = np.flatnonzero([part.start == firsts[0] for part in self.record.segments])[0]
-        deviation = {
-            side: float(np.median(np.asarray(pieces[first].deviation(1)))) for side, pieces in self.channels.smoothed.items()
-        }
+        errors = self._errors(experiment, windows, firsts, _STATES_OF_ONE_RUN, alone=True)
+        first = next(one for one in self.segments if one.rows.start == firsts[0])
+        deviation = {side: float(np.median(np.asarray(one.deviation(1)))) for side, one in first.smoothed.items()}
         return errors, _growth(experiment, windows, deviation)
 
     def _errors(
         self, experiment: Experiment, windows: Windows, firsts: np.ndarray, passes: int, *, alone: bool = False
     ) -> dict[str, float]:
         rows = firsts[:, None] + np.arange(windows.torque.shape[1])[None, :]
-        residual, start = _foretold(experiment, windows, passes, self.rest)
+        residual, start = _residuals(experiment, windows, passes, self.rest)
         residual = np.asarray(residual)[: len(firsts)]
         if alone:
             velocity = {side: one[None] for side, one in _run(experiment, windows, start).velocity.items()}
@@ -158,25 +163,25 @@ class Ground:
             }
         found = {}
         for i, side in enumerate(experiment.sides):
-            found[POSITION_CHANNELS[side]] = self.channels.noise[side] * _rms([residual[:, :, i]])
+            found[POSITION_CHANNELS[side]] = self.noise[side] * _rms([residual[:, :, i]])
         for side in experiment.sides:
-            smoothed = np.full(len(self.record.time), np.nan)
-            for part, one in zip(self.record.segments, self.channels.smoothed[side], strict=True):
-                smoothed[part] = np.asarray(one.velocity)
+            smoothed = np.full(self.segments[-1].rows.stop, np.nan)
+            for one in self.segments:
+                smoothed[one.rows] = np.asarray(one.smoothed[side].velocity)
             found[f"velocity_{side}"] = _rms([np.asarray(velocity[side]) - smoothed[rows]])
         return found
 
-    def permuted(self, experiment: Experiment, added: Mapping[str, Sequence[np.ndarray]], seed: int = 0) -> Proof:
+    def permuted(self, experiment: Experiment, added: Mapping[str, Sequence[np.ndarray]], seed: int = 0) -> Comparison:
         """Errors of a model with a known torque that is the right one in the wrong order: blocks of time, shuffled.
 
         Args:
             experiment: the nominal model.
-            added: torque that the extended model adds on each side, of each part, N m.
+            added: torque that the extended model adds on each side, segment by segment, N m.
             seed: of the order.
         """
-        time = np.concatenate([np.asarray(part.time) for part in self.parts])
-        at = np.round((time - time[0]) / self.record.sample_period).astype(int)
-        size = max(round(_BLOCK / self.record.sample_period), 1)
+        time = np.concatenate([one.time for one in self.segments])
+        at = np.round((time - time[0]) / self.period).astype(int)
+        size = max(round(_BLOCK / self.period), 1)
         order = _order(len(time), size, np.random.default_rng(seed))
         tables, torques = {}, {}
         before = self.torques(experiment)
@@ -191,12 +196,12 @@ class Ground:
             ]
         model = self._driven(experiment, tables)
         windows, firsts = self.windows(model, self.samples)
-        return Proof(self._errors(model, windows, firsts, 8) | self.torque_errors(torques), torques)
+        return Comparison(self._errors(model, windows, firsts, _STATES) | self.torque_errors(torques), torques)
 
 
-def foretold(growth: float) -> bool:
-    """Whether a free run with this growth (:meth:`Ground.free_run`) says anything."""
-    return bool(growth < _FORETOLD)
+def predictable(growth: float) -> bool:
+    """Whether a free run with this growth (:meth:`ReferenceLog.free_run`) says anything."""
+    return bool(growth < _PREDICTABLE)
 
 
 class _KnownTorque(SideEffect):
@@ -223,7 +228,7 @@ def _order(count: int, size: int, random: np.random.Generator) -> np.ndarray:
 
 
 @eqx.filter_jit
-def _foretold(experiment: Experiment, windows: Windows, passes: int, rest: bool) -> tuple[Array, PlantState]:
+def _residuals(experiment: Experiment, windows: Windows, passes: int, rest: bool) -> tuple[Array, PlantState]:
     """Position residuals over the noise from the best initial states, and these."""
     return projected_residual(experiment, windows, passes, rest)
 
@@ -243,7 +248,7 @@ def _run(experiment: Experiment, windows: Windows, start: PlantState) -> PlantSt
 
 
 @eqx.filter_jit
-def _strays(experiment: Experiment, windows: Windows) -> dict[str, Array]:
+def _largest_departures(experiment: Experiment, windows: Windows) -> dict[str, Array]:
     def one(start: PlantState, torque: Array, time: Array) -> dict[str, Array]:
         return trajectory(experiment, start, torque, time).position
 
@@ -257,7 +262,7 @@ def _growth(experiment: Experiment, windows: Windows, deviation: dict[str, float
     moved = {side: value + step * deviation[side] for side, value in start.velocity.items()}
     begun = start, PlantState(start.position, moved, start.effects)
     one, other = (_run(experiment, windows, state).position for state in begun)
-    # of what diverges, or of a side that never moved, nothing can be foretold
+    # of what diverges, or of a side that never moved, nothing can be predicted
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         change = {side: _rms([np.asarray(other[side] - one[side])]) / step for side in experiment.sides}
         return float(np.max([change[side] / np.std(windows.measured[side][0]) for side in experiment.sides]))

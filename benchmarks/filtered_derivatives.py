@@ -1,0 +1,26 @@
+"""Kinematics as commonly found: Butterworth low-pass of 4th order forth and back, then central differences."""
+
+import jax.numpy as jnp
+import numpy as np
+from scipy import signal
+
+from jaxbl.identification.regression import Kinematics, kinematics_from
+
+
+def differentiated(time: np.ndarray, torque: np.ndarray, positions: dict[str, np.ndarray], cutoff: float) -> Kinematics:
+    """Kinematics of a log.
+
+    Args:
+        time: even, s, shape (samples,).
+        torque: input held from each sample to the next, N m, shape (samples,).
+        positions: of each side, rad, shape (samples,).
+        cutoff: of the low-pass, Hz.
+    """
+    period = (time[-1] - time[0]) / (len(time) - 1)
+    sections = signal.butter(4, min(2.0 * cutoff * period, 0.99), output="sos")
+    states = {}
+    for side, position in positions.items():
+        smooth = signal.sosfiltfilt(sections, position)
+        velocity = np.gradient(smooth, period)
+        states[side] = jnp.asarray(np.stack([smooth, velocity, np.gradient(velocity, period)], axis=1))
+    return kinematics_from(time, torque, states)

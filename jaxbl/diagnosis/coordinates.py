@@ -1,0 +1,128 @@
+"""Coordinates of a log that a missing torque may depend on: speed, position, reversals, gap, load, time and others."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxbl.identification.regression import Kinematics, transmitted
+from jaxbl.identification.segments import Segment
+from jaxbl.simulate import Experiment
+
+from .residuals import Residual
+
+EVERYWHERE = "all"
+"""The coordinate that is the same all along a log."""
+
+
+class CoordinateValues(NamedTuple):
+    """A coordinate along a segment of a log.
+
+    Attributes:
+        values: a number a sample, or the index of its class.
+        unit: of the number.
+        classes: names of the classes; empty for numbers.
+        symbol: for sentences.
+    """
+
+    values: np.ndarray
+    unit: str = ""
+    classes: tuple[str, ...] = ()
+    symbol: str = ""
+
+
+def coordinates_of(
+    experiment: Experiment,
+    segment: Segment,
+    residual: Residual,
+    *,
+    rotating: bool | Mapping[str, bool] = True,
+) -> dict[str, CoordinateValues]:
+    """Coordinates of a residual along its segment; of those that explain as much, the simpler ones first.
+
+    Args:
+        experiment: the model.
+        segment: of the log.
+        residual: along it.
+        rotating: whether positions are angles in rad; by side where they differ.
+    """
+    part = segment.kinematics
+    side = "motor" if residual.name == "transmission" else residual.name
+    turns = dict.fromkeys(part.position, rotating) if isinstance(rotating, bool) else rotating
+    length = "rad" if turns[side] else "m"
+    omega = "ω" if turns[side] else "v"
+    velocity = np.asarray(part.velocity[side])
+    deviation = np.asarray(segment.smoothed[side].deviation(1))
+    still = np.abs(velocity) <= np.maximum(3.0 * deviation, 1e-3 * np.sqrt(np.mean(velocity**2)))
+    found = {
+        EVERYWHERE: CoordinateValues(np.zeros(len(velocity), int), classes=("everywhere",)),
+        "direction": CoordinateValues(
+            np.where(still, 1, np.where(velocity > 0.0, 2, 0)), classes=("backward", "at rest", "forward"),
+        ),
+        "reversals": _near_reversals(part, velocity, still, residual.bandwidth),
+    }  # fmt: skip
+    geared = len(part.position) > 1 and experiment.transmission is not None
+    if geared:
+        found |= _gear_classes(experiment, part)
+    found["|speed|"] = CoordinateValues(np.abs(velocity), f"{length}/s", symbol=f"|{omega}|")
+    found["speed"] = CoordinateValues(velocity, f"{length}/s", symbol=omega)
+    for one in part.position:
+        position = np.asarray(part.position[one])
+        if turns[one] and np.ptp(position) > 1.2 * 2.0 * np.pi and one in (side, "load"):
+            name = "turn" if one == side else f"{one} turn"
+            symbol = "θe mod 2π" if one == "motor" else "θs mod 2π"
+            found[name] = CoordinateValues(np.mod(position, 2.0 * np.pi), "rad", symbol=symbol)
+    symbol = ("θe" if side == "motor" else "θs") if turns[side] else "x"
+    found["position"] = CoordinateValues(np.asarray(part.position[side]), length, symbol=symbol)
+    if side != "load" and geared:
+        found["load position"] = CoordinateValues(
+            np.asarray(part.position["load"]), "rad" if turns["load"] else "m", symbol="θs" if turns["load"] else "x"
+        )
+    if geared:
+        twist, rate = (np.asarray(experiment.plant.twist(one)) for one in (part.position, part.velocity))  # type: ignore[arg-type]
+        found["twist"] = CoordinateValues(twist, "rad" if turns["motor"] else "m", symbol="z")
+        found["twist rate"] = CoordinateValues(rate, "rad/s" if turns["motor"] else "m/s", symbol="ż")
+    unit = "N m" if turns["motor"] else "N"
+    if side == "motor":
+        found["input"] = CoordinateValues(np.asarray(part.torque), unit, symbol="u")
+    acceleration = np.asarray(part.acceleration[side])
+    if residual.name in experiment.sides:
+        # by the model: the measured one's noise is the residual's, and would be found there
+        acceleration = acceleration - residual.torque / float(experiment.plant.inertia(side))
+    found["acceleration"] = CoordinateValues(acceleration, f"{length}/s²", symbol="a")
+    found["time"] = CoordinateValues(np.asarray(part.time), "s", symbol="t")
+    return found
+
+
+def _gear_classes(experiment: Experiment, part: Kinematics) -> dict[str, CoordinateValues]:
+    """On which side of the gap the transmission is, and which way it is loaded."""
+    found, plant = {}, experiment.plant
+    torque = part.transmitted
+    if torque is None:
+        torque = transmitted(experiment, part)
+    torque = np.asarray(torque)
+    if plant.half_gap > 0.0:
+        twist = np.asarray(plant.twist(part.position))  # type: ignore[arg-type]
+        inside = np.where(np.abs(twist) < plant.half_gap, 1, np.where(twist > 0.0, 2, 0))
+        found["gap"] = CoordinateValues(inside, classes=("outside, z < 0", "inside of the gap", "outside, z > 0"))
+    idle = np.abs(torque) < 0.02 * np.sqrt(np.mean(torque**2))
+    loaded = np.where(idle, 1, np.where(torque > 0.0, 2, 0))
+    found["load sign"] = CoordinateValues(loaded, classes=("negative load", "no load", "positive load"))
+    return found
+
+
+def _near_reversals(part: Kinematics, velocity: np.ndarray, still: np.ndarray, bandwidth: float) -> CoordinateValues:
+    """Whether the motion reverses nearby, and to which direction: near is what the low-pass smears, and some more."""
+    time = np.asarray(part.time)
+    sign = np.where(still, 0.0, np.sign(velocity))
+    moving = np.flatnonzero(sign)
+    turning = np.flatnonzero(np.diff(sign[moving]))
+    near = np.zeros(len(time), int)
+    if len(turning):
+        first, last = moving[turning], moving[turning + 1]
+        between = np.median(np.diff(time[first])) if len(first) > 1 else 0.5 * (time[-1] - time[0])
+        window = min(max(0.3 / bandwidth, 0.05 * between), 0.2 * between)
+        for begin, end in zip(first, last, strict=True):
+            rows = slice(*np.searchsorted(time, (time[begin] - window, time[end] + window)))
+            near[rows] = 1 if sign[end] > 0.0 else 2
+    return CoordinateValues(near, classes=("away from reversals", "reversals to forward", "reversals to backward"))

@@ -1,0 +1,128 @@
+"""A diagnosis as a task: study, log, and what is held out of it; and which logs are refused."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxbl.config import Config, read_model
+from jaxbl.errors import InputError
+from jaxbl.identification.logs import Logs, read_logs
+from jaxbl.identification.task import LogTask
+from jaxbl.records import Record
+
+HELD_OUT = 0.25
+"""Share of a log that is held out where there is no other one for it."""
+GEAR_TOLERANCE = 0.25
+"""A missing effect (a soft shaft, a gap) shifts the ratio of both motions, on a short log by a fifth."""
+_FEWEST = 100
+"""Samples of a part of a log, and of what is held out: the smoother's ends, some ten samples each, are then a small part."""
+_ALIKE = 4.0
+"""Factor between the inertias that two logs of one machine may show."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DiagnosisTask(LogTask):
+    """A study and its log, part of which may be held out.
+
+    Attributes:
+        holdout: the rest of the log, or another log.
+        separate: whether it is another log.
+    """
+
+    holdout: Record
+    separate: bool
+
+
+def read_diagnosis_task(
+    log: Logs, model: str | Path | Mapping[str, Any] | Config, *, holdout: Logs | None = None
+) -> DiagnosisTask:
+    """Read study and logs; arguments as of :func:`jaxbl.diagnosis.diagnose.diagnose`.
+
+    Raises:
+        InputError: unfit log or study, or a hold-out log of another machine.
+    """
+    config, missing = read_model(model)
+    record = read_logs(config, log, GEAR_TOLERANCE)
+    if holdout is None:
+        record, other = split(record)
+    else:
+        other = read_logs(config, holdout, GEAR_TOLERANCE)
+        _check_machine(record, other)
+    return DiagnosisTask(config, missing, _long(record), _long(other), holdout is not None)
+
+
+def input_rms(record: Record) -> float:
+    """Of the input on all segments of a log, N m."""
+    assert record.torque is not None
+    return float(np.sqrt(np.mean(np.concatenate([np.square(record.torque[part]) for part in record.segments]))))
+
+
+def _long(record: Record) -> Record:
+    """Without parts that are too short for the equations of motion."""
+    parts = tuple(part for part in record.segments if part.stop - part.start >= _FEWEST)
+    if not parts:
+        raise InputError(
+            f"{record.path}: its longest part has {max(part.stop - part.start for part in record.segments)} samples; "
+            f"at least {_FEWEST} are needed"
+        )
+    return dataclasses.replace(record, segments=parts)
+
+
+def split(record: Record) -> tuple[Record, Record]:
+    """The samples to be fitted, and those held out: the last of the log, at their own times."""
+    total = sum(part.stop - part.start for part in record.segments)
+    left = round((1.0 - HELD_OUT) * total)
+    if HELD_OUT * total < _FEWEST:
+        raise InputError(
+            f"{record.path}: {total} samples are too few to hold a quarter of them out; at least "
+            f"{int(np.ceil(_FEWEST / HELD_OUT))} are needed, or another log: --holdout"
+        )
+    row = record.segments[-1].stop
+    for part in record.segments:
+        if left <= part.stop - part.start:
+            row = part.start + left
+            break
+        left -= part.stop - part.start
+    first = tuple(slice(part.start, min(part.stop, row)) for part in record.segments if part.start < row)
+    last = tuple(slice(max(part.start, row), part.stop) for part in record.segments if part.stop > row)
+    cut = {name: None if (one := getattr(record, name)) is None else one[:row] for name in ("time", "torque", "transmitted")}
+    positions = {side: values[:row] for side, values in record.positions.items()}
+    # times count from the log's first sample in both: a disturbance may be periodic in time
+    return dataclasses.replace(record, **cut, positions=positions, segments=first), dataclasses.replace(
+        record, segments=last
+    )
+
+
+def _check_machine(record: Record, other: Record) -> None:
+    """Refuse a hold-out log of another machine."""
+    if other.path.resolve() == record.path.resolve():
+        raise InputError(f"{other.path}: is the log itself; without --holdout its last quarter is held out")
+    if not np.isclose(record.sample_period, other.sample_period, rtol=1e-2, atol=0.0):
+        raise InputError(
+            f"{other.path}: is sampled every {other.sample_period:.6g} s, {record.path} every {record.sample_period:.6g} s; "
+            f"[log] resample = {record.sample_period:.6g} reads both alike"
+        )
+    for side in record.positions:
+        if side not in other.positions:
+            raise InputError(f"{other.path}: has no {side} position, which {record.path} has; it is of another machine")
+    gears = record.findings.gearing, other.findings.gearing
+    if gears[0] is not None and gears[1] is not None and not (gears[0].wide or gears[1].wide):
+        ratios = gears[0].ratio, gears[1].ratio
+        clear = all(one.residual < 0.1 for one in gears if one is not None)
+        if clear and abs(ratios[1] / ratios[0] - 1.0) > GEAR_TOLERANCE:
+            raise InputError(
+                f"{other.path}: theta_e moves {ratios[1]:.4g} for each 1 of theta_s, on {record.path} {ratios[0]:.4g}; it "
+                "is of another machine, or a sign or unit differs"
+            )
+    inertias = []
+    for one in (record.findings.dynamics, other.findings.dynamics):
+        if one is not None and one.shares[0] > 0.1 and 10.0 * one.errors[0] * one.inflation[0] < abs(one.values[0]):
+            inertias.append(float(one.values[0]))
+    if len(inertias) == 2 and not 1.0 / _ALIKE < inertias[1] / inertias[0] < _ALIKE:
+        raise InputError(
+            f"{other.path}: shows an inertia of {inertias[1]:.3g}, {record.path} of {inertias[0]:.3g} at the motor; it is "
+            "of another machine, or a sign or unit differs"
+        )

@@ -1,0 +1,180 @@
+"""The proof on what was held out: whether a model with the missing effects predicts it better, beside floor and controls."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbl.drive.parameters import get_leaf, leaf_paths, set_leaves
+from jaxbl.identification.logs import unit_on
+from jaxbl.identification.trajectory import Free
+from jaxbl.records import Record
+from jaxbl.simulate import Experiment
+
+from .diagnosis_task import DiagnosisTask, input_rms
+from .effect_search import Explainer, Explanation, Model
+from .reference_log import Comparison, predictable
+from .setup import Setup
+
+_WORSE, _WORSE_SPEED = 1.02, 1.05
+"""Errors of a model over those of the one given, or over the noise, up to which it is no worse: what numbers fitted on other
+data cost; of speeds the noise is known less well."""
+
+
+class FittedModel(NamedTuple):
+    """A model with some effects, all numbers fitted.
+
+    Attributes:
+        names: of the effects.
+        experiment: the model.
+        free: numbers that were fitted, its own first.
+        theta: of these.
+        deviation: standard deviation of theta.
+    """
+
+    names: tuple[str, ...]
+    experiment: Experiment
+    free: tuple[Free, ...]
+    theta: np.ndarray
+    deviation: np.ndarray
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All fitted numbers, by path."""
+        return {one.path: float(one.value(self.theta[i])) for i, one in enumerate(self.free)}
+
+    @property
+    def own(self) -> dict[str, float]:
+        """Values of the nominal model's own numbers."""
+        added = tuple(f"effects.{name}." for name in self.names)
+        return {path: value for path, value in self.values.items() if not path.startswith(added)}
+
+    @property
+    def numbers(self) -> dict[str, dict[str, float]]:
+        """All numbers of the effects, those that were not free among them."""
+        effects = {name: get_leaf(self.experiment, f"effects.{name}") for name in self.names}
+        return {name: {leaf: float(get_leaf(one, leaf)) for leaf in leaf_paths(one)} for name, one in effects.items()}
+
+    def errors(self) -> dict[str, float]:
+        """Standard errors of the values."""
+        return {one.path: float(one.slope(self.theta[i])) * self.deviation[i] for i, one in enumerate(self.free)}
+
+
+def free_values(free: Sequence[Free], theta: np.ndarray) -> dict[str, Any]:
+    """Values of free numbers, by path."""
+    return {one.path: jnp.asarray(one.value(theta[i])) for i, one in enumerate(free)}
+
+
+def at_period(experiment: Experiment, period: float) -> Experiment:
+    """A model at the sampling period of another log, s."""
+    return eqx.tree_at(lambda e: e.run.sample_period, experiment, jnp.asarray(period))
+
+
+def fit_model(explainer: Explainer, numbers: Mapping[str, Mapping[str, float]], theta: np.ndarray) -> FittedModel:
+    """A model with some effects, its own numbers and theirs fitted from given ones."""
+    free, found = explainer.polished({name: dict(one) for name, one in numbers.items()}, theta)
+    return FittedModel(tuple(numbers), found.experiment, free, found.theta, found.deviation)
+
+
+class Proof:
+    """Models fitted on the log, and compared on what was held out.
+
+    Attributes:
+        before: the model as given, on what was held out.
+        noise: of each channel there: what a perfect model would leave.
+    """
+
+    def __init__(self, task: DiagnosisTask, setup: Setup):
+        self.task, self.setup, self.other = task, setup, setup.holdout
+        self.before = self.other.compare(self._at(setup.nominal))
+        self.noise = self.other.noise_floor(self.before.torques)
+
+    def _at(self, experiment: Experiment) -> Experiment:
+        """A model at the period of what was held out."""
+        return at_period(experiment, self.other.period)
+
+    def accepted(self, explainer: Explainer, found: Explanation) -> tuple[FittedModel, Comparison, list[str]]:
+        """The model with what was found, how it compares, and the effects that are withdrawn: with them it is worse."""
+        names, withdrawn = found.model.names, []
+        while True:
+            base = found.model if names else found.nominal
+            fitted = fit_model(explainer, {name: base.numbers[name] for name in names}, base.theta)
+            after = self.other.compare(self._at(fitted.experiment))
+            if not self._worse(after) and (names or is_better(after.errors, self.before.errors)):
+                return fitted, after, withdrawn
+            if not names:
+                break
+            withdrawn.append(names[-1])
+            names = names[:-1]
+        own = self.setup.own
+        given = FittedModel((), self.setup.nominal, own, np.zeros(len(own)), self.setup.prior)
+        return given, self.before, withdrawn
+
+    def _worse(self, after: Comparison) -> bool:
+        """Whether a model is worse than the one given on what was held out, by more than noise."""
+        return any(
+            not value
+            <= (_WORSE_SPEED if name.startswith("velocity") else _WORSE) * max(self.before.errors[name], self.noise[name])
+            for name, value in after.errors.items()
+        )
+
+    def gap(self, fitted: FittedModel, after: Comparison, rival: Model | None) -> dict[str, Any]:
+        """Errors on held-out data before and after, the noise, and controls.
+
+        Args:
+            fitted: the model with what was found.
+            after: how it compares.
+            rival: the best model with a wrong effect, or None.
+        """
+        record, other, nominal = self.task.holdout, self.other, self.setup.nominal
+        part = record.segments
+        found: dict[str, Any] = {
+            "holdout": {
+                "file": str(record.path.resolve()),
+                "separate": self.task.separate,
+                "from": float(record.time[part[0].start]),
+                "to": float(record.time[part[-1].stop - 1]),
+                "window": other.samples * other.period,
+                "bandwidth": dict(other.bandwidth),
+            },
+            "units": {name: _unit(record, name) for name in self.noise},
+            "driving": {"motor": input_rms(record)},
+            "holdout_rmse_before": self.before.errors,
+            "holdout_rmse_after": after.errors,
+            "noise_floor": self.noise,
+            "free_run": {},
+            "controls": {},
+        }
+        runs = {"before": nominal, "after": fitted.experiment}
+        for name, one in runs.items():
+            errors, growth = other.free_run(self._at(one))
+            if not predictable(growth):
+                found["free_run"] = {"why_not": "small changes of the initial speed grow to the size of the motion"}
+                break
+            found["free_run"][name] = errors
+        if rival is not None:
+            wrong = set_leaves(rival.experiment, arrays(free_values(self.setup.own, rival.theta)))
+            found["controls"]["wrong"] = {"effect": rival.names[-1], "rmse": other.compare(self._at(wrong)).errors}
+        if fitted.names:
+            added = {
+                side: [one.torque - left.torque for one, left in zip(pieces, after.torques[side], strict=True)]
+                for side, pieces in self.before.torques.items()
+            }
+            found["controls"]["permuted"] = {"rmse": other.permuted(self._at(nominal), added).errors}
+        return found
+
+
+def is_better(new: Mapping[str, float], old: Mapping[str, float]) -> bool:
+    """Whether errors are less, all in all: what new numbers alone have to reach to take the place of those given."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return bool(np.sum(np.log([new[name] for name in old]) - np.log(list(old.values()))) < 0.0)
+
+
+_UNITS = {"theta": "rad", "velocity": "rad/s", "torque": "N m"}
+
+
+def _unit(record: Record, name: str) -> str:
+    side = "load" if name in ("theta_s", "velocity_load", "torque_load") else "motor"
+    return unit_on(record, f"{side}.position", _UNITS[name.split("_")[0]])

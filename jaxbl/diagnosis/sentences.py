@@ -1,0 +1,132 @@
+"""Sentences that say where a model lacks torque, and how much of it."""
+
+import numpy as np
+
+from .coordinates import EVERYWHERE
+from .localise import SIGNIFICANT, Coordinate, Localised
+
+_SIMPLER = 0.04
+"""Share of the power by which a later coordinate must explain more than an earlier one, to be named in its place."""
+_TELLING = 0.5
+"""Share of the power from which on a coordinate, or a narrow peak, is named."""
+_CROWDED = 0.35
+"""Share of the power less share of the time from which on a region is named."""
+_PLACE = {
+    EVERYWHERE: "alike everywhere",
+    "direction": "by the direction of motion",
+    "reversals": "at speed reversals",
+    "gap": "by the gap",
+    "load sign": "by the sign of the load",
+    "speed": "a function of speed",
+    "|speed|": "by the size of the speed",
+    "turn": "a function of the position within a turn",
+    "load turn": "a function of the load's position within a turn",
+    "position": "a function of position",
+    "load position": "a function of the load's position",
+    "twist": "a function of the twist",
+    "twist rate": "a function of the twist's rate",
+    "input": "a function of the input",
+    "acceleration": "a function of acceleration",
+    "time": "it comes and goes with time",
+}
+
+
+def sentence_of(found: Localised, unit: str = "N m") -> str:
+    """One sentence: which equation, where, and how much of the residual power lies there."""
+    side = found.name if found.name == "transmission" else f"{found.name} side"
+    if not found.significant:
+        return f"{side}: nothing beyond noise ({found.noise:.2g} {unit} rms up to {found.bandwidth:.3g} Hz)"
+    size = f"{found.missing:.2g} {unit} rms"
+    best = max((one.explained for one in found.coordinates.values()), default=0.0)
+    telling = next((one for one in found.coordinates.values() if one.explained >= best - _SIMPLER), None)
+    crowd = _crowded(found)
+    clauses = []
+    if crowd is not None and (best < _TELLING or crowd[0] > 0.6):
+        clauses.append(crowd[1])
+    own = [one for one in found.peaks if not one.in_motion]
+    if own and own[0].power_share > max(best, _TELLING) - _SIMPLER:
+        clauses.append(
+            f"at {own[0].frequency:.4g} Hz; {_percent(own[0].power_share)} of the residual power is a narrow peak there"
+        )
+    elif telling is not None and best >= _TELLING:
+        values = _class_means(telling, unit)
+        place = _PLACE.get(telling.name, f"a function of {telling.name}")
+        clauses.append(f"{place}{values}; {_percent(telling.explained)} of the residual power goes with it")
+    if not clauses and found.excess_z < SIGNIFICANT:
+        return f"{side}, {_faint(found, unit)}"
+    if not clauses:
+        hint = ""
+        if telling is not None and best > 0.1:
+            hint = f" (most: {_percent(best)}, {_PLACE.get(telling.name, telling.name)})"
+        clauses.append(f"nowhere in particular: neither speed nor position, load or time explains half of it{hint}")
+    return f"{side}, {'; '.join(clauses)} ({size})"
+
+
+def _faint(found: Localised, unit: str) -> str:
+    """The region that stands out most where the whole does not."""
+    each = [(one, region) for one in found.coordinates.values() for region in one.regions]
+    one, region = max(each, key=lambda pair: max(abs(pair[1].mean_z), pair[1].excess_z))
+    z = max(abs(region.mean_z), region.excess_z)
+    if found.peaks and found.peaks[0].excess_z > z:
+        peak = found.peaks[0]
+        return f"faint: a narrow peak of {peak.amplitude:.2g} {unit} at {peak.frequency:.4g} Hz"
+    place = region.label or f"where {region.low:.3g} < {one.symbol or one.name} < {region.high:.3g} {one.unit}".rstrip()
+    if abs(region.mean_z) >= region.excess_z:
+        return f"faint: {region.mean:+.2g} ± {region.mean_error:.1g} {unit} on average {place}"
+    return f"faint: {np.sqrt(max(region.excess, 0.0)):.2g} {unit} rms beyond noise {place}"
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * min(share, 1.0):.0f} %"
+
+
+def _class_means(coordinate: Coordinate, unit: str) -> str:
+    """Mean torques of the few classes of a coordinate."""
+    shown = [one for one in coordinate.regions if one.label and abs(one.mean_z) > 3.0]
+    return f" ({', '.join(f'{one.mean:+.2g} {unit} {one.label}' for one in shown)})" if shown else ""
+
+
+def _crowded(found: Localised) -> tuple[float, str] | None:
+    """The region that holds much of the power in little of the time: its share of power less that of time, and a clause."""
+    best: tuple[float, str] | None = None
+    for one in found.coordinates.values():
+        if one.name in (EVERYWHERE, "direction", "input", "acceleration", "twist rate"):
+            continue
+        power, time = (np.array([getattr(r, key) for r in one.regions]) for key in ("power_share", "time_share"))
+        z = np.array([r.excess_z for r in one.regions])
+        if one.name == "reversals":
+            near = np.array([r.label.startswith("reversals") for r in one.regions])
+            groups = [near] if near.any() else []
+        elif any(r.label for r in one.regions):
+            groups = [np.arange(len(power)) == i for i in range(len(power))]
+        else:
+            numbers = np.arange(len(power))
+            groups = [(numbers >= i) & (numbers <= j) for i in range(len(power)) for j in range(i, len(power))]
+        for rows in groups:
+            held, spent = float(power[rows].sum()), float(time[rows].sum())
+            score = held - spent
+            if held < 0.6 or held < 2.0 * spent or score < _CROWDED or np.max(z[rows]) < SIGNIFICANT:
+                continue
+            # of regions that hold as much, the simpler coordinate's
+            if best is None or score > best[0] + _SIMPLER:
+                best = score, f"{_region_text(one, rows)}"
+    return best
+
+
+def _region_text(coordinate: Coordinate, rows: np.ndarray) -> str:
+    chosen = [one for one, taken in zip(coordinate.regions, rows, strict=True) if taken]
+    share = _percent(sum(one.power_share for one in chosen))
+    if chosen[0].label:
+        if coordinate.name == "reversals":
+            return f"at speed reversals; {share} of the residual power lies near them"
+        return f"{chosen[0].label}; {share} of the residual power lies there"
+    low, high = chosen[0].low, chosen[-1].high
+    unit = f" {coordinate.unit}" if coordinate.unit else ""
+    symbol = coordinate.symbol or coordinate.name
+    if coordinate.name == "|speed|" and rows[0]:
+        return f"at low speed; {share} of the residual power lies where {symbol} < {high:.2g}{unit}"
+    if coordinate.name == "|speed|" and rows[-1]:
+        return f"at high speed; {share} of the residual power lies where {symbol} > {low:.2g}{unit}"
+    if coordinate.name == "time":
+        return f"for a while; {share} of the residual power lies between {low:.4g} and {high:.4g} s"
+    return f"at a place; {share} of the residual power lies where {low:.3g} < {symbol} < {high:.3g}{unit}"

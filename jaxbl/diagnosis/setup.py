@@ -1,0 +1,130 @@
+"""What a diagnosis begins with: the nominal model on both logs, and where it lacks torque."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxbl.errors import InputError
+from jaxbl.identification.logs import default_paths, on_record
+from jaxbl.identification.segments import Segment, segments_of
+from jaxbl.identification.trajectory import Free, free_parameters
+from jaxbl.records import POSITION_CHANNELS, Record
+from jaxbl.simulate import Experiment
+
+from .diagnosis_task import DiagnosisTask, input_rms
+from .input_noise import smoothed_input, unfelt
+from .linearised_model import Linear
+from .localise import Localised, localise
+from .neutral_effects import complete
+from .reference_log import WINDOW, ReferenceLog
+from .residuals import Residual, white_noise
+
+_DIVERGED = 10.0
+"""Departure from the motion on short windows, over its range, from which on a model counts as diverging."""
+_NOISY = 1e-3
+"""Noise over the input's rms from which on it is asked whether the drive felt it."""
+_CLEAR = 3.0
+"""Nats from which on it counts as shown that the drive did not: odds of twenty."""
+
+
+class Setup(NamedTuple):
+    """The nominal model and the logs.
+
+    Attributes:
+        bare: the model as given.
+        nominal: the same with all effects at neutral numbers.
+        own: its numbers that are not exactly known.
+        prior: relative standard deviation of each.
+        fitted: the log that numbers are fitted to.
+        holdout: what is held out.
+        lacking: torques that the model lacks on the log, by side, segment by segment.
+        located: where it lacks them, by side.
+        torque_noise: of the channel that recorded the input, N m, which both logs are without; 0 where the drive felt it.
+    """
+
+    bare: Experiment
+    nominal: Experiment
+    own: tuple[Free, ...]
+    prior: np.ndarray
+    fitted: ReferenceLog
+    holdout: ReferenceLog
+    lacking: dict[str, list[Residual]]
+    located: dict[str, Localised]
+    torque_noise: float
+
+
+def set_up(task: DiagnosisTask) -> Setup:
+    """The nominal model on both logs.
+
+    Raises:
+        InputError: a model that diverges, or whose effects are in an order that others would change.
+    """
+    config, record = task.config, task.record
+    assert record.torque is not None
+    bare = on_record(config, record)
+    # one structure for all models, so that they share their compiled programs
+    nominal = complete(bare)
+    _check_order(bare, nominal)
+    own = free_parameters(bare, default_paths(config, bare), float(np.std(record.torque)))
+    prior = np.full(len(own), config.uncertainty.relative)
+    rest = config.log.initial_state == "rest"
+    segments, held = (segments_of(one, nominal.sides) for one in (record, task.holdout))
+    _check_stable(task, nominal, ReferenceLog(segments, {}, rest))
+    noise = _torque_noise(input_rms(record), nominal, own, segments)
+    if noise > 0.0:
+        segments, held = (_quiet(some, noise) for some in (segments, held))
+    lacking = ReferenceLog(segments, {}, rest).torques(nominal)
+    located = localise(nominal, lacking, segments, rotating=rotating(record, nominal))
+    bandwidth = {name: one.bandwidth for name, one in located.items()}
+    fitted = ReferenceLog(segments, bandwidth, rest)
+    holdout = ReferenceLog(held, bandwidth, rest and task.separate)
+    return Setup(bare, nominal, own, prior, fitted, holdout, lacking, located, noise)
+
+
+def rotating(record: Record, experiment: Experiment) -> dict[str, bool]:
+    """Whether each side's positions are angles."""
+    return {side: record.findings.channels[POSITION_CHANNELS[side]].unit != "m" for side in experiment.sides}
+
+
+def _quiet(segments: Sequence[Segment], noise: float) -> list[Segment]:
+    """Segments with their inputs smoothed; `noise`: the inputs' standard deviation, N m."""
+    return [dataclasses.replace(one, torque=smoothed_input(one.torque, noise)) for one in segments]
+
+
+def _torque_noise(size: float, nominal: Experiment, own: Sequence[Free], segments: Sequence[Segment]) -> float:
+    """Noise of the channel that recorded the input, N m, where the drive does not feel it; 0 where it does.
+
+    Args:
+        size: rms of the input, N m.
+        nominal: the model.
+        own: its numbers.
+        segments: of the log.
+    """
+    noise = white_noise([one.torque for one in segments])
+    if not _NOISY * size < noise:
+        return 0.0
+    # the model as given: numbers that may change would absorb some of the noise
+    none, width = np.zeros(len(own)), np.ones(len(own))
+    given, smooth = (Linear(nominal, own, none, width, none, some, none) for some in (segments, _quiet(segments, noise)))
+    smoothness, _ = given.choose(())
+    return noise if unfelt(given.left(smoothness), smooth.left(smoothness)) > _CLEAR else 0.0
+
+
+def _check_order(bare: Experiment, nominal: Experiment) -> None:
+    """Refuse a model of which two effects share a name, and are called by positions that others would shift."""
+    names = [effect.name for effect in bare.effects]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None and [effect.name for effect in nominal.effects[: len(names)]] != names:
+        raise InputError(f"effects: two are {twice}; list them before those of the actuator")
+
+
+def _check_stable(task: DiagnosisTask, nominal: Experiment, log: ReferenceLog) -> None:
+    """Refuse a model that diverges under the log's input."""
+    for side, apart in log.largest_departures(nominal).items():
+        if not apart < _DIVERGED:
+            raise InputError(
+                f"{task.record.path}: the model diverges under this log's input: within {WINDOW:g} s its {side} leaves the "
+                f"measured motion by {apart:.2g} times the whole of it; a number of it, or its sign, is wrong"
+            )

@@ -1,0 +1,212 @@
+"""What an identification found, as in `identification.json`."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbl.config import Config
+from jaxbl.drive.parameters import leaf_paths, set_leaves
+from jaxbl.records import POSITION_CHANNELS, Record
+from jaxbl.simulate import Experiment
+
+from .intervals import UNSEEN, Refusal, Spread, interval, spread
+from .logs import decimation, unit_on
+from .profile import Profile
+from .regression import Kinematics, errors, regress
+from .search import Found
+from .segments import long_enough, reading_noise, segments_of, windows_of
+from .task import LogTask
+from .trajectory import Fit, Free, projected_residual
+
+
+def torque_errors(
+    record: Record, experiment: Experiment, parts: Sequence[Kinematics], factor: int
+) -> dict[str, dict[str, Any]]:
+    """How far a model misses the torques of a log after decimation, by equation, with units."""
+    found = errors(experiment, parts, factor) if parts else {}
+    return {name: one | {"unit": unit_on(record, name, "N m")} for name, one in found.items()}
+
+
+def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Experiment, samples: int) -> dict[str, Any]:
+    """How well the numbers found serve another log, beside the nominal ones.
+
+    Args:
+        config: the study.
+        record: the other log.
+        nominal, fitted: the model before and after.
+        samples: length of the windows, as far as the log has it.
+    """
+    period = jnp.asarray(record.sample_period)
+    rebased = [eqx.tree_at(lambda e: e.run.sample_period, one, period) for one in (nominal, fitted)]
+    segments = segments_of(record, nominal.sides)
+    noise = reading_noise(segments)
+    longest = max(map(len, segments))
+    windows, _ = windows_of(segments, nominal, min(samples, longest), config.log.initial_state == "rest")
+    left = [eqx.filter_jit(projected_residual)(one, windows)[0] for one in rebased]
+    position = {}
+    for i, side in enumerate(nominal.sides):
+        before, after = (noise[side] * float(jnp.sqrt(jnp.mean(one[:, :, i] ** 2))) for one in left)
+        unit = record.findings.channels[POSITION_CHANNELS[side]].unit
+        position[side] = {"rms": after, "nominal_rms": before, "noise": noise[side], "unit": unit}
+    factor = decimation(config, record)
+    parts = long_enough(segments, factor)
+    before, torque = (torque_errors(record, one, parts, factor) for one in rebased)
+    for name, one in torque.items():
+        one["nominal_rms"], one["nominal_relative"] = before[name]["rms"], before[name]["relative"]
+    return {
+        "file": str(record.path.resolve()),
+        "window": windows.torque.shape[1] * record.sample_period,
+        "position": position,
+        "torque": torque,
+    }
+
+
+def _derived(experiment: Experiment, found: Found) -> dict[str, Any]:
+    """What else the law's numbers say (half_gap beside dead_zone), with standard errors by the delta method."""
+    if experiment.transmission is None:
+        return {}
+
+    def others(theta: jax.Array) -> dict[str, Any]:
+        at = set_leaves(experiment, {one.path: one.value(theta[i]) for i, one in enumerate(found.free)})
+        assert at.transmission is not None
+        known = {path.rpartition(".")[2] for path in leaf_paths(at) if path.startswith("transmission.")}
+        return {name: value for name, value in at.transmission.truth().items() if name not in known}
+
+    values, slopes = others(found.fit.theta), jax.jacfwd(others)(found.fit.theta)
+    derived = {}
+    for name, value in values.items():
+        error = float(jnp.sqrt(slopes[name] @ found.spread.covariance @ slopes[name]))
+        derived[f"transmission.{name}"] = {
+            "value": float(value), "standard_error": error,
+            "interval": [float(value) - 1.96 * error, float(value) + 1.96 * error],
+        }  # fmt: skip
+    return derived
+
+
+def _parameters(record: Record, free: Sequence[Free], fit: Fit, width: Spread) -> dict[str, dict[str, Any]]:
+    """Values with standard errors and 95 % intervals, by path."""
+    theta, deviation = np.asarray(fit.theta), np.sqrt(np.diag(np.asarray(width.covariance)))
+    return {
+        one.path: {
+            "value": float(one.value(theta[i])),
+            "standard_error": float(one.slope(theta[i])) * deviation[i],
+            "interval": list(interval(one, theta[i], deviation[i])),
+            "unit": unit_on(record, one.path, one.unit),
+            "nominal": one.nominal,
+        }
+        for i, one in enumerate(free)
+    }
+
+
+def by_regression(
+    nominal: Experiment, free: Sequence[Free], parts: Sequence[Kinematics], factor: int, record: Record
+) -> dict[str, Any]:
+    """Least squares on the equations of motion; numbers that they do not show are left out."""
+    found = regress(nominal, free, parts, factor)
+    information = np.einsum("wtsp,wtsq->pq", found.jacobian, found.jacobian)
+    values, vectors = np.linalg.eigh(information)
+    blind = values < 1.0 / UNSEEN**2
+    seen = [i for i in range(len(free)) if not np.any(np.abs(vectors[i, blind]) > 0.1)]
+    parameters = _parameters(record, free, found, spread(found))
+    at = {path: jnp.asarray(one["value"]) for path, one in parameters.items()}
+    return {
+        "parameters": {free[i].path: parameters[free[i].path] for i in seen},
+        "measured_transmitted_torque": record.transmitted is not None,
+        "bandwidth": 0.5 / (factor * record.sample_period),
+        "torque": torque_errors(record, set_leaves(nominal, at), parts, factor),
+        "converged": found.converged,
+    }
+
+
+def by_trajectories(found: Found, record: Record) -> dict[str, Any]:
+    """How the trajectory fit went."""
+
+    def by_path(values: Any) -> dict[str, Any]:
+        return dict(zip([one.path for one in found.free], values, strict=True))
+
+    return {
+        "kind": "prediction_error" if found.smoothness else "output_error",
+        "window": found.samples * record.sample_period,
+        "windows": len(found.firsts),
+        "converged": found.fit.converged,
+        "starts": len(found.starts),
+        "starts_agreeing": sum(start["agrees"] for start in found.starts),
+        "variance_over_noise": found.spread.variance,
+        "inflation": by_path(found.spread.inflation),
+        "smoothness": found.smoothness,
+        "between_windows": {} if found.between is None else by_path(found.between),
+    }
+
+
+def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mapping[str, Profile]) -> dict[str, Any]:
+    """The summary but for `method`, `torque`, `gains` and `holdout`.
+
+    Args:
+        task: study and log.
+        fitted: the model with the numbers found.
+        found: the fit.
+        profiles: of the numbers, by path, if they were asked for.
+    """
+    noise = {side: float(one) for side, one in found.windows.noise.items()}
+    record, width = task.record, np.asarray(found.spread.covariance)
+    deviation = np.sqrt(np.diag(width))
+    parameters = _parameters(record, found.free, found.fit, found.spread)
+    for path, one in profiles.items():
+        points = [list(point) for point in zip(one.values.tolist(), one.deviance.tolist(), strict=True)]
+        parameters[path] |= {"profile_interval": list(one.interval), "profile": points}
+    parameters |= _derived(fitted, found)
+    residual = {
+        side: {
+            "rms": noise[side] * float(jnp.sqrt(jnp.mean(found.fit.residual[:, :, i] ** 2))),
+            "noise": noise[side],
+            "unit": record.findings.channels[POSITION_CHANNELS[side]].unit,
+        }
+        for i, side in enumerate(fitted.sides)
+    }
+    return {
+        "title": task.config.title,
+        "identity": task.identity,
+        "file": str(record.path.resolve()),
+        "samples": len(record.time),
+        "sample_period": record.sample_period,
+        "parameters": parameters,
+        "correlation": {
+            "parameters": [one.path for one in found.free],
+            "matrix": width / np.outer(deviation, deviation),
+        },
+        "refused": [
+            {"direction": one.direction, "why": _why(one), "relative_deviation": one.deviation} for one in found.refused
+        ],
+        "held": found.held,
+        "condition": found.condition,
+        "residual": residual,
+        "notes": list(record.notes),
+    }
+
+
+_HELP = {
+    "inertia": "faster changes of torque",
+    "viscous": "a wider range of speeds",
+    "stiffness": "larger torques through the gear, near its resonance",
+    "half_gap": "reversals that cross the gap",
+    "dead_zone": "reversals that cross the gap",
+    "slope": "slow passages through the gap",
+    "torque": "slow motion with reversals",
+    "relative": "a load or an inertia that is known",
+}
+
+
+def _why(refusal: Refusal) -> str:
+    names = list(refusal.direction)
+    if len(names) == 1:
+        text = f"this log hardly depends on {names[0]}"
+    else:
+        text = "this log depends hardly on these changing together, by the shares given"
+    keys = dict.fromkeys(_HELP[key] for path in names for key in _HELP if path.endswith(key))
+    helps = f"; what would help: {', or '.join(keys)}" if keys else ""
+    size = f"{100.0 * refusal.deviation:.0f} %" if refusal.deviation < 100.0 else "anything"
+    return f"{text}: it leaves {size} open (standard deviation){helps}"

@@ -1,0 +1,104 @@
+"""Columns over a log: its smoothed motion, the fit's residuals, the fitted model's torques, and what the observers see."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbl.records import POSITION_CHANNELS, Record
+from jaxbl.simulate import Experiment, Signals, State, replay
+
+from .regression import model_torques
+from .search import Found
+from .segments import Segment
+
+
+def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, found: Found) -> dict[str, np.ndarray]:
+    """Columns of a log and its fit, each of shape (samples,).
+
+    Args:
+        record: the log.
+        segments: of the log; they cover all of it.
+        fitted: the model with the numbers found.
+        found: the fit.
+
+    Returns:
+        `t`, `u`, positions (`theta_e`, ...), `transmitted` where it was measured; `SIDE.velocity` and `SIDE.acceleration`
+        with their deviations; `SIDE.residual`, rad; the model's `torque` and `SIDE.effects`, N m.
+    """
+    assert record.torque is not None
+    columns = {"t": record.time, "u": record.torque}
+    columns |= {POSITION_CHANNELS[side]: record.positions[side] for side in fitted.sides}
+    if record.transmitted is not None:
+        columns["transmitted"] = record.transmitted
+    for side in fitted.sides:
+        smoothed = [one.smoothed[side] for one in segments]
+        for order, name in ((1, "velocity"), (2, "acceleration")):
+            columns[f"{side}.{name}"] = np.concatenate([np.asarray(one.state[:, order]) for one in smoothed])
+            columns[f"{side}.{name}_deviation"] = np.concatenate([np.asarray(one.deviation(order)) for one in smoothed])
+    rows = (found.firsts[:, None] + np.arange(found.samples)[None, :]).ravel()
+    for i, side in enumerate(fitted.sides):
+        column = np.full(len(record.time), np.nan)
+        column[rows] = float(found.windows.noise[side]) * np.asarray(found.fit.residual[:, :, i]).ravel()
+        columns[f"{side}.residual"] = column
+    return columns | _model_columns(fitted, segments)
+
+
+def _model_columns(fitted: Experiment, segments: Sequence[Segment]) -> dict[str, np.ndarray]:
+    """Torques by the fitted model at the smoothed motion, N m: the law's, and what effects take on each side."""
+    pieces: dict[str, list[np.ndarray]] = {}
+    for one in segments:
+        deviation = {side: smoothed.deviation(1) for side, smoothed in one.smoothed.items()}
+        for name, values in model_torques(fitted, one.kinematics, deviation).items():
+            pieces.setdefault("torque" if name == "transmission" else f"{name}.effects", []).append(np.asarray(values))
+    return {name: np.concatenate(values) for name, values in pieces.items()}
+
+
+@eqx.filter_jit
+def _replayed(experiment: Experiment, torque: jax.Array, measured: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    def keep(state: State, signals: Signals) -> dict[str, Any]:
+        row: dict[str, Any] = {}
+        if signals.twist is not None:
+            row["twist"] = signals.twist
+        for side in experiment.sides:
+            row[f"{side}.velocity_estimate"] = signals.side(side).velocity_estimate
+            row[f"{side}.torque_estimate"] = signals.side(side).torque_estimate
+        if state.identifier is not None:
+            assert experiment.identifier is not None and experiment.transmission is not None
+            path = experiment.identifier.estimate(state.identifier, experiment.transmission)
+            row |= {f"{side}.{name}": value for side, values in path.items() for name, value in values.items()}
+        return row
+
+    return replay(experiment, torque, measured, record=keep)[1]
+
+
+def observer_chain(
+    experiment: Experiment, segments: Sequence[Segment], samples: int
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The paper's chain on the longest segment: observers, and the recursive identifier on their equivalent control.
+
+    Args:
+        experiment: with the observers' gains.
+        segments: of the log.
+        samples: of the log.
+
+    Returns:
+        Columns of shape (samples,), NaN elsewhere, and the identifier's numbers at the end, by name and side.
+    """
+    longest = max(segments, key=len)
+    readings = {side: jnp.asarray(longest.readings[side]) for side in experiment.sides}
+    kept = _replayed(experiment, jnp.asarray(longest.torque), readings)
+    estimates = ("velocity_estimate", "torque_estimate")
+    leading = ["twist", *(f"{side}.{name}" for side in experiment.sides for name in estimates)]
+    columns = {}
+    for name in [*(name for name in leading if name in kept), *(name for name in kept if name not in leading)]:
+        columns[name] = np.full(samples, np.nan)
+        columns[name][longest.rows] = np.asarray(kept[name])
+    found: dict[str, Any] = {}
+    if experiment.transmission is not None:
+        for name in experiment.transmission.truth():
+            found[name] = {side: float(kept[f"{side}.{name}"][-1]) for side in experiment.sides}
+    return columns, found

@@ -1,0 +1,102 @@
+"""A log in segments without gaps: input, readings and smoothed motion of each."""
+
+# arrays of numpy go where those of jax are asked for
+# pyright: reportArgumentType=false
+
+import dataclasses
+from collections.abc import Sequence
+from functools import cached_property
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbl.drive.plant import PlantState
+from jaxbl.records import Record
+from jaxbl.simulate import Experiment
+
+from .regression import Kinematics, Path, effect_path, kinematics_from, shortest
+from .smoother import Smoothed, smooth
+from .trajectory import Windows, cut
+
+_FEWEST = 50
+"""Samples of a segment whose torques are compared: the smoother's ends, some ten samples each, are then a small part."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Segment:
+    """A part of a log without gaps.
+
+    Attributes:
+        rows: of the log.
+        time: s from the log's first sample, shape (samples,).
+        period: sampling period, s.
+        torque: input, N m, held from each sample to the next, shape (samples,).
+        readings: positions of each side, rad, shape (samples,).
+        smoothed: the same smoothed, with derivatives.
+        transmitted: measured transmitted torque, N m, shape (samples,), or None.
+    """
+
+    rows: slice
+    time: np.ndarray
+    period: float
+    torque: np.ndarray
+    readings: dict[str, np.ndarray]
+    smoothed: dict[str, Smoothed]
+    transmitted: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @cached_property
+    def kinematics(self) -> Kinematics:
+        """The smoothed motion as the equations of motion take it."""
+        states = {side: one.state for side, one in self.smoothed.items()}
+        return kinematics_from(self.time, self.torque, states, self.transmitted)
+
+
+def segments_of(record: Record, sides: Sequence[str]) -> list[Segment]:
+    """Segments of a log, the positions of each side smoothed."""
+    assert record.torque is not None
+    found = []
+    for rows in record.segments:
+        readings = {side: record.positions[side][rows] for side in sides}
+        smoothed = {side: smooth(jnp.asarray(one), record.sample_period) for side, one in readings.items()}
+        time, torque = record.time[rows] - record.time[0], record.torque[rows]
+        transmitted = None if record.transmitted is None else record.transmitted[rows]
+        found.append(Segment(rows, time, record.sample_period, torque, readings, smoothed, transmitted))
+    return found
+
+
+def reading_noise(segments: Sequence[Segment]) -> dict[str, float]:
+    """Standard deviation of the readings' noise of each side, rad: the mean over the segments."""
+    return {side: float(np.mean([float(one.smoothed[side].noise) for one in segments])) for side in segments[0].smoothed}
+
+
+def long_enough(segments: Sequence[Segment], factor: int) -> list[Kinematics]:
+    """Kinematics of the segments that are long enough to be decimated by a factor."""
+    return [one.kinematics for one in segments if len(one) >= max(2 * shortest(factor), _FEWEST)]
+
+
+def windows_of(
+    segments: Sequence[Segment], experiment: Experiment, samples: int, rest: bool = False
+) -> tuple[Windows, np.ndarray]:
+    """A log in windows, segment by segment, and the row that each begins with.
+
+    Args:
+        segments: of the log.
+        experiment: says how effects begin.
+        samples: length of a window; segments that are shorter are left out.
+        rest: whether each segment begins at rest.
+    """
+    pieces, firsts = [], []
+    noise = reading_noise(segments)
+    for one in segments:
+        if len(one) < samples:
+            continue
+        position = {side: motion.position for side, motion in one.smoothed.items()}
+        velocity = {side: motion.velocity for side, motion in one.smoothed.items()}
+        along = Path(jnp.asarray(one.time), jnp.asarray(one.torque), position, velocity)
+        start = PlantState(position, velocity, effect_path(experiment, along)[0])
+        pieces.append(cut(one.torque, one.readings, one.period, start, noise, samples, float(one.time[0]), rest))
+        firsts.append(one.rows.start + samples * np.arange(len(one) // samples))
+    return Windows.join(pieces), np.concatenate(firsts)
