@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from .drive.effects import AbstractEffect
 from .drive.encoders import Encoders
 from .drive.excitation import AbstractExcitation
-from .drive.parameters import Scalar, parameter
+from .drive.parameters import Scalar, option, parameter
 from .drive.plant import AbstractDrive, Initial, Plant, PlantState
 from .drive.transmission import AbstractTransmission
 from .observer.equivalent_control import EquivalentControl
@@ -32,9 +32,9 @@ Number = Any  # an array of one number a lane: Float[Array, ""] inside a step
 class Run(eqx.Module):
     """Time grid and tolerances."""
 
-    sample_period: Scalar
-    steps: int = eqx.field(static=True)
-    substeps: int = eqx.field(static=True, default=10)
+    sample_period: Scalar = parameter("s", "period of encoders, observers, identifier", default=1e-3, above=0.0, fixed=True)
+    steps: int = eqx.field(static=True, default=20_000)
+    substeps: int = option("plant steps per sample", default=10, minimum=1)
     position_tolerance: Scalar = parameter(
         "rad", "largest position error of a converged observer (load: divided by the gear ratio)", default=1e-3, above=0.0
     )

@@ -32,16 +32,17 @@ class Parameter(NamedTuple):
     role: Any = None
 
 
-def parameter(unit: str, doc: str, *, default: Any = dataclasses.MISSING, **about: Any) -> Any:
+def parameter(unit: str, doc: str, *, default: Any = dataclasses.MISSING, fixed: bool = False, **about: Any) -> Any:
     """Declare a number of a module as an `equinox` field.
 
     Args:
         unit: SI unit as printed on axes; "" where dimensionless.
         doc: one line for the reference.
         default: value where the config gives none; without it the key is required.
+        fixed: what is compiled depends on the number, so that an axis over it has one program a value.
         **about: `minimum` (inclusive), `above` (exclusive), `maximum` (inclusive), `role`.
     """
-    metadata = {"parameter": Parameter(unit, doc, **about)}
+    metadata = {"parameter": Parameter(unit, doc, **about), "fixed": fixed}
     if default is dataclasses.MISSING:
         return eqx.field(metadata=metadata)
     return eqx.field(default=default, metadata=metadata)
@@ -49,7 +50,7 @@ def parameter(unit: str, doc: str, *, default: Any = dataclasses.MISSING, **abou
 
 def option(doc: str, *, default: Any = dataclasses.MISSING, **limits: float) -> Any:
     """Declare a choice that is fixed at compile time (a count, a seed, a name), not a leaf."""
-    metadata = {"parameter": Parameter("", doc, **limits)}
+    metadata = {"parameter": Parameter("", doc, **limits), "fixed": True}
     if default is dataclasses.MISSING:
         return eqx.field(static=True, metadata=metadata)
     return eqx.field(static=True, default=default, metadata=metadata)
@@ -87,8 +88,12 @@ def leaf_paths(tree: Any, prefix: str = "") -> dict[str, Parameter]:
                     found |= leaf_paths(member, f"{path}.{key}.")
         elif dataclasses.is_dataclass(value):
             found |= leaf_paths(value, f"{path}.")
-        elif "parameter" in field.metadata and value is not None and not field.metadata.get("static"):
-            found[path] = field.metadata["parameter"]
+        elif (
+            value is not None
+            and "parameter" in (known := field.metadata)
+            and not (known.get("static") or known.get("fixed"))
+        ):
+            found[path] = known["parameter"]
     return found
 
 

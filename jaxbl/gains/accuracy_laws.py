@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from jaxbl.config import Config, FigureTable, nearest
+from jaxbl.config import Config, FigureTable
 from jaxbl.errors import InputError
+from jaxbl.records.table import nearest
 
 if TYPE_CHECKING:
     from jaxbl.sweeps.sweep import StudyResult

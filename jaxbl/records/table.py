@@ -66,7 +66,7 @@ def describe(error: ValidationError, location: list[str | int] | None = None) ->
     message = first["msg"].removeprefix("Input ")
     if kind == "unknown_key":
         return (*place, context["key"]), f"{where}{message}"
-    if kind in ("period", "sweep", "axis", "figure", "range", "consistency"):
+    if kind == "consistency":
         return place, f"{where}{message}"
     return place, f"{where}{message}, not {given}"
 
@@ -119,8 +119,9 @@ class _ColumnTable(StrictTable):
         return data
 
 
-def _consistency(message: str, **context: Any) -> PydanticCustomError:
-    return PydanticCustomError("consistency", message, context)  # type: ignore[arg-type]
+def wrong(message: str) -> PydanticCustomError:
+    """What a table's own check raises."""
+    return PydanticCustomError("consistency", message)  # type: ignore[arg-type]
 
 
 class TimeTable(_ColumnTable):
@@ -135,7 +136,7 @@ class TimeTable(_ColumnTable):
     @model_validator(mode="after")
     def _one_source(self) -> "TimeTable":
         if self.period is not None and self.column is not None:
-            raise _consistency("has both column and period; period is for logs without time stamps")
+            raise wrong("has both column and period; period is for logs without time stamps")
         return self
 
 
@@ -172,9 +173,9 @@ class PositionTable(_ChannelTable):
     @model_validator(mode="after")
     def _counts(self) -> "PositionTable":
         if self.unit == "counts" and self.counts_per_turn is None:
-            raise _consistency("unit counts needs counts_per_turn")
+            raise wrong("unit counts needs counts_per_turn")
         if self.unit != "counts" and self.counts_per_turn is not None:
-            raise _consistency("counts_per_turn is for unit counts, not for {unit}", unit=self.unit)
+            raise wrong(f"counts_per_turn is for unit counts, not for {self.unit}")
         return self
 
 
@@ -199,7 +200,7 @@ class TorqueTable(_ChannelTable):
     @model_validator(mode="after")
     def _constant(self) -> "TorqueTable":
         if self.unit in ("V", "A", "counts") and self.factor is None:
-            raise _consistency("unit {unit} needs factor, the torque in N m (or force in N) of one {unit}", unit=self.unit)
+            raise wrong(f"unit {self.unit} needs factor, the torque in N m (or force in N) of one {self.unit}")
         return self
 
 
@@ -248,15 +249,15 @@ class LogTable(StrictTable):
     @model_validator(mode="after")
     def _possible(self) -> "LogTable":
         if self.start is not None and self.stop is not None and self.start >= self.stop:
-            raise _consistency("start {start} should be less than stop {stop}", start=self.start, stop=self.stop)
+            raise wrong(f"start {self.start} should be less than stop {self.stop}")
         absent = self.absent or []
         for name in absent:
             if getattr(self, name) is not None:
-                raise _consistency("{name} is described and said to be absent; remove one of them", name=name)
+                raise wrong(f"{name} is described and said to be absent; remove one of them")
         if "theta_e" in absent and "theta_s" in absent:
-            raise _consistency("absent: a log without theta_e and theta_s has no position; one of them is needed")
+            raise wrong("absent: a log without theta_e and theta_s has no position; one of them is needed")
         if self.theta_e is not None and self.theta_e.skew == "estimate":
-            raise _consistency("theta_e.skew: 'estimate' is for theta_s, whose skew is found against theta_e")
+            raise wrong("theta_e.skew: 'estimate' is for theta_s, whose skew is found against theta_e")
         if self.theta_s is not None and self.theta_s.skew == "estimate" and "theta_e" in absent:
-            raise _consistency("theta_s.skew: 'estimate' needs theta_e, which is said to be absent")
+            raise wrong("theta_s.skew: 'estimate' needs theta_e, which is said to be absent")
         return self

@@ -20,10 +20,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from jaxbl.config import Config, FigureTable, is_boolean, nearest, numeric_paths
+from jaxbl.config import Config, FigureTable, is_boolean, numeric_paths
 from jaxbl.errors import InputError
 from jaxbl.gains.accuracy_laws import Law, accuracy_laws, check_selection, fixed_values, selected
 from jaxbl.observer.conditions import CONDITIONS, Condition
+from jaxbl.records.table import nearest
 from jaxbl.sweeps.metrics import describe
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult

@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxbl.config import TOLERANCE, AxisTable, Config, nearest, with_values
+from jaxbl.config import TOLERANCE, AxisTable, Config, with_values
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.errors import InputError
+from jaxbl.records.table import nearest
 
 from .metrics import metric_columns
 from .refine import Criterion, Grid

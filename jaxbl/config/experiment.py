@@ -1,0 +1,127 @@
+"""Tables of what is simulated: drive, transmission, effects, input, sensors, observers, and the run."""
+
+# pyright: reportInvalidTypeForm=false
+# types of keys are made as the module is imported
+
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from jaxbl.drive.effects import EFFECTS, make_effect
+from jaxbl.drive.encoders import Encoders
+from jaxbl.drive.excitation import EXCITATIONS, Recorded
+from jaxbl.drive.parameters import parameters
+from jaxbl.drive.plant import DRIVES, Initial
+from jaxbl.drive.transmission import TRANSMISSIONS
+from jaxbl.errors import InputError
+from jaxbl.observer.equivalent_control import EquivalentControl
+from jaxbl.observer.recursive import Identifier
+from jaxbl.observer.super_twisting import OBSERVERS, AbstractSuperTwisting, Observers
+from jaxbl.records.table import nearest, wrong
+from jaxbl.simulate import Run
+
+from .tables import Table, table_for, tagged
+
+
+class RecordedTable(Table):
+    """Input from a CSV or Parquet file, played back with zero-order hold."""
+
+    kind: Literal["recorded"]
+    file: str = Field(description="CSV or Parquet file; relative to the config file")
+    time_column: str = Field(default="t", description="column of times in s")
+    torque_column: str = Field(default="u", description="column of torques in N m")
+    gain: float = Field(default=1.0, description="factor on the recorded torque")
+
+    def build(self) -> Recorded:
+        import pandas as pd
+
+        path = Path(self.file)
+        try:
+            frame = pd.read_parquet(path) if path.suffix == ".parquet" else pd.read_csv(path)
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path}: cannot be read as CSV or Parquet: {str(error).splitlines()[0]}") from None
+        columns = []
+        for column in (self.time_column, self.torque_column):
+            if column not in frame:
+                raise InputError(f"{path}: no column '{column}'; {nearest(column, map(str, frame.columns))}")
+            values = np.asarray(pd.to_numeric(frame[column], errors="coerce"), dtype=float)
+            if len(values) == 0 or not np.isfinite(values).all():
+                row = 0 if len(values) == 0 else int(np.argmin(np.isfinite(values)))
+                raise InputError(f"{path}: column '{column}', row {row}: should be a finite number")
+            columns.append(values)
+        times, torques = columns
+        if (np.diff(times) <= 0.0).any():
+            row = int(np.argmax(np.diff(times) <= 0.0)) + 1
+            raise InputError(f"{path}: column '{self.time_column}', row {row}: times should increase")
+        return Recorded(times=times - times[0], torques=torques, gain=self.gain)  # type: ignore[arg-type]
+
+
+DriveTable = tagged([table_for(cls, kind=name) for name, cls in DRIVES.items()], "kind")
+TransmissionTable = tagged([table_for(cls, law=name) for name, cls in TRANSMISSIONS.items()], "law")
+ExcitationTable = tagged(
+    [RecordedTable if name == "recorded" else table_for(cls, kind=name) for name, cls in EXCITATIONS.items()], "kind"
+)
+EffectTable = tagged([table_for(cls, partial(make_effect, name), kind=name) for name, cls in EFFECTS.items()], "kind")
+GainsTable = table_for(AbstractSuperTwisting)
+InitialTable = table_for(Initial)
+EncodersTable = table_for(Encoders)
+EquivalentControlTable = table_for(EquivalentControl)
+IdentifierTable = table_for(Identifier)
+
+
+class ObserverTable(Table):
+    """Super-twisting observers (7)-(8) of both sides."""
+
+    discretisation: Literal["implicit", "explicit"] = Field(
+        default="implicit", description="implicit: proximal backward Euler; explicit: forward Euler of (7)"
+    )
+    motor: GainsTable = Field(description="gains of the motor observer")
+    load: GainsTable | None = Field(default=None, description="gains of the load observer; none on a rigid drive")
+
+    def build(self) -> Observers:
+        cls = OBSERVERS[self.discretisation]
+        return Observers(cls(**dict(self.motor)), None if self.load is None else cls(**dict(self.load)))
+
+
+_MOST_STEPS = 2e9
+"""Samples are counted in 32 bits."""
+
+
+class _RunTable(Table):
+    """The keys of a run from which its number of samples and the type of its numbers follow."""
+
+    duration: float = Field(default=20.0, gt=0.0, description="length of the run", json_schema_extra={"unit": "s"})
+    precision: Literal["float64", "float32"] = Field(default="float64", description="floating-point type of the run")
+
+    @property
+    def steps(self) -> int:
+        """Number of samples."""
+        return round(self.duration / self.sample_period)
+
+    @model_validator(mode="after")
+    def _long_enough(self) -> "_RunTable":
+        if self.sample_period > self.duration:
+            raise wrong(
+                f"sample_period {self.sample_period} s is longer than duration {self.duration} s; "
+                "it should be a small part of it"
+            )
+        if self.duration / self.sample_period > _MOST_STEPS:
+            raise wrong(
+                f"duration {self.duration} s holds more than {_MOST_STEPS:.0e} samples of {self.sample_period} s; "
+                "it should hold fewer"
+            )
+        if self.steps < 8:
+            raise wrong(
+                f"duration {self.duration} s holds only {self.steps} samples of {self.sample_period} s; "
+                "at least 8 are needed"
+            )
+        return self
+
+    def build(self) -> Run:
+        return Run(steps=self.steps, **{field.name: getattr(self, field.name) for field, _ in parameters(Run)})
+
+
+RunTable = table_for(Run, base=_RunTable)

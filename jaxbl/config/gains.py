@@ -1,0 +1,140 @@
+"""Tables of the commands that choose and judge observer gains: tune and verify."""
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from jaxbl.records.table import wrong
+
+from .experiment import ExcitationTable
+from .tables import Table
+
+
+class AlphaRatioTable(Table):
+    """Range of alpha / f⁺ that is searched, in equal ratios."""
+
+    start: float = Field(default=1.1, gt=1.0, le=1e9, description="least alpha / f⁺; no observer converges below 1")
+    stop: float = Field(default=100.0, gt=1.0, le=1e9, description="largest alpha / f⁺")
+
+
+class LambdaRatioTable(Table):
+    """Range of lambda / √f⁺ that is searched, in equal ratios."""
+
+    start: float = Field(default=0.3, gt=0.0, le=1e9, description="least lambda / √f⁺")
+    stop: float = Field(default=50.0, gt=0.0, le=1e9, description="largest lambda / √f⁺")
+
+
+class GainPairTable(Table):
+    """Gains of one observer."""
+
+    lambda_: float = Field(alias="lambda", ge=0.0, description="gain lambda", json_schema_extra={"unit": "√rad/s"})
+    alpha: float = Field(ge=0.0, description="gain alpha", json_schema_extra={"unit": "rad/s²"})
+
+
+class CompareTable(Table):
+    """Other gains that tuned ones are compared with."""
+
+    name: str = Field(min_length=1, description="how tables and figures call them")
+    motor: GainPairTable = Field(description="gains of the motor observer")
+    load: GainPairTable | None = Field(default=None, description="gains of the load observer; none on a rigid drive")
+
+
+TUNE_NAMES = ("tuned", "usual rule", "config")
+"""What a comparison of gains always holds."""
+
+
+class TuneTable(Table):
+    """How `jaxbl tune` chooses lambda and alpha; f⁺ is the bound that a pilot run of the study finds."""
+
+    objective: Literal["velocity", "torque"] = Field(
+        default="velocity", description="rms error over the last quarter of the run that is made least, worst over the seeds"
+    )
+    worst_over_uncertainty: bool = Field(
+        default=False,
+        description="worst also over the corners of inertias and viscous frictions (1 ± uncertainty.relative)",
+    )
+    margin_exact: float = Field(
+        default=1.1, ge=1.0, description="least lambda over what the exact condition asks at the true f⁺ along each run"
+    )
+    margin_alpha: float = Field(default=1.1, gt=1.0, description="least alpha over the true f⁺ along each run")
+    longest_convergence: float | None = Field(
+        default=None, gt=0.0, description="convergence time allowed; left out: the first three quarters of the run",
+        json_schema_extra={"unit": "s"},
+    )  # fmt: skip
+    alpha_ratio: AlphaRatioTable = Field(default_factory=AlphaRatioTable)
+    lambda_ratio: LambdaRatioTable = Field(default_factory=LambdaRatioTable)
+    num: int = Field(default=16, ge=3, le=1000, description="values of each gain in the coarse map and in each zoom")
+    refine: int = Field(default=2, ge=0, le=10, description="zooms around the best cell; each spans two cells of the last")
+    holdout: ExcitationTable | None = Field(  # pyright: ignore[reportInvalidTypeForm]
+        default=None,
+        description="a table as [excitation]: input that gains are compared on; left out: the study's, with other noise",
+    )
+    compare: list[CompareTable] = Field(default=[], description="named gains to compare with")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "TuneTable":
+        for key in ("alpha_ratio", "lambda_ratio"):
+            span = getattr(self, key)
+            if span.start >= span.stop:
+                raise wrong(f"{key}: start {span.start} should be less than stop {span.stop}")
+        if self.alpha_ratio.stop < self.margin_alpha:
+            raise wrong(
+                f"alpha_ratio: stop {self.alpha_ratio.stop} is below margin_alpha {self.margin_alpha}; it should be above it"
+            )
+        names = [other.name for other in self.compare]
+        for i, name in enumerate(names):
+            if name in names[:i] or name in TUNE_NAMES:
+                raise wrong(f"compare[{i}].name: '{name}' is taken; choose another one")
+        return self
+
+
+class RangeTable(Table):
+    """Values between two ends, evenly spaced on a log scale."""
+
+    start: float = Field(gt=0.0, description="first value")
+    stop: float = Field(gt=0.0, description="last value")
+    num: int = Field(ge=2, le=8192, description="number of values")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "RangeTable":
+        if self.start >= self.stop:
+            raise wrong(f"start {self.start} should be less than stop {self.stop}")
+        return self
+
+    def values(self) -> np.ndarray:
+        """The values, shape (num,)."""
+        return np.geomspace(self.start, self.stop, self.num)
+
+
+class MarkTable(GainPairTable):
+    """A pair of gains to be marked in the atlas, run once on the study's drive."""
+
+    name: str = Field(description="label")
+    side: Literal["motor", "load"] = Field(default="motor", description="observer that has these gains")
+
+
+class VerifyTable(Table):
+    """What `jaxbl verify` does besides the study's own points: the normalised error system, and marks."""
+
+    q: float | None = Field(default=None, gt=0.0, lt=1.0, description="q of condition (32); left out: its limit q → 0")
+    alpha_ratio: RangeTable = Field(
+        default_factory=lambda: RangeTable(start=1.02, stop=20.0, num=512), description="alpha / f_plus of the atlas"
+    )
+    lambda_ratio: RangeTable = Field(
+        default_factory=lambda: RangeTable(start=0.002, stop=25.0, num=512), description="lambda / √f_plus of the atlas"
+    )
+    damping: list[Annotated[float, Field(gt=0.0, le=1000.0)]] = Field(
+        default=[0.1, 0.3, 1.0],
+        description="dampings (friction / inertia × velocity error / f_plus) whose boundaries are simulated",
+    )
+    marks: list[MarkTable] = Field(default=[], description="gains to be marked")
+
+    @model_validator(mode="after")
+    def _possible(self) -> "VerifyTable":
+        if self.alpha_ratio.start <= 1.0:
+            raise wrong(
+                f"alpha_ratio.start {self.alpha_ratio.start} should exceed 1: no lambda converges where alpha is not above "
+                "f_plus"
+            )
+        return self

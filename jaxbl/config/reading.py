@@ -1,0 +1,214 @@
+"""Reading studies: TOML files, what they include, and one line about what is wrong with them."""
+
+import copy
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from jaxbl.errors import InputError
+from jaxbl.records.reader import read_log_table
+from jaxbl.records.table import Key, LogTable, brief, describe
+
+from .study import Config, nearest_path, numeric_paths
+
+
+def read_config(source: str | Path | Mapping[str, Any] | Config) -> Config:
+    """Read and validate a study from a TOML file, a mapping, or a config.
+
+    Raises:
+        InputError: unreadable file, bad TOML, unknown key, wrong type or range; one line that names file and key.
+    """
+    return source if isinstance(source, Config) else _validate(*_read(source))
+
+
+_UNGIVEN = {"lambda": 1.0, "alpha": 1.0}
+
+
+def read_model(source: str | Path | Mapping[str, Any] | Config) -> tuple[Config, frozenset[str]]:
+    """Read a study that is to be held against a log: `[excitation]` and the observers' gains may be missing.
+
+    Returns:
+        The study, with something harmless in place of what is missing; and what is: `excitation`, `observer.motor`,
+        `observer.load`.
+
+    Raises:
+        InputError: as :func:`read_config`.
+    """
+    if isinstance(source, Config):
+        return source, frozenset()
+    data, name, origins = _read(source)
+    missing = set()
+    if "excitation" not in data:
+        missing.add("excitation")
+        data["excitation"] = {"kind": "sine", "amplitude": 0.0, "frequency": 1.0}
+    drive, observer = data.get("drive"), data.setdefault("observer", {})
+    rigid = isinstance(drive, dict) and drive.get("kind") == "rigid"
+    for side in ("motor",) if rigid else ("motor", "load"):
+        if isinstance(observer, dict) and side not in observer:
+            missing.add(f"observer.{side}")
+            observer[side] = dict(_UNGIVEN)
+    return _validate(data, name, origins), frozenset(missing)
+
+
+def _read(source: str | Path | Mapping[str, Any]) -> tuple[dict[str, Any], str, dict[Key, str]]:
+    """Data of a study with what it includes, how messages call it, and the file that each key came from."""
+    if isinstance(source, Mapping):
+        name, data, folder = "config", copy.deepcopy(dict(source)), Path()
+    else:
+        path = Path(source)
+        name, data, folder = str(path), _load(path), path.parent
+        _localise(data, folder)
+    origins: dict[Key, str] = {}
+    chain = [] if isinstance(source, Mapping) else [Path(source).resolve()]
+    return _included(data, name, folder, chain, origins), name, origins
+
+
+def read_log_config(path: Path) -> tuple[LogTable, float | None]:
+    """The `[log]` table of a TOML file and the gear ratio, if it has one: a whole study, or nothing but `[log]`.
+
+    Raises:
+        InputError: unreadable file, bad TOML, unknown key, wrong type or range; one line that names file and key.
+    """
+    data = _included(_load(path), str(path), path.parent, [path.resolve()], {})
+    if set(data) <= {"title", "notes", "log"}:
+        return read_log_table(data.get("log"), str(path)), None
+    config, _ = read_model(path)
+    return config.log, None if config.drive.kind == "rigid" else config.drive.gear_ratio
+
+
+def _load(path: Path) -> dict[str, Any]:
+    """A TOML file as it stands."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a folder; a TOML file is needed") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: is not text in UTF-8; a TOML file is needed") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+
+
+def _localise(data: dict[str, Any], folder: Path) -> None:
+    """Make files that a config names relative to the folder it lies in."""
+    tune = data.get("tune")
+    for table in (data.get("excitation"), tune.get("holdout") if isinstance(tune, dict) else None):
+        if isinstance(table, dict) and isinstance(table.get("file"), str):
+            table["file"] = str((folder / table["file"]).resolve())
+
+
+def _included(data: dict[str, Any], name: str, folder: Path, chain: list[Path], origins: dict[Key, str]) -> dict[str, Any]:
+    """The data with the files that it includes merged in.
+
+    Args:
+        data: a config, of which `include` is taken out.
+        name: how messages call it.
+        folder: where the included files are looked for.
+        chain: files that led here.
+        origins: gets the file that each key of an included file came from.
+    """
+    files = data.pop("include", [])
+    files = [files] if isinstance(files, str) else files
+    if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
+        raise InputError(f"{name}: include: should be a file name or an array of them, not {brief(files)}")
+    merged: dict[str, Any] = {}
+    for file in files:
+        path = folder / file
+        if not path.exists():
+            raise InputError(f"{name}: include: {path}: no such file")
+        if path.resolve() in chain:
+            raise InputError(f"{name}: include: {path} includes this file in turn; files should not include one another")
+        inner = _load(path)
+        _localise(inner, path.parent)
+        found: dict[Key, str] = {}
+        inner = _included(inner, str(path), path.parent, [*chain, path.resolve()], found)
+        _merge(merged, inner, origins, {key: str(path) for key in _keys(inner)} | found)
+    _merge(merged, data, origins, dict.fromkeys(_keys(data), name))
+    return merged
+
+
+def _keys(data: Any, key: Key = ()) -> Iterator[Key]:
+    """Places of everything in a config."""
+    pairs = data.items() if isinstance(data, Mapping) else enumerate(data) if isinstance(data, list) else ()
+    for name, value in pairs:
+        yield (*key, name)
+        yield from _keys(value, (*key, name))
+
+
+def _merge(into: dict[str, Any], data: dict[str, Any], origins: dict[Key, str], new: dict[Key, str], key: Key = ()) -> None:
+    """Put the keys of `data` over those of `into`, and `new` over their `origins`."""
+    for name, value in data.items():
+        here, old = (*key, name), into.get(name)
+        origins[here] = new[here]
+        # a table of another kind is another table
+        if (
+            isinstance(old, dict)
+            and isinstance(value, dict)
+            and all(value.get(tag, old.get(tag)) == old.get(tag) for tag in ("kind", "law"))
+        ):
+            _merge(old, value, origins, new, here)
+        else:
+            into[name] = copy.deepcopy(value)
+            origins |= {place: file for place, file in new.items() if place[: len(here)] == here}
+
+
+def _validate(data: dict[str, Any], name: str = "", origins: Mapping[Key, str] | None = None) -> Config:
+    try:
+        return Config.model_validate(data)
+    except ValidationError as error:
+        place, text = _describe(error)
+        # the file that the key came from, where that is not the one asked for
+        while place and origins is not None and place not in origins:
+            place = place[:-1]
+        name = name if origins is None else origins.get(place, name)
+        raise InputError(f"{name}: {text}" if name else text) from None
+
+
+_UNIONS = {("drive",): 1, ("transmission",): 1, ("excitation",): 1, ("effects",): 2, ("tune", "holdout"): 2}
+"""Unions, and how far into a location pydantic puts the tag of their member."""
+
+
+def _describe(error: ValidationError) -> tuple[Key, str]:
+    """The first error: the key that is wrong, and one line that says so."""
+    location = list(error.errors()[0]["loc"])
+    for union, tag in _UNIONS.items():
+        if tuple(location[: len(union)]) == union and len(location) > tag:
+            del location[tag]
+    if location[:1] == ["axes"] and "values" in location:
+        del location[4:]  # the member of the union that came last
+    if location[:1] == ["figures"] and "where" in location:
+        del location[4:]
+    return describe(error, location)
+
+
+def with_values(config: Config, values: Mapping[str, Any]) -> Config:
+    """A copy of the config with other values at some dotted paths.
+
+    Raises:
+        InputError: a path that does not exist (the nearest valid one is named), or a value out of range.
+    """
+    data = config.resolved()
+    known = numeric_paths(config)
+    for path, value in values.items():
+        if path not in known:
+            raise InputError(f"unknown path '{path}'; {nearest_path(path, known)}")
+        section, *keys = path.split(".")
+        if section == "effects":
+            kind, _, key = path.removeprefix("effects.").rpartition(".")
+            kinds = [effect.kind for effect in config.effects]
+            target = data["effects"][int(kind) if kind.isdigit() else kinds.index(kind)]
+        else:
+            *tables, key = keys
+            target = data.setdefault(section, {})
+            for table in tables:
+                target = target.setdefault(table, {})
+        if type(target.get(key)) is int and isinstance(value, float) and value.is_integer():
+            value = int(value)  # a whole number from start, stop and num
+        target[key] = value
+    return _validate(data)

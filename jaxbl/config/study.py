@@ -1,0 +1,209 @@
+"""The whole study: its tables, what they ask of each other, and the experiment that they describe.
+
+What the config says is found again in the experiment under the same dotted path.
+"""
+
+# pyright: reportInvalidTypeForm=false
+# types of keys are made as the module is imported
+
+import difflib
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import tomli_w
+from pydantic import Field, model_validator
+
+from jaxbl.drive.effects import EFFECTS
+from jaxbl.drive.parameters import Parameter, as_arrays
+from jaxbl.records.table import LogTable, wrong
+from jaxbl.simulate import Experiment
+
+from .experiment import (
+    DriveTable,
+    EffectTable,
+    EncodersTable,
+    EquivalentControlTable,
+    ExcitationTable,
+    IdentifierTable,
+    InitialTable,
+    ObserverTable,
+    RunTable,
+    TransmissionTable,
+)
+from .gains import TuneTable, VerifyTable
+from .logs import IdentifyTable, UncertaintyTable
+from .sweep import AxisTable, FigureTable, SweepTable
+from .tables import Table
+
+
+class Config(Table):
+    """A study: everything that a run needs, validated."""
+
+    include: str | list[str] = Field(
+        default=[],
+        exclude=True,
+        description="TOML files, relative to this one, whose tables are merged in key by key: keys of this file win, those "
+        "of later files over those of earlier ones; arrays, and tables of another kind or law, are replaced as a whole",
+    )
+    title: str = Field(default="", description="headline of the report")
+    notes: list[str] = Field(default=[], description="remarks of the author, repeated in summary and report")
+    drive: DriveTable = Field(description="what is driven")
+    transmission: TransmissionTable | None = Field(default=None, description="law of the gear; none on a rigid drive")
+    effects: list[EffectTable] = Field(default=[], description="effects beyond the nominal drive")
+    initial: InitialTable = Field(default_factory=InitialTable, description="state at t = 0")
+    excitation: ExcitationTable = Field(description="input torque")
+    encoders: EncodersTable = Field(default_factory=EncodersTable, description="position sensors")
+    observer: ObserverTable
+    equivalent_control: EquivalentControlTable = Field(
+        default_factory=EquivalentControlTable, description="low-pass on the equivalent control"
+    )
+    identifier: IdentifierTable = Field(default_factory=IdentifierTable, description="recursive least squares")
+    run: RunTable = Field(default_factory=RunTable)
+    sweep: SweepTable = Field(default_factory=SweepTable)
+    uncertainty: UncertaintyTable = Field(default_factory=UncertaintyTable)
+    tune: TuneTable | None = Field(default=None)
+    log: LogTable = Field(default_factory=LogTable)
+    identify: IdentifyTable = Field(default_factory=IdentifyTable)
+    verify: VerifyTable = Field(default_factory=VerifyTable)
+    axes: list[AxisTable] = Field(default=[])
+    figures: list[FigureTable] = Field(default=[])
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Config":
+        if self.include:
+            raise wrong("include is for read_config, which merges the files in")
+        _check_sides(self)
+        _check_effects(self)
+        known = numeric_paths(self)
+        for path in self.uncertainty.exact:
+            if path not in known and path != "drive.gear_ratio":
+                raise wrong(f"uncertainty.exact: unknown path '{path}'; {nearest_path(path, known)}")
+        return self
+
+    def build(self) -> Experiment:
+        """The experiment that the config describes, with Python numbers as leaves."""
+        rigid = self.drive.kind == "rigid"
+        return Experiment(
+            drive=self.drive.build(),
+            transmission=None if self.transmission is None else self.transmission.build(),
+            effects=tuple(effect.build() for effect in self.effects),
+            initial=self.initial.build(),
+            excitation=self.excitation.build(),
+            encoders=self.encoders.build(),
+            observer=self.observer.build(),
+            equivalent_control=self.equivalent_control.build(),
+            identifier=None if rigid else self.identifier.build(),
+            run=self.run.build(),
+        )
+
+    def resolved(self) -> dict[str, Any]:
+        """The whole config as plain data, defaults filled in."""
+        return self.model_dump(by_alias=True, exclude_none=True)
+
+    def to_toml(self) -> str:
+        """The whole config as TOML that :func:`read_config` takes."""
+        return tomli_w.dumps(self.resolved())
+
+
+def _check_sides(config: Config) -> None:
+    """A rigid drive has no transmission and no load; a two-inertia drive needs both, and steps that resolve the gear."""
+    rigid = config.drive.kind == "rigid"
+    if rigid and config.transmission is not None:
+        raise wrong("[transmission] has no meaning on a rigid drive; remove it, or use drive.kind = 'two_inertia'")
+    if not rigid and config.transmission is None:
+        raise wrong("[transmission] is missing: a two_inertia drive needs a law")
+    others = () if config.tune is None else config.tune.compare
+    gains = {"observer": config.observer} | {f"tune.compare[{i}]": other for i, other in enumerate(others)}
+    for name, table in gains.items():
+        if rigid and table.load is not None:
+            raise wrong(f"{name}.load has no meaning on a rigid drive; remove it")
+        if not rigid and table.load is None:
+            raise wrong(f"{name}.load is missing: a two_inertia drive has a load observer")
+    for i, mark in enumerate(config.verify.marks):
+        if rigid and mark.side == "load":
+            raise wrong(f"verify.marks[{i}].side: 'load' has no meaning on a rigid drive; it should be 'motor'")
+    if config.transmission is not None:
+        rate = config.transmission.stiffness
+        rate *= 1.0 / config.drive.motor_inertia + config.drive.gear_ratio**2 / config.drive.load_inertia
+        # the scheme is stable while step * frequency < 2
+        least = math.floor(config.run.sample_period * math.sqrt(rate) / 2.0) + 1
+        if config.run.substeps < least:
+            raise wrong(
+                f"run.substeps: {config.run.substeps} plant steps a sample are unstable for this stiffness and "
+                f"sample_period; at least {least} are needed, ten times as many for accuracy"
+            )
+
+
+def _check_effects(config: Config) -> None:
+    """Effects act on what the drive has, and leave each side some inertia."""
+    rigid = config.drive.kind == "rigid"
+    for i, effect in enumerate(config.effects):
+        place = effect.kind.partition(".")[0]
+        if rigid and (place == "transmission" or (place == "load" and "motor" in EFFECTS[effect.kind].places)):
+            raise wrong(
+                f"effects[{i}]: {effect.kind} has no meaning on a rigid drive; motor.* and actuator.* effects act on it"
+            )
+    for side in ("motor",) if rigid else ("motor", "load"):
+        nominal = getattr(config.drive, f"{side}_inertia")
+        heavier = [effect for effect in config.effects if effect.kind.partition(".")[0] == side]
+        added = [float(effect.build().added_inertia()) for effect in heavier]
+        if (total := nominal + sum(added)) <= 0.0:
+            kind = next(effect.kind for effect, inertia in zip(heavier, added, strict=True) if inertia < 0.0)
+            raise wrong(
+                f"effects: {kind} leaves a total inertia of {total:g} on the {side}; it should stay above -{nominal:g}"
+            )
+
+
+def numeric_paths(config: Config) -> dict[str, Parameter]:
+    """Dotted paths of everything that an axis may vary in this config, with unit and description."""
+    found: dict[str, Parameter] = {}
+    for section in ("drive", "transmission", "initial", "excitation", "encoders", "observer", "equivalent_control",
+                    "identifier", "run"):  # fmt: skip
+        table = getattr(config, section)
+        if table is not None:
+            found |= dict(_paths(table, section))
+    kinds = [effect.kind for effect in config.effects]
+    for i, effect in enumerate(config.effects):
+        label = effect.kind if kinds.count(effect.kind) == 1 else str(i)
+        found |= dict(_paths(effect, f"effects.{label}"))
+    if config.drive.kind == "rigid":
+        return {
+            path: known
+            for path, known in found.items()
+            if path.startswith("effects.") or ("load" not in path and not path.startswith("identifier."))
+        }
+    return found
+
+
+_FIXED = ("kind", "law", "file", "time_column", "torque_column", "precision")
+"""Keys that no axis varies."""
+
+
+def _paths(table: Table, prefix: str) -> Iterator[tuple[str, Parameter]]:
+    for name, field in type(table).model_fields.items():
+        value = getattr(table, name)
+        path = f"{prefix}.{field.alias or name}"
+        if isinstance(value, Table):
+            yield from _paths(value, path)
+        elif name not in _FIXED:
+            extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+            yield path, Parameter(str(extra.get("unit", "")), field.description or "")
+
+
+def nearest_path(path: str, known: Mapping[str, Parameter]) -> str:
+    """A hint that names the nearest valid path, or all of them where none is near."""
+    close = difflib.get_close_matches(path, list(known), n=1, cutoff=0.3)
+    return f"nearest valid path: '{close[0]}'" if close else f"valid paths: {', '.join(known)}"
+
+
+def precision(config: Config) -> Any:
+    """Context in which the config's floating-point type is JAX's default."""
+    return jax.enable_x64(config.run.precision == "float64")
+
+
+def prepare(config: Config) -> Experiment:
+    """The config's experiment with array leaves of its precision; call inside :func:`precision`."""
+    return as_arrays(config.build(), jnp.dtype(config.run.precision))

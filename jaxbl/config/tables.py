@@ -1,0 +1,64 @@
+"""Tables of a study: strict TOML tables, generated from the modules that compute with what they hold.
+
+A key, its unit and its range are so written once, in the module.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Union
+
+from pydantic import Field, create_model
+
+from jaxbl.drive.parameters import key_of, parameters
+from jaxbl.records.table import StrictTable
+
+
+class Table(StrictTable):
+    """A table that may build what it describes."""
+
+    factory: ClassVar[Callable[..., Any]]
+    """What the table builds (generated tables)."""
+
+    if TYPE_CHECKING:
+        # keys of generated tables
+        def __getattr__(self, name: str) -> Any: ...
+
+    def build(self) -> Any:
+        """The module that a generated table stands for."""
+        names = {name for name in type(self).model_fields if name not in ("kind", "law")}
+        return self.factory(**{name: getattr(self, name) for name in names})
+
+
+def table_for(module: type, factory: Callable[..., Any] | None = None, base: type[Table] = Table, **tag: str) -> type[Table]:
+    """Generate the config table of a module class from its declared parameters.
+
+    Args:
+        module: class with fields declared by :func:`jaxbl.drive.parameters.parameter` or `option`.
+        factory: what the table builds; left out: the class.
+        base: table with further keys.
+        **tag: a key with one value, by which a table is told from others (`kind="sine"`).
+    """
+    fields: dict[str, Any] = {key: (Literal[value], ...) for key, value in tag.items()}
+    for field, known in parameters(module):
+        kind: Any = field.type if field.metadata.get("static") else float
+        optional = field.default is None
+        fields[field.name] = (
+            kind | None if optional else kind,
+            Field(
+                default=... if field.default is dataclasses.MISSING else field.default,
+                alias=key_of(field.name) if key_of(field.name) != field.name else None,
+                description=known.doc,
+                json_schema_extra={"unit": known.unit} if known.unit else None,
+                ge=known.minimum,
+                gt=known.above,
+                le=known.maximum,
+            ),
+        )
+    model = create_model(module.__name__, __base__=base, __doc__=module.__doc__, **fields)
+    model.factory = factory or module
+    return model
+
+
+def tagged(tables: list[type[Table]], key: str) -> Any:
+    """The type of a table that is one of several, told apart by the value of a key (`kind`, `law`)."""
+    return Annotated[Union[tuple(tables)], Field(discriminator=key)]  # noqa: UP007
