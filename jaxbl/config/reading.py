@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from jaxbl.errors import InputError
 from jaxbl.records.reader import read_log_table
-from jaxbl.records.table import Key, LogTable, brief, describe
+from jaxbl.records.table import Key, LogTable, brief, first_error
 
 from .study import Config, nearest_path, numeric_paths
 
@@ -184,7 +184,7 @@ def _describe(error: ValidationError) -> tuple[Key, str]:
         del location[4:]  # the member of the union that came last
     if location[:1] == ["figures"] and "where" in location:
         del location[4:]
-    return describe(error, location)
+    return first_error(error, location)
 
 
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:

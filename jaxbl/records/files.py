@@ -21,17 +21,22 @@ from .table import nearest
 _KINDS = "text (CSV and the like), Parquet, MATLAB (.mat) and JSON can be read"
 
 
-class Columns:
-    """The columns of a log file.
+class LogFile:
+    """A log file as it is being read.
 
     Attributes:
         path: the file.
         columns: name -> values, one-dimensional; numbers in place of names where the file has none.
+        notes: what was done to the log, and what is odd about it, in sentences.
     """
 
     def __init__(self, path: Path, columns: dict[str | int, Any]):
-        self.path = path
-        self.columns = columns
+        self.path, self.columns = path, columns
+        self.notes: list[str] = []
+
+    def wrong(self, text: str) -> InputError:
+        """What to raise where something is wrong with the file."""
+        return InputError(f"{self.path}: {text}")
 
     def name(self, column: str | int, channel: str = "") -> str | int:
         """The name of a column that is given by name or number.
@@ -46,14 +51,14 @@ class Columns:
             if column < len(names):
                 return names[column]
             count = f"has {len(names)} columns, numbered 0 to {len(names) - 1}" if len(names) != 1 else "has only column 0"
-            raise InputError(f"{self.path}: no column {column}: the file {count}")
+            raise self.wrong(f"no column {column}: the file {count}")
         key = f"; [log] {channel} can name another" if channel else ""
         if all(isinstance(name, int) for name in names):
-            raise InputError(
-                f"{self.path}: no column '{column}': the file has no header; give the column's number, 0 to {len(names) - 1}"
+            raise self.wrong(
+                f"no column '{column}': the file has no header; give the column's number, 0 to {len(names) - 1}"
                 + (f", as [log] {channel}" if channel else "")
             )
-        raise InputError(f"{self.path}: no column '{column}'; {nearest(column, map(str, names))}{key}")
+        raise self.wrong(f"no column '{column}'; {nearest(column, map(str, names))}{key}")
 
     def raw(self, column: str | int, channel: str = "") -> np.ndarray:
         """A column as it stands, shape (rows,)."""
@@ -74,11 +79,23 @@ class Columns:
             cell = np.asarray(given, dtype=object)[row]
             empty = cell is None or (isinstance(cell, float) and np.isnan(cell))
             what = "empty or not a number" if empty else repr(cell)
-            raise InputError(f"{self.path}: column {name!r}, data row {row + 1} is {what}; it should be a finite number")
+            raise self.wrong(f"column {name!r}, data row {row + 1} is {what}; it should be a finite number")
+        return values
+
+    def same_length(self, values: np.ndarray, length: int, column: str | int) -> np.ndarray:
+        """The values of a column, which should be as many as there are time stamps.
+
+        Raises:
+            InputError: they are not.
+        """
+        if len(values) != length:
+            raise self.wrong(
+                f"column {column!r} has {len(values)} values and the time {length}; they should be equally many"
+            )
         return values
 
 
-def read_columns(path: Path) -> Columns:
+def read_log_file(path: Path) -> LogFile:
     """Read all columns of a log file; the suffix and the first bytes say which kind it is.
 
     Raises:
@@ -96,11 +113,11 @@ def read_columns(path: Path) -> Columns:
         raise InputError(f"{path}: is empty; {_KINDS}")
     suffix = path.suffix.lower()
     if content.startswith(b"PAR1"):
-        return Columns(path, _parquet(path))
+        return LogFile(path, _parquet(path))
     if content.startswith(b"\x89HDF"):
-        return Columns(path, _hdf5(path))
+        return LogFile(path, _hdf5(path))
     if suffix == ".mat":
-        return Columns(path, _matlab(path))
+        return LogFile(path, _matlab(path))
     if b"\0" in content:
         raise InputError(f"{path}: is not a log of a known kind; {_KINDS}")
     try:
@@ -108,8 +125,8 @@ def read_columns(path: Path) -> Columns:
     except UnicodeDecodeError:
         text = content.decode("latin-1")  # a degree sign in a header of an old program
     if suffix == ".json" or text.lstrip()[0] in "[{":
-        return Columns(path, _json(path, text))
-    return Columns(path, _text(path, text))
+        return LogFile(path, _json(path, text))
+    return LogFile(path, _text(path, text))
 
 
 def _parquet(path: Path) -> dict[str | int, Any]:

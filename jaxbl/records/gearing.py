@@ -1,20 +1,24 @@
 """Motor against load position: ratio, skew, lost motion."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from . import lost_motion, quality
+from . import lost_motion
+from .least_squares import jackknifed
 from .lost_motion import Flank, LostMotion
-from .quality import SHORTEST, Array, Slices
+from .rigid_body import direction_of
+from .signal_quality import SHORTEST, ChannelFigures, bandwidth, interpolated, longest, low_passed, settled
 
 HARMONICS = 8
-"""Terms of the series over position that takes out what repeats with it."""
-
-
-UNLIKE = 0.2
-"""Share of the motor's motion that the load's leaves unexplained, beyond which they are not said to go together."""
+"""Terms of the cosine series over position: eccentricity and the first harmonics of gear and encoder errors."""
+UNRELATED = 0.2
+"""Share of the motor's motion that the load's leaves unexplained, beyond which the two count as unrelated."""
+WIDE_TWIST = 0.25
+"""Share of the motor's motion that the twist takes, beyond which the load follows the motor only loosely."""
+_MIXTURES = np.radians([0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0])
+"""Mixtures of velocity and acceleration, each over its rms, whose sign is tried as that of the transmitted torque."""
 
 
 @dataclass(frozen=True)
@@ -26,17 +30,17 @@ class Gearing:
         ratio_error: standard error; beside a twist as large as the motion it takes that share of the ratio.
         lost_motion: shift of theta_e against theta_s from flank to flank of the gap, at the motor; rad or m.
         lost_motion_error: standard error.
-        skew: by how much the stamps of theta_s are later than its readings, s, against those of theta_e; None where it
-            cannot be told.
+        skew: by how much the stamps of theta_s are later than its readings, s, against those of theta_e; None where the
+            log does not show it.
         skew_error: standard error.
-        residual: rms of what is left, at the motor, over the rms of theta_e about its mean.
+        residual: rms of the residual, at the motor, over the rms of theta_e about its mean.
         lost_motion_interval: 95 %.
-        flank: what tells the flank: the direction of motion, or a load that changes sides.
-        flank_changes: on which the lost motion rests.
-        flank_times: of these, s from the first sample, where the load made them.
-        lost_motion_range: what a tenth of the places falls below, and a tenth exceeds, where the load changes sides.
+        flank: what decides the flank: the direction of motion, or the sign of the load torque.
+        flank_changes: number of changes of the flank, from which the lost motion is found.
+        flank_times: times of these, s from the first sample, where the load made them.
+        lost_motion_range: 10 % and 90 % quantiles over the positions, where the load torque changes its sign.
         twist: range of theta_e - ratio theta_s, with the ratio that is expected, if one is; at the motor.
-        twist_residual: rms of the twist that lost motion and wind-up leave over the rms of theta_e about its mean.
+        twist_residual: rms of the twist that lost motion and wind-up do not explain, over the rms of theta_e about its mean.
         least_twist: range of the twist with the ratio that was found.
         motion: range of theta_e.
     """
@@ -60,8 +64,8 @@ class Gearing:
 
     @property
     def wide(self) -> bool:
-        """Whether the twist is of the size of the motion whatever the ratio, so that the load hardly follows the motor."""
-        return min(self.twist, self.least_twist) > WIDE * self.motion
+        """Whether the twist is a large part of the motion whatever the ratio, so that the load follows only loosely."""
+        return min(self.twist, self.least_twist) > WIDE_TWIST * self.motion
 
     def lost_motion_text(self, unit: str) -> str:
         """Value, error and interval; in degrees as well."""
@@ -76,7 +80,7 @@ class Gearing:
         return f"{text})"
 
     def stands_out(self, noise: float) -> bool:
-        """Whether the lost motion is more than its error and the noise (:func:`seen`)."""
+        """Whether the lost motion is more than its error and the noise (:func:`twist_noise`)."""
         return self.lost_motion > max(4.0 * self.lost_motion_error, noise)
 
 
@@ -85,23 +89,23 @@ def _decimals(error: float) -> int:
     return int(np.clip(1 - np.floor(np.log10(error)), 0, 9)) if 0.0 < error < np.inf else 6
 
 
-def gearing(
-    times: Array,
-    motor: Array,
-    load: Array,
-    segments: Slices,
+def fit_gearing(
+    times: np.ndarray,
+    motor: np.ndarray,
+    load: np.ndarray,
+    segments: Sequence[slice],
     period: float,
     *,
     expected: float | None = None,
     turn: float | None = None,
 ) -> Gearing | None:
-    """Regress motor on load position, its velocity, acceleration and flank; None where the motion does not tell.
+    """Regress motor on load position, its velocity, acceleration and flank; None where the motion is too small.
 
     A delay of the load's stamps adds to theta_e what is proportional to the velocity, lost motion what has the sign of the
-    transmitted torque; so they part wherever the speed varies. That sign is taken as the sign of a mixture of velocity
-    (friction) and acceleration (inertia) of the load, the one that explains most. Viscous friction at the load winds up the
-    shaft in proportion to velocity too, and cannot be told from a delay. Errors of the encoders and the gear that repeat
-    with position (eccentricity) are taken out of both by a cosine series over the range of theta_s.
+    transmitted torque; so they can be separated wherever the speed varies. That sign is taken as the sign of a mixture of
+    velocity (friction) and acceleration (inertia) of the load, the one that explains most. Viscous friction at the load
+    winds up the shaft in proportion to velocity too, and cannot be separated from a delay. Errors of the encoders and the
+    gear that repeat with position (eccentricity) are removed from both by a cosine series over the range of theta_s.
 
     Args:
         times: shape (samples,), s.
@@ -109,30 +113,18 @@ def gearing(
         load: theta_s, shape (samples,).
         segments: contiguous parts.
         period: s.
-        expected: ratio of motor over load motion, as far as it is known; lost motion is then that beside it.
+        expected: ratio of motor over load motion, if it is known; lost motion is then found with it.
         turn: of the load, after which gear and encoders repeat; None on a linear axis.
     """
-    longest = max(segments, key=lambda s: s.stop - s.start)
-    width = _width(load[longest], period)
+    part = longest(segments)
+    width = _width(load[part], period)
     usable = [s for s in segments if s.stop - s.start >= SHORTEST]
     if width == 0.0 or not usable:
         return None
-    skew, known = 0.0, True
-    fit = None
-    for _ in range(5):
-        fit = _gear_fit(times, motor, load, usable, period, 4.0 * width, skew)
-        if fit is None:
-            return None
-        _, _, found, _ = fit
-        step = float(found[1] / found[0])
-        if not known or abs(step) < 1e-3 * period:
-            break
-        skew += step
-        # a quarter of the fastest period: no delay of an encoder, but a load that moves on its own
-        if abs(skew) > 0.25 / width:
-            skew, known = 0.0, False
-    assert fit is not None
-    target, rows, found, errors = fit
+    fit = _fit_with_skew(times, motor, load, usable, period, width)
+    if fit is None:
+        return None
+    target, rows, found, errors, skew, known = fit
     # the ratio is that of the whole motion, whatever repeats within it
     slopes, slope_errors = _fitted(target, rows[:, :4])
     if not np.isfinite(slopes).all():
@@ -140,27 +132,27 @@ def gearing(
     left = target - rows[:, :4] @ slopes
     spread = float(np.std(target))
     residual = float(np.sqrt(np.mean(left**2))) / spread if spread else np.inf
-    # encoders do not wait for long; and at one speed, to and fro, a delay looks like lost motion
+    # encoders are not late by many periods; and at one speed, to and fro, a delay looks like lost motion
     alike = abs(float(rows[:, 1] @ rows[:, 2])) / float(np.linalg.norm(rows[:, 1]) * np.linalg.norm(rows[:, 2]) + 1e-300)
-    known = known and residual < UNLIKE and abs(skew) < 10.0 * period and alike < 0.97
-    # what is not clearly there is better not undone
+    known = known and residual < UNRELATED and abs(skew) < 10.0 * period and alike < 0.97
+    # only a significant skew is undone
     undone = skew if known and abs(skew) > 4.0 * errors[1] / abs(found[0]) else 0.0
     ratio = float(slopes[0]) if expected is None else expected
     aligned = [_aligned(times[s], load[s], undone) for s in usable]
     motor_there = np.concatenate([motor[s] for s in usable])
     load_there, motion = np.concatenate(aligned), float(np.ptp(motor_there))
     twist, least = (float(np.ptp(motor_there - r * load_there)) for r in (ratio, float(slopes[0])))
-    wide = min(twist, least) > WIDE * motion
+    wide = min(twist, least) > WIDE_TWIST * motion
     # a load that sticks and slips, or a coarse encoder, shows its direction no sooner than the motor does
-    slow = min(width, _width(motor[longest], period) or width)
+    slow = min(width, _width(motor[part], period) or width)
     lost = _lost_motion(times, motor, aligned, usable, period, 4.0 * slow, ratio, turn, wide=wide)
     if lost is None:
         value, error = 2.0 * float(found[2]) * float(np.sign(found[0])), 2.0 * float(errors[2])
         lost = LostMotion.unsure(value, error)
-    # how the gap is crossed is not modelled: what that was found to be worth, on motions of several frequencies
+    # how the gap is crossed is not modelled: 0.5 % of the gap, as found on motions of several frequencies
     speed = float(np.sqrt(np.mean(rows[:, 1] ** 2)))
     skew_error = float(np.hypot(errors[1], 0.005 * lost.value / speed) / abs(found[0]))
-    # beside a gap as large as the motion nothing is told of delays
+    # with a gap as large as the motion a delay cannot be found
     known = known and not wide
     return Gearing(
         ratio=float(slopes[0]),
@@ -182,37 +174,56 @@ def gearing(
     )
 
 
-def _width(positions: Array, period: float) -> float:
+def _fit_with_skew(
+    times: np.ndarray, motor: np.ndarray, load: np.ndarray, segments: Sequence[slice], period: float, width: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, bool] | None:
+    """Repeats :func:`_gear_fit` until the skew of the load stays; its results, the skew, and whether there is one."""
+    skew, known, fit = 0.0, True, None
+    # converges quadratically: five steps are ample
+    for _ in range(5):
+        fit = _gear_fit(times, motor, load, segments, period, 4.0 * width, skew)
+        if fit is None:
+            return None
+        step = float(fit[2][1] / fit[2][0])
+        if not known or abs(step) < 1e-3 * period:
+            break
+        skew += step
+        # a quarter of the fastest period: no delay of an encoder, but a load that moves on its own
+        if abs(skew) > 0.25 / width:
+            skew, known = 0.0, False
+    assert fit is not None
+    return *fit, skew, known
+
+
+def _width(positions: np.ndarray, period: float) -> float:
     """Bandwidth of the velocity, Hz; of motion that is slower than a spectrum shows, a few times one over its duration."""
-    width = quality.bandwidth(positions, period, slope=True)
+    width = bandwidth(positions, period, slope=True)
     slow = 10.0 / (len(positions) * period)
     if width or len(positions) < SHORTEST:
         return width
-    left = positions - quality.low_passed(positions, 4.0 * slow, period)
-    return slow if np.std(left) < 0.03 * np.ptp(positions) else 0.0
+    fast = positions - low_passed(positions, 4.0 * slow, period)
+    return slow if np.std(fast) < 0.03 * np.ptp(positions) else 0.0
 
 
-def _fitted(target: Array, rows: Array) -> tuple[Array, Array]:
-    """As :func:`quality.jackknifed`; without the velocity, in column 1, where it is nothing but the flank."""
-    found, errors = quality.jackknifed(target, rows)
+def _fitted(target: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As :func:`jackknifed`; without the velocity, in column 1, where it is nothing but the flank."""
+    found, errors = jackknifed(target, rows)
     if np.isfinite(found).all():
         return found, errors
-    found, errors = quality.jackknifed(target, np.delete(rows, 1, axis=1))
+    found, errors = jackknifed(target, np.delete(rows, 1, axis=1))
     return np.insert(found, 1, 0.0), np.insert(errors, 1, np.inf)
 
 
-def _aligned(times: Array, load: Array, skew: float) -> Array:
+def _aligned(times: np.ndarray, load: np.ndarray, skew: float) -> np.ndarray:
     """Load positions at the times of the motor's."""
-    from scipy.interpolate import CubicSpline
-
-    return CubicSpline(times, load)(np.clip(times + skew, times[0], times[-1])) if skew else load
+    return interpolated(times, load, times + skew) if skew else load
 
 
 def _lost_motion(
-    times: Array,
-    motor: Array,
-    aligned: list[Array],
-    segments: Slices,
+    times: np.ndarray,
+    motor: np.ndarray,
+    aligned: list[np.ndarray],
+    segments: Sequence[slice],
     period: float,
     cutoff: float,
     ratio: float,
@@ -220,7 +231,7 @@ def _lost_motion(
     *,
     wide: bool,
 ) -> LostMotion | None:
-    """By the load's changes of side, where there are any, else by the direction of motion.
+    """By changes of the load torque's sign, where there are any, else by the direction of motion.
 
     Args:
         times: shape (samples,), s.
@@ -228,17 +239,16 @@ def _lost_motion(
         aligned: theta_s without its skew, of each segment.
         segments: contiguous parts.
         period: s.
-        cutoff: of the low-pass that velocities are taken behind, Hz.
+        cutoff: of the low-pass before differences are taken, Hz.
         ratio: of motor over load motion.
         turn: of the load.
-        wide: whether the twist is about as large as the motion; what repeats with position cannot be told from it then.
+        wide: whether the twist is a large part of the motion; errors that repeat with position cannot be separated then.
     """
     parts = []
     for s, load in zip(segments, aligned, strict=True):
-        smooth = quality.low_passed(load, cutoff, period)
+        smooth = low_passed(load, cutoff, period)
         velocity = np.gradient(smooth, period)
-        edge = min(round(1.0 / (cutoff * period)), len(smooth) // 8) + 2
-        cut = slice(edge, len(smooth) - edge)
+        cut = settled(len(smooth), cutoff, period)
         parts.append(
             np.stack([times[s], motor[s] - ratio * load, smooth, velocity, np.gradient(velocity, period)], axis=1)[cut]
         )
@@ -274,7 +284,7 @@ def _lost_motion(
             best = (size, flank, clear)
     found = None if best is None else lost_motion.by_motion(twist, terms, best[1], best[2])
     if wide and best is not None and found is not None:
-        # a shaft winds up as its load is moved: part of this shift, and in so few cycles nothing tells how much
+        # a shaft winds up as its load is moved: part of this shift, and in so few cycles it is unknown how much
         alone = lost_motion.by_motion(twist, terms[:, :1], best[1], best[2])
         return found if alone is None else found.between(alone)
     if best is not None and not wide and (found is None or found.error > 0.25 * abs(found.value)):
@@ -285,52 +295,46 @@ def _lost_motion(
             found = still
     if wide or (found is not None and found.residual < 0.25 * abs(found.value)):
         return found
-    # what two flanks by the direction of motion leave is no less than they are
+    # two flanks by the direction of motion explain little: the load may change them
     return lost_motion.by_load(time, twist, position, velocity, turn) or found
 
 
-def _widened(at: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
+def _widened(at: np.ndarray, by: int) -> np.ndarray:
     """True within some samples of where it is."""
     count = np.concatenate([[0], np.cumsum(at)])
     index = np.arange(len(at))
     return count[np.minimum(index + by + 1, len(at))] > count[np.maximum(index - by, 0)]
 
 
-def seen(ratio: float, motor: quality.Channel, load: quality.Channel) -> float:
-    """Twist that stands out of noise and resolution of both encoders, rms, at the motor."""
+def twist_noise(ratio: float, motor: ChannelFigures, load: ChannelFigures) -> float:
+    """Noise and resolution of both encoders together, rms, at the motor, in their unit."""
     noise = [motor.noise, ratio * load.noise, motor.resolution / 12.0**0.5, ratio * load.resolution / 12.0**0.5]
     return float(np.hypot.reduce(noise))
 
 
-WIDE = 0.25
-"""Share of the motor's motion that the twist takes, beyond which motor and load are not said to move alike."""
-
-
-_MIXTURES = np.radians([0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0])
-"""From velocity alone to acceleration alone, each over its rms."""
-
-
 def _gear_fit(
-    times: Array, motor: Array, load: Array, segments: Slices, period: float, cutoff: float, skew: float
-) -> tuple[Array, Array, Array, Array] | None:
-    """One regression of :func:`gearing` at a given skew.
+    times: np.ndarray,
+    motor: np.ndarray,
+    load: np.ndarray,
+    segments: Sequence[slice],
+    period: float,
+    cutoff: float,
+    skew: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+    """One regression of :func:`fit_gearing` at a given skew.
 
     Returns:
         Motor positions, shape (rows,); terms (position, velocity, flank, 1, acceleration, series), shape
         (rows, 5 + HARMONICS); coefficients and standard errors, shape (5 + HARMONICS,).
     """
-    from scipy.interpolate import CubicSpline
-
     targets, parts = [], []
     lowest, highest = float(load.min()), float(load.max())
     for s in segments:
-        inside = np.clip(times[s] + skew, times[s][0], times[s][-1])
-        smooth = quality.low_passed(CubicSpline(times[s], load[s])(inside), cutoff, period)
+        smooth = low_passed(interpolated(times[s], load[s], times[s] + skew), cutoff, period)
         velocity = np.gradient(smooth, times[s])
-        edge = min(round(1.0 / (cutoff * period)), len(smooth) // 8) + 2
-        cut = slice(edge, len(smooth) - edge)
+        cut = settled(len(smooth), cutoff, period)
         parts.append((smooth, velocity, np.gradient(velocity, times[s]), cut))
-        targets.append(quality.low_passed(motor[s], cutoff, period)[cut])
+        targets.append(low_passed(motor[s], cutoff, period)[cut])
     target = np.concatenate(targets)
     sizes = [np.sqrt(np.mean(np.concatenate([part[i][part[3]] for part in parts]) ** 2)) + 1e-300 for i in (1, 2)]
     position, velocity, acceleration = (np.concatenate([part[i][part[3]] for part in parts]) for i in range(3))
@@ -342,9 +346,9 @@ def _gear_fit(
     best = None
     for angle in _MIXTURES:
         mixed = [np.cos(angle) * part[1] / sizes[0] + np.sin(angle) * part[2] / sizes[1] for part in parts]
-        directions = [quality.low_passed(quality.direction_of(m), cutoff, period) for m in mixed]
+        directions = [low_passed(direction_of(m), cutoff, period) for m in mixed]
         flank = np.concatenate([d[part[3]] for d, part in zip(directions, parts, strict=True)])
-        # on its way from flank to flank it is anywhere in the gap
+        # between the flanks the twist is anywhere in the gap
         clear = np.abs(np.concatenate([m[part[3]] for m, part in zip(mixed, parts, strict=True)])) > 0.3
         few = np.flatnonzero(clear)[:: max(len(position) // 20_000, 1)]
         if len(few) < 3 * rows.shape[1] or clear.sum() < 0.25 * len(clear):

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from . import quality
-from .gearing import Gearing, seen
-from .quality import Array
+from .gearing import Gearing, twist_noise
+from .least_squares import jackknifed
 from .reader import Record, read_log_table, read_record
+from .signal_quality import low_passed
 from .table import POSITION_CHANNELS, LogTable
 
 
@@ -50,7 +49,7 @@ class Inspection:
     judgements: tuple[Judgement, ...]
 
     @property
-    def twist(self) -> Array | None:
+    def twist(self) -> np.ndarray | None:
         """theta_e - gear_ratio theta_s about its median, rad (m), shape (samples,); None with one encoder."""
         both = self.record.positions
         if self.gear_ratio is None or len(both) < 2:
@@ -112,29 +111,34 @@ def inspect(
     return Inspection(record, table, ratio, reversals, tuple(found))
 
 
-def velocity(record: Record, side: str | None = None) -> Array:
+def main_side(record: Record) -> str:
+    """The side whose encoder shows the motion: motor, or load where the motor has none."""
+    return "motor" if "motor" in record.positions else "load"
+
+
+def velocity(record: Record, side: str | None = None) -> np.ndarray:
     """Velocity by differences of the low-passed position, rad/s (m/s), shape (samples,).
 
     Args:
         record: the log.
         side: motor or load; left out: the motor if it has an encoder.
     """
-    side = side or ("motor" if "motor" in record.positions else "load")
+    side = side or main_side(record)
     width = record.findings.channels[POSITION_CHANNELS[side]].bandwidth
     speed = np.zeros(len(record.time))
     for s in record.segments:
         smooth = record.positions[side][s]
         if width:
-            smooth = quality.low_passed(smooth, 4.0 * width, record.sample_period)
+            smooth = low_passed(smooth, 4.0 * width, record.sample_period)
         speed[s] = np.gradient(smooth, record.sample_period)
     return speed
 
 
-def _moving(speed: Array) -> NDArray[np.bool_]:
+def _moving(speed: np.ndarray) -> np.ndarray:
     return np.abs(speed) > 0.1 * np.sqrt(np.mean(speed**2))
 
 
-def _reversals(record: Record, speed: Array) -> int:
+def _reversals(record: Record, speed: np.ndarray) -> int:
     count = 0
     for s in record.segments:
         signs = np.sign(speed[s][_moving(speed)[s]])
@@ -142,71 +146,70 @@ def _reversals(record: Record, speed: Array) -> int:
     return count
 
 
-def _of_inertia_and_friction(record: Record, speed: Array, reversals: int) -> list[Judgement]:
+def _of_inertia_and_friction(record: Record, speed: np.ndarray, reversals: int) -> list[Judgement]:
     names = ("inertia", "viscous friction", "Coulomb friction", "constant torque")
     torque, found = record.torque, record.findings.dynamics
     if torque is None:
-        return [Judgement(name, "no", "no torque was recorded, so that only the kinematics show") for name in names]
+        return [Judgement(name, "no", "no torque was recorded: the log shows kinematics only") for name in names]
     if np.ptp(torque) == 0.0:
-        why = "the input is constant: free motion tells only ratios to the inertia (or to a known gravity torque)"
+        why = "the input is constant: free motion gives only ratios to the inertia (or to a known gravity torque)"
         return [Judgement(name, "weak", why) for name in names]
     if found is None:
-        return [Judgement(name, "no", "the motion does not stand out of the noise") for name in names]
+        return [Judgement(name, "no", "the motion does not exceed the noise") for name in names]
     moving = np.abs(speed[_moving(speed)])
     slow, fast = np.quantile(moving, [0.05, 0.95])
     both = min((speed[_moving(speed)] > 0).mean(), (speed[_moving(speed)] < 0).mean())
-    channel = "theta_e" if "motor" in record.positions else "theta_s"
-    width = record.findings.channels[channel].bandwidth
+    width = record.findings.channels[POSITION_CHANNELS[main_side(record)]].bandwidth
     percent = [f"{100 * share:.0f} % of the torque" for share in found.shares]
     spread = [abs(error / value) if value else math.inf for value, error in zip(found.values, found.errors, strict=True)]
 
-    def judge(name: str, i: int, yes: str, unlike: str) -> Judgement:
+    def judge(name: str, i: int, yes: str, similar: str) -> Judgement:
         if found.inflation[i] > 10.0:
-            return Judgement(name, "weak", f"looks like {unlike} in this motion (variance × {found.inflation[i]:.0f})")
+            return Judgement(name, "weak", f"hard to separate from {similar} here (variance × {found.inflation[i]:.0f})")
         if found.values[i] < 2.0 * found.errors[i]:
-            return Judgement(name, "weak", f"a rough fit finds no positive one ({percent[i]}): other effects hide it")
+            return Judgement(name, "weak", f"a rough fit finds no positive value ({percent[i]}): other effects hide it")
         if found.shares[i] < 0.05:
-            return Judgement(name, "weak", f"it takes only {percent[i]}")
+            return Judgement(name, "weak", f"it makes only {percent[i]}")
         if spread[i] > 0.2:
-            return Judgement(name, "weak", f"a rough fit finds it to {100 * spread[i]:.0f} % of itself ({percent[i]})")
+            return Judgement(name, "weak", f"a rough fit finds it only to ± {100 * spread[i]:.0f} % ({percent[i]})")
         return Judgement(name, "yes", f"{yes}: {percent[i]}")
 
     result = [judge("inertia", 0, f"motion up to {width:.3g} Hz", "a spring or gravity")]
     if fast < 1.5 * slow:
-        why = f"speeds of {slow:.3g} to {fast:.3g} are too alike to tell viscous from Coulomb friction"
+        why = f"speeds of {slow:.3g} to {fast:.3g} are too close to separate viscous from Coulomb friction"
         return [*result, *(Judgement(name, "weak", why) for name in names[1:3]), _constant(both)]
     result.append(judge("viscous friction", 1, f"speeds of {slow:.3g} to {fast:.3g}", "Coulomb friction"))
     if both < 0.05:
-        why = "motion in one direction only: it looks like a constant torque"
+        why = "motion in one direction only: hard to separate from a constant torque"
         return [*result, Judgement("Coulomb friction", "weak", why), _constant(both)]
     return [*result, judge("Coulomb friction", 2, f"{reversals} reversals", "viscous friction"), _constant(both)]
 
 
 def _beside_a_gap(judgement: Judgement) -> Judgement:
-    """Of a motor that moves as far as the gap lets it, a fit of one rigid body says little."""
+    """A fit of one rigid body says little of a motor whose load follows only loosely."""
     if judgement.answer == "no" or judgement.quantity == "constant torque":
         return judgement
-    why = f"{judgement.why}; in a fit of a rigid drive, while here the load follows the motor loosely"
+    why = f"{judgement.why}; by a fit of a rigid drive, while here the load follows the motor only loosely"
     return replace(judgement, answer="weak", why=why)
 
 
 def _constant(both: float) -> Judgement:
     if both < 0.05:
-        return Judgement("constant torque", "weak", "motion in one direction only: it looks like Coulomb friction")
-    return Judgement("constant torque", "yes", f"motion in both directions ({100 * both:.0f} % in the rarer one)")
+        return Judgement("constant torque", "weak", "motion in one direction only: hard to separate from Coulomb friction")
+    return Judgement("constant torque", "yes", f"motion in both directions ({100 * both:.0f} % in the less frequent one)")
 
 
-def _of_transmission(record: Record, speed: Array, reversals: int, ratio: float | None) -> list[Judgement]:
+def _of_transmission(record: Record, speed: np.ndarray, reversals: int, ratio: float | None) -> list[Judgement]:
     names = ("gear ratio", "lost motion", "stiffness")
     gearing, channels = record.findings.gearing, record.findings.channels
     if len(record.positions) < 2:
         missing = "load" if "motor" in record.positions else "motor"
-        why = f"there is no {missing} encoder: nothing is known of what lies between"
+        why = f"there is no {missing} encoder: the transmission in between is not observed"
         return [Judgement(name, "no", why) for name in names]
     if gearing is None or ratio is None:
-        return [Judgement(name, "no", "the motion does not stand out of the noise") for name in names]
+        return [Judgement(name, "no", "the motion does not exceed the noise") for name in names]
     share = min(gearing.twist, gearing.least_twist) / gearing.motion
-    left = f"{100 * gearing.residual:.2g} % of theta_e is left over"
+    left = f"{100 * gearing.residual:.2g} % of theta_e is not explained"
     if gearing.wide:
         left = f"gap and wind-up take {100 * share:.0f} % of the range of theta_e"
     result = [
@@ -216,7 +219,7 @@ def _of_transmission(record: Record, speed: Array, reversals: int, ratio: float 
             f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {left}",
         )
     ]
-    noise = seen(ratio, channels["theta_e"], channels["theta_s"])
+    noise = twist_noise(ratio, channels["theta_e"], channels["theta_s"])
     result.append(_lost_motion(gearing, reversals, noise, channels["theta_e"].unit))
     return [*result, _stiffness(record, speed, ratio, noise)]
 
@@ -224,18 +227,18 @@ def _of_transmission(record: Record, speed: Array, reversals: int, ratio: float 
 def _lost_motion(gearing: Gearing, reversals: int, noise: float, unit: str) -> Judgement:
     size = gearing.lost_motion_text(unit)
     if gearing.flank == "load":
-        return Judgement("lost motion", "yes", f"theta_e shifts by {size} as the load changes sides")
+        return Judgement("lost motion", "yes", f"theta_e shifts by {size} as the load torque changes its sign")
     if reversals < 2:
-        return Judgement("lost motion", "no", f"{reversals} reversals: both flanks of the gap must be touched")
+        return Judgement("lost motion", "no", f"{reversals} reversals: both flanks of the gap must come into contact")
     if gearing.wide:
-        return Judgement("lost motion", "weak", f"shift of {size} with the wind-up, which looks alike in this motion")
+        return Judgement("lost motion", "weak", f"shift of {size} includes the wind-up, which this motion does not separate")
     if gearing.stands_out(noise):
         return Judgement("lost motion", "yes", f"theta_e shifts by {size} from flank to flank")
     return Judgement("lost motion", "weak", f"shift of theta_e from flank to flank is {size}, noise {noise:.2g} {unit}")
 
 
-def _stiffness(record: Record, speed: Array, ratio: float, seen: float) -> Judgement:
-    """From twist over torque within one direction of motion."""
+def _stiffness(record: Record, speed: np.ndarray, ratio: float, noise: float) -> Judgement:
+    """From twist over torque within one direction of motion; `noise` is the twist's, rms."""
     torque, dynamics = record.transmitted, record.findings.dynamics
     if torque is None:
         if record.torque is None or np.ptp(record.torque) == 0.0:
@@ -244,18 +247,18 @@ def _stiffness(record: Record, speed: Array, ratio: float, seen: float) -> Judge
     twist = record.positions["motor"] - ratio * record.positions["load"]
     width = record.findings.channels["theta_e"].bandwidth
     if width == 0.0 or dynamics is None:
-        return Judgement("stiffness", "no", "the motion does not stand out of the noise")
+        return Judgement("stiffness", "no", "the motion does not exceed the noise")
     targets, rows = [], []
     for s in record.segments:
-        held = quality.low_passed(np.stack([twist[s], torque[s], np.sign(speed[s]), speed[s]], axis=1), 4.0 * width,
-                                  record.sample_period)  # fmt: skip
-        targets.append(held[:, 0])
-        rows.append(np.column_stack([held[:, 1:], np.ones(len(held))]))
-    found, errors = quality.jackknifed(np.concatenate(targets), np.concatenate(rows))
+        signals = np.stack([twist[s], torque[s], np.sign(speed[s]), speed[s]], axis=1)
+        smooth = low_passed(signals, 4.0 * width, record.sample_period)
+        targets.append(smooth[:, 0])
+        rows.append(np.column_stack([smooth[:, 1:], np.ones(len(smooth))]))
+    found, errors = jackknifed(np.concatenate(targets), np.concatenate(rows))
     reach = abs(float(found[0])) * float(np.std(torque))
     unit = record.findings.channels["theta_e"].unit
-    if not np.isfinite(found[0]) or found[0] < 5.0 * errors[0] or reach < seen:
+    if not np.isfinite(found[0]) or found[0] < 5.0 * errors[0] or reach < noise:
         return Judgement("stiffness", "weak", f"the twist hardly follows the torque (it winds up {reach:.2g} {unit} rms)")
     return Judgement(
-        "stiffness", "yes", f"the twist follows the torque: {reach:.2g} {unit} rms against a noise of {seen:.2g}"
+        "stiffness", "yes", f"the twist follows the torque: {reach:.2g} {unit} rms against a noise of {noise:.2g}"
     )

@@ -5,10 +5,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from . import quality
-from .quality import Array
+from .least_squares import BLOCKS, jackknifed
+from .signal_quality import SHORTEST
 
 Flank = Literal["motion", "load"]
 
@@ -19,15 +18,15 @@ class LostMotion:
 
     Attributes:
         value: rad or m.
-        error: standard error, which holds for residuals that are correlated in time and over position.
+        error: standard error, valid for residuals that are correlated in time and over position.
         interval: 95 %.
-        flank: what tells the flank: the direction of motion (with the load's inertia), or a load that changes sides at some
-            times, on top of what repeats with position and direction.
-        changes: changes of the flank that it rests on.
+        flank: what decides the flank: the direction of motion (with the load's inertia), or a load torque that changes its
+            sign at some times, beside errors that repeat with position and direction.
+        changes: number of changes of the flank, from which it is found.
         at: times of these changes where the load made them, s.
-        least: shift at the tenth of all places with the least, where the load changed sides; else the value.
-        largest: the same of the largest.
-        residual: rms of the twist that is left.
+        least: 10 % quantile of the shift over the positions, where the load torque changed its sign; else the value.
+        largest: 90 % quantile.
+        residual: rms of the residual twist.
     """
 
     value: float
@@ -42,14 +41,14 @@ class LostMotion:
 
     @classmethod
     def unsure(cls, value: float, error: float) -> "LostMotion":
-        """From a rough regression, where no flank is touched for long."""
-        return cls(value, error, _interval(value, error, quality.BLOCKS - 1), "motion", 0, (), value, value, math.inf)
+        """From a rough regression, where no flank is in contact for long."""
+        return cls(value, error, _interval(value, error, BLOCKS - 1), "motion", 0, (), value, value, math.inf)
 
     def between(self, other: "LostMotion") -> "LostMotion":
         """Anywhere between two that rest on different assumptions."""
         value, error = 0.5 * (self.value + other.value), 0.5 * abs(self.value - other.value)
         error = math.hypot(error, max(self.error, other.error))
-        return replace(self, value=value, error=error, interval=_interval(value, error, quality.BLOCKS - 1),
+        return replace(self, value=value, error=error, interval=_interval(value, error, BLOCKS - 1),
                        least=value, largest=value)  # fmt: skip
 
 
@@ -64,23 +63,23 @@ def _interval(value: float, error: float, freedom: int) -> tuple[float, float]:
 
 
 def by_motion(
-    twist: Array, rows: Array, flank: Array, clear: NDArray[np.bool_], *, beside: float = 0.0
+    twist: np.ndarray, rows: np.ndarray, flank: np.ndarray, clear: np.ndarray, *, beside: float = 0.0
 ) -> LostMotion | None:
-    """From the twist on both flanks, wherever one of them is surely touched.
+    """From the twist on both flanks, wherever one of them is surely in contact.
 
     Args:
         twist: theta_e - ratio theta_s, shape (samples,).
-        rows: what else the twist depends on, shape (samples, terms).
+        rows: other terms of the twist, shape (samples, terms).
         flank: its sign is that of the torque, shape (samples,).
         clear: where the gap is not being crossed, shape (samples,).
         beside: standard error of other causes.
     """
     signs = np.sign(flank[clear])
     changes = int(np.count_nonzero(np.diff(signs)))
-    if changes < 2 or len(signs) < quality.SHORTEST:
+    if changes < 2 or len(signs) < SHORTEST:
         return None
     terms = np.column_stack([0.5 * signs, rows[clear]])
-    found, errors = quality.jackknifed(twist[clear], terms)
+    found, errors = jackknifed(twist[clear], terms)
     if not np.isfinite(found).all():
         return None
     value = float(found[0])
@@ -90,31 +89,33 @@ def by_motion(
     stretch = np.concatenate([[0], np.cumsum(np.diff(signs) != 0)])
     levels = np.bincount(stretch, rest) / np.bincount(stretch)
     between = 2.0 * float(np.sqrt(np.mean(levels**2) / max(len(levels) - 2, 1)))
-    # corners of the motion are rounded by the filter: what that may leave, where nothing else does
+    # corners of the motion are rounded by the filter: an error of 1e-4 at most
     error = math.hypot(max(float(errors[0]), between), 1e-4 * value, beside)
-    interval = _interval(value, error, min(quality.BLOCKS, len(levels)) - 1)
+    interval = _interval(value, error, min(BLOCKS, len(levels)) - 1)
     return LostMotion(value, error, interval, "motion", changes, (), value, value, left)
 
 
-# by the side that the load pulls to
+# by the sign of the load torque
 
 
 BINS = 60
-"""Places over the range, or the turn, of the load."""
+"""Places over the range, or the turn, of the load: 6 degrees of a turn, finer than eccentricity and first harmonics."""
 
 
 @dataclass(frozen=True)
 class _Cells:
     """Mean twist wherever a pass over the range crosses a place, in the order of time."""
 
-    twist: Array
-    time: Array
-    place: NDArray[np.intp]
-    passing: NDArray[np.intp]
-    group: NDArray[np.intp]  # of the same place and direction
+    twist: np.ndarray
+    time: np.ndarray
+    place: np.ndarray
+    passing: np.ndarray
+    group: np.ndarray  # of the same place and direction
 
 
-def _cells(times: Array, twist: Array, position: Array, velocity: Array, turn: float | None) -> _Cells | None:
+def _cells(
+    times: np.ndarray, twist: np.ndarray, position: np.ndarray, velocity: np.ndarray, turn: float | None
+) -> _Cells | None:
     moving = np.abs(velocity) > 0.25 * np.sqrt(np.mean(velocity**2))
     low, high = float(position.min()), float(position.max())
     if high == low:
@@ -125,7 +126,7 @@ def _cells(times: Array, twist: Array, position: Array, velocity: Array, turn: f
     place = np.clip(((position - low) / span - turns) * BINS, 0, BINS - 1).astype(int)
     forwards = velocity > 0.0
     at = np.flatnonzero(moving)
-    if len(at) < quality.SHORTEST:
+    if len(at) < SHORTEST:
         return None
     # a long rest may hide a change of the load
     rests = np.diff(times[at]) > 0.02 * (times[at[-1]] - times[at[0]])
@@ -141,7 +142,7 @@ def _cells(times: Array, twist: Array, position: Array, velocity: Array, turn: f
     return _Cells(mean[order], when[order], place[at][first], passing[first], 2 * place[at][first] + forwards[at][first])
 
 
-def _shift(cells: _Cells, late: NDArray[np.bool_], kept: NDArray[np.bool_]) -> tuple[float, Array]:
+def _shift(cells: _Cells, late: np.ndarray, kept: np.ndarray) -> tuple[float, np.ndarray]:
     """Biweight location of the shifts of the places that were crossed in both states, and these shifts.
 
     Where the load hardly pulls, the gap is not crossed in full: such places fall short, and count less.
@@ -170,14 +171,14 @@ def _shift(cells: _Cells, late: NDArray[np.bool_], kept: NDArray[np.bool_]) -> t
     return found, shifts
 
 
-def _left(cells: _Cells, late: NDArray[np.bool_], shift: float) -> Array:
+def _left(cells: _Cells, late: np.ndarray, shift: float) -> np.ndarray:
     """Twist less that of its place, direction and state."""
     rest = cells.twist - shift * late
     counts = np.maximum(np.bincount(cells.group), 1)
     return rest - (np.bincount(cells.group, rest) / counts)[cells.group]
 
 
-def _states(cells: _Cells) -> NDArray[np.bool_] | None:
+def _states(cells: _Cells) -> np.ndarray | None:
     """Which of two states each cell is in: the assignment that leaves least, with few changes."""
     count = len(cells.twist)
     groups = np.bincount(cells.group)
@@ -215,7 +216,7 @@ def _states(cells: _Cells) -> NDArray[np.bool_] | None:
     return None if chosen is None else chosen[1]
 
 
-def _viterbi(values: Array, shift: float, variance: float) -> NDArray[np.bool_]:
+def _viterbi(values: np.ndarray, shift: float, variance: float) -> np.ndarray:
     """The sequence of levels 0 and shift that fits best, each change at the price of 20 log-likelihoods."""
     price = 40.0 * max(variance, 1e-12 * shift**2)
     cost = np.stack([values**2, (values - shift) ** 2], axis=1)
@@ -233,7 +234,9 @@ def _viterbi(values: Array, shift: float, variance: float) -> NDArray[np.bool_]:
     return state
 
 
-def by_load(times: Array, twist: Array, position: Array, velocity: Array, turn: float | None) -> LostMotion | None:
+def by_load(
+    times: np.ndarray, twist: np.ndarray, position: np.ndarray, velocity: np.ndarray, turn: float | None
+) -> LostMotion | None:
     """From what changes between passes over the same places in the same direction; None where nothing clearly does.
 
     Args:
@@ -259,7 +262,7 @@ def by_load(times: Array, twist: Array, position: Array, velocity: Array, turn: 
     if abs(value) < 6.0 * residual or not _better_than_drift(cells, left):
         return None
     passes = np.unique(cells.passing)
-    groups = np.array_split(np.arange(BINS), quality.BLOCKS)
+    groups = np.array_split(np.arange(BINS), BLOCKS)
     without_passes = [_shift(cells, state, cells.passing != p)[0] for p in passes]
     without_places = [_shift(cells, state, ~np.isin(cells.place, g))[0] for g in groups if np.isin(cells.place, g).any()]
     variance = 0.0
@@ -277,14 +280,14 @@ def by_load(times: Array, twist: Array, position: Array, velocity: Array, turn: 
         return None
     sign = math.copysign(1.0, value)
     least, largest = np.quantile(sign * shifts, [0.1, 0.9])
-    freedom = min(len(passes), quality.BLOCKS) - 1
+    freedom = min(len(passes), BLOCKS) - 1
     size = abs(value)
     return LostMotion(
         size, error, _interval(size, error, freedom), "load", len(at), at, float(least), float(largest), residual
     )
 
 
-def _better_than_drift(cells: _Cells, left: Array) -> bool:
+def _better_than_drift(cells: _Cells, left: np.ndarray) -> bool:
     """Whether two states leave much less than a steady drift over time does."""
     zero = np.zeros(len(left), dtype=bool)
     plain = _left(cells, zero, 0.0)

@@ -36,7 +36,7 @@ Key = tuple[str | int, ...]
 """Where a value lies in a config: keys of tables and positions in arrays."""
 
 
-def describe(error: ValidationError, location: list[str | int] | None = None) -> tuple[Key, str]:
+def first_error(error: ValidationError, location: list[str | int] | None = None) -> tuple[Key, str]:
     """The first error: the key that is wrong, and one line that says so.
 
     Args:
@@ -109,7 +109,11 @@ _SECONDS: Any = {"unit": "s"}
 
 
 class _ColumnTable(StrictTable):
-    """What all channels have in common; a column's name or number alone stands for a table with nothing else in it."""
+    """What time and channels have in common; a column's name or number alone stands for a table with nothing else in it."""
+
+    column: _Column | None = Field(
+        default=None, description="name of the column, or its number counted from 0; left out: the channel's own name"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -117,6 +121,10 @@ class _ColumnTable(StrictTable):
         if isinstance(data, str) or (isinstance(data, int) and not isinstance(data, bool)):
             return {"column": data}
         return data
+
+    def column_or(self, name: str) -> str | int:
+        """The column that is given, else the one with a channel's own name."""
+        return name if self.column is None else self.column
 
 
 def wrong(message: str) -> PydanticCustomError:
@@ -127,7 +135,6 @@ def wrong(message: str) -> PydanticCustomError:
 class TimeTable(_ColumnTable):
     """The time stamps of a log."""
 
-    column: _Column | None = Field(default=None, description="name of the column, or its number counted from 0; left out: t")
     unit: Literal["s", "ms", "us", "ns"] = Field(default="s", description="unit of the stamps")
     period: float | None = Field(
         default=None, gt=0.0, description="sampling period of a log without stamps", json_schema_extra=_SECONDS
@@ -143,9 +150,6 @@ class TimeTable(_ColumnTable):
 class _ChannelTable(_ColumnTable):
     """What measured channels have in common."""
 
-    column: _Column | None = Field(
-        default=None, description="name of the column, or its number counted from 0; left out: the channel's own name"
-    )
     sign: _Sign = Field(default=1, description="-1 if the column counts the other way; 1 or -1")
     offset: float = Field(default=0.0, description="added last, in SI units")
     signed_bits: int | None = Field(
@@ -178,6 +182,11 @@ class PositionTable(_ChannelTable):
             raise wrong(f"counts_per_turn is for unit counts, not for {self.unit}")
         return self
 
+    @property
+    def si_unit(self) -> str:
+        """m on a linear axis, else rad."""
+        return "m" if self.unit in ("m", "mm") else "rad"
+
 
 class TorqueTable(_ChannelTable):
     """A torque's column (force on a linear axis), or that of a voltage, current or duty that stands for it."""
@@ -204,7 +213,7 @@ class TorqueTable(_ChannelTable):
         return self
 
 
-Channel = Literal["u", "theta_e", "theta_s"]
+_ChannelName = Literal["u", "theta_e", "theta_s"]
 POSITION_CHANNELS = {"motor": "theta_e", "load": "theta_s"}
 """Side of the drive -> the channel of its encoder."""
 
@@ -224,7 +233,7 @@ class LogTable(StrictTable):
     theta_e: PositionTable | None = Field(default=None, description="motor position; left out: column theta_e, in rad")
     theta_s: PositionTable | None = Field(default=None, description="load position; left out: column theta_s, in rad")
     transmitted: TorqueTable | None = Field(default=None, description="measured transmitted torque; left out: none")
-    absent: list[Channel] | None = Field(
+    absent: list[_ChannelName] | None = Field(
         default=None, description="channels that were not recorded, of u, theta_e, theta_s; left out: none"
     )
     where: dict[str, _Plain] | None = Field(
@@ -261,3 +270,8 @@ class LogTable(StrictTable):
         if self.theta_s is not None and self.theta_s.skew == "estimate" and "theta_e" in absent:
             raise wrong("theta_s.skew: 'estimate' needs theta_e, which is said to be absent")
         return self
+
+    @property
+    def load_unit(self) -> str:
+        """Of the load position and the twist: m on a linear axis, else rad."""
+        return (self.theta_s or PositionTable()).si_unit

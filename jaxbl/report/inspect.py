@@ -9,8 +9,10 @@ import tomli_w
 from matplotlib.figure import Figure
 
 from jaxbl.files import plain, write_atomic
-from jaxbl.records import POSITION_CHANNELS, Record, quality
-from jaxbl.records.inspection import Inspection, velocity
+from jaxbl.records import POSITION_CHANNELS, Inspection, Record
+from jaxbl.records.inspection import main_side, velocity
+from jaxbl.records.signal_quality import longest, low_passed, spectrum
+from jaxbl.records.time_stamps import GAP
 
 from .figures import Drawn, stacked_axes
 from .page import PageTable, write_report
@@ -111,13 +113,9 @@ def _shown(record: Record, segment: slice) -> slice:
     return slice(segment.start, segment.stop, max(len(record.time) // _POINTS, 1))
 
 
-def _side(record: Record) -> str:
-    return "motor" if "motor" in record.positions else "load"
-
-
 def _channels(record: Record) -> Drawn:
     values = _values(record)
-    side = _side(record)
+    side = main_side(record)
     unit = record.findings.channels[POSITION_CHANNELS[side]].unit
     rows = [(_LABELS[n], record.findings.channels[n].unit, v, _COLOUR[n]) for n, v in values.items()]
     rows.append((f"{side} velocity", f"{unit}/s", velocity(record, side), COLOURS[3]))
@@ -135,11 +133,11 @@ def _channels(record: Record) -> Drawn:
 
 def _spectra(record: Record) -> Drawn:
     values = {n: v for n, v in _values(record).items() if np.ptp(v)}
-    longest = max(record.segments, key=lambda s: s.stop - s.start)
+    part = longest(record.segments)
     figure, axes = stacked_axes(len(values), 2.1, width=7.0)
     for ax, (name, signal) in zip(axes, values.items(), strict=True):
         channel = record.findings.channels[name]
-        frequency, density = quality.spectrum(signal[longest], record.sample_period)
+        frequency, density = spectrum(signal[part], record.sample_period)
         ax.loglog(frequency, np.sqrt(density), color=_COLOUR[name], lw=1.0)
         if channel.noise:
             floor = channel.noise * np.sqrt(2.0 * record.sample_period)
@@ -159,7 +157,7 @@ def _spectra(record: Record) -> Drawn:
 
 def _torque_over_velocity(record: Record) -> Drawn:
     assert record.torque is not None
-    side = _side(record)
+    side = main_side(record)
     channel = record.findings.channels[POSITION_CHANNELS[side]]
     dynamics = record.findings.dynamics
     speed = velocity(record, side)
@@ -170,7 +168,7 @@ def _torque_over_velocity(record: Record) -> Drawn:
         assert dynamics is not None
         for s in record.segments:
             # the same low-pass as that of the acceleration
-            torque[s] = quality.low_passed(torque[s], 4.0 * channel.bandwidth, record.sample_period)
+            torque[s] = low_passed(torque[s], 4.0 * channel.bandwidth, record.sample_period)
             torque[s] -= dynamics.values[0] * np.gradient(speed[s], record.sample_period)
         label = "u less inertia torque"
         # transients of the filter
@@ -232,7 +230,7 @@ def _twist(inspection: Inspection) -> Drawn:
 
 def _intervals(record: Record) -> Drawn:
     ends, intervals = np.cumsum(record.intervals), 1e3 * record.intervals
-    inside = record.intervals <= quality.GAP * record.findings.sampling.median_period
+    inside = record.intervals <= GAP * record.findings.sampling.median_period
     ends, intervals = ends[inside], intervals[inside]
     figure = Figure(figsize=(7.0, 2.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True)

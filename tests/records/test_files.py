@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from jaxbl.errors import InputError
-from jaxbl.records.files import read_columns
+from jaxbl.records.files import read_log_file
 
 T, U = np.arange(5) * 0.1, np.array([1.5, -2.0, 3e-7, 4e12, 0.0])
 
@@ -70,7 +70,7 @@ WRITERS = {
 def test_every_kind_of_file_gives_the_same_columns(name, tmp_path):
     path = tmp_path / name
     WRITERS[name](path)
-    columns = read_columns(path)
+    columns = read_log_file(path)
     keys = (0, 1) if name.startswith("bare") else ("t", "u")
     assert set(keys) <= set(columns.columns)
     for key, number, values in zip(keys, (0, 1), (T, U), strict=True):
@@ -89,7 +89,7 @@ def test_numbers_survive_text(tmp_path_factory, values, separator, header):
     path = tmp_path_factory.mktemp("text") / "log.txt"
     rows = [separator.join(repr(v) for v in (value, -value)) for value in values]
     path.write_text("\n".join([separator.join("ab")] * header + rows))
-    columns = read_columns(path)
+    columns = read_log_file(path)
     np.testing.assert_array_equal(columns.numbers("a" if header else 0), values)
     np.testing.assert_array_equal(columns.numbers(1), np.negative(values))
 
@@ -100,7 +100,7 @@ def test_structures_and_matrices_of_matlab_have_columns_of_their_own(tmp_path):
         file["log/t"], file["log/inner/u"] = T[None], U[None]
         file["both"] = np.stack([T, U])
     for name in ("a.mat", "b.mat"):
-        columns = read_columns(tmp_path / name)
+        columns = read_log_file(tmp_path / name)
         for column, values in {"log.t": T, "log.inner.u": U, "both[0]": T, "both[1]": U}.items():
             np.testing.assert_array_equal(columns.numbers(column), values)
 
@@ -131,16 +131,16 @@ def test_unreadable_files_are_named_in_one_line(name, tmp_path):
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(InputError, match=message) as error:
-        read_columns(path)
+        read_log_file(path)
     assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
 
 
 def test_a_folder_and_a_file_without_vectors(tmp_path):
     with pytest.raises(InputError, match="is a folder; a log file is needed"):
-        read_columns(tmp_path)
+        read_log_file(tmp_path)
     savemat(tmp_path / "a.mat", {"x": 1.0, "name": "hi"})
     with pytest.raises(InputError, match="holds no vectors of numbers"):
-        read_columns(tmp_path / "a.mat")
+        read_log_file(tmp_path / "a.mat")
 
 
 COLUMNS = {
@@ -162,4 +162,4 @@ def test_columns_that_are_not_there_or_not_numbers(case, tmp_path):
     content, column, message = COLUMNS[case]
     (tmp_path / "log.csv").write_text(content)
     with pytest.raises(InputError, match=message):
-        read_columns(tmp_path / "log.csv").numbers(column)
+        read_log_file(tmp_path / "log.csv").numbers(column)

@@ -43,7 +43,7 @@ def test_a_gap_as_large_as_the_motion_is_no_wrong_ratio_and_no_skew(tmp_path, wi
     assert abs(gearing.ratio - 5.0) < 2.0 * gearing.ratio_error
     assert len(found.record.notes) == 1
     assert found.record.notes[0].startswith("theta_e - 5 theta_s ranges over 0.3")
-    assert found.record.notes[0].endswith("with a gap or wind-up of that size the log hardly checks gear_ratio.")
+    assert found.record.notes[0].endswith("with backlash or wind-up of that size this log hardly confirms gear_ratio.")
     # asymptotically 4 j0 either way, if nothing is known of the wind-up
     assert gearing.lost_motion_interval[0] < 0.14 and gearing.lost_motion_interval[1] > 0.16
     answers = {j.quantity: j for j in found.judgements}
@@ -85,7 +85,7 @@ SLIPS = {
         r"theta_e moves .*: theta_e is in degrees; see unit",
     ),
     "load in degrees": (lambda e, s: (e, np.degrees(s)), r"theta_e moves .*: theta_s is in degrees; see unit"),
-    "at the motor": (lambda e, s: (e, 20.0 * s), r"theta_s is already counted at the motor shaft"),
+    "at the motor": (lambda e, s: (e, 20.0 * s), r"theta_s is already referred to the motor shaft"),
 }
 
 

@@ -49,7 +49,7 @@ def test_a_load_that_moves_on_its_own_tells_no_skew(tmp_path):
     frame = made(count=6000).assign(theta_s=0.5 * np.sin(5.0 * t) + 0.3 * np.sin(11.0 * t))
     frame.to_parquet(tmp_path / "log.parquet")
     found = inspect(tmp_path / "log.parquet", gear_ratio=GEAR_RATIO).record
-    assert any(note.startswith("theta_e and theta_s hardly go together") for note in found.notes)
+    assert any(note.startswith("theta_e and theta_s are hardly related") for note in found.notes)
     assert found.findings.channels["theta_s"].skew is None
 
 
@@ -59,14 +59,14 @@ def test_a_compliant_transmission_shows_its_stiffness(tmp_path):
     assert answers(tmp_path, frame)["stiffness"][0] == "yes"
     frame["sensor"] = frame["u"]
     found = answers(tmp_path, frame.drop(columns="u"), {"absent": ["u"], "transmitted": "sensor"})
-    assert found["inertia"] == ("no", "no torque was recorded, so that only the kinematics show")
+    assert found["inertia"] == ("no", "no torque was recorded: the log shows kinematics only")
 
 
 def test_one_encoder_says_nothing_of_the_transmission(tmp_path):
     for side, other in (("theta_e", "load"), ("theta_s", "motor")):
         found = answers(tmp_path, made()[["t", "u", side]])
         for quantity in ("gear ratio", "lost motion", "stiffness"):
-            assert found[quantity] == ("no", f"there is no {other} encoder: nothing is known of what lies between")
+            assert found[quantity] == ("no", f"there is no {other} encoder: the transmission in between is not observed")
         assert found["inertia"][0] == "yes"
 
 
@@ -86,15 +86,15 @@ def test_one_direction_one_speed_and_one_frequency(tmp_path):
         return pd.DataFrame({"t": t, "u": u, "theta_e": position, "theta_s": position / GEAR_RATIO})
 
     found = answers(tmp_path, log(forwards))
-    assert found["constant torque"] == ("weak", "motion in one direction only: it looks like Coulomb friction")
+    assert found["constant torque"] == ("weak", "motion in one direction only: hard to separate from Coulomb friction")
     assert found["Coulomb friction"][0] == "weak"
-    assert found["lost motion"] == ("no", "0 reversals: both flanks of the gap must be touched")
+    assert found["lost motion"] == ("no", "0 reversals: both flanks of the gap must come into contact")
     triangle = 4.0 * np.abs((t / 2.0) % 1.0 - 0.5) + 1e-5 * np.random.default_rng(0).standard_normal(6000)
     found = answers(tmp_path, log(np.convolve(np.pad(triangle, 25, "edge"), np.ones(51) / 51.0, "valid")))
     for quantity in ("viscous friction", "Coulomb friction"):
-        assert found[quantity][0] == "weak" and "too alike to tell viscous from Coulomb friction" in found[quantity][1]
+        assert found[quantity][0] == "weak" and "too close to separate viscous from Coulomb friction" in found[quantity][1]
     found = answers(tmp_path, log(np.sin(6.0 * t)))
-    assert found["inertia"][0] == "weak" and "looks like a spring or gravity" in found["inertia"][1]
+    assert found["inertia"][0] == "weak" and "hard to separate from a spring or gravity" in found["inertia"][1]
 
 
 def test_noise_identifies_nothing(tmp_path):

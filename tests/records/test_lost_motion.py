@@ -8,12 +8,12 @@ import pytest
 from measured import GEAR_RATIO, SERVO, made, real
 
 from jaxbl.records import inspect, lost_motion
-from jaxbl.records.gearing import gearing
+from jaxbl.records.gearing import fit_gearing
 
 
 def geared(frame, expected=GEAR_RATIO):
     times, motor, load = (frame[name].to_numpy() for name in ("t", "theta_e", "theta_s"))
-    return gearing(times, motor, load, [slice(0, len(times))], times[1] - times[0], expected=expected, turn=2.0 * np.pi)
+    return fit_gearing(times, motor, load, [slice(0, len(times))], times[1] - times[0], expected=expected, turn=2.0 * np.pi)
 
 
 def load_driven(seed, *, gap=0.02, drift=0.0, changes=(61.0,), around=False):
@@ -82,8 +82,10 @@ def test_it_is_told_with_its_interval(tmp_path):
     load_driven(0).to_parquet(tmp_path / "log.parquet")
     found = inspect(tmp_path / "log.parquet", {"absent": ["u"]}, gear_ratio=1.0)
     why = next(j.why for j in found.judgements if j.quantity == "lost motion")
-    assert why.startswith("theta_e shifts by 0.0") and why.endswith("as the load changes sides")
-    assert any("as the load changes sides at 6" in note and "slipped coupling" in note for note in found.record.notes)
+    assert why.startswith("theta_e shifts by 0.0") and why.endswith("as the load torque changes its sign")
+    assert any(
+        "after the load torque changed its sign, at 6" in note and "slipped coupling" in note for note in found.record.notes
+    )
     made(gap=0.1, noise=1e-3).to_parquet(tmp_path / "log.parquet")
     found = inspect(tmp_path / "log.parquet", gear_ratio=GEAR_RATIO)
     assert any("changes of the flank by the direction of motion" in note for note in found.record.notes)

@@ -252,7 +252,7 @@ def test_skew_and_lost_motion_are_found_within_their_uncertainty(tmp_path, skew,
     assert found.skew_error < 5e-5
     assert found.lost_motion == pytest.approx(quality.get("gap", 0.0), rel=0.03, abs=2e-3)
     assert found.ratio == pytest.approx(GEAR_RATIO, rel=1e-3)
-    assert any("late against" in n or "early against" in n for n in record.notes) == bool(skew)
+    assert any("lags theta_e" in n or "leads theta_e" in n for n in record.notes) == bool(skew)
     # undone on request
     undone = read_record(path, {"theta_s": {"skew": "estimate"}})
     assert any(note.startswith("theta_s: moved by its skew") for note in undone.notes)
@@ -371,7 +371,7 @@ BAD = {
     "at rest": (
         changed(theta_e=lambda f: 1e-3 * (np.arange(len(f)) % 900 > 600) + 1e-3 * (np.arange(len(f)) % 7 > 5)),
         {"absent": ["theta_s"]},
-        "theta_e moves by 2 steps of its resolution 0.001 only: nothing excites the drive",
+        "theta_e moves by only 2 steps of its resolution 0.001; a log of a drive in motion is needed",
     ),
     "wrapped": (
         changed(theta_e=lambda f: f["theta_e"] % (2.0 * np.pi)),
@@ -435,7 +435,7 @@ BAD = {
         {"theta_e": "theta_s", "theta_s": "theta_e"},
         "the sides are swapped, and one has the wrong sign",
     ),
-    "at the motor": (changed(theta_s=lambda f: 20.0 * f["theta_s"]), {}, "theta_s is already counted at the motor shaft"),
+    "at the motor": (changed(theta_s=lambda f: 20.0 * f["theta_s"]), {}, "theta_s is already referred to the motor shaft"),
     "wrong ratio": (
         changed(theta_s=lambda f: 2.0 * f["theta_s"]),
         {},
@@ -473,13 +473,13 @@ def test_doubts_are_remarks(tmp_path):
     # one encoder of another drive
     odd = frame.assign(theta_s=made(seed=5)["theta_s"])
     notes = read_record(wrote(tmp_path, odd), gear_ratio=GEAR_RATIO).notes
-    assert any(note.startswith("theta_e and theta_s hardly go together") for note in notes)
+    assert any(note.startswith("theta_e and theta_s are hardly related") for note in notes)
     notes = read_record(wrote(tmp_path, frame.assign(t=1000.0 * frame["t"])), gear_ratio=GEAR_RATIO).notes
     assert any("if the stamps are not in s, set [log] t.unit" in note for note in notes)
     notes = read_record(wrote(tmp_path, frame.assign(t=frame["t"] / 1000.0)), gear_ratio=GEAR_RATIO).notes
     assert any("rpm: check its unit" in note for note in notes)
     notes = read_record(wrote(tmp_path, frame.assign(u=0.0)), gear_ratio=GEAR_RATIO).notes
-    assert notes == ("u is 0 throughout: the log shows free motion, and no inertia by itself.",)
+    assert notes == ("u is 0 in all rows: free motion, which does not show the inertia by itself.",)
 
 
 def test_a_falling_load_gives_its_energy_back(tmp_path):

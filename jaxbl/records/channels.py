@@ -1,0 +1,221 @@
+"""Channels of a log: columns become SI values; what a column shows of a wrong unit, sign of words or wrap-around."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from .files import LogFile
+from .signal_quality import resolution
+from .table import POSITION_CHANNELS, LogTable, PositionTable, TorqueTable, nearest
+from .time_stamps import TimeStamps
+
+
+class RawChannel(NamedTuple):
+    """A channel in SI units at its own time stamps.
+
+    Attributes:
+        values: shape (rows,).
+        unit: rad, m, N m or N.
+        saturated: share of rows at the saturation level that `[log]` gives.
+        skew: by how much the stamps are later than the values, s; "estimate": to be found.
+        held: whether each value holds until the next stamp.
+    """
+
+    values: np.ndarray
+    unit: str
+    saturated: float
+    skew: float | str
+    held: bool
+
+
+def read_channels(file: LogFile, table: LogTable, stamps: TimeStamps) -> dict[str, RawChannel]:
+    """All channels of a log at the rows that are read: theta_e, theta_s, u, transmitted, as far as they were recorded.
+
+    Raises:
+        InputError: a column is missing, or its values contradict the `[log]` table.
+    """
+    found: dict[str, RawChannel] = {}
+    linear = False
+    for name in POSITION_CHANNELS.values():
+        if _is_recorded(file, table, name):
+            position = getattr(table, name) or PositionTable()
+            linear |= position.si_unit == "m" and not found
+            found[name] = _position(file, name, position, stamps)
+    if not found:
+        columns = ", ".join(map(str, file.columns))
+        raise file.wrong(f"no column 'theta_e' or 'theta_s'; columns: {columns}; [log] theta_e can name the motor position")
+    torques = {"u": table.u or TorqueTable()} if _is_recorded(file, table, "u") else {}
+    if table.transmitted is not None:
+        torques["transmitted"] = table.transmitted
+    for name, torque in torques.items():
+        found[name] = _torque(file, name, torque, stamps, linear=linear)
+    return found
+
+
+def _is_recorded(file: LogFile, table: LogTable, name: str) -> bool:
+    """Whether a channel is to be read: a position that `[log]` does not name may be missing, a misspelt column may not."""
+    if name in (table.absent or []):
+        return False
+    if getattr(table, name) is not None or name in file.columns:
+        return True
+    if name == "u":
+        names = list(file.columns)
+        hint = "the file has no header" if all(isinstance(n, int) for n in names) else nearest("u", map(str, names))
+        raise file.wrong(f"no column 'u'; {hint}; [log] u can name it, absent = [\"u\"] says that there is none")
+    used = {t.column for t in (table.t, table.u, table.theta_e, table.theta_s) if t is not None}
+    for other in file.columns:
+        near = isinstance(other, str) and other.lower().replace("_", "").replace(" ", "") == name.replace("_", "")
+        if near and other not in used:
+            raise file.wrong(f"no column '{name}', but '{other}'; [log] {name} = \"{other}\" would read it")
+    file.notes.append(f"There is no {name} ({'motor' if name == 'theta_e' else 'load'} position) in this log.")
+    return False
+
+
+def _numbers(file: LogFile, name: str, column: str | int, bits: int | None, stamps: TimeStamps) -> np.ndarray:
+    """Numbers of a column at the rows that are read, unsigned words made signed."""
+    values = file.same_length(file.numbers(column, f"{name}.column"), stamps.total, column)
+    if bits is not None:
+        outside = (values != np.round(values)) | (values < -(2.0 ** (bits - 1))) | (values >= 2.0**bits)
+        if outside.any():
+            row = int(np.argmax(outside))
+            raise file.wrong(
+                f"column {column!r}, data row {row + 1}: {values[row]:g} is no word of {bits} bits; see [log] "
+                f"{name}.signed_bits"
+            )
+        values = np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values)
+    return values[stamps.rows]
+
+
+def _position(file: LogFile, name: str, table: PositionTable, stamps: TimeStamps) -> RawChannel:
+    column = table.column_or(name)
+    values = _numbers(file, name, column, table.signed_bits, stamps)
+    if table.minus is not None:
+        values = values - _numbers(file, name, table.minus, table.signed_bits, stamps)
+    if np.ptp(values) == 0.0:
+        raise file.wrong(
+            f'column {column!r} ({name}) is {values[0]:g} in all rows; it should move; absent = ["{name}"] leaves it out'
+        )
+    if table.wrap is None:
+        _check_wrap(file, name, table, values, stamps)
+    else:
+        values = _unwrapped(file, name, table, values)
+    _check_unit(file, name, table, values)
+    one = {
+        "rad": 1.0,
+        "deg": math.pi / 180.0,
+        "turn": 2.0 * math.pi,
+        "counts": 2.0 * math.pi / (table.counts_per_turn or 1.0),
+        "m": 1.0,
+        "mm": 1e-3,
+    }[table.unit]
+    values = table.sign * table.factor * one * values + table.offset
+    return RawChannel(values, table.si_unit, 0.0, table.skew, held=False)
+
+
+def _torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamps, *, linear: bool) -> RawChannel:
+    column = table.column_or(name)
+    values = _numbers(file, name, column, table.signed_bits, stamps)
+    if linear and table.unit == "N m":
+        raise file.wrong(f"[log] {name}.unit is N m, but the position is in m; on a linear axis it should be N")
+    if table.signed_bits is None:
+        _check_unsigned(file, name, column, values)
+    if name == "u" and np.ptp(values) == 0.0:
+        file.notes.append(f"u is {values[0]:g} in all rows: free motion, which does not show the inertia by itself.")
+    saturated = 0.0
+    if table.saturation is not None:
+        # the margins are for the rounding of decimal numbers
+        if np.abs(values).max() > table.saturation * (1.0 + 1e-9):
+            row = int(np.argmax(np.abs(values)))
+            raise file.wrong(
+                f"column {column!r}, data row {stamps.rows[row] + 1}: {values[row]:g} exceeds [log] {name}.saturation = "
+                f"{table.saturation:g}"
+            )
+        saturated = float(np.mean(np.abs(values) >= table.saturation * (1.0 - 1e-9)))
+    factor = 1.0 if table.factor is None else table.factor
+    values = table.sign * factor * values + table.offset
+    return RawChannel(values, "N" if linear else "N m", saturated, table.skew, held=name == "u")
+
+
+# wrap-around
+
+
+def _unwrapped(file: LogFile, name: str, table: PositionTable, values: np.ndarray) -> np.ndarray:
+    assert table.wrap is not None
+    if np.ptp(values) > 1.001 * table.wrap:
+        raise file.wrong(
+            f"column {table.column_or(name)!r} ranges over {np.ptp(values):g}, more than [log] {name}.wrap = "
+            f"{table.wrap:g}; wrap should be the period after which it starts again"
+        )
+    unwrapped = np.unwrap(values, period=table.wrap)
+    count = int(np.count_nonzero(np.abs(np.diff(unwrapped) - np.diff(values)) > 0.5 * table.wrap))
+    if count:
+        file.notes.append(f"{name}: {count} wrap-arounds undone.")
+    return unwrapped
+
+
+def _check_wrap(file: LogFile, name: str, table: PositionTable, values: np.ndarray, stamps: TimeStamps) -> None:
+    """Refuse values with a few jumps by a usual period, which are otherwise smooth."""
+    size = np.abs(np.diff(values))
+    span = float(np.ptp(values))
+    at = np.flatnonzero(size > 0.75 * span)
+    if not len(at) or len(at) > 0.1 * len(values):
+        return
+    usual = float(np.quantile(np.delete(size, at), 0.999)) if len(at) < len(size) else np.inf
+    # a turn in each unit, and counters of 3 to 32 bits
+    periods = [2.0 * math.pi, 360.0, 1.0, *(2.0**k for k in range(3, 33)), table.counts_per_turn or 360.0]
+    # without its jump by a period the motion goes on as before
+    around = [p for p in periods if p >= span * 0.999 and (np.abs(size[at] - p) <= 3.0 * usual + 1e-9 * p).all()]
+    if around and usual < 0.05 * around[0]:
+        raise file.wrong(
+            f"column {table.column_or(name)!r} ({name}) jumps by about {around[0]:.10g} at {len(at)} rows (data row "
+            f"{stamps.rows[at[0] + 1] + 1} first) and goes on from there: it wraps around; set wrap = {around[0]:.10g} in "
+            f"[log] {name}"
+        )
+
+
+# units
+
+
+def _check_unsigned(file: LogFile, name: str, column: str | int, values: np.ndarray) -> None:
+    """Refuse whole numbers from 0 up that leave out the middle of a word's range: negative ones were logged as unsigned."""
+    if values.min() < 0.0 or (values != np.round(values)).any():
+        return
+    for bits in (8, 16, 32):
+        top = 2.0**bits
+        empty = not ((values > 0.375 * top) & (values < 0.625 * top)).any()
+        if 0.625 * top <= values.max() < top and empty and (values <= 0.375 * top).any():
+            raise file.wrong(
+                f"column {column!r} ({name}) holds whole numbers up to {values.max():.0f} and none about "
+                f"{0.5 * top:.0f}: signed words of {bits} bits, logged as unsigned; "
+                f"set signed_bits = {bits} in [log] {name}"
+            )
+
+
+def _check_unit(file: LogFile, name: str, table: PositionTable, values: np.ndarray) -> None:
+    """Refuse radians whose steps are an encoder's in degrees, the other way round, and counts."""
+    step = resolution(values)
+    if table.factor != 1.0 or table.unit not in ("rad", "deg") or not step:
+        return
+    column = f"column {table.column_or(name)!r} ({name})"
+    turns = {"rad": 2.0 * math.pi, "deg": 360.0}
+    other = "deg" if table.unit == "rad" else "rad"
+    long = {"rad": "radians", "deg": "degrees"}
+    if _is_encoder(turns[other] / step) and not _is_encoder(turns[table.unit] / step):
+        raise file.wrong(
+            f"{column} has steps of {step:.6g}, a turn of {round(turns[other] / step)} counts in {long[other]}: it is not "
+            f'in {long[table.unit]}; set unit = "{other}" in [log] {name}'
+        )
+    if table.unit == "rad" and math.isclose(step, 1.0, rel_tol=1e-9) and len(np.unique(values)) > 16:
+        raise file.wrong(
+            f'{column} holds whole numbers only: counts, not radians; set unit = "counts" and counts_per_turn in [log] '
+            + name
+        )
+
+
+def _is_encoder(counts: float) -> bool:
+    """Whether a number of counts a turn is a power of two, as those of absolute and of interpolated encoders are."""
+    if not 2.0**6 <= counts <= 2.0**27:
+        return False
+    power = math.log2(counts)
+    return abs(power - round(power)) < 1e-4

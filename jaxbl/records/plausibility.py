@@ -1,0 +1,204 @@
+"""Whether a log fits what is said of it: motion at all, gear ratio, sign of the torque; and remarks on what is odd."""
+
+import math
+
+import numpy as np
+
+from .files import LogFile
+from .gearing import UNRELATED, Gearing, twist_noise
+from .resampling import Grid
+from .rigid_body import RigidFit
+from .signal_quality import ChannelFigures, resolution
+from .table import LogTable, PositionTable
+
+
+def check_motion(file: LogFile, name: str, values: np.ndarray) -> None:
+    """Refuse a position that moves by three steps of its resolution or less."""
+    step = resolution(values)
+    if step and np.ptp(values) < 3.5 * step:
+        raise file.wrong(
+            f"{name} moves by only {round(np.ptp(values) / step)} steps of its resolution {step:.3g}; a log of a drive in "
+            "motion is needed"
+        )
+
+
+def check_gear_ratio(
+    file: LogFile, table: LogTable, grid: Grid, found: Gearing | None, expected: float | None, tolerance: float
+) -> None:
+    """Compare the ratio of both motions with the gear ratio that is expected.
+
+    Args:
+        file: the log; gets remarks where the log is doubtful, but possible.
+        table: its units, of which one may be wrong.
+        grid: theta_e and theta_s.
+        found: how they are related; None where there is too little motion.
+        expected: motor over load motion; None: not known.
+        tolerance: relative deviation that is noted only.
+
+    Raises:
+        InputError: the log contradicts the ratio; the message names the most likely mistake.
+    """
+    if expected is not None and (found is None or found.wide or found.residual >= UNRELATED):
+        _check_size(file, table, grid, expected)
+    if found is None or found.residual >= UNRELATED:
+        left = "" if found is None else f" ({100 * found.residual:.0f} % of theta_e is not explained by theta_s)"
+        file.notes.append(
+            f"theta_e and theta_s are hardly related{left}: they may not belong to one drive, or the load hardly moves "
+            "beyond the lost motion."
+        )
+    elif expected is not None and found.wide:
+        _check_twist(file, table, found, expected)
+    elif expected is not None:
+        _check_ratio(file, table, found, expected, tolerance)
+
+
+def _check_ratio(file: LogFile, table: LogTable, found: Gearing, expected: float, tolerance: float) -> None:
+    relative = found.ratio / expected
+    # 2 %: backlash and elasticity change the ratio of a short motion by as much
+    uncertain = max(0.02, 3.0 * found.residual, 5.0 * found.ratio_error / abs(expected))
+    if abs(relative - 1.0) <= uncertain:
+        return
+    guess, why = min(_mistakes(table, expected), key=lambda pair: abs(relative / pair[0] - 1.0))
+    if abs(relative / guess - 1.0) > uncertain:
+        why = "gear_ratio, or a unit in [log], is wrong"
+    moves = f"theta_e moves {found.ratio:.4g} for each 1 of theta_s, where gear_ratio is {expected:g}"
+    if abs(relative - 1.0) <= tolerance:
+        file.notes.append(f"{moves}: effects that the model leaves out may cause this, or gear_ratio is a little wrong.")
+        return
+    if found.residual < 0.05:
+        raise file.wrong(f"{moves}: {why}")
+    file.notes.append(f"{moves}, but the two are related only roughly; perhaps {why}.")
+
+
+def _mistakes(table: LogTable, expected: float) -> list[tuple[float, str]]:
+    """Usual mistakes: the factor that each puts on the ratio of both motions, and what is wrong then."""
+    units = {name: (getattr(table, name) or PositionTable()).unit for name in ("theta_e", "theta_s")}
+    degrees, see = 180.0 / math.pi, "; see unit in [log]"
+    return [
+        (-1.0, "the sign of one of them is wrong; set sign = -1 in [log] theta_e or theta_s"),
+        (1.0 / expected**2, "the sides are swapped; exchange the columns in [log] theta_e and theta_s"),
+        (-1.0 / expected**2, "the sides are swapped, and one has the wrong sign; see [log] theta_e and theta_s"),
+        (degrees, ("theta_s is not in degrees" if units["theta_s"] == "deg" else "theta_e is in degrees") + see),
+        (1.0 / degrees, ("theta_e is not in degrees" if units["theta_e"] == "deg" else "theta_s is in degrees") + see),
+        (1.0 / expected, "theta_s is already referred to the motor shaft; set factor = 1 / gear_ratio in [log] theta_s"),
+    ]
+
+
+def _check_size(file: LogFile, table: LogTable, grid: Grid, expected: float) -> None:
+    """Refuse motions of sizes so different that wrong units or swapped sides explain them better than any gap."""
+    motor, load = grid.values["theta_e"], grid.values["theta_s"]
+
+    def relative_twist(ratio: float) -> float:
+        """Rms of the twist over that of the motion: far below 1 where load and motor move together."""
+        moved = max(float(np.std(motor)), abs(ratio) * float(np.std(load)))
+        return float(np.std(motor - ratio * load)) / moved if moved else 0.0
+
+    if relative_twist(expected) < 0.8:
+        return
+    # load and motor may well move against each other, beyond a resonance or in a gap: no mistake of sign is meant here
+    least, why = min((relative_twist(expected * factor), why) for factor, why in _mistakes(table, expected) if factor > 0.0)
+    if least < 0.7:
+        size = float(np.std(motor)) / (abs(expected) * float(np.std(load)))
+        raise file.wrong(f"theta_e moves {size:.3g} times as far as gear_ratio {expected:g} times theta_s: {why}")
+
+
+def _check_twist(file: LogFile, table: LogTable, found: Gearing, expected: float) -> None:
+    """Where the twist is as large as the motion, so that the log fits many ratios: refuse a twist beyond the motion."""
+    unit = table.load_unit
+    ranges = f"theta_e - {expected:g} theta_s ranges over {found.twist:.3g} {unit}, theta_e over {found.motion:.3g} {unit}"
+    # a load that a motor moves through a gap moves no farther than the motor
+    if found.twist > max(3.0 * found.least_twist, 1.5 * found.motion):
+        raise file.wrong(
+            f"{ranges}: gear_ratio, or a unit in [log], is wrong (with {found.ratio:.3g} in place of {expected:g} it "
+            f"would be {found.least_twist:.3g} {unit})"
+        )
+    against = " They mostly move in opposite directions: perhaps the sign of one of them is wrong."
+    file.notes.append(
+        f"{ranges}: with backlash or wind-up of that size this log hardly confirms gear_ratio."
+        + (against if found.ratio * expected < 0.0 else "")
+    )
+
+
+def check_torque(file: LogFile, found: RigidFit, grid: Grid, position: np.ndarray) -> None:
+    """A passive drive takes energy from its input; inertia and friction are positive.
+
+    Args:
+        file: the log; gets a remark where the torque is doubtful.
+        found: rigid-drive fit of the torque.
+        grid: its `u` is the torque.
+        position: that the torque moves, shape (samples,).
+
+    Raises:
+        InputError: the torque has the wrong sign.
+    """
+    work = total = travel = away = 0.0
+    for s in grid.segments:
+        torque, steps = grid.values["u"][s][:-1], np.diff(position[s])
+        work += float(torque @ steps)
+        total += float(np.abs(torque) @ np.abs(steps))
+        travel += float(np.abs(steps).sum())
+        away += abs(float(position[s][-1] - position[s][0]))
+    share = work / total if total else 0.0
+    heavy = found.inflation[0] < 10.0 and found.shares[0] > 0.1
+    backwards = heavy and found.values[0] < -8.0 * found.errors[0]
+    if away > 0.2 * travel:
+        # potential energy may pay for the motion
+        share = max(share, 0.0)
+    if backwards and share < 0.02:
+        raise file.wrong(
+            "the torque has the wrong sign: the drive accelerates against it"
+            + (f" and returns {-100 * share:.0f} % of the work" if share < -0.02 else "")
+            + "; set sign = -1 in [log] u"
+        )
+    # a driven load returns work as well: no error
+    if share < -0.1:
+        file.notes.append(
+            f"The drive returns {-100 * share:.0f} % of the work: the load drives it, or the sign of u is wrong."
+        )
+    elif backwards and share < 0.1:
+        file.notes.append("The drive seems to accelerate against u: see its sign, unit and column.")
+
+
+# remarks
+
+
+def note_channel(file: LogFile, name: str, figures: ChannelFigures, fastest: float) -> None:
+    """Remark on jumps, saturation and improbable speeds of a channel; `fastest` is its rate of change, unit/s."""
+    if figures.jumps:
+        file.notes.append(
+            f"{name}: {figures.jumps} jump{'s' * (figures.jumps > 1)} that the motion does not explain: "
+            "dropped counts or disturbed readings."
+        )
+    if figures.saturated:
+        file.notes.append(f"{name} is saturated in {100 * figures.saturated:.2g} % of the samples.")
+    # 1e4 rad/s, about 100 000 rpm, is beyond drives
+    if figures.unit == "rad" and fastest > 1e4:
+        file.notes.append(f"{name} reaches {fastest:.3g} rad/s, {fastest * 30.0 / math.pi:.3g} rpm: check its unit.")
+
+
+def note_skew(file: LogFile, found: Gearing, period: float) -> None:
+    """Remark on a skew between both encoders that is significant and no tiny part of the period, s."""
+    if found.skew is None or found.skew_error is None:
+        return
+    if abs(found.skew) > 6.0 * found.skew_error and abs(found.skew) > 0.05 * period:
+        how = "lags" if found.skew > 0.0 else "leads"
+        file.notes.append(
+            f"theta_s {how} theta_e by {1e3 * abs(found.skew):.3g} ± {1e3 * found.skew_error:.2g} ms: a skew of the stamps, "
+            "or viscous friction of the load that winds up the shaft; this log cannot tell them apart."
+        )
+
+
+def note_lost_motion(file: LogFile, table: LogTable, found: Gearing, figures: dict[str, ChannelFigures]) -> None:
+    """Remark on the lost motion where it stands out of the noise of both encoders."""
+    unit = table.load_unit
+    text = f"Lost motion at the motor: {found.lost_motion_text(unit)}"
+    if found.flank == "load":
+        times = ", ".join(f"{t:.3g}" for t in found.flank_times[:6]) + (", ..." if len(found.flank_times) > 6 else "")
+        low, high = found.lost_motion_range
+        one = " With one change only, a slipped coupling or lost counts would look the same."
+        file.notes.append(
+            f"{text}, from positions passed in the same direction before and after the load torque changed its sign, at "
+            f"{times} s; {low:.2g} to {high:.2g} {unit} by position." + (one if len(found.flank_times) == 1 else "")
+        )
+    elif found.stands_out(twist_noise(found.ratio, figures["theta_e"], figures["theta_s"])) and not found.wide:
+        file.notes.append(f"{text}, from {found.flank_changes} changes of the flank by the direction of motion.")

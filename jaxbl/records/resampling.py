@@ -1,0 +1,97 @@
+"""Channels at their own time stamps become samples at even spacing, moved by their skews."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from .channels import RawChannel
+from .files import LogFile
+from .signal_quality import SHORTEST, interpolated
+from .time_stamps import Segments
+
+
+class Grid(NamedTuple):
+    """Evenly spaced samples of all channels.
+
+    Attributes:
+        time: s, shape (samples,).
+        values: channel -> SI values, shape (samples,).
+        segments: contiguous parts.
+        period: s.
+    """
+
+    time: np.ndarray
+    values: dict[str, np.ndarray]
+    segments: Sequence[slice]
+    period: float
+
+
+def resampled(
+    file: LogFile,
+    segments: Segments,
+    channels: Mapping[str, RawChannel],
+    period: float,
+    skews: Mapping[str, float],
+    *,
+    interpolate: bool,
+) -> Grid:
+    """All channels on one grid within each segment: positions by cubic splines, a held torque by its means.
+
+    Args:
+        file: the log.
+        segments: times and parts.
+        channels: at these times.
+        period: of the grid, s.
+        skews: of each channel, s.
+        interpolate: False where the stamps lie on the grid already, so that only skews move values.
+
+    Raises:
+        InputError: a segment is too short for period and skews.
+    """
+    times, values, parts, begin = [], {name: [] for name in channels}, [], 0
+    for part, first in zip(segments.parts, segments.starts, strict=True):
+        stamps = segments.times[part]
+        if not interpolate and not any(skews.values()):
+            grid = first + period * np.arange(len(stamps), dtype=float)
+        else:
+            grid = _common_grid(file, stamps, period, skews.values(), None if interpolate else first)
+        for name, raw in channels.items():
+            own = stamps - skews[name]
+            if not interpolate and not skews[name] and len(grid) == len(stamps):
+                values[name].append(raw.values[part])
+            elif raw.held:
+                values[name].append(_held_means(own, raw.values[part], grid, period))
+            else:
+                values[name].append(interpolated(own, raw.values[part], grid))
+        times.append(grid)
+        parts.append(slice(begin, begin + len(grid)))
+        begin += len(grid)
+    return Grid(np.concatenate(times), {name: np.concatenate(v) for name, v in values.items()}, tuple(parts), period)
+
+
+def _common_grid(file: LogFile, stamps: np.ndarray, period: float, skews, first: float | None) -> np.ndarray:
+    """Times at which all channels have values, s; on the grid that begins at `first`, if it is given."""
+    low = max(float(stamps[0]) - skew for skew in skews)
+    if first is not None:
+        # where the channels without skew have their samples
+        low = first + period * math.ceil((low - first) / period - 1e-6)
+    high = min(float(stamps[-1]) - skew for skew in skews)
+    count = math.floor((high - low) / period + 1e-6) + 1
+    if count < SHORTEST // 2:
+        raise file.wrong(
+            f"with these skews and this period a segment has {max(count, 0)} samples; at least {SHORTEST // 2} are needed"
+        )
+    return low + period * np.arange(count, dtype=float)
+
+
+def _held_means(stamps: np.ndarray, values: np.ndarray, grid: np.ndarray, period: float) -> np.ndarray:
+    """Means, over each period of a grid, of values that are held from each stamp to the next.
+
+    The last value is held for one more period. Means keep the impulse, and with it the velocity that a torque makes.
+    """
+    edges = np.append(stamps, max(stamps[-1], grid[-1]) + 2.0 * period)
+    integral = np.concatenate([[0.0], np.cumsum(values * np.diff(edges))])
+    ends = np.append(grid, grid[-1] + period)
+    return np.diff(np.interp(ends, edges, integral)) / period

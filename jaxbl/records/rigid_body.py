@@ -1,0 +1,98 @@
+"""A rough fit of a rigid drive to a log: torque against acceleration, velocity, its sign, position and a constant."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .least_squares import jackknifed
+from .signal_quality import SHORTEST, bandwidth, longest, low_passed, settled
+
+
+@dataclass(frozen=True)
+class RigidFit:
+    """A rough regression of the torque on the motion of a rigid drive, to judge a log by; no identification.
+
+    The terms are acceleration, velocity, its sign, position and a constant.
+
+    Attributes:
+        names: of the terms.
+        values: coefficients, SI units, shape (terms,).
+        errors: their standard errors, shape (terms,).
+        inflation: variance inflation factor of each: 1 if its term is uncorrelated with all others, shape (terms,).
+        shares: rms of each term over that of the torque, shape (terms,).
+        skew: by how much the stamps of u are later than the torque, s.
+        skew_error: standard error.
+        residual: rms of the residual over the rms of the torque about its mean.
+    """
+
+    names: tuple[str, ...]
+    values: np.ndarray
+    errors: np.ndarray
+    inflation: np.ndarray
+    shares: np.ndarray
+    skew: float
+    skew_error: float
+    residual: float
+
+
+def direction_of(velocity: np.ndarray) -> np.ndarray:
+    """+1 or -1 by the sign of a velocity, smooth through zero, shape (samples,)."""
+    # 2 % of the rms velocity: standstill then counts as neither direction
+    return velocity / np.hypot(velocity, 0.02 * np.sqrt(np.mean(velocity**2)) + 1e-300)
+
+
+def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence[slice], period: float) -> RigidFit | None:
+    """Regress torque on the motion of one encoder; None where there is too little motion.
+
+    Args:
+        torque: held from each stamp to the next, shape (samples,).
+        position: shape (samples,).
+        segments: contiguous parts.
+        period: s.
+    """
+    width = bandwidth(position[longest(segments)], period, slope=True)
+    if width == 0.0 or np.ptp(torque) == 0.0:
+        return None
+    # three times the bandwidth: the corners of the motion stay, noise of the second derivative goes
+    cutoff = 3.0 * width
+    targets, all_rows = [], []
+    for s in segments:
+        if s.stop - s.start < SHORTEST:
+            continue
+        smooth = low_passed(position[s], cutoff, period)
+        velocity = np.gradient(smooth, period)
+        acceleration = np.gradient(velocity, period)
+        direction = low_passed(direction_of(velocity), cutoff, period)
+        held = low_passed(torque[s], cutoff, period)
+        cut = settled(len(smooth), cutoff, period)
+        columns = [acceleration, velocity, direction, smooth, np.ones_like(smooth), -np.gradient(held, period)]
+        all_rows.append(np.stack(columns, axis=1)[cut])
+        targets.append(held[cut])
+    if not targets:
+        return None
+    target, rows = np.concatenate(targets), np.concatenate(all_rows)
+    if np.ptp(target) == 0.0:
+        return None
+    found, errors = jackknifed(target, rows)
+    if not np.isfinite(found).all():
+        # two terms are proportional to each other
+        found, errors = np.zeros(6), np.full(6, np.inf)
+    terms = rows[:, :5]
+    centred = terms[:, :4] - terms[:, :4].mean(axis=0)
+    spread = np.sqrt(np.mean(centred**2, axis=0))
+    inflation = np.full(5, np.inf)
+    if np.isfinite(errors).all() and (spread > 0.0).all():
+        inflation = np.append(np.diag(np.linalg.inv(np.corrcoef(centred.T))), 1.0)
+    left = target - rows @ found
+    return RigidFit(
+        names=("inertia", "viscous", "coulomb", "spring", "constant"),
+        values=found[:5],
+        errors=errors[:5],
+        inflation=inflation,
+        shares=np.abs(found[:5]) * np.sqrt(np.mean(terms**2, axis=0)) / np.sqrt(np.mean(target**2)),
+        # a torque that is held for a period acts half a period after its stamp
+        skew=float(found[5]) + 0.5 * period,
+        skew_error=float(errors[5]),
+        residual=float(np.std(left) / np.std(target)),
+    )

@@ -1,0 +1,230 @@
+"""Time stamps of a log: the rows that are read, gaps between them, and whether they lie on an even grid."""
+
+import itertools
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from .files import LogFile
+from .signal_quality import SHORTEST, longest, resolution
+from .table import LogTable, TimeTable
+
+GAP = 3.5
+"""Intervals longer than this many periods are gaps: up to three lost samples in a row are interpolated."""
+_ONE = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Unit of the stamps -> s."""
+_SLOW = 0.5
+"""Period in s from which a remark asks for the unit of the stamps: drives are sampled much faster."""
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Figures on the time stamps of a log.
+
+    Attributes:
+        samples: rows that were read.
+        median_period: median of the intervals, s.
+        jitter: rms deviation of the intervals from their mean, without gaps, s.
+        longest_interval: s; gaps included.
+        gaps: intervals longer than three and a half periods.
+        repeated: rows whose stamp is that of the row before.
+        even: whether the stamps lie on an even grid, apart from their rounding.
+    """
+
+    samples: int
+    median_period: float
+    jitter: float
+    longest_interval: float
+    gaps: int
+    repeated: int
+    even: bool
+
+
+class TimeStamps(NamedTuple):
+    """The rows that are read, and their times.
+
+    Attributes:
+        times: s from the first stamp of the file, shape (rows,).
+        start: first stamp of the file, s.
+        rows: their numbers in the file, counted from 0, shape (rows,).
+        total: rows of the file.
+        median: median interval of the file, s.
+        gap: longest interval that is no gap, s.
+    """
+
+    times: np.ndarray
+    start: float
+    rows: np.ndarray
+    total: int
+    median: float
+    gap: float
+
+
+class Segments(NamedTuple):
+    """Parts of a log between its gaps.
+
+    Attributes:
+        times: s, shape (rows,); where the stamps are even, those of their grid.
+        distinct: False for rows left out as their stamp is that of the row before, shape (rows of the time stamps,).
+        parts: rows of each.
+        starts: time of the first sample of each, s.
+        period: of the grid where the stamps are even, else their median interval, s.
+        sampling: figures on the stamps.
+    """
+
+    times: np.ndarray
+    distinct: np.ndarray
+    parts: list[slice]
+    starts: list[float]
+    period: float
+    sampling: Sampling
+
+
+def read_time_stamps(file: LogFile, table: LogTable) -> TimeStamps:
+    """The rows that `[log]` selects, and their times.
+
+    Raises:
+        InputError: time goes back or stands still, or too few rows are left.
+    """
+    stamps = _stamps(file, table.t or TimeTable())
+    start = float(stamps[0])
+    stamps = stamps - start
+    rows = _selected_rows(file, table, stamps)
+    intervals = np.diff(stamps)
+    median = float(np.median(intervals)) or float(np.mean(intervals))
+    # stamps that were rounded to more than a period come in groups
+    group = 0.0 if np.median(intervals) else float(np.median(intervals[intervals > 0.0]))
+    if median >= _SLOW:
+        file.notes.append(f"The period is {median:g} s: if the stamps are not in s, set [log] t.unit.")
+    # 2.5: one group may be missing
+    return TimeStamps(stamps[rows], start, rows, len(stamps), median, max(GAP * median, 2.5 * group))
+
+
+def _stamps(file: LogFile, table: TimeTable) -> np.ndarray:
+    """Of all rows, s, shape (rows of the file,)."""
+    if table.period is not None:
+        length = max(len(values) for values in file.columns.values())
+        stamps = np.arange(length, dtype=float) * table.period
+    else:
+        stamps = file.numbers(table.column_or("t"), "t.column") * _ONE[table.unit]
+    if len(stamps) < SHORTEST:
+        raise file.wrong(f"has {len(stamps)} rows; a log needs at least {SHORTEST}")
+    back = np.diff(stamps) < 0.0
+    if back.any():
+        row = int(np.argmax(back)) + 1
+        raise file.wrong(
+            f"column {file.name(table.column_or('t'))!r}, data row {row + 1}: time goes back from {stamps[row - 1]:.9g} s "
+            f"to {stamps[row]:.9g} s; stamps should increase"
+        )
+    if stamps[0] == stamps[-1]:
+        name = file.name(table.column_or("t"))
+        raise file.wrong(f"column {name!r} is {stamps[0]:g} s in all rows; stamps should increase")
+    return stamps
+
+
+def _selected_rows(file: LogFile, table: LogTable, stamps: np.ndarray) -> np.ndarray:
+    """Numbers of the rows that `where`, `start` and `stop` leave; stamps from the first one on."""
+    keep = np.ones(len(stamps), dtype=bool)
+    for column, value in (table.where or {}).items():
+        given = file.same_length(file.raw(column), len(stamps), column)
+        keep &= given == value
+        if not keep.any():
+            found = ", ".join(repr(v.item() if hasattr(v, "item") else v) for v in np.unique(given.astype(object))[:6])
+            raise file.wrong(f"[log] where leaves no row: '{column}' is never {value!r}; values: {found}")
+    for limit, outside in ((table.start, np.less), (table.stop, np.greater)):
+        if limit is not None:
+            keep &= ~outside(stamps, limit)
+    rows = np.flatnonzero(keep)
+    if len(rows) < SHORTEST:
+        raise file.wrong(
+            f"[log] where, start and stop leave {len(rows)} of {len(stamps)} rows; at least {SHORTEST} are needed"
+        )
+    if len(rows) < len(stamps):
+        file.notes.append(f"{len(rows)} of {len(stamps)} rows are read, by [log] where, start and stop.")
+    return rows
+
+
+def split_at_gaps(file: LogFile, stamps: TimeStamps) -> Segments:
+    """Parts between gaps, without those that are too short and without repeated stamps.
+
+    Raises:
+        InputError: too few samples are left.
+    """
+    times, rows = stamps.times, stamps.rows
+    parts = _parts(times, stamps.gap)
+    grids = [even_grid(times[p]) for p in parts if _is_long(p)]
+    even = bool(grids) and all(grid.even for grid in grids)
+    distinct = np.ones(len(times), dtype=bool)
+    if not even:
+        # no spline takes a stamp twice
+        distinct = np.diff(times, prepend=-1.0) != 0.0
+    repeated = len(times) - int(distinct.sum())
+    if repeated:
+        row = rows[int(np.argmin(distinct))] + 1
+        file.notes.append(f"{repeated} rows have the stamp of the row before and were left out (data row {row} first).")
+        times, rows = times[distinct], rows[distinct]
+        parts = _parts(times, stamps.gap)
+    kept = [p for p in parts if _is_long(p)]
+    samples = sum(map(_length, kept))
+    if samples < SHORTEST:
+        most = max(map(_length, parts))
+        raise file.wrong(f"gaps leave no {SHORTEST} samples in a row (the longest part has {most}); a log needs them")
+    intervals = np.diff(times)
+    if len(parts) > 1:
+        widest = int(np.argmax(intervals))
+        left_out = len(times) - samples
+        file.notes.append(
+            f"Gaps: {len(parts) - 1}; segments: {len(kept)}; the longest gap is {intervals[widest]:.4g} s, "
+            f"after data row {rows[widest] + 1}" + (f"; {left_out} samples between gaps were left out." if left_out else ".")
+        )
+    inside = intervals[intervals <= stamps.gap]
+    period, starts = stamps.median, [float(times[p.start]) for p in kept]
+    if even:
+        times = times.copy()
+        for p, grid in zip(kept, grids, strict=True):
+            times[p] = grid.first + grid.period * np.arange(_length(p))
+        period, starts = grids[kept.index(longest(kept))].period, [grid.first for grid in grids]
+    sampling = Sampling(
+        samples=len(stamps.times),
+        median_period=stamps.median,
+        jitter=float(np.std(inside)) if len(inside) else 0.0,
+        longest_interval=float(intervals.max()),
+        gaps=len(parts) - 1,
+        repeated=repeated,
+        even=even,
+    )
+    return Segments(times, distinct, kept, starts, period, sampling)
+
+
+def _length(part: slice) -> int:
+    return part.stop - part.start
+
+
+def _is_long(part: slice) -> bool:
+    return _length(part) >= SHORTEST // 2
+
+
+def _parts(stamps: np.ndarray, gap: float) -> list[slice]:
+    ends = np.flatnonzero(np.diff(stamps) > gap) + 1
+    return [slice(a, b) for a, b in itertools.pairwise([0, *ends.tolist(), len(stamps)])]
+
+
+class EvenGrid(NamedTuple):
+    """The even grid that fits stamps best: whether they lie on it, its period and its first time, s."""
+
+    even: bool
+    period: float
+    first: float
+
+
+def even_grid(stamps: np.ndarray) -> EvenGrid:
+    """The even grid that fits increasing stamps best, in s, shape (samples,), by least squares."""
+    index = np.arange(len(stamps)) - 0.5 * (len(stamps) - 1)
+    middle = stamps.mean()
+    period = float(index @ (stamps - middle) / (index @ index))
+    largest = float(np.abs(stamps - middle - period * index).max())
+    # 2 % of a period changes no result; stamps that were rounded, say to milliseconds, are off by up to half a step
+    rounding = resolution(np.diff(stamps))
+    even = largest <= 0.02 * period or largest <= 0.55 * min(rounding, 20.0 * period)
+    return EvenGrid(even, period, float(middle + period * index[0]))
