@@ -65,7 +65,7 @@ def test_page_and_lines(checked):
     assert any("no counterexample to any condition" in line for line in lines)
     assert any("failed although a condition held" in line and "Causes, by experiment" in line for line in lines)
     (marked,) = [line for line in lines if line.startswith("small gains")]
-    assert "no condition can hold" in marked or "worst disturbance enlarges the error" in marked
+    assert "no condition can hold" in marked or "worst disturbance enlarges the velocity error" in marked
     (marked,) = [line for line in lines if line.startswith("good gains")]
     assert "any disturbance within f⁺ dies out" in marked
     assert len(list((folder / "figures").glob("*.png"))) == 5
