@@ -13,13 +13,10 @@ from .errors import InputError
 from .terminal import duration, end_at_once_if_interrupted, naming, running, with_exit_code
 
 if TYPE_CHECKING:
-    from jaxbl.diagnosis.diagnose import Diagnosis
     from jaxbl.gains.tune import Tuning
     from jaxbl.gains.verify import Verdict
-    from jaxbl.identification.identify import Identification
     from jaxbl.sweeps.programs import Backend
     from jaxbl.sweeps.sweep import StudyResult
-    from jaxbl.workers import Progress
 
     from .config import Config
 
@@ -40,11 +37,9 @@ LogOutOption = Annotated[
     Path | None, typer.Option("--out", metavar="DIR", help="folder for the results [default: results/<log name>]")
 ]
 LogOverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="allow a folder that holds results of another log: they are replaced")
+    bool, typer.Option("--overwrite", help="write into a folder that holds results of another log")
 ]
-OverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="allow a folder that holds another study: its results are removed")
-]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="remove the results of another study from the folder")]
 BackendOption = Annotated[
     str | None,
     typer.Option(
@@ -170,7 +165,7 @@ def _compute(
     out: Path | None,
     overwrite: bool,
     backend: "Backend | None",
-    run: "Callable[..., StudyResult | Tuning | Verdict]",
+    run: Callable[..., Any],
     write_report: Callable[[Any, Path], list[str]],
 ) -> None:
     """Run a command on a study that continues where an interrupted call stopped, and write its report."""
@@ -246,7 +241,7 @@ def identify(
 def _fit(
     words: list[str],
     task: Any,
-    run_task: "Callable[[Any, Progress], Identification | Diagnosis]",
+    run_task: Callable[..., Any],
     model: Path,
     result: Path,
     overwrite: bool,

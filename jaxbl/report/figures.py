@@ -30,17 +30,16 @@ def save(figure: Figure, path: Path) -> Path:
     return path
 
 
-def stacked_axes(rows: int, height: float, width: float = 9.0, margin: float = 0.6, sharex: bool = True):
+def stacked_axes(rows: int, height: float, width: float = 9.0, sharex: bool = True):
     """A figure of axes one above the other. Returns the figure and a flat array of its axes.
 
     Args:
         rows: number of axes.
         height: of each, in inches.
         width: of the figure, in inches.
-        margin: height for labels below and legends above, in inches.
         sharex: one time axis for all.
     """
-    figure = Figure(figsize=(width, height * rows + margin), layout="constrained")
+    figure = Figure(figsize=(width, height * rows + 0.6), layout="constrained")
     axes = figure.subplots(rows, 1, sharex=sharex, squeeze=False).ravel()
     figure.align_ylabels(axes)
     return figure, axes

@@ -77,6 +77,7 @@ def _intervals(found: Identification) -> Drawn:
     names = [*fitted, *held]
     figure = Figure(figsize=(9.0, 1.1 + 0.4 * len(names)), layout="constrained")
     ax = figure.subplots()
+    beside: Any = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": 9}
     shown = [0.0]
     for i, one in enumerate(fitted.values()):
         size = abs(one["nominal"]) or abs(one["value"]) or 1.0
@@ -89,17 +90,10 @@ def _intervals(found: Identification) -> Drawn:
         shown += [max(low, middle - 100.0), min(high, middle + 100.0)]
         half = 0.5 * abs(one["interval"][1] - one["interval"][0])
         text = _with_error(one["value"], half, one.get("unit", ""))
-        ax.annotate(text, (1.01, i), xycoords=("axes fraction", "data"), va="center", fontsize=9)
+        ax.annotate(text, (1.01, i), **beside)
     for i in range(len(fitted), len(names)):
         ax.plot(0.0, i, "o", mfc="white", mec=FAINT, ms=6)
-        ax.annotate(
-            "held at nominal: not seen in this log",
-            (1.01, i),
-            xycoords=("axes fraction", "data"),
-            va="center",
-            fontsize=9,
-            color="#555555",
-        )
+        ax.annotate("held at nominal: not seen in this log", (1.01, i), color="#555555", **beside)
     ax.axvline(0.0, color="black", lw=0.8, zorder=0)
     room = 0.06 * (max(shown) - min(shown)) or 1.0
     ax.set_yticks(range(len(names)), names)
@@ -117,7 +111,7 @@ def _intervals(found: Identification) -> Drawn:
 
 def _residuals(log: LogSignals) -> Drawn:
     residual = log.found.summary["residual"]
-    figure, axes = stacked_axes(len(residual), 2.0, margin=0.7)
+    figure, axes = stacked_axes(len(residual), 2.0)
     for ax, (side, one) in zip(axes, residual.items(), strict=True):
         unit, values = log.unit[side], log[f"{side}.residual"]
         label = f"rms {one['rms']:.2g} {unit}, {one['rms'] / one['noise']:.3g} times the noise"
@@ -378,7 +372,7 @@ def _friction(log: LogSignals) -> Drawn:
 
 def _path(log: LogSignals) -> Drawn:
     found, names = log.found, list(log.found.summary["method"]["recursive"])
-    figure, axes = stacked_axes(len(names), 2.1, margin=0.5)
+    figure, axes = stacked_axes(len(names), 2.1)
     late = slice((log.observed.start + log.observed.stop) // 2, log.observed.stop)
     # what a law derives from its own parameters is an angle, as they are
     units = {field.name: about.unit for field, about in parameters(log.experiment.transmission)}

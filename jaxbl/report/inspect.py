@@ -23,12 +23,7 @@ _POINTS = 6000
 _LINES = 25
 """Lines printed at most: a terminal shows about that many."""
 _LABELS = {"u": "input u", "theta_e": "motor θe", "theta_s": "load θs", "transmitted": "transmitted"}
-_COLOUR = {
-    "u": COLOURS[6],
-    "theta_e": COLOURS[0],
-    "theta_s": COLOURS[1],
-    "transmitted": COLOURS[2],
-}
+_COLOUR = {"u": COLOURS[6], "theta_e": COLOURS[0], "theta_s": COLOURS[1], "transmitted": COLOURS[2]}
 
 
 def write_inspection_report(inspection: Inspection, folder: Path) -> list[str]:

@@ -141,12 +141,8 @@ def _levels(verdict: Verdict, side: str) -> Drawn:
         handles = condition_curves(ax, conditions_of(verdict.config), 1.0, (max(bins[0][0], 1.0001), bins[0][-1]))
         wrong = verdict.counterexamples
         if len(wrong):
-            wrong = wrong[
-                (wrong["level"] == level)
-                & (wrong["side"] == side)
-                & (wrong["bound"] == "true")
-                & (wrong["condition"] == "exact")
-            ]
+            about = {"level": level, "side": side, "bound": "true", "condition": "exact"}
+            wrong = wrong[np.logical_and.reduce([wrong[name] == value for name, value in about.items()])]
             bound = wrong[f"{side}.f_plus"]
             place = wrong[f"observer.{side}.alpha"] / bound, wrong[f"observer.{side}.lambda"] / np.sqrt(bound)
             ax.plot(*place, "x", ms=2.5, mew=0.7, color=COLOURS[1])
@@ -301,31 +297,13 @@ def _level_table(level: dict[str, Any]) -> PageTable:
     name = "Normalised error system, worst disturbance"
     if level["level"] != "normalised":
         name = f"{_LEVELS[level['level']].capitalize()}; {level['side']} observer"
-    rows: list[list[object]] = [
-        [
-            entry["title"],
-            entry["holds"],
-            entry["counterexamples"],
-            entry["fails_but_converged"],
-            entry["conservatism"]["median"],
-            entry["conservatism"]["max"],
-            entry["conservatism"]["at_least"] > 0,
-        ]
-        for entry in level["conditions"]
-    ]
-    heading = (
-        f"{name}: {level['cells']} {'cells' if level['level'] == 'normalised' else 'runs'}, {level['converged']} converged"
-    )
-    head = [
-        "condition",
-        "holds",
-        "holds, but failed",
-        "fails, but converged",
-        "λ demanded / least: median",
-        "largest",
-        "at least",
-    ]
-    return PageTable(heading, head, rows)
+    rows: list[list[object]] = []
+    for entry in level["conditions"]:
+        counts, ratio = (entry[key] for key in ("holds", "counterexamples", "fails_but_converged")), entry["conservatism"]
+        rows.append([entry["title"], *counts, ratio["median"], ratio["max"], ratio["at_least"] > 0])
+    kind = "cells" if level["level"] == "normalised" else "runs"
+    head = ["condition", "holds", "holds, but failed", "fails, but converged", "λ demanded / least: median", "largest"]
+    return PageTable(f"{name}: {level['cells']} {kind}, {level['converged']} converged", [*head, "at least"], rows)
 
 
 def _claimed_tables(level: dict[str, Any]) -> list[PageTable]:
@@ -363,15 +341,14 @@ def _mark_table(verdict: Verdict) -> PageTable:
 def _counterexample_table(verdict: Verdict) -> PageTable:
     found = verdict.counterexamples[verdict.counterexamples["bound"] == "true"]
     paths = [axis.path for axis in verdict.config.axes if axis.path in found]
-    counts = found.groupby(["level", "side", "condition", "cause"], sort=False).size().sort_values(ascending=False)
-    examples = found.drop_duplicates(["level", "side", "condition", "cause"]).set_index(
-        ["level", "side", "condition", "cause"]
-    )
+    keys = ["level", "side", "condition", "cause"]
+    counts = found.groupby(keys, sort=False).size().sort_values(ascending=False)
+    examples = found.drop_duplicates(keys).set_index(keys)
     rows: list[list[object]] = []
     for key, count in counts.items():
         example = examples.loc[key]
         rows.append([*key, int(count), *(_plain(example[path]) for path in paths)])
-    head = ["level", "side", "condition", "cause", "runs", *(f"e.g. {path}" for path in paths)]
+    head = [*keys, "runs", *(f"e.g. {path}" for path in paths)]
     return PageTable("Counterexamples by cause (all of them, with all figures: counterexamples.parquet)", head, rows)
 
 
