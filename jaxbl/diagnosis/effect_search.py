@@ -1,10 +1,10 @@
-"""Which effects a model lacks on a record: screened on the linearised model, decided on models that have them.
+"""Which effects a model lacks on a record: screened on the linearised model, decided by models that have them.
 
 A round: all candidates are screened on the prediction errors of the model so far; of the best, each is put into the
 model, its numbers and the model's own refitted (Gauss-Newton through the simulated step, the prior on the nominal numbers
-kept), and their evidences compared. What wins stays, and the next round begins, until nothing pays for its columns. Then
-what is left is asked whether it is noise: any function of time, position or velocity that pays says that something else
-is missing.
+kept), and their evidences compared. The best one stays if it raises the evidence, and the next round begins. In the end
+free functions of time, position and velocity are fitted to what remains: one that raises the evidence clearly says that
+something else is missing.
 """
 
 import dataclasses
@@ -28,37 +28,46 @@ from .neutral_effects import candidates, complete
 from .refit import Refined, refined
 from .whittle import Spectrum
 
-Array = np.ndarray
 Names = tuple[str, ...]
 
 Verdict = Literal["explained", "no_discrepancy", "unknown_effect"]
 
 ODDS = -2.0
-"""Log prior odds of each effect to be missing."""
+"""Log prior odds of each effect to be missing: a probability of 0.12."""
 _FINALISTS, _LEADERS = 5, 3
-_BEHIND = 0.5
-"""Share of the best gain in evidence that a finalist must reach (or be within :data:`_NEAR`)."""
-_NEAR = 25.0
+"""Candidates of a screening that are put into the model, and those that get a Kalman gain of their own before. Each costs a
+refit."""
+_BEHIND, _NEAR = 0.5, 25.0
+"""A finalist is tried if the screening gives it this share of the best one's gain, or a gain within so many nats of it: it
+is linear, and may order candidates wrongly."""
 FAR = 5.0
-"""Standard deviations of what is known of a number that it can hardly be off."""
+"""Standard deviations of a number's prior beyond which it hardly lies (one in a million)."""
 _WEAK = 6.0
-"""Standard errors up to which an effect's torque is small enough for the effect to be needless."""
-_STEPS = 15
-_SETTLED = 2e-3
+"""Standard errors of an effect's torque below which the effect is asked for once more: an error of the first fit may be as
+large."""
+_STEPS, _SETTLED = 15, 2e-3
+"""Gauss-Newton steps of a refit at most, and the relative change of all numbers below which it has ended. The last fit is
+exact (:mod:`.refit`); evidences are compared at this one."""
 _LEAST_GAIN = 1e-3
-_EARNED = 0.2
-"""Share of what free functions earn beside an effect that it must earn itself to be named."""
+"""Nats; what gains less in a screening gains nothing but rounding."""
+_SHARE_OF_UNKNOWN = 0.2
+"""An effect is named beside something unknown if its gain is this share of what a free function gains: known effects that
+only imitate the unknown one gain less."""
 _LEAST_CHANCE = 0.01
+"""Alternatives of a lower probability are not listed."""
 CLEAR = 100.0
-"""Nats that a free function must earn to tell that something else is missing, of a size that counts (:data:`LEAST`)."""
+"""Nats that a free function larger than :data:`LEAST` must gain to say that something else is missing: far beyond chance,
+since quantisation and time stepping leave structure, too (benchmarks/NOTES.md)."""
 _SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
+"""Prior sizes of a free function that are tried, over :data:`.candidates.SHARE`: down to the least that counts."""
 _MOST = 4
+"""Effects that are sought: twice as many as the bench hides at once."""
 _RECENT = 4
 """Models along the record that are kept: where a refit ended, the next one begins."""
 LEAST = 1e-3
-"""Share of the driving torque that an effect must have to be named: time stepping leaves a twentieth of it."""
+"""Share of the driving torque that an effect must have to be named; the error of time stepping is a twentieth of it."""
 FLOOR = 0.006
-"""Nats a prediction error that structure in the noise (quantisation, above all) may be worth: 1.2 % of its variance."""
+"""Nats a prediction error that structure in the noise (above all quantisation) may bring: 1.2 % of its variance."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +87,7 @@ class Model:
     names: Names
     experiment: Experiment
     numbers: dict[str, Numbers]
-    theta: Array
+    theta: np.ndarray
     log_evidence: float
     log_likelihood: float
     linear: Linear
@@ -110,9 +119,9 @@ class Explanation:
         findings: in the order in which they were found.
         model: the nominal model with the findings, all numbers refitted.
         nominal: the nominal model, its own numbers refitted.
-        wrong: the best model with a wrong effect in place of the last finding, or None.
-        rest: what is left over: evidence (nats) of each function of time, position or velocity, and the share of the driving
-            torque, of those tried, that its size has most likely.
+        wrong: the best model with another effect in place of the last finding, or None.
+        rest: gain in evidence (nats) of each free function of time, position or velocity, and its most likely size among
+            those tried, as a share of the driving torque.
     """
 
     verdict: Verdict
@@ -131,11 +140,11 @@ class Polished(NamedTuple):
 
 
 class _Finalist(NamedTuple):
-    """A candidate that did well on the linearised model: its numbers, and the change of the model's own beside them."""
+    """One of the best candidates on the linearised model: its numbers, and the change of the model's own beside them."""
 
     name: str
     numbers: Numbers
-    own: Array
+    own: np.ndarray
     gain: float
 
 
@@ -152,7 +161,7 @@ class _Scored(NamedTuple):
     name: str
     found: Set
     count: int
-    deviation: Array
+    deviation: np.ndarray
 
     @property
     def log_likelihood(self) -> float:
@@ -166,7 +175,7 @@ class _Scored(NamedTuple):
 
 
 class _Tried(NamedTuple):
-    """A candidate that was put into the model: what it earns (nats), and its numbers."""
+    """A candidate that was put into the model: its gain in evidence (nats), and its numbers."""
 
     name: str
     gain: float
@@ -183,13 +192,13 @@ class _Point(NamedTuple):
     experiment: Experiment
     linear: Linear
     values: dict[str, Numbers]
-    theta: Array
+    theta: np.ndarray
     found: Set
     cost: float
 
 
 class Explainer:
-    """Which effects a model lacks on a record: the record, the nominal model, and the models tried."""
+    """The search for missing effects on a record: the record, the nominal model, and the models tried."""
 
     def __init__(
         self,
@@ -217,7 +226,7 @@ class Explainer:
         self._recent: dict[tuple, Linear] = {}
         self._polished: tuple[tuple, Polished] | None = None
 
-    def polished(self, values: Mapping[str, Numbers], theta: Array) -> "Polished":
+    def polished(self, values: Mapping[str, Numbers], theta: np.ndarray) -> "Polished":
         """The model with some effects, with the numbers of least prediction errors (:mod:`.polish`)."""
         key = _key(values, theta)
         if self._polished is None or self._polished[0] != key:
@@ -233,7 +242,7 @@ class Explainer:
         theta = self.polished(found.model.numbers, found.model.theta).refined.theta[: len(self.free)]
         return bool(np.all(np.abs(theta) < FAR * self.prior))
 
-    def linear(self, values: Mapping[str, Numbers], theta: Array) -> Linear:
+    def linear(self, values: Mapping[str, Numbers], theta: np.ndarray) -> Linear:
         """The model with some effects along the record."""
         key = _key(values, theta)
         if key not in self._recent:
@@ -247,7 +256,7 @@ class Explainer:
         """Size of the input, N m."""
         return float(np.std(np.concatenate([one.torque for one in self.segments])))
 
-    def _linear(self, experiment: Experiment, names: Names, theta: Array) -> Linear:
+    def _linear(self, experiment: Experiment, names: Names, theta: np.ndarray) -> Linear:
         paths = paths_of(names)
         own = (*self.free, *free_parameters(experiment, paths, self._torque))
         widths = [EFFECTS[name].roles()[leaf].width for name in names for leaf in _fitted(name)]
@@ -258,7 +267,12 @@ class Explainer:
         return Linear(experiment, own, at, prior, centre, self.segments, bound)
 
     def refit(
-        self, names: Names, numbers: Mapping[str, Numbers], theta: Array, smoothness: Sequence[float], deviation: Array
+        self,
+        names: Names,
+        numbers: Mapping[str, Numbers],
+        theta: np.ndarray,
+        smoothness: Sequence[float],
+        deviation: np.ndarray,
     ) -> Model:
         """Put effects into the model and refit everything."""
         values = {name: dict(numbers[name]) for name in names}
@@ -288,9 +302,9 @@ class Explainer:
         self,
         names: Names,
         values: dict[str, Numbers],
-        theta: Array,
+        theta: np.ndarray,
         smoothness: Sequence[float],
-        deviation: Array,
+        deviation: np.ndarray,
     ) -> _Point:
         """Cost at some numbers, and where the linear step leads."""
         experiment = with_numbers(self.nominal, values)
@@ -308,7 +322,7 @@ class Explainer:
         cost = float(columns.products[0, 0] + np.sum((theta / self.prior) ** 2))
         return _Point(experiment, linear, values, theta, found, cost)
 
-    def _moved(self, point: _Point, change: Array) -> tuple[Array, dict[str, Numbers]]:
+    def _moved(self, point: _Point, change: np.ndarray) -> tuple[np.ndarray, dict[str, Numbers]]:
         count = len(self.free)
         values = {name: dict(numbers) for name, numbers in point.values.items()}
         for one, by in zip(point.linear.free[count:], change[count:], strict=True):
@@ -348,8 +362,8 @@ class Explainer:
                 found[plain] = [_Tried(plain, first.gain, current.numbers[plain]), *rivals]
             wrong = others[0][1] if others else None
             rest = self.remainder(current)
-            # next to what no effect explains, this one is little: more of them would dress up as that
-            if record[0].gain < _EARNED * _most(rest) and _most(rest) > CLEAR:
+            # small beside what no effect explains: more of them would only imitate that
+            if record[0].gain < _SHARE_OF_UNKNOWN * _most(rest) and _most(rest) > CLEAR:
                 break
         rest = self.remainder(current) if rest is None else rest
         left = _most(rest)
@@ -361,14 +375,14 @@ class Explainer:
             found = {name: tried for name, tried in found.items() if name in current.names}
         if current.names != before:
             wrong = wrong if current.names[-1:] == before[-1:] else None
-            # what was seen beside an effect that was little next to it is there without that effect too
+            # a free function that was needed beside the effect is needed without it, too
             rest = {name: max(rest[name], one) for name, one in self.remainder(current).items()}
             left = _most(rest)
         findings = tuple(_finding(one, current, left) for one in found.values())
         return Explanation(_verdict(left, findings), findings, current, nominal, wrong, rest)
 
     def without(self, found: Explanation, names: Collection[str]) -> Explanation:
-        """What is left of an explanation when some of its effects are withdrawn: what is not explained is sought anew."""
+        """An explanation without some of its effects; free functions are fitted anew to what remains."""
         model, kept = found.model, tuple(name for name in found.model.names if name not in names)
         smoothness, deviation = model.linear.choose(())
         # where nothing is kept, its own numbers have nothing to do with those beside effects
@@ -379,10 +393,10 @@ class Explainer:
         return Explanation(_verdict(_most(rest), findings), findings, model, found.nominal, None, rest)
 
     def _plain(self, model: Model, found: dict[str, list["_Tried"]], left: float) -> tuple[Model, dict[str, list["_Tried"]]]:
-        """Where something unknown remains, only what earns a good part of that is named, and of what it does not part, the
-        simplest: numbers to spare dress up as what they do not know."""
+        """Where something unknown remains: only effects with a good part of its gain, and of those that differ by less than
+        it the one with the fewest numbers, since spare numbers imitate the unknown."""
         smoothness, deviation = model.linear.choose(())
-        kept = {name: tried for name, tried in found.items() if tried[0].gain > _EARNED * left}
+        kept = {name: tried for name, tried in found.items() if tried[0].gain > _SHARE_OF_UNKNOWN * left}
         numbers = {name: model.numbers[name] for name in kept}
         model = self.refit(tuple(kept), numbers, model.theta, smoothness, deviation)
         for name, tried in list(kept.items()):
@@ -412,18 +426,18 @@ class Explainer:
         name: str,
         names: Names,
         numbers: Mapping[str, Numbers],
-        theta: Array,
+        theta: np.ndarray,
         smoothness: Sequence[float],
-        deviation: Array,
+        deviation: np.ndarray,
     ) -> Model | None:
-        """The model without one of its effects where that earns nothing beside the others, all numbers refitted."""
+        """The model without one of its effects, all numbers refitted, if the effect gains nothing beside the others."""
         full = self.refit(names, numbers, theta, smoothness, deviation)
         less = self.refit(tuple(one for one in names if one != name), numbers, theta, smoothness, deviation)
         return less if self._gain(less, full) <= 0.0 else None
 
     def _settled(self, model: Model) -> Model:
-        """A model without effects that are needless once all numbers are those of least prediction errors: where a fit
-        along the smoothed motion had ended wrong, an effect may have been found that only made up for it."""
+        """A model without effects that are needless once all numbers are those of least prediction errors: one may only have
+        compensated for an error of the fit along the smoothed motion."""
         free, best = self.polished(model.numbers, model.theta)
         count = len(self.free)
         numbers = {name: dict(one) for name, one in model.numbers.items()}
@@ -462,7 +476,7 @@ class Explainer:
         return model, renamed
 
     def _round(self, current: Model) -> tuple[list[float], list[tuple[float, Model]]]:
-        """Models with one effect more, and what each earns (nats), best first."""
+        """Models with one effect more, and their gains in evidence (nats), best first."""
         smoothness, deviation = current.linear.choose(())
         current = self.refit(current.names, current.numbers, current.theta, smoothness, deviation)
         smoothness, deviation, finalists = self._screen(current, smoothness)
@@ -474,7 +488,7 @@ class Explainer:
         tried: list[tuple[float, Model]] = []
         best = finalists[0].gain
         for one in finalists:
-            # those far behind have their turn where those before have not kept their promise
+            # those far behind are tried only if none before them gained
             behind = one.gain < max(min(_BEHIND * best, best - _NEAR), 0.0)
             if behind and any(gain > 0.0 for gain, _ in tried):
                 break
@@ -485,7 +499,7 @@ class Explainer:
         return smoothness, sorted(tried, key=lambda pair: -pair[0])
 
     def _coloured_round(self, current: Model) -> tuple[list[float], list[tuple[float, Model]]]:
-        """As :meth:`_round`, where errors are not white and count by their spectrum; what earns nothing is left out."""
+        """As :meth:`_round` by Whittle's likelihood, where errors are not white; without those that gain nothing."""
         linear = current.linear
         smoothness, deviation = linear.choose(())
         spectrum = linear.spectrum(smoothness)
@@ -504,7 +518,7 @@ class Explainer:
         return smoothness, sorted(tried, key=lambda pair: -pair[0])
 
     def remainder(self, model: Model) -> dict[str, tuple[float, float]]:
-        """What free functions would earn beside a model (nats), and their size over the driving torque, by name."""
+        """Gain in evidence of free functions beside a model (nats), and their size over the driving torque, by name."""
         rest = self._remainder(model.linear)
         if _most(rest) > CLEAR:
             # errors of the smoothed motion cancel to first order only; along the predictor's own path nothing is approximate
@@ -515,7 +529,7 @@ class Explainer:
         smoothness, deviation = linear.choose(())
         functions = functions_of(linear.signals)
         columns = linear.columns(functions, smoothness, deviation)
-        earned = {}
+        gained = {}
         for i, one in enumerate(functions):
             best = (-np.inf, 0.0)
             for size in _SIZES:
@@ -526,29 +540,29 @@ class Explainer:
                 assert none is not None and some is not None
                 base, more = (_Scored("", found, linear.count, deviation) for found in (none, some))
                 best = max(best, (self._gain(base, more), size * SHARE))
-            earned[one.name] = best
-        return earned
+            gained[one.name] = best
+        return gained
 
     def _gain(self, base: "Model | _Scored", model: "Model | _Scored") -> float:
-        """What a model's effect earns: evidence, less a floor of what it takes off the misfit."""
+        """Gain in evidence of a model's effect (nats), less what structure in the noise may bring (:data:`FLOOR`)."""
         explained = model.log_likelihood - base.log_likelihood
         gain = model.log_evidence - base.log_evidence
         return gain - min(max(explained, 0.0), self.floor) if np.isfinite(gain) else -np.inf
 
-    def _screen(self, model: Model, smoothness: list[float]) -> tuple[list[float], Array, list[_Finalist]]:
-        """Candidates that do well on the linearised model, and the predictor to judge them by: with the best of them in."""
+    def _screen(self, model: Model, smoothness: list[float]) -> tuple[list[float], np.ndarray, list[_Finalist]]:
+        """The best candidates on the linearised model, and the predictor chosen with the first of them."""
         linear = model.linear
         smoothness, deviation = linear.choose((), smoothness)
         variants = self._variants(model)
         _, ranked = self._ranked(linear, variants, smoothness, deviation)
         if not ranked:
             return smoothness, deviation, []
-        # a predictor that makes up for what is missing hides it: the best ones are tried with predictors of their own
+        # a predictor chosen without an effect compensates for it: the best ones are tried with predictors of their own
         leaders = [linear.choose([variants[one.found.which[0]]]) for one in ranked[:_LEADERS]]
         few = {one.name for one in ranked[: 2 * _FINALISTS]}
         variants = [one for one in variants if one.name in few]
         smoothness, deviation = min(leaders, key=lambda one: float(np.sum(np.log(one[1]))))
-        # beside the model without them under the same predictor: what they earn in truth, models that have them tell
+        # compared with the model without them under the same predictor
         base, ranked = self._ranked(linear, variants, smoothness, deviation)
         finalists = [
             _Finalist(one.name, one.found.numbers[0], one.found.own[: len(self.free)], self._gain(base, one))
@@ -566,7 +580,7 @@ class Explainer:
         return variants_of(model.experiment, lacking, model.linear.scales)
 
     def _ranked(
-        self, linear: Linear, variants: Sequence[Candidate], smoothness: Sequence[float], noise: Array | Spectrum
+        self, linear: Linear, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray | Spectrum
     ) -> tuple["_Scored", list["_Scored"]]:
         """The model without candidates, and with the best variant of each, best first."""
         scorer = Scorer(linear.columns(variants, smoothness, noise), variants)
@@ -593,16 +607,16 @@ def _verdict(left: float, findings: Sequence[Finding]) -> Verdict:
 
 
 def _most(rest: Mapping[str, tuple[float, float]]) -> float:
-    """What the best free function earns of those that are large enough for an effect."""
+    """Largest gain of the free functions that are large enough for an effect."""
     return max((gain for gain, share in rest.values() if share > LEAST), default=0.0)
 
 
-def _key(values: Mapping[str, Numbers], theta: Array) -> tuple:
+def _key(values: Mapping[str, Numbers], theta: np.ndarray) -> tuple:
     return (*((name, *numbers.items()) for name, numbers in values.items()), theta.tobytes())
 
 
 def _finding(tried: Sequence[_Tried], model: Model, left: float) -> Finding:
-    """The first of those tried, with its confidence: structure that is left over makes differences mean less."""
+    """The first of those tried, with its confidence; where something unknown remains, differences of evidence count less."""
     heat = left if left > CLEAR else 1.0
     # or nothing is missing
     *chances, _ = _softmax(np.array([*(one.gain for one in tried), 0.0]) / heat)
@@ -612,7 +626,7 @@ def _finding(tried: Sequence[_Tried], model: Model, left: float) -> Finding:
     return Finding(name, float(chances[0]), model.numbers[name], others)
 
 
-def _softmax(values: Array) -> Array:
+def _softmax(values: np.ndarray) -> np.ndarray:
     weights = np.exp(values - np.max(values))
     return weights / weights.sum()
 
