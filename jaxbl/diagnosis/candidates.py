@@ -23,8 +23,6 @@ from jaxbl.simulate import Experiment, with_effects
 
 from .linearised_segment import Part
 
-Array = np.ndarray
-
 
 class Candidate(Protocol):
     """Torques that may be missing: some columns, and what is there without any of them."""
@@ -54,7 +52,7 @@ class Candidate(Protocol):
         """Effects whose torques :meth:`columns` needs."""
         ...
 
-    def columns(self, signals: "Signals", torques: Sequence[Array]) -> Array:
+    def columns(self, signals: "Signals", torques: Sequence[np.ndarray]) -> np.ndarray:
         """Columns in N m, shape (width, samples, sides + 1), and behind them what is there at coefficients of 0, if
         anything is."""
         ...
@@ -89,7 +87,7 @@ class Variant:
         """As of :class:`Candidate`."""
         return tuple(effect for effect, _ in self.unit) if self.trial is None else self.trial
 
-    def columns(self, signals: "Signals", torques: Sequence[Array]) -> Array:
+    def columns(self, signals: "Signals", torques: Sequence[np.ndarray]) -> np.ndarray:
         """As :meth:`Candidate.columns`."""
         if self.trial is None:
             return np.stack([torque / size for torque, (_, size) in zip(torques, self.unit, strict=True)])
@@ -104,7 +102,7 @@ SPACING = 0.3
 """Prior standard deviation of the logarithm of a number about its trial value."""
 
 
-def rms(values: Array) -> float:
+def rms(values: np.ndarray) -> float:
     """Root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
@@ -204,9 +202,9 @@ class Signals:
         # what must be held where a side stands still
         self.needed = {side: np.asarray(values) for side, values in _needed(experiment, part.moving()).items()}
         self.direction = {side: self._direction(side) for side in self.sides}
-        self.known: dict[int, tuple[Candidate, Array]] = {}
+        self.known: dict[int, tuple[Candidate, np.ndarray]] = {}
 
-    def _direction(self, side: str) -> Array:
+    def _direction(self, side: str) -> np.ndarray:
         velocity, deviation = np.asarray(self.part.velocity[side]), np.asarray(self.part.deviation[side])
         period = float(self.part.time[1] - self.part.time[0])
         # the share of the time around a sample in forward motion less that in backward motion
@@ -224,9 +222,9 @@ class Signals:
         """Torque on a side for 1 N m at the motor."""
         return float(self.experiment.drive.ratio(side))
 
-    def of(self, effects: Sequence[AbstractEffect]) -> list[Array]:
+    def of(self, effects: Sequence[AbstractEffect]) -> list[np.ndarray]:
         """Torque that each effect adds, shape (samples, sides + 1); on top of what a model without it has."""
-        found: list[Array] = [np.zeros(0)] * len(effects)
+        found: list[np.ndarray] = [np.zeros(0)] * len(effects)
         for name in dict.fromkeys(effect.name for effect in effects):
             which = [i for i, effect in enumerate(effects) if effect.name == name]
             place = self.experiment.drive.place(effects[which[0]].place)
@@ -246,7 +244,7 @@ class Signals:
 _AT_ONCE = 6
 
 
-def forces_of(candidates: Sequence[Candidate], signals: Signals, spare: int = 0) -> Array:
+def forces_of(candidates: Sequence[Candidate], signals: Signals, spare: int = 0) -> np.ndarray:
     """Columns of candidates, one after the other, N m, and columns of zeros; shape (columns, samples, sides + 1)."""
     widths = [one.width + one.offset for one in candidates]
     found = np.zeros((sum(widths) + spare, signals.count, len(signals.sides) + 1))

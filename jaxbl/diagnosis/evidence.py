@@ -15,8 +15,6 @@ from scipy.linalg import solve_triangular
 
 from .candidates import Candidate, Numbers
 
-Array = np.ndarray
-
 
 @dataclasses.dataclass(frozen=True)
 class Columns:
@@ -35,13 +33,13 @@ class Columns:
             their priors part the two, so that these are joined: the data's precision may be too large for them to be seen.
     """
 
-    products: Array
+    products: np.ndarray
     own: int
     places: tuple[tuple[int, ...], ...]
     offsets: tuple[int, ...]
-    scale: Array
-    centre: Array
-    bound: Array
+    scale: np.ndarray
+    centre: np.ndarray
+    bound: np.ndarray
     twins: Mapping[int, tuple[int, float]] = dataclasses.field(default_factory=dict)
 
 
@@ -61,7 +59,7 @@ class Set:
     log_evidence: float
     misfit: float
     numbers: tuple[Numbers, ...]
-    own: Array
+    own: np.ndarray
 
 
 class Scorer:
@@ -139,12 +137,12 @@ class Scorer:
 class _Solved(NamedTuple):
     """Coefficients of least squares with a prior, the least cost, and the logarithm of the determinant of the precision."""
 
-    coefficients: Array
+    coefficients: np.ndarray
     cost: float
     determinant: float
 
 
-def _solved(inner: Array, towards: Array, total: float, spread: Array, centre: Array) -> _Solved | None:
+def _solved(inner: np.ndarray, towards: np.ndarray, total: float, spread: np.ndarray, centre: np.ndarray) -> _Solved | None:
     precision = spread**-2.0
     matrix = inner + np.diag(precision)
     towards = towards - precision * centre
@@ -160,7 +158,7 @@ def _solved(inner: Array, towards: Array, total: float, spread: Array, centre: A
     return _Solved(coefficients, total - float(inside @ inside), determinant)
 
 
-def _root(unit: Array) -> Array | None:
+def _root(unit: np.ndarray) -> np.ndarray | None:
     """Cholesky factor of a matrix with ones on its diagonal, whose columns may be all but alike; None if it is none."""
     for ridge in (1e-12, 1e-11, 1e-10, 1e-9, 1e-8):
         try:

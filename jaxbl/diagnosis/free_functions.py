@@ -15,8 +15,6 @@ from jaxbl.drive.effects import AbstractEffect
 
 from .candidates import Numbers, Signals
 
-Array = np.ndarray
-
 KINDS = "time", "drift", "position", "place", "velocity", "memory"
 """Torque over time; friction over time; torque over position; friction over position; torque over velocity; friction that
 yields before it slides."""
@@ -52,7 +50,7 @@ class Function:
     def effects(self) -> tuple[AbstractEffect, ...]:
         return ()
 
-    def columns(self, signals: Signals, torques: Sequence[Array]) -> Array:
+    def columns(self, signals: Signals, torques: Sequence[np.ndarray]) -> np.ndarray:
         """As :meth:`.candidates.Candidate.columns`; N m."""
         part, side = signals.part, self.side
         position, velocity = np.asarray(part.position[side]), np.asarray(part.velocity[side])
@@ -94,14 +92,14 @@ def functions_of(signals: Sequence[Signals]) -> list[Function]:
     return found
 
 
-def _hats(values: Array, span: tuple[float, float], count: int) -> Array:
+def _hats(values: np.ndarray, span: tuple[float, float], count: int) -> np.ndarray:
     """Triangles of height 1 about evenly spaced knots, shape (samples, count)."""
     low, high = span
     at = (values - low) / max(high - low, 1e-300) * (count - 1)
     return np.maximum(1.0 - np.abs(at[:, None] - np.arange(count)[None, :]), 0.0)
 
 
-def _stops(position: Array, lengths: Array) -> Array:
+def _stops(position: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Elastoplastic elements of several lengths, between -1 and 1, shape (samples, lengths)."""
     steps = np.diff(position, prepend=position[0])[:, None] / np.maximum(lengths, 1e-300)[None, :]
     return np.asarray(_stopped(jnp.asarray(steps)))

@@ -244,22 +244,26 @@ def _gradient(part: Part, gain: Array, left: Array) -> Array:
 
 
 _COARSE_SMOOTHNESS = 10.0 ** np.arange(-11.0, 1.0)
+"""Ratios of process to reading noise, tried for all sides at once: from a filter over thousands of samples to none."""
 _FINE_SMOOTHNESS = 10.0 ** np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
-_LEAST = 1e-11
+"""Factors on the best of them, side by side."""
 OFF = 0.5
-"""Prior size of the error of an inertia or a viscous friction, relative."""
+"""Prior size of the error of an inertia or a viscous friction, relative: nominal ones are right within a factor of two."""
 _FREQUENCIES, _COARSE = 8, 16
+"""Peaks of the spectrum that are tried; frequencies at which the response to a torque is computed, smooth in between."""
 _HIGHEST = 50.0
 """Hz: a torque of a higher frequency hardly moves a drive."""
 _NO_INPUT = 1e-3
+"""Input over the torque that the motion takes, rms, below which the drive moves freely."""
 DIVERGED = 1e30
-"""Products of prediction errors, over their variance or in rad^2, from which on a model is one that diverges."""
+"""Products of prediction errors, over their variance or in rad^2, from which on a model diverges: squares soon overflow."""
 _SILENT = 1e-20
-"""Influence of an initial state over that of others below which it has none: that of an effect that does nothing."""
+"""Influence of an initial state over that of others, squared, below which it has none (the state of a neutral effect):
+rounding is 1e-16."""
 _LOST = 0.01
-"""Nats that rounding may take: under too low a gain an initial state's influence may grow from sample to sample."""
+"""Nats that rounding may take (benchmarks/NOTES.md): under too low a gain the influence of an initial state grows."""
 _COLUMNS, _MANY = 16, 80
-"""Least padded number of candidate columns; number from which on they are many."""
+"""Least padded number of candidate columns, and the number from which on XLA's matrix product is the faster one."""
 
 
 class Predictor:
@@ -446,8 +450,8 @@ class Linear:
         else:
             (chosen,) = self._predictors([near], forces)
         for i in range(len(self.sides)) if len(self.sides) > 1 or near is not None else ():
-            now = chosen.smoothness
-            options = [[max(float(q * f), _LEAST) if j == i else q for j, q in enumerate(now)] for f in _FINE_SMOOTHNESS]
+            now, least = chosen.smoothness, _COARSE_SMOOTHNESS[0]
+            options = [[max(float(q * f), least) if j == i else q for j, q in enumerate(now)] for f in _FINE_SMOOTHNESS]
             other = best(options)
             if np.sum(np.log(other.squares)) < np.sum(np.log(chosen.squares)):
                 chosen = other
