@@ -138,8 +138,9 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
             summary["where_after"] = where_lacking(record, left)
         if found.wrong is not None:
             summary["rival"] = rival_tables(config, setup.own, found.wrong)
+        model = extended_study(config, fitted.numbers, fitted.own | gain_values)
+        coordinates = _coordinates(task, setup)
         done()
-    model = extended_study(config, fitted.numbers, fitted.own | gain_values)
     replays = "excitation" in task.missing
     pairs = {
         side: [
@@ -149,8 +150,8 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         for side in lacking
     }
     return Diagnosis(
-        config, model, record, task.holdout, plain(summary), trace, lacking, observed[0], _coordinates(task, setup),
-        setup.located, pairs, replays,
+        config, model, record, task.holdout, plain(summary), trace, lacking, observed[0], coordinates, setup.located, pairs,
+        replays,
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from hidden_log import FRICTION, logged, model
 from scipy.optimize import minimize
 
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
-from jaxbl.diagnosis.effect_search import paths_of, with_effects
+from jaxbl.diagnosis.effect_search import paths_of, with_numbers
 from jaxbl.diagnosis.linearised_model import Linear
 from jaxbl.diagnosis.neutral_effects import complete
 from jaxbl.diagnosis.refit import _Refiner, refined
@@ -28,7 +28,7 @@ def setting(tmp_path_factory):
     logged().write(log)
     task = read_diagnosis_task(log, model())
     bare = on_record(task.config, task.record)
-    experiment = with_effects(complete(bare), {NAME: {"torque": 1.1 * FRICTION["torque"]}})
+    experiment = with_numbers(complete(bare), {NAME: {"torque": 1.1 * FRICTION["torque"]}})
     torque = float(np.std(task.record.torque))
     own = free_parameters(bare, default_paths(task.config, bare), torque)
     free = (*own, *free_parameters(experiment, paths_of([NAME]), torque))
@@ -70,7 +70,7 @@ def test_deviations_are_those_of_repetitions(tmp_path):
         logged(seed=seed).write(log)
         task = read_diagnosis_task(log, model())
         bare = on_record(task.config, task.record)
-        experiment = with_effects(complete(bare), {NAME: {"torque": FRICTION["torque"]}})
+        experiment = with_numbers(complete(bare), {NAME: {"torque": FRICTION["torque"]}})
         torque = float(np.std(task.record.torque))
         own = free_parameters(bare, default_paths(task.config, bare), torque)
         free = (*own, *free_parameters(experiment, paths_of([NAME]), torque))
@@ -86,7 +86,7 @@ def test_deviations_are_those_of_repetitions(tmp_path):
 def test_numbers_under_which_the_predictor_diverges_are_not_taken(setting):
     """Without a word: what is not finite has no likelihood."""
     experiment, free, width, segments = setting
-    wild = with_effects(experiment, {"motor.viscous_friction": {"viscous": -5.0}})
+    wild = with_numbers(experiment, {"motor.viscous_friction": {"viscous": -5.0}})
     refiner = _Refiner(wild, free, width, segments)
     theta = np.zeros(len(free))
     (path,) = refiner._path(theta, refiner.start(), [1e-11])
