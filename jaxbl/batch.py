@@ -8,7 +8,7 @@ import pandas as pd
 
 from .errors import InputError
 from .files import claim_log_folder, finished_summary, make_folder, removed_if_empty
-from .report.diagnose import probability, rms_text, write_diagnosis_report
+from .report.diagnose import probability, rms_text
 from .workers import Progress, each, forget_programs, worth
 
 _LOGS = (".csv", ".parquet", ".mat")
