@@ -71,6 +71,7 @@ def run_batch(work: list[LogJob], out: Path, processes: int | None, progress: Pr
 def _diagnosed(job: LogJob) -> dict[str, Any]:
     """Row of a batch: a log's diagnosis, or why there is none."""
     from .diagnosis.diagnose import read_diagnosis_task, run_diagnosis
+    from .report.diagnose import write_diagnosis_report
 
     forget_programs()
     try:
