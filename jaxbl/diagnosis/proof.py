@@ -155,7 +155,7 @@ class Proof:
                 break
             found["free_run"][name] = errors
         if rival is not None:
-            wrong = set_leaves(rival.experiment, arrays(free_values(self.setup.own, rival.theta)))
+            wrong = set_leaves(rival.experiment, free_values(self.setup.own, rival.theta))
             found["controls"]["wrong"] = {"effect": rival.names[-1], "rmse": other.compare(self._at(wrong)).errors}
         if fitted.names:
             added = {
