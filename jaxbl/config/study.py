@@ -126,7 +126,7 @@ def _check_sides(config: Config) -> None:
         if rigid and mark.side == "load":
             raise wrong(f"verify.marks[{i}].side: 'load' has no meaning on a rigid drive; it should be 'motor'")
     if config.transmission is not None:
-        rate = config.transmission.stiffness
+        rate = config.transmission.build().stiffness
         rate *= 1.0 / config.drive.motor_inertia + config.drive.gear_ratio**2 / config.drive.load_inertia
         # the scheme is stable while step * frequency < 2
         least = math.floor(config.run.sample_period * math.sqrt(rate) / 2.0) + 1

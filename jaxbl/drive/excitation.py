@@ -1,7 +1,10 @@
-"""Input torque u(t), evaluated once a sample and held until the next (zero-order hold, as a drive does it)."""
+"""Input torque u(t), evaluated once a sample and held until the next (zero-order hold, as a drive does it).
+
+Further packages add inputs through the entry-point group `jaxbl.excitations`; the entry's name is the input's.
+"""
 
 import abc
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -9,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .parameters import Scalar, option, parameter
+from .registry import Registry, check_declared, check_subclass
 
 
 class AbstractExcitation(eqx.Module):
@@ -21,6 +25,16 @@ class AbstractExcitation(eqx.Module):
         """Torque in N m at a time in s."""
 
 
+def _check(name: str, found: Any) -> None:
+    check_subclass(name, found, AbstractExcitation)
+    check_declared(found)
+
+
+EXCITATIONS = Registry("jaxbl.excitations", _check)
+"""The inputs by name: the built-in ones and those of installed packages."""
+
+
+@EXCITATIONS.add
 class Sine(AbstractExcitation):
     """offset + amplitude sin(2 pi frequency t + phase)."""
 
@@ -34,6 +48,7 @@ class Sine(AbstractExcitation):
         return self.offset + self.amplitude * jnp.sin(2.0 * jnp.pi * self.frequency * time + self.phase)
 
 
+@EXCITATIONS.add
 class Multisine(AbstractExcitation):
     """`count` harmonics of `frequency` with equal amplitudes and Schroeder phases -pi k (k - 1) / count.
 
@@ -53,6 +68,7 @@ class Multisine(AbstractExcitation):
         return self.amplitude / jnp.sqrt(float(self.count)) * jnp.sum(waves)
 
 
+@EXCITATIONS.add
 class Chirp(AbstractExcitation):
     """Sine whose frequency moves linearly from `start_frequency` to `stop_frequency` over `sweep_time`, then stays."""
 
@@ -80,6 +96,7 @@ def _held(hold: Scalar, time: Float[Array, ""]) -> Array:
     return jnp.floor(holds + 1e-4 + _rounding(holds)).astype(jnp.int32)
 
 
+@EXCITATIONS.add
 class Steps(AbstractExcitation):
     """Random levels, uniform in [-amplitude, amplitude], each held for `hold` seconds."""
 
@@ -95,6 +112,7 @@ class Steps(AbstractExcitation):
         return self.amplitude * level.astype(jnp.result_type(time))
 
 
+@EXCITATIONS.add
 class Prbs(AbstractExcitation):
     """Pseudo-random binary sequence +-amplitude: a maximum-length shift register of `order` bits, one bit per `hold`."""
 
@@ -111,6 +129,7 @@ class Prbs(AbstractExcitation):
         return self.amplitude * levels[_held(self.hold, time) % len(levels)]
 
 
+@EXCITATIONS.add
 class Recorded(AbstractExcitation):
     """Samples played back with zero-order hold; the last one is held on."""
 
@@ -123,8 +142,3 @@ class Recorded(AbstractExcitation):
         # half a microsecond of slack: time stamps are decimal numbers
         index = jnp.searchsorted(self.times, time + 5e-7 + _rounding(time), side="right") - 1
         return self.gain * self.torques[jnp.clip(index, 0)]
-
-
-EXCITATIONS: dict[str, type[AbstractExcitation]] = {
-    excitation.name: excitation for excitation in (Sine, Multisine, Chirp, Steps, Prbs, Recorded)
-}

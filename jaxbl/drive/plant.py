@@ -150,7 +150,7 @@ class Plant(eqx.Module):
     @property
     def half_gap(self) -> float:
         """Half of the free play that law and effects describe together, rad at the motor; 0 where there is none."""
-        gap = 0.0 if self.transmission is None else float(self.transmission.truth().get("half_gap", 0.0))
+        gap = 0.0 if self.transmission is None else float(self.transmission.half_gap)
         return gap + sum(float(effect.free_play()) for effect in self.effects)
 
     def twist(self, position: Sides) -> Float[Array, ""]:

@@ -1,5 +1,6 @@
 """Classes by name: those of this package, and those that installed packages add through entry points."""
 
+import dataclasses
 import inspect
 import logging
 import multiprocessing
@@ -74,3 +75,10 @@ def check_subclass(name: str, found: Any, base: type) -> None:
         raise TypeError(f"should define {missing}")
     if (own := getattr(found, "name", None)) != name:
         raise TypeError(f"its name should be '{name}' as in the entry point, not {own!r}")
+
+
+def check_declared(found: Any) -> None:
+    """Check that every number of a module class is declared, as its config table needs it. Raises `TypeError`."""
+    for field in dataclasses.fields(found):
+        if "parameter" not in field.metadata:
+            raise TypeError(f"{field.name} should be declared by parameter(...) or option(...)")

@@ -2,22 +2,36 @@
 
 Each law also knows itself as a linear regression, torque = regressors(z) . theta, which is what the recursive
 identifier of eqs. (18)-(28) works on, and how theta reads in the law's own parameters.
+
+Further packages add laws through the entry-point group `jaxbl.transmissions`; the entry's name is the law's.
 """
 
 import abc
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .parameters import Scalar, parameter
+from .registry import Registry, check_declared, check_subclass
 
 
 class AbstractTransmission(eqx.Module):
-    """A transmission law. `deflection` is what of z is left once contact is made; torque follows from it."""
+    """A transmission law. `deflection` is what of z is left once contact is made; torque follows from it.
+
+    Attributes:
+        name: key `law` of the config.
+        errors: metrics that the law adds, and the parameter in `truth` of whose identified value each is the relative error.
+        stiffness: largest slope of the law, N m/rad; the plant's steps have to resolve it.
+        half_gap: half of the free play, rad on the motor side; 0 where there is none.
+    """
 
     name: ClassVar[str]
+    errors: ClassVar[Mapping[str, str]] = {}
+    stiffness: eqx.AbstractVar[Scalar]
+    half_gap: eqx.AbstractVar[Scalar]
 
     def deflection(self, z: Float[Array, ""]) -> Float[Array, ""]:
         """Elastic deflection in rad that the twist z (rad) leaves; z itself unless the law has a free gap."""
@@ -33,13 +47,25 @@ class AbstractTransmission(eqx.Module):
 
     @abc.abstractmethod
     def from_theta(self, theta: tuple[Float[Array, ""], ...]) -> dict[str, Float[Array, ""]]:
-        """The law's parameters (and `half_gap`) from regression coefficients."""
+        """The law's parameters, and what else `truth` has, from regression coefficients."""
 
     @abc.abstractmethod
     def truth(self) -> dict[str, Scalar]:
         """The same parameters as they are in this law."""
 
 
+def _check(name: str, found: Any) -> None:
+    check_subclass(name, found, AbstractTransmission)
+    if missing := getattr(found, "__abstractvars__", ()):
+        raise TypeError(f"should define {', '.join(sorted(missing))}")
+    check_declared(found)
+
+
+TRANSMISSIONS = Registry("jaxbl.transmissions", _check)
+"""The laws by name: the built-in ones and those of installed packages."""
+
+
+@TRANSMISSIONS.add
 class SigmoidBacklash(AbstractTransmission):
     """Smooth backlash, eq. (3): C = K (z - 4 j_0 (1 - e^{-gamma z}) / (1 + e^{-gamma z})), with tanh(gamma z / 2).
 
@@ -48,9 +74,14 @@ class SigmoidBacklash(AbstractTransmission):
     """
 
     name: ClassVar[str] = "sigmoid_backlash"
+    errors: ClassVar[Mapping[str, str]] = {"stiffness_error": "stiffness", "dead_zone_error": "half_gap"}
     stiffness: Scalar = parameter("N m/rad", "stiffness K", above=0.0)
     dead_zone: Scalar = parameter("rad", "dead-zone amplitude j_0 of law (3); the half gap is 4 j_0", minimum=0.0)
     slope: Scalar = parameter("1/rad", "slope gamma of law (3)", above=0.0)
+
+    @property
+    def half_gap(self) -> Scalar:
+        return 4.0 * self.dead_zone
 
     def torque(self, deflection):
         return self.stiffness * (deflection - 4.0 * self.dead_zone * jnp.tanh(0.5 * self.slope * deflection))
@@ -64,13 +95,16 @@ class SigmoidBacklash(AbstractTransmission):
         return {"stiffness": stiffness, "dead_zone": dead_zone, "half_gap": 4.0 * dead_zone}
 
     def truth(self):
-        return {"stiffness": self.stiffness, "dead_zone": self.dead_zone, "half_gap": 4.0 * self.dead_zone}
+        return {"stiffness": self.stiffness, "dead_zone": self.dead_zone, "half_gap": self.half_gap}
 
 
+@TRANSMISSIONS.add
 class LinearShaft(AbstractTransmission):
     """Flexible shaft without play, eq. (5): C = K z."""
 
     name: ClassVar[str] = "linear_shaft"
+    errors: ClassVar[Mapping[str, str]] = {"stiffness_error": "stiffness"}
+    half_gap: ClassVar[float] = 0.0  # type: ignore[misc]
     stiffness: Scalar = parameter("N m/rad", "stiffness K", above=0.0)
 
     def torque(self, deflection):
@@ -86,6 +120,7 @@ class LinearShaft(AbstractTransmission):
         return {"stiffness": self.stiffness}
 
 
+@TRANSMISSIONS.add
 class DeadZone(AbstractTransmission):
     """Hard dead zone: C = K (z - clip(z, -half_gap, half_gap)).
 
@@ -94,6 +129,7 @@ class DeadZone(AbstractTransmission):
     """
 
     name: ClassVar[str] = "dead_zone"
+    errors: ClassVar[Mapping[str, str]] = {"stiffness_error": "stiffness", "dead_zone_error": "half_gap"}
     stiffness: Scalar = parameter("N m/rad", "stiffness K in contact", above=0.0)
     half_gap: Scalar = parameter("rad", "half of the free play, on the motor side", minimum=0.0)
 
@@ -113,6 +149,3 @@ class DeadZone(AbstractTransmission):
 
     def truth(self):
         return {"stiffness": self.stiffness, "half_gap": self.half_gap}
-
-
-TRANSMISSIONS: dict[str, type[AbstractTransmission]] = {law.name: law for law in (SigmoidBacklash, LinearShaft, DeadZone)}

@@ -25,7 +25,7 @@ from jaxbl.errors import InputError
 from jaxbl.gains.accuracy_laws import Law, accuracy_laws, check_selection, fixed_values, selected
 from jaxbl.observer.conditions import CONDITIONS, Condition
 from jaxbl.records.table import nearest
-from jaxbl.sweeps.metrics import describe
+from jaxbl.sweeps.metrics import metric_of
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 
@@ -114,7 +114,7 @@ def _label(config: Config, path: str) -> str:
 
 def _value_label(value: str) -> str:
     side, _, _ = value.rpartition(".")
-    about = describe(value)
+    about = metric_of(value)
     label = f"|{about.label}|" if _is_magnitude(value) else about.label
     return with_unit(f"{side}: {label}" if side else label, about.unit)
 
@@ -246,7 +246,7 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable, points: Poi
             under = []
             if gridded and (best := _best(table, part, spec)) is not None:
                 ax.plot(best[0], best[1], "*", ms=13, mfc="white", mec="black", mew=1.0, clip_on=False, zorder=5)
-                under.append(f"best ★ {best[2]:.2g} {describe(spec.value).unit}".rstrip())
+                under.append(f"best ★ {best[2]:.2g} {metric_of(spec.value).unit}".rstrip())
             if spec.overlays:
                 # most points of a refined study lie at its boundary: the median is that of the coarse grid
                 bound = _bound(part if points is None else part[points.always_simulated(part)], spec)

@@ -1,85 +1,425 @@
-"""Figures of a run, computed in the loop over time: observation errors, convergence, gain margins, identification.
+"""Metrics of a run, computed in the loop over time: observation errors, convergence, gain margins, identification.
 
-RMS figures are over the last quarter of the run, in SI units. Position and velocity tolerances of the load are those of
-the motor divided by the gear ratio.
+A metric is one class: its column, unit, label and meaning, and how it is computed. Further packages add classes derived
+from :class:`RunMetric` or :class:`GainMetric` through the entry-point group `jaxbl.metrics`; the entry's name is the
+metric's. RMS values are over the last quarter of the run, in SI units. Position and velocity tolerances of the load are
+those of the motor divided by the gear ratio.
 """
 
+import abc
+import functools
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxbl.drive.registry import Registry, check_subclass
+from jaxbl.drive.transmission import TRANSMISSIONS
 from jaxbl.errors import InputError
 from jaxbl.observer import conditions
-from jaxbl.simulate import Experiment, Reducer, Signals, State
+from jaxbl.simulate import Experiment, Reducer, Signals, State, TrueSide
 
 from .pieces import in_pieces
 
 Number = Float[Array, ""]
 
 
-class Metric(NamedTuple):
-    """What a column holds: unit, short name for axis labels, meaning."""
+class Metric(abc.ABC):
+    """A column of each side: `<side>.<name>`."""
 
-    unit: str
-    label: str
-    doc: str
+    name: ClassVar[str]
+    unit: ClassVar[str] = ""
+    label: ClassVar[str]
+    """Short name for axes of figures; what it means is in `doc`."""
+    doc: ClassVar[str]
 
-
-SIDE_METRICS: dict[str, Metric] = {
-    "converged": Metric("", "converged", "position and velocity errors stay within tolerance over the last quarter"),
-    "convergence_time": Metric(
-        "s", "convergence time", "time from which both errors stay within tolerance; NaN where not converged"
-    ),
-    "convergence_time_bound": Metric(
-        "s", "bound on convergence time", "bound (42) on it for the noise-free observer; inf where (32) fails"
-    ),
-    "convergence_time_worst": Metric(
-        "s", "worst convergence time", "longest convergence time that a disturbance within f_plus can cause; inf where ρ ≥ 1"
-    ),
-    "position_rmse": Metric("rad", "position error, rms", "rms position error"),
-    "velocity_rmse": Metric("rad/s", "velocity error, rms", "rms velocity error"),
-    "torque_rmse": Metric(
-        "N m", "torque error, rms", "rms error of the transmitted torque from this side's equivalent control"
-    ),
-    "position_size": Metric("rad", "position, rms", "rms true position: the size that its errors compare with"),
-    "velocity_size": Metric("rad/s", "velocity, rms", "rms true velocity: the size that its errors compare with"),
-    "chatter": Metric(
-        "rad/s", "chatter of the velocity", "rms sample-to-sample change of the velocity error, divided by √2"
-    ),
-    "f_plus": Metric("rad/s²", "true bound f⁺", "largest true right-hand side error |f(x₂) − f(x̂₂) + ξ| along the run"),
-    "f_plus_acceleration": Metric(
-        "rad/s²", "twice the largest acceleration", "twice the largest acceleration: the paper's text for f⁺"
-    ),
-    "margin_alpha": Metric("", "α / f⁺", "gain alpha over the true bound f_plus"),
-    **{
-        f"margin_{name}": Metric("", f"margin to {condition.title}", f"λ over the least λ of {condition.title}")
-        for name, condition in conditions.CONDITIONS.items()
-    },
-    "stiffness_error": Metric("", "error of K", "relative error of the identified stiffness"),
-    "dead_zone_error": Metric(
-        "", "error of the dead zone", "relative error of the identified dead zone (half gap of law dead_zone)"
-    ),
-    "excitation": Metric("", "excitation", "smallest eigenvalue of the normalised information matrix"),
-}
+    def applies(self, experiment: Experiment) -> bool:
+        """Whether an experiment has this metric."""
+        return True
 
 
-class _Totals(NamedTuple):
-    """Carry of one side."""
+def _check(name: str, found: Any) -> None:
+    base = GainMetric if isinstance(found, type) and issubclass(found, GainMetric) else RunMetric
+    check_subclass(name, found, base)
+    if not all(isinstance(getattr(found, about, None), str) for about in ("unit", "label", "doc")):
+        raise TypeError("unit, label and doc should be text")
 
-    last_outside: Number
-    position: Number
-    velocity: Number
-    torque: Number
-    true_position: Number
-    true_velocity: Number
-    change: Number
-    previous: Number
-    f_plus: Number
-    acceleration: Number
+
+class _Metrics(Registry):
+    """Laws of installed packages may report errors of parameters of their own."""
+
+    def _all(self) -> dict[str, Any]:
+        if not self._loaded:
+            super()._all()
+            for law in TRANSMISSIONS.values():
+                for name, parameter in law.errors.items():
+                    if name not in self._found:
+                        about = {"name": name, "label": f"error of {parameter}"}
+                        about["doc"] = f"relative error of the identified {parameter}"
+                        self._found[name] = type("LawError", (IdentificationError,), about)
+        return self._found
+
+
+SIDE_METRICS = _Metrics("jaxbl.metrics", _check)
+"""The metrics of each side by name, in the order of the columns."""
+
+
+class SideSample(NamedTuple):
+    """What a metric sees of a side at one sample, SI units: errors are true values less estimates."""
+
+    time: Number
+    inside: Number
+    """1 in the last quarter of the run, else 0."""
+    within: Array
+    """Whether position and velocity errors are within tolerance."""
+    true: TrueSide
+    position_error: Number
+    velocity_error: Number
+    torque_error: Number
+
+
+class SideEnd(NamedTuple):
+    """What a metric sees of a side at the end of the run."""
+
+    experiment: Experiment
+    state: State
+    start: Any
+    """Time of the first sample of the last quarter, s."""
+    count: int
+    """Samples of the last quarter."""
+    identified: Mapping[str, Number]
+    """Identified parameters of the transmission; none without an identifier."""
+
+
+class RunMetric(Metric):
+    """A metric with a state that each sample moves on; metrics with the same `carry` share that of the first of them."""
+
+    carry: ClassVar[str | None] = None
+
+    def init(self, zero: Number) -> Any:
+        """State before the first sample, of zeros of the run's precision."""
+        return ()
+
+    def update(self, carry: Any, sample: SideSample) -> Any:
+        """State after a sample."""
+        return carry
+
+    @abc.abstractmethod
+    def result(self, carry: Any, end: SideEnd) -> Array:
+        """The metric, from the state after the last sample."""
+
+
+class ObserverGains(NamedTuple):
+    """What the gain conditions ask of an observer: its gains and its errors at t = 0."""
+
+    lambda_: Array
+    alpha: Array
+    position_error: Array
+    velocity_error: Array
+
+
+class GainMetric(Metric):
+    """A metric of gains and f_plus alone, computed after the loop over time by a program that serves all studies."""
+
+    @abc.abstractmethod
+    def judge(self, gains: ObserverGains, f_plus: Array) -> Array:
+        """The metric of many lanes, from arrays of one shape."""
+
+
+@SIDE_METRICS.add
+class Converged(RunMetric):
+    """The state is the last time at which an error was out of tolerance, -1 before any."""
+
+    name = "converged"
+    label = "converged"
+    doc = "position and velocity errors stay within tolerance over the last quarter"
+    carry = "last_outside"
+
+    def init(self, zero):
+        return zero - 1.0
+
+    def update(self, carry, sample):
+        return jnp.where(sample.within, carry, sample.time)
+
+    def result(self, carry, end):
+        return carry < end.start - 0.5 * end.experiment.run.sample_period
+
+
+@SIDE_METRICS.add
+class ConvergenceTime(Converged):
+    """As :class:`Converged`, whose state it shares."""
+
+    name = "convergence_time"
+    unit = "s"
+    label = "convergence time"
+    doc = "time from which both errors stay within tolerance; NaN where not converged"
+
+    def result(self, carry, end):
+        entered = jnp.where(carry < 0.0, 0.0, carry + end.experiment.run.sample_period)
+        return jnp.where(super().result(carry, end), entered, jnp.nan)
+
+
+@SIDE_METRICS.add
+class ConvergenceTimeBound(GainMetric):
+    """Bound (42)."""
+
+    name = "convergence_time_bound"
+    unit = "s"
+    label = "bound on convergence time"
+    doc = "bound (42) on it for the noise-free observer; inf where (32) fails"
+
+    def judge(self, gains, f_plus):
+        errors = gains.position_error, gains.velocity_error
+        return conditions.convergence_time_bound(gains.lambda_, gains.alpha, f_plus, *errors)
+
+
+@SIDE_METRICS.add
+class ConvergenceTimeWorst(GainMetric):
+    """The longest that a disturbance can make it."""
+
+    name = "convergence_time_worst"
+    unit = "s"
+    label = "worst convergence time"
+    doc = "longest convergence time that a disturbance within f_plus can cause; inf where ρ ≥ 1"
+
+    def judge(self, gains, f_plus):
+        errors = gains.position_error, gains.velocity_error
+        return conditions.convergence_time_worst(gains.lambda_, gains.alpha, f_plus, *errors)
+
+
+class Rms(RunMetric):
+    """Root of the mean square of a signal over the last quarter."""
+
+    @abc.abstractmethod
+    def signal(self, sample: SideSample) -> Number:
+        """The signal at one sample."""
+
+    def init(self, zero):
+        return zero
+
+    def update(self, carry, sample):
+        return carry + sample.inside * self.signal(sample) * self.signal(sample)
+
+    def result(self, carry, end):
+        return jnp.sqrt(carry / end.count)
+
+
+@SIDE_METRICS.add
+class PositionRmse(Rms):
+    """Of the position error."""
+
+    name = "position_rmse"
+    unit = "rad"
+    label = "position error, rms"
+    doc = "rms position error"
+
+    def signal(self, sample):
+        return sample.position_error
+
+
+@SIDE_METRICS.add
+class VelocityRmse(Rms):
+    """Of the velocity error."""
+
+    name = "velocity_rmse"
+    unit = "rad/s"
+    label = "velocity error, rms"
+    doc = "rms velocity error"
+
+    def signal(self, sample):
+        return sample.velocity_error
+
+
+@SIDE_METRICS.add
+class TorqueRmse(Rms):
+    """Of the torque error."""
+
+    name = "torque_rmse"
+    unit = "N m"
+    label = "torque error, rms"
+    doc = "rms error of the transmitted torque from this side's equivalent control"
+
+    def signal(self, sample):
+        return sample.torque_error
+
+
+@SIDE_METRICS.add
+class PositionSize(Rms):
+    """Of the true position."""
+
+    name = "position_size"
+    unit = "rad"
+    label = "position, rms"
+    doc = "rms true position: the size that its errors compare with"
+
+    def signal(self, sample):
+        return sample.true.position
+
+
+@SIDE_METRICS.add
+class VelocitySize(Rms):
+    """Of the true velocity."""
+
+    name = "velocity_size"
+    unit = "rad/s"
+    label = "velocity, rms"
+    doc = "rms true velocity: the size that its errors compare with"
+
+    def signal(self, sample):
+        return sample.true.velocity
+
+
+@SIDE_METRICS.add
+class Chatter(RunMetric):
+    """The state is the sum of squares, and the velocity error of the last sample."""
+
+    name = "chatter"
+    unit = "rad/s"
+    label = "chatter of the velocity"
+    doc = "rms sample-to-sample change of the velocity error, divided by √2"
+
+    def init(self, zero):
+        return zero, zero
+
+    def update(self, carry, sample):
+        total, previous = carry
+        change = sample.velocity_error - previous
+        return total + sample.inside * change * change, sample.velocity_error
+
+    def result(self, carry, end):
+        return jnp.sqrt(0.5 * carry[0] / end.count)
+
+
+@SIDE_METRICS.add
+class FPlus(RunMetric):
+    """The bound that gains have to meet."""
+
+    name = "f_plus"
+    unit = "rad/s²"
+    label = "true bound f⁺"
+    doc = "largest true right-hand side error |f(x₂) − f(x̂₂) + ξ| along the run"
+
+    def init(self, zero):
+        return zero
+
+    def update(self, carry, sample):
+        return jnp.maximum(carry, jnp.abs(sample.true.perturbation))
+
+    def result(self, carry, end):
+        return carry
+
+
+@SIDE_METRICS.add
+class FPlusAcceleration(RunMetric):
+    """The bound that the paper proposes."""
+
+    name = "f_plus_acceleration"
+    unit = "rad/s²"
+    label = "twice the largest acceleration"
+    doc = "twice the largest acceleration: the paper's text for f⁺"
+
+    def init(self, zero):
+        return zero
+
+    def update(self, carry, sample):
+        return jnp.maximum(carry, jnp.abs(sample.true.acceleration))
+
+    def result(self, carry, end):
+        return 2.0 * carry
+
+
+@SIDE_METRICS.add
+class MarginAlpha(GainMetric):
+    """At most 1: no lambda converges."""
+
+    name = "margin_alpha"
+    label = "α / f⁺"
+    doc = "gain alpha over the true bound f_plus"
+
+    def judge(self, gains, f_plus):
+        return gains.alpha / f_plus
+
+
+def _margin(condition_name: str, condition: conditions.Condition) -> type[GainMetric]:
+    class Margin(GainMetric):
+        """At most 1: the condition fails."""
+
+        name = f"margin_{condition_name}"
+        label = f"margin to {condition.title}"
+        doc = f"λ over the least λ of {condition.title}"
+
+        def judge(self, gains, f_plus):
+            return gains.lambda_ / condition.least_lambda(gains.alpha, f_plus)
+
+    return Margin
+
+
+for _name, _condition in conditions.CONDITIONS.items():
+    SIDE_METRICS.add(_margin(_name, _condition))
+
+
+class IdentificationError(RunMetric):
+    """Relative error of an identified parameter that the law reports (`AbstractTransmission.errors`)."""
+
+    def applies(self, experiment):
+        return experiment.identifier is not None and self.name in getattr(experiment.transmission, "errors", ())
+
+    def result(self, carry, end):
+        assert end.experiment.transmission is not None
+        parameter = end.experiment.transmission.errors[self.name]
+        return end.identified[parameter] / end.experiment.transmission.truth()[parameter] - 1.0
+
+
+@SIDE_METRICS.add
+class StiffnessError(IdentificationError):
+    """Of the stiffness."""
+
+    name = "stiffness_error"
+    label = "error of K"
+    doc = "relative error of the identified stiffness"
+
+
+@SIDE_METRICS.add
+class DeadZoneError(IdentificationError):
+    """Of the dead zone."""
+
+    name = "dead_zone_error"
+    label = "error of the dead zone"
+    doc = "relative error of the identified dead zone (half gap of law dead_zone)"
+
+
+@SIDE_METRICS.add
+class Excitation(RunMetric):
+    """How well the input tells the unknowns of the law apart."""
+
+    name = "excitation"
+    label = "excitation"
+    doc = "smallest eigenvalue of the normalised information matrix"
+
+    def applies(self, experiment):
+        return experiment.identifier is not None and experiment.transmission is not None
+
+    def result(self, carry, end):
+        assert end.experiment.identifier is not None and end.state.identifier is not None
+        return end.experiment.identifier.excitation(end.state.identifier)
+
+
+@functools.cache
+def _metrics(kind: type[Metric]) -> dict[str, Any]:
+    """The metrics of a kind, by name."""
+    return {name: cls() for name, cls in SIDE_METRICS.items() if issubclass(cls, kind)}
+
+
+def _carries(experiment: Experiment) -> dict[str, RunMetric]:
+    """The states of a side: by name, the metric that moves each on."""
+    found: dict[str, RunMetric] = {}
+    for metric in _metrics(RunMetric).values():
+        if metric.applies(experiment):
+            found.setdefault(metric.carry or metric.name, metric)
+    return found
 
 
 def window_start(steps: int) -> int:
@@ -87,14 +427,12 @@ def window_start(steps: int) -> int:
     return steps - max(steps // 4, 1)
 
 
-def _init(experiment: Experiment) -> dict[str, _Totals]:
+def _init(experiment: Experiment) -> dict[str, tuple]:
     zero = jnp.zeros_like(experiment.run.sample_period)
-    return {side: _Totals(zero - 1.0, *[zero] * 9) for side in experiment.sides}
+    return {side: tuple(metric.init(zero) for metric in _carries(experiment).values()) for side in experiment.sides}
 
 
-def _update(
-    experiment: Experiment, totals: dict[str, _Totals], index: Int[Array, ""], signals: Signals
-) -> dict[str, _Totals]:
+def _update(experiment: Experiment, totals: dict[str, tuple], index: Int[Array, ""], signals: Signals) -> dict[str, tuple]:
     run = experiment.run
     inside = (index >= window_start(run.steps)).astype(signals.time.dtype)
     new = {}
@@ -109,56 +447,34 @@ def _update(
         within = (jnp.abs(position) * ratio <= run.position_tolerance) & (
             jnp.abs(velocity) * ratio <= run.velocity_tolerance
         )
-        change = velocity - old.previous
-        new[side] = _Totals(
-            jnp.where(within, old.last_outside, signals.time),
-            old.position + inside * position * position,
-            old.velocity + inside * velocity * velocity,
-            old.torque + inside * torque * torque,
-            old.true_position + inside * true.position * true.position,
-            old.true_velocity + inside * true.velocity * true.velocity,
-            old.change + inside * change * change,
-            velocity,
-            jnp.maximum(old.f_plus, jnp.abs(true.perturbation)),
-            jnp.maximum(old.acceleration, jnp.abs(true.acceleration)),
-        )
+        sample = SideSample(signals.time, inside, within, true, position, velocity, torque)
+        metrics = _carries(experiment).values()
+        new[side] = tuple(metric.update(carry, sample) for metric, carry in zip(metrics, old, strict=True))
     return new
 
 
-def _result(experiment: Experiment, totals: dict[str, _Totals], state: State) -> dict[str, Array]:
+_OVERFLOW = ("position_rmse", "velocity_rmse", "torque_rmse", "f_plus", "f_plus_acceleration")
+"""Metrics that overflow with the lane: they show whether it stayed finite."""
+
+
+def _result(experiment: Experiment, totals: dict[str, tuple], state: State) -> dict[str, Array]:
     run = experiment.run
-    count = run.steps - window_start(run.steps)
-    start = window_start(run.steps) * run.sample_period
-    identified = {}
+    first = window_start(run.steps)
+    identified: Mapping[str, Any] = {}
     if state.identifier is not None:
         assert experiment.identifier is not None and experiment.transmission is not None
         identified = experiment.identifier.estimate(state.identifier, experiment.transmission)
     figures: dict[str, Array] = {}
     finite = jnp.asarray(True)
     for side, total in totals.items():
-        converged = total.last_outside < start - 0.5 * run.sample_period
-        entered = jnp.where(total.last_outside < 0.0, 0.0, total.last_outside + run.sample_period)
+        end = SideEnd(experiment, state, first * run.sample_period, run.steps - first, identified.get(side, {}))
+        carries = dict(zip(_carries(experiment), total, strict=True))
         out = {
-            "converged": converged,
-            "convergence_time": jnp.where(converged, entered, jnp.nan),
-            "position_rmse": jnp.sqrt(total.position / count),
-            "velocity_rmse": jnp.sqrt(total.velocity / count),
-            "torque_rmse": jnp.sqrt(total.torque / count),
-            "position_size": jnp.sqrt(total.true_position / count),
-            "velocity_size": jnp.sqrt(total.true_velocity / count),
-            "chatter": jnp.sqrt(0.5 * total.change / count),
-            "f_plus": total.f_plus,
-            "f_plus_acceleration": 2.0 * total.acceleration,
+            name: metric.result(carries[metric.carry or name], end)
+            for name, metric in _metrics(RunMetric).items()
+            if metric.applies(experiment)
         }
-        if state.identifier is not None:
-            assert experiment.transmission is not None and experiment.identifier is not None
-            truth, found = experiment.transmission.truth(), identified[side]
-            out["stiffness_error"] = found["stiffness"] / truth["stiffness"] - 1.0
-            if "half_gap" in truth:
-                out["dead_zone_error"] = found["half_gap"] / truth["half_gap"] - 1.0
-            out["excitation"] = experiment.identifier.excitation(state.identifier)
-        # sums overflow with the lane: they tell whether it stayed finite
-        ok = jnp.isfinite(total.position + total.velocity + total.torque + total.f_plus + total.acceleration)
+        ok = jnp.isfinite(sum(out[name] for name in _OVERFLOW))
         out = {name: jnp.where(ok, value, False if name == "converged" else jnp.nan) for name, value in out.items()}
         finite = finite & ok
         figures |= {f"{side}.{name}": value for name, value in out.items()}
@@ -169,22 +485,16 @@ METRICS = Reducer(_init, _update, _result)
 """The metrics of every sweep."""
 
 
-class Gains(NamedTuple):
-    """What the gain conditions ask of an observer: its gains and its errors at t = 0."""
-
-    lambda_: Array
-    alpha: Array
-    position_error: Array
-    velocity_error: Array
-
-
-def observer_gains(experiment: Experiment) -> dict[str, Gains]:
+def observer_gains(experiment: Experiment) -> dict[str, ObserverGains]:
     """Gains of the experiment's observers by side."""
     observers = {side: getattr(experiment.observer, side) for side in experiment.sides}
-    return {side: Gains(*(getattr(observer, name) for name in Gains._fields)) for side, observer in observers.items()}
+    return {
+        side: ObserverGains(*(getattr(observer, name) for name in ObserverGains._fields))
+        for side, observer in observers.items()
+    }
 
 
-def with_conditions(figures: Mapping[str, Any], gains: dict[str, Gains]) -> dict[str, np.ndarray]:
+def with_conditions(figures: Mapping[str, Any], gains: dict[str, ObserverGains]) -> dict[str, np.ndarray]:
     """Figures together with those that follow from gains and f_plus alone: margins to conditions, convergence times.
 
     Apart from the loop over time, by programs that serve all studies.
@@ -203,32 +513,27 @@ def with_conditions(figures: Mapping[str, Any], gains: dict[str, Gains]) -> dict
 
 @jax.jit
 def _judged(lambda_: Array, alpha: Array, position_error: Array, velocity_error: Array, f_plus: Array) -> dict[str, Array]:
-    given, errors = (lambda_, alpha, f_plus), (position_error, velocity_error)
-    out = {
-        "convergence_time_bound": conditions.convergence_time_bound(*given, *errors),
-        "convergence_time_worst": conditions.convergence_time_worst(*given, *errors),
-        "margin_alpha": alpha / f_plus,
-    }
-    for name, condition in conditions.CONDITIONS.items():
-        out[f"margin_{name}"] = lambda_ / condition.least_lambda(alpha, f_plus)
+    gains = ObserverGains(lambda_, alpha, position_error, velocity_error)
+    out = {name: metric.judge(gains, f_plus) for name, metric in _metrics(GainMetric).items()}
     # a lane that overflowed has no bound
     return {name: jnp.where(jnp.isnan(f_plus), jnp.nan, value) for name, value in out.items()}
 
 
-def describe(column: str) -> Metric:
-    """Unit and meaning of a metric column such as `motor.velocity_rmse`."""
-    if column == "finite":
-        return Metric("", "finite", "no number of the lane overflowed")
-    return SIDE_METRICS[column.partition(".")[2]]
+class _Finite(Metric):
+    """The one column that is not of a side."""
+
+    label = "finite"
+    doc = "no number of the lane overflowed"
+
+
+def metric_of(column: str) -> type[Metric]:
+    """The metric of a column such as `motor.velocity_rmse`."""
+    return _Finite if column == "finite" else SIDE_METRICS[column.partition(".")[2]]
 
 
 def metric_columns(experiment: Experiment) -> list[str]:
     """The columns that :data:`METRICS` and :func:`with_conditions` give for this experiment."""
-    names = list(SIDE_METRICS)
-    if experiment.identifier is None or experiment.transmission is None:
-        names = [n for n in names if n not in ("stiffness_error", "dead_zone_error", "excitation")]
-    elif "half_gap" not in experiment.transmission.truth():
-        names.remove("dead_zone_error")
+    names = [name for name, metric in _metrics(Metric).items() if metric.applies(experiment)]
     return ["finite", *(f"{side}.{name}" for side in experiment.sides for name in names)]
 
 

@@ -13,7 +13,7 @@ from jaxbl.errors import InputError
 from jaxbl.fused.split import Unsupported
 from jaxbl.simulate import Experiment, scan
 
-from .metrics import METRICS, Gains, metric_columns, observer_gains
+from .metrics import METRICS, ObserverGains, metric_columns, observer_gains
 
 if TYPE_CHECKING:
     from jaxbl.fused.passage import Passage
@@ -49,7 +49,7 @@ class Program(NamedTuple):
         instead: what the fused loop does not know, where the scan takes its place.
     """
 
-    run: Callable[[dict[str, np.ndarray], np.ndarray], tuple[dict[str, Any], dict[str, Gains]]]
+    run: Callable[[dict[str, np.ndarray], np.ndarray], tuple[dict[str, Any], dict[str, ObserverGains]]]
     megabytes: float
     instead: str | None = None
 
@@ -124,7 +124,7 @@ def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tu
     else:
         raise Unsupported(f"{len(devices)} devices of platform {devices[0].platform}")
 
-    def run(values: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[dict[str, Any], dict[str, Gains]]:
+    def run(values: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[dict[str, Any], dict[str, ObserverGains]]:
         with jax.default_device(devices[0]):
             # seeds that only fill up the last chunk are copies of one
             found = {seed: passage(values, seed) for seed in dict.fromkeys(int(seed) for seed in seeds)}

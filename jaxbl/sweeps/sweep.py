@@ -15,7 +15,7 @@ from jaxbl.errors import InputError
 from jaxbl.workers import Progress
 
 from .engine import Chunk, Engine, Estimate
-from .metrics import describe
+from .metrics import metric_of
 from .programs import Backend
 from .refine import refine
 from .store import Store, claim
@@ -91,7 +91,7 @@ class StudyResult:
             first = {other: 0 for other in dataset.dims if other != dim}
             dataset = dataset.assign_coords({path: dataset[path].isel(first, drop=True) for path in paths}).drop_vars(dim)
         for name in dataset.data_vars:
-            about = describe(str(name))
+            about = metric_of(str(name))
             dataset[name].attrs = {"units": about.unit, "long_name": about.doc}
         assert isinstance(dataset, xarray.Dataset)
         return dataset

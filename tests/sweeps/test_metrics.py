@@ -12,8 +12,8 @@ from jaxbl.simulate import scan
 from jaxbl.sweeps.metrics import (
     METRICS,
     SIDE_METRICS,
-    describe,
     metric_columns,
+    metric_of,
     observer_gains,
     window_start,
     with_conditions,
@@ -150,5 +150,5 @@ def test_every_column_has_unit_and_meaning():
     columns = metric_columns(paper())
     assert len(columns) == 1 + 2 * len(SIDE_METRICS)
     for column in columns:
-        assert describe(column).doc
-    assert describe("load.torque_rmse").unit == "N m"
+        assert metric_of(column).doc
+    assert metric_of("load.torque_rmse").unit == "N m"

@@ -1,0 +1,130 @@
+"""A transmission law, an input and a metric of an installed package: simulated, swept, identified online, documented."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from plugin import install_package
+
+ROOT = Path(__file__).parents[1]
+SOURCE = '''
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from jaxbl.drive.excitation import AbstractExcitation
+from jaxbl.drive.parameters import Scalar, parameter
+from jaxbl.drive.transmission import AbstractTransmission
+from jaxbl.sweeps.metrics import RunMetric
+
+
+class CubicShaft(AbstractTransmission):
+    """Flexible shaft that hardens: C = K z + K_3 z^3."""
+
+    name: ClassVar[str] = "cubic_shaft"
+    errors: ClassVar[dict] = {"stiffness_error": "stiffness", "cubic_error": "cubic"}
+    half_gap: ClassVar[float] = 0.0
+    stiffness: Scalar = parameter("N m/rad", "stiffness K", above=0.0)
+    cubic: Scalar = parameter("N m/rad³", "hardening K_3", minimum=0.0)
+
+    def torque(self, deflection):
+        return self.stiffness * deflection + self.cubic * deflection**3
+
+    def regressors(self, z):
+        return z, z**3
+
+    def from_theta(self, theta):
+        return {"stiffness": theta[0], "cubic": theta[1]}
+
+    def truth(self):
+        return {"stiffness": self.stiffness, "cubic": self.cubic}
+
+
+class Triangle(AbstractExcitation):
+    """Triangle wave between -amplitude and amplitude."""
+
+    name: ClassVar[str] = "triangle"
+    amplitude: Scalar = parameter("N m", "amplitude")
+    frequency: Scalar = parameter("Hz", "frequency", above=0.0)
+
+    def __call__(self, time):
+        turns = self.frequency * time
+        return self.amplitude * (4.0 * jnp.abs(turns - jnp.floor(turns + 0.5)) - 1.0)
+
+
+class VelocityPeak(RunMetric):
+    """The state is the largest error so far."""
+
+    name = "velocity_peak"
+    unit = "rad/s"
+    label = "velocity error, peak"
+    doc = "largest velocity error in the last quarter"
+
+    def init(self, zero):
+        return zero
+
+    def update(self, carry, sample):
+        return jnp.maximum(carry, sample.inside * jnp.abs(sample.velocity_error))
+
+    def result(self, carry, end):
+        return carry
+'''
+SCRIPT = """
+import json, runpy
+import jaxbl
+
+study = json.loads(open("study.json").read())
+trial = jaxbl.run(study)
+swept = jaxbl.sweep(study | {"axes": [{"path": "transmission.cubic", "values": [20.0, 40.0]}]})
+error = (trial.trace["motor.velocity"] - trial.trace["motor.velocity_estimate"]).abs()
+page = runpy.run_path(PAGE)["page"]()
+print(json.dumps({
+    "input": list(trial.trace["u"][:3]),
+    "identified": trial.summary["identified"],
+    "peak": [trial.summary["metrics"]["motor.velocity_peak"], error[-len(error) // 4:].max()],
+    "swept": swept.frame[["motor.velocity_peak", "motor.cubic_error", "motor.stiffness_error"]].to_dict("list"),
+    "page": [line for line in page.splitlines() if "cubic" in line or "triangle" in line or "velocity_peak" in line],
+}))
+"""
+STUDY = {
+    "drive": {"kind": "two_inertia", "motor_inertia": 0.05, "motor_viscous": 0.15, "load_inertia": 7.0,
+              "load_viscous": 16.0, "gear_ratio": 5.0},
+    "transmission": {"law": "cubic_shaft", "stiffness": 1.0, "cubic": 30.0},
+    "excitation": {"kind": "triangle", "amplitude": 0.4, "frequency": 0.4},
+    "observer": {"motor": {"lambda": 8.0, "alpha": 30.0}, "load": {"lambda": 1.0, "alpha": 1.0}},
+    "run": {"duration": 10.0, "substeps": 2},
+}  # fmt: skip
+
+
+@pytest.mark.slow
+def test_parts_of_an_installed_package_are_used_everywhere(tmp_path):
+    parts = {"transmissions": {"cubic_shaft": "CubicShaft"}, "excitations": {"triangle": "Triangle"}}
+    parts["metrics"] = {"velocity_peak": "VelocityPeak", "broken": "Nothing"}
+    install_package(tmp_path, "more_parts", SOURCE, {f"jaxbl.{group}": entries for group, entries in parts.items()})
+    (tmp_path / "study.json").write_text(json.dumps(STUDY))
+    script = SCRIPT.replace("PAGE", repr(str(ROOT / "docs" / "generate.py")))
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    # what is wrong is left out with one line, and ends nothing
+    assert [line for line in done.stderr.splitlines() if "warning" in line] == [
+        "warning: jaxbl.metrics: 'broken' (more_parts:Nothing) is left out: "
+        "AttributeError: module 'more_parts' has no attribute 'Nothing'"
+    ]
+    found = json.loads(done.stdout)
+    assert found["input"] == pytest.approx([-0.4, -0.39936, -0.39872])
+    for name, true in (("stiffness", 1.0), ("cubic", 30.0)):
+        assert found["identified"][name]["true"] == true
+        assert found["identified"][name]["motor"] == pytest.approx(true, rel=0.2)
+    assert found["peak"][0] == pytest.approx(found["peak"][1])
+    assert found["swept"]["motor.velocity_peak"][0] != found["swept"]["motor.velocity_peak"][1]
+    assert max(map(abs, found["swept"]["motor.cubic_error"])) < 0.2
+    text = "\n".join(found["page"])
+    assert '`[transmission]` with `law = "cubic_shaft"`' in text and '`[excitation]` with `kind = "triangle"`' in text
+    assert "| `side.velocity_peak` | rad/s | largest velocity error in the last quarter |" in text
+    assert "| `side.cubic_error` |  | relative error of the identified cubic |" in text
