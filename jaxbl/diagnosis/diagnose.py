@@ -122,7 +122,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         gap = proof.gap(fitted, after, found.wrong)
         done()
         lacking_after = setup.fitted.torques(fitted.experiment)
-        _, gain_values = gains_for(task.missing, fitted.experiment, segments)
+        _, gain_values = gains_for(task.missing, fitted.experiment, setup.recorded)
         observing = set_leaves(setup.bare, arrays(gain_values))
         observed = _observed(task, setup, observing)
         trace = trace_of(task, (lacking, lacking_after), (proof.before.torques, after.torques), observed)

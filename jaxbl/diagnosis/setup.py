@@ -37,7 +37,8 @@ class Setup(NamedTuple):
         nominal: the same with all effects at neutral numbers.
         own: its numbers that are not exactly known.
         prior: relative standard deviation of each.
-        fitted: the log that numbers are fitted to.
+        recorded: segments of the log that numbers are fitted to, with the input as it was recorded.
+        fitted: that log, with the input that drives models.
         holdout: what is held out.
         lacking: torques that the model lacks on the log, by side, segment by segment.
         located: where it lacks them, by side.
@@ -48,6 +49,7 @@ class Setup(NamedTuple):
     nominal: Experiment
     own: tuple[Free, ...]
     prior: np.ndarray
+    recorded: Sequence[Segment]
     fitted: ReferenceLog
     holdout: ReferenceLog
     lacking: dict[str, list[Residual]]
@@ -70,17 +72,17 @@ def set_up(task: DiagnosisTask) -> Setup:
     own = free_parameters(bare, default_paths(config, bare), float(np.std(record.torque)))
     prior = np.full(len(own), config.uncertainty.relative)
     rest = config.log.initial_state == "rest"
-    segments, held = (segments_of(one, nominal.sides) for one in (record, task.holdout))
-    _check_stable(task, nominal, ReferenceLog(segments, {}, rest))
-    noise = _torque_noise(input_rms(record), nominal, own, segments)
+    recorded, held = (segments_of(one, nominal.sides) for one in (record, task.holdout))
+    _check_stable(task, nominal, ReferenceLog(recorded, {}, rest))
+    noise, segments = _torque_noise(input_rms(record), nominal, own, recorded), recorded
     if noise > 0.0:
-        segments, held = (_quiet(some, noise) for some in (segments, held))
+        segments, held = (_quiet(some, noise) for some in (recorded, held))
     lacking = ReferenceLog(segments, {}, rest).torques(nominal)
     located = localise(nominal, lacking, segments, rotating=rotating(record, nominal))
     bandwidth = {name: one.bandwidth for name, one in located.items()}
     fitted = ReferenceLog(segments, bandwidth, rest)
     holdout = ReferenceLog(held, bandwidth, rest and task.separate)
-    return Setup(bare, nominal, own, prior, fitted, holdout, lacking, located, noise)
+    return Setup(bare, nominal, own, prior, recorded, fitted, holdout, lacking, located, noise)
 
 
 def rotating(record: Record, experiment: Experiment) -> dict[str, bool]:
