@@ -445,6 +445,8 @@ def _start_jax() -> None:
 
 def _print(lines: list[str], folder: Path, computed: "StudyResult | Tuning | Verdict | None" = None) -> None:
     """Print what was found, what it took to compute, and where the report is."""
+    from .fused import SCANNED
+
     for line in lines:
         typer.echo(line)
     cost = getattr(computed, "cost", None)
@@ -452,7 +454,7 @@ def _print(lines: list[str], folder: Path, computed: "StudyResult | Tuning | Ver
         compiling, computing = duration(cost["compile_seconds"]), duration(cost["run_seconds"])
         typer.echo(f"Compiled in {compiling}, ran {cost['lanes']:.0f} lanes in {computing}.")
     for what in computed.scanned if computed is not None else ():
-        typer.echo(f"Scanned, and slower for it: the fused loop does not know {what}.")
+        typer.echo(SCANNED % what)
     typer.echo(f"{folder / 'report.html'}")
 
 

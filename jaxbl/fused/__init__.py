@@ -5,3 +5,35 @@ XLA makes several kernels of a time step and passes the state through memory bet
 registers: on CPUs compiled by LLVM (`llvm`), on a GPU as one kernel (`pallas`). `passage` takes lanes through a whole run by
 either; `single_plant` does what a log asks for, one plant's path and the derivatives of its steps.
 """
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+
+import jax
+
+SCANNED = "Scanned, and slower for it: the fused loop does not know %s."
+"""Said of what is left to XLA."""
+
+
+class Unsupported(Exception):
+    """Something that a fused loop cannot do."""
+
+
+@contextmanager
+def attempted(what: str = f"how to compile with JAX {jax.__version__}") -> Iterator[None]:
+    """Around the making of a loop: whatever goes wrong is `Unsupported`, as JAX and LLVM change from version to version."""
+    try:
+        yield
+    except Unsupported:
+        raise
+    except Exception as error:  # of any kind: imports, tracing, lowering and assemblers have their own
+        said = str(error).strip().partition("\n")[0]
+        raise Unsupported(f"{what} ({type(error).__name__}: {said:.200})") from error
+
+
+@cache
+def say_scanned(why: str) -> None:
+    """On stderr, once; for what has no report that could say it."""
+    logging.getLogger(__name__).warning(SCANNED, why)

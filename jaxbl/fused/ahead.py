@@ -10,8 +10,9 @@ import numpy as np
 
 from jaxbl.simulate import LONGEST_BLOCK, unit_noise
 
+from . import Unsupported
 from .llvm import Loop
-from .split import Unsupported, recursion
+from .split import recursion
 
 Block = tuple[list[Any], list[Any], list[Any]]
 """Next state of what lanes share, what follows a block of samples reads of it, and what each sample does."""

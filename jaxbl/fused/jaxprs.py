@@ -1,4 +1,8 @@
-"""Rewriting of traced functions: calls opened, operations replaced, products joined with sums."""
+"""Reading and rewriting of traced functions: calls opened, operations replaced, products joined with sums.
+
+JAX's versions write jaxprs differently. What differs is read here alone: other modules take its types, and the parameters
+of equations, from here.
+"""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -8,11 +12,17 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
+from jax.extend.core import Jaxpr as Jaxpr
+from jax.extend.core import jaxpr_as_fun as jaxpr_as_fun
 
-_CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call", "checkpoint")
+_CALLS = ("jit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 """Primitives that only call another jaxpr."""
 Functions = Mapping[str, Callable[..., Any]]
 """By the name of the primitive that they replace."""
+
+
+class UnknownForm(Exception):
+    """JAX writes an equation in a way that is not known here."""
 
 
 def flat(function: Callable[..., Any], *examples: Any) -> ClosedJaxpr:
@@ -62,11 +72,8 @@ def contracted(closed: ClosedJaxpr, multiply_add: MultiplyAdd) -> ClosedJaxpr:
                 c = value_of(env, eqn.invars[1 if first else 0])
                 minus = eqn.primitive.name == "sub"
                 env[out] = multiply_add(a, b, c, minus_product=minus and not first, minus_rest=minus and first)
-            elif eqn.primitive.name == "scan":
-                inner = contracted(eqn.params["jaxpr"], multiply_add)
-                evaluate([eqn.replace(params=eqn.params | {"jaxpr": inner})], env)
             elif out not in inside:
-                evaluate([eqn], env)
+                evaluate([eqn], env, lambda body: contracted(body, multiply_add))
         return [value_of(env, v) for v in jaxpr.outvars]
 
     return jax.make_jaxpr(evaluated)(*(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in closed.in_avals))
@@ -74,10 +81,27 @@ def contracted(closed: ClosedJaxpr, multiply_add: MultiplyAdd) -> ClosedJaxpr:
 
 def _callee(eqn: JaxprEqn) -> ClosedJaxpr | None:
     """What an equation calls, if it does nothing else."""
-    if eqn.primitive.name not in _CALLS:
-        return None
-    inner = eqn.params["jaxpr" if "jaxpr" in eqn.params else "call_jaxpr"]
-    return inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
+    return parameter(eqn, "jaxpr", "call_jaxpr") if eqn.primitive.name in _CALLS else None
+
+
+def parameter(eqn: JaxprEqn, *names: str) -> Any:
+    """Of an equation, by the first of these names that it has."""
+    for name in names:
+        if name in eqn.params:
+            return eqn.params[name]
+    raise UnknownForm(f"{eqn.primitive.name} without {' or '.join(names)}")
+
+
+def repetition(eqn: JaxprEqn) -> tuple[int, ClosedJaxpr, int]:
+    """Of a scan of scalars: how often it does what, and how many of those that it reads stay the same.
+
+    What a scan reads or writes once a step has an axis outside; scalars alone are fixed or carried. So nothing depends on
+    how JAX counts them, which is not the same in 0.10 and 0.11.
+    """
+    body, fixed = parameter(eqn, "jaxpr"), len(eqn.invars) - len(eqn.outvars)
+    if fixed < 0 or (len(body.in_avals), len(body.out_avals)) != (len(eqn.invars), len(eqn.outvars)):
+        raise UnknownForm("scan that reads or makes others than its body")
+    return parameter(eqn, "length"), body, fixed
 
 
 def _inlined(closed: ClosedJaxpr, functions: Functions, *arguments: Any) -> list[Any]:
@@ -87,16 +111,11 @@ def _inlined(closed: ClosedJaxpr, functions: Functions, *arguments: Any) -> list
         given = [value_of(env, v) for v in eqn.invars]
         called, name = _callee(eqn), eqn.primitive.name
         if called is not None:
-            results = _inlined(called, functions, *given)
+            env |= dict(zip(eqn.outvars, _inlined(called, functions, *given), strict=True))
         elif name in functions and jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
-            results = [functions[name](*given)]
+            env[eqn.outvars[0]] = functions[name](*given)
         else:
-            params = eqn.params
-            if name == "scan":
-                params = params | {"jaxpr": substituted(params["jaxpr"], functions)}
-            results = eqn.primitive.bind(*given, **params)
-            results = results if eqn.primitive.multiple_results else [results]
-        env |= dict(zip(eqn.outvars, results, strict=True))
+            evaluate([eqn], env, lambda body: substituted(body, functions))
     return [value_of(env, v) for v in jaxpr.outvars]
 
 
@@ -106,10 +125,18 @@ def _given(closed: ClosedJaxpr, arguments: Sequence[Any]) -> dict[Var, Any]:
     return dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *arguments], strict=True))
 
 
-def evaluate(eqns: Iterable[JaxprEqn], env: dict[Var, Any]) -> None:
-    """Evaluate equations one after the other; `env` has what they read, and gets what they make."""
+def evaluate(
+    eqns: Iterable[JaxprEqn], env: dict[Var, Any], rewritten: Callable[[ClosedJaxpr], ClosedJaxpr] | None = None
+) -> None:
+    """Evaluate equations one after the other; `env` has what they read, and gets what they make.
+
+    `rewritten` is what scans do in place of what they did.
+    """
     for eqn in eqns:
-        results = eqn.primitive.bind(*[value_of(env, v) for v in eqn.invars], **eqn.params)
+        params = eqn.params
+        if rewritten is not None and eqn.primitive.name == "scan":
+            params = params | {"jaxpr": rewritten(parameter(eqn, "jaxpr"))}
+        results = eqn.primitive.bind(*[value_of(env, v) for v in eqn.invars], **params)
         env |= dict(zip(eqn.outvars, results if eqn.primitive.multiple_results else [results], strict=True))
 
 

@@ -10,12 +10,12 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 from llvmlite import binding, ir
 
+from . import Unsupported
 from .elementary import FUNCTIONS
-from .jaxprs import substituted
-from .split import Around, Unsupported
+from .jaxprs import ClosedJaxpr, JaxprEqn, Literal, Var, parameter, repetition, substituted
+from .split import Around
 
 _INT, _BIT, _POINTER = ir.IntType(64), ir.IntType(1), ir.PointerType()
 _KINDS = {
@@ -300,20 +300,18 @@ class _Writer:
     def equation(self, eqn: JaxprEqn, given: list[Vector]) -> list[Vector]:
         name = eqn.primitive.name
         if name == "scan":
-            return self.scan(eqn.params, given)
+            return self.scan(eqn, given)
         dtype = _dtype(eqn.invars[0])
         rule = (_OF_FLOATS if jnp.issubdtype(dtype, jnp.floating) else _OF_INTEGERS).get(name) or _OF_ALL.get(name)
         if rule is None:
             raise Unsupported(f"{name} of {dtype}")
         return [rule(self, eqn, *given)]
 
-    def scan(self, params: dict[str, Any], given: list[Vector]) -> list[Vector]:
+    def scan(self, eqn: JaxprEqn, given: list[Vector]) -> list[Vector]:
         """A loop of fixed length that carries a state: the substeps of a plant."""
-        fixed, inner = params["num_consts"], params["jaxpr"]
-        if len(given) != fixed + params["num_carry"] or len(inner.out_avals) != params["num_carry"]:
-            raise Unsupported("a scan with inputs or outputs a step")
+        length, inner, fixed = repetition(eqn)
         state = given[fixed:]
-        return self.count(_INT(0), _INT(params["length"]), state, lambda _, state: self.run(inner, [*given[:fixed], *state]))
+        return self.count(_INT(0), _INT(length), state, lambda _, state: self.run(inner, [*given[:fixed], *state]))
 
     def vector(self, kind: ir.Type) -> ir.VectorType:
         return ir.VectorType(kind, self.lanes)
@@ -370,7 +368,7 @@ def _clamp(w: _Writer, eqn: JaxprEqn, low: Vector, a: Vector, high: Vector) -> V
 
 
 def _power(w: _Writer, eqn: JaxprEqn, a: Vector) -> Vector:
-    power = eqn.params["y"]
+    power = parameter(eqn, "y")
     if not 1 <= abs(power) <= 8:
         raise Unsupported(f"integer_pow by {power}")
     result = a
@@ -397,13 +395,11 @@ def _select(w: _Writer, eqn: JaxprEqn, which: Vector, *cases: Vector) -> Vector:
 
 
 def _convert(w: _Writer, eqn: JaxprEqn, a: Vector) -> Vector:
-    old, new = _dtype(eqn.invars[0]), np.dtype(eqn.params["new_dtype"])
+    old, new = _dtype(eqn.invars[0]), _dtype(eqn.outvars[0])
     if old == new:
         return a
     if new == _BOOL:
         raise Unsupported(f"conversion of {old} to bool")
-    if str(new) not in _KINDS:
-        raise Unsupported(f"numbers of type {new}")
     target, wider = w.vector(_KINDS[str(new)]), old == _BOOL or new.itemsize > old.itemsize
     signed = jnp.issubdtype(old, jnp.signedinteger)
     was, becomes = (jnp.issubdtype(dtype, jnp.floating) for dtype in (old, new))
@@ -426,13 +422,15 @@ _OF_FLOATS: dict[str, Callable[..., Vector]] = {
     "div": _divide,
     "neg": lambda w, eqn, a: w.build.fneg(a),
     "square": lambda w, eqn, a: w.build.fmul(a, a, flags=_FLAGS),
+    # JAX 0.11's, in derivatives of tanh
+    "one_minus_square": lambda w, eqn, a: w.build.fmul(w.build.fadd(w.like(a, 1.0), a), w.build.fsub(w.like(a, 1.0), a)),
     "integer_pow": _power,
     "abs": lambda w, eqn, a: w.intrinsic("fabs", a),
     "sqrt": lambda w, eqn, a: w.intrinsic("sqrt", a),
     "floor": lambda w, eqn, a: w.intrinsic("floor", a),
     "ceil": lambda w, eqn, a: w.intrinsic("ceil", a),
     # lax.RoundingMethod: away from zero, to nearest even
-    "round": lambda w, eqn, a: w.intrinsic(("round", "rint")[int(eqn.params["rounding_method"])], a),
+    "round": lambda w, eqn, a: w.intrinsic(("round", "rint")[int(parameter(eqn, "rounding_method"))], a),
     "sign": _sign,
     "max": _LARGER,
     "min": _SMALLER,
@@ -456,6 +454,6 @@ _OF_ALL: dict[str, Callable[..., Vector]] = {
     },
     "select_n": _select,
     "convert_element_type": _convert,
-    "bitcast_convert_type": lambda w, eqn, a: w.build.bitcast(a, w.vector(_KINDS[str(np.dtype(eqn.params["new_dtype"]))])),
+    "bitcast_convert_type": lambda w, eqn, a: w.build.bitcast(a, w.vector(_KINDS[str(_dtype(eqn.outvars[0]))])),
     **dict.fromkeys(("copy", "copy_p", "broadcast_in_dim", "reshape", "squeeze"), lambda w, eqn, a: a),
 }

@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array
 
+from . import attempted
 from .elementary import rounded
-from .jaxprs import contracted, flat, substituted
-from .split import Around, Unsupported
+from .jaxprs import ClosedJaxpr, contracted, flat, jaxpr_as_fun, substituted
+from .split import Around
 
 _ABSENT = {"round": rounded}
 """What Triton's lowering lacks."""
@@ -79,11 +79,8 @@ class Kernel:
 
     def compiled(self) -> Callable[..., list[Array]]:
         """For the device at hand. Raises `Unsupported` where there is no such kernel."""
-        try:
+        with attempted("how to compile for this device"):
             return jax.jit(self.run).lower(*self.arguments).compile()
-        except Exception as error:  # of any kind: lowering, Triton and the assembler have their own
-            said = str(error).strip().partition("\n")[0]
-            raise Unsupported(f"how to compile for this device ({type(error).__name__}: {said:.200})") from error
 
     def run(self, values: list[Array], inputs: tuple[list[Array], list[Array], list[Array]]) -> list[Array]:
         """The lanes' results `(lanes,)` each, of `arguments`."""

@@ -17,7 +17,6 @@ from jaxbl.simulate import Experiment, Reducer, advance, begin, block_length, fi
 
 from .ahead import Shared, ahead_of_lanes, host
 from .llvm import Arrays, Loop, vector_lanes
-from .pallas import LANES, Kernel
 from .split import Around, Kind, carry_kinds, split
 
 
@@ -186,6 +185,9 @@ class DevicePassage(Passage):
         *,
         interpret: bool = False,
     ):
+        # here, as no processor needs it, and it takes a quarter of a second
+        from .pallas import LANES, Kernel
+
         # a loop of scalars is the work of a processor; a GPU would start a kernel for each of its steps
         with jax.default_device(host()):
             super().__init__(experiment, reducers, paths, lanes, LANES)

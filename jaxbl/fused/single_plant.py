@@ -5,10 +5,10 @@ starts some twenty kernels for a step of a single plant, and passes what they co
 do (effects that read tables) is left to XLA. In float64, under `jax.enable_x64`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
-from typing import Any, NamedTuple
+from functools import lru_cache, wraps
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,9 +18,10 @@ import numpy as np
 from jaxbl.drive.plant import PlantState
 from jaxbl.simulate import Experiment, corrected, move, trajectory
 
-from .jaxprs import flat
-from .llvm import Loop, vector_lanes
-from .split import Unsupported
+from . import Unsupported, attempted, say_scanned
+
+if TYPE_CHECKING:
+    from .llvm import Loop
 
 _FLOAT = np.dtype(float)
 _NUMBER = jax.ShapeDtypeStruct((), _FLOAT)
@@ -103,7 +104,7 @@ def slopes(
         return np.array(changes, float), np.array(new, float)
     _check((torque, time, *leaves))
     count = len(torque)
-    whole = -(-count // vector_lanes(_FLOAT)) * vector_lanes(_FLOAT)
+    whole = -(-count // loop.lanes) * loop.lanes
     values = [np.pad(np.asarray(column, float), (0, whole - count), "edge") for column in (*leaves, torque, time)]
     numbers = plant.numbers(experiment)
     changes, new = np.empty((len(directions), len(leaves), whole)), np.empty((len(leaves), whole))
@@ -185,6 +186,7 @@ class _Plant(NamedTuple):
 @lru_cache(maxsize=64)
 def _read(plant: _Plant) -> tuple[int, ...]:
     """Places of the experiment's leaves that a step reads. Raises `Unsupported` if one of them is no number."""
+    from .jaxprs import flat
 
     def step(leaves: list[Any], state: list[Any], torque: Any, time: Any) -> list[Any]:
         return plant.step(plant.structure.unflatten(leaves), state, torque, time)
@@ -199,9 +201,27 @@ def _read(plant: _Plant) -> tuple[int, ...]:
     return read
 
 
-@lru_cache(maxsize=64)
-def _path_loop(plant: _Plant, sides: tuple[str, ...]) -> Loop | None:
+def _or_none(compiled: "Callable[..., Loop]") -> "Callable[..., Loop | None]":
+    """Compiles a loop once; where there can be none, says so."""
+
+    @lru_cache(maxsize=64)
+    @wraps(compiled)
+    def found(*given: Any) -> "Loop | None":
+        try:
+            with attempted():
+                return compiled(*given)
+        except Unsupported as why:
+            say_scanned(str(why))
+            return None
+
+    return found
+
+
+@_or_none
+def _path_loop(plant: _Plant, sides: tuple[str, ...]) -> "Loop":
     """From state, numbers, first time and gains, and a sample's index, torque and readings."""
+    from .jaxprs import flat
+    from .llvm import Loop
 
     def sample(state: list[Any], numbers: list[Any], first: Any, gains: list[Any], index: Any, inputs: list[Any]) -> Any:
         experiment = plant.put(numbers)
@@ -212,18 +232,17 @@ def _path_loop(plant: _Plant, sides: tuple[str, ...]) -> Loop | None:
         return plant.step(experiment, jax.tree.leaves(seen), torque, time), state
 
     count = plant.shape.num_leaves
-    try:
-        fixed = [_NUMBER] * len(_read(plant)), _NUMBER, [_NUMBER] * (2 * len(sides))
-        index, inputs = jax.ShapeDtypeStruct((), np.int32), [_NUMBER] * (1 + len(sides))
-        body = flat(sample, [_NUMBER] * count, *fixed, index, inputs)
-        return Loop(body, _FLOAT, carry=count, lanes=1, fixed=len(jax.tree.leaves(fixed)))
-    except Unsupported:
-        return None
+    fixed = [_NUMBER] * len(_read(plant)), _NUMBER, [_NUMBER] * (2 * len(sides))
+    index, inputs = jax.ShapeDtypeStruct((), np.int32), [_NUMBER] * (1 + len(sides))
+    body = flat(sample, [_NUMBER] * count, *fixed, index, inputs)
+    return Loop(body, _FLOAT, carry=count, lanes=1, fixed=len(jax.tree.leaves(fixed)))
 
 
-@lru_cache(maxsize=64)
-def _slopes_loop(plant: _Plant) -> Loop | None:
+@_or_none
+def _slopes_loop(plant: _Plant) -> "Loop":
     """From state, torque and time of a lane, numbers, and changes of numbers, state and torque."""
+    from .jaxprs import flat
+    from .llvm import Loop
 
     def slope(state: list[Any], torque: Any, time: Any, numbers: list[Any], changes: tuple[Any, ...]) -> Any:
         def step(numbers: list[Any], state: list[Any], torque: Any) -> list[Any]:
@@ -233,9 +252,6 @@ def _slopes_loop(plant: _Plant) -> Loop | None:
         return change, new
 
     count = plant.shape.num_leaves
-    try:
-        state, numbers = [_NUMBER] * count, [_NUMBER] * len(_read(plant))
-        body = flat(slope, state, _NUMBER, _NUMBER, numbers, (numbers, state, _NUMBER))
-        return Loop(body, _FLOAT, values=count + 2, fixed=2 * len(numbers) + count + 1)
-    except Unsupported:
-        return None
+    state, numbers = [_NUMBER] * count, [_NUMBER] * len(_read(plant))
+    body = flat(slope, state, _NUMBER, _NUMBER, numbers, (numbers, state, _NUMBER))
+    return Loop(body, _FLOAT, values=count + 2, fixed=2 * len(numbers) + count + 1)

@@ -13,10 +13,10 @@ import numpy as np
 
 from jaxbl.simulate import Experiment, Reducer, Signals, State, advance, begin, block_length, figures, settled
 
+from . import Unsupported
 from .ahead import Shared, ahead_of_lanes, host
 from .jaxprs import flat
 from .llvm import Loop
-from .split import Unsupported
 
 
 def recorded(

@@ -11,16 +11,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 
-from .jaxprs import evaluate, flat, value_of
+from . import Unsupported
+from .jaxprs import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, evaluate, flat, jaxpr_as_fun, value_of
 
 NUMBERS = ("float32", "float64", "int32", "uint32", "int64", "bool")
 """Types that lanes may read."""
-
-
-class Unsupported(Exception):
-    """Something in a step that a fused loop cannot do."""
 
 
 class Kind(enum.IntFlag):

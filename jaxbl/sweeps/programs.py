@@ -10,7 +10,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
-from jaxbl.fused.split import Unsupported
+from jaxbl.fused import Unsupported, attempted
 from jaxbl.simulate import Experiment, scan
 
 from .metrics import METRICS, ObserverGains, metric_columns, observer_gains
@@ -101,7 +101,8 @@ def compile_program(
     """
     if backend == "fused":
         try:
-            return _fused(experiment, layout, devices, tuple(columns))
+            with attempted():
+                return _fused(experiment, layout, devices, tuple(columns))
         except Unsupported as why:
             if insist:
                 raise InputError(f"--backend fused: the fused loop does not know {why}; use --backend scan") from None
@@ -112,10 +113,8 @@ def compile_program(
 def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tuple[str, ...]) -> Program:
     if not paths:
         raise Unsupported("lanes that differ in nothing but their seed")
-    try:
-        from jaxbl.fused.passage import DevicePassage, HostPassage
-    except ImportError as error:
-        raise Unsupported(f"how to compile here ({error})") from None
+    from jaxbl.fused.passage import DevicePassage, HostPassage
+
     if devices[0].platform == "cpu":
         passage: Passage = HostPassage(experiment, (METRICS,), paths, layout.points, len(devices))
     elif devices[0].platform == "gpu" and len(devices) == 1:

@@ -7,15 +7,16 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config, precision, prepare, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import plain
-from jaxbl.fused.single_run import recorded
+from jaxbl.fused import Unsupported, attempted, say_scanned
 from jaxbl.observer.conditions import CONDITIONS, peak_ratio
 from jaxbl.records import POSITION_CHANNELS
-from jaxbl.simulate import Experiment, Reducer, Signals, State
+from jaxbl.simulate import Experiment, Reducer, Signals, State, scan
 
 from .metrics import METRICS, observer_gains, with_conditions
 from .store import identity
@@ -52,9 +53,17 @@ def run(study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every:
         raise InputError(f"every: should be between 1 and the number of samples {config.run.steps}, not {every}")
     with precision(config):
         experiment = prepare(config)
-        figures, kept = recorded(experiment, seed, (METRICS, _LAST), partial(_row, experiment), every)
+        what = (METRICS, _LAST), partial(_row, experiment), every
+        try:
+            with attempted():
+                from jaxbl.fused.single_run import recorded
+
+                figures, kept = recorded(experiment, seed, *what)
+        except Unsupported as why:
+            say_scanned(str(why))
+            figures, kept = jax.jit(lambda seed: scan(experiment, seed, *what))(jnp.asarray(seed))
         figures = with_conditions(figures, observer_gains(experiment))
-        trace = pd.DataFrame({name: column.astype(float) for name, column in kept.items()})
+        trace = pd.DataFrame({name: np.asarray(column, float) for name, column in kept.items()})
     last = {name: plain(figures.pop(name)) for name in list(figures) if name.startswith("last.")}
     metrics = {name: plain(value) for name, value in figures.items()}
     return Trial(config, trace, _summary(config, last, metrics, seed))

@@ -1,22 +1,25 @@
 """The fused loop does what the scan does: all laws, effects and observers, both precisions."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from effect_values import VALUES
 from jax.extend.core import jaxpr_as_fun
+from jax.sharding import AbstractDevice, AbstractMesh, use_abstract_mesh
 
 from jaxbl.drive import Encoders, Initial, LinearShaft, Rigid, TwoInertia, as_arrays, get_leaf, set_leaves
 from jaxbl.drive.effects import make_effect
 from jaxbl.drive.excitation import Chirp, Sine
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.drive.transmission import DeadZone
+from jaxbl.fused import Unsupported
 from jaxbl.fused.ahead import Looped
 from jaxbl.fused.jaxprs import contracted, substituted
 from jaxbl.fused.pallas import LANES, Kernel
 from jaxbl.fused.passage import DevicePassage, HostPassage
-from jaxbl.fused.split import Unsupported
 from jaxbl.observer import OBSERVERS, EquivalentControl, Identifier, Observers
 from jaxbl.simulate import Experiment, Reducer, Run, scan
 from jaxbl.sweeps.metrics import METRICS
@@ -146,6 +149,7 @@ def test_every_effect_in_the_kernel_of_accelerators(names):
 
 @pytest.mark.parametrize("names", [HALF, OTHERS], ids=["half", "others"])
 @pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
 def test_the_kernel_can_be_written_for_a_gpu(names, precision):
     """No GPU is needed for that: every operation is one that Triton knows, products are joined with sums."""
     law = DeadZone(60.0, 0.05) if names is HALF else LinearShaft(60.0)
@@ -154,7 +158,10 @@ def test_the_kernel_can_be_written_for_a_gpu(names, precision):
         paths = tuple(path for path in leaf_paths(whole) if path.startswith("effects."))
         parts = DevicePassage(whole, (METRICS,), paths, 5, interpret=True)
         kernel = Kernel(parts._body, parts._around, len(paths), 2 * LANES, 200, 64)
-        written = jax.jit(kernel.run).trace(*kernel.arguments).lower(lowering_platforms=("cuda",)).as_text()
+        # from JAX 0.11 on it has to be told which GPU; before 0.10 it was not told the platform
+        named = ("NVIDIA H100", None, "gpu")[: len(dataclasses.fields(AbstractDevice))]
+        with use_abstract_mesh(AbstractMesh((), (), abstract_device=AbstractDevice(*named))):
+            written = jax.jit(kernel.run).trace(*kernel.arguments).lower(lowering_platforms=("cuda",)).as_text()
     assert "fma.rn" in written
     if jax.default_backend() == "cpu":
         with pytest.raises(Unsupported, match="how to compile for this device"):
@@ -171,7 +178,7 @@ def test_what_is_joined_for_a_gpu_computes_the_same(names):
 
     def multiply_add(a, b, c, *, minus_product, minus_rest):
         joined.append(a)
-        return (-a if minus_product else a) * b + (-c if minus_rest else c)
+        return (jnp.negative(a) if minus_product else a) * b + (jnp.negative(c) if minus_rest else c)
 
     random = np.random.default_rng(1)
     for part in (parts._body, *parts._around):
