@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint versions clean
 
 demo: .venv/installed
 	$(BIN)/jaxbl sweep sweeps/gain_map.toml
@@ -14,6 +14,9 @@ lint: .venv/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+
+versions: .venv/installed-dev
+	.ci/versions
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv

@@ -48,9 +48,21 @@ BackendOption = Annotated[
 ]
 
 
+def _say_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        typer.echo(f"jaxbl {version('jaxbl')}")
+        raise typer.Exit
+
+
 @app.callback()
-def _main() -> None:
-    """Needed by typer to keep subcommands with their names."""
+def _main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_say_version, is_eager=True, help="say which version this is, and stop")
+    ] = False,
+) -> None:
+    pass
 
 
 @app.command()
@@ -466,7 +478,3 @@ def main(run: Callable[[], object] = app) -> None:
 def program() -> None:
     """Entry point: as :func:`main`, and an interrupt ends the process at once."""
     end_at_once_if_interrupted(main)
-
-
-if __name__ == "__main__":
-    program()

@@ -35,7 +35,7 @@ def installed(tmp_path_factory):
 def jaxbl(installed, *arguments):
     """Run a command in a process of its own."""
     done = subprocess.run(
-        [sys.executable, "-m", "jaxbl.cli", *map(str, arguments)], env=installed, capture_output=True, text=True
+        [sys.executable, "-m", "jaxbl", *map(str, arguments)], env=installed, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     assert "warning" not in done.stderr

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import tomllib
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ GAINS = [listed(ALPHA, 5.0, 9.0), listed(LAMBDA, 3.0, 6.0)]
 def jaxbl(*arguments, cwd, **environment):
     """The command as a process of its own, its output in pipes."""
     return subprocess.run(
-        [sys.executable, "-m", "jaxbl.cli", *arguments], cwd=cwd, capture_output=True, text=True, timeout=120, check=False,
+        [sys.executable, "-m", "jaxbl", *arguments], cwd=cwd, capture_output=True, text=True, timeout=120, check=False,
         env=os.environ | environment,
     )  # fmt: skip
 
@@ -62,6 +63,13 @@ def write(folder, data=None, name="study.toml"):
 
 def left(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def test_the_version_does_not_wait_for_jax(tmp_path):
+    shown = jaxbl("--version", cwd=tmp_path, PYTHONPROFILEIMPORTTIME="1")
+    assert (shown.returncode, shown.stdout) == (0, f"jaxbl {version('jaxbl')}\n")
+    assert " jaxbl.cli\n" in shown.stderr
+    assert " jax\n" not in shown.stderr
 
 
 def test_help_does_not_wait_for_jax(tmp_path):
@@ -98,7 +106,7 @@ def test_interrupted_sweep_says_how_to_go_on(tmp_path):
     axes = [listed("run.sample_period", *(1e-3 * (1 + i / 100) for i in range(30)))]
     study = write(tmp_path, rigid(axes=axes), "a study.toml")
     folder = tmp_path / "out"
-    command = [sys.executable, "-m", "jaxbl.cli", "sweep", study.name, "--out", "out"]
+    command = [sys.executable, "-m", "jaxbl", "sweep", study.name, "--out", "out"]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         for _ in range(3600):
             if list(folder.glob("points/part-*.parquet")) or process.poll() is not None:
@@ -570,7 +578,7 @@ def test_an_interrupted_identification_writes_nothing_and_says_how_to_start_agai
 
 def test_an_interrupt_while_numbers_are_sought(axis, tmp_path):
     """SIGINT from outside, as soon as the folder is there."""
-    command = [sys.executable, "-m", "jaxbl.cli", *IDENTIFY]
+    command = [sys.executable, "-m", "jaxbl", *IDENTIFY]
     folder = tmp_path / "results" / "an axis"
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         for _ in range(3600):

@@ -33,6 +33,7 @@ FLOORS = [
     {"report"},
     {"batch", "terminal"},
     {"cli"},
+    {"__main__"},
 ]
 BELOW = {part: set().union(*FLOORS[:i]) for i, floor in enumerate(FLOORS) for part in floor}
 

@@ -26,7 +26,8 @@ class Table(StrictTable):
     def build(self) -> Any:
         """The module that a generated table stands for."""
         names = {name for name in type(self).model_fields if name not in ("kind", "law")}
-        return self.factory(**{name: getattr(self, name) for name in names})
+        # of the class: an instance would bind a partial function from Python 3.14 on
+        return type(self).factory(**{name: getattr(self, name) for name in names})
 
 
 def table_for(module: type, factory: Callable[..., Any] | None = None, base: type[Table] = Table, **tag: str) -> type[Table]:

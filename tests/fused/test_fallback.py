@@ -1,0 +1,89 @@
+"""What a JAX or an LLVM of another version makes unknown is scanned, and one line says so."""
+
+import re
+import sys
+
+import jax
+import numpy as np
+import pytest
+from small_study import ALPHA, listed, small
+
+import jaxbl
+from jaxbl import fused
+from jaxbl.fused import jaxprs, llvm, single_plant
+from jaxbl.study.engine import prepare
+
+NAME = "motor.velocity_rmse"
+
+
+def renamed(monkeypatch):
+    def parameter(eqn, *names):
+        return parameters(eqn, *(f"new_{name}" for name in names))
+
+    parameters = jaxprs.parameter
+    monkeypatch.setattr(jaxprs, "parameter", parameter)
+
+
+def unread(monkeypatch):
+    def parse_assembly(text):
+        raise RuntimeError("LLVM IR parsing error\n<string>:3:26: error: expected type")
+
+    monkeypatch.setattr(llvm.binding, "parse_assembly", parse_assembly)
+
+
+def moved(monkeypatch):
+    for name in ("passage", "single_run", "llvm"):
+        monkeypatch.setitem(sys.modules, f"jaxbl.fused.{name}", None)
+
+
+UNKNOWN = {
+    renamed: r"how to compile with JAX [\d.]+ \(UnknownForm: \w+ without new_\w+( or new_call_jaxpr)?\)",
+    unread: r"how to compile with JAX [\d.]+ \(RuntimeError: LLVM IR parsing error\)",
+    moved: r"how to compile with JAX [\d.]+ \(ModuleNotFoundError: import of jaxbl\.fused\.\w+ halted.*\)",
+}
+
+
+@pytest.fixture(params=UNKNOWN, ids=lambda change: change.__name__)
+def unknown(request, monkeypatch):
+    """Makes it so; returns what is said of it."""
+    fused.say_scanned.cache_clear()
+    single_plant._path_loop.cache_clear()
+    yield lambda: request.param(monkeypatch) or UNKNOWN[request.param]
+    # loops that could not be had are not kept
+    single_plant._path_loop.cache_clear()
+
+
+def test_a_sweep_is_scanned(unknown, caplog):
+    study = small({"run.substeps": 2}, axes=[listed(ALPHA, 5.0, 9.0, 20.0)])
+    expected, said = jaxbl.sweep(study, backend="scan").frame, unknown()
+    result = jaxbl.sweep(study)
+    (why,) = result.scanned
+    np.testing.assert_array_equal(result.frame[NAME], expected[NAME])
+    assert re.fullmatch(said, why)
+    with pytest.raises(jaxbl.InputError, match=f"^--backend fused: the fused loop does not know {said}; use --backend scan"):
+        jaxbl.sweep(study, backend="fused")
+    assert not caplog.messages
+
+
+def test_a_run_is_scanned(unknown, caplog):
+    study = small({"run.substeps": 2})
+    expected, said = jaxbl.run(study, every=7), unknown()
+    found = [jaxbl.run(study, every=7) for _ in range(2)]
+    for one in found:
+        assert one.summary["metrics"][NAME] == pytest.approx(expected.summary["metrics"][NAME], rel=1e-6)
+        np.testing.assert_allclose(one.trace["theta_e"], expected.trace["theta_e"], rtol=1e-6, atol=1e-9)
+    (line,) = caplog.messages
+    assert re.fullmatch(fused.SCANNED % said, line)
+
+
+def test_a_plant_is_scanned(unknown, caplog):
+    with jax.enable_x64(True):
+        one = prepare(jaxbl.read_config(small({"run.substeps": 2})))
+        start, torque = one.plant.init(one.initial), np.ones(50)
+        expected, said = single_plant.path(one, start, torque), unknown()
+        single_plant._path_loop.cache_clear()
+        found = [single_plant.path(one, start, torque) for _ in range(2)]
+    for path in found:
+        np.testing.assert_allclose(path.position["motor"], expected.position["motor"], rtol=1e-9, atol=1e-12)
+    (line,) = caplog.messages
+    assert re.fullmatch(fused.SCANNED % said, line)
