@@ -11,10 +11,11 @@ from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
-from jax.extend.core import Jaxpr as Jaxpr
+from jax.extend.core import JaxprEqn, Literal, Var
 from jax.extend.core import jaxpr_as_fun as jaxpr_as_fun
 
+ClosedJaxpr = Any
+"""What `jax.make_jaxpr` gives: constants and a jaxpr until JAX 0.10, a jaxpr with them inside from 0.11 on."""
 _CALLS = ("jit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 """Primitives that only call another jaxpr."""
 Functions = Mapping[str, Callable[..., Any]]

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import Unsupported
-from .jaxprs import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, evaluate, flat, jaxpr_as_fun, value_of
+from .jaxprs import ClosedJaxpr, JaxprEqn, Literal, Var, evaluate, flat, jaxpr_as_fun, value_of
 
 NUMBERS = ("float32", "float64", "int32", "uint32", "int64", "bool")
 """Types that lanes may read."""
@@ -198,7 +198,7 @@ def _kind(kinds: dict[Var, Kind], v: Var | Literal) -> Kind:
     return Kind.FIXED if isinstance(v, Literal) else kinds[v]
 
 
-def _kinds(jaxpr: Jaxpr, given: Sequence[Kind]) -> dict[Var, Kind]:
+def _kinds(jaxpr: Any, given: Sequence[Kind]) -> dict[Var, Kind]:
     kinds = dict.fromkeys(jaxpr.constvars, Kind.FIXED) | dict(zip(jaxpr.invars, given, strict=True))
     for eqn in jaxpr.eqns:
         kind = Kind.FIXED
@@ -208,7 +208,7 @@ def _kinds(jaxpr: Jaxpr, given: Sequence[Kind]) -> dict[Var, Kind]:
     return kinds
 
 
-def _live(jaxpr: Jaxpr) -> list[JaxprEqn]:
+def _live(jaxpr: Any) -> list[JaxprEqn]:
     """Equations that an output needs."""
     needed = {v for v in jaxpr.outvars if isinstance(v, Var)}
     kept = []
