@@ -6,12 +6,12 @@ import sys
 import jax
 import numpy as np
 import pytest
+from jaxbl.study.engine import prepare
 from small_study import ALPHA, listed, small
 
 import jaxbl
 from jaxbl import fused
 from jaxbl.fused import jaxprs, llvm, single_plant
-from jaxbl.study.engine import prepare
 
 NAME = "motor.velocity_rmse"
 
