@@ -6,11 +6,11 @@ import sys
 import jax
 import numpy as np
 import pytest
-from jaxbl.study.engine import prepare
 from small_study import ALPHA, listed, small
 
 import jaxbl
 from jaxbl import fused
+from jaxbl.config import prepare
 from jaxbl.fused import jaxprs, llvm, single_plant
 
 NAME = "motor.velocity_rmse"
