@@ -30,7 +30,7 @@ from jaxbl.fused.jaxprs import contracted, flat
 from jaxbl.fused.pallas import multiply_add
 from jaxbl.fused.passage import DevicePassage
 from jaxbl.simulate import scan
-from jaxbl.throughput.workload import FIGURES, NAMES, RANGES, SEED, Workload, constants, figures_of
+from jaxbl.throughput.workload import FIGURES, NAMES, RANGES, SEED, Workload, constants, identified_figures
 
 _THREADS = 128
 
@@ -58,7 +58,7 @@ def chain_by_hand(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
         sizes = np.int32(work.steps), np.int32(work.start), np.int32(work.window)
         grid = -(-work.lanes // _THREADS)
         kernel((grid,), (_THREADS,), (numbers, *sizes, torque, noise, np.int32(work.lanes), given, out))
-        return figures_of(work, list(cupy.asnumpy(out)))
+        return identified_figures(work, list(cupy.asnumpy(out)))
 
     return run
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import entry_points
 from typing import Any, TypeVar
 
-Kind = TypeVar("Kind", bound=type)
+Added = TypeVar("Added", bound=type)
 
 
 class Registry(Mapping[str, Any]):
@@ -28,7 +28,7 @@ class Registry(Mapping[str, Any]):
         self._found: dict[str, Any] = {}
         self._loaded = False
 
-    def add(self, cls: Kind) -> Kind:
+    def add(self, cls: Added) -> Added:
         """Add a class of this package under its `name`; a decorator."""
         self._found[cls.name] = cls  # type: ignore[attr-defined]
         return cls

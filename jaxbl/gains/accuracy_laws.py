@@ -48,7 +48,7 @@ _PERIOD_EXPONENT = 0.1  # of the error in the period, under noise; white noise a
 _SIZES = ("position_size", "velocity_size", "velocity_rmse")
 
 
-class Fit(NamedTuple):
+class PowerLawFit(NamedTuple):
     """A straight line in log-log, y = exp(intercept) x^slope, over x[first] ... x[last].
 
     The standard error is that of least squares, from the scatter of the points about the line; a bend that the criterion
@@ -89,7 +89,7 @@ class Law:
     series: dict[str, Any]
     where: dict[str, Any]
     theory: float
-    fit: Fit | None
+    fit: PowerLawFit | None
     stops: dict[str, str]
     x_values: np.ndarray
     y_values: np.ndarray
@@ -137,7 +137,7 @@ class Law:
         }
 
 
-def fit_power_law(x: np.ndarray, y: np.ndarray, usable: np.ndarray | None = None) -> Fit | None:
+def fit_power_law(x: np.ndarray, y: np.ndarray, usable: np.ndarray | None = None) -> PowerLawFit | None:
     """The widest run of neighbouring points that one power law describes, by least squares in log-log.
 
     A run is taken if it has :data:`LEAST_POINTS` over :data:`LEAST_SPAN`, no point farther than :data:`LARGEST_RESIDUAL`
@@ -170,7 +170,7 @@ def fit_power_law(x: np.ndarray, y: np.ndarray, usable: np.ndarray | None = None
     return found
 
 
-def _line(log_x: np.ndarray, log_y: np.ndarray, first: int, last: int) -> tuple[Fit, float]:
+def _line(log_x: np.ndarray, log_y: np.ndarray, first: int, last: int) -> tuple[PowerLawFit, float]:
     """Least squares over a run, and the largest residual in ln y."""
     u, v = log_x[first : last + 1], log_y[first : last + 1]
     about = u - u.mean()
@@ -180,7 +180,7 @@ def _line(log_x: np.ndarray, log_y: np.ndarray, first: int, last: int) -> tuple[
     error = math.sqrt(float(residual @ residual) / (len(u) - 2) / float(about @ about))
     middle = (len(u) + 1) // 2
     halves = (_slope(u[:middle], v[:middle]), _slope(u[-middle:], v[-middle:]))
-    return Fit(slope, error, intercept, first, last, halves), float(np.abs(residual).max())
+    return PowerLawFit(slope, error, intercept, first, last, halves), float(np.abs(residual).max())
 
 
 def _slope(u: np.ndarray, v: np.ndarray) -> float:
@@ -188,7 +188,7 @@ def _slope(u: np.ndarray, v: np.ndarray) -> float:
     return float(about @ v / (about @ about))
 
 
-def _bend(log_x: np.ndarray, log_y: np.ndarray, fit: Fit) -> tuple[float, float]:
+def _bend(log_x: np.ndarray, log_y: np.ndarray, fit: PowerLawFit) -> tuple[float, float]:
     """Upper half's slope less lower half's, and the standard error that scatter alone gives this difference."""
     u, v = log_x[fit.first : fit.last + 1], log_y[fit.first : fit.last + 1]
     middle = (len(u) + 1) // 2
@@ -400,7 +400,7 @@ class _Line:
             return f"saturation: the velocity error is {100.0 * self._velocity[i]:.2g} % of the velocity"
         return None
 
-    def stops(self, fit: Fit | None) -> dict[str, str]:
+    def stops(self, fit: PowerLawFit | None) -> dict[str, str]:
         """Why the law ends, at each end; without a law why there is none."""
         if not len(self.x):
             return {"below": "no points", "above": "no points"}

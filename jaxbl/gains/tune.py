@@ -29,7 +29,7 @@ from jaxbl.sweeps.sweep import sweep
 from jaxbl.workers import Progress
 
 from .pilot import Scenarios, pilot, scenarios_of
-from .tune_summary import FIGURES, figures_of, summarise
+from .tune_summary import COMPARED, compared_figures, summarise
 
 Gains = dict[str, tuple[float, float]]
 """lambda (rad^0.5/s) and alpha (rad/s^2) of each side."""
@@ -287,7 +287,9 @@ class Search:
                 own = (frame[f"observer.{side}.lambda"] == lambda_) & (frame[f"observer.{side}.alpha"] == alpha)
                 # another pair may share this side's gains: its runs are the same
                 rows.append(
-                    figures_of(name, side, frame[own].drop_duplicates([*self.scenarios.columns, "seed"]), (lambda_, alpha))
+                    compared_figures(
+                        name, side, frame[own].drop_duplicates([*self.scenarios.columns, "seed"]), (lambda_, alpha)
+                    )
                 )
         return rows
 
@@ -322,7 +324,7 @@ class Search:
         result = sweep(data, folder, progress=update, devices=self.devices, overwrite=self.overwrite, backend=self.backend)
         self.scanned |= dict.fromkeys(result.scanned)
         self.cost = {key: value + result.cost[key] for key, value in self.cost.items()}
-        names = [f"{side}.{figure}" for side in self.sides for figure in FIGURES]
+        names = [f"{side}.{figure}" for side in self.sides for figure in COMPARED]
         paths = [axis["path"] for axis in data["axes"]]
         return result.read([*paths, "seed", "finite", *names])
 
@@ -333,7 +335,7 @@ _LARGEST = ("velocity_rmse", "torque_rmse", "convergence_time", "convergence_tim
 def _worst(frame: pd.DataFrame, side: str) -> pd.DataFrame:
     """One row for each pair of gains: the worst over scenarios and seeds; NaN where a run diverged or did not converge."""
     keys = [f"observer.{side}.lambda", f"observer.{side}.alpha"]
-    part = frame[[*keys, "finite"]].assign(**{name: frame[f"{side}.{name}"] for name in FIGURES})
+    part = frame[[*keys, "finite"]].assign(**{name: frame[f"{side}.{name}"] for name in COMPARED})
     groups = part.groupby(keys, sort=True)
     worst = {name: groups[name].max() for name in _LARGEST}
     least = {name: groups[name].min() for name in ("margin_alpha", "margin_exact", "converged", "finite")}

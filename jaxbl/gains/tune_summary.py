@@ -18,7 +18,7 @@ from jaxbl.sweeps.metrics import SIDE_METRICS
 if TYPE_CHECKING:
     from .tune import Search
 
-FIGURES = (
+COMPARED = (
     "converged",
     "convergence_time",
     "convergence_time_worst",
@@ -45,7 +45,7 @@ def summarise(search: "Search", named: list[dict[str, Any]], held_out: list[dict
 
     Args:
         search: with all its stages run.
-        named: a row for each of the gains compared and each side (:func:`figures_of`), on the study's own runs.
+        named: a row for each of the gains compared and each side (:func:`compared_figures`), on the study's own runs.
         held_out: the same on the held-out ones.
     """
     return _Summary(search, named, held_out).plain()
@@ -92,7 +92,7 @@ class _Summary:
 
     def _achieved(self, side: str) -> dict[str, Any]:
         row = self.best[side]
-        names = [name for name in FIGURES if name != "converged"]
+        names = [name for name in COMPARED if name != "converged"]
         return {name: plain_number(row[name]) for name in names} | {
             "peak_ratio": _peak_ratio(row["lambda"], row["alpha"], row["f_plus"])
         }
@@ -208,9 +208,9 @@ def called_gains(name: str) -> str:
     return {"usual rule": "the usual rule's gains", "config": "the study's own gains"}.get(name, f"the gains '{name}'")
 
 
-def figures_of(name: str, side: str, runs: pd.DataFrame, gains: tuple[float, float]) -> dict[str, Any]:
+def compared_figures(name: str, side: str, runs: pd.DataFrame, gains: tuple[float, float]) -> dict[str, Any]:
     """Figures of some gains over all runs of a side: a row of the comparison."""
-    figures = {figure: runs[f"{side}.{figure}"] for figure in FIGURES}
+    figures = {figure: runs[f"{side}.{figure}"] for figure in COMPARED}
     converged, finite = figures["converged"].astype(bool), runs["finite"].astype(bool)
     bound = figures["f_plus"].max() if finite.all() else math.nan
     row: dict[str, Any] = {

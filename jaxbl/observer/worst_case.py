@@ -10,9 +10,8 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
-Values = Float[Array, "..."]
+from .conditions import Values
 
 # part of the fastest time constant that a step takes: the peak ratio is then good to about 1e-7
 _STEP = 0.1

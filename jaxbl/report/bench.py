@@ -6,7 +6,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from jaxbl.files import make_folder, write_atomic
-from jaxbl.throughput.run import CEILING, OURS, PRECISIONS, SCAN, Result
+from jaxbl.throughput.run import CEILING, OURS, PRECISIONS, SCAN, BenchResult
 
 from .figures import Drawn
 from .page import save_all
@@ -15,13 +15,13 @@ from .style import COLOURS, style
 _COLUMNS: list[str] = ["", "bits", "lanes", "lane-steps/s", "median", "of C++", "first call", "deviation"]
 
 
-def draw_throughput(result: Result) -> list[Drawn]:
+def draw_throughput(result: BenchResult) -> list[Drawn]:
     """The figures of a benchmark."""
     with style():
         return [_bars(result), _curve(result)]
 
 
-def _bars(result: Result) -> Drawn:
+def _bars(result: BenchResult) -> Drawn:
     names = list(dict.fromkeys(row.name for row in result.rows))
     names.sort(key=lambda name: result.speed(name, "float32") or result.speed(name, "float64") or 0.0)
     figure = Figure(figsize=(8.0, 0.42 * len(names) + 1.1))
@@ -47,7 +47,7 @@ def _bars(result: Result) -> Drawn:
     return Drawn("throughput", figure, caption)
 
 
-def _curve(result: Result) -> Drawn:
+def _curve(result: BenchResult) -> Drawn:
     figure = Figure(figsize=(7.0, 3.8))
     axes = figure.add_subplot()
     for name, colour in ((CEILING, COLOURS[0]), (OURS, COLOURS[1]), (SCAN, COLOURS[2])):
@@ -68,7 +68,7 @@ def _curve(result: Result) -> Drawn:
     return Drawn("lanes", figure, caption)
 
 
-def table(result: Result) -> list[list[str]]:
+def table(result: BenchResult) -> list[list[str]]:
     """Header and rows of the table, as text."""
     rows = [_COLUMNS]
     for row in result.rows:
@@ -88,7 +88,7 @@ def table(result: Result) -> list[list[str]]:
     return rows
 
 
-def throughput_lines(result: Result) -> list[str]:
+def throughput_lines(result: BenchResult) -> list[str]:
     """The benchmark for the terminal."""
     rows = table(result)
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
@@ -105,7 +105,7 @@ def throughput_lines(result: Result) -> list[str]:
     return lines
 
 
-def write_bench_report(result: Result, folder: Path) -> list[str]:
+def write_bench_report(result: BenchResult, folder: Path) -> list[str]:
     """Write `bench.json` and figures. Returns the lines for the terminal."""
     make_folder(folder)
     write_atomic(folder / "bench.json", json.dumps(result.plain(), indent=2, ensure_ascii=False))

@@ -213,7 +213,7 @@ class Engine:
                 self.scanned.append(program.instead)
             return program, metric_columns(experiment)
 
-    def estimate(self) -> "Estimate":
+    def estimate(self) -> "SweepEstimate":
         """Memory and time of all chunks, from a compilation and a short run at the same chunk shape."""
         config = self.points.groups[0].config
         # long enough for what a run costs once not to count
@@ -233,7 +233,7 @@ class Engine:
         lane_steps = short * math.prod(self.layout)
         steps = [group.config.run.steps for group in self.points.groups]
         chunks_a_group = len(self) // len(steps)
-        return Estimate(
+        return SweepEstimate(
             points=len(self.points.groups) * self.points.coarse_lanes,
             rows=self.rows,
             most_points=len(self.points),
@@ -248,7 +248,7 @@ class Engine:
 
 
 @dataclasses.dataclass(frozen=True)
-class Estimate:
+class SweepEstimate:
     """What a study will cost; a refined one, what its coarse grid will cost.
 
     Attributes:

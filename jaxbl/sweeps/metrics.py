@@ -14,17 +14,15 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from jaxbl.drive.registry import Registry, check_subclass
 from jaxbl.drive.transmission import TRANSMISSIONS
 from jaxbl.errors import InputError
 from jaxbl.observer import conditions
-from jaxbl.simulate import Experiment, Reducer, Signals, State, TrueSide
+from jaxbl.simulate import Experiment, Number, Reducer, Signals, State, TrueSide
 
 from .pieces import in_pieces
-
-Number = Float[Array, ""]
 
 
 class Metric(abc.ABC):

@@ -18,19 +18,19 @@ from jaxbl.errors import InputError
 from jaxbl.records.table import nearest
 
 from .metrics import metric_columns
-from .refine import Criterion, Grid
+from .refine import CellGrid, Criterion
 
-Columns = dict[str, np.ndarray]
+AxisColumns = dict[str, np.ndarray]
 
 _MOST_RUNS = 1e10
 _MOST_VALUES = 10_000_000
 """Of one axis: its values are kept."""
 
 
-class Block(NamedTuple):
+class AxisBlock(NamedTuple):
     """Axes that advance together: columns of equal length by path."""
 
-    columns: Columns
+    columns: AxisColumns
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -47,7 +47,7 @@ class Refinement(NamedTuple):
     """How a study is refined: the axes, their grid with all lane axes, and when neighbours disagree."""
 
     paths: list[str]
-    grid: Grid
+    grid: CellGrid
     criterion: Criterion
 
 
@@ -80,7 +80,7 @@ class Points:
             halved = [next(iter(b.columns)) in refined for b in self._blocks_of_leaves]
             sizes = [(len(b) - 1 >> depth) + 1 if h else len(b) for b, h in zip(self._blocks_of_leaves, halved, strict=True)]
             self.coarse_lanes = math.prod(sizes)
-            self.refinement = Refinement(refined, Grid(sizes, halved, depth), _criterion(config, base, refined))
+            self.refinement = Refinement(refined, CellGrid(sizes, halved, depth), _criterion(config, base, refined))
         outside = math.prod(len(b) for b in structural) * config.sweep.seeds
         if (runs := outside * self.coarse_lanes) > _MOST_RUNS:
             raise InputError(f"axes: {runs:.2g} runs are more than {_MOST_RUNS:.0e}; fewer values, or a quasi-random design")
@@ -98,7 +98,7 @@ class Points:
     def __len__(self) -> int:
         return len(self.groups) * self.lanes
 
-    def columns(self, indices: np.ndarray) -> Columns:
+    def columns(self, indices: np.ndarray) -> AxisColumns:
         """Values of the lane axes at some points of a group, by path; float64 arrays of the shape of `indices`."""
         return _take(self._blocks_of_leaves, indices)
 
@@ -154,7 +154,7 @@ class Points:
         base = with_values(config, first)
         return base, set(leaf_paths(base.build()))
 
-    def _blocks(self, config: Config, depths: Mapping[str, int]) -> list[Block]:
+    def _blocks(self, config: Config, depths: Mapping[str, int]) -> list[AxisBlock]:
         sampled = [axis for axis in config.axes if axis.values is None and axis.num is None]
         if sampled and config.sweep.design == "grid":
             i = config.axes.index(sampled[0])
@@ -173,17 +173,17 @@ class Points:
                 raise InputError(f"axes: '{axis.path}' is fixed at compile time; list its values instead of sampling it")
             if axis.zip is not None:
                 raise InputError(f"axes: '{axis.path}' is sampled quasi-randomly and cannot be zipped")
-        blocks: list[Block] = []
+        blocks: list[AxisBlock] = []
         labels: dict[str, int] = {}
         for axis in config.axes:
             if axis in sampled:
                 if axis is sampled[0]:
-                    blocks.append(Block(_quasi_random(sampled, config)))
+                    blocks.append(AxisBlock(_quasi_random(sampled, config)))
             elif axis.zip is None:
-                blocks.append(Block({axis.path: axis.grid(depths.get(axis.path, 0))}))
+                blocks.append(AxisBlock({axis.path: axis.grid(depths.get(axis.path, 0))}))
             elif axis.zip not in labels:
                 labels[axis.zip] = len(blocks)
-                blocks.append(Block({axis.path: axis.grid()}))
+                blocks.append(AxisBlock({axis.path: axis.grid()}))
             else:
                 block, values = blocks[labels[axis.zip]], axis.grid()
                 if len(values) != len(block):
@@ -209,9 +209,9 @@ def _extremes(values: list[Any]) -> list[Any]:
     return [values[0], min(values), max(values)]
 
 
-def _take(blocks: list[Block], indices: np.ndarray) -> Columns:
-    """Columns of a product of blocks at some flat indices, last block fastest."""
-    out: Columns = {}
+def _take(blocks: list[AxisBlock], indices: np.ndarray) -> AxisColumns:
+    """AxisColumns of a product of blocks at some flat indices, last block fastest."""
+    out: AxisColumns = {}
     remaining = indices
     for block in reversed(blocks):
         for path, column in block.columns.items():
@@ -235,7 +235,7 @@ def _criterion(config: Config, base: Config, refined: list[str]) -> Criterion:
     return Criterion.of([metric], TOLERANCE if tolerance is None else tolerance)
 
 
-def _quasi_random(axes: list[AxisTable], config: Config) -> Columns:
+def _quasi_random(axes: list[AxisTable], config: Config) -> AxisColumns:
     """Sobol or Latin hypercube points over the ranges of some axes, uniform in their scale."""
     from scipy.stats import qmc  # a third of a second that only these designs need
 

@@ -52,7 +52,7 @@ class Criterion(NamedTuple):
         return np.logical_or.reduce(apart, axis=(1, 2))
 
 
-class Grid:
+class CellGrid:
     """A fine grid of vertices, some of whose axes are refined: every 2^depth-th vertex along them is on the coarse grid.
 
     Cells span the refined axes; along the others every value has a grid of its own. A cell is known by its lower corner.
@@ -161,7 +161,7 @@ class _Known:
 
 
 def refine(
-    grid: Grid,
+    grid: CellGrid,
     evaluate: Callable[[Indices], np.ndarray],
     differ: Callable[[np.ndarray, np.ndarray], np.ndarray],
 ) -> tuple[Indices, np.ndarray]:

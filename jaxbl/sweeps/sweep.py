@@ -14,7 +14,7 @@ from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
 from jaxbl.workers import Progress
 
-from .engine import Chunk, Engine, Estimate
+from .engine import Chunk, Engine, SweepEstimate
 from .metrics import metric_of
 from .programs import Backend
 from .refine import refine
@@ -225,6 +225,6 @@ def load(folder: str | Path) -> StudyResult:
     return StudyResult(store.config(), store)
 
 
-def dry_run(study: str | Path | Mapping[str, Any] | Config, *, backend: Backend | None = None) -> Estimate:
+def dry_run(study: str | Path | Mapping[str, Any] | Config, *, backend: Backend | None = None) -> SweepEstimate:
     """What a study will cost, from a compilation and a short calibration run; of a refined one, its coarse grid."""
     return Engine(read_config(study), backend=backend, insist=backend is not None).estimate()

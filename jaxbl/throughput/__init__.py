@@ -3,5 +3,5 @@
 What rivals run is written once more in each one's own way (`rivals`), and used nowhere else.
 """
 
-from .run import Result as Result
+from .run import BenchResult as BenchResult
 from .run import bench as bench

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from jaxbl.errors import NoResult
-from jaxbl.workers import cores
+from jaxbl.workers import Progress, cores
 
 from .ours import Fused, Scanned
 from .rivals.compiled import Compiled, forget
@@ -27,7 +27,6 @@ from .rivals.plain import Plain
 from .workload import Workload
 
 Runner = Callable[[], dict[str, np.ndarray]]
-Progress = Callable[[int, int], None]
 
 CEILING, OURS, SCAN = "c++, all cores", "jaxbl fused, all cores", "jaxbl scan, all devices"
 PRECISIONS = ("float32", "float64")
@@ -112,7 +111,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Result:
+class BenchResult:
     """All figures of a benchmark.
 
     Attributes:
@@ -139,7 +138,7 @@ class Result:
         return found[0] if found else None
 
 
-def bench(*, quick: bool = False, progress: Progress | None = None) -> Result:
+def bench(*, quick: bool = False, progress: Progress | None = None) -> BenchResult:
     """Measure this machine: the paper's chain by everyone, in turns, each checked against one reference.
 
     Args:
@@ -156,7 +155,7 @@ def bench(*, quick: bool = False, progress: Progress | None = None) -> Result:
     return found
 
 
-def _bench(folder: Path, count: int, quick: bool, progress: Progress | None) -> Result:
+def _bench(folder: Path, count: int, quick: bool, progress: Progress | None) -> BenchResult:
     devices = len(jax.local_devices(backend="cpu"))
     able, left_out = _able(entries(folder, count, devices), folder)
     steps, rounds = (1500, 3) if quick else (4000, 7)
@@ -204,7 +203,7 @@ def _bench(folder: Path, count: int, quick: bool, progress: Progress | None) -> 
         tick()
     study = _study(count, devices, {entry.name for entry in able}, 1000)
     tick()
-    return Result(_machine(count), rows, curve, study, left_out)
+    return BenchResult(_machine(count), rows, curve, study, left_out)
 
 
 def _is_run(entry: Entry, precision: str, quick: bool) -> bool:

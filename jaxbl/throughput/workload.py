@@ -158,7 +158,7 @@ def constants() -> dict[str, float]:
     }
 
 
-def figures_of(workload: Workload, sums: list[np.ndarray]) -> dict[str, np.ndarray]:
+def identified_figures(workload: Workload, sums: list[np.ndarray]) -> dict[str, np.ndarray]:
     """Figures `(lanes,)` from the nine sums over the run that rivals keep.
 
     Args:

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from jaxbl.report.bench import throughput_lines, write_bench_report
-from jaxbl.throughput.run import CEILING, OURS, SCAN, Result, Row
+from jaxbl.throughput.run import CEILING, OURS, SCAN, BenchResult, Row
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def result():
     ]
     study = [{"name": OURS, "precision": "float32", "lanes": 1000, "steps": 3000, "seconds": 1.25}]
     machine = {"processor": "a processor", "cores": 2, "versions": {"jax": "1.0"}}
-    return Result(machine, rows, curve, study, {"numba, prange": "no numba; pip install 'jaxbl[bench]'"})
+    return BenchResult(machine, rows, curve, study, {"numba, prange": "no numba; pip install 'jaxbl[bench]'"})
 
 
 def test_files_and_figures(result, tmp_path):

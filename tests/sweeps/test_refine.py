@@ -18,7 +18,7 @@ from jaxbl.report.sweep import headline
 from jaxbl.sweeps.engine import Engine, Layout
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.programs import BACKENDS
-from jaxbl.sweeps.refine import Criterion, Grid, refine
+from jaxbl.sweeps.refine import CellGrid, Criterion, refine
 from jaxbl.sweeps.sweep import StudyResult, dry_run, load, sweep
 
 # ---------------------------------------------------------------- geometry, on functions instead of runs
@@ -47,7 +47,7 @@ def traced(function, grid):
 
 
 def square(n, depth, dimensions=2):
-    return Grid([n] * dimensions, [True] * dimensions, depth)
+    return CellGrid([n] * dimensions, [True] * dimensions, depth)
 
 
 def corners(values):
@@ -171,13 +171,13 @@ def test_axes_that_are_not_refined_have_a_grid_of_their_own():
     def shifted(c, x, y, e):
         return (x + 0.2 * c + 0.0 * e > 0.5) & (y > 0.3)
 
-    grid = Grid([3, 5, 9, 2], [False, True, True, False], 3)
+    grid = CellGrid([3, 5, 9, 2], [False, True, True, False], 3)
     assert grid.sizes == (3, 33, 65, 2)
     mask, full, batches = traced(shifted, grid)
     together = len(batches)
     for i, j in itertools.product(range(3), range(2)):
         part = full[i, :, :, j]
-        alone, _, _ = traced(lambda *_, part=part: part, Grid([5, 9], [True, True], 3))
+        alone, _, _ = traced(lambda *_, part=part: part, CellGrid([5, 9], [True, True], 3))
         np.testing.assert_array_equal(mask[i, :, :, j], alone)
     assert together <= 12
 

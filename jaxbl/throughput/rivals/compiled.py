@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 
-from ..workload import Workload, constants, figures_of
+from ..workload import Workload, constants, identified_figures
 
 WIDTH = 64
 """Lanes of a block: several registers of the widest vectors, and a state that stays in the first cache."""
@@ -32,7 +32,7 @@ class Compiled:
         w = self._workload
         numba.set_num_threads(min(self._threads, numba.config.NUMBA_NUM_THREADS))  # pyright: ignore
         sums = self._function(w.steps, w.start, w.window, self._torque, self._noise, self._constants, self._values)
-        return figures_of(w, list(sums[:, : w.lanes]))
+        return identified_figures(w, list(sums[:, : w.lanes]))
 
 
 def forget() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..workload import Workload, constants, figures_of
+from ..workload import Workload, constants, identified_figures
 
 _FLAGS = ("-std=c++20", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fopenmp", "-shared", "-fPIC")
 """Fused multiply-add as the compiler likes (GCC's default), but no reordering: sums are compensated."""
@@ -70,7 +70,7 @@ class Native:
             ctypes.byref(self._constants), w.steps, w.start, w.window, self._torque.ctypes, self._noise.ctypes,
             self._padded, *self._table, self.threads,
         )  # fmt: skip
-        return figures_of(w, [sums[: w.lanes] for sums in self._out])
+        return identified_figures(w, [sums[: w.lanes] for sums in self._out])
 
 
 def _pointers(arrays: list[np.ndarray]) -> Any:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..workload import Workload, constants, figures_of
+from ..workload import Workload, constants, identified_figures
 
 State = Sequence[Any]
 """Motor and load position and velocity."""
@@ -95,7 +95,7 @@ class Plain:
                 sums[8] += load_off * load_off
             twist = twist + c["share"] * (z - twist)
             bend = bend + c["share"] * (-4.0 * tanh(0.5 * c["slope"] * z) - bend)
-        return figures_of(w, [np.atleast_1d(column) for column in sums])
+        return identified_figures(w, [np.atleast_1d(column) for column in sums])
 
     def _moreau(self, dead_zone: Any) -> Plant:
         c, tanh = self._c, self._f.tanh
