@@ -6,7 +6,7 @@ of the machine it runs on. Calls into it release the interpreter's lock, so that
 
 import ctypes
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -67,6 +67,48 @@ def vector_lanes(dtype: np.dtype) -> int:
     return 2 * size // dtype.itemsize
 
 
+class Argument(NamedTuple):
+    """An array that a loop reads or writes where it lies.
+
+    Attributes:
+        name: for messages, e.g. `input 2`.
+        dtype: of its numbers.
+        holds: how many: "one", one for each of "lanes" or of "samples", or "both": one for each sample of each lane.
+    """
+
+    name: str
+    dtype: np.dtype
+    holds: str
+
+    def check(self, array: np.ndarray, steps: int, lanes: int) -> None:
+        """Refuse an array whose end the loop would pass, or whose numbers it would take for others.
+
+        Raises:
+            ValueError: wrong type or length, or not contiguous.
+        """
+        count = {"one": 1, "lanes": lanes, "samples": steps, "both": steps * lanes}[self.holds]
+        if array.dtype != self.dtype or array.size != count or not array.flags.c_contiguous:
+            wrong = f"not {array.size} of {array.dtype}"
+            raise ValueError(f"{self.name} of a loop needs {count} contiguous numbers of type {self.dtype}, {wrong}")
+
+
+def signature_of(body: ClosedJaxpr, around: Around | None, values: int, carry: int, fixed: int) -> list[Argument]:
+    """The arrays of a loop in their order; arguments as of :class:`Loop`."""
+    after, finish = ([], []) if around is None else (around.after.jaxpr.invars, around.finish.jaxpr.invars)
+    own, kept = values + carry, body.jaxpr.outvars[carry:]
+    results = [] if around is None else around.finish.jaxpr.outvars
+    groups: list[tuple[str, Sequence[Any], Any]] = [
+        ("value", body.jaxpr.invars[:values], "lanes"),
+        ("carry", body.jaxpr.invars[values:own], "lanes"),
+        ("fixed number", body.jaxpr.invars[own : own + fixed], "one"),
+        ("input", body.jaxpr.invars[own + fixed :], "samples"),
+        ("input afterwards", [*after[own:], *finish[own:]], "one"),
+        ("kept number", kept, "both"),
+        ("result", results, "lanes"),
+    ]
+    return [Argument(f"{name} {i}", _dtype(v), holds) for name, some, holds in groups for i, v in enumerate(some)]
+
+
 class Loop:
     """A compiled loop over samples, and what is done around it.
 
@@ -97,8 +139,9 @@ class Loop:
         self.lanes = lanes or vector_lanes(dtype)
         body = substituted(body, FUNCTIONS)
         around = None if around is None else Around(*(substituted(part, FUNCTIONS) for part in around))
+        self.signature = signature_of(body, around, values, carry, fixed)
         module = ir.Module("loop")
-        _Writer(module, self.lanes).loop(body, around, values, carry, fixed)
+        _Writer(module, self.lanes).loop(body, around, self.signature, values, carry, fixed)
         parsed = binding.parse_assembly(str(module))
         options = binding.create_pipeline_tuning_options(speed_level=3)
         passes = binding.create_pass_builder(_machine(), options)
@@ -121,24 +164,31 @@ class Loop:
         """Take lanes `first` to `last` (multiples of `lanes`) through samples; the carry's arrays are overwritten.
 
         Args:
-            arrays: contiguous; values and carry `(lanes,)`, fixed `()` and inputs `(steps,)` of the body, inputs `()` of
-                what is done after it and of the finish, what is kept `(steps, lanes)` with no more lanes than run, and
-                results `(lanes,)`.
+            arrays: as the signature says; what is kept is written `(steps, lanes)` with no more lanes than run.
             steps: samples.
             first: lane.
             last: lane behind the last one.
             begins: first block of a run: the carry is not read.
             ends: last block of a run: results are written, the carry is not.
+
+        Raises:
+            ValueError: arrays that do not fit the signature.
         """
-        given = arrays if isinstance(arrays, Arrays) else Arrays(arrays)
+        given = arrays if isinstance(arrays, Arrays) else Arrays(self.signature, arrays, steps, last)
+        if steps > given.steps or last > given.lanes:
+            raise ValueError(f"{steps} samples of lanes up to {last}: arrays were made for {given.steps} and {given.lanes}")
         self._call(ctypes.addressof(given.addresses), steps, first, last, begins, ends)
 
 
 class Arrays:
-    """Arrays for a loop, which reads where they lie."""
+    """Arrays for a loop, which reads where they lie: checked against its signature for so many samples and lanes."""
 
-    def __init__(self, arrays: Sequence[np.ndarray]):
-        self._kept = list(arrays)
+    def __init__(self, signature: Sequence[Argument], arrays: Sequence[np.ndarray], steps: int, lanes: int):
+        if len(arrays) != len(signature):
+            raise ValueError(f"a loop needs {len(signature)} arrays, not {len(arrays)}")
+        for one, array in zip(signature, arrays, strict=True):
+            one.check(array, steps, lanes)
+        self.steps, self.lanes, self._kept = steps, lanes, list(arrays)
         self.addresses = (ctypes.c_void_p * len(arrays))(*[x.__array_interface__["data"][0] for x in arrays])
 
 
@@ -150,7 +200,15 @@ class _Writer:
         self.constant: set[Vector] = set()
         """Those that do not change in the loop over time."""
 
-    def loop(self, body: ClosedJaxpr, around: Around | None, values: int, carry: int, fixed: int) -> None:
+    def loop(
+        self,
+        body: ClosedJaxpr,
+        around: Around | None,
+        signature: Sequence[Argument],
+        values: int,
+        carry: int,
+        fixed: int,
+    ) -> None:
         function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [_POINTER, *[_INT] * 5]), "loop")
         # what registers have no room for lies on the stack: no vector of it over two lines of the cache
         function.attributes.alignstack = 64
@@ -159,10 +217,8 @@ class _Writer:
         build: Any = ir.IRBuilder(function.append_basic_block("entry"))
         self.build = build
         own = values + carry
-        follows = [] if around is None else [*around.after.jaxpr.invars[own:], *around.finish.jaxpr.invars[own:]]
         kept = body.jaxpr.outvars[carry:]
-        results = [] if around is None else around.finish.jaxpr.outvars
-        dtypes = [_dtype(v) for v in [*body.jaxpr.invars, *follows, *kept, *results]]
+        dtypes = [one.dtype for one in signature]
         kinds = [_KINDS[str(dtype)] for dtype in dtypes]
         if any(not jnp.issubdtype(dtype, jnp.floating) for dtype in dtypes[:own]):
             raise Unsupported("lanes that carry other numbers than floating-point ones")
@@ -179,7 +235,7 @@ class _Writer:
 
         inputs = range(own + fixed, len(body.jaxpr.invars))
         steady = [scalar(i, _INT(0)) for i in range(own, own + fixed)]
-        end = len(body.jaxpr.invars) + len(follows)
+        end = next((i for i, one in enumerate(signature) if one.name.startswith(("kept", "result"))), len(signature))
         afterwards = [scalar(i, _INT(0)) for i in range(len(body.jaxpr.invars), end)]
         width = build.sub(last, first)
 

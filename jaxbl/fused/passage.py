@@ -159,7 +159,8 @@ class HostPassage(Passage):
         running: deque[list[Future[None]]] = deque()
         for number, block in enumerate(blocks):
             ends = self._unread if block.ends is None else block.ends
-            arrays = Arrays([*given, *carry, *block.handed, *block.last, *ends, *found])
+            every = [*given, *carry, *block.handed, *block.last, *ends, *found]
+            arrays = Arrays(self._loop.signature, every, block.length, self._filled)
             run = partial(self._loop, arrays, block.length, begins=number == 0, ends=block.ends is not None)
             running.append([thread.submit(run, *part) for thread, part in zip(self._threads, pairwise(edges), strict=True)])
             # what lanes share is computed meanwhile, a block or two ahead of them

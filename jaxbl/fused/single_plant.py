@@ -70,7 +70,6 @@ def path(
     fixed = [*plant.numbers(experiment), np.asarray(time, float)]
     fixed += [np.asarray(value, float) for side in sides for value in (gain or {})[side]]
     given = torque, *((measured or {})[side] for side in sides)
-    _check(given)
     inputs = np.arange(len(torque), dtype=np.int32), *(np.ascontiguousarray(column, float) for column in given)
     kept = [np.empty(len(torque)) for _ in carry]
     loop([*carry, *fixed, *inputs, *kept], len(torque), 0, 1)
@@ -102,7 +101,6 @@ def slopes(
         found = [_pushed(experiment, states, jnp.asarray(torque), jnp.asarray(time), one) for one in changes]
         changes, new = [jax.tree.leaves(change) for change, _ in found], jax.tree.leaves(found[0][1])
         return np.array(changes, float), np.array(new, float)
-    _check((torque, time, *leaves))
     count = len(torque)
     whole = -(-count // loop.lanes) * loop.lanes
     values = [np.pad(np.asarray(column, float), (0, whole - count), "edge") for column in (*leaves, torque, time)]
@@ -117,12 +115,6 @@ def slopes(
     with ThreadPoolExecutor(len(jax.local_devices())) as pool:
         list(pool.map(along, directions, changes))
     return changes[:, :, :count], new[:, :count]
-
-
-def _check(columns: Sequence[np.ndarray]) -> None:
-    """What is passed by address must be as long as the loop takes it to be."""
-    if len({np.shape(column) for column in columns}) > 1:
-        raise ValueError(f"columns of one length are needed, not of {[len(column) for column in columns]}")
 
 
 _scanned = eqx.filter_jit(trajectory)

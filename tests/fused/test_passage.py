@@ -205,6 +205,7 @@ def test_an_error_of_a_thread_reaches_the_caller(monkeypatch):
             raise MemoryError("no more")
         loop(*arguments, **options)
 
+    failing.signature = loop.signature
     monkeypatch.setattr(passage, "_loop", failing)
     with pytest.raises(MemoryError, match="no more"):
         passage(work.values(), SEED)

@@ -164,10 +164,10 @@ def test_columns_of_other_lengths_are_refused():
     one = experiment([])
     start, torque, _ = record(one)
     states = path(one, start, torque)
-    with pytest.raises(ValueError, match="of one length"):
+    with pytest.raises(ValueError, match="of a loop needs"):
         slopes(one, states, torque[:-1], 1e-3 * np.arange(STEPS - 1), directions(one, start))
     gain = dict.fromkeys(one.sides, np.array([0.3, 20.0]))
-    with pytest.raises(ValueError, match="of one length"):
+    with pytest.raises(ValueError, match="of a loop needs"):
         path(one, start, torque, 0.0, dict.fromkeys(one.sides, torque[:-5]), gain)
 
 

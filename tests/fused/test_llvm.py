@@ -1,0 +1,69 @@
+"""A loop reads and writes where arrays lie: what does not fit its signature is refused before it runs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxbl.fused.jaxprs import flat
+from jaxbl.fused.llvm import Arrays, Loop
+
+NUMBER, INDEX = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((), np.int32)
+
+
+@pytest.fixture(scope="module")
+def loop():
+    """Sums of a factor times the samples, and the sums so far."""
+
+    def sample(factor, total, first, index, value):
+        total = total + factor * value + first * index.astype(jnp.float64)
+        return total, total
+
+    return Loop(flat(sample, NUMBER, NUMBER, NUMBER, INDEX, NUMBER), np.dtype(float), values=1, carry=1, fixed=1, lanes=2)
+
+
+def arrays():
+    return {
+        "value 0": np.array([1.0, 2.0]),
+        "carry 0": np.zeros(2),
+        "fixed number 0": np.array(10.0),
+        "input 0": np.arange(5, dtype=np.int32),
+        "input 1": np.arange(5.0),
+        "kept number 0": np.empty(10),
+    }
+
+
+def test_a_loop_says_what_it_takes(loop):
+    assert [one.name for one in loop.signature] == list(arrays())
+    assert [one.holds for one in loop.signature] == ["lanes", "lanes", "one", "samples", "samples", "both"]
+    given = arrays()
+    loop(list(given.values()), 5, 0, 2)
+    np.testing.assert_array_equal(given["carry 0"], [110.0, 120.0])
+    np.testing.assert_array_equal(given["kept number 0"].reshape(5, 2)[2], [33.0, 36.0])
+
+
+WRONG = {
+    "shorter": lambda array: array.ravel()[:-1],
+    "longer": lambda array: np.append(array, array.ravel()[0]),
+    "of another type": lambda array: array.astype(np.float32 if array.dtype == float else np.int64),
+    "with gaps": lambda array: np.repeat(array.ravel(), 2)[::2] if array.size > 1 else array.astype(np.float32),
+}
+
+
+@pytest.mark.parametrize("name", arrays())
+@pytest.mark.parametrize("wrong", WRONG)
+def test_what_does_not_fit_is_refused(loop, name, wrong):
+    given = arrays()
+    given[name] = WRONG[wrong](given[name])
+    with pytest.raises(ValueError, match=rf"^{name} of a loop needs \d+ contiguous numbers of type"):
+        loop(list(given.values()), 5, 0, 2)
+
+
+def test_arrays_serve_no_more_samples_and_lanes_than_they_were_made_for(loop):
+    made = Arrays(loop.signature, list(arrays().values()), 5, 2)
+    with pytest.raises(ValueError, match="arrays were made for 5 and 2"):
+        loop(made, 6, 0, 2)
+    with pytest.raises(ValueError, match="arrays were made for 5 and 2"):
+        loop(made, 5, 0, 4)
+    with pytest.raises(ValueError, match="needs 6 arrays, not 5"):
+        loop(list(arrays().values())[:-1], 5, 0, 2)
