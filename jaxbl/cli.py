@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -449,7 +450,8 @@ def _start_jax() -> None:
     if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
         jax.config.update("jax_num_cpu_devices", cores())
     if jax.config.values["jax_compilation_cache_dir"] is None:
-        cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "jaxbl"
+        # of this Python's own: another one packs programs otherwise
+        cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "jaxbl" / sys.implementation.cache_tag
         jax.config.update("jax_compilation_cache_dir", str(cache))
         # also what takes less than a second: a study has several of them
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)

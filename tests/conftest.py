@@ -13,8 +13,9 @@ from jaxbl.workers import forget_programs
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_num_cpu_devices", 2)
-# what one worker or run has compiled serves the others
-jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parents[1] / ".cache" / "jax"))
+# what one worker or run has compiled serves the others of this Python; another one packs programs otherwise
+cache = Path(__file__).parents[1] / ".cache" / "jax" / sys.implementation.cache_tag
+jax.config.update("jax_compilation_cache_dir", str(cache))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
 
 # a crowded machine is no failure
