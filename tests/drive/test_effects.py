@@ -287,8 +287,7 @@ def test_no_other_module_holds_the_name_of_an_effect():
         if "effects" in file.parts:
             continue
         tree = ast.parse(file.read_text(encoding="utf-8"))
-        docs = {id(node.body[0].value) for node in ast.walk(tree) if isinstance(getattr(node, "body", None), list)
-                and node.body and isinstance(node.body[0], ast.Expr)}  # fmt: skip
+        docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
         for node in ast.walk(tree):
             if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs:
                 assert not any(re.search(rf"\b{re.escape(one)}\b", node.value) for one in names), (file, node.value)

@@ -203,7 +203,7 @@ def test_numbers_are_tried_out_on_another_log(everything):
 
 def test_model_replays_the_log_where_the_study_has_no_excitation(everything, tmp_path):
     lines = "\n".join(write_identification_report(everything, tmp_path))
-    assert "On log1.csv, motor: positions over 0.5 s are met to" in lines
+    assert "On log1.csv, motor: position residual over 0.5 s" in lines
     assert "motor observer: lambda = " in lines
     assert "(transmission)" in lines
     again = run(tmp_path / "model.toml")
