@@ -57,7 +57,7 @@ def oracle(case: Case) -> Mapping[str, float]:
     import jax
     import numpy as np
 
-    from jaxbl.diagnosis.diagnose import new_explainer, read_diagnosis_task
+    from jaxbl.diagnosis.diagnose import new_search, read_diagnosis_task
     from jaxbl.diagnosis.proof import at_period, fit_model
     from jaxbl.diagnosis.setup import set_up
 
@@ -66,7 +66,7 @@ def oracle(case: Case) -> Mapping[str, float]:
         task = read_diagnosis_task(paths[0], case.model, holdout=other)
     with jax.enable_x64(True):
         setup = set_up(task)
-        fitted = fit_model(new_explainer(setup), case.truth["effects"], np.zeros(len(setup.own)))
+        fitted = fit_model(new_search(setup), case.truth["effects"], np.zeros(len(setup.own)))
         return setup.holdout.compare(at_period(fitted.experiment, setup.holdout.period)).errors
 
 

@@ -5,6 +5,7 @@ import builtins
 import dis
 import importlib
 import inspect
+import re
 from pathlib import Path
 
 import pytest
@@ -106,6 +107,38 @@ def test_every_public_module_class_and_function_has_a_docstring(name):
     for member, value in vars(module).items():
         if not member.startswith("_") and (inspect.isclass(value) or inspect.isfunction(value)) and value.__module__ == name:
             assert value.__doc__, f"{name}.{member}"
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_cross_references_lead_somewhere(name):
+    module = importlib.import_module(name)
+    package = name if hasattr(module, "__path__") else name.rpartition(".")[0]
+    for reference in re.findall(
+        r":(?:mod|func|class|meth|data):`([^`]+)`", Path(module.__file__).read_text(encoding="utf-8")
+    ):
+        path = package + reference if reference.startswith(".") else reference
+        if path.startswith("jaxbl."):
+            assert resolved(path), reference
+        else:
+            first = path.partition(".")[0]
+            assert hasattr(module, first) or any(hasattr(one, first) for one in classes_of(module)), reference
+
+
+def resolved(path):
+    """Whether a dotted path names a module or something in one."""
+    parts = path.split(".")
+    for i in range(len(parts), 0, -1):
+        if ".".join(parts[:i]) in MODULES:
+            found = importlib.import_module(".".join(parts[:i]))
+            for part in parts[i:]:
+                found = getattr(found, part, None)
+            return found is not None
+    return False
+
+
+def classes_of(module):
+    """Classes that a module defines."""
+    return [one for one in vars(module).values() if inspect.isclass(one) and one.__module__ == module.__name__]
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "sweeps").glob("*.toml")), ids=lambda f: f.stem)

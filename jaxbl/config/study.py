@@ -104,7 +104,7 @@ class Config(Table):
         return self.model_dump(by_alias=True, exclude_none=True)
 
     def to_toml(self) -> str:
-        """The whole config as TOML that :func:`read_config` takes."""
+        """The whole config as TOML that :func:`.reading.read_config` takes."""
         return tomli_w.dumps(self.resolved())
 
 

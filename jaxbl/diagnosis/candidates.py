@@ -52,7 +52,7 @@ class Candidate(Protocol):
         """Effects whose torques :meth:`columns` needs."""
         ...
 
-    def columns(self, signals: "Signals", torques: Sequence[np.ndarray]) -> np.ndarray:
+    def columns(self, signals: "MotionTorques", torques: Sequence[np.ndarray]) -> np.ndarray:
         """Columns in N m, shape (width, samples, sides + 1), and behind them what is there at coefficients of 0, if
         anything is."""
         ...
@@ -87,7 +87,7 @@ class Variant:
         """As of :class:`Candidate`."""
         return tuple(effect for effect, _ in self.unit) if self.trial is None else self.trial
 
-    def columns(self, signals: "Signals", torques: Sequence[np.ndarray]) -> np.ndarray:
+    def columns(self, signals: "MotionTorques", torques: Sequence[np.ndarray]) -> np.ndarray:
         """As :meth:`Candidate.columns`."""
         if self.trial is None:
             return np.stack([torque / size for torque, (_, size) in zip(torques, self.unit, strict=True)])
@@ -190,7 +190,7 @@ def all_of_the_input() -> Variant:
     return Variant(twice.name, ((twice, 1.0),), None, lambda values: {})
 
 
-class Signals:
+class MotionTorques:
     """Torques of effects along one part of a record."""
 
     def __init__(self, experiment: Experiment, part: Part):
@@ -244,7 +244,7 @@ class Signals:
 _AT_ONCE = 6
 
 
-def forces_of(candidates: Sequence[Candidate], signals: Signals, spare: int = 0) -> np.ndarray:
+def forces_of(candidates: Sequence[Candidate], signals: MotionTorques, spare: int = 0) -> np.ndarray:
     """Columns of candidates, one after the other, N m, and columns of zeros; shape (columns, samples, sides + 1)."""
     widths = [one.width + one.offset for one in candidates]
     found = np.zeros((sum(widths) + spare, signals.count, len(signals.sides) + 1))

@@ -27,7 +27,7 @@ from .coordinates import CoordinateValues, coordinates_of
 from .diagnosis_summary import extended_study, observers_say, rival_tables, summary_of, where_lacking
 from .diagnosis_task import DiagnosisTask, read_diagnosis_task
 from .diagnosis_trace import trace_of
-from .effect_search import Explainer, Explanation
+from .effect_search import EffectSearch, Explanation
 from .localise import SIGNIFICANT, Localised, localise
 from .observer_residual import Observed, observed_torques
 from .proof import Proof, at_period
@@ -113,12 +113,12 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         nominal, segments, lacking = setup.nominal, setup.fitted.segments, setup.lacking
         proof = Proof(task, setup)
         done()
-        explainer, found = _explained(task, setup)
+        search, found = _explained(task, setup)
         done()
-        fitted, after, withdrawn = proof.accepted(explainer, found)
+        fitted, after, withdrawn = proof.accepted(search, found)
         done()
         if withdrawn:
-            found = explainer.without(found, withdrawn)
+            found = search.without(found, withdrawn)
         gap = proof.gap(fitted, after, found.wrong)
         done()
         lacking_after = setup.fitted.torques(fitted.experiment)
@@ -155,28 +155,28 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
     )  # fmt: skip
 
 
-def new_explainer(setup: Setup, bound: float = np.inf) -> Explainer:
+def new_search(setup: Setup, bound: float = np.inf) -> EffectSearch:
     """The search for effects on the log; `bound`: standard deviations that the model's own numbers may be off."""
-    return Explainer(setup.bare, setup.own, setup.prior.tolist(), setup.fitted.segments, bound)
+    return EffectSearch(setup.bare, setup.own, setup.prior.tolist(), setup.fitted.segments, bound)
 
 
-def _explained(task: DiagnosisTask, setup: Setup) -> tuple[Explainer, Explanation]:
+def _explained(task: DiagnosisTask, setup: Setup) -> tuple[EffectSearch, Explanation]:
     """What the log says that the model lacks.
 
     Where two effects are missing at once, the model's own numbers may go wrong, and hide both. If they do, effects are
     sought with these numbers held near to what is known of them; what that finds counts if it explains the log, with
     numbers that stay there without being held.
     """
-    explainer = new_explainer(setup)
-    found = explainer.run()
-    if not explainer.plausible(found):
-        other = new_explainer(setup, _BOUND)
+    search = new_search(setup)
+    found = search.run()
+    if not search.plausible(found):
+        other = new_search(setup, _BOUND)
         again = other.run()
         if again.verdict != "unknown_effect" and other.plausible(again):
-            explainer, found = other, again
+            search, found = other, again
     if found.verdict == "no_discrepancy":
-        _check_shown(task.record, setup, explainer.shown())
-    return explainer, found
+        _check_shown(task.record, setup, search.shown())
+    return search, found
 
 
 def _check_shown(record: Record, setup: Setup, shown: float) -> None:

@@ -15,7 +15,7 @@ from jaxbl.simulate import Experiment
 from .diagnosis_task import DiagnosisTask, input_rms
 from .effect_search import FAR, Explanation, Finding, Model
 from .localise import SIGNIFICANT, Localised
-from .neutral_effects import joined
+from .neutral_effects import with_added
 from .observer_residual import Observed, compared
 from .proof import FittedModel, free_values
 from .sentences import sentence_of
@@ -177,7 +177,7 @@ def extended_study(config: Config, numbers: Mapping[str, Mapping[str, float]], v
 
 def _with_effects(data: dict[str, Any], numbers: Mapping[str, Mapping[str, Any]]) -> Config:
     added = [{"kind": name, **one} for name, one in numbers.items()]
-    data["effects"] = joined(data.get("effects", []), added, lambda one: one["kind"])
+    data["effects"] = with_added(data.get("effects", []), added, lambda one: one["kind"])
     return read_config(data)
 
 

@@ -30,7 +30,7 @@ from .whittle import Spectrum
 
 Names = tuple[str, ...]
 
-Verdict = Literal["explained", "no_discrepancy", "unknown_effect"]
+VerdictName = Literal["explained", "no_discrepancy", "unknown_effect"]
 
 ODDS = -2.0
 """Log prior odds of each effect to be missing: a probability of 0.12."""
@@ -124,7 +124,7 @@ class Explanation:
             those tried, as a share of the driving torque.
     """
 
-    verdict: Verdict
+    verdict: VerdictName
     findings: tuple[Finding, ...]
     model: Model
     nominal: Model
@@ -132,7 +132,7 @@ class Explanation:
     rest: dict[str, tuple[float, float]]
 
 
-class Polished(NamedTuple):
+class Refitted(NamedTuple):
     """A model with the numbers of least prediction errors, and which of them were free: its own first."""
 
     free: tuple[Free, ...]
@@ -197,7 +197,7 @@ class _Point(NamedTuple):
     cost: float
 
 
-class Explainer:
+class EffectSearch:
     """The search for missing effects on a record: the record, the nominal model, and the models tried."""
 
     def __init__(
@@ -212,7 +212,7 @@ class Explainer:
 
         Args:
             experiment: the nominal model, with array leaves; its sample period is that of the record. Models of the
-                explanation have all effects, those that are not found at neutral numbers (:mod:`.complete`).
+                explanation have all effects, those that are not found at neutral numbers (:mod:`.neutral_effects`).
             free: its own numbers that are not exactly known.
             prior: relative standard deviation of each.
             segments: of the log.
@@ -224,22 +224,22 @@ class Explainer:
         self.segments = segments
         self.floor = FLOOR * sum(map(len, segments)) * len(experiment.sides)
         self._recent: dict[tuple, Linear] = {}
-        self._polished: tuple[tuple, Polished] | None = None
+        self._refitted: tuple[tuple, Refitted] | None = None
 
-    def polished(self, values: Mapping[str, Numbers], theta: np.ndarray) -> "Polished":
-        """The model with some effects, with the numbers of least prediction errors (:mod:`.polish`)."""
+    def refitted(self, values: Mapping[str, Numbers], theta: np.ndarray) -> "Refitted":
+        """The model with some effects, with the numbers of least prediction errors (:mod:`.refit`)."""
         key = _key(values, theta)
-        if self._polished is None or self._polished[0] != key:
+        if self._refitted is None or self._refitted[0] != key:
             experiment = with_numbers(self.nominal, values)
             added = free_parameters(experiment, paths_of(values), self._torque)
             free, width = (*self.free, *added), np.concatenate([self.prior, np.full(len(added), WIDE)])
             start = np.concatenate([theta, np.zeros(len(added))])
-            self._polished = key, Polished(free, refined(experiment, free, start, width, self.segments))
-        return self._polished[1]
+            self._refitted = key, Refitted(free, refined(experiment, free, start, width, self.segments))
+        return self._refitted[1]
 
     def plausible(self, found: Explanation) -> bool:
         """Whether the model's own numbers, fitted to the last digit, are where they may be by what is known of them."""
-        theta = self.polished(found.model.numbers, found.model.theta).refined.theta[: len(self.free)]
+        theta = self.refitted(found.model.numbers, found.model.theta).refined.theta[: len(self.free)]
         return bool(np.all(np.abs(theta) < FAR * self.prior))
 
     def linear(self, values: Mapping[str, Numbers], theta: np.ndarray) -> Linear:
@@ -369,7 +369,7 @@ class Explainer:
         left = _most(rest)
         before = current.names
         if left > CLEAR and found:
-            current, found = self._plain(current, found, left)
+            current, found = self._fewest(current, found, left)
         if len(current.names) > 1:
             current = self._settled(current)
             found = {name: tried for name, tried in found.items() if name in current.names}
@@ -392,7 +392,9 @@ class Explainer:
         findings = tuple(one for one in found.findings if one.effect in kept)
         return Explanation(_verdict(_most(rest), findings), findings, model, found.nominal, None, rest)
 
-    def _plain(self, model: Model, found: dict[str, list["_Tried"]], left: float) -> tuple[Model, dict[str, list["_Tried"]]]:
+    def _fewest(
+        self, model: Model, found: dict[str, list["_Tried"]], left: float
+    ) -> tuple[Model, dict[str, list["_Tried"]]]:
         """Where something unknown remains: only effects with a good part of its gain, and of those that differ by less than
         it the one with the fewest numbers, since spare numbers imitate the unknown."""
         smoothness, deviation = model.linear.choose(())
@@ -438,7 +440,7 @@ class Explainer:
     def _settled(self, model: Model) -> Model:
         """A model without effects that are needless once all numbers are those of least prediction errors: one may only have
         compensated for an error of the fit along the smoothed motion."""
-        free, best = self.polished(model.numbers, model.theta)
+        free, best = self.refitted(model.numbers, model.theta)
         count = len(self.free)
         numbers = {name: dict(one) for name, one in model.numbers.items()}
         weak: set[str] = set()
@@ -522,7 +524,7 @@ class Explainer:
         rest = self._remainder(model.linear)
         if _most(rest) > CLEAR:
             # errors of the smoothed motion cancel to first order only; along the predictor's own path nothing is approximate
-            rest = self._remainder(self.polished(model.numbers, model.theta).refined.linear)
+            rest = self._remainder(self.refitted(model.numbers, model.theta).refined.linear)
         return rest
 
     def _remainder(self, linear: Linear) -> dict[str, tuple[float, float]]:
@@ -602,7 +604,7 @@ def _same(name: str, others: Iterable[str]) -> bool:
     return word is not None and any(EFFECTS[one].exclusive == word and one.partition(".")[0] == place for one in others)
 
 
-def _verdict(left: float, findings: Sequence[Finding]) -> Verdict:
+def _verdict(left: float, findings: Sequence[Finding]) -> VerdictName:
     return "unknown_effect" if left > CLEAR else "explained" if findings else "no_discrepancy"
 
 

@@ -1,7 +1,7 @@
 """Which effects explain a record, and how surely: the evidence of sets of candidates.
 
-Prediction errors are linear in everything (:mod:`.linear`), so that a set of candidates costs one small linear solve. The
-model's own numbers take part with their prior; amplitudes have a broad one, which is what a set pays for its columns
+Prediction errors are linear in everything (:mod:`.linearised_model`), so that a set of candidates costs one small linear
+solve. The model's own numbers take part with their prior; amplitudes have a broad one, which is the price of each column
 (Laplace's method; the model is linear, so that it is exact). References: D. MacKay, Bayesian interpolation, Neural
 Computation 4 (1992); R. Kass, A. Raftery, Bayes factors, JASA 90 (1995).
 """
@@ -17,7 +17,7 @@ from .candidates import Candidate, Numbers
 
 
 @dataclasses.dataclass(frozen=True)
-class Columns:
+class Products:
     """Everything that prediction errors are linear in, as products.
 
     Attributes:
@@ -65,7 +65,7 @@ class Set:
 class Scorer:
     """Evidence of sets, computed once each."""
 
-    def __init__(self, columns: Columns, variants: Sequence[Candidate]):
+    def __init__(self, columns: Products, variants: Sequence[Candidate]):
         self.columns, self.variants = columns, variants
         self.base = np.arange(1, 1 + columns.own)
         self.known: dict[tuple[int, ...], Set | None] = {}

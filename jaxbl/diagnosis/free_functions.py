@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxbl.drive.effects import AbstractEffect
 
-from .candidates import Numbers, Signals
+from .candidates import MotionTorques, Numbers
 
 KINDS = "time", "drift", "position", "place", "velocity", "memory"
 """Torque over time; friction over time; torque over position; friction over position; torque over velocity; friction that
@@ -50,7 +50,7 @@ class Function:
     def effects(self) -> tuple[AbstractEffect, ...]:
         return ()
 
-    def columns(self, signals: Signals, torques: Sequence[np.ndarray]) -> np.ndarray:
+    def columns(self, signals: MotionTorques, torques: Sequence[np.ndarray]) -> np.ndarray:
         """As :meth:`.candidates.Candidate.columns`; N m."""
         part, side = signals.part, self.side
         position, velocity = np.asarray(part.position[side]), np.asarray(part.velocity[side])
@@ -73,7 +73,7 @@ class Function:
         return found
 
 
-def functions_of(signals: Sequence[Signals]) -> list[Function]:
+def functions_of(signals: Sequence[MotionTorques]) -> list[Function]:
     """All of them, for a record in parts."""
     found = []
     for side in signals[0].sides:

@@ -35,8 +35,8 @@ from jaxbl.identification.smoother import Smoothed
 from jaxbl.identification.trajectory import Free, with_fitted
 from jaxbl.simulate import Experiment
 
-from .candidates import SHARE, SPACING, Candidate, Signals, all_of_the_input, forces_of, rms
-from .evidence import Columns
+from .candidates import SHARE, SPACING, Candidate, MotionTorques, all_of_the_input, forces_of, rms
+from .evidence import Products
 from .linearised_segment import Part
 from .neutral_effects import bucket
 from .whittle import Spectrum, spectrum_of, weighted_products
@@ -55,7 +55,7 @@ def linearise(
     """The model along each part of a record.
 
     Args:
-        experiment: the model with all effects (:func:`.complete.complete`); its sample period is that of the record.
+        experiment: the model with all effects (:func:`.neutral_effects.complete`); its sample period is that of the record.
         free: its own numbers.
         theta: their values, which the model has.
         segments: of the log.
@@ -340,7 +340,7 @@ class Linear:
         self.experiment = with_fitted(experiment, free, jnp.asarray(self.theta))
         self.period, self.sides = segments[0].period, experiment.sides
         self.parts = linearise(self.experiment, free, self.theta, segments)
-        self.signals = [Signals(self.experiment, part) for part in self.parts]
+        self.signals = [MotionTorques(self.experiment, part) for part in self.parts]
         self.count = sum(int(np.asarray(one.weight).sum()) for one in self.parts)
         self.states = self.parts[0].defect.shape[1]
         self.drive, self.driven = self._drive()
@@ -425,7 +425,7 @@ class Linear:
         ]
 
     def _some(self, forces: int, width: int) -> np.ndarray:
-        """Columns that are not there to fill up, some of the forces among them."""
+        """Products that are not there to fill up, some of the forces among them."""
         own, padded = len(self.free), self.parts[0].own.shape[2]
         last = 1 + padded + width + np.arange(self.states)
         return np.concatenate([np.arange(1 + own), 1 + padded + np.arange(forces), last])
@@ -473,7 +473,7 @@ class Linear:
             grams.append(np.asarray(_grams(part, gains, force))[:, :, some[:, None], some])
         return [Predictor(self, one, [gram[i] for gram in grams]) for i, one in enumerate(options)]
 
-    def _forces(self, variants: Sequence[Candidate], signals: Signals) -> np.ndarray:
+    def _forces(self, variants: Sequence[Candidate], signals: MotionTorques) -> np.ndarray:
         """Torques of candidates, padded with columns of zeros; shape (columns, samples, sides + 1)."""
         width = sum(one.width + one.offset for one in variants)
         return forces_of(variants, signals, bucket(width, _COLUMNS, 2) - width if width else 0)
@@ -528,7 +528,7 @@ class Linear:
         """Of what is left."""
         return spectrum_of(self.left(smoothness))
 
-    def columns(self, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray | Spectrum) -> Columns:
+    def columns(self, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray | Spectrum) -> Products:
         """Products of everything that the prediction errors are linear in, initial states eliminated.
 
         Args:
@@ -566,10 +566,10 @@ class Linear:
                 scale[list(place)] = np.minimum(scale[list(place)], OFF * nominal)
         centre = np.zeros(at)
         centre[1 : 1 + own] = self.centre
-        return Columns(total, own, tuple(places), tuple(offsets), scale, centre, self.bound, self._twins(variants, places))
+        return Products(total, own, tuple(places), tuple(offsets), scale, centre, self.bound, self._twins(variants, places))
 
     def _twins(self, variants: Sequence[Candidate], places: Sequence[tuple[int, ...]]) -> dict[int, tuple[int, float]]:
-        """Columns that are those of other numbers: the error of a number that is free acts as that number does."""
+        """Products that are those of other numbers: the error of a number that is free acts as that number does."""
         slopes = [float(one.slope(self.theta[i])) for i, one in enumerate(self.free)]
         found = {}
         for one, place in zip(variants, places, strict=True):
@@ -581,7 +581,7 @@ class Linear:
                 found[1 + j] = 1 + i, slopes[j] / slopes[i]
         return found
 
-    def _power(self, torques: np.ndarray, signals: Signals) -> np.ndarray:
+    def _power(self, torques: np.ndarray, signals: MotionTorques) -> np.ndarray:
         """Sums of squares of torques, referred to the motor."""
         over = np.array([*(signals.over(side) for side in self.sides), 1.0])
         return np.einsum("cts,cts->cs", torques, torques) @ over**-2.0

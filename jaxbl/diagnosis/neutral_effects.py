@@ -35,7 +35,7 @@ def candidates(experiment: Experiment) -> list[str]:
 def complete(experiment: Experiment) -> Experiment:
     """A model with all effects that it lacks at neutral numbers; array leaves."""
     added = [as_arrays(make_effect(name, **EFFECTS[name].neutral()), float) for name in candidates(experiment)]
-    effects = joined(experiment.effects, added, lambda one: one.name)
+    effects = with_added(experiment.effects, added, lambda one: one.name)
     kinds = list(EFFECTS)
     if len({one.name for one in effects}) == len(effects):
         # one order whatever was given, so that models share their programs; that of the actuator's matters
@@ -43,7 +43,7 @@ def complete(experiment: Experiment) -> Experiment:
     return eqx.tree_at(lambda e: e.effects, experiment, tuple(effects))
 
 
-def joined(given: Iterable[Effect], added: Iterable[Effect], name_of: Callable[[Effect], str]) -> list[Effect]:
+def with_added(given: Iterable[Effect], added: Iterable[Effect], name_of: Callable[[Effect], str]) -> list[Effect]:
     """Effects that a model has, in their order, and others behind them; effects of the actuator before those given of a
     higher rank (:class:`jaxbl.drive.effects.ActuatorEffect`)."""
 

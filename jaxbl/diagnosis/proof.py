@@ -14,7 +14,7 @@ from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
 from .diagnosis_task import DiagnosisTask, input_rms
-from .effect_search import Explainer, Explanation, Model
+from .effect_search import EffectSearch, Explanation, Model
 from .reference_log import Comparison, predictable
 from .setup import Setup
 
@@ -72,9 +72,9 @@ def at_period(experiment: Experiment, period: float) -> Experiment:
     return eqx.tree_at(lambda e: e.run.sample_period, experiment, jnp.asarray(period))
 
 
-def fit_model(explainer: Explainer, numbers: Mapping[str, Mapping[str, float]], theta: np.ndarray) -> FittedModel:
+def fit_model(search: EffectSearch, numbers: Mapping[str, Mapping[str, float]], theta: np.ndarray) -> FittedModel:
     """A model with some effects, its own numbers and theirs fitted from given ones."""
-    free, found = explainer.polished({name: dict(one) for name, one in numbers.items()}, theta)
+    free, found = search.refitted({name: dict(one) for name, one in numbers.items()}, theta)
     return FittedModel(tuple(numbers), found.experiment, free, found.theta, found.deviation)
 
 
@@ -95,12 +95,12 @@ class Proof:
         """A model at the period of what was held out."""
         return at_period(experiment, self.other.period)
 
-    def accepted(self, explainer: Explainer, found: Explanation) -> tuple[FittedModel, Comparison, list[str]]:
+    def accepted(self, search: EffectSearch, found: Explanation) -> tuple[FittedModel, Comparison, list[str]]:
         """The model with what was found, how it compares, and the effects that are withdrawn: with them it is worse."""
         names, withdrawn = found.model.names, []
         while True:
             base = found.model if names else found.nominal
-            fitted = fit_model(explainer, {name: base.numbers[name] for name in names}, base.theta)
+            fitted = fit_model(search, {name: base.numbers[name] for name in names}, base.theta)
             after = self.other.compare(self._at(fitted.experiment))
             if not self._worse(after) and (names or is_better(after.errors, self.before.errors)):
                 return fitted, after, withdrawn

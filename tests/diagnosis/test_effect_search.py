@@ -5,7 +5,7 @@ import pytest
 from hidden.cases import cases
 from hidden_log import logged, model
 
-from jaxbl.diagnosis.effect_search import CLEAR, Explainer
+from jaxbl.diagnosis.effect_search import CLEAR, EffectSearch
 from jaxbl.identification.identify import read_identification_task
 from jaxbl.identification.logs import default_paths, on_record
 from jaxbl.identification.segments import segments_of
@@ -22,7 +22,7 @@ def explained(case, tmp_path):
     nominal = on_record(task.config, task.record)
     free = free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
     prior = [task.config.uncertainty.relative] * len(free)
-    return Explainer(nominal, free, prior, segments_of(task.record, nominal.sides)).run()
+    return EffectSearch(nominal, free, prior, segments_of(task.record, nominal.sides)).run()
 
 
 @pytest.mark.slow
@@ -70,6 +70,6 @@ def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
     nominal = on_record(task.config, task.record)
     free = free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
     prior = [task.config.uncertainty.relative] * len(free)
-    found = Explainer(nominal, free, prior, segments_of(task.record, nominal.sides)).run()
+    found = EffectSearch(nominal, free, prior, segments_of(task.record, nominal.sides)).run()
     assert found.verdict == "explained"
     assert [one.effect for one in found.findings] == ["motor.coulomb_friction"]

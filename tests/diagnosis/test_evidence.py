@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import lsq_linear
 from scipy.stats import multivariate_normal
 
-from jaxbl.diagnosis.evidence import Columns, Scorer
+from jaxbl.diagnosis.evidence import Products, Scorer
 from jaxbl.diagnosis.linearised_model import _least_squares
 
 
@@ -23,7 +23,7 @@ class Candidate:
 def columns(design, errors, scale, centre, **more):
     """Two own numbers, one candidate; errors of unit variance are `errors` plus the columns."""
     whole = np.column_stack([errors, design])
-    return Columns(whole.T @ whole, 2, ((3,),), (-1,), np.r_[np.inf, scale], np.r_[0.0, centre], np.full(2, np.inf), **more)
+    return Products(whole.T @ whole, 2, ((3,),), (-1,), np.r_[np.inf, scale], np.r_[0.0, centre], np.full(2, np.inf), **more)
 
 
 def drawn(size=1.0):

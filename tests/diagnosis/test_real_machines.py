@@ -6,7 +6,7 @@ from measured import EMPS, XL330, real
 from small_study import rigid
 
 from jaxbl.diagnosis.diagnose import diagnose, read_diagnosis_task
-from jaxbl.diagnosis.effect_search import Explainer
+from jaxbl.diagnosis.effect_search import EffectSearch
 from jaxbl.diagnosis.residuals import narrowed
 from jaxbl.identification.logs import default_paths, on_record
 from jaxbl.identification.segments import segments_of
@@ -33,7 +33,7 @@ def explained(log, study):
     nominal = on_record(task.config, task.record)
     free = free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
     prior = [task.config.uncertainty.relative] * len(free)
-    return Explainer(nominal, free, prior, segments_of(task.record, nominal.sides)).run()
+    return EffectSearch(nominal, free, prior, segments_of(task.record, nominal.sides)).run()
 
 
 @pytest.mark.slow

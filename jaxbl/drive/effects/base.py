@@ -80,7 +80,7 @@ class Role(NamedTuple):
 
 
 def size(unit: str, doc: str, *, trial: Callable[[Scales], float] = lambda log: 1.0, **limits: Any) -> Any:
-    """Declare a number that the effect's torque is proportional to. Arguments as of :func:`.parameters.parameter`."""
+    """Declare a number that the torque is proportional to. Arguments as of :func:`jaxbl.drive.parameters.parameter`."""
     return parameter(unit, doc, role=Role("size", 0.0, lambda log: (trial(log),)), **limits)
 
 
