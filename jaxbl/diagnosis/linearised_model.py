@@ -17,7 +17,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,7 +32,7 @@ from jaxbl.identification.regression import Path, effect_path
 from jaxbl.identification.segments import Segment
 from jaxbl.identification.smoother import Smoothed
 from jaxbl.identification.trajectory import Free, with_fitted
-from jaxbl.simulate import Experiment
+from jaxbl.simulate import Experiment, with_effects
 
 from .candidates import SHARE, SPACING, Candidate, MotionTorques, all_of_the_input, forces_of, rms
 from .evidence import Products
@@ -62,7 +61,7 @@ def linearise(
     """
     sides = experiment.sides
     added = tuple(_AddedTorque(side=side, torque=jnp.zeros(())) for side in sides)  # type: ignore[arg-type]
-    extended = eqx.tree_at(lambda e: e.effects, experiment, (*experiment.effects, *added))
+    extended = with_effects(experiment, (*experiment.effects, *added))
     return [_part(extended, free, theta, one.time, one.torque, one.readings, one.smoothed) for one in segments]
 
 

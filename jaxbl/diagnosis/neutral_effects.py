@@ -7,11 +7,9 @@ matter of numbers.
 from collections.abc import Callable, Iterable
 from typing import TypeVar
 
-import equinox as eqx
-
 from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.parameters import as_arrays
-from jaxbl.simulate import Experiment
+from jaxbl.simulate import Experiment, with_effects
 
 Effect = TypeVar("Effect")
 
@@ -40,7 +38,7 @@ def complete(experiment: Experiment) -> Experiment:
     if len({one.name for one in effects}) == len(effects):
         # one order whatever was given, so that models share their programs; that of the actuator's matters
         effects.sort(key=lambda one: len(kinds) if one.place == "actuator" else kinds.index(one.name))
-    return eqx.tree_at(lambda e: e.effects, experiment, tuple(effects))
+    return with_effects(experiment, tuple(effects))
 
 
 def with_added(given: Iterable[Effect], added: Iterable[Effect], name_of: Callable[[Effect], str]) -> list[Effect]:

@@ -22,7 +22,7 @@ from jaxbl.fused.single_plant import path
 from jaxbl.identification.segments import Segment, reading_noise, windows_of
 from jaxbl.identification.trajectory import Windows, projected_residual
 from jaxbl.records import POSITION_CHANNELS
-from jaxbl.simulate import Experiment, trajectory
+from jaxbl.simulate import Experiment, trajectory, with_effects
 
 from .neutral_effects import bucket
 from .residuals import Residual, narrowed, residual_torques
@@ -132,7 +132,7 @@ class ReferenceLog:
             given = tables.get(side, np.zeros(0))
             table[: len(given)] = given
             known.append(_KnownTorque(side=side, torque=jnp.asarray(table), first=first, period=period))  # type: ignore[arg-type]
-        return eqx.tree_at(lambda e: e.effects, experiment, (*known, *experiment.effects))
+        return with_effects(experiment, (*known, *experiment.effects))
 
     def free_run(self, experiment: Experiment) -> tuple[dict[str, float], float]:
         """Errors of one run over the longest segment, and what a standard deviation of the initial speed would do to it.

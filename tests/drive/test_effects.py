@@ -293,8 +293,8 @@ def test_no_other_module_holds_the_name_of_an_effect():
                 assert not any(re.search(rf"\b{re.escape(one)}\b", node.value) for one in names), (file, node.value)
 
 
-ORDINARY = {"inertia", "damping", "gravity", "backlash", "lag", "hardening", "saturation"}
-"""Kinds that are plain words, too: of nominal numbers, and of what a sentence or a tuned observer may speak of."""
+ORDINARY = {"inertia", "damping", "gravity", "backlash", "lag", "hardening", "saturation", "eccentricity"}
+"""Kinds that are plain words, too: of nominal numbers, and of what a sentence may speak of (eccentric encoders)."""
 
 
 def test_memory_moves_with_the_positions_to_second_order():

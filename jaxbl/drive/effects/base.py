@@ -327,8 +327,8 @@ def _check_neutral(effect: AbstractEffect) -> None:
 
 
 _HOOKS = (
-    "init", "settled", "advance", "actuate", "transmission_error", "deflect", "transmit", "resist", "dry_friction",
-    "added_inertia",
+    "init", "settled", "advance", "actuate", "transmission_error", "deflect", "free_play", "transmit", "resist",
+    "dry_friction", "added_inertia",
 )  # fmt: skip
 _NEUTRAL = 1e-6
 """Largest torque or angle of a neutral effect at motions of size 1: rounding in float32."""
