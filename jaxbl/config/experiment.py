@@ -20,8 +20,8 @@ from jaxbl.errors import InputError
 from jaxbl.observer.equivalent_control import EquivalentControl
 from jaxbl.observer.recursive import Identifier
 from jaxbl.observer.super_twisting import OBSERVERS, AbstractSuperTwisting, Observers
-from jaxbl.records.table import nearest, wrong
 from jaxbl.simulate import Run
+from jaxbl.validation import nearest, wrong
 
 from .tables import Table, table_for, tagged
 

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from jaxbl.records.table import wrong
+from jaxbl.validation import wrong
 
 from .experiment import ExcitationTable
 from .tables import Table

@@ -10,7 +10,8 @@ from pydantic import ValidationError
 
 from jaxbl.errors import InputError
 from jaxbl.records.reader import read_log_table
-from jaxbl.records.table import Key, LogTable, brief, first_error
+from jaxbl.records.table import LogTable
+from jaxbl.validation import Key, brief, first_error
 
 from .study import Config, nearest_path, numeric_paths
 

@@ -18,8 +18,9 @@ from pydantic import Field, model_validator
 
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import Parameter, as_arrays
-from jaxbl.records.table import LogTable, wrong
+from jaxbl.records.table import LogTable
 from jaxbl.simulate import Experiment
+from jaxbl.validation import wrong
 
 from .experiment import (
     DriveTable,

@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from jaxbl.records.table import wrong
+from jaxbl.validation import wrong
 
 from .tables import Table
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Union
 from pydantic import Field, create_model
 
 from jaxbl.drive.parameters import key_of, parameters
-from jaxbl.records.table import StrictTable
+from jaxbl.validation import StrictTable
 
 
 class Table(StrictTable):

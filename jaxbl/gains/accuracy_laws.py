@@ -20,7 +20,7 @@ import pandas as pd
 
 from jaxbl.config import Config, FigureTable
 from jaxbl.errors import InputError
-from jaxbl.records.table import nearest
+from jaxbl.validation import nearest
 
 if TYPE_CHECKING:
     from jaxbl.sweeps.sweep import StudyResult

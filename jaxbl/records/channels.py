@@ -5,9 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbl.validation import nearest
+
 from .files import LogFile
 from .signal_quality import resolution
-from .table import POSITION_CHANNELS, LogTable, PositionTable, TorqueTable, nearest
+from .table import POSITION_CHANNELS, LogTable, PositionTable, TorqueTable
 from .time_stamps import TimeStamps
 
 

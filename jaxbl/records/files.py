@@ -15,8 +15,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.errors import InputError
-
-from .table import nearest
+from jaxbl.validation import nearest
 
 _KINDS = "text (CSV and the like), Parquet, MATLAB (.mat) and JSON can be read"
 

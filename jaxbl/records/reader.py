@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from jaxbl.errors import InputError
+from jaxbl.validation import first_error
 
 from .channels import RawChannel, read_channels
 from .files import LogFile, read_log_file
@@ -18,7 +19,7 @@ from .plausibility import check_gear_ratio, check_motion, check_torque, note_cha
 from .resampling import Grid, resampled
 from .rigid_body import RigidFit, fit_rigid_drive
 from .signal_quality import ChannelFigures, channel_figures, longest
-from .table import POSITION_CHANNELS, LogTable, first_error
+from .table import POSITION_CHANNELS, LogTable
 from .time_stamps import Sampling, Segments, read_time_stamps, split_at_gaps
 
 

@@ -24,10 +24,10 @@ from jaxbl.config import Config, FigureTable, is_boolean, numeric_paths
 from jaxbl.errors import InputError
 from jaxbl.gains.accuracy_laws import Law, accuracy_laws, check_selection, fixed_values, selected
 from jaxbl.observer.conditions import CONDITIONS, Condition
-from jaxbl.records.table import nearest
 from jaxbl.sweeps.metrics import metric_of
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
+from jaxbl.validation import nearest
 
 from .figures import SIDES, Drawn
 from .refined_maps import Filling, on_coarse_values

@@ -15,7 +15,7 @@ import numpy as np
 from jaxbl.config import TOLERANCE, AxisTable, Config, with_values
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.errors import InputError
-from jaxbl.records.table import nearest
+from jaxbl.validation import nearest
 
 from .metrics import metric_columns
 from .refine import CellGrid, Criterion
