@@ -5,7 +5,6 @@ without a trace, with any reducers: :func:`scan` for simulated and :func:`replay
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -84,8 +83,8 @@ class State(eqx.Module):
 class Sample(NamedTuple):
     """What a step is given: time, and either unit noise (simulation) or input and measured positions (a record).
 
-    With unit noise, an `input` (N m) takes the place of the excitation's. `known` (rad/s^2) are accelerations that the
-    observers are told of besides their nominal equations, by side.
+    With unit noise, an `input` (N m) takes the place of the excitation's. `known` (rad/s^2) are accelerations by side that
+    the observers add to their nominal ones, held from each sample to the next.
     """
 
     time: Number
@@ -137,32 +136,30 @@ class Signals(NamedTuple):
 def initial_state(experiment: Experiment, measured: dict[str, Number] | None = None) -> State:
     """State at t = 0; for a record, from its first measured positions (rad) and standstill."""
     zero = jnp.zeros_like(jnp.asarray(experiment.run.sample_period))
+    rest = dict.fromkeys(experiment.sides, zero)
     plant = experiment.plant.init(experiment.initial) if measured is None else None
-    observer = {}
-    for side in experiment.sides:
-        position = plant.position[side] if plant is not None else measured[side]  # type: ignore[index]
-        velocity = plant.velocity[side] if plant is not None else zero
-        observer[side] = getattr(experiment.observer, side).init(position, velocity)
+    position, velocity = (measured or {}, rest) if plant is None else (plant.position, plant.velocity)
+    observer = {side: getattr(experiment.observer, side).init(position[side], velocity[side]) for side in experiment.sides}
     identifier = None
     if experiment.identifier is not None and experiment.transmission is not None:
         identifier = experiment.identifier.init(experiment.transmission, experiment.sides, zero)
-    return State(plant, observer, dict.fromkeys(experiment.sides, zero), identifier)
+    return State(plant, observer, rest, identifier)
 
 
 def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, Signals]:
     """The whole chain for one sample: sense, observe, filter, identify, and move the plant on to the next sample."""
     drive, plant, period = experiment.drive, experiment.plant, experiment.run.sample_period
-    if sample.measured is None:
-        assert sample.noise is not None and state.plant is not None
-        torque_in = experiment.excitation(sample.time) if sample.input is None else sample.input
+    before: Any = state.plant  # None on a record
+    torque_in: Any = experiment.excitation(sample.time) if sample.input is None else sample.input
+    if sample.noise is None:
+        measured, moved = sample.measured or {}, None
+    else:
+        noise = {side: value.astype(jnp.result_type(period)) for side, value in sample.noise.items()}
         measured = {
-            side: experiment.encoders.measure(side, state.plant.position[side], sample.noise[side], drive.ratio(side))
+            side: experiment.encoders.measure(side, before.position[side], noise[side], drive.ratio(side))
             for side in drive.sides
         }
-        moved = move(plant, experiment.run, state.plant, torque_in, sample.time)
-    else:
-        assert sample.input is not None
-        torque_in, measured, moved = sample.input, sample.measured, None
+        moved = move(plant, experiment.run, before, torque_in, sample.time)
 
     observers, filtered, estimates = {}, {}, {}
     for side in drive.sides:
@@ -191,23 +188,16 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
         estimate = estimates[side]
         true = None
         if moved is not None:
-            assert state.plant is not None
-            acceleration = (moved.velocity[side] - state.plant.velocity[side]) / period
-            true = TrueSide(
-                position=state.plant.position[side],
-                velocity=state.plant.velocity[side],
-                acceleration=acceleration,
-                perturbation=acceleration - drive.acceleration(side, estimate.velocity, torque_in),
-            )
+            acceleration = (moved.velocity[side] - before.velocity[side]) / period
+            perturbation = acceleration - drive.acceleration(side, estimate.velocity, torque_in)
+            true = TrueSide(before.position[side], before.velocity[side], acceleration, perturbation)
         sides[side] = SideSignals(measured[side], estimate.position, estimate.velocity, filtered[side], torques[side], true)
     torque = None
-    if moved is not None:
-        assert state.plant is not None
-        if experiment.transmission is not None:
-            torque, _ = plant.transmitted(state.plant.position, state.plant.velocity, state.plant.effects)
-        else:
-            expected = drive.acceleration("motor", state.plant.velocity["motor"], torque_in)
-            torque = drive.inertia("motor") * (expected - sides["motor"].true.acceleration)
+    if moved is not None and experiment.transmission is not None:
+        torque, _ = plant.transmitted(before.position, before.velocity, before.effects)
+    elif moved is not None:
+        expected = drive.acceleration("motor", before.velocity["motor"], torque_in)
+        torque = drive.inertia("motor") * (expected - sides["motor"].true.acceleration)
     signals = Signals(sample.time, torque_in, twist, torque, sides["motor"], sides.get("load"))
     return State(moved, observers, filtered, identifier), signals
 
@@ -222,14 +212,6 @@ def move(plant: Plant, run: Run, state: PlantState, torque: Scalar, time: Number
     if run.substeps == 1:
         return substep(jnp.asarray(0), state)
     return jax.lax.fori_loop(0, run.substeps, substep, state, unroll=UNROLL_SUBSTEPS)
-
-
-def settle(experiment: Experiment, state: State) -> State:
-    """The same state, ready for further samples without loss; for loops of more than some thousand samples in float32."""
-    if state.identifier is None:
-        return state
-    assert experiment.identifier is not None
-    return State(state.plant, state.observer, state.equivalent_control, experiment.identifier.settle(state.identifier))
 
 
 class Reducer(NamedTuple):
@@ -255,11 +237,6 @@ def unit_noise(seed: Int[Array, ""], indices: Int[Array, " samples"], sides: tup
     return {side: draws[:, i] for i, side in enumerate(sides)}
 
 
-def simulated(experiment: Experiment, time: Number, noise: dict[str, Number]) -> Sample:
-    """A sample of a simulation, with unit noise in the precision of the experiment."""
-    return Sample(time, {side: value.astype(jnp.result_type(time)) for side, value in noise.items()})
-
-
 LONGEST_BLOCK = 512
 """Samples whose noise is drawn at once, at most."""
 
@@ -279,35 +256,23 @@ def begin(experiment: Experiment, reducers: tuple[Reducer, ...], state: State | 
     return initial_state(experiment) if state is None else state, tuple(r.init(experiment) for r in reducers)
 
 
-def proceed(
-    experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry, index: Int[Array, ""], given: Sample
+def advance(
+    experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry, index: Int[Array, ""], *given: Any
 ) -> tuple[Carry, Signals]:
-    """One sample further: state, reducers, and the signals at sample `index`."""
+    """One sample further: state, reducers, and the signals at sample `index`. `given` is a :class:`Sample` without its time:
+    of a simulation the unit noise of each side."""
     state, totals = carry
-    state, signals = step(experiment, state, given)
+    period = experiment.run.sample_period
+    state, signals = step(experiment, state, Sample(index.astype(jnp.result_type(period)) * period, *given))
     return (state, tuple(r.update(experiment, t, index, signals) for r, t in zip(reducers, totals, strict=True))), signals
 
 
-def advance(
-    experiment: Experiment,
-    reducers: tuple[Reducer, ...],
-    carry: Carry,
-    index: Int[Array, ""],
-    noise: dict[str, Number],
-) -> tuple[Carry, Signals]:
-    """One sample of a simulation further, with unit noise: :func:`proceed` with what is :func:`simulated`."""
-    return proceed(experiment, reducers, carry, index, simulated(experiment, time_of(experiment, index), noise))
-
-
-def time_of(experiment: Experiment, index: Int[Array, ""]) -> Number:
-    """Time of a sample, s."""
-    return index.astype(jnp.result_type(experiment.run.sample_period)) * experiment.run.sample_period
-
-
 def settled(experiment: Experiment, carry: Carry) -> Carry:
-    """What goes from one block of samples to the next."""
+    """What goes from one block of samples to the next: sums in float32 lose nothing over more than some thousand samples."""
     state, totals = carry
-    return settle(experiment, state), totals
+    if experiment.identifier is None or state.identifier is None:
+        return carry
+    return eqx.tree_at(lambda s: s.identifier, state, experiment.identifier.settle(state.identifier)), totals
 
 
 def figures(experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry) -> dict[str, Array]:
@@ -342,8 +307,7 @@ def scan(
     def samples(indices: Int[Array, " samples"]) -> tuple[dict[str, Array], ...]:
         return (unit_noise(seed, indices, experiment.sides),)
 
-    sample = partial(simulated, experiment)
-    return _scan(experiment, begin(experiment, reducers), experiment.run.steps, samples, sample, reducers, record, every)
+    return _scan(experiment, begin(experiment, reducers), experiment.run.steps, samples, reducers, record, every)
 
 
 def replay(
@@ -362,12 +326,9 @@ def replay(
         experiment: with array leaves; its sample period is that of the record.
         torque: input in N m.
         measured: positions of each side in rad.
-        reducers: figures to compute along the record.
-        record: what to keep of every `every`-th sample; None keeps nothing.
-        every: decimation of what is kept.
+        reducers, record, every: as of :func:`scan`.
         state: where to begin; left out, at the first position and standstill.
-        known: accelerations of each side that the observers are told of besides their nominal equations, held from each
-            sample to the next, rad/s^2; the equivalent control is then what is missing beyond these, too.
+        known: of each sample, as of :class:`Sample`; the equivalent control is then what is missing beyond these, too.
 
     Returns:
         As :func:`scan`.
@@ -377,13 +338,10 @@ def replay(
     state = State(None, state.observer, state.equivalent_control, state.identifier)
 
     def samples(indices: Int[Array, " samples"]) -> tuple[Any, ...]:
-        told = None if known is None else {side: known[side][indices] for side in experiment.sides}
-        return torque[indices], {side: measured[side][indices] for side in experiment.sides}, told
+        given = torque, {side: measured[side] for side in experiment.sides}, known
+        return None, *jax.tree.map(lambda column: column[indices], given)
 
-    def sample(time: Number, torque: Number, measured: dict[str, Number], told: dict[str, Number] | None) -> Sample:
-        return Sample(time, None, torque, measured, told)
-
-    return _scan(experiment, begin(experiment, reducers, state), len(torque), samples, sample, reducers, record, every)
+    return _scan(experiment, begin(experiment, reducers, state), len(torque), samples, reducers, record, every)
 
 
 def _scan(
@@ -391,16 +349,14 @@ def _scan(
     start: Carry,
     steps: int,
     samples: Callable[[Int[Array, " samples"]], tuple[Any, ...]],
-    sample_of: Callable[..., Sample],
     reducers: tuple[Reducer, ...],
     record: Callable[[State, Signals], Any] | None,
     every: int,
 ) -> tuple[dict[str, Array], Any]:
-    """The loop over time; `samples` gives what samples of a block are made of, `sample_of` makes one of time and that."""
+    """The loop over time; `samples` gives what :func:`advance` is given for the samples of a block."""
 
     def sample(carry: Carry, given: tuple[Array, tuple[Any, ...]]) -> tuple[Carry, Any]:
-        index, parts = given
-        carry, signals = proceed(experiment, reducers, carry, index, sample_of(time_of(experiment, index), *parts))
+        carry, signals = advance(experiment, reducers, carry, given[0], *given[1])
         return carry, None if record is None else record(carry[0], signals)
 
     def block(carry: Carry, first: Array, length: int) -> tuple[Carry, Any]:

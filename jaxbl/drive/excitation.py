@@ -4,7 +4,8 @@ Further packages add inputs through the entry-point group `jaxbl.excitations`; t
 """
 
 import abc
-from typing import Any, ClassVar
+from functools import partial
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .parameters import Scalar, option, parameter
-from .registry import Registry, check_declared, check_subclass
+from .registry import Registry, check_module
 
 
 class AbstractExcitation(eqx.Module):
@@ -25,12 +26,7 @@ class AbstractExcitation(eqx.Module):
         """Torque in N m at a time in s."""
 
 
-def _check(name: str, found: Any) -> None:
-    check_subclass(name, found, AbstractExcitation)
-    check_declared(found)
-
-
-EXCITATIONS = Registry("jaxbl.excitations", _check)
+EXCITATIONS = Registry("jaxbl.excitations", partial(check_module, base=AbstractExcitation))
 """The inputs by name: the built-in ones and those of installed packages."""
 
 

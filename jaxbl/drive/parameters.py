@@ -32,7 +32,9 @@ class Parameter(NamedTuple):
     role: Any = None
 
 
-def parameter(unit: str, doc: str, *, default: Any = dataclasses.MISSING, fixed: bool = False, **about: Any) -> Any:
+def parameter(
+    unit: str, doc: str, *, default: Any = dataclasses.MISSING, fixed: bool = False, static: bool = False, **about: Any
+) -> Any:
     """Declare a number of a module as an `equinox` field.
 
     Args:
@@ -40,20 +42,16 @@ def parameter(unit: str, doc: str, *, default: Any = dataclasses.MISSING, fixed:
         doc: one line for the reference.
         default: value where the config gives none; without it the key is required.
         fixed: what is compiled depends on the number, so that an axis over it has one program a value.
+        static: the number is no leaf at all.
         **about: `minimum` (inclusive), `above` (exclusive), `maximum` (inclusive), `role`.
     """
     metadata = {"parameter": Parameter(unit, doc, **about), "fixed": fixed}
-    if default is dataclasses.MISSING:
-        return eqx.field(metadata=metadata)
-    return eqx.field(default=default, metadata=metadata)
+    return eqx.field(static=static, default=default, metadata=metadata)
 
 
-def option(doc: str, *, default: Any = dataclasses.MISSING, **limits: float) -> Any:
+def option(doc: str, **about: Any) -> Any:
     """Declare a choice that is fixed at compile time (a count, a seed, a name), not a leaf."""
-    metadata = {"parameter": Parameter("", doc, **limits), "fixed": True}
-    if default is dataclasses.MISSING:
-        return eqx.field(static=True, metadata=metadata)
-    return eqx.field(static=True, default=default, metadata=metadata)
+    return parameter("", doc, fixed=True, static=True, **about)
 
 
 def parameters(module: Any) -> Iterator[tuple[dataclasses.Field, Parameter]]:
@@ -68,10 +66,6 @@ def key_of(field_name: str) -> str:
     return field_name[:-1] if field_name.endswith("_") and keyword.iskeyword(field_name[:-1]) else field_name
 
 
-def _attribute_of(key: str) -> str:
-    return f"{key}_" if keyword.iskeyword(key) else key
-
-
 def leaf_paths(tree: Any, prefix: str = "") -> dict[str, Parameter]:
     """Dotted paths of all numeric leaves that an axis may vary, e.g. `observer.motor.alpha`.
 
@@ -80,20 +74,13 @@ def leaf_paths(tree: Any, prefix: str = "") -> dict[str, Parameter]:
     """
     found: dict[str, Parameter] = {}
     for field in dataclasses.fields(tree):
-        value = getattr(tree, field.name)
-        path = f"{prefix}{key_of(field.name)}"
-        if isinstance(value, tuple):
-            for key, member in _members(value).items():
-                if dataclasses.is_dataclass(member):
-                    found |= leaf_paths(member, f"{path}.{key}.")
-        elif dataclasses.is_dataclass(value):
-            found |= leaf_paths(value, f"{path}.")
-        elif (
-            value is not None
-            and "parameter" in (known := field.metadata)
-            and not (known.get("static") or known.get("fixed"))
-        ):
-            found[path] = known["parameter"]
+        value, path, known = getattr(tree, field.name), f"{prefix}{key_of(field.name)}", field.metadata
+        parts = {f"{path}.{key}": one for key, one in _members(value).items()} if isinstance(value, tuple) else {path: value}
+        for path, part in parts.items():
+            if dataclasses.is_dataclass(part):
+                found |= leaf_paths(part, f"{path}.")
+            elif part is not None and "parameter" in known and not known["fixed"]:
+                found[path] = known["parameter"]
     return found
 
 
@@ -117,10 +104,11 @@ def get_leaf(tree: Any, path: str) -> Any:
                     break
             else:
                 raise KeyError(path)
-        elif hasattr(tree, _attribute_of(keys[0])):
-            tree, keys = getattr(tree, _attribute_of(keys[0])), keys[1:]
         else:
-            raise KeyError(path)
+            name = f"{keys[0]}_" if keyword.iskeyword(keys[0]) else keys[0]
+            if not hasattr(tree, name):
+                raise KeyError(path)
+            tree, keys = getattr(tree, name), keys[1:]
     return tree
 
 

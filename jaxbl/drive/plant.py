@@ -10,7 +10,6 @@ References: J. J. Moreau, Numerical aspects of the sweeping process, CMAME 177 (
 Methods for Nonsmooth Dynamical Systems, Springer (2008), ch. 10.
 """
 
-import abc
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -34,17 +33,17 @@ class AbstractDrive(eqx.Module):
     name: ClassVar[str]
     sides: ClassVar[tuple[str, ...]]
 
-    @abc.abstractmethod
     def inertia(self, side: str) -> Scalar:
         """Nominal inertia, kg m^2."""
+        return getattr(self, f"{side}_inertia")
 
-    @abc.abstractmethod
     def viscous(self, side: str) -> Scalar:
         """Nominal viscous friction, N m s/rad."""
+        return getattr(self, f"{side}_viscous")
 
-    @abc.abstractmethod
     def torque_gain(self, side: str) -> Scalar:
         """Factor of the transmitted torque C in the side's equation of motion: -1 on the motor, N_0 on the load."""
+        return -1.0 if side == "motor" else self.ratio(side)
 
     def ratio(self, side: str) -> Scalar:
         """Motor angle for one unit of the side's angle."""
@@ -74,15 +73,6 @@ class TwoInertia(AbstractDrive):
     load_viscous: Scalar = parameter("N m s/rad", "load viscous friction f_s", minimum=0.0)
     gear_ratio: Scalar = parameter("", "gear ratio N_0: motor turns for one load turn", above=0.0)
 
-    def inertia(self, side):
-        return self.motor_inertia if side == "motor" else self.load_inertia
-
-    def viscous(self, side):
-        return self.motor_viscous if side == "motor" else self.load_viscous
-
-    def torque_gain(self, side):
-        return -1.0 if side == "motor" else self.gear_ratio
-
     def ratio(self, side):
         return 1.0 if side == "motor" else self.gear_ratio
 
@@ -94,15 +84,6 @@ class Rigid(AbstractDrive):
     sides: ClassVar[tuple[str, ...]] = ("motor",)
     motor_inertia: Scalar = parameter("kg m²", "inertia (a mass in kg on a linear axis)", above=0.0)
     motor_viscous: Scalar = parameter("N m s/rad", "viscous friction", minimum=0.0)
-
-    def inertia(self, side):
-        return self.motor_inertia
-
-    def viscous(self, side):
-        return self.motor_viscous
-
-    def torque_gain(self, side):
-        return -1.0
 
     def place(self, place):
         return "motor" if place == "load" else place
@@ -243,13 +224,7 @@ class Plant(eqx.Module):
         """What acts on each side but for its nominal viscous friction, N m: the sum of all torques, and the level of
         set-valued dry friction that opposes motion beside it (the Python number 0.0 without any).
 
-        Args:
-            position: rad.
-            velocity: rad/s, at which velocity-dependent effects are evaluated.
-            states: of the effects.
-            torque: that acts on the motor, N m.
-            time: s.
-            transmitted: transmitted torque, N m, where it is known; left out, the transmission's.
+        `torque` (N m) is the one that acts on the motor; `transmitted` (N m), where it is known, stands for the gear's.
         """
         gains: dict[str, Scalar] = {"motor": -1.0}
         through: Scalar = 0.0
@@ -288,13 +263,8 @@ class Plant(eqx.Module):
 
 
 def _rubbed(before: Float[Array, ""], free: Scalar, stop: Scalar) -> Float[Array, ""]:
-    """Velocity after a step under set-valued friction, rad/s.
-
-    Args:
-        before: velocity.
-        free: velocity that the step would reach without friction.
-        stop: what friction takes off in a whole step of motion.
-    """
+    """Velocity after a step under set-valued friction, from that before, that which it would `free` reach without friction,
+    and what friction takes from it in a whole step of motion; all rad/s."""
     direction = jnp.where(before != 0.0, jnp.sign(before), -jnp.sign(free))
     along = free - direction * stop
     apart = before - along

@@ -1,7 +1,6 @@
 """Classes by name: those of this package, and those that installed packages add through entry points."""
 
 import dataclasses
-import inspect
 import logging
 import multiprocessing
 from collections.abc import Callable, Iterator, Mapping
@@ -66,19 +65,19 @@ def check_subclass(name: str, found: Any, base: type) -> None:
     """Check that an entry is a class that can be used in place of `base`, under the name that it was entered with.
 
     Raises:
-        TypeError: it is no class, not derived from `base`, lacks a method, or has another name.
+        TypeError: it is no class, not derived from `base`, lacks a method or number, or has another name.
     """
     if not (isinstance(found, type) and issubclass(found, base)):
         raise TypeError(f"should be a class derived from {base.__name__}")
-    if inspect.isabstract(found):
-        missing = ", ".join(sorted(found.__abstractmethods__))  # type: ignore[attr-defined]
-        raise TypeError(f"should define {missing}")
+    if missing := {*getattr(found, "__abstractmethods__", ()), *getattr(found, "__abstractvars__", ())}:
+        raise TypeError(f"should define {', '.join(sorted(missing))}")
     if (own := getattr(found, "name", None)) != name:
         raise TypeError(f"its name should be '{name}' as in the entry point, not {own!r}")
 
 
-def check_declared(found: Any) -> None:
-    """Check that every number of a module class is declared, as its config table needs it. Raises `TypeError`."""
+def check_module(name: str, found: Any, base: type) -> None:
+    """As :func:`check_subclass`, and that every number of the class is declared, as its config table needs it."""
+    check_subclass(name, found, base)
     for field in dataclasses.fields(found):
         if "parameter" not in field.metadata:
             raise TypeError(f"{field.name} should be declared by parameter(...) or option(...)")

@@ -8,14 +8,15 @@ Further packages add laws through the entry-point group `jaxbl.transmissions`; t
 
 import abc
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from functools import partial
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .parameters import Scalar, parameter
-from .registry import Registry, check_declared, check_subclass
+from .registry import Registry, check_module
 
 
 class AbstractTransmission(eqx.Module):
@@ -54,14 +55,7 @@ class AbstractTransmission(eqx.Module):
         """The same parameters as they are in this law."""
 
 
-def _check(name: str, found: Any) -> None:
-    check_subclass(name, found, AbstractTransmission)
-    if missing := getattr(found, "__abstractvars__", ()):
-        raise TypeError(f"should define {', '.join(sorted(missing))}")
-    check_declared(found)
-
-
-TRANSMISSIONS = Registry("jaxbl.transmissions", _check)
+TRANSMISSIONS = Registry("jaxbl.transmissions", partial(check_module, base=AbstractTransmission))
 """The laws by name: the built-in ones and those of installed packages."""
 
 

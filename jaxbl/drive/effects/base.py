@@ -18,7 +18,6 @@ import numpy as np
 from ..parameters import Parameter, parameter, parameters
 from ..registry import Registry
 
-Side = Literal["motor", "load"]
 Value = Any  # a number or an array of one: hooks are duck-typed, neutral ones answer the Python number 0.0
 Numbers = dict[str, float]
 """Numbers of one effect, by name."""
@@ -219,7 +218,7 @@ class SideEffect(AbstractEffect):
     """An effect on the motor or on the load."""
 
     places: ClassVar[tuple[str, ...]] = ("motor", "load")
-    side: Side = eqx.field(static=True, kw_only=True)
+    side: str = eqx.field(static=True, kw_only=True)
 
     @property
     def place(self) -> str:
@@ -253,11 +252,8 @@ class _Effects(Registry):
 
 def make_effect(name: str, **numbers: float) -> AbstractEffect:
     """The effect of a full name (`load.coulomb_friction`) with given numbers. Raises `KeyError` for an unknown name."""
-    return _made(EFFECTS[name], name.partition(".")[0], numbers)
-
-
-def _made(cls: type[AbstractEffect], place: str, numbers: Mapping[str, float]) -> AbstractEffect:
-    return cls(side=place, **numbers) if issubclass(cls, SideEffect) else cls(**numbers)  # type: ignore[arg-type]
+    cls: Any = EFFECTS[name]
+    return cls(side=name.partition(".")[0], **numbers) if issubclass(cls, SideEffect) else cls(**numbers)
 
 
 def correction_of(number: str, side: str) -> tuple[str, str]:
@@ -278,17 +274,14 @@ def _check_entry(name: str, found: Any) -> None:
         raise ValueError(f"places should be among {', '.join(PLACES)}, and kind a lower-case word")
     if issubclass(found, SideEffect) != (place in ("motor", "load")):
         raise TypeError("effects on motor or load, and no others, should be derived from SideEffect")
-    _check_hooks(found)
-    _check_numbers(found)
-    if found.neutral():
-        _check_neutral(_made(found, place, found.neutral()))
-
-
-def _check_hooks(cls: type[AbstractEffect]) -> None:
-    for hook in _HOOKS:
-        expected, given = (list(inspect.signature(getattr(one, hook)).parameters) for one in (AbstractEffect, cls))
-        if len(given) != len(expected):
+    for hook, of_base in inspect.getmembers(AbstractEffect, inspect.isfunction):
+        expected, given = (list(inspect.signature(one).parameters) for one in (of_base, getattr(found, hook)))
+        if not hook.startswith("_") and len(given) != len(expected):
             raise TypeError(f"{hook} should take ({', '.join(expected)}), not ({', '.join(given)})")
+    _check_numbers(found)
+    if neutral := found.neutral():
+        side = {"side": place} if issubclass(found, SideEffect) else {}
+        _check_neutral(found(**side, **neutral))  # type: ignore[arg-type]
 
 
 def _check_numbers(cls: type[AbstractEffect]) -> None:
@@ -309,27 +302,22 @@ def _check_neutral(effect: AbstractEffect) -> None:
     """Check that at neutral numbers nothing is added, at a few motions."""
     state: Any = effect.init()
     for time, position, velocity in ((0.0, 0.3, 2.0), (0.1, -1.7, -0.5), (0.2, 4.0, 0.0)):
-        at = np.float64(position), np.float64(velocity)
-        state = effect.advance(state, Motion(np.float64(time), *at), 1e-3)
-        acting = effect.actuate(state, at[0], 1e-3)[1]
+        motion = Motion(*map(np.float64, (time, position, velocity)))
+        state = effect.advance(state, motion, 1e-3)
         off = {
-            "resist": effect.resist(state, Motion(np.float64(time), *at)),
-            "dry_friction": effect.dry_friction(state, at[1]),
+            "resist": effect.resist(state, motion),
+            "dry_friction": effect.dry_friction(state, motion.velocity),
             "added_inertia": effect.added_inertia(),
-            "transmission_error": effect.transmission_error(state, at[0]),
-            "deflect": effect.deflect(state, at[0]) - at[0],
-            "transmit": effect.transmit(state, *at),
-            "actuate": acting - at[0],
+            "transmission_error": effect.transmission_error(state, motion.position),
+            "deflect": effect.deflect(state, motion.position) - motion.position,
+            "transmit": effect.transmit(state, motion.position, motion.velocity),
+            "actuate": effect.actuate(state, motion.position, 1e-3)[1] - motion.position,
         }
         for hook, value in off.items():
             if not abs(float(value)) < _NEUTRAL:
                 raise ValueError(f"its neutral numbers {effect.neutral()} are not neutral: {hook} adds {float(value):.3g}")
 
 
-_HOOKS = (
-    "init", "settled", "advance", "actuate", "transmission_error", "deflect", "free_play", "transmit", "resist",
-    "dry_friction", "added_inertia",
-)  # fmt: skip
 _NEUTRAL = 1e-6
 """Largest torque or angle of a neutral effect at motions of size 1: rounding in float32."""
 
