@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -58,10 +58,8 @@ class Shared(NamedTuple):
         return jax.ShapeDtypeStruct(length, jnp.int32), dict.fromkeys(self.sides, noise)
 
 
-class Ahead(Protocol):
-    """From the state of what lanes share, seed, first sample and length of a block."""
-
-    def __call__(self, state: list[Any], seed: int, first: int, length: int) -> Block: ...
+Ahead = Callable[[list[Any], int, int, int], Block]
+"""From the state of what lanes share, seed, first sample and length of a block."""
 
 
 class Scanned:
@@ -80,11 +78,8 @@ class Scanned:
 
 
 class Looped:
-    """By XLA what needs no state, for all samples of a block at once; by a loop of scalars the rest.
-
-    Raises:
-        Unsupported: there can be no such loop.
-    """
+    """By XLA what needs no state, for all samples of a block at once; by a loop of scalars the rest. `Unsupported` where
+    there can be no such loop."""
 
     def __init__(self, shared: Shared, lengths: set[int]):
         parts = recursion(shared.inner, shared.state, shared.shapes())

@@ -7,7 +7,7 @@ of equations, from here.
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -39,14 +39,11 @@ def substituted(closed: ClosedJaxpr, functions: Functions) -> ClosedJaxpr:
     return found if not any(_callee(eqn) for eqn in found.jaxpr.eqns) else substituted(found, functions)
 
 
-class MultiplyAdd(Protocol):
-    """`a * b + c` in one operation, product or rest with the other sign."""
+def contracted(closed: ClosedJaxpr, multiply_add: Callable[..., Any]) -> ClosedJaxpr:
+    """The same with a product that one sum or difference alone reads joined with it.
 
-    def __call__(self, a: Any, b: Any, c: Any, *, minus_product: bool, minus_rest: bool) -> Any: ...
-
-
-def contracted(closed: ClosedJaxpr, multiply_add: MultiplyAdd) -> ClosedJaxpr:
-    """The same with a product that one sum or difference alone reads joined with it."""
+    `multiply_add(a, b, c, minus_product=..., minus_rest=...)` is a * b + c, the product or the rest with the other sign.
+    """
     jaxpr = closed.jaxpr
     reads = Counter(v for eqn in jaxpr.eqns for v in eqn.invars if isinstance(v, Var))
     reads.update(v for v in jaxpr.outvars if isinstance(v, Var))
@@ -122,8 +119,7 @@ def _inlined(closed: ClosedJaxpr, functions: Functions, *arguments: Any) -> list
 
 def _given(closed: ClosedJaxpr, arguments: Sequence[Any]) -> dict[Var, Any]:
     """What the first equations read."""
-    jaxpr = closed.jaxpr
-    return dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *arguments], strict=True))
+    return dict(zip([*closed.jaxpr.constvars, *closed.jaxpr.invars], [*closed.consts, *arguments], strict=True))
 
 
 def evaluate(

@@ -5,7 +5,9 @@ of the machine it runs on. Calls into it release the interpreter's lock, so that
 """
 
 import ctypes
+from collections import defaultdict
 from collections.abc import Callable, Sequence
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -31,20 +33,14 @@ Vector = Any
 """A value of LLVM (which has no types that a checker could use): a number in all lanes, or an index."""
 _FLAGS = ("contract",)
 """A product and a sum may become one instruction; nothing is reordered, as sums are compensated."""
-
-
 _BOOL = np.dtype(bool)
 
 
-def _dtype(v: Var | Literal) -> np.dtype:
-    dtype = v.aval.dtype  # pyright: ignore[reportAttributeAccessIssue]
-    if str(dtype) not in _KINDS:
-        raise Unsupported(f"numbers of type {dtype}")
-    return np.dtype(dtype)
-
-
-def _shape(v: Var | Literal) -> tuple[int, ...]:
-    return v.aval.shape  # pyright: ignore[reportAttributeAccessIssue]
+def _dtype(v: Any) -> np.dtype:
+    """Of a variable or literal of a jaxpr."""
+    if str(v.aval.dtype) not in _KINDS:
+        raise Unsupported(f"numbers of type {v.aval.dtype}")
+    return np.dtype(v.aval.dtype)
 
 
 def _machine() -> Any:
@@ -68,24 +64,15 @@ def vector_lanes(dtype: np.dtype) -> int:
 
 
 class Argument(NamedTuple):
-    """An array that a loop reads or writes where it lies.
-
-    Attributes:
-        name: for messages, e.g. `input 2`.
-        dtype: of its numbers.
-        holds: how many: "one", one for each of "lanes" or of "samples", or "both": one for each sample of each lane.
-    """
+    """An array that a loop reads or writes where it lies: its group and place there (`input 2`), type, and how many numbers
+    it holds: "one", one for each of "lanes" or of "samples", or "both": one for each sample of each lane."""
 
     name: str
     dtype: np.dtype
     holds: str
 
     def check(self, array: np.ndarray, steps: int, lanes: int) -> None:
-        """Refuse an array whose end the loop would pass, or whose numbers it would take for others.
-
-        Raises:
-            ValueError: wrong type or length, or not contiguous.
-        """
+        """Refuse an array of wrong type or length, or with gaps, by `ValueError`."""
         count = {"one": 1, "lanes": lanes, "samples": steps, "both": steps * lanes}[self.holds]
         if array.dtype != self.dtype or array.size != count or not array.flags.c_contiguous:
             wrong = f"not {array.size} of {array.dtype}"
@@ -94,19 +81,17 @@ class Argument(NamedTuple):
 
 def signature_of(body: ClosedJaxpr, around: Around | None, values: int, carry: int, fixed: int) -> list[Argument]:
     """The arrays of a loop in their order; arguments as of :class:`Loop`."""
-    after, finish = ([], []) if around is None else (around.after.jaxpr.invars, around.finish.jaxpr.invars)
-    own, kept = values + carry, body.jaxpr.outvars[carry:]
-    results = [] if around is None else around.finish.jaxpr.outvars
-    groups: list[tuple[str, Sequence[Any], Any]] = [
-        ("value", body.jaxpr.invars[:values], "lanes"),
-        ("carry", body.jaxpr.invars[values:own], "lanes"),
-        ("fixed number", body.jaxpr.invars[own : own + fixed], "one"),
-        ("input", body.jaxpr.invars[own + fixed :], "samples"),
-        ("input afterwards", [*after[own:], *finish[own:]], "one"),
-        ("kept number", kept, "both"),
-        ("result", results, "lanes"),
+    own, read = values + carry, body.jaxpr.invars
+    groups: list[tuple[str, str, Sequence[Any]]] = [
+        ("value", "lanes", read[:values]),
+        ("carry", "lanes", read[values:own]),
+        ("fixed number", "one", read[own : own + fixed]),
+        ("input", "samples", read[own + fixed :]),
+        ("input afterwards", "one", [v for part in (around or ())[1:] for v in part.jaxpr.invars[own:]]),
+        ("kept number", "both", body.jaxpr.outvars[carry:]),
+        ("result", "lanes", around.finish.jaxpr.outvars if around else []),
     ]
-    return [Argument(f"{name} {i}", _dtype(v), holds) for name, some, holds in groups for i, v in enumerate(some)]
+    return [Argument(f"{name} {i}", _dtype(v), holds) for name, holds, some in groups for i, v in enumerate(some)]
 
 
 class Loop:
@@ -115,9 +100,7 @@ class Loop:
     Args:
         body: jaxpr of one sample, scalars of one lane: values, carry, fixed, one sample's inputs -> carry, and what is kept.
         dtype: of the lanes' numbers.
-        values: number of values; they differ from lane to lane.
-        carry: numbers that a lane carries.
-        fixed: number of those that all lanes read and that differ from call to call.
+        values, carry, fixed: how many differ from lane to lane, a lane carries, and all lanes read unchanged in a call.
         around: left out, nothing.
         lanes: that are computed together; left out, as many as suit the machine.
 
@@ -141,7 +124,7 @@ class Loop:
         around = None if around is None else Around(*(substituted(part, FUNCTIONS) for part in around))
         self.signature = signature_of(body, around, values, carry, fixed)
         module = ir.Module("loop")
-        _Writer(module, self.lanes).loop(body, around, self.signature, values, carry, fixed)
+        _Writer(module, self.lanes).loop(body, around, self.signature)
         parsed = binding.parse_assembly(str(module))
         options = binding.create_pipeline_tuning_options(speed_level=3)
         passes = binding.create_pass_builder(_machine(), options)
@@ -161,18 +144,10 @@ class Loop:
         begins: bool = False,
         ends: bool = False,
     ) -> None:
-        """Take lanes `first` to `last` (multiples of `lanes`) through samples; the carry's arrays are overwritten.
+        """Take lanes from `first` up to `last` (multiples of `lanes`) through samples; the carry's arrays are overwritten.
 
-        Args:
-            arrays: as the signature says; what is kept is written `(steps, lanes)` with no more lanes than run.
-            steps: samples.
-            first: lane.
-            last: lane behind the last one.
-            begins: first block of a run: the carry is not read.
-            ends: last block of a run: results are written, the carry is not.
-
-        Raises:
-            ValueError: arrays that do not fit the signature.
+        What is kept is written `(steps, lanes)` with no more lanes than run. A block that `begins` a run does not read the
+        carry; one that `ends` it writes results in its place. `ValueError` for arrays that do not fit the signature.
         """
         given = arrays if isinstance(arrays, Arrays) else Arrays(self.signature, arrays, steps, last)
         if steps > given.steps or last > given.lanes:
@@ -200,15 +175,7 @@ class _Writer:
         self.constant: set[Vector] = set()
         """Those that do not change in the loop over time."""
 
-    def loop(
-        self,
-        body: ClosedJaxpr,
-        around: Around | None,
-        signature: Sequence[Argument],
-        values: int,
-        carry: int,
-        fixed: int,
-    ) -> None:
+    def loop(self, body: ClosedJaxpr, around: Around | None, signature: Sequence[Argument]) -> None:
         function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [_POINTER, *[_INT] * 5]), "loop")
         # what registers have no room for lies on the stack: no vector of it over two lines of the cache
         function.attributes.alignstack = 64
@@ -216,11 +183,13 @@ class _Writer:
         table, steps, first, last, begins, ends = function.args
         build: Any = ir.IRBuilder(function.append_basic_block("entry"))
         self.build = build
-        own = values + carry
-        kept = body.jaxpr.outvars[carry:]
+        group: defaultdict[str, list[int]] = defaultdict(list)
+        for i, one in enumerate(signature):
+            group[one.name.rpartition(" ")[0]].append(i)
+        own, carry = [*group["value"], *group["carry"]], len(group["carry"])
         dtypes = [one.dtype for one in signature]
         kinds = [_KINDS[str(dtype)] for dtype in dtypes]
-        if any(not jnp.issubdtype(dtype, jnp.floating) for dtype in dtypes[:own]):
+        if any(not jnp.issubdtype(dtypes[i], jnp.floating) for i in own):
             raise Unsupported("lanes that carry other numbers than floating-point ones")
         arrays = [build.load(build.gep(table, [_INT(i)], source_etype=_POINTER), typ=_POINTER) for i in range(len(dtypes))]
 
@@ -233,54 +202,41 @@ class _Writer:
             one = build.insert_element(nothing, value, ir.IntType(32)(0))
             return build.shuffle_vector(one, nothing, ir.Constant(self.vector(ir.IntType(32)), None))
 
-        inputs = range(own + fixed, len(body.jaxpr.invars))
-        steady = [scalar(i, _INT(0)) for i in range(own, own + fixed)]
-        end = next((i for i, one in enumerate(signature) if one.name.startswith(("kept", "result"))), len(signature))
-        afterwards = [scalar(i, _INT(0)) for i in range(len(body.jaxpr.invars), end)]
+        steady = [scalar(i, _INT(0)) for i in group["fixed number"]]
+        afterwards = [scalar(i, _INT(0)) for i in group["input afterwards"]]
         width = build.sub(last, first)
 
         def lanes(lane: Vector, _: list[Vector]) -> list[Vector]:
-            sizes = [dtype.itemsize for dtype in dtypes]
+            def read(name: str) -> list[Vector]:
+                places = {i: build.gep(arrays[i], [lane], source_etype=kinds[i]) for i in group[name]}
+                return [build.load(at, align=dtypes[i].itemsize, typ=self.vector(kinds[i])) for i, at in places.items()]
 
-            def read(some: range) -> list[Vector]:
-                places = {i: build.gep(arrays[i], [lane], source_etype=kinds[i]) for i in some}
-                return [build.load(place, align=sizes[i], typ=self.vector(kinds[i])) for i, place in places.items()]
+            def write(name: str, values: Sequence[Vector], at: Vector) -> list[Vector]:
+                for i, value in zip(group[name], values, strict=True):
+                    value = build.zext(value, self.vector(kinds[i])) if dtypes[i] == _BOOL else value
+                    build.store(value, build.gep(arrays[i], [at], source_etype=kinds[i]), align=dtypes[i].itemsize)
+                return []
 
-            def write(i: int, value: Vector, at: Vector) -> None:
-                value = build.zext(value, self.vector(kinds[i])) if dtypes[i] == _BOOL else value
-                build.store(value, build.gep(arrays[i], [at], source_etype=kinds[i]), align=sizes[i])
-
-            numbers = read(range(values))
+            numbers = read("value")
             self.constant = {*numbers, *steady}
 
             def sample(index: Vector, state: list[Vector]) -> list[Vector]:
-                found = self.run(body, [*numbers, *state, *steady, *(scalar(i, index) for i in inputs)])
-                at = build.add(build.mul(index, width), build.sub(lane, first))
-                for i, value in enumerate(found[carry:], end):
-                    write(i, value, at)
+                found = self.run(body, [*numbers, *state, *steady, *(scalar(i, index) for i in group["input"])])
+                write("kept number", found[carry:], build.add(build.mul(index, width), build.sub(lane, first)))
                 return found[:carry]
 
-            def leave() -> list[Vector]:
-                for i, value in enumerate(state, values):
-                    write(i, value, lane)
-                return []
-
             if around is None:
-                state = self.count(_INT(0), steps, read(range(values, own)), sample)
-                return leave()
-            before, after, closing = around
-            behind = len(after.in_avals) - own
-
-            def finish() -> list[Vector]:
-                found = self.run(closing, [*numbers, *state, *afterwards[behind:]])
-                for i, value in enumerate(found, end + len(kept)):
-                    write(i, value, lane)
-                return []
-
-            state = self.either(begins, lambda: self.run(before, numbers), lambda: read(range(values, own)))
+                return write("carry", self.count(_INT(0), steps, read("carry"), sample), lane)
+            before, after, finish = around
+            behind = len(after.in_avals) - len(own)
+            state = self.either(begins, lambda: self.run(before, numbers), lambda: read("carry"))
             state = self.count(_INT(0), steps, state, sample)
             state = self.run(after, [*numbers, *state, *afterwards[:behind]])
-            return self.either(ends, finish, leave)
+            return self.either(
+                ends,
+                lambda: write("result", self.run(finish, [*numbers, *state, *afterwards[behind:]]), lane),
+                lambda: write("carry", state, lane),
+            )
 
         self.count(first, last, [], lanes, by=self.lanes)
         build.ret_void()
@@ -288,8 +244,7 @@ class _Writer:
     def either(self, which: Vector, yes: Callable[[], list[Vector]], no: Callable[[], list[Vector]]) -> list[Vector]:
         """yes() if which else no()."""
         build = self.build
-        cases = [build.append_basic_block(name) for name in ("yes", "no")]
-        behind = build.append_basic_block("behind")
+        *cases, behind = (build.append_basic_block(name) for name in ("yes", "no", "behind"))
         build.cbranch(build.icmp_signed("!=", which, _INT(0)), *cases)
         ways = []
         for block, case in zip(cases, (yes, no), strict=True):
@@ -336,7 +291,7 @@ class _Writer:
         """The equations of a jaxpr of scalars."""
         jaxpr = closed.jaxpr
         env: dict[Var, Vector] = dict(zip(jaxpr.invars, arguments, strict=True))
-        if any(map(_shape, jaxpr.constvars)):
+        if any(v.aval.shape for v in jaxpr.constvars):
             raise Unsupported("steps that read tables")
         env |= {v: self.number(value, _dtype(v)) for v, value in zip(jaxpr.constvars, closed.consts, strict=True)}
 
@@ -344,30 +299,28 @@ class _Writer:
             return self.number(v.val, _dtype(v)) if isinstance(v, Literal) else env[v]
 
         for eqn in jaxpr.eqns:
-            if any(map(_shape, eqn.outvars)):
-                raise Unsupported(f"{eqn.primitive.name} of shape {_shape(eqn.outvars[0])}")
+            made: list[Any] = eqn.outvars
+            if any(v.aval.shape for v in made):
+                raise Unsupported(f"{eqn.primitive.name} of shape {made[0].aval.shape}")
             given = [read(v) for v in eqn.invars]
             results = self.equation(eqn, given)
             if all(self.is_constant(value) for value in given):
                 self.constant |= set(results)
-            env |= dict(zip(eqn.outvars, results, strict=True))
+            env |= dict(zip(made, results, strict=True))
         return [read(v) for v in jaxpr.outvars]
 
     def equation(self, eqn: JaxprEqn, given: list[Vector]) -> list[Vector]:
         name = eqn.primitive.name
         if name == "scan":
-            return self.scan(eqn, given)
+            # a loop of fixed length that carries a state: the substeps of a plant
+            length, inner, fixed = repetition(eqn)
+            still, state = given[:fixed], given[fixed:]
+            return self.count(_INT(0), _INT(length), state, lambda _, state: self.run(inner, [*still, *state]))
         dtype = _dtype(eqn.invars[0])
         rule = (_OF_FLOATS if jnp.issubdtype(dtype, jnp.floating) else _OF_INTEGERS).get(name) or _OF_ALL.get(name)
         if rule is None:
             raise Unsupported(f"{name} of {dtype}")
         return [rule(self, eqn, *given)]
-
-    def scan(self, eqn: JaxprEqn, given: list[Vector]) -> list[Vector]:
-        """A loop of fixed length that carries a state: the substeps of a plant."""
-        length, inner, fixed = repetition(eqn)
-        state = given[fixed:]
-        return self.count(_INT(0), _INT(length), state, lambda _, state: self.run(inner, [*given[:fixed], *state]))
 
     def vector(self, kind: ir.Type) -> ir.VectorType:
         return ir.VectorType(kind, self.lanes)
@@ -427,9 +380,7 @@ def _power(w: _Writer, eqn: JaxprEqn, a: Vector) -> Vector:
     power = parameter(eqn, "y")
     if not 1 <= abs(power) <= 8:
         raise Unsupported(f"integer_pow by {power}")
-    result = a
-    for _ in range(abs(power) - 1):
-        result = w.build.fmul(result, a, flags=_FLAGS)
+    result = reduce(lambda x, y: w.build.fmul(x, y, flags=_FLAGS), [a] * abs(power))
     return result if power > 0 else w.build.fdiv(w.like(a, 1.0), result)
 
 
@@ -470,21 +421,27 @@ def _convert(w: _Writer, eqn: JaxprEqn, a: Vector) -> Vector:
     return (w.build.trunc if not wider else w.build.sext if signed else w.build.zext)(a, target)
 
 
+def _instruction(name: str, **options: Any) -> Callable[..., Vector]:
+    return lambda w, eqn, *given: getattr(w.build, name)(*given, **options)
+
+
+def _intrinsic(name: str) -> Callable[..., Vector]:
+    return lambda w, eqn, *given: w.intrinsic(name, *given)
+
+
 _OF_FLOATS: dict[str, Callable[..., Vector]] = {
-    "add": lambda w, eqn, a, b: w.build.fadd(a, b, flags=_FLAGS),
-    "add_any": lambda w, eqn, a, b: w.build.fadd(a, b, flags=_FLAGS),
-    "sub": lambda w, eqn, a, b: w.build.fsub(a, b, flags=_FLAGS),
-    "mul": lambda w, eqn, a, b: w.build.fmul(a, b, flags=_FLAGS),
+    "add": _instruction("fadd", flags=_FLAGS),
+    "add_any": _instruction("fadd", flags=_FLAGS),
+    "sub": _instruction("fsub", flags=_FLAGS),
+    "mul": _instruction("fmul", flags=_FLAGS),
     "div": _divide,
-    "neg": lambda w, eqn, a: w.build.fneg(a),
+    "neg": _instruction("fneg"),
     "square": lambda w, eqn, a: w.build.fmul(a, a, flags=_FLAGS),
     # JAX 0.11's, in derivatives of tanh
     "one_minus_square": lambda w, eqn, a: w.build.fmul(w.build.fadd(w.like(a, 1.0), a), w.build.fsub(w.like(a, 1.0), a)),
     "integer_pow": _power,
-    "abs": lambda w, eqn, a: w.intrinsic("fabs", a),
-    "sqrt": lambda w, eqn, a: w.intrinsic("sqrt", a),
-    "floor": lambda w, eqn, a: w.intrinsic("floor", a),
-    "ceil": lambda w, eqn, a: w.intrinsic("ceil", a),
+    "abs": _intrinsic("fabs"),
+    **{name: _intrinsic(name) for name in ("sqrt", "floor", "ceil")},
     # lax.RoundingMethod: away from zero, to nearest even
     "round": lambda w, eqn, a: w.intrinsic(("round", "rint")[int(parameter(eqn, "rounding_method"))], a),
     "sign": _sign,
@@ -494,20 +451,12 @@ _OF_FLOATS: dict[str, Callable[..., Vector]] = {
     "is_finite": lambda w, eqn, a: w.build.fcmp_ordered("<", w.intrinsic("fabs", a), w.like(a, float("inf"))),
 }
 _OF_INTEGERS: dict[str, Callable[..., Vector]] = {
-    "add": lambda w, eqn, a, b: w.build.add(a, b),
-    "sub": lambda w, eqn, a, b: w.build.sub(a, b),
-    "mul": lambda w, eqn, a, b: w.build.mul(a, b),
-    "shift_left": lambda w, eqn, a, b: w.build.shl(a, b),
-    "and": lambda w, eqn, a, b: w.build.and_(a, b),
-    "or": lambda w, eqn, a, b: w.build.or_(a, b),
-    "xor": lambda w, eqn, a, b: w.build.xor(a, b),
-    "not": lambda w, eqn, a: w.build.not_(a),
+    **{name: _instruction(name) for name in ("add", "sub", "mul", "xor")},
+    **{name: _instruction(f"{name}_") for name in ("and", "or", "not")},
+    "shift_left": _instruction("shl"),
 }
 _OF_ALL: dict[str, Callable[..., Vector]] = {
-    **{
-        name: _comparison(order)
-        for name, order in {"gt": ">", "lt": "<", "ge": ">=", "le": "<=", "eq": "==", "ne": "!="}.items()
-    },
+    **dict(zip(("gt", "lt", "ge", "le", "eq", "ne"), map(_comparison, (">", "<", ">=", "<=", "==", "!=")), strict=True)),
     "select_n": _select,
     "convert_element_type": _convert,
     "bitcast_convert_type": lambda w, eqn, a: w.build.bitcast(a, w.vector(_KINDS[str(_dtype(eqn.outvars[0]))])),

@@ -34,13 +34,11 @@ class Kernel:
         around: what is done around a block of samples.
         values: number of values; they differ from lane to lane.
         size: lanes, a multiple of `LANES`.
-        steps: samples.
-        length: of a block; the last one has the rest.
+        steps, length: samples of a run and of a block; the last block has the rest.
         interpret: run by Pallas's interpreter, on any device.
 
-    Attributes:
-        arguments: shapes of what it is called with: values `(lanes,)` each; inputs of the body `(steps,)` each, of what
-            follows a block `(blocks,)`, of the finish `()`.
+    `arguments` are the shapes of what it is called with: values `(lanes,)` each; inputs of the body `(steps,)` each, of what
+    follows a block `(blocks,)`, of the finish `()`.
     """
 
     def __init__(
@@ -88,6 +86,7 @@ class Kernel:
         shared = [jnp.reshape(x, -1) for part in inputs for x in part]
         truths = [x.dtype == jnp.bool_ for x in shared]
         shared = [x.astype(jnp.int32) if true else x for x, true in zip(shared, truths, strict=True)]
+        stored = [jnp.dtype(jnp.int32) if aval.dtype == jnp.bool_ else aval.dtype for aval in self._results]
         lanes = pl.BlockSpec((LANES,), lambda i: (i,))
         count = values[0].size
         found = pl.pallas_call(
@@ -95,7 +94,7 @@ class Kernel:
             grid=(count // LANES,),
             in_specs=[*[lanes] * self._values, *(pl.BlockSpec(x.shape, lambda i: (0,)) for x in shared)],
             out_specs=[lanes] * len(self._results),
-            out_shape=[jax.ShapeDtypeStruct((count,), _stored(aval.dtype)) for aval in self._results],
+            out_shape=[jax.ShapeDtypeStruct((count,), dtype) for dtype in stored],
             interpret=self._interpret,
             compiler_params=None if self._interpret else triton.CompilerParams(num_warps=LANES // 32),
         )(*values, *shared)
@@ -147,8 +146,3 @@ def multiply_add(a: Any, b: Any, c: Any, *, minus_product: bool, minus_rest: boo
         result_shape_dtypes=[jax.ShapeDtypeStruct(given[0].shape, given[0].dtype)],
     )
     return result
-
-
-def _stored(dtype: Any) -> Any:
-    """Of a result in memory."""
-    return jnp.int32 if dtype == jnp.bool_ else dtype

@@ -21,14 +21,8 @@ from .split import Around, Kind, carry_kinds, split
 
 
 class Block(NamedTuple):
-    """What lanes need for a block of samples.
-
-    Attributes:
-        length: samples.
-        handed: inputs of each sample `(length,)`.
-        last: inputs of what follows the block `()`.
-        ends: inputs of a lane's figures `()`; of the last block.
-    """
+    """What lanes need for a block of samples: inputs of each sample `(length,)`, of what follows the block `()`, and, of the
+    last block, of a lane's figures `()`."""
 
     length: int
     handed: list[np.ndarray]

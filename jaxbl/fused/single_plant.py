@@ -8,7 +8,7 @@ do (effects that read tables) is left to XLA. In float64, under `jax.enable_x64`
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, wraps
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,21 +20,12 @@ from jaxbl.simulate import Experiment, corrected, move, trajectory
 
 from . import Unsupported, attempted, say_scanned
 
-if TYPE_CHECKING:
-    from .llvm import Loop
-
 _FLOAT = np.dtype(float)
 _NUMBER = jax.ShapeDtypeStruct((), _FLOAT)
 
 
 class Direction(NamedTuple):
-    """In which a step's derivative is sought.
-
-    Attributes:
-        experiment: change of the experiment's leaves, floats.
-        state: change of the state's.
-        torque: change of the input, N m.
-    """
+    """In which a step's derivative is sought: changes of the experiment's leaves, of the state's, and of the input (N m)."""
 
     experiment: Experiment
     state: PlantState
@@ -49,17 +40,7 @@ def path(
     measured: dict[str, np.ndarray] | None = None,
     gain: dict[str, np.ndarray] | None = None,
 ) -> PlantState:
-    """The plant's states at the samples, with a leading time axis.
-
-    Args:
-        experiment: with array leaves.
-        start: state at the first sample, scalars.
-        torque: input in N m `(samples,)`, held from each sample to the next.
-        time: time of the first sample in s.
-        measured: positions of each side in rad `(samples,)`, to predict from: each state is then what follows from the
-            samples before.
-        gain: by which a prediction error corrects position (1) and velocity (1/s) of its side `(2,)`; needs `measured`.
-    """
+    """The plant's states at the samples, with a leading time axis; arguments as of :func:`jaxbl.simulate.trajectory`."""
     plant = _Plant.of(experiment, start)
     sides = () if gain is None else tuple(sorted(gain))
     loop = _path_loop(plant, sides)
@@ -83,14 +64,12 @@ def slopes(
 
     Args:
         experiment: with array leaves.
-        states: at the samples, leaves `(samples,)`.
-        torque: input in N m `(samples,)`.
-        time: s `(samples,)`.
+        states: at the samples, leaves `(samples,)`; likewise torque (N m) and time (s).
         directions: of change.
 
     Returns:
-        Change of the state by a change along each direction `(directions, states, samples)`, in the order of the state's
-        leaves, and the state `(states, samples)`.
+        Change of the state along each direction `(directions, states, samples)`, in the order of the state's leaves, and the
+        state after the step `(states, samples)`.
     """
     plant = _Plant.of(experiment, states)
     leaves = jax.tree.leaves(states)
@@ -139,13 +118,7 @@ def _pushed(
 
 
 class _Plant(NamedTuple):
-    """What loops are compiled for: experiments of one structure.
-
-    Attributes:
-        structure: of the experiment.
-        kinds: shapes and types of its leaves.
-        shape: structure of the state.
-    """
+    """What loops are compiled for: experiments of one structure, shapes and types of their leaves, structure of a state."""
 
     structure: Any
     kinds: tuple[tuple[tuple[int, ...], str], ...]
@@ -193,15 +166,19 @@ def _read(plant: _Plant) -> tuple[int, ...]:
     return read
 
 
-def _or_none(compiled: "Callable[..., Loop]") -> "Callable[..., Loop | None]":
-    """Compiles a loop once; where there can be none, says so."""
+def _or_none(written: Callable[..., tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]]) -> Any:
+    """Compiles a loop once, from a function of a sample, examples of its arguments, and options; None where it cannot."""
 
     @lru_cache(maxsize=64)
-    @wraps(compiled)
-    def found(*given: Any) -> "Loop | None":
+    @wraps(written)
+    def found(*given: Any) -> Any:
         try:
             with attempted():
-                return compiled(*given)
+                from .jaxprs import flat
+                from .llvm import Loop
+
+                sample, examples, numbers = written(*given)
+                return Loop(flat(sample, *examples), _FLOAT, **numbers)
         except Unsupported as why:
             say_scanned(str(why))
             return None
@@ -210,10 +187,8 @@ def _or_none(compiled: "Callable[..., Loop]") -> "Callable[..., Loop | None]":
 
 
 @_or_none
-def _path_loop(plant: _Plant, sides: tuple[str, ...]) -> "Loop":
+def _path_loop(plant: _Plant, sides: tuple[str, ...]) -> Any:
     """From state, numbers, first time and gains, and a sample's index, torque and readings."""
-    from .jaxprs import flat
-    from .llvm import Loop
 
     def sample(state: list[Any], numbers: list[Any], first: Any, gains: list[Any], index: Any, inputs: list[Any]) -> Any:
         experiment = plant.put(numbers)
@@ -226,15 +201,13 @@ def _path_loop(plant: _Plant, sides: tuple[str, ...]) -> "Loop":
     count = plant.shape.num_leaves
     fixed = [_NUMBER] * len(_read(plant)), _NUMBER, [_NUMBER] * (2 * len(sides))
     index, inputs = jax.ShapeDtypeStruct((), np.int32), [_NUMBER] * (1 + len(sides))
-    body = flat(sample, [_NUMBER] * count, *fixed, index, inputs)
-    return Loop(body, _FLOAT, carry=count, lanes=1, fixed=len(jax.tree.leaves(fixed)))
+    examples = [_NUMBER] * count, *fixed, index, inputs
+    return sample, examples, {"carry": count, "lanes": 1, "fixed": len(jax.tree.leaves(fixed))}
 
 
 @_or_none
-def _slopes_loop(plant: _Plant) -> "Loop":
+def _slopes_loop(plant: _Plant) -> Any:
     """From state, torque and time of a lane, numbers, and changes of numbers, state and torque."""
-    from .jaxprs import flat
-    from .llvm import Loop
 
     def slope(state: list[Any], torque: Any, time: Any, numbers: list[Any], changes: tuple[Any, ...]) -> Any:
         def step(numbers: list[Any], state: list[Any], torque: Any) -> list[Any]:
@@ -245,5 +218,5 @@ def _slopes_loop(plant: _Plant) -> "Loop":
 
     count = plant.shape.num_leaves
     state, numbers = [_NUMBER] * count, [_NUMBER] * len(_read(plant))
-    body = flat(slope, state, _NUMBER, _NUMBER, numbers, (numbers, state, _NUMBER))
-    return Loop(body, _FLOAT, values=count + 2, fixed=2 * len(numbers) + count + 1)
+    examples = state, _NUMBER, _NUMBER, numbers, (numbers, state, _NUMBER)
+    return slope, examples, {"values": count + 2, "fixed": 2 * len(numbers) + count + 1}

@@ -26,18 +26,8 @@ def recorded(
     record: Callable[[State, Signals], dict[str, Any]],
     every: int = 1,
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Simulate one experiment. Call in its precision (`jax.enable_x64`).
-
-    Args:
-        experiment: with array leaves.
-        seed: seed of the encoder noise.
-        reducers: figures to compute along the run.
-        record: what to keep of every `every`-th sample, scalars by name.
-        every: decimation of the record.
-
-    Returns:
-        The reducers' figures `()`, and the record `(samples,)`, both by name.
-    """
+    """Simulate one experiment, in its precision: the reducers' figures `()` and the record `(samples,)`, both by name.
+    Arguments as of :func:`jaxbl.simulate.scan`."""
     with jax.default_device(host()):
         start = jax.eval_shape(lambda: begin(experiment, reducers))
         tree, leaves = jax.tree.structure(start), jax.tree.leaves(start)

@@ -6,6 +6,7 @@ neither lane nor time, *shared* if it depends on time alone, a *lane's* otherwis
 
 import enum
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -28,13 +29,10 @@ class Kind(enum.IntFlag):
 
 
 class Parts(NamedTuple):
-    """A function `f(values, carry, given) -> results` of one lane in two parts.
+    """A function `f(values, carry, given) -> results` of one lane in two parts, and which results are the lanes'.
 
-    Attributes:
-        shared: from the shared part of the carry and `given` to the shared results and what the lanes' part reads of it.
-        lane: the lanes' part: values, its part of the carry, what `shared` hands over -> the lanes' results. Numbers that
-            never change stand in it as such, so that compilers see what follows from them.
-        of_lane: which results are the lanes'.
+    `shared`: its part of the carry, `given` -> its results, and what the lanes' part reads of it.
+    `lane`: values, its part of the carry, what it reads -> its results. Fixed numbers stand in it, for compilers to see.
     """
 
     shared: Callable[[Sequence[Any], Any], tuple[list[Any], list[Any]]]
@@ -43,13 +41,8 @@ class Parts(NamedTuple):
 
 
 class Around(NamedTuple):
-    """What is done around the loop over a block of samples, jaxprs of scalars of one lane.
-
-    Attributes:
-        before: a run's first block: values -> carry.
-        after: every block: values, carry, inputs -> carry.
-        finish: the last block: values, carry, inputs -> results.
-    """
+    """What is done around the loop over a block of samples, jaxprs of scalars of one lane: before the first block (values ->
+    carry), after each (values, carry, inputs -> carry), and to finish (values, carry, inputs -> results)."""
 
     before: ClosedJaxpr
     after: ClosedJaxpr
@@ -57,13 +50,8 @@ class Around(NamedTuple):
 
 
 def carry_kinds(start: Callable[..., Any], functions: Iterable[tuple[Callable[..., Any], Any]], values: Any) -> list[Kind]:
-    """Kinds of the leaves of a carry.
-
-    Args:
-        start: from values to the first carry.
-        functions: each from (values, carry, given) to a carry, with an example of what is given.
-        values: example of the values that differ from lane to lane.
-    """
+    """Kinds of the leaves of a carry that `start(values)` begins and `functions`, each with an example of what it is given,
+    take further: `f(values, carry, given)`."""
     made = flat(start, values)
     kinds = _kinds(made.jaxpr, [Kind.LANE] * len(made.jaxpr.invars))
     found = [_kind(kinds, out) for out in made.jaxpr.outvars]
@@ -90,15 +78,10 @@ def split(
     kinds: Sequence[Kind],
     results: Sequence[Kind] | None = None,
 ) -> Parts:
-    """The two parts of a function of one lane.
+    """The two parts of a function of one lane, from examples of its arguments and the kinds of the carry's leaves.
 
-    Args:
-        function: of examples `values`, `carry` and `given`.
-        kinds: of the carry's leaves.
-        results: kinds that the results are to have; left out, those that they come to have.
-
-    Raises:
-        Unsupported: lanes read something that is no number: an array, or the state of a random number generator.
+    `results` are the kinds that the results are to have; left out, those that they come to have. `Unsupported` where lanes
+    read something that is no number: an array, or the state of a random number generator.
     """
     closed = flat(function, values, carry, given)
     jaxpr = closed.jaxpr
@@ -150,10 +133,8 @@ def split(
 class Recursion(NamedTuple):
     """A function `f(state, given) -> (state, handed)` of one sample in two parts.
 
-    Attributes:
-        direct: what is handed over of `given` alone, by place; the rest needs the state.
-        ahead: from `given` to the former, and to what `step` reads of it.
-        step: state, what `ahead` hands it -> state, and the rest of what is handed over.
+    `direct` says of each number handed over whether it needs no state. `ahead`: `given` -> these, and what `step` reads.
+    `step`: state, what it reads -> state, and the rest of what is handed over.
     """
 
     direct: list[bool]
@@ -162,11 +143,8 @@ class Recursion(NamedTuple):
 
 
 def recursion(function: Callable[..., tuple[list[Any], list[Any]]], state: Sequence[Any], given: Any) -> Recursion:
-    """What needs the state of the sample before, and what may be computed for all samples at once.
-
-    Raises:
-        Unsupported: what needs the state reads something that is no number.
-    """
+    """What needs the state of the sample before, and what may be computed for all samples at once. `Unsupported` where the
+    former reads something that is no number."""
     count = len(state)
     jaxpr = flat(function, list(state), given).jaxpr
     known = _kinds(jaxpr, [Kind.LANE] * count + [Kind.SHARED] * (len(jaxpr.invars) - count))
@@ -187,11 +165,7 @@ def recursion(function: Callable[..., tuple[list[Any], list[Any]]], state: Seque
 
     read = parts.lane.jaxpr.invars[count + len(unread) :]
     examples = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in read]
-    return Recursion(
-        direct,
-        lambda given: parts.shared([None] * sum(direct), given),
-        flat(step, list(state), examples),
-    )
+    return Recursion(direct, partial(parts.shared, [None] * sum(direct)), flat(step, list(state), examples))
 
 
 def _kind(kinds: dict[Var, Kind], v: Var | Literal) -> Kind:
