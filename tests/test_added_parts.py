@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxbl.drive.excitation import AbstractExcitation
 from jaxbl.drive.parameters import Scalar, parameter
 from jaxbl.drive.transmission import AbstractTransmission
-from jaxbl.sweeps.metrics import RunMetric
+from jaxbl.sweeps.metrics import Rms, RunMetric
 
 
 class CubicShaft(AbstractTransmission):
@@ -71,6 +71,11 @@ class VelocityPeak(RunMetric):
 
     def result(self, carry, end):
         return carry
+
+
+AccelerationSize = Rms.of(
+    "acceleration_size", "rad/s²", "acceleration, rms", "rms acceleration", signal=lambda _, at: at.true.acceleration
+)
 '''
 SCRIPT = """
 import json, runpy
@@ -85,6 +90,10 @@ print(json.dumps({
     "input": list(trial.trace["u"][:3]),
     "identified": trial.summary["identified"],
     "peak": [trial.summary["metrics"]["motor.velocity_peak"], error[-len(error) // 4:].max()],
+    "size": [
+        trial.summary["metrics"]["motor.acceleration_size"],
+        (trial.trace["motor.acceleration"][-len(error) // 4:] ** 2).mean() ** 0.5,
+    ],
     "swept": swept.frame[["motor.velocity_peak", "motor.cubic_error", "motor.stiffness_error"]].to_dict("list"),
     "page": [line for line in page.splitlines() if "cubic" in line or "triangle" in line or "velocity_peak" in line],
 }))
@@ -102,7 +111,11 @@ STUDY = {
 @pytest.mark.slow
 def test_parts_of_an_installed_package_are_used_everywhere(tmp_path):
     parts = {"transmissions": {"cubic_shaft": "CubicShaft"}, "excitations": {"triangle": "Triangle"}}
-    parts["metrics"] = {"velocity_peak": "VelocityPeak", "broken": "Nothing"}
+    parts["metrics"] = {
+        "velocity_peak": "VelocityPeak",
+        "acceleration_size": "AccelerationSize",
+        "broken": "Nothing",
+    }
     install_package(tmp_path, "more_parts", SOURCE, {f"jaxbl.{group}": entries for group, entries in parts.items()})
     (tmp_path / "study.json").write_text(json.dumps(STUDY))
     script = SCRIPT.replace("PAGE", repr(str(ROOT / "docs" / "generate.py")))
@@ -122,6 +135,7 @@ def test_parts_of_an_installed_package_are_used_everywhere(tmp_path):
         assert found["identified"][name]["true"] == true
         assert found["identified"][name]["motor"] == pytest.approx(true, rel=0.2)
     assert found["peak"][0] == pytest.approx(found["peak"][1])
+    assert found["size"][0] == pytest.approx(found["size"][1])
     assert found["swept"]["motor.velocity_peak"][0] != found["swept"]["motor.velocity_peak"][1]
     assert max(map(abs, found["swept"]["motor.cubic_error"])) < 0.2
     text = "\n".join(found["page"])

@@ -23,19 +23,13 @@ from .programs import Backend, Layout, Program, backend_of, compile_program, fas
 LANES_PER_DEVICE: dict[Backend, int] = {"scan": 4096, "fused": 16384}
 """Default lanes a device computes at once: the scan's carry then stays in a core's cache, and what lanes of the fused loop
 share counts little (benchmarks/NOTES.md)."""
-LANES_ON_A_GPU = 2**18
+_LANES_ON_A_GPU = 2**18
 """The same there, by either backend: some 2000 lanes for each of its processors, which is what keeps all of it busy."""
 
 
 class Chunk(NamedTuple):
-    """One call of a compiled program: every one of some seeds at every one of some points of a group.
-
-    Attributes:
-        index: number of the chunk in its study.
-        group: index of the group.
-        seeds: as many as the layout's, or fewer.
-        points: indices of points of the group, as many as the layout's, or fewer.
-    """
+    """One call of a compiled program: every one of some seeds at every one of some points of a group (their indices), as many
+    of both as the layout's, or fewer."""
 
     index: int
     group: int
@@ -43,7 +37,7 @@ class Chunk(NamedTuple):
     points: np.ndarray
 
 
-REFINED_LANES_PER_DEVICE = 1024
+_REFINED_LANES_PER_DEVICE = 1024
 """The same in a refined study: its batches are small, and fill larger chunks badly (benchmarks/NOTES.md)."""
 
 
@@ -55,7 +49,7 @@ def layout_for(config: Config, points: Points, devices: list[Any], backend: Back
     count = len(devices)
     if points.refinement is not None:
         return _refined_layout(config, count, chunk)
-    capacity = chunk or count * (LANES_ON_A_GPU if devices[0].platform == "gpu" else LANES_PER_DEVICE[backend])
+    capacity = chunk or count * (_LANES_ON_A_GPU if devices[0].platform == "gpu" else LANES_PER_DEVICE[backend])
     # chunks of equal size waste no padding on the last one; a multiple of the devices, along the longer side, suits them
     per_chunk = math.ceil(points.lanes / math.ceil(points.lanes / capacity))
     if points.lanes >= count and points.lanes > 1:
@@ -70,7 +64,7 @@ def layout_for(config: Config, points: Points, devices: list[Any], backend: Back
 
 def _refined_layout(config: Config, devices: int, chunk: int | None) -> Layout:
     """Several seeds before whole rows of points: a batch has few points, and needs all seeds of them."""
-    capacity = chunk or REFINED_LANES_PER_DEVICE * devices
+    capacity = chunk or _REFINED_LANES_PER_DEVICE * devices
     seeds = min(config.sweep.seeds, max(capacity // (64 * devices), 1))
     return Layout(seeds, max(math.ceil(capacity / seeds / devices), 2) * devices)
 
@@ -83,10 +77,8 @@ class Engine:
         layout: chunk shape; left out, one that suits the devices.
         devices: left out, all local ones.
         backend: left out, the faster one here.
-        insist: refuse a study that the fused loop cannot run; else it is scanned.
-
-    Attributes:
-        scanned: what the fused loop did not know of groups that were scanned in its place.
+        insist: refuse a study that the fused loop cannot run; else it is scanned, and `scanned` says what the loop did not
+            know.
     """
 
     def __init__(
@@ -169,15 +161,10 @@ class Engine:
 
     def labels(self, chunk: Chunk) -> dict[str, np.ndarray]:
         """What tells the rows of a chunk apart: values by axis path, and seeds."""
-        columns = self.points.columns(chunk.points)
-        structural = self.points.groups[chunk.group].structural
+        group = self.points.groups[chunk.group]
+        values = group.structural | self.points.columns(chunk.points)
         shape = (len(chunk.seeds), len(chunk.points))
-        data = {}
-        for path in self.points.paths:
-            if path in columns:
-                data[path] = np.broadcast_to(columns[path], shape).ravel()
-            else:
-                data[path] = np.full(shape, structural[path]).ravel()
+        data = {path: np.broadcast_to(values[path], shape).ravel() for path in self.points.paths}
         data["seed"] = np.broadcast_to(chunk.seeds[:, None], shape).ravel()
         return data
 
@@ -255,13 +242,10 @@ class SweepEstimate:
         points: points that are simulated in any case.
         rows: these with all seeds.
         most_points: points of the study; of a refined one, those of its fine grid.
-        chunks: chunks for `rows`.
-        lanes_a_chunk: lanes of each.
-        compile_seconds: time of all compilations.
-        run_seconds: time of all chunks.
-        lane_steps_per_second: measured rate.
+        chunks: chunks for `rows`, of `lanes_a_chunk` lanes each.
+        compile_seconds: time of all compilations; `run_seconds`, of all chunks.
+        lane_steps_per_second: measured rate, with `backend`.
         megabytes: memory of a chunk, MB.
-        backend: that was measured.
     """
 
     points: int

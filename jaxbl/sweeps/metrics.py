@@ -1,15 +1,16 @@
 """Metrics of a run, computed in the loop over time: observation errors, convergence, gain margins, identification.
 
-A metric is one class: its column, unit, label and meaning, and how it is computed. Further packages add classes derived
-from :class:`RunMetric` or :class:`GainMetric` through the entry-point group `jaxbl.metrics`; the entry's name is the
-metric's. RMS values are over the last quarter of the run, in SI units. Position and velocity tolerances of the load are
-those of the motor divided by the gear ratio.
+A metric is one class: its column, unit, label and meaning, and how it is computed. Those that differ from others in a
+signal or a formula alone are made by :meth:`Metric.of`. Further packages add classes derived from :class:`RunMetric` or
+:class:`GainMetric`, or made so, through the entry-point group `jaxbl.metrics`; the entry's name is the metric's. RMS values
+are over the last quarter of the run, in SI units. Position and velocity tolerances of the load are those of the motor
+divided by the gear ratio.
 """
 
 import abc
 import functools
-from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +35,12 @@ class Metric(abc.ABC):
     """Short name for axes of figures; what it means is in `doc`."""
     doc: ClassVar[str]
 
+    @classmethod
+    def of(cls, name: str, unit: str, label: str, doc: str, **methods: Any) -> type[Self]:
+        """A metric of this kind, with what the kind leaves open (`signal` of an rms or peak, `judge` of gains)."""
+        found: Any = type(name, (cls,), {"name": name, "unit": unit, "label": label, "doc": doc, **methods})
+        return found
+
     def applies(self, experiment: Experiment) -> bool:
         """Whether an experiment has this metric."""
         return True
@@ -55,9 +62,8 @@ class _Metrics(Registry):
             for law in TRANSMISSIONS.values():
                 for name, parameter in law.errors.items():
                     if name not in self._found:
-                        about = {"name": name, "label": f"error of {parameter}"}
-                        about["doc"] = f"relative error of the identified {parameter}"
-                        self._found[name] = type("LawError", (IdentificationError,), about)
+                        doc = f"relative error of the identified {parameter}"
+                        self._found[name] = IdentificationError.of(name, "", f"error of {parameter}", doc)
         return self._found
 
 
@@ -127,7 +133,51 @@ class GainMetric(Metric):
         """The metric of many lanes, from arrays of one shape."""
 
 
-@SIDE_METRICS.add
+class SignalMetric(RunMetric):
+    """A number that follows from one signal, and is zero at first."""
+
+    @abc.abstractmethod
+    def signal(self, sample: SideSample) -> Number:
+        """The signal at one sample."""
+
+    def init(self, zero):
+        return zero
+
+
+class Rms(SignalMetric):
+    """Root of the mean square of a signal over the last quarter."""
+
+    def update(self, carry, sample):
+        return carry + sample.inside * self.signal(sample) * self.signal(sample)
+
+    def result(self, carry, end):
+        return jnp.sqrt(carry / end.count)
+
+
+class Peak(SignalMetric):
+    """Largest size of a signal along the run, times a factor."""
+
+    factor: ClassVar[float] = 1.0
+
+    def update(self, carry, sample):
+        return jnp.maximum(carry, jnp.abs(self.signal(sample)))
+
+    def result(self, carry, end):
+        return self.factor * carry
+
+
+class IdentificationError(RunMetric):
+    """Relative error of an identified parameter that the law reports (`AbstractTransmission.errors`)."""
+
+    def applies(self, experiment):
+        return experiment.identifier is not None and self.name in getattr(experiment.transmission, "errors", ())
+
+    def result(self, carry, end):
+        assert end.experiment.transmission is not None
+        parameter = end.experiment.transmission.errors[self.name]
+        return end.identified[parameter] / end.experiment.transmission.truth()[parameter] - 1.0
+
+
 class Converged(RunMetric):
     """The state is the last time at which an error was out of tolerance, -1 before any."""
 
@@ -146,7 +196,6 @@ class Converged(RunMetric):
         return carry < end.start - 0.5 * end.experiment.run.sample_period
 
 
-@SIDE_METRICS.add
 class ConvergenceTime(Converged):
     """As :class:`Converged`, whose state it shares."""
 
@@ -160,117 +209,6 @@ class ConvergenceTime(Converged):
         return jnp.where(super().result(carry, end), entered, jnp.nan)
 
 
-@SIDE_METRICS.add
-class ConvergenceTimeBound(GainMetric):
-    """Bound (42)."""
-
-    name = "convergence_time_bound"
-    unit = "s"
-    label = "bound on convergence time"
-    doc = "bound (42) on it for the noise-free observer; inf where (32) fails"
-
-    def judge(self, gains, f_plus):
-        errors = gains.position_error, gains.velocity_error
-        return conditions.convergence_time_bound(gains.lambda_, gains.alpha, f_plus, *errors)
-
-
-@SIDE_METRICS.add
-class ConvergenceTimeWorst(GainMetric):
-    """The longest that a disturbance can make it."""
-
-    name = "convergence_time_worst"
-    unit = "s"
-    label = "worst convergence time"
-    doc = "longest convergence time that a disturbance within f_plus can cause; inf where ρ ≥ 1"
-
-    def judge(self, gains, f_plus):
-        errors = gains.position_error, gains.velocity_error
-        return conditions.convergence_time_worst(gains.lambda_, gains.alpha, f_plus, *errors)
-
-
-class Rms(RunMetric):
-    """Root of the mean square of a signal over the last quarter."""
-
-    @abc.abstractmethod
-    def signal(self, sample: SideSample) -> Number:
-        """The signal at one sample."""
-
-    def init(self, zero):
-        return zero
-
-    def update(self, carry, sample):
-        return carry + sample.inside * self.signal(sample) * self.signal(sample)
-
-    def result(self, carry, end):
-        return jnp.sqrt(carry / end.count)
-
-
-@SIDE_METRICS.add
-class PositionRmse(Rms):
-    """Of the position error."""
-
-    name = "position_rmse"
-    unit = "rad"
-    label = "position error, rms"
-    doc = "rms position error"
-
-    def signal(self, sample):
-        return sample.position_error
-
-
-@SIDE_METRICS.add
-class VelocityRmse(Rms):
-    """Of the velocity error."""
-
-    name = "velocity_rmse"
-    unit = "rad/s"
-    label = "velocity error, rms"
-    doc = "rms velocity error"
-
-    def signal(self, sample):
-        return sample.velocity_error
-
-
-@SIDE_METRICS.add
-class TorqueRmse(Rms):
-    """Of the torque error."""
-
-    name = "torque_rmse"
-    unit = "N m"
-    label = "torque error, rms"
-    doc = "rms error of the transmitted torque from this side's equivalent control"
-
-    def signal(self, sample):
-        return sample.torque_error
-
-
-@SIDE_METRICS.add
-class PositionSize(Rms):
-    """Of the true position."""
-
-    name = "position_size"
-    unit = "rad"
-    label = "position, rms"
-    doc = "rms true position: the size that its errors compare with"
-
-    def signal(self, sample):
-        return sample.true.position
-
-
-@SIDE_METRICS.add
-class VelocitySize(Rms):
-    """Of the true velocity."""
-
-    name = "velocity_size"
-    unit = "rad/s"
-    label = "velocity, rms"
-    doc = "rms true velocity: the size that its errors compare with"
-
-    def signal(self, sample):
-        return sample.true.velocity
-
-
-@SIDE_METRICS.add
 class Chatter(RunMetric):
     """The state is the sum of squares, and the velocity error of the last sample."""
 
@@ -291,105 +229,6 @@ class Chatter(RunMetric):
         return jnp.sqrt(0.5 * carry[0] / end.count)
 
 
-@SIDE_METRICS.add
-class FPlus(RunMetric):
-    """The bound that gains have to meet."""
-
-    name = "f_plus"
-    unit = "rad/s²"
-    label = "true bound f⁺"
-    doc = "largest true right-hand side error |f(x₂) − f(x̂₂) + ξ| along the run"
-
-    def init(self, zero):
-        return zero
-
-    def update(self, carry, sample):
-        return jnp.maximum(carry, jnp.abs(sample.true.perturbation))
-
-    def result(self, carry, end):
-        return carry
-
-
-@SIDE_METRICS.add
-class FPlusAcceleration(RunMetric):
-    """The bound that the paper proposes."""
-
-    name = "f_plus_acceleration"
-    unit = "rad/s²"
-    label = "twice the largest acceleration"
-    doc = "twice the largest acceleration: the paper's text for f⁺"
-
-    def init(self, zero):
-        return zero
-
-    def update(self, carry, sample):
-        return jnp.maximum(carry, jnp.abs(sample.true.acceleration))
-
-    def result(self, carry, end):
-        return 2.0 * carry
-
-
-@SIDE_METRICS.add
-class MarginAlpha(GainMetric):
-    """At most 1: no lambda converges."""
-
-    name = "margin_alpha"
-    label = "α / f⁺"
-    doc = "gain alpha over the true bound f_plus"
-
-    def judge(self, gains, f_plus):
-        return gains.alpha / f_plus
-
-
-def _margin(condition_name: str, condition: conditions.Condition) -> type[GainMetric]:
-    class Margin(GainMetric):
-        """At most 1: the condition fails."""
-
-        name = f"margin_{condition_name}"
-        label = f"margin to {condition.title}"
-        doc = f"λ over the least λ of {condition.title}"
-
-        def judge(self, gains, f_plus):
-            return gains.lambda_ / condition.least_lambda(gains.alpha, f_plus)
-
-    return Margin
-
-
-for _name, _condition in conditions.CONDITIONS.items():
-    SIDE_METRICS.add(_margin(_name, _condition))
-
-
-class IdentificationError(RunMetric):
-    """Relative error of an identified parameter that the law reports (`AbstractTransmission.errors`)."""
-
-    def applies(self, experiment):
-        return experiment.identifier is not None and self.name in getattr(experiment.transmission, "errors", ())
-
-    def result(self, carry, end):
-        assert end.experiment.transmission is not None
-        parameter = end.experiment.transmission.errors[self.name]
-        return end.identified[parameter] / end.experiment.transmission.truth()[parameter] - 1.0
-
-
-@SIDE_METRICS.add
-class StiffnessError(IdentificationError):
-    """Of the stiffness."""
-
-    name = "stiffness_error"
-    label = "error of K"
-    doc = "relative error of the identified stiffness"
-
-
-@SIDE_METRICS.add
-class DeadZoneError(IdentificationError):
-    """Of the dead zone."""
-
-    name = "dead_zone_error"
-    label = "error of the dead zone"
-    doc = "relative error of the identified dead zone (half gap of law dead_zone)"
-
-
-@SIDE_METRICS.add
 class Excitation(RunMetric):
     """How well the input tells the unknowns of the law apart."""
 
@@ -403,6 +242,73 @@ class Excitation(RunMetric):
     def result(self, carry, end):
         assert end.experiment.identifier is not None and end.state.identifier is not None
         return end.experiment.identifier.excitation(end.state.identifier)
+
+
+def _time(of: Callable[..., Array]) -> Callable[[GainMetric, ObserverGains, Array], Array]:
+    """A convergence time that follows from gains, f_plus and the errors at the start."""
+    return lambda _, g, f_plus: of(g.lambda_, g.alpha, f_plus, g.position_error, g.velocity_error)
+
+
+def _margin(name: str, condition: conditions.Condition) -> type[GainMetric]:
+    def judge(self: Any, gains: ObserverGains, f_plus: Array) -> Array:
+        return gains.lambda_ / condition.least_lambda(gains.alpha, f_plus)
+
+    about = f"margin to {condition.title}", f"λ over the least λ of {condition.title}"
+    return GainMetric.of(f"margin_{name}", "", *about, judge=judge)
+
+
+for _metric in (
+    Converged,
+    ConvergenceTime,
+    GainMetric.of(
+        "convergence_time_bound", "s", "bound on convergence time",
+        "bound (42) on it for the noise-free observer; inf where (32) fails",
+        judge=_time(conditions.convergence_time_bound),
+    ),
+    GainMetric.of(
+        "convergence_time_worst", "s", "worst convergence time",
+        "longest convergence time that a disturbance within f_plus can cause; inf where ρ ≥ 1",
+        judge=_time(conditions.convergence_time_worst),
+    ),
+    Rms.of("position_rmse", "rad", "position error, rms", "rms position error", signal=lambda _, at: at.position_error),
+    Rms.of("velocity_rmse", "rad/s", "velocity error, rms", "rms velocity error", signal=lambda _, at: at.velocity_error),
+    Rms.of(
+        "torque_rmse", "N m", "torque error, rms",
+        "rms error of the transmitted torque from this side's equivalent control",
+        signal=lambda _, at: at.torque_error,
+    ),
+    Rms.of(
+        "position_size", "rad", "position, rms", "rms true position: the size that its errors compare with",
+        signal=lambda _, at: at.true.position,
+    ),
+    Rms.of(
+        "velocity_size", "rad/s", "velocity, rms", "rms true velocity: the size that its errors compare with",
+        signal=lambda _, at: at.true.velocity,
+    ),
+    Chatter,
+    Peak.of(
+        "f_plus", "rad/s²", "true bound f⁺", "largest true right-hand side error |f(x₂) − f(x̂₂) + ξ| along the run",
+        signal=lambda _, at: at.true.perturbation,
+    ),
+    Peak.of(
+        "f_plus_acceleration", "rad/s²", "twice the largest acceleration",
+        "twice the largest acceleration: the paper's text for f⁺",
+        signal=lambda _, at: at.true.acceleration,
+        factor=2.0,
+    ),
+    GainMetric.of(
+        "margin_alpha", "", "α / f⁺", "gain alpha over the true bound f_plus",
+        judge=lambda _, gains, f_plus: gains.alpha / f_plus,
+    ),
+    *(_margin(name, condition) for name, condition in conditions.CONDITIONS.items()),
+    IdentificationError.of("stiffness_error", "", "error of K", "relative error of the identified stiffness"),
+    IdentificationError.of(
+        "dead_zone_error", "", "error of the dead zone",
+        "relative error of the identified dead zone (half gap of law dead_zone)",
+    ),
+    Excitation,
+):  # fmt: skip
+    SIDE_METRICS.add(_metric)
 
 
 @functools.cache
@@ -428,6 +334,14 @@ def window_start(steps: int) -> int:
 def _init(experiment: Experiment) -> dict[str, tuple]:
     zero = jnp.zeros_like(experiment.run.sample_period)
     return {side: tuple(metric.init(zero) for metric in _carries(experiment).values()) for side in experiment.sides}
+
+
+def identified(experiment: Experiment, state: State) -> Mapping[str, Mapping[str, Number]]:
+    """Identified parameters of the transmission by side; none without an identifier."""
+    if state.identifier is None:
+        return {}
+    assert experiment.identifier is not None and experiment.transmission is not None
+    return experiment.identifier.estimate(state.identifier, experiment.transmission)
 
 
 def _update(experiment: Experiment, totals: dict[str, tuple], index: Int[Array, ""], signals: Signals) -> dict[str, tuple]:
@@ -458,14 +372,11 @@ _OVERFLOW = ("position_rmse", "velocity_rmse", "torque_rmse", "f_plus", "f_plus_
 def _result(experiment: Experiment, totals: dict[str, tuple], state: State) -> dict[str, Array]:
     run = experiment.run
     first = window_start(run.steps)
-    identified: Mapping[str, Any] = {}
-    if state.identifier is not None:
-        assert experiment.identifier is not None and experiment.transmission is not None
-        identified = experiment.identifier.estimate(state.identifier, experiment.transmission)
+    parameters = identified(experiment, state)
     figures: dict[str, Array] = {}
     finite = jnp.asarray(True)
     for side, total in totals.items():
-        end = SideEnd(experiment, state, first * run.sample_period, run.steps - first, identified.get(side, {}))
+        end = SideEnd(experiment, state, first * run.sample_period, run.steps - first, parameters.get(side, {}))
         carries = dict(zip(_carries(experiment), total, strict=True))
         out = {
             name: metric.result(carries[metric.carry or name], end)
@@ -517,16 +428,13 @@ def _judged(lambda_: Array, alpha: Array, position_error: Array, velocity_error:
     return {name: jnp.where(jnp.isnan(f_plus), jnp.nan, value) for name, value in out.items()}
 
 
-class _Finite(Metric):
-    """The one column that is not of a side."""
-
-    label = "finite"
-    doc = "no number of the lane overflowed"
+_FINITE = Metric.of("finite", "", "finite", "no number of the lane overflowed")
+"""The one column that is not of a side."""
 
 
 def metric_of(column: str) -> type[Metric]:
     """The metric of a column such as `motor.velocity_rmse`."""
-    return _Finite if column == "finite" else SIDE_METRICS[column.partition(".")[2]]
+    return _FINITE if column == "finite" else SIDE_METRICS[column.partition(".")[2]]
 
 
 def metric_columns(experiment: Experiment) -> list[str]:

@@ -21,19 +21,12 @@ from .metrics import metric_columns
 from .refine import CellGrid, Criterion
 
 AxisColumns = dict[str, np.ndarray]
+"""Values of axes that advance together, by path: columns of equal length."""
 
 _MOST_RUNS = 1e10
+"""Days of computing on the fastest machines (benchmarks/NOTES.md): more is a slip in the axes."""
 _MOST_VALUES = 10_000_000
 """Of one axis: its values are kept."""
-
-
-class AxisBlock(NamedTuple):
-    """Axes that advance together: columns of equal length by path."""
-
-    columns: AxisColumns
-
-    def __len__(self) -> int:
-        return len(next(iter(self.columns.values())))
 
 
 class Group(NamedTuple):
@@ -71,17 +64,18 @@ class Points:
         refined = self._refined(config)
         depth = config.sweep.refine or 0
         blocks = self._blocks(config, dict.fromkeys(refined, depth))
-        structural = [b for b in blocks if not all(path in self.leaves for path in b.columns)]
-        self._blocks_of_leaves = [b for b in blocks if all(path in self.leaves for path in b.columns)]
-        self.lanes = math.prod(len(b) for b in self._blocks_of_leaves)
+        structural = [b for b in blocks if not all(path in self.leaves for path in b)]
+        self._blocks_of_leaves = [b for b in blocks if all(path in self.leaves for path in b)]
+        self.lanes = _points_of(self._blocks_of_leaves)
         self.refinement: Refinement | None = None
         self.coarse_lanes = self.lanes
         if refined:
-            halved = [next(iter(b.columns)) in refined for b in self._blocks_of_leaves]
-            sizes = [(len(b) - 1 >> depth) + 1 if h else len(b) for b, h in zip(self._blocks_of_leaves, halved, strict=True)]
+            halved = [next(iter(b)) in refined for b in self._blocks_of_leaves]
+            fine = [_length(b) for b in self._blocks_of_leaves]
+            sizes = [(n - 1 >> depth) + 1 if h else n for n, h in zip(fine, halved, strict=True)]
             self.coarse_lanes = math.prod(sizes)
             self.refinement = Refinement(refined, CellGrid(sizes, halved, depth), _criterion(config, base, refined))
-        outside = math.prod(len(b) for b in structural) * config.sweep.seeds
+        outside = _points_of(structural) * config.sweep.seeds
         if (runs := outside * self.coarse_lanes) > _MOST_RUNS:
             raise InputError(f"axes: {runs:.2g} runs are more than {_MOST_RUNS:.0e}; fewer values, or a quasi-random design")
         if (runs := outside * self.lanes) > _MOST_RUNS:
@@ -90,7 +84,7 @@ class Points:
                 "it should be less, or the axes should have fewer values"
             )
         self.groups = []
-        for index in range(math.prod(len(b) for b in structural)):
+        for index in range(_points_of(structural)):
             values = {path: column[0] for path, column in _take(structural, np.array([index])).items()}
             values = {path: v.item() if isinstance(v, np.generic) else v for path, v in values.items()}
             self.groups.append(Group(with_values(base, values), values))
@@ -108,7 +102,7 @@ class Points:
 
     def values(self, path: str) -> np.ndarray:
         """All values of a lane axis in their order, those of the fine grid if it is refined."""
-        return next(block.columns[path] for block in self._blocks_of_leaves if path in block.columns)
+        return next(block[path] for block in self._blocks_of_leaves if path in block)
 
     def always_simulated(self, columns: Mapping[str, Any]) -> np.ndarray:
         """Which rows of a frame, or of its columns by name, are on points that are always simulated."""
@@ -154,7 +148,7 @@ class Points:
         base = with_values(config, first)
         return base, set(leaf_paths(base.build()))
 
-    def _blocks(self, config: Config, depths: Mapping[str, int]) -> list[AxisBlock]:
+    def _blocks(self, config: Config, depths: Mapping[str, int]) -> list[AxisColumns]:
         sampled = [axis for axis in config.axes if axis.values is None and axis.num is None]
         if sampled and config.sweep.design == "grid":
             i = config.axes.index(sampled[0])
@@ -173,31 +167,31 @@ class Points:
                 raise InputError(f"axes: '{axis.path}' is fixed at compile time; list its values instead of sampling it")
             if axis.zip is not None:
                 raise InputError(f"axes: '{axis.path}' is sampled quasi-randomly and cannot be zipped")
-        blocks: list[AxisBlock] = []
+        blocks: list[AxisColumns] = []
         labels: dict[str, int] = {}
         for axis in config.axes:
             if axis in sampled:
                 if axis is sampled[0]:
-                    blocks.append(AxisBlock(_quasi_random(sampled, config)))
+                    blocks.append(_quasi_random(sampled, config))
             elif axis.zip is None:
-                blocks.append(AxisBlock({axis.path: axis.grid(depths.get(axis.path, 0))}))
+                blocks.append({axis.path: axis.grid(depths.get(axis.path, 0))})
             elif axis.zip not in labels:
                 labels[axis.zip] = len(blocks)
-                blocks.append(AxisBlock({axis.path: axis.grid()}))
+                blocks.append({axis.path: axis.grid()})
             else:
                 block, values = blocks[labels[axis.zip]], axis.grid()
-                if len(values) != len(block):
+                if len(values) != (others := _length(block)):
                     raise InputError(
-                        f"axes: '{axis.path}' has {len(values)} values, the others zipped as '{axis.zip}' have {len(block)}"
+                        f"axes: '{axis.path}' has {len(values)} values, the others zipped as '{axis.zip}' have {others}"
                     )
-                block.columns[axis.path] = values
+                block[axis.path] = values
         for label, index in labels.items():
-            columns = blocks[index].columns
+            columns = blocks[index]
             if len(columns) < 2 or label in (*self.paths, "seed"):
                 raise InputError(
                     f"axes: zip = '{label}' should be a word of its own, the same on all axes that advance together"
                 )
-            if len(set(zip(*(column.tolist() for column in columns.values()), strict=True))) < len(blocks[index]):
+            if len(set(zip(*(column.tolist() for column in columns.values()), strict=True))) < _length(columns):
                 raise InputError(f"axes: the axes zipped as '{label}' list a point twice; their points should differ")
         return blocks
 
@@ -209,14 +203,22 @@ def _extremes(values: list[Any]) -> list[Any]:
     return [values[0], min(values), max(values)]
 
 
-def _take(blocks: list[AxisBlock], indices: np.ndarray) -> AxisColumns:
-    """AxisColumns of a product of blocks at some flat indices, last block fastest."""
+def _length(block: AxisColumns) -> int:
+    return len(next(iter(block.values())))
+
+
+def _points_of(blocks: list[AxisColumns]) -> int:
+    """Points of a product of blocks."""
+    return math.prod(_length(block) for block in blocks)
+
+
+def _take(blocks: list[AxisColumns], indices: np.ndarray) -> AxisColumns:
+    """Values of a product of blocks at some flat indices, last block fastest."""
     out: AxisColumns = {}
     remaining = indices
     for block in reversed(blocks):
-        for path, column in block.columns.items():
-            out[path] = column[remaining % len(block)]
-        remaining = remaining // len(block)
+        out |= {path: column[remaining % _length(block)] for path, column in block.items()}
+        remaining = remaining // _length(block)
     return out
 
 

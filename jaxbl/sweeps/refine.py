@@ -24,12 +24,8 @@ Indices = np.ndarray
 
 
 class Criterion(NamedTuple):
-    """When two neighbours disagree.
-
-    Attributes:
-        columns: metric columns that are compared.
-        tolerances: largest relative difference for each column; 0 for those that are true or false.
-    """
+    """When two neighbours disagree: in which metric columns, by more than which relative difference each (0 for columns that
+    are true or false)."""
 
     columns: tuple[str, ...]
     tolerances: tuple[float, ...]
@@ -68,18 +64,19 @@ class CellGrid:
         self.coarse_sizes = tuple(sizes)
         self.sizes = tuple((n - 1 << depth) + 1 if halved else n for n, halved in zip(sizes, refined, strict=True))
         steps = np.cumprod([1, *self.sizes[:0:-1]], dtype=np.int64)[::-1] if sizes else np.array([], np.int64)
-        self._all_steps = [int(step) for step in steps]
         self._refined = list(refined)
+        # of the coarse grid: distance of neighbours along each axis
+        self._strides = [int(step) << depth if halved else int(step) for step, halved in zip(steps, refined, strict=True)]
         # of the refined axes alone: distance of neighbours as flat indices, and vertices
-        self._steps = [step for step, halved in zip(self._all_steps, refined, strict=True) if halved]
+        self._steps = [int(step) for step, halved in zip(steps, refined, strict=True) if halved]
         self._sizes = [size for size, halved in zip(self.sizes, refined, strict=True) if halved]
 
     def coarse(self, positions: np.ndarray) -> Indices:
         """Flat indices of vertices of the coarse grid, given by their positions in it."""
         out = np.zeros(np.shape(positions), np.int64)
         remaining = np.asarray(positions, np.int64)
-        for size, step, halved in reversed(list(zip(self.coarse_sizes, self._all_steps, self._refined, strict=True))):
-            out += (remaining % size) * (step << self.depth if halved else step)
+        for size, stride in reversed(list(zip(self.coarse_sizes, self._strides, strict=True))):
+            out += (remaining % size) * stride
             remaining = remaining // size
         return out
 
@@ -93,8 +90,7 @@ class CellGrid:
 
     def _product(self, counts: Sequence[int]) -> Indices:
         out = np.zeros(1, np.int64)
-        for count, step, halved in zip(counts, self._all_steps, self._refined, strict=True):
-            stride = step << self.depth if halved else step
+        for count, stride in zip(counts, self._strides, strict=True):
             out = (out[:, None] + stride * np.arange(count)).ravel()
         return out
 
@@ -145,21 +141,6 @@ class CellGrid:
         return np.unique(cells)
 
 
-class _Known:
-    """Values of vertices, found by their flat index."""
-
-    def __init__(self, vertices: Indices, values: np.ndarray):
-        self.vertices, self.values = vertices, values
-
-    def __getitem__(self, vertices: Indices) -> np.ndarray:
-        return self.values[np.searchsorted(self.vertices, vertices)]
-
-    def add(self, vertices: Indices, values: np.ndarray) -> None:
-        order = np.argsort(np.concatenate([self.vertices, vertices]), kind="stable")
-        self.vertices = np.concatenate([self.vertices, vertices])[order]
-        self.values = np.concatenate([self.values, values])[order]
-
-
 def refine(
     grid: CellGrid,
     evaluate: Callable[[Indices], np.ndarray],
@@ -177,12 +158,14 @@ def refine(
         The vertices that were simulated, sorted, and their values.
     """
     vertices = grid.coarse_vertices()
-    known = _Known(vertices, evaluate(vertices))
+    values = evaluate(vertices)
+
+    def at(some: Indices) -> np.ndarray:
+        return values[np.searchsorted(vertices, some)]
 
     def around_hot_edges(cells: Indices, level: int) -> Indices:
         found = [
-            grid.around(axis, starts[differ(known[starts], known[ends])], level)
-            for axis, starts, ends in grid.edges(cells, level)
+            grid.around(axis, starts[differ(at(starts), at(ends))], level) for axis, starts, ends in grid.edges(cells, level)
         ]
         return np.unique(np.concatenate(found))
 
@@ -196,23 +179,16 @@ def refine(
             to_halve = [none] * target
             needed = hot[target]
             for level in range(target, 0, -1):
-                wanted = _union(hot[level - 1], grid.parents(needed, level))
-                needed = to_halve[level - 1] = _without(wanted, halved[level - 1])
+                wanted = np.union1d(hot[level - 1], grid.parents(needed, level))
+                needed = to_halve[level - 1] = np.setdiff1d(wanted, halved[level - 1], assume_unique=True)
             if not any(len(cells) for cells in to_halve):
                 break
             batch = np.unique(np.concatenate([grid.vertices(cells, i + 1) for i, cells in enumerate(to_halve)]))
-            batch = _without(batch, known.vertices)
+            batch = np.setdiff1d(batch, vertices, assume_unique=True)
             if len(batch):
-                known.add(batch, evaluate(batch))
+                new, places = evaluate(batch), np.searchsorted(vertices, batch)
+                vertices, values = np.insert(vertices, places, batch), np.insert(values, places, new, axis=0)
             for level, cells in enumerate(to_halve, 1):
-                halved[level - 1] = _union(halved[level - 1], cells)
-                hot[level] = _union(hot[level], around_hot_edges(grid.children(cells, level), level))
-    return known.vertices, known.values
-
-
-def _union(a: Indices, b: Indices) -> Indices:
-    return np.union1d(a, b)
-
-
-def _without(a: Indices, b: Indices) -> Indices:
-    return np.setdiff1d(a, b, assume_unique=True)
+                halved[level - 1] = np.union1d(halved[level - 1], cells)
+                hot[level] = np.union1d(hot[level], around_hot_edges(grid.children(cells, level), level))
+    return vertices, values

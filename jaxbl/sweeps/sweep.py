@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 _MOST_NUMBERS = 2e8
-"""Of a dataset that is mostly empty."""
+"""Of a dataset that is mostly empty: 1.6 GB."""
 
 
 @dataclasses.dataclass(frozen=True)

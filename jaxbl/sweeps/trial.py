@@ -18,7 +18,7 @@ from jaxbl.observer.conditions import CONDITIONS, peak_ratio
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.simulate import Experiment, Reducer, Signals, State, scan
 
-from .metrics import METRICS, observer_gains, with_conditions
+from .metrics import METRICS, identified, observer_gains, with_conditions
 from .store import identity
 
 
@@ -71,10 +71,8 @@ def run(study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every:
 
 def _last(experiment: Experiment, largest: Any, state: State) -> dict[str, Any]:
     figures = {"last.largest_torque": largest}
-    if state.identifier is not None:
-        assert experiment.identifier is not None and experiment.transmission is not None
-        for side, found in experiment.identifier.estimate(state.identifier, experiment.transmission).items():
-            figures |= {f"last.{side}.{name}": value for name, value in found.items()}
+    for side, found in identified(experiment, state).items():
+        figures |= {f"last.{side}.{name}": value for name, value in found.items()}
     return figures
 
 
@@ -105,21 +103,19 @@ def _row(experiment: Experiment, state: State, signals: Signals) -> dict[str, An
             f"{side}.equivalent_control": s.equivalent_control,
             f"{side}.torque_estimate": s.torque_estimate,
         }
-    if state.identifier is not None:
-        assert experiment.identifier is not None and experiment.transmission is not None
-        identified = experiment.identifier.estimate(state.identifier, experiment.transmission)
-        for side in experiment.sides:
-            row |= {f"{side}.{name}": value for name, value in identified[side].items()}
+    found = identified(experiment, state)
+    for side in experiment.sides:
+        row |= {f"{side}.{name}": value for name, value in found.get(side, {}).items()}
     return row
 
 
 def _summary(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed: int) -> dict[str, Any]:
     experiment = config.build()
-    identified: dict[str, Any] = {}
+    parameters: dict[str, Any] = {}
     if experiment.transmission is not None:
         for name, true in experiment.transmission.truth().items():
             sides = {side: last[f"last.{side}.{name}"] for side in experiment.sides}
-            identified[name] = {"true": true, **sides}
+            parameters[name] = {"true": true, **sides}
     conditions = {}
     for side in experiment.sides:
         f_plus = metrics[f"{side}.f_plus"]
@@ -130,7 +126,7 @@ def _summary(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed
         "single_run": identity(config, "simulate"),
         "seed": seed,
         "metrics": metrics,
-        "identified": identified,
+        "identified": parameters,
         "conditions": conditions,
         "remarks": [*config.notes, *_remarks(experiment, last, metrics, conditions)],
     }
