@@ -6,11 +6,14 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .errors import InputError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 LOG_RESULTS = ("inspection.json", "identification.json", "diagnosis.json")
 """What `inspect`, `identify` and `diagnose` write into a folder; each names the log that the results are of."""
@@ -42,9 +45,20 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def write_atomic(path: Path, content: str | bytes) -> None:
     """Write a file so that it is either there whole or not at all."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    draft = _draft(path)
     draft.write_bytes(content.encode() if isinstance(content, str) else content)
     draft.replace(path)
+
+
+def write_table(path: Path, frame: "pd.DataFrame") -> None:
+    """Write a Parquet file so that it is either there whole or not at all."""
+    draft = _draft(path)
+    frame.to_parquet(draft, index=False)
+    draft.replace(path)
+
+
+def _draft(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}")
 
 
 def make_folder(path: Path) -> None:

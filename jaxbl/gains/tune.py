@@ -10,7 +10,6 @@ study of its own, kept in the folder's `tune/`: an interrupted search goes on wh
 # pyright: reportGeneralTypeIssues=false
 
 import dataclasses
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,14 +20,12 @@ import pandas as pd
 
 from jaxbl.config import TUNE_NAMES, Config, TuneTable, read_config
 from jaxbl.errors import NoResult
-from jaxbl.files import make_folder, write_atomic
 from jaxbl.sweeps.metrics import undisturbed
-from jaxbl.sweeps.programs import Backend, backend_of
-from jaxbl.sweeps.store import backend_kept, claim, mark
-from jaxbl.sweeps.sweep import sweep
+from jaxbl.sweeps.programs import Backend
 from jaxbl.workers import Progress
 
 from .pilot import Scenarios, pilot, scenarios_of
+from .stages import Stages
 from .tune_summary import COMPARED, compared_figures, summarise
 
 Gains = dict[str, tuple[float, float]]
@@ -73,42 +70,27 @@ def tune(
 ) -> Tuning:
     """Choose lambda and alpha of both observers for a study.
 
+    `out`, `progress`, `devices`, `overwrite` and `backend` are as in :func:`jaxbl.sweep`, over all runs of the search.
+
     Args:
         study: TOML file, mapping or config; its `[tune]` table says what is asked of the gains, its axes are not used.
-        out: folder to keep the runs in; a search that was interrupted there goes on where it stopped. Without it nothing
-            is written.
-        progress: called with finished and total lanes of all stages.
-        devices: JAX devices to use; left out, all local ones.
-        overwrite: remove the results of another study from `out`.
-        backend: `fused` or `scan` (:func:`jaxbl.sweep`); left out, the faster one here.
 
     Raises:
         InputError: wrong config, a folder that holds something else, or a backend that cannot run the study.
         NoResult: no gains in the range meet the constraints, or the drive diverges.
     """
-    config, backend = read_config(study), backend_of(backend)
+    config = read_config(study)
     table = config.tune or TuneTable()
     config = config.model_copy(update={"tune": table})
     scenarios = scenarios_of(config, table)
-    stages, found = None, None
-    if out is not None:
-        claim(Path(out), config, "tune", overwrite=overwrite)
-        stages = Path(out) / "tune"
-        backend = backend_kept(stages / "manifest.json", backend)
-        if (stages / "manifest.json").exists():
-            found = json.loads((stages / "manifest.json").read_text(encoding="utf-8")).get("pilot")
-    search = Search(scenarios, table, found or pilot(scenarios, table), stages, devices, overwrite, backend)
-    if stages is not None and found is None:
-        # before the stages: it is what makes the folder this study's
-        make_folder(stages)
-        write_atomic(
-            stages / "manifest.json",
-            json.dumps(mark(config, "tune") | {"pilot": search.pilot, "backend": backend}, indent=2),
-        )
-    search.progress = progress
+    stages = Stages(config, "tune", out, progress, devices, overwrite, backend)
+    found = stages.found.get("pilot")
+    search = Search(scenarios, table, found or pilot(scenarios, table), stages)
+    if found is None:
+        stages.keep(pilot=search.pilot)
     search.run()
     summary = summarise(search, search.compare(held_out=False), search.compare(held_out=True))
-    return Tuning(config, summary, search.candidates, search.cost, tuple(search.scanned))
+    return Tuning(config, summary, search.candidates, stages.cost, tuple(stages.scanned))
 
 
 class Window(NamedTuple):
@@ -138,21 +120,9 @@ def _cell(ends: tuple[float, float], num: int) -> float:
 class Search:
     """The stages of a search: coarse map, zooms, comparison."""
 
-    def __init__(
-        self,
-        scenarios: Scenarios,
-        table: TuneTable,
-        pilot: dict[str, Any],
-        folder: Path | None,
-        devices: list[Any] | None,
-        overwrite: bool,
-        backend: Backend | None,
-    ):
-        self.scenarios, self.table, self.pilot = scenarios, table, pilot
-        self.folder, self.devices, self.overwrite, self.backend = folder, devices, overwrite, backend
+    def __init__(self, scenarios: Scenarios, table: TuneTable, pilot: dict[str, Any], stages: Stages):
+        self.scenarios, self.table, self.pilot, self.stages = scenarios, table, pilot, stages
         self.sides = tuple(pilot)
-        self.progress: Progress | None = None
-        self.metric = f"{table.objective}_rmse"
         self.f_plus = {side: float(found["f_plus"]) for side, found in pilot.items()}
         for side, bound in self.f_plus.items():
             if not bound > 0.0:
@@ -162,11 +132,8 @@ class Search:
         )
         self.windows = [dict.fromkeys(self.sides, self.limits)]
         self.candidates: dict[str, pd.DataFrame] = {}
-        self.cost = {"compile_seconds": 0.0, "run_seconds": 0.0, "lanes": 0.0}
-        self.scanned: dict[str, None] = {}
-        self._done = 0
         seeds, lanes = scenarios.config.sweep.seeds, len(scenarios.names)
-        self._total = seeds * lanes * (table.num**2 * (1 + table.refine) + 2 * len(self.gains_to_compare({})))
+        stages.total = seeds * lanes * (table.num**2 * (1 + table.refine) + 2 * len(self.gains_to_compare({})))
 
     def run(self) -> None:
         """Search. Raises `NoResult` where nothing is feasible."""
@@ -313,17 +280,7 @@ class Search:
             for label, columns in together
             for path, values in columns.items()
         ]
-        done = self._done
-
-        def update(finished: int, total: int) -> None:
-            self._done = done + finished
-            if self.progress:
-                self.progress(self._done, max(self._total, self._done))
-
-        folder = None if self.folder is None else self.folder / name
-        result = sweep(data, folder, progress=update, devices=self.devices, overwrite=self.overwrite, backend=self.backend)
-        self.scanned |= dict.fromkeys(result.scanned)
-        self.cost = {key: value + result.cost[key] for key, value in self.cost.items()}
+        result = self.stages.run(data, name)
         names = [f"{side}.{figure}" for side in self.sides for figure in COMPARED]
         paths = [axis["path"] for axis in data["axes"]]
         return result.read([*paths, "seed", "finite", *names])

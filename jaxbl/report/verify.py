@@ -15,7 +15,8 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxbl.gains.verify import Verdict, conditions_of, judged_sides
+from jaxbl.gains.error_system import conditions_of
+from jaxbl.gains.verify import Verdict, judged_sides
 from jaxbl.observer.conditions import CONDITIONS
 
 from .figures import Drawn

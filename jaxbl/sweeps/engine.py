@@ -28,8 +28,8 @@ _LANES_ON_A_GPU = 2**18
 
 
 class Chunk(NamedTuple):
-    """One call of a compiled program: every one of some seeds at every one of some points of a group (their indices), as many
-    of both as the layout's, or fewer."""
+    """One call of a compiled program: every one of some seeds at every one of some points of a group (their indices), as
+    many of both as the layout's, or fewer."""
 
     index: int
     group: int

@@ -15,12 +15,12 @@ import pyarrow.parquet as pq
 
 from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
-from jaxbl.files import LOG_RESULTS, log_named_in, make_folder, read_json, write_atomic
+from jaxbl.files import LOG_RESULTS, log_named_in, make_folder, read_json, write_atomic, write_table
 
 from .programs import Backend, Layout
 
 FORMAT = 2
-
+"""Of the manifest: raised where older versions could not read it."""
 
 _COMMANDS = {
     # command: its marker, which says whose the folder is; what it leaves; keys of the config that decide none of its numbers
@@ -29,7 +29,7 @@ _COMMANDS = {
     "verify": ("verify/manifest.json", ("verdict.json", "counterexamples.parquet", "verify"), ("tune",)),
     "tune": ("tune/manifest.json", ("gains.toml", "tuning.json", "tune"), ("axes", "verify")),
 }
-_COMMON = ("figures", "report.html")
+_COMMON = "figures", "report.html"
 
 
 def identity(config: Config, command: str = "sweep") -> str:
@@ -61,21 +61,6 @@ def mark(config: Config, command: str) -> dict[str, Any]:
     """What a command's marker says of its study: its own identity, and that of the study's single run."""
     own = {} if command == "simulate" else {"identity": identity(config, command)}
     return own | {"single_run": identity(config, "simulate"), "title": config.title}
-
-
-def backend_kept(marker: Path, asked: Backend | None) -> Backend | None:
-    """The backend that a search or verification was begun with, so that all of it is by one; as asked if none was begun.
-
-    Raises:
-        InputError: it was begun with another one than is asked for.
-    """
-    if not marker.exists():
-        return asked
-    begun = read_json(marker).get("backend")
-    if asked not in (None, begun):
-        how = f"with --backend {begun}; go on with that" if begun else "without --backend; go on without it"
-        raise InputError(f"{marker.parent.parent}: was begun {how}, or choose another folder with --out")
-    return begun
 
 
 def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bool = False) -> None:
@@ -115,18 +100,12 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
         raise InputError(
             f"{folder}: holds another study ('{title}', other numbers); choose another folder with --out, or --overwrite"
         )
-    for marker, outputs, _ in _COMMANDS.values():
-        for name in (marker, *outputs):
-            _remove(folder / name)
-    for name in _COMMON:
-        _remove(folder / name)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
+    left = [name for marker, outputs, _ in _COMMANDS.values() for name in (marker, *outputs)]
+    for path in (folder / name for name in (*left, *_COMMON)):
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
 
 
 class Store:
@@ -145,7 +124,7 @@ class Store:
             manifest = {
                 "format": FORMAT,
                 **mark(config, "sweep"),
-                "layout": {"seeds": layout.seeds, "points": layout.points},
+                "layout": layout._asdict(),
                 "backend": backend,
                 "parts": parts,
                 "rows": rows,
@@ -202,9 +181,7 @@ class Store:
             return False
 
     def write(self, index: int, frame: pd.DataFrame) -> None:
-        draft = self.part(index).with_suffix(f".{os.getpid()}.draft")
-        frame.to_parquet(draft, index=False)
-        draft.replace(self.part(index))
+        write_table(self.part(index), frame)
 
     def read_part(self, index: int, labels: dict[str, np.ndarray], columns: list[str]) -> pd.DataFrame | None:
         """Some columns of a chunk, or None where it is damaged or holds other rows than those of `labels`."""

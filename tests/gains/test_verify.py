@@ -12,7 +12,9 @@ from small_study import ALPHA, LAMBDA, listed, rigid
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
-from jaxbl.gains import verify as module
+from jaxbl.gains import error_system as module
+from jaxbl.gains.counterexamples import repeated
+from jaxbl.gains.stages import Stages
 from jaxbl.gains.verify import verify
 from jaxbl.sweeps.engine import Engine
 from jaxbl.sweeps.sweep import load, sweep
@@ -362,9 +364,7 @@ def test_a_long_period_is_the_cause_and_a_quarter_of_the_runs_own_mends_it(check
 def test_runs_repeated_for_their_cause_keep_their_noise():
     study = read_config(rigid(axes=GAINS, sweep={"seeds": 2, "first_seed": 5}))
     frame = sweep(study).frame
-    again = module._again(study, frame.iloc[[1, 5]], {}, {"run.substeps": 2})
-    repeated = sweep(again.study).frame
-    rows = repeated.iloc[again.positions(repeated)]
+    rows = repeated(study, frame.iloc[[1, 5]], {}, {"run.substeps": 2}, Stages(study, "verify"), "again")
     keys = [LAMBDA, ALPHA, "seed"]
     pd.testing.assert_frame_equal(rows[keys].reset_index(drop=True), frame.iloc[[1, 5]][keys].reset_index(drop=True))
     assert set(rows["seed"]) <= {5, 6}

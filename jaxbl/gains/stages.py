@@ -1,0 +1,93 @@
+"""A command that runs several studies, one after the other: their folder, backend, progress and cost."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from jaxbl.config import Config
+from jaxbl.errors import InputError
+from jaxbl.files import make_folder, read_json, write_atomic
+from jaxbl.sweeps.programs import Backend, backend_of
+from jaxbl.sweeps.store import claim, mark
+from jaxbl.sweeps.sweep import StudyResult, sweep
+from jaxbl.workers import Progress
+
+
+class Stages:
+    """The studies of `tune` or `verify`, kept in a folder of this name in the study's folder; without one nothing is kept.
+
+    Raises:
+        InputError: the folder holds something else, or was begun with another backend: all of it is by one.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        command: str,
+        out: str | Path | None = None,
+        progress: Progress | None = None,
+        devices: list[Any] | None = None,
+        overwrite: bool = False,
+        backend: Backend | None = None,
+    ):
+        self.folder: Path | None = None
+        self.devices = devices
+        self.found: dict[str, Any] = {}
+        """The manifest that an earlier call left."""
+        self.total = 0
+        """Lanes of all stages."""
+        self.scanned: dict[str, None] = {}
+        """What the fused loop did not know of runs that were scanned in its place."""
+        self.cost = {"compile_seconds": 0.0, "run_seconds": 0.0, "lanes": 0.0}
+        self._config, self._command, self._progress, self._overwrite = config, command, progress, overwrite
+        self._backend: Backend | None = backend_of(backend)
+        self._done = 0
+        if out is None:
+            return
+        claim(Path(out), config, command, overwrite=overwrite)
+        self.folder = Path(out) / command
+        if (self.folder / "manifest.json").exists():
+            self.found = read_json(self.folder / "manifest.json")
+            begun = self.found.get("backend")
+            if backend not in (None, begun):
+                how = f"with --backend {begun}; go on with that" if begun else "without --backend; go on without it"
+                raise InputError(f"{out}: was begun {how}, or choose another folder with --out")
+            self._backend = backend_of(begun)
+
+    def keep(self, **found: Any) -> None:
+        """Write the manifest, which makes the folder this study's, with something that was found before the stages."""
+        if self.folder is not None:
+            make_folder(self.folder)
+            manifest = mark(self._config, self._command) | found | {"backend": self._backend}
+            write_atomic(self.folder / "manifest.json", json.dumps(manifest, indent=2))
+
+    def place(self, *names: str) -> Path | None:
+        """A path in the folder, if there is one."""
+        return None if self.folder is None else self.folder.joinpath(*names)
+
+    def run(self, study: Config | dict[str, Any], name: str) -> StudyResult:
+        """Run a stage, or go on with it."""
+        before = self._done
+
+        def update(finished: int, _: int) -> None:
+            self._done = before + finished
+            if self._progress:
+                self._progress(self._done, max(self.total, self._done))
+
+        result = sweep(
+            study,
+            self.place(name),
+            progress=update,
+            devices=self.devices,
+            overwrite=self._overwrite,
+            backend=self._backend,
+        )
+        self.scanned |= dict.fromkeys(result.scanned)
+        self.cost = {key: value + result.cost[key] for key, value in self.cost.items()}
+        return result
+
+    def rerun(self, study: Config | dict[str, Any], *names: str) -> pd.DataFrame:
+        """Runs besides the stages, by the backend that is faster for them; other ones in their place are removed."""
+        return sweep(study, self.place(*names), devices=self.devices, overwrite=True).frame
