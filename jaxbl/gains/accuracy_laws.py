@@ -20,6 +20,7 @@ import pandas as pd
 
 from jaxbl.config import Config, FigureTable
 from jaxbl.errors import InputError
+from jaxbl.files import plain
 from jaxbl.validation import nearest
 
 if TYPE_CHECKING:
@@ -43,7 +44,6 @@ _FLOOR = 3.0  # times another cause's error: that is then a third of it, 6 % in 
 _SIGNAL = 3.0  # the signal is less than so many errors: no estimate any more
 _NEAR = 10.0  # beyond a law's end, a cause of this strength is named: a tenth of the error, or an error of a tenth
 _PERIOD_EXPONENT = 0.1  # of the error in the period, under noise; white noise alone gives 1/2
-
 
 _SIZES = ("position_size", "velocity_size", "velocity_rmse")
 
@@ -93,7 +93,7 @@ class Law:
     stops: dict[str, str]
     x_values: np.ndarray
     y_values: np.ndarray
-    figure: int = 0
+    figure: int
 
     @property
     def slope(self) -> float | None:
@@ -173,8 +173,7 @@ def fit_power_law(x: np.ndarray, y: np.ndarray, usable: np.ndarray | None = None
 def _line(log_x: np.ndarray, log_y: np.ndarray, first: int, last: int) -> tuple[PowerLawFit, float]:
     """Least squares over a run, and the largest residual in ln y."""
     u, v = log_x[first : last + 1], log_y[first : last + 1]
-    about = u - u.mean()
-    slope = float(about @ v / (about @ about))
+    about, slope = u - u.mean(), _slope(u, v)
     intercept = float(v.mean() - slope * u.mean())
     residual = v - intercept - slope * u
     error = math.sqrt(float(residual @ residual) / (len(u) - 2) / float(about @ about))
@@ -215,7 +214,7 @@ def accuracy_laws(result: "StudyResult", figures: list[FigureTable] | None = Non
         side = figure.value.partition(".")[0]
         sizes = [f"{side}.{name}" for name in _SIZES if f"{side}.{name}" in result.columns]
         frame = result.read([*(axis.path for axis in config.axes), "finite", figure.value, *sizes])
-        found += [dataclasses.replace(law, figure=index) for law in _of_figure(config, frame, figure)]
+        found += _of_figure(config, frame, figure, index)
     return found
 
 
@@ -286,22 +285,18 @@ def _rows(frame: pd.DataFrame, fixed: dict[str, Any]) -> pd.DataFrame:
     return frame[keep]
 
 
-def _of_figure(config: Config, frame: pd.DataFrame, figure: FigureTable) -> Iterator[Law]:
+def _of_figure(config: Config, frame: pd.DataFrame, figure: FigureTable, index: int) -> Iterator[Law]:
     """The laws of a figure: one a panel and series."""
     assert figure.theory is not None
     fixed = fixed_values(config, figure)
     chosen = _rows(frame, fixed)
     for facet in [None] if figure.facet is None else sorted(chosen[figure.facet].unique()):
         for name in [None] if figure.series is None else sorted(chosen[figure.series].unique()):
-            where = fixed | ({} if figure.facet is None else {figure.facet: _plain(facet)})
-            series = {} if figure.series is None else {figure.series: _plain(name)}
+            where = fixed | ({} if figure.facet is None else {figure.facet: plain(facet)})
+            series = {} if figure.series is None else {figure.series: plain(name)}
             line = _Line(config, frame, figure, where | series)
             fit = fit_power_law(line.x, line.y, line.usable)
-            yield Law(figure.value, figure.x, series, where, figure.theory, fit, line.stops(fit), line.x, line.y)
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value
+            yield Law(figure.value, figure.x, series, where, figure.theory, fit, line.stops(fit), line.x, line.y, index)
 
 
 class _Line:

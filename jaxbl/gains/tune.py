@@ -26,7 +26,7 @@ from jaxbl.workers import Progress
 
 from .pilot import Scenarios, pilot, scenarios_of
 from .stages import Stages
-from .tune_summary import COMPARED, compared_figures, summarise
+from .tune_summary import COMPARED, Summary, compared_figures
 
 Gains = dict[str, tuple[float, float]]
 """lambda (rad^0.5/s) and alpha (rad/s^2) of each side."""
@@ -89,7 +89,7 @@ def tune(
     if found is None:
         stages.keep(pilot=search.pilot)
     search.run()
-    summary = summarise(search, search.compare(held_out=False), search.compare(held_out=True))
+    summary = Summary(search, search.compare(held_out=False), search.compare(held_out=True)).plain()
     return Tuning(config, summary, search.candidates, stages.cost, tuple(stages.scanned))
 
 
@@ -142,15 +142,12 @@ class Search:
                 last = self.windows[-1]
                 if all(_cell(ends, self.table.num) - 1.0 < _FINEST for w in last.values() for ends in w):
                     break
-                best = {side: self.best(side) for side in self.sides}
-                self.windows.append(
-                    {
-                        side: last[side].around(
-                            best[side]["alpha_ratio"], best[side]["lambda_ratio"], self.table.num, self.limits
-                        )
-                        for side in self.sides
-                    }
-                )
+                windows = {}
+                for side in self.sides:
+                    best = self.best(side)
+                    centre = best["alpha_ratio"], best["lambda_ratio"]
+                    windows[side] = last[side].around(*centre, self.table.num, self.limits)
+                self.windows.append(windows)
             self._map(stage)
 
     def best(self, side: str) -> dict[str, Any]:
@@ -160,9 +157,8 @@ class Search:
 
     def cells(self, side: str) -> dict[str, float]:
         """Ratio of neighbouring values of each gain in the last stage."""
-        return {
-            key: _cell(ends, self.table.num) for key, ends in zip(("alpha", "lambda"), self.windows[-1][side], strict=True)
-        }
+        window, num = self.windows[-1][side], self.table.num
+        return {"alpha": _cell(window.alpha, num), "lambda": _cell(window.lambda_, num)}
 
     def _map(self, stage: int) -> None:
         """Run the points of a stage and judge them."""
@@ -221,19 +217,16 @@ class Search:
             f"all constraints in all runs; how many keep each: {counts}"
         )
 
-    def usual(self) -> Gains:
-        """Levant's usual rule at the pilot's f_plus."""
-        return {side: (USUAL_LAMBDA * math.sqrt(bound), USUAL_ALPHA * bound) for side, bound in self.f_plus.items()}
-
     def gains_to_compare(self, tuned: Gains) -> dict[str, Gains]:
         """Gains of both sides by name."""
+        usual = {side: (USUAL_LAMBDA * math.sqrt(bound), USUAL_ALPHA * bound) for side, bound in self.f_plus.items()}
         observers = {side: getattr(self.scenarios.config.observer, side) for side in self.sides}
         own = {side: (float(observer.lambda_), float(observer.alpha)) for side, observer in observers.items()}
         others = {
             other.name: {side: (getattr(other, side).lambda_, getattr(other, side).alpha) for side in self.sides}
             for other in self.table.compare
         }
-        return dict(zip(TUNE_NAMES, (tuned, self.usual(), own), strict=True)) | others
+        return dict(zip(TUNE_NAMES, (tuned, usual, own), strict=True)) | others
 
     def compare(self, *, held_out: bool) -> list[dict[str, Any]]:
         """Figures of all named gains, one row for each name and side: on the study's own runs, or on the held-out input with
@@ -253,11 +246,8 @@ class Search:
             for side, (lambda_, alpha) in gains.items():
                 own = (frame[f"observer.{side}.lambda"] == lambda_) & (frame[f"observer.{side}.alpha"] == alpha)
                 # another pair may share this side's gains: its runs are the same
-                rows.append(
-                    compared_figures(
-                        name, side, frame[own].drop_duplicates([*self.scenarios.columns, "seed"]), (lambda_, alpha)
-                    )
-                )
+                runs = frame[own].drop_duplicates([*self.scenarios.columns, "seed"])
+                rows.append(compared_figures(name, side, runs, (lambda_, alpha)))
         return rows
 
     def _sweep(self, name: str, axes: list[tuple[str, dict[str, list[float]]]], *, held_out: bool = False) -> pd.DataFrame:
@@ -286,21 +276,19 @@ class Search:
         return result.read([*paths, "seed", "finite", *names])
 
 
-_LARGEST = ("velocity_rmse", "torque_rmse", "convergence_time", "convergence_time_worst", "f_plus")
+_WORST = {
+    **dict.fromkeys(("velocity_rmse", "torque_rmse", "convergence_time", "convergence_time_worst", "f_plus"), "max"),
+    **dict.fromkeys(("margin_alpha", "margin_exact", "converged", "finite"), "min"),
+}
+"""How figures of several runs become one."""
 
 
 def _worst(frame: pd.DataFrame, side: str) -> pd.DataFrame:
     """One row for each pair of gains: the worst over scenarios and seeds; NaN where a run diverged or did not converge."""
     keys = [f"observer.{side}.lambda", f"observer.{side}.alpha"]
     part = frame[[*keys, "finite"]].assign(**{name: frame[f"{side}.{name}"] for name in COMPARED})
-    groups = part.groupby(keys, sort=True)
-    worst = {name: groups[name].max() for name in _LARGEST}
-    least = {name: groups[name].min() for name in ("margin_alpha", "margin_exact", "converged", "finite")}
-    found = pd.DataFrame(worst | least)
-    found["converged"] = found["converged"].astype(bool)
-    found["finite"] = found["finite"].astype(bool)
+    found = part.groupby(keys, sort=True).agg(_WORST).astype({"converged": bool, "finite": bool})
     # the largest of some is not the largest of all
     found.loc[~found["converged"], "convergence_time"] = np.nan
-    numbers = [*worst, "margin_alpha", "margin_exact"]
-    found.loc[~found["finite"], numbers] = np.nan
+    found.loc[~found["finite"], [name for name in _WORST if name not in ("converged", "finite")]] = np.nan
     return found.rename_axis(["lambda", "alpha"]).reset_index()

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
+from jaxbl.files import plain
 from jaxbl.observer.conditions import peak_ratio
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
@@ -30,7 +31,8 @@ COMPARED = (
 )
 """Metrics of a side that gains are judged by."""
 
-_FLAT, _WORTH = 0.05, 0.01  # relative differences of errors
+_FLAT = 0.05  # errors that differ by less are as good in practice
+_WORTH = 0.01  # a constraint that costs less is not worth a remark
 
 
 def pareto_front(candidates: pd.DataFrame) -> pd.DataFrame:
@@ -40,7 +42,7 @@ def pareto_front(candidates: pd.DataFrame) -> pd.DataFrame:
     return feasible[feasible["error"] < before]
 
 
-def summarise(search: "Search", named: list[dict[str, Any]], held_out: list[dict[str, Any]]) -> dict[str, Any]:
+class Summary:
     """Plain data of a finished search, as in `tuning.json`.
 
     Args:
@@ -48,10 +50,7 @@ def summarise(search: "Search", named: list[dict[str, Any]], held_out: list[dict
         named: a row for each of the gains compared and each side (:func:`compared_figures`), on the study's own runs.
         held_out: the same on the held-out ones.
     """
-    return _Summary(search, named, held_out).plain()
 
-
-class _Summary:
     def __init__(self, search: "Search", named: list[dict[str, Any]], held_out: list[dict[str, Any]]):
         self.search, self.table, self.config = search, search.table, search.scenarios.config
         self.best = {side: search.best(side) for side in search.sides}
@@ -59,6 +58,7 @@ class _Summary:
         self.factors = {side: self._factors(side) for side in search.sides}
 
     def plain(self) -> dict[str, Any]:
+        """All of it."""
         search, table, sides = self.search, self.table, self.search.sides
         first, seeds = self.config.sweep.first_seed, self.config.sweep.seeds
         unit = SIDE_METRICS[f"{table.objective}_rmse"].unit
@@ -86,16 +86,18 @@ class _Summary:
                 "rows": self.rows,
                 "factors": self.factors,
             },
-            "pareto": {side: _records(pareto_front(search.candidates[side])) for side in sides},
+            "pareto": {side: self._front(side) for side in sides},
             "remarks": [*self.config.notes, *self._remarks()],
         }
 
     def _achieved(self, side: str) -> dict[str, Any]:
         row = self.best[side]
-        names = [name for name in COMPARED if name != "converged"]
-        return {name: plain_number(row[name]) for name in names} | {
-            "peak_ratio": _peak_ratio(row["lambda"], row["alpha"], row["f_plus"])
-        }
+        ratio = _peak_ratio(row["lambda"], row["alpha"], row["f_plus"])
+        return plain({name: row[name] for name in COMPARED if name != "converged"} | {"peak_ratio": ratio})
+
+    def _front(self, side: str) -> list[dict[str, Any]]:
+        names = ["lambda", "alpha", "lambda_ratio", "alpha_ratio", "convergence_time", "error"]
+        return plain(pareto_front(self.search.candidates[side])[names].to_dict("records"))
 
     def row(self, name: str, side: str) -> dict[str, Any]:
         return next(row for row in self.rows if (row["name"], row["side"]) == (name, side))
@@ -219,30 +221,18 @@ def compared_figures(name: str, side: str, runs: pd.DataFrame, gains: tuple[floa
     }  # fmt: skip
     for figure in ("velocity_rmse", "torque_rmse", "convergence_time"):
         whole = converged.all() if figure == "convergence_time" else finite.all()
-        values = figures[figure]
-        row[figure] = {"worst": plain_number(values.max()) if whole else None, "median": plain_number(values.median())}
-    for figure in ("margin_alpha", "margin_exact"):
-        row[figure] = plain_number(figures[figure].min()) if finite.all() else None
-    # what a disturbance within f_plus could make of it
-    row["convergence_time_worst"] = plain_number(figures["convergence_time_worst"].max()) if finite.all() else None
-    return row | {"f_plus": plain_number(bound), "peak_ratio": _peak_ratio(*gains, bound)}
-
-
-def _records(front: pd.DataFrame) -> list[dict[str, Any]]:
-    names = ["lambda", "alpha", "lambda_ratio", "alpha_ratio", "convergence_time", "error"]
-    return [{name: plain_number(row[name]) for name in names} for _, row in front.iterrows()]
+        row[figure] = {"worst": figures[figure].max() if whole else None, "median": figures[figure].median()}
+    # the worst that a disturbance within f_plus could make of convergence, too
+    worst = {name: figures[name].min() for name in ("margin_alpha", "margin_exact")}
+    worst["convergence_time_worst"] = figures["convergence_time_worst"].max()
+    row |= worst if finite.all() else dict.fromkeys(worst)
+    return plain(row | {"f_plus": bound, "peak_ratio": _peak_ratio(*gains, bound)})
 
 
 def _peak_ratio(lambda_: float, alpha: float, f_plus: float) -> float | None:
     with jax.enable_x64(True):
-        return plain_number(peak_ratio(*(jnp.asarray(float(x)) for x in (lambda_, alpha, f_plus))))
+        return plain(peak_ratio(*(jnp.asarray(float(x)) for x in (lambda_, alpha, f_plus))))
 
 
 def _ratio(value: float | None, other: float | None) -> float | None:
     return None if value is None or not other else value / other
-
-
-def plain_number(value: Any) -> float | None:
-    """A number that JSON knows: what is not finite becomes None."""
-    value = float(value)
-    return value if math.isfinite(value) else None
