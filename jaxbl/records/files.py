@@ -8,6 +8,8 @@ import io
 import json
 import re
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -82,11 +84,7 @@ class LogFile:
         return values
 
     def same_length(self, values: np.ndarray, length: int, column: str | int) -> np.ndarray:
-        """The values of a column, which should be as many as there are time stamps.
-
-        Raises:
-            InputError: they are not.
-        """
+        """The values of a column; InputError where they are not as many as there are time stamps."""
         if len(values) != length:
             raise self.wrong(
                 f"column {column!r} has {len(values)} values and the time {length}; they should be equally many"
@@ -101,54 +99,62 @@ def read_log_file(path: Path) -> LogFile:
         InputError: the file is missing, empty, or of no known kind.
     """
     try:
-        content = path.read_bytes()
+        return LogFile(path, _columns(path))
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
+        why = "no such file"
     except IsADirectoryError:
-        raise InputError(f"{path}: is a folder; a log file is needed") from None
+        why = "is a folder; a log file is needed"
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+        why = f"cannot be read: {error.strerror}"
+    except InputError as error:
+        why = str(error)
+    raise InputError(f"{path}: {why}")
+
+
+def _columns(path: Path) -> dict[str | int, Any]:
+    content, suffix = path.read_bytes(), path.suffix.lower()
     if not content.strip():
-        raise InputError(f"{path}: is empty; {_KINDS}")
-    suffix = path.suffix.lower()
+        raise InputError(f"is empty; {_KINDS}")
     if content.startswith(b"PAR1"):
-        return LogFile(path, _parquet(path))
-    if content.startswith(b"\x89HDF"):
-        return LogFile(path, _hdf5(path))
+        with _reading("Parquet"):
+            frame = pd.read_parquet(path)
+        return {str(name): frame[name].to_numpy() for name in frame.columns}
+    # MATLAB 7.3 puts half a kilobyte before it
+    if b"\x89HDF" in (content[:4], content[512:516]):
+        return _hdf5(path)
     if suffix == ".mat":
-        return LogFile(path, _matlab(path))
+        return _matlab(path)
     if b"\0" in content:
-        raise InputError(f"{path}: is not a log of a known kind; {_KINDS}")
+        raise InputError(f"is not a log of a known kind; {_KINDS}")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = content.decode("latin-1")  # a degree sign in a header of an old program
-    if suffix == ".json" or text.lstrip()[0] in "[{":
-        return LogFile(path, _json(path, text))
-    return LogFile(path, _text(path, text))
+    return _json(text) if suffix == ".json" or text.lstrip()[0] in "[{" else _text(text)
 
 
-def _parquet(path: Path) -> dict[str | int, Any]:
+@contextmanager
+def _reading(kind: str) -> Iterator[None]:
+    """Errors of the libraries that read files, which are of many classes, in one line."""
     try:
-        frame = pd.read_parquet(path)
-    except Exception as error:  # pyarrow has many kinds
-        raise InputError(f"{path}: cannot be read as Parquet: {_first_line(error)}") from None
-    return {str(name): frame[name].to_numpy() for name in frame.columns}
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        first = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"cannot be read as {kind}: {first}") from None
 
 
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eEdD][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
+_NO_ROWS = "has a header and no rows; a log needs rows of numbers"
 
 
-def _text(path: Path, text: str) -> dict[str | int, Any]:
+def _text(text: str) -> dict[str | int, Any]:
     """Comma, semicolon, tab or white space between columns; a header or none; # before remarks."""
     lines = text.splitlines()
     skipped = next((i for i, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), None)
     if skipped is None:
-        raise InputError(f"{path}: holds only remarks; rows of numbers are needed")
+        raise InputError("holds only remarks; rows of numbers are needed")
     first = lines[skipped]
     # a comma between digits may be a decimal one, but not where nothing else separates
     separator = next((c for c in ";\t," if c in first), r"\s+")
@@ -159,13 +165,13 @@ def _text(path: Path, text: str) -> dict[str | int, Any]:
         cells = [*cells, ""]  # a separator at the end of the rows
     sample = "\n".join(lines[skipped + header : skipped + header + 50])
     decimal = "," if separator != "," and re.search(r"\d,\d", sample) and not re.search(r"\d\.\d", sample) else "."
-    try:
-        with warnings.catch_warnings(action="error", category=pd.errors.ParserWarning):
+    with _reading("a table"), warnings.catch_warnings(action="error", category=pd.errors.ParserWarning):
+        try:
             frame = pd.read_csv(
                 io.StringIO(text),
                 sep=separator,
                 header=None,
-                names=_names(path, cells) if header else None,
+                names=_names(cells) if header else None,
                 skiprows=skipped + header,
                 comment="#",
                 skipinitialspace=True,
@@ -173,14 +179,12 @@ def _text(path: Path, text: str) -> dict[str | int, Any]:
                 index_col=False,
                 low_memory=False,
             )
-    except (ValueError, pd.errors.ParserWarning) as error:
-        if "No columns" in str(error):
-            raise InputError(f"{path}: has a header and no rows; a log needs rows of numbers") from None
-        if isinstance(error, pd.errors.ParserWarning):
-            raise InputError(f"{path}: rows have more columns than the header; they should have {len(cells)}") from None
-        raise InputError(f"{path}: cannot be read as a table: {_first_line(error)}") from None
+        except pd.errors.EmptyDataError:
+            raise InputError(_NO_ROWS) from None
+        except pd.errors.ParserWarning:
+            raise InputError(f"rows have more columns than the header; they should have {len(cells)}") from None
     if not len(frame):
-        raise InputError(f"{path}: has a header and no rows; a log needs rows of numbers")
+        raise InputError(_NO_ROWS)
     return {name if isinstance(name, str) else int(name): frame[name].to_numpy() for name in frame.columns}
 
 
@@ -189,57 +193,50 @@ def _cells(line: str, separator: str) -> list[str]:
     return [cell.strip() for cell in cells]
 
 
-def _names(path: Path, cells: list[str]) -> list[str]:
+def _names(cells: list[str]) -> list[str]:
     if cells and not cells[-1]:
         cells = [*cells[:-1], f"column {len(cells) - 1}"]  # a separator at the end of the lines
     for i, cell in enumerate(cells):
         if cell in cells[:i]:
-            raise InputError(f"{path}: two columns are called '{cell}'; names should differ")
+            raise InputError(f"two columns are called '{cell}'; names should differ")
     return cells
 
 
-def _json(path: Path, text: str) -> dict[str | int, Any]:
+def _json(text: str) -> dict[str | int, Any]:
     """An array of objects, an object that holds one, or an object of arrays."""
     try:
         data = json.loads(text)
     except ValueError as error:
-        raise InputError(f"{path}: is not valid JSON: {error}") from None
+        raise InputError(f"is not valid JSON: {error}") from None
     if isinstance(data, dict):
         rows = [value for value in data.values() if isinstance(value, list) and value and isinstance(value[0], dict)]
-        if len(rows) == 1:
-            data = rows[0]
-        else:
-            columns = {name: _plain(value) for name, value in data.items() if isinstance(value, list)}
+        if len(rows) != 1:
+            columns: dict[str | int, Any] = {name: _plain(value) for name, value in data.items() if isinstance(value, list)}
             if not columns:
-                raise InputError(f"{path}: holds no array of rows or of numbers; a log needs one")
-            return columns  # type: ignore[return-value]
+                raise InputError("holds no array of rows or of numbers; a log needs one")
+            return columns
+        data = rows[0]
     if not data or not all(isinstance(row, dict) for row in data):
-        raise InputError(f"{path}: should hold an array of objects, one a row")
+        raise InputError("should hold an array of objects, one a row")
     names = dict.fromkeys(name for row in data for name in row)
     return {name: _plain([row.get(name) for row in data]) for name in names}
 
 
 def _plain(values: list[Any]) -> np.ndarray:
-    array = np.empty(len(values), dtype=object)
-    array[:] = values
-    return np.asarray(pd.Series(array).infer_objects())
+    return np.asarray(pd.Series(values, dtype=object).infer_objects())
 
 
 def _matlab(path: Path) -> dict[str | int, Any]:
     """Vectors, columns of matrices, and fields of structures (`name.field`)."""
     from scipy.io import loadmat
 
-    try:
+    with _reading("a MATLAB file"):
         data = loadmat(path, squeeze_me=True, struct_as_record=True)
-    except NotImplementedError:
-        return _hdf5(path)
-    except Exception as error:  # scipy has many kinds
-        raise InputError(f"{path}: cannot be read as a MATLAB file: {_first_line(error)}") from None
     columns: dict[str | int, Any] = {}
     for name, value in data.items():
         if not name.startswith("__"):
             _add(columns, name, value)
-    return _some(path, columns)
+    return _some(columns)
 
 
 def _add(columns: dict[str | int, Any], name: str, value: Any) -> None:
@@ -270,15 +267,12 @@ def _hdf5(path: Path) -> dict[str | int, Any]:
         if named and item.attrs.get("MATLAB_class") != b"char" and item.dtype.kind in "biuf":
             _add(columns, name.replace("/", "."), np.squeeze(item[()]))
 
-    try:
-        with h5py.File(path) as file:
-            file.visititems(visit)
-    except Exception as error:  # h5py has many kinds
-        raise InputError(f"{path}: cannot be read as a MATLAB file: {_first_line(error)}") from None
-    return _some(path, columns)
+    with _reading("a MATLAB file"), h5py.File(path) as file:
+        file.visititems(visit)
+    return _some(columns)
 
 
-def _some(path: Path, columns: dict[str | int, Any]) -> dict[str | int, Any]:
+def _some(columns: dict[str | int, Any]) -> dict[str | int, Any]:
     if not columns:
-        raise InputError(f"{path}: holds no vectors of numbers; a log needs them")
+        raise InputError("holds no vectors of numbers; a log needs them")
     return columns

@@ -1,13 +1,13 @@
 """Motor against load position: ratio, skew, lost motion."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from . import lost_motion
 from .least_squares import jackknifed
-from .lost_motion import Flank, LostMotion
+from .lost_motion import LostMotion
 from .rigid_body import direction_of
 from .signal_quality import SHORTEST, ChannelFigures, bandwidth, interpolated, longest, low_passed, settled
 
@@ -22,43 +22,27 @@ _MIXTURES = np.radians([0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0])
 
 
 @dataclass(frozen=True)
-class Gearing:
+class Gearing(LostMotion):
     """Motor position as a function of the load's: theta_e = ratio theta_s + constant + half the lost motion by flank.
 
     Attributes:
         ratio: motor over load motion.
         ratio_error: standard error; beside a twist as large as the motion it takes that share of the ratio.
-        lost_motion: shift of theta_e against theta_s from flank to flank of the gap, at the motor; rad or m.
-        lost_motion_error: standard error.
         skew: by how much the stamps of theta_s are later than its readings, s, against those of theta_e; None where the
             log does not show it.
         skew_error: standard error.
         residual: rms of the residual, at the motor, over the rms of theta_e about its mean.
-        lost_motion_interval: 95 %.
-        flank: what decides the flank: the direction of motion, or the sign of the load torque.
-        flank_changes: number of changes of the flank, from which the lost motion is found.
-        flank_times: times of these, s from the first sample, where the load made them.
-        lost_motion_range: 10 % and 90 % quantiles over the positions, where the load torque changes its sign.
         twist: range of theta_e - ratio theta_s, with the ratio that is expected, if one is; at the motor.
-        twist_residual: rms of the twist that lost motion and wind-up do not explain, over the rms of theta_e about its mean.
         least_twist: range of the twist with the ratio that was found.
         motion: range of theta_e.
     """
 
     ratio: float
     ratio_error: float
-    lost_motion: float
-    lost_motion_error: float
     skew: float | None
     skew_error: float | None
     residual: float
-    lost_motion_interval: tuple[float, float]
-    flank: Flank
-    flank_changes: int
-    flank_times: tuple[float, ...]
-    lost_motion_range: tuple[float, float]
     twist: float
-    twist_residual: float
     least_twist: float
     motion: float
 
@@ -107,21 +91,13 @@ def fit_gearing(
     winds up the shaft in proportion to velocity too, and cannot be separated from a delay. Errors of the encoders and the
     gear that repeat with position (eccentricity) are removed from both by a cosine series over the range of theta_s.
 
-    Args:
-        times: shape (samples,), s.
-        motor: theta_e, shape (samples,).
-        load: theta_s, shape (samples,).
-        segments: contiguous parts.
-        period: s.
-        expected: ratio of motor over load motion, if it is known; lost motion is then found with it.
-        turn: of the load, after which gear and encoders repeat; None on a linear axis.
+    Lost motion is found with the ratio that is `expected`, if one is. Gear and encoders repeat after a `turn` of the load;
+    None on a linear axis.
     """
     part = longest(segments)
     width = _width(load[part], period)
     usable = [s for s in segments if s.stop - s.start >= SHORTEST]
-    if width == 0.0 or not usable:
-        return None
-    fit = _fit_with_skew(times, motor, load, usable, period, width)
+    fit = _fit_with_skew(times, motor, load, usable, period, width) if width and usable else None
     if fit is None:
         return None
     target, rows, found, errors, skew, known = fit
@@ -129,46 +105,38 @@ def fit_gearing(
     slopes, slope_errors = _fitted(target, rows[:, :4])
     if not np.isfinite(slopes).all():
         return None
-    left = target - rows[:, :4] @ slopes
-    spread = float(np.std(target))
-    residual = float(np.sqrt(np.mean(left**2))) / spread if spread else np.inf
+    left, slope = target - rows[:, :4] @ slopes, float(slopes[0])
+    spread = float(np.std(target)) or 1e-300
+    residual = float(np.sqrt(np.mean(left**2))) / spread
     # encoders are not late by many periods; and at one speed, to and fro, a delay looks like lost motion
     alike = abs(float(rows[:, 1] @ rows[:, 2])) / float(np.linalg.norm(rows[:, 1]) * np.linalg.norm(rows[:, 2]) + 1e-300)
     known = known and residual < UNRELATED and abs(skew) < 10.0 * period and alike < 0.97
     # only a significant skew is undone
     undone = skew if known and abs(skew) > 4.0 * errors[1] / abs(found[0]) else 0.0
-    ratio = float(slopes[0]) if expected is None else expected
-    aligned = [_aligned(times[s], load[s], undone) for s in usable]
-    motor_there = np.concatenate([motor[s] for s in usable])
-    load_there, motion = np.concatenate(aligned), float(np.ptp(motor_there))
-    twist, least = (float(np.ptp(motor_there - r * load_there)) for r in (ratio, float(slopes[0])))
+    ratio = slope if expected is None else expected
+    aligned = [interpolated(times[s], load[s], times[s] + undone) if undone else load[s] for s in usable]
+    motor_there, load_there = np.concatenate([motor[s] for s in usable]), np.concatenate(aligned)
+    twist, least = (float(np.ptp(motor_there - r * load_there)) for r in (ratio, slope))
+    motion = float(np.ptp(motor_there))
     wide = min(twist, least) > WIDE_TWIST * motion
     # a load that sticks and slips, or a coarse encoder, shows its direction no sooner than the motor does
     slow = min(width, _width(motor[part], period) or width)
     lost = _lost_motion(times, motor, aligned, usable, period, 4.0 * slow, ratio, turn, wide=wide)
     if lost is None:
-        value, error = 2.0 * float(found[2]) * float(np.sign(found[0])), 2.0 * float(errors[2])
-        lost = LostMotion.unsure(value, error)
+        lost = LostMotion.from_motion(2.0 * float(found[2]) * float(np.sign(found[0])), 2.0 * float(errors[2]))
     # how the gap is crossed is not modelled: 0.5 % of the gap, as found on motions of several frequencies
     speed = float(np.sqrt(np.mean(rows[:, 1] ** 2)))
-    skew_error = float(np.hypot(errors[1], 0.005 * lost.value / speed) / abs(found[0]))
+    skew_error = float(np.hypot(errors[1], 0.005 * lost.lost_motion / speed) / abs(found[0]))
     # with a gap as large as the motion a delay cannot be found
     known = known and not wide
     return Gearing(
-        ratio=float(slopes[0]),
-        ratio_error=float(np.hypot(slope_errors[0], slopes[0] * least / motion if wide else 0.0)),
-        lost_motion=lost.value,
-        lost_motion_error=lost.error,
+        **vars(replace(lost, twist_residual=lost.twist_residual / spread)),
+        ratio=slope,
+        ratio_error=float(np.hypot(slope_errors[0], slope * least / motion if wide else 0.0)),
         skew=skew if known else None,
         skew_error=skew_error if known else None,
         residual=residual,
-        lost_motion_interval=lost.interval,
-        flank=lost.flank,
-        flank_changes=lost.changes,
-        flank_times=lost.at,
-        lost_motion_range=(lost.least, lost.largest),
         twist=twist,
-        twist_residual=lost.residual / spread if spread else np.inf,
         least_twist=least,
         motion=motion,
     )
@@ -214,11 +182,6 @@ def _fitted(target: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.insert(found, 1, 0.0), np.insert(errors, 1, np.inf)
 
 
-def _aligned(times: np.ndarray, load: np.ndarray, skew: float) -> np.ndarray:
-    """Load positions at the times of the motor's."""
-    return interpolated(times, load, times + skew) if skew else load
-
-
 def _lost_motion(
     times: np.ndarray,
     motor: np.ndarray,
@@ -233,17 +196,11 @@ def _lost_motion(
 ) -> LostMotion | None:
     """By changes of the load torque's sign, where there are any, else by the direction of motion.
 
-    Args:
-        times: shape (samples,), s.
-        motor: theta_e, shape (samples,).
-        aligned: theta_s without its skew, of each segment.
-        segments: contiguous parts.
-        period: s.
-        cutoff: of the low-pass before differences are taken, Hz.
-        ratio: of motor over load motion.
-        turn: of the load.
-        wide: whether the twist is a large part of the motion; errors that repeat with position cannot be separated then.
+    `aligned` is theta_s without its skew, of each segment; `cutoff` that of the low-pass before differences are taken, Hz.
+    Where the twist is `wide`, a large part of the motion, errors that repeat with position cannot be separated.
     """
+    from scipy.ndimage import minimum_filter1d
+
     parts = []
     for s, load in zip(segments, aligned, strict=True):
         smooth = low_passed(load, cutoff, period)
@@ -262,17 +219,17 @@ def _lost_motion(
         rows += [position - low, *(np.cos(k * place) for k in range(1, HARMONICS + 1))]
         rows += [np.sin(k * place) for k in range(1, HARMONICS + 1)] if around else []
     terms = np.stack(rows, axis=1)
-    sizes = [np.sqrt(np.mean(v**2)) + 1e-300 for v in (velocity, acceleration)]
+    sizes = _rms(velocity), _rms(acceleration)
     # the filter takes as long to notice a corner of the motion
     guard = round(0.5 / (cutoff * period))
     best = None
     for angle in _MIXTURES:
-        flank = np.cos(angle) * velocity / sizes[0] + np.sin(angle) * acceleration / sizes[1]
+        flank = _mixture(angle, velocity, acceleration, sizes)
         clear = np.abs(flank) > 0.3
         if clear.sum() < 0.25 * len(clear):
             continue
         for part in np.split(np.arange(len(clear)), ends):
-            clear[part] = ~_widened(~clear[part], guard)
+            clear[part] = minimum_filter1d(clear[part], 2 * guard + 1, mode="nearest")
         few = np.flatnonzero(clear)[:: max(int(clear.sum()) // 20_000, 1)]
         if len(few) < 3 * terms.shape[1] or clear.sum() < 0.1 * len(clear):
             continue
@@ -282,28 +239,34 @@ def _lost_motion(
         size = float(np.mean((twist[few] - fitted) ** 2))
         if best is None or size < best[0]:
             best = (size, flank, clear)
-    found = None if best is None else lost_motion.by_motion(twist, terms, best[1], best[2])
-    if wide and best is not None and found is not None:
+    if best is None:
+        return None if wide else lost_motion.by_load(time, twist, position, velocity, turn)
+    _, flank, clear = best
+    found = lost_motion.by_motion(twist, terms, flank, clear)
+    if wide:
         # a shaft winds up as its load is moved: part of this shift, and in so few cycles it is unknown how much
-        alone = lost_motion.by_motion(twist, terms[:, :1], best[1], best[2])
-        return found if alone is None else found.between(alone)
-    if best is not None and not wide and (found is None or found.error > 0.25 * abs(found.value)):
+        alone = lost_motion.by_motion(twist, terms[:, :1], flank, clear)
+        return found.between(alone) if found and alone else found
+    if found is None or found.lost_motion_error > 0.25 * abs(found.lost_motion):
         # at one speed, delays and wind-up look like lost motion: take a delay to be no more than a period
         delay = ratio * period * float(np.sqrt(np.mean(velocity**2)))
-        still = lost_motion.by_motion(twist, np.delete(terms, 1, axis=1), best[1], best[2], beside=delay)
-        if still is not None and (found is None or still.error < 0.5 * found.error):
+        still = lost_motion.by_motion(twist, np.delete(terms, 1, axis=1), flank, clear, beside=delay)
+        if still is not None and (found is None or still.lost_motion_error < 0.5 * found.lost_motion_error):
             found = still
-    if wide or (found is not None and found.residual < 0.25 * abs(found.value)):
+    if found is not None and found.twist_residual < 0.25 * abs(found.lost_motion):
         return found
     # two flanks by the direction of motion explain little: the load may change them
     return lost_motion.by_load(time, twist, position, velocity, turn) or found
 
 
-def _widened(at: np.ndarray, by: int) -> np.ndarray:
-    """True within some samples of where it is."""
-    count = np.concatenate([[0], np.cumsum(at)])
-    index = np.arange(len(at))
-    return count[np.minimum(index + by + 1, len(at))] > count[np.maximum(index - by, 0)]
+def _rms(values: np.ndarray) -> float:
+    """Of a signal; never zero."""
+    return float(np.sqrt(np.mean(values**2))) + 1e-300
+
+
+def _mixture(angle: float, velocity: np.ndarray, acceleration: np.ndarray, sizes: tuple[float, float]) -> np.ndarray:
+    """One of :data:`_MIXTURES`, by the rms of both."""
+    return np.cos(angle) * velocity / sizes[0] + np.sin(angle) * acceleration / sizes[1]
 
 
 def twist_noise(ratio: float, motor: ChannelFigures, load: ChannelFigures) -> float:
@@ -323,40 +286,41 @@ def _gear_fit(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
     """One regression of :func:`fit_gearing` at a given skew.
 
-    Returns:
-        Motor positions, shape (rows,); terms (position, velocity, flank, 1, acceleration, series), shape
-        (rows, 5 + HARMONICS); coefficients and standard errors, shape (5 + HARMONICS,).
+    Motor positions, shape (rows,); terms (position, velocity, flank, 1, acceleration, series), shape (rows, 5 + HARMONICS);
+    coefficients and standard errors, shape (5 + HARMONICS,).
     """
-    targets, parts = [], []
-    lowest, highest = float(load.min()), float(load.max())
+    parts, smooth_motor = [], []
     for s in segments:
         smooth = low_passed(interpolated(times[s], load[s], times[s] + skew), cutoff, period)
         velocity = np.gradient(smooth, times[s])
-        cut = settled(len(smooth), cutoff, period)
-        parts.append((smooth, velocity, np.gradient(velocity, times[s]), cut))
-        targets.append(low_passed(motor[s], cutoff, period)[cut])
-    target = np.concatenate(targets)
-    sizes = [np.sqrt(np.mean(np.concatenate([part[i][part[3]] for part in parts]) ** 2)) + 1e-300 for i in (1, 2)]
-    position, velocity, acceleration = (np.concatenate([part[i][part[3]] for part in parts]) for i in range(3))
-    place = np.pi * (position - lowest) / (highest - lowest)
+        parts.append(np.stack([smooth, velocity, np.gradient(velocity, times[s])]))
+        smooth_motor.append(low_passed(motor[s], cutoff, period))
+    inner = [settled(len(signal), cutoff, period) for signal in smooth_motor]
+
+    def joined(signals: list[np.ndarray]) -> np.ndarray:
+        return np.concatenate([signal[..., cut] for signal, cut in zip(signals, inner, strict=True)], axis=-1)
+
+    target = joined(smooth_motor)
+    position, velocity, acceleration = joined(parts)
+    sizes = _rms(velocity), _rms(acceleration)
+    lowest = float(load.min())
+    place = np.pi * (position - lowest) / (float(load.max()) - lowest)
     series = [np.cos(k * place) for k in range(1, HARMONICS + 1)]
     rows = np.stack(
         [position - lowest, velocity, np.zeros_like(position), np.ones_like(position), acceleration, *series], axis=1
     )
     best = None
     for angle in _MIXTURES:
-        mixed = [np.cos(angle) * part[1] / sizes[0] + np.sin(angle) * part[2] / sizes[1] for part in parts]
-        directions = [low_passed(direction_of(m), cutoff, period) for m in mixed]
-        flank = np.concatenate([d[part[3]] for d, part in zip(directions, parts, strict=True)])
+        mixed = [_mixture(angle, velocity, acceleration, sizes) for _, velocity, acceleration in parts]
         # between the flanks the twist is anywhere in the gap
-        clear = np.abs(np.concatenate([m[part[3]] for m, part in zip(mixed, parts, strict=True)])) > 0.3
+        clear = np.abs(joined(mixed)) > 0.3
         few = np.flatnonzero(clear)[:: max(len(position) // 20_000, 1)]
         if len(few) < 3 * rows.shape[1] or clear.sum() < 0.25 * len(clear):
             continue
-        rows[:, 2] = flank
+        flank = rows[:, 2] = joined([low_passed(direction_of(m), cutoff, period) for m in mixed])
         scaled = rows[few] / (np.abs(rows[few]).max(axis=0) + 1e-300)
-        best_fit = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ target[few], rcond=1e-12)[0]
-        size = float(np.mean((target[few] - scaled @ best_fit) ** 2))
+        fitted = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ target[few], rcond=1e-12)[0]
+        size = float(np.mean((target[few] - scaled @ fitted) ** 2))
         if best is None or size < best[0]:
             best = (size, flank, clear)
     if best is None:

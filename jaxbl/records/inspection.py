@@ -1,7 +1,7 @@
 """What a measured log can and cannot identify, judged before anything is fitted to it."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -117,19 +117,13 @@ def main_side(record: Record) -> str:
 
 
 def velocity(record: Record, side: str | None = None) -> np.ndarray:
-    """Velocity by differences of the low-passed position, rad/s (m/s), shape (samples,).
-
-    Args:
-        record: the log.
-        side: motor or load; left out: the motor if it has an encoder.
-    """
+    """Velocity by differences of the low-passed position, rad/s (m/s), shape (samples,); by default of the main side."""
     side = side or main_side(record)
     width = record.findings.channels[POSITION_CHANNELS[side]].bandwidth
     speed = np.zeros(len(record.time))
     for s in record.segments:
-        smooth = record.positions[side][s]
-        if width:
-            smooth = low_passed(smooth, 4.0 * width, record.sample_period)
+        position = record.positions[side][s]
+        smooth = low_passed(position, 4.0 * width, record.sample_period) if width else position
         speed[s] = np.gradient(smooth, record.sample_period)
     return speed
 
@@ -139,23 +133,24 @@ def _moving(speed: np.ndarray) -> np.ndarray:
 
 
 def _reversals(record: Record, speed: np.ndarray) -> int:
-    count = 0
-    for s in record.segments:
-        signs = np.sign(speed[s][_moving(speed)[s]])
-        count += int(np.count_nonzero(np.diff(signs)))
-    return count
+    moving = _moving(speed)
+    return sum(int(np.count_nonzero(np.diff(np.sign(speed[s][moving[s]])))) for s in record.segments)
+
+
+def _same(quantities: Iterable[str], answer: Literal["weak", "no"], why: str) -> list[Judgement]:
+    return [Judgement(quantity, answer, why) for quantity in quantities]
 
 
 def _of_inertia_and_friction(record: Record, speed: np.ndarray, reversals: int) -> list[Judgement]:
     names = ("inertia", "viscous friction", "Coulomb friction", "constant torque")
     torque, found = record.torque, record.findings.dynamics
     if torque is None:
-        return [Judgement(name, "no", "no torque was recorded: the log shows kinematics only") for name in names]
+        return _same(names, "no", "no torque was recorded: the log shows kinematics only")
     if np.ptp(torque) == 0.0:
         why = "the input is constant: free motion gives only ratios to the inertia (or to a known gravity torque)"
-        return [Judgement(name, "weak", why) for name in names]
+        return _same(names, "weak", why)
     if found is None:
-        return [Judgement(name, "no", "the motion does not exceed the noise") for name in names]
+        return _same(names, "no", "the motion does not exceed the noise")
     moving = np.abs(speed[_moving(speed)])
     slow, fast = np.quantile(moving, [0.05, 0.95])
     both = min((speed[_moving(speed)] > 0).mean(), (speed[_moving(speed)] < 0).mean())
@@ -175,14 +170,20 @@ def _of_inertia_and_friction(record: Record, speed: np.ndarray, reversals: int) 
         return Judgement(name, "yes", f"{yes}: {percent[i]}")
 
     result = [judge("inertia", 0, f"motion up to {width:.3g} Hz", "a spring or gravity")]
+    alone = "motion in one direction only: hard to separate from"
     if fast < 1.5 * slow:
         why = f"speeds of {slow:.3g} to {fast:.3g} are too close to separate viscous from Coulomb friction"
-        return [*result, *(Judgement(name, "weak", why) for name in names[1:3]), _constant(both)]
-    result.append(judge("viscous friction", 1, f"speeds of {slow:.3g} to {fast:.3g}", "Coulomb friction"))
+        result += _same(names[1:3], "weak", why)
+    else:
+        result.append(judge("viscous friction", 1, f"speeds of {slow:.3g} to {fast:.3g}", "Coulomb friction"))
+        if both < 0.05:
+            result += _same(["Coulomb friction"], "weak", f"{alone} a constant torque")
+        else:
+            result.append(judge("Coulomb friction", 2, f"{reversals} reversals", "viscous friction"))
     if both < 0.05:
-        why = "motion in one direction only: hard to separate from a constant torque"
-        return [*result, Judgement("Coulomb friction", "weak", why), _constant(both)]
-    return [*result, judge("Coulomb friction", 2, f"{reversals} reversals", "viscous friction"), _constant(both)]
+        return [*result, Judgement("constant torque", "weak", f"{alone} Coulomb friction")]
+    why = f"motion in both directions ({100 * both:.0f} % in the less frequent one)"
+    return [*result, Judgement("constant torque", "yes", why)]
 
 
 def _beside_a_gap(judgement: Judgement) -> Judgement:
@@ -193,48 +194,39 @@ def _beside_a_gap(judgement: Judgement) -> Judgement:
     return replace(judgement, answer="weak", why=why)
 
 
-def _constant(both: float) -> Judgement:
-    if both < 0.05:
-        return Judgement("constant torque", "weak", "motion in one direction only: hard to separate from Coulomb friction")
-    return Judgement("constant torque", "yes", f"motion in both directions ({100 * both:.0f} % in the less frequent one)")
-
-
 def _of_transmission(record: Record, speed: np.ndarray, reversals: int, ratio: float | None) -> list[Judgement]:
     names = ("gear ratio", "lost motion", "stiffness")
     gearing, channels = record.findings.gearing, record.findings.channels
     if len(record.positions) < 2:
         missing = "load" if "motor" in record.positions else "motor"
-        why = f"there is no {missing} encoder: the transmission in between is not observed"
-        return [Judgement(name, "no", why) for name in names]
+        return _same(names, "no", f"there is no {missing} encoder: the transmission in between is not observed")
     if gearing is None or ratio is None:
-        return [Judgement(name, "no", "the motion does not exceed the noise") for name in names]
+        return _same(names, "no", "the motion does not exceed the noise")
     share = min(gearing.twist, gearing.least_twist) / gearing.motion
     left = f"{100 * gearing.residual:.2g} % of theta_e is not explained"
     if gearing.wide:
         left = f"gap and wind-up take {100 * share:.0f} % of the range of theta_e"
-    result = [
-        Judgement(
-            "gear ratio",
-            "yes" if gearing.residual < 0.05 and not gearing.wide else "weak",
-            f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {left}",
-        )
-    ]
     noise = twist_noise(ratio, channels["theta_e"], channels["theta_s"])
-    result.append(_lost_motion(gearing, reversals, noise, channels["theta_e"].unit))
-    return [*result, _stiffness(record, speed, ratio, noise)]
+    answer = "yes" if gearing.residual < 0.05 and not gearing.wide else "weak"
+    return [
+        Judgement("gear ratio", answer, f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {left}"),
+        _lost_motion(gearing, reversals, noise, channels["theta_e"].unit),
+        _stiffness(record, speed, ratio, noise),
+    ]
 
 
 def _lost_motion(gearing: Gearing, reversals: int, noise: float, unit: str) -> Judgement:
     size = gearing.lost_motion_text(unit)
+    answer, why = "weak", f"shift of theta_e from flank to flank is {size}, noise {noise:.2g} {unit}"
     if gearing.flank == "load":
-        return Judgement("lost motion", "yes", f"theta_e shifts by {size} as the load torque changes its sign")
-    if reversals < 2:
-        return Judgement("lost motion", "no", f"{reversals} reversals: both flanks of the gap must come into contact")
-    if gearing.wide:
-        return Judgement("lost motion", "weak", f"shift of {size} includes the wind-up, which this motion does not separate")
-    if gearing.stands_out(noise):
-        return Judgement("lost motion", "yes", f"theta_e shifts by {size} from flank to flank")
-    return Judgement("lost motion", "weak", f"shift of theta_e from flank to flank is {size}, noise {noise:.2g} {unit}")
+        answer, why = "yes", f"theta_e shifts by {size} as the load torque changes its sign"
+    elif reversals < 2:
+        answer, why = "no", f"{reversals} reversals: both flanks of the gap must come into contact"
+    elif gearing.wide:
+        why = f"shift of {size} includes the wind-up, which this motion does not separate"
+    elif gearing.stands_out(noise):
+        answer, why = "yes", f"theta_e shifts by {size} from flank to flank"
+    return Judgement("lost motion", answer, why)
 
 
 def _stiffness(record: Record, speed: np.ndarray, ratio: float, noise: float) -> Judgement:

@@ -29,12 +29,10 @@ def join(records: Sequence[Record]) -> Record:
                 f"{record.path}: is sampled every {record.sample_period:.6g} s, {first.path} every {period:.6g} s; "
                 f"[log] resample = {period:.6g} reads both alike"
             )
-        for name, has in _channels(record).items():
-            if has != _channels(first)[name]:
-                with_, without = (record, first) if has else (first, record)
-                raise InputError(
-                    f"{without.path}: has no {name}, which {with_.path} has; logs of one machine should be alike"
-                )
+        for one, other in ((record, first), (first, record)):
+            if missing := _channels(other) - _channels(one):
+                name = min(missing)
+                raise InputError(f"{one.path}: has no {name}, which {other.path} has; logs of one machine should be alike")
         times.append(record.time - record.time[0] + end)
         end = float(times[-1][-1]) + _PAUSE * period
         segments += [slice(part.start + rows, part.stop + rows) for part in record.segments]
@@ -53,9 +51,9 @@ def join(records: Sequence[Record]) -> Record:
     )
 
 
-def _channels(record: Record) -> dict[str, bool]:
-    found = {f"{side} position": side in record.positions for side in ("motor", "load")}
-    return found | {"torque": record.torque is not None, "transmitted torque": record.transmitted is not None}
+def _channels(record: Record) -> set[str]:
+    torques = {"torque": record.torque, "transmitted torque": record.transmitted}
+    return {f"{side} position" for side in record.positions} | {name for name, one in torques.items() if one is not None}
 
 
 def _together(parts):

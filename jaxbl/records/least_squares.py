@@ -7,14 +7,9 @@ BLOCKS = 12
 
 
 def jackknifed(target: np.ndarray, regressors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least squares with standard errors that hold for residuals of any correlation in time.
+    """Coefficients of regressors, shape (samples, terms), and their standard errors (delete-a-block jackknife).
 
-    Args:
-        target: shape (samples,).
-        regressors: shape (samples, terms).
-
-    Returns:
-        Coefficients and standard errors (delete-a-block jackknife), shape (terms,) each; nan where undetermined.
+    The errors hold for residuals of any correlation in time; both are nan where undetermined.
     """
     scale = np.sqrt(np.mean(regressors**2, axis=0))
     scale[scale == 0.0] = 1.0

@@ -1,7 +1,7 @@
 """Lost motion from two encoders: how far the motor shifts against the load from flank to flank of the gap."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -14,42 +14,42 @@ Flank = Literal["motion", "load"]
 
 @dataclass(frozen=True)
 class LostMotion:
-    """Shift of theta_e - ratio theta_s between the flanks of the gap, at the motor.
+    """Shift of theta_e - ratio theta_s between the flanks of the gap, at the motor, in rad or m.
 
     Attributes:
-        value: rad or m.
-        error: standard error, valid for residuals that are correlated in time and over position.
-        interval: 95 %.
+        lost_motion: the shift.
+        lost_motion_error: standard error, valid for residuals that are correlated in time and over position.
+        lost_motion_interval: 95 %.
         flank: what decides the flank: the direction of motion (with the load's inertia), or a load torque that changes its
             sign at some times, beside errors that repeat with position and direction.
-        changes: number of changes of the flank, from which it is found.
-        at: times of these changes where the load made them, s.
-        least: 10 % quantile of the shift over the positions, where the load torque changed its sign; else the value.
-        largest: 90 % quantile.
-        residual: rms of the residual twist.
+        flank_changes: number of changes of the flank, from which the lost motion is found.
+        flank_times: times of these, s from the first sample, where the load made them.
+        lost_motion_range: 10 % and 90 % quantiles over the positions, where the load torque changes its sign.
+        twist_residual: rms of the twist that lost motion and wind-up do not explain; in a `Gearing` over the rms of theta_e
+            about its mean.
     """
 
-    value: float
-    error: float
-    interval: tuple[float, float]
+    lost_motion: float
+    lost_motion_error: float
+    lost_motion_interval: tuple[float, float]
     flank: Flank
-    changes: int
-    at: tuple[float, ...]
-    least: float
-    largest: float
-    residual: float
+    flank_changes: int
+    flank_times: tuple[float, ...]
+    lost_motion_range: tuple[float, float]
+    twist_residual: float
 
     @classmethod
-    def unsure(cls, value: float, error: float) -> "LostMotion":
-        """From a rough regression, where no flank is in contact for long."""
-        return cls(value, error, _interval(value, error, BLOCKS - 1), "motion", 0, (), value, value, math.inf)
+    def from_motion(
+        cls, value: float, error: float, residual: float = math.inf, changes: int = 0, freedom: int = BLOCKS - 1
+    ) -> "LostMotion":
+        """Where the direction of motion decides the flank; of no changes where no flank is in contact for long."""
+        return cls(value, error, _interval(value, error, freedom), "motion", changes, (), (value, value), residual)
 
     def between(self, other: "LostMotion") -> "LostMotion":
         """Anywhere between two that rest on different assumptions."""
-        value, error = 0.5 * (self.value + other.value), 0.5 * abs(self.value - other.value)
-        error = math.hypot(error, max(self.error, other.error))
-        return replace(self, value=value, error=error, interval=_interval(value, error, BLOCKS - 1),
-                       least=value, largest=value)  # fmt: skip
+        value, error = 0.5 * (self.lost_motion + other.lost_motion), 0.5 * abs(self.lost_motion - other.lost_motion)
+        error = math.hypot(error, max(self.lost_motion_error, other.lost_motion_error))
+        return self.from_motion(value, error, self.twist_residual, self.flank_changes)
 
 
 def _interval(value: float, error: float, freedom: int) -> tuple[float, float]:
@@ -65,14 +65,10 @@ def _interval(value: float, error: float, freedom: int) -> tuple[float, float]:
 def by_motion(
     twist: np.ndarray, rows: np.ndarray, flank: np.ndarray, clear: np.ndarray, *, beside: float = 0.0
 ) -> LostMotion | None:
-    """From the twist on both flanks, wherever one of them is surely in contact.
+    """From the twist theta_e - ratio theta_s on both flanks, wherever one of them is surely in contact.
 
-    Args:
-        twist: theta_e - ratio theta_s, shape (samples,).
-        rows: other terms of the twist, shape (samples, terms).
-        flank: its sign is that of the torque, shape (samples,).
-        clear: where the gap is not being crossed, shape (samples,).
-        beside: standard error of other causes.
+    `rows` are other terms of the twist, shape (samples, terms); `flank` has the sign of the torque; `clear` is False where
+    the gap is crossed; `beside` is the standard error of other causes.
     """
     signs = np.sign(flank[clear])
     changes = int(np.count_nonzero(np.diff(signs)))
@@ -91,8 +87,7 @@ def by_motion(
     between = 2.0 * float(np.sqrt(np.mean(levels**2) / max(len(levels) - 2, 1)))
     # corners of the motion are rounded by the filter: an error of 1e-4 at most
     error = math.hypot(max(float(errors[0]), between), 1e-4 * value, beside)
-    interval = _interval(value, error, min(BLOCKS, len(levels)) - 1)
-    return LostMotion(value, error, interval, "motion", changes, (), value, value, left)
+    return LostMotion.from_motion(value, error, left, changes, min(BLOCKS, len(levels)) - 1)
 
 
 # by the sign of the load torque
@@ -111,6 +106,10 @@ class _Cells:
     place: np.ndarray
     passing: np.ndarray
     group: np.ndarray  # of the same place and direction
+
+    def centred(self, values: np.ndarray) -> np.ndarray:
+        """Values of the cells less the mean of those of the same place and direction."""
+        return values - (np.bincount(self.group, values) / np.maximum(np.bincount(self.group), 1))[self.group]
 
 
 def _cells(
@@ -142,7 +141,7 @@ def _cells(
     return _Cells(mean[order], when[order], place[at][first], passing[first], 2 * place[at][first] + forwards[at][first])
 
 
-def _shift(cells: _Cells, late: np.ndarray, kept: np.ndarray) -> tuple[float, np.ndarray]:
+def _shift(cells: _Cells, late: np.ndarray, kept: np.ndarray | bool = True) -> tuple[float, np.ndarray]:
     """Biweight location of the shifts of the places that were crossed in both states, and these shifts.
 
     Where the load hardly pulls, the gap is not crossed in full: such places fall short, and count less.
@@ -171,23 +170,14 @@ def _shift(cells: _Cells, late: np.ndarray, kept: np.ndarray) -> tuple[float, np
     return found, shifts
 
 
-def _left(cells: _Cells, late: np.ndarray, shift: float) -> np.ndarray:
-    """Twist less that of its place, direction and state."""
-    rest = cells.twist - shift * late
-    counts = np.maximum(np.bincount(cells.group), 1)
-    return rest - (np.bincount(cells.group, rest) / counts)[cells.group]
-
-
 def _states(cells: _Cells) -> np.ndarray | None:
     """Which of two states each cell is in: the assignment that leaves least, with few changes."""
     count = len(cells.twist)
-    groups = np.bincount(cells.group)
-    plain = _left(cells, np.zeros(count, dtype=bool), 0.0)
+    plain = cells.centred(cells.twist)
     # one change: the step, less its mean in each place and direction, that goes along best
     best, late = 0.0, None
     for change in range(2, count - 1, max(count // 400, 1)):
-        step = (np.arange(count) >= change).astype(float)
-        step -= (np.bincount(cells.group, step) / np.maximum(groups, 1))[cells.group]
+        step = cells.centred((np.arange(count) >= change).astype(float))
         size = float(step @ step)
         gain = float(step @ plain) ** 2 / size if size > 1e-9 else 0.0
         if gain > best:
@@ -198,20 +188,17 @@ def _states(cells: _Cells) -> np.ndarray | None:
     chosen = None
     for state in starts:
         for _ in range(12):
-            shift, _ = _shift(cells, state, np.ones(count, dtype=bool))
+            shift, _ = _shift(cells, state)
             if not math.isfinite(shift) or shift == 0.0:
                 break
-            left = _left(cells, state, shift)
+            left = cells.centred(cells.twist - shift * state)
             again = _viterbi(left + shift * state, shift, float(np.var(left)))
             if (again == state).all():
                 break
             state = again
-        else:
-            shift, _ = _shift(cells, state, np.ones(count, dtype=bool))
-        if not math.isfinite(shift):
-            continue
-        size = float(np.sum(_left(cells, state, shift) ** 2))
-        if chosen is None or size < chosen[0]:
+        shift, _ = _shift(cells, state)
+        size = float(np.sum(cells.centred(cells.twist - shift * state) ** 2))
+        if math.isfinite(shift) and (chosen is None or size < chosen[0]):
             chosen = (size, state)
     return None if chosen is None else chosen[1]
 
@@ -239,12 +226,7 @@ def by_load(
 ) -> LostMotion | None:
     """From what changes between passes over the same places in the same direction; None where nothing clearly does.
 
-    Args:
-        times: shape (samples,), s.
-        twist: theta_e - ratio theta_s, shape (samples,).
-        position: of the load, shape (samples,).
-        velocity: of the load, shape (samples,).
-        turn: of the load, after which gear and encoders repeat; None on a linear axis.
+    Position and velocity are the load's, which repeats after a `turn`; None on a linear axis.
     """
     cells = _cells(times, twist, position, velocity, turn)
     if cells is None or len(cells.twist) < 24:
@@ -252,11 +234,10 @@ def by_load(
     state = _states(cells)
     if state is None or state.all() or not state.any():
         return None
-    every = np.ones(len(state), dtype=bool)
-    value, shifts = _shift(cells, state, every)
+    value, shifts = _shift(cells, state)
     if not math.isfinite(value):
         return None
-    left = _left(cells, state, value)
+    left = cells.centred(cells.twist - value * state)
     residual = float(np.std(left))
     # two levels stand apart; a drift does not
     if abs(value) < 6.0 * residual or not _better_than_drift(cells, left):
@@ -271,27 +252,18 @@ def by_load(
         if len(finite) < max(3, len(without) - 1):
             return None
         variance += (len(finite) - 1) / len(finite) * float(np.sum((finite - finite.mean()) ** 2))
-    error = math.sqrt(variance)
-    if abs(value) < 8.0 * error:
-        return None
+    size, error = abs(value), math.sqrt(variance)
     turned = np.flatnonzero(np.diff(state))
-    at = tuple(float(0.5 * (cells.time[i] + cells.time[i + 1])) for i in turned)
-    if len(turned) > len(passes):
+    if size < 8.0 * error or len(turned) > len(passes):
         return None
-    sign = math.copysign(1.0, value)
-    least, largest = np.quantile(sign * shifts, [0.1, 0.9])
-    freedom = min(len(passes), BLOCKS) - 1
-    size = abs(value)
-    return LostMotion(
-        size, error, _interval(size, error, freedom), "load", len(at), at, float(least), float(largest), residual
-    )
+    at = tuple(float(0.5 * (cells.time[i] + cells.time[i + 1])) for i in turned)
+    least, largest = np.quantile(math.copysign(1.0, value) * shifts, [0.1, 0.9])
+    interval = _interval(size, error, min(len(passes), BLOCKS) - 1)
+    return LostMotion(size, error, interval, "load", len(at), at, (float(least), float(largest)), residual)
 
 
 def _better_than_drift(cells: _Cells, left: np.ndarray) -> bool:
     """Whether two states leave much less than a steady drift over time does."""
-    zero = np.zeros(len(left), dtype=bool)
-    plain = _left(cells, zero, 0.0)
-    counts = np.maximum(np.bincount(cells.group), 1)
-    time = cells.time - (np.bincount(cells.group, cells.time) / counts)[cells.group]
+    plain, time = cells.centred(cells.twist), cells.centred(cells.time)
     slope = float(time @ plain) / max(float(time @ time), 1e-300)
     return float(np.sum(left**2)) < 0.5 * float(np.sum((plain - slope * time) ** 2))

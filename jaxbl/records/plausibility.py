@@ -25,18 +25,9 @@ def check_motion(file: LogFile, name: str, values: np.ndarray) -> None:
 def check_gear_ratio(
     file: LogFile, table: LogTable, grid: Grid, found: Gearing | None, expected: float | None, tolerance: float
 ) -> None:
-    """Compare the ratio of both motions with the gear ratio that is expected.
+    """Compare the ratio of both motions with the gear ratio that is expected, if it is known.
 
-    Args:
-        file: the log; gets remarks where the log is doubtful, but possible.
-        table: its units, of which one may be wrong.
-        grid: theta_e and theta_s.
-        found: how they are related; None where there is too little motion.
-        expected: motor over load motion; None: not known.
-        tolerance: relative deviation that is noted only.
-
-    Raises:
-        InputError: the log contradicts the ratio; the message names the most likely mistake.
+    Up to a relative deviation of `tolerance` the file gets a remark. Beyond, InputError names the most likely mistake.
     """
     if expected is not None and (found is None or found.wide or found.residual >= UNRELATED):
         _check_size(file, table, grid, expected)
@@ -120,16 +111,9 @@ def _check_twist(file: LogFile, table: LogTable, found: Gearing, expected: float
 
 
 def check_torque(file: LogFile, found: RigidFit, grid: Grid, position: np.ndarray) -> None:
-    """A passive drive takes energy from its input; inertia and friction are positive.
+    """Refuse a torque of the wrong sign, or remark on it: a passive drive takes energy from its input; inertia is positive.
 
-    Args:
-        file: the log; gets a remark where the torque is doubtful.
-        found: rigid-drive fit of the torque.
-        grid: its `u` is the torque.
-        position: that the torque moves, shape (samples,).
-
-    Raises:
-        InputError: the torque has the wrong sign.
+    `position` is what the torque, `u` of the grid, moves.
     """
     work = total = travel = away = 0.0
     for s in grid.segments:

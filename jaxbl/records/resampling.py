@@ -39,16 +39,8 @@ def resampled(
 ) -> Grid:
     """All channels on one grid within each segment: positions by cubic splines, a held torque by its means.
 
-    Args:
-        file: the log.
-        segments: times and parts.
-        channels: at these times.
-        period: of the grid, s.
-        skews: of each channel, s.
-        interpolate: False where the stamps lie on the grid already, so that only skews move values.
-
-    Raises:
-        InputError: a segment is too short for period and skews.
+    Without `interpolate` the stamps lie on the grid already, so that only skews (s) move values. InputError where a segment
+    is too short for period and skews.
     """
     times, values, parts, begin = [], {name: [] for name in channels}, [], 0
     for part, first in zip(segments.parts, segments.starts, strict=True):

@@ -43,14 +43,7 @@ def direction_of(velocity: np.ndarray) -> np.ndarray:
 
 
 def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence[slice], period: float) -> RigidFit | None:
-    """Regress torque on the motion of one encoder; None where there is too little motion.
-
-    Args:
-        torque: held from each stamp to the next, shape (samples,).
-        position: shape (samples,).
-        segments: contiguous parts.
-        period: s.
-    """
+    """Regress a torque, held from each stamp to the next, on the motion of one encoder; None where that is too small."""
     width = bandwidth(position[longest(segments)], period, slope=True)
     if width == 0.0 or np.ptp(torque) == 0.0:
         return None

@@ -55,21 +55,13 @@ def channel_figures(
 ) -> ChannelFigures:
     """Figures on a channel.
 
-    Args:
-        values: its longest segment at even spacing, shape (samples,); for noise and bandwidth.
-        period: of these, s.
-        parts: values at the time stamps of the log, between gaps.
-        stamps: of the parts, s, where they are uneven.
-        unit: rad, m, N m or N.
-        is_position: of an encoder.
-        saturated: share of samples at a known saturation level; 0 where none is known.
+    Noise and bandwidth are those of `values`, its longest segment at even spacing; all else is that of the `parts` between
+    gaps, with `stamps` (s) where these are uneven. `saturated` is the share of samples at a known saturation level.
     """
     every = np.concatenate(parts)
     step = resolution(every)
     frequency, density = spectrum(values, period)
-    found = 0
-    if is_position:
-        found = sum(jumps(part, step, None if stamps is None else stamps[i]) for i, part in enumerate(parts))
+    found = sum(map(jumps, parts, [step] * len(parts), stamps or [None] * len(parts))) if is_position else 0
     return ChannelFigures(
         unit=unit,
         least=float(every.min()),
@@ -100,15 +92,9 @@ def resolution(values: np.ndarray) -> float:
 
 
 def spectrum(values: np.ndarray, period: float, *, slope: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """One-sided power spectral density by Welch's method, of the values or of their slope.
+    """One-sided power spectral density of evenly spaced values, or of their slope, by Welch's method.
 
-    Args:
-        values: shape (samples,), evenly spaced.
-        period: s.
-        slope: of the rate of change.
-
-    Returns:
-        Frequencies in Hz without 0, and densities in unit²/Hz; (unit/s)²/Hz of the slope.
+    Frequencies in Hz without 0, and densities in unit²/Hz; (unit/s)²/Hz of the slope.
     """
     from scipy.signal import welch
 
@@ -128,13 +114,7 @@ def noise_floor(frequency: np.ndarray, density: np.ndarray) -> float:
 
 
 def bandwidth(values: np.ndarray, period: float, *, slope: bool) -> float:
-    """Frequency in Hz below which 95 % of the power that stands out of the noise lies; 0 where none does.
-
-    Args:
-        values: shape (samples,), evenly spaced.
-        period: s.
-        slope: of the rate of change (a position's velocity).
-    """
+    """Frequency in Hz below which 95 % of the power lies that stands out of the noise, of values or their slope; 0: none."""
     frequency, density = spectrum(values, period)
     # steps of the resolution make noise of their own, and not always up to the end of the band
     floor = max(noise_floor(frequency, density), resolution(values) ** 2 / 6.0 * period)
@@ -154,8 +134,7 @@ def stays(values: np.ndarray, step: float) -> float:
     share = 0
     for extreme in (values.min(), values.max()):
         at = np.concatenate([[False], np.abs(values - extreme) <= 0.5 * step, [False]])
-        starts, ends = np.flatnonzero(np.diff(at.astype(int)) == 1), np.flatnonzero(np.diff(at.astype(int)) == -1)
-        lengths = ends - starts
+        lengths = np.diff(np.flatnonzero(np.diff(at)))[::2]
         # one stay may be a rest; a signal that is cut off comes back to the same value
         if np.count_nonzero(lengths >= 5) >= 2:
             share += int(lengths[lengths >= 5].sum())
@@ -163,12 +142,9 @@ def stays(values: np.ndarray, step: float) -> float:
 
 
 def jumps(positions: np.ndarray, step: float, stamps: np.ndarray | None = None) -> int:
-    """Isolated outliers and steps of a position: differences far off those around them.
+    """Isolated outliers and steps of a position: differences far off those around them, and more than a few steps.
 
-    Args:
-        positions: shape (samples,).
-        step: resolution, of which motion leaves differences of a few.
-        stamps: times of the positions, s, shape (samples,); left out: evenly spaced.
+    Positions without time stamps (s) are evenly spaced.
     """
     from scipy.ndimage import median_filter, percentile_filter
 
@@ -186,12 +162,9 @@ def jumps(positions: np.ndarray, step: float, stamps: np.ndarray | None = None) 
 
 
 def low_passed(values: np.ndarray, cutoff: float, period: float) -> np.ndarray:
-    """Values without what is above a frequency, without delay: 2nd-order Butterworth forwards and backwards.
+    """Values without what is above a frequency (Hz), without delay: 2nd-order Butterworth forwards and backwards.
 
-    Args:
-        values: shape (samples,) or (samples, columns), evenly spaced.
-        cutoff: Hz; values are left as they are where it is near the end of the band.
-        period: s.
+    Samples run along the first axis. Where the cutoff is near the end of the band, values stay as they are.
     """
     from scipy.signal import butter, sosfiltfilt
 
@@ -208,13 +181,7 @@ def settled(samples: int, cutoff: float, period: float) -> slice:
 
 
 def interpolated(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Values at other times by a cubic spline; beyond the ends the value at the end.
-
-    Args:
-        times: s, increasing, shape (samples,).
-        values: shape (samples,).
-        at: s, shape (times,).
-    """
+    """Values at other times by a cubic spline; beyond the ends the value at the end."""
     from scipy.interpolate import CubicSpline
 
     return CubicSpline(times, values)(np.clip(at, times[0], times[-1]))
