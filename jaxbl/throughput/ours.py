@@ -12,10 +12,10 @@ from jaxbl.fused.passage import HostPassage
 from jaxbl.simulate import scan
 from jaxbl.sweeps.engine import LANES_PER_DEVICE
 
-from .workload import FIGURES, RANGES, SEED, Workload, chunks, joined
+from .workload import FIGURES, RANGES, SEED, Chunked, Workload
 
 
-class Scanned:
+class Scanned(Chunked):
     """`lax.scan` and `vmap`, in chunks that stay in the caches, devices side by side."""
 
     def __init__(self, workload: Workload, devices: int):
@@ -28,13 +28,8 @@ class Scanned:
         sweep = jax.shard_map(
             jax.vmap(lane, (0, None)), mesh=mesh, in_specs=(lanes, PartitionSpec()), out_specs=lanes, check_vma=False
         )
-        self._lanes, self._seed = workload.lanes, jnp.asarray(SEED)
         chunk = min(LANES_PER_DEVICE["scan"] * devices, -(-workload.lanes // devices) * devices)
-        self._given = chunks(workload.values(), chunk, workload.lanes)
-        self.compiled = jax.jit(sweep).lower(self._given[0], self._seed).compile()
-
-    def __call__(self) -> dict[str, np.ndarray]:
-        return joined([self.compiled(values, self._seed) for values in self._given], self._lanes)
+        super().__init__(sweep, workload, chunk, jnp.asarray(SEED))
 
 
 class Fused:

@@ -7,7 +7,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -40,21 +40,13 @@ _TOLERANCE = {
 
 
 class Entry(NamedTuple):
-    """Who runs the workload.
-
-    Attributes:
-        name: in `bench.json` and on charts.
-        make: from a workload to what runs it.
-        lanes: that it is given, as many as it can bear.
-        needs: a module it cannot do without.
-        tolerance: of its own method, where it does not take the reference's steps.
-    """
+    """Who runs the workload, by its name in `bench.json` and on charts."""
 
     name: str
     make: Callable[[Workload], Runner]
-    lanes: int
-    needs: str | None = None
-    tolerance: float = 0.0
+    lanes: int  # that it is given, as many as it can bear
+    needs: str | None = None  # a module it cannot do without
+    tolerance: float = 0.0  # of its own method, where it does not take the reference's steps
 
 
 def entries(folder: Path, count: int, devices: int) -> list[Entry]:
@@ -90,8 +82,7 @@ class Row:
         first_seconds: of making it and calling it once: tracing and compilation included.
         deviation: largest median deviation of its figures from the reference, relative.
         seconds: of each round.
-        lane_steps_per_second: by the least of them.
-        median_lane_steps_per_second: by their median.
+        lane_steps_per_second, median_lane_steps_per_second: by the least of them, and by their median.
     """
 
     name: str
@@ -100,11 +91,11 @@ class Row:
     steps: int
     first_seconds: float
     deviation: float
-    seconds: list[float] = field(default_factory=list)
-    lane_steps_per_second: float = 0.0
-    median_lane_steps_per_second: float = 0.0
+    seconds: list[float]
+    lane_steps_per_second: float = field(init=False)
+    median_lane_steps_per_second: float = field(init=False)
 
-    def finish(self) -> None:
+    def __post_init__(self) -> None:
         work = self.lanes * self.steps
         self.lane_steps_per_second = work / min(self.seconds)
         self.median_lane_steps_per_second = work / statistics.median(self.seconds)
@@ -169,8 +160,9 @@ def _bench(folder: Path, count: int, quick: bool, progress: Progress | None) -> 
         if progress is not None:
             progress(done, parts)
 
-    rows, runners = [], []
-    references: dict[int, dict[str, np.ndarray]] = {}
+    checked: list[tuple[Any, ...]] = []
+    runners, seconds = [], [[] for _ in jobs]
+    reference = cache(_reference)
     for precision in PRECISIONS:
         with _in(precision):
             Workload(1, steps, precision).inputs()
@@ -178,25 +170,19 @@ def _bench(folder: Path, count: int, quick: bool, progress: Progress | None) -> 
         work = Workload(entry.lanes // (8 if quick and entry.lanes > 1 else 1), steps, precision)
         with _in(precision):
             begun = time.perf_counter()
-            runner = entry.make(work)
-            figures = runner()
-            row = Row(entry.name, precision, work.lanes, steps, time.perf_counter() - begun, 0.0)
-        if work.lanes not in references:
-            references[work.lanes] = _reference(work.lanes, steps)
-        row.deviation = _check(entry, precision, figures, references[work.lanes])
-        rows.append(row)
-        runners.append(runner)
+            runners.append(entry.make(work))
+            figures = runners[-1]()
+            first = time.perf_counter() - begun
+        deviation = _check(entry, precision, figures, reference(work.lanes, steps))
+        checked.append((entry.name, precision, work.lanes, steps, first, deviation))
         tick()
     for _ in range(rounds):
-        for row, runner in zip(rows, runners, strict=True):
-            with _in(row.precision):
-                begun = time.perf_counter()
-                runner()
-                row.seconds.append(time.perf_counter() - begun)
+        for (_, precision), runner, own in zip(jobs, runners, seconds, strict=True):
+            with _in(precision):
+                own.append(_seconds(runner))
             tick()
-    for row in rows:
-        row.finish()
     del runners
+    rows = [Row(*one, seconds=own) for one, own in zip(checked, seconds, strict=True)]
     curve = []
     for many in lanes:
         curve += _curve(able, many, 500 if quick else 1000, ("float32",) if quick else PRECISIONS)
@@ -211,6 +197,12 @@ def _is_run(entry: Entry, precision: str, quick: bool) -> bool:
     if entry.lanes == 1:
         return precision == "float64"
     return not quick or precision == "float32" or entry.name.startswith(("c++", "jaxbl fused"))
+
+
+def _seconds(runner: Callable[[], Any]) -> float:
+    begun = time.perf_counter()
+    runner()
+    return time.perf_counter() - begun
 
 
 def _in(precision: str) -> Any:
@@ -264,20 +256,10 @@ def _curve(able: Sequence[Entry], lanes: int, steps: int, precisions: Sequence[s
             short = round(1e8 / lanes / steps)
             for _ in range(max(5, min(15, short))):
                 for i, runner in enumerate(runners):
-                    for _ in range(max(1, min(4, short))):
-                        begun = time.perf_counter()
-                        runner()
-                        best[i] = min(best[i], time.perf_counter() - begun)
-        points += [
-            {
-                "name": e.name,
-                "precision": precision,
-                "lanes": lanes,
-                "steps": steps,
-                "lane_steps_per_second": lanes * steps / t,
-            }
-            for e, t in zip(chosen, best, strict=True)
-        ]
+                    best[i] = min(best[i], *(_seconds(runner) for _ in range(max(1, min(4, short)))))
+        for entry, least in zip(chosen, best, strict=True):
+            point = {"name": entry.name, "precision": precision, "lanes": lanes, "steps": steps}
+            points.append(point | {"lane_steps_per_second": lanes * steps / least})
     return points
 
 
@@ -297,11 +279,8 @@ def _study(count: int, devices: int, able: set[str], lanes: int) -> list[dict[st
             jax.clear_caches()
             forget()
             library.cache_clear()
-            begun = time.perf_counter()
-            entry.make(work)()
-            seconds = time.perf_counter() - begun
-            rows.append({"name": entry.name, "precision": work.precision, "lanes": lanes, "steps": work.steps})
-            rows[-1]["seconds"] = seconds
+            row = {"name": entry.name, "precision": work.precision, "lanes": lanes, "steps": work.steps}
+            rows.append(row | {"seconds": _seconds(lambda entry=entry: entry.make(work)())})
     return rows
 
 

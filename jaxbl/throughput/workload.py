@@ -5,6 +5,7 @@ recorded. Every lane has a dead zone, a noise level and gains of its own; all sh
 """
 
 import math
+from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -62,13 +63,7 @@ NAMES = tuple(f"{side}.{name}" for side in SIDES for name in ("velocity_rmse", "
 
 
 class Workload(NamedTuple):
-    """So many lanes over so many samples.
-
-    Attributes:
-        lanes: number of lanes.
-        steps: samples.
-        precision: `float32` or `float64`.
-    """
+    """So many lanes over so many samples (steps), in `float32` or `float64`."""
 
     lanes: int
     steps: int
@@ -134,16 +129,21 @@ def _inputs(steps: int, precision: str) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(torque, work.dtype), np.stack([np.asarray(noise[side], work.dtype) for side in SIDES], 1)
 
 
-def chunks(values: dict[str, np.ndarray], size: int, lanes: int) -> list[dict[str, Any]]:
-    """Values in parts of one size, the last one filled up."""
-    count = -(-lanes // size) * size
-    padded = {path: np.pad(column, (0, count - lanes), "edge") for path, column in values.items()}
-    return [{path: jnp.asarray(column[at : at + size]) for path, column in padded.items()} for at in range(0, count, size)]
+class Chunked:
+    """A function of values by path, compiled for chunks of one size; the last one is filled up."""
 
+    def __init__(self, function: Callable[..., Any], workload: Workload, size: int, *rest: Any):
+        self._lanes, self._rest = workload.lanes, rest
+        count = -(-workload.lanes // size) * size
+        padded = {path: np.pad(column, (0, count - len(column)), "edge") for path, column in workload.values().items()}
+        self._chunks = [
+            {path: jnp.asarray(column[at : at + size]) for path, column in padded.items()} for at in range(0, count, size)
+        ]
+        self.compiled = jax.jit(function).lower(self._chunks[0], *rest).compile()
 
-def joined(parts: list[dict[str, Any]], lanes: int) -> dict[str, np.ndarray]:
-    """Figures of parts, one after the other."""
-    return {name: np.concatenate([np.asarray(part[name]) for part in parts])[:lanes] for name in parts[0]}
+    def __call__(self) -> dict[str, np.ndarray]:
+        parts = [self.compiled(values, *self._rest) for values in self._chunks]
+        return {name: np.concatenate([np.asarray(part[name]) for part in parts])[: self._lanes] for name in parts[0]}
 
 
 def constants() -> dict[str, float]:
@@ -159,12 +159,8 @@ def constants() -> dict[str, float]:
 
 
 def identified_figures(workload: Workload, sums: list[np.ndarray]) -> dict[str, np.ndarray]:
-    """Figures `(lanes,)` from the nine sums over the run that rivals keep.
-
-    Args:
-        workload: what was run.
-        sums: of products of both regressors (3), of regressors and torques (2 a side), of squared velocity errors (1 each).
-    """
+    """Figures `(lanes,)` from the nine sums over the run that rivals keep: of products of both regressors (3), of regressors
+    and torques (2 a side), of squared velocity errors (1 each)."""
     first, both, second, *right = (np.asarray(column, np.float64) for column in sums)
     determinant = first * second - both * both
     figures = {}

@@ -14,7 +14,6 @@ def result():
     for precision, speed in (("float32", 2e9), ("float64", 5e8)):
         for name, share in ((CEILING, 1.0), (OURS, 0.8), (SCAN, 0.2), ("NumPy, one lane", 1e-5)):
             row = Row(name, precision, 1000, 100, 1.5, 1e-12, seconds=[1e5 / speed / share, 2e5 / speed / share])
-            row.finish()
             rows.append(row)
     curve = [
         {"name": name, "precision": "float32", "lanes": lanes, "steps": 100, "lane_steps_per_second": 1e6 * lanes}

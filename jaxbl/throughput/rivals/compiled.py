@@ -3,12 +3,14 @@
 # of the extra `bench`, which need not be there
 # pyright: reportMissingImports=false
 
+import math
 from collections.abc import Callable
 from functools import cache
 
 import numpy as np
 
-from ..workload import Workload, constants, identified_figures
+from ..workload import Workload, identified_figures
+from .plain import loop, moreau, numbers_of, super_twisting
 
 WIDTH = 64
 """Lanes of a block: several registers of the widest vectors, and a state that stays in the first cache."""
@@ -20,18 +22,18 @@ class Compiled:
     def __init__(self, workload: Workload, threads: int, blocked: bool):
         self._workload, self._threads = workload, threads
         self._function = _blocked(workload.precision) if blocked else _plain()
-        self._torque, self._noise = workload.inputs()
+        torque, noise = workload.inputs()
+        self._inputs = [np.ascontiguousarray(column) for column in (torque, *noise.T)]
         padded = -(-workload.lanes // WIDTH) * WIDTH
         self._values = np.stack([np.resize(column, padded) for column in workload.values().values()])
-        # with them 0, 1 and 2: an untyped number would make float64 of a float32
-        self._constants = np.array([*constants().values(), 0, 1, 2], workload.dtype)
+        self._constants = numbers_of(workload.dtype.type)
 
     def __call__(self) -> dict[str, np.ndarray]:
         import numba
 
         w = self._workload
         numba.set_num_threads(min(self._threads, numba.config.NUMBA_NUM_THREADS))  # pyright: ignore
-        sums = self._function(w.steps, w.start, w.window, self._torque, self._noise, self._constants, self._values)
+        sums = self._function(w.steps, w.start, w.window, *self._inputs, self._constants, self._values)
         return identified_figures(w, list(sums[:, : w.lanes]))
 
 
@@ -43,62 +45,20 @@ def forget() -> None:
 
 @cache
 def _plain() -> Callable[..., np.ndarray]:
-    import math
-
     from numba import njit, prange
 
+    compiled = njit(error_model="numpy")
+    plant, observe = compiled(moreau(math.tanh)), compiled(super_twisting(math.sqrt, np.sign))
+    one = compiled(loop(math.tanh, plant, observe, observe))
+
     @njit(parallel=True, error_model="numpy")
-    def run(steps, start, window, torque, noise, c, values):  # pragma: no cover
-        lanes = values.shape[1]
-        out = np.zeros((9, lanes))
-        h, motor_inertia, motor_viscous, load_inertia, load_viscous = c[0], c[1], c[2], c[3], c[4]
-        ratio, stiffness, slope, share, motor_error, zero, two = c[5], c[6], c[7], c[8], c[9], c[10], c[12]
-        half, bow = h / two, slope / two
-        motor_mass, motor_drag = motor_inertia / h, motor_viscous / two
-        load_mass, load_drag = load_inertia / h, load_viscous / two
-        for lane in prange(lanes):
-            motor_alpha, motor_lambda, load_alpha = values[0, lane], values[1, lane], values[2, lane]
-            load_lambda, gap, level = values[3, lane], two * two * values[4, lane], values[5, lane]
-            motor = motor_rate = load = load_rate = motor_seen = load_seen = load_guess = zero
-            motor_control = load_control = twist = bend = zero
-            motor_guess = -motor_error
-            s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = 0.0
-            for i in range(steps):
-                u = torque[i]
-                motor_read = motor + level * noise[i, 0]
-                load_read = load + level / ratio * noise[i, 1]
-                if i >= window:
-                    s7 += (motor_rate - motor_guess) * (motor_rate - motor_guess)
-                    s8 += (load_rate - load_guess) * (load_rate - load_guess)
-                motor_middle, load_middle = motor + half * motor_rate, load + half * load_rate
-                z = motor_middle - ratio * load_middle
-                through = stiffness * (z - gap * math.tanh(bow * z))
-                motor_rate = ((motor_mass - motor_drag) * motor_rate + u - through) / (motor_mass + motor_drag)
-                load_rate = ((load_mass - load_drag) * load_rate + ratio * through) / (load_mass + load_drag)
-                motor, load = motor_middle + half * motor_rate, load_middle + half * load_rate
-                motor_miss, load_miss = motor_read - motor_seen, load_read - load_seen
-                motor_sign, load_sign = np.sign(motor_miss), np.sign(load_miss)
-                motor_now, load_now = motor_alpha * motor_sign, load_alpha * load_sign
-                motor_seen += h * (motor_guess + motor_lambda * motor_sign * math.sqrt(abs(motor_miss)))
-                load_seen += h * (load_guess + load_lambda * load_sign * math.sqrt(abs(load_miss)))
-                motor_guess += h * ((u - motor_viscous * motor_guess) / motor_inertia + motor_now)
-                load_guess += h * (load_now - load_viscous * load_guess / load_inertia)
-                motor_control += share * (motor_now - motor_control)
-                load_control += share * (load_now - load_control)
-                if i >= start:
-                    motor_torque, load_torque = -motor_inertia * motor_control, load_inertia / ratio * load_control
-                    s0 += twist * twist
-                    s1 += twist * bend
-                    s2 += bend * bend
-                    s3 += twist * motor_torque
-                    s4 += bend * motor_torque
-                    s5 += twist * load_torque
-                    s6 += bend * load_torque
-                z = motor_read - ratio * load_read
-                twist += share * (z - twist)
-                bend -= share * (two * two * math.tanh(bow * z) + bend)
-            out[0, lane], out[1, lane], out[2, lane], out[3, lane], out[4, lane] = s0, s1, s2, s3, s4
-            out[5, lane], out[6, lane], out[7, lane], out[8, lane] = s5, s6, s7, s8
+    def run(steps, start, window, torque, motor_noise, load_noise, c, values):  # pragma: no cover
+        out = np.zeros((9, values.shape[1]))
+        for lane in prange(values.shape[1]):
+            v = values[:, lane]
+            sums = one(steps, start, window, torque, motor_noise, load_noise, c, v[0], v[1], v[2], v[3], v[4], v[5], 0.0)
+            for k in range(9):
+                out[k, lane] = sums[k]
         return out
 
     return run
@@ -112,27 +72,41 @@ def _blocked(precision: str) -> Callable[..., np.ndarray]:
     n = WIDTH
 
     @njit(parallel=True, error_model="numpy", fastmath={"contract"})
-    def run(steps, start, window, torque, noise, c, values):  # pragma: no cover
+    def run(steps, start, window, torque, motor_noise, load_noise, c, values):  # pragma: no cover
         lanes = values.shape[1]
         out = np.zeros((9, lanes))
-        h, motor_inertia, motor_viscous, load_inertia, load_viscous = c[0], c[1], c[2], c[3], c[4]
-        ratio, stiffness, slope, share, motor_error, zero, one, two = c[5], c[6], c[7], c[8], c[9], c[10], c[11], c[12]
-        half, bow, four = h / two, slope / two, two * two
-        motor_mass, motor_drag = motor_inertia / h, motor_viscous / two
-        load_mass, load_drag = load_inertia / h, load_viscous / two
+        (
+            h,
+            motor_inertia,
+            motor_viscous,
+            load_inertia,
+            load_viscous,
+            ratio,
+            stiffness,
+            slope,
+            share,
+            miss,
+            zero,
+            half,
+            four,
+        ) = c
+        one, bow = half + half, half * slope
+        motor_mass, motor_drag = motor_inertia / h, half * motor_viscous
+        load_mass, load_drag = load_inertia / h, half * load_viscous
+        half = half * h
         motor_keep, motor_gain = (motor_mass - motor_drag) / (motor_mass + motor_drag), one / (motor_mass + motor_drag)
         load_keep, load_gain = (load_mass - load_drag) / (load_mass + load_drag), one / (load_mass + load_drag)
         motor_inverse, load_friction, load_share = one / motor_inertia, load_viscous / load_inertia, load_inertia / ratio
         for block in prange(lanes // n):
             # one buffer: of its parts the compiler knows that they do not overlap
-            s = np.zeros(27 * n, c.dtype)
+            s = np.zeros(27 * n, values.dtype)
             for k in range(6):
                 for j in range(n):
                     s[k * n + j] = values[k, block * n + j]
             for j in range(n):
-                s[13 * n + j] = -motor_error
+                s[13 * n + j] = -miss
             for i in range(steps):
-                u, motor_unit, load_unit = torque[i], noise[i, 0], noise[i, 1] / ratio
+                u, motor_unit, load_unit = torque[i], motor_noise[i], load_noise[i] / ratio
                 counts, inside = (one if i >= start else zero), (one if i >= window else zero)
                 for j in range(n):
                     motor, motor_rate, load, load_rate = s[6 * n + j], s[7 * n + j], s[8 * n + j], s[9 * n + j]

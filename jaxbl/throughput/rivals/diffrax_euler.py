@@ -10,16 +10,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxbl.drive import set_leaves
 from jaxbl.simulate import advance, begin, figures
 from jaxbl.sweeps.engine import LANES_PER_DEVICE
 
-from ..workload import FIGURES, Workload, chunks, joined
+from ..workload import FIGURES, Chunked, Workload
 
 
-class Diffrax:
+class Diffrax(Chunked):
     """One workload, compiled."""
 
     def __init__(self, workload: Workload):
@@ -32,7 +31,6 @@ class Diffrax:
 
         def lane(values: dict[str, Any]) -> dict[str, Any]:
             own = set_leaves(experiment, values)
-
             start, tree = jax.tree.flatten(begin(own, (FIGURES,)))
 
             def rates(t: Any, y: tuple[Any, ...], args: Any) -> tuple[Any, ...]:
@@ -55,9 +53,4 @@ class Diffrax:
             last: Any = solution.ys
             return figures(own, (FIGURES,), tree.unflatten([x[0] for x in last]))
 
-        self._given = chunks(workload.values(), LANES_PER_DEVICE["scan"], workload.lanes)
-        self._lanes = workload.lanes
-        self.compiled = jax.jit(jax.vmap(lane)).lower(self._given[0]).compile()
-
-    def __call__(self) -> dict[str, np.ndarray]:
-        return joined([self.compiled(values) for values in self._given], self._lanes)
+        super().__init__(jax.vmap(lane), workload, LANES_PER_DEVICE["scan"])

@@ -1,21 +1,16 @@
 """The chain as a loop over time in Python: with lane arrays of NumPy, or one lane in Python's own numbers, whose plant SciPy
-solves, or whose observers are OpenSMC's."""
+solves, or whose observers are OpenSMC's. The same functions of numbers are what numba compiles (`compiled`)."""
 
 # of the extra `bench`, which need not be there
 # pyright: reportMissingImports=false
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..workload import Workload, constants, identified_figures
-
-State = Sequence[Any]
-"""Motor and load position and velocity."""
-Plant = Callable[[State, Any], State]
-"""From a state and a torque to the next sample's."""
 
 
 class Functions(NamedTuple):
@@ -28,6 +23,11 @@ class Functions(NamedTuple):
 
 _ARRAYS = Functions(np.tanh, np.sqrt, np.sign)
 _NUMBERS = Functions(math.tanh, math.sqrt, lambda x: (x > 0.0) - (x < 0.0))
+
+
+def numbers_of(kind: Callable[[float], Any]) -> tuple[Any, ...]:
+    """The chain's constants as `kind`, and 0, 1/2 and 4: a literal would make float64 of numba's float32."""
+    return tuple(kind(value) for value in (*constants().values(), 0.0, 0.5, 4.0))
 
 
 class Plain:
@@ -51,124 +51,151 @@ class Plain:
     ):
         self._workload, self._solver, self._library = workload, solver, library
         torque, noise = workload.inputs()
-        self._f = _NUMBERS if numbers else _ARRAYS
-        self._torque, self._noise = (torque.tolist(), noise.tolist()) if numbers else (torque, noise)
+        self._functions = _NUMBERS if numbers else _ARRAYS
+        self._inputs = [x.tolist() if numbers else x for x in (torque, *noise.T)]
         values = [column[chosen] for column in workload.values().values()]
         self._values: list[Any] = [column.item() for column in values] if numbers else values
-        kind = float if numbers else workload.dtype.type
-        self._c = {name: kind(value) for name, value in constants().items()}
+        self._constants = numbers_of(float if numbers else workload.dtype.type)
 
     def __call__(self) -> dict[str, np.ndarray]:
-        w, c = self._workload, self._c
-        h, ratio, tanh = c["period"], c["gear_ratio"], self._f.tanh
-        motor_alpha, motor_lambda, load_alpha, load_lambda, dead_zone, noise = self._values
-        zero = 0.0 * noise
-        plant = self._moreau(dead_zone) if self._solver is None else self._solved(dead_zone)
-        observer = _OpenSMC if self._library else _Euler
-        motor = observer(motor_lambda, motor_alpha, h, zero - c["motor_error"], self._f)
-        load = observer(load_lambda, load_alpha, h, zero, self._f)
-        state = [zero] * 4
-        motor_control = load_control = twist = bend = zero
-        sums = [zero if self._f is _NUMBERS else zero.astype(np.float64) for _ in range(9)]
-        for i in range(w.steps):
-            u, (motor_unit, load_unit) = self._torque[i], self._noise[i]
-            motor_read, load_read = state[0] + noise * motor_unit, state[2] + noise / ratio * load_unit
-            motor_off, load_off = state[1] - motor.velocity, state[3] - load.velocity
-            state = plant(state, u)
-            motor_now = motor.step(motor_read, (u - c["motor_viscous"] * motor.velocity) / c["motor_inertia"])
-            load_now = load.step(load_read, -c["load_viscous"] * load.velocity / c["load_inertia"])
-            motor_control = motor_control + c["share"] * (motor_now - motor_control)
-            load_control = load_control + c["share"] * (load_now - load_control)
-            z = motor_read - ratio * load_read
-            if i >= w.start:
-                motor_torque = -c["motor_inertia"] * motor_control
-                load_torque = c["load_inertia"] / ratio * load_control
-                sums[0] += twist * twist
-                sums[1] += twist * bend
-                sums[2] += bend * bend
-                sums[3] += twist * motor_torque
-                sums[4] += bend * motor_torque
-                sums[5] += twist * load_torque
-                sums[6] += bend * load_torque
-            if i >= w.window:
-                sums[7] += motor_off * motor_off
-                sums[8] += load_off * load_off
-            twist = twist + c["share"] * (z - twist)
-            bend = bend + c["share"] * (-4.0 * tanh(0.5 * c["slope"] * z) - bend)
+        w = self._workload
+        plant = moreau(self._functions.tanh) if self._solver is None else _solved(self._solver)
+        motor = load = super_twisting(*self._functions[1:])
+        if self._library:
+            motor, load = _OpenSMC(self._functions.sign).observe, _OpenSMC(self._functions.sign).observe
+        run = loop(self._functions.tanh, plant, motor, load)
+        total = 0.0 if self._functions is _NUMBERS else np.zeros(len(self._values[0]))
+        sums = run(w.steps, w.start, w.window, *self._inputs, self._constants, *self._values, total)
         return identified_figures(w, [np.atleast_1d(column) for column in sums])
 
-    def _moreau(self, dead_zone: Any) -> Plant:
-        c, tanh = self._c, self._f.tanh
-        h, half, gap = c["period"], 0.5 * c["period"], 4.0 * dead_zone
 
-        def step(state: State, torque: Any) -> State:
-            motor, motor_rate, load, load_rate = state
-            motor, load = motor + half * motor_rate, load + half * load_rate
-            z = motor - c["gear_ratio"] * load
-            through = c["stiffness"] * (z - gap * tanh(0.5 * c["slope"] * z))
-            mass, drag = c["motor_inertia"] / h, 0.5 * c["motor_viscous"]
-            motor_rate = ((mass - drag) * motor_rate + torque - through) / (mass + drag)
-            mass, drag = c["load_inertia"] / h, 0.5 * c["load_viscous"]
-            load_rate = ((mass - drag) * load_rate + c["gear_ratio"] * through) / (mass + drag)
-            return motor + half * motor_rate, motor_rate, load + half * load_rate, load_rate
+def loop(tanh: Callable, plant: Callable, observe_motor: Callable, observe_load: Callable) -> Callable[..., tuple[Any, ...]]:
+    """From inputs, constants and a lane's values to its nine sums, which begin with `total`."""
 
-        return step
+    def run(
+        steps, start, window, torque, motor_noise, load_noise, c,
+        motor_alpha, motor_lambda, load_alpha, load_lambda, dead_zone, noise, total,
+    ):  # fmt: skip
+        (
+            h,
+            motor_inertia,
+            motor_viscous,
+            load_inertia,
+            load_viscous,
+            ratio,
+            stiffness,
+            slope,
+            share,
+            miss,
+            zero,
+            half,
+            four,
+        ) = c
+        gap, load_noise_level, bow, load_share = four * dead_zone, noise / ratio, half * slope, load_inertia / ratio
+        motor_mass, motor_drag = motor_inertia / h, half * motor_viscous
+        load_mass, load_drag = load_inertia / h, half * load_viscous
+        kicks = motor_mass - motor_drag, motor_mass + motor_drag, load_mass - load_drag, load_mass + load_drag
+        of_plant = half * h, ratio, stiffness, bow, *kicks
+        motor = motor_rate = load = load_rate = motor_seen = load_seen = load_guess = zero * noise
+        motor_control = load_control = twist = bend = motor
+        motor_guess = motor - miss
+        s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = total
+        for i in range(steps):
+            u = torque[i]
+            motor_read, load_read = motor + noise * motor_noise[i], load + load_noise_level * load_noise[i]
+            if i >= window:
+                motor_off, load_off = motor_rate - motor_guess, load_rate - load_guess
+                s7 = s7 + motor_off * motor_off
+                s8 = s8 + load_off * load_off
+            motor, motor_rate, load, load_rate = plant(motor, motor_rate, load, load_rate, u, gap, of_plant)
+            nominal = (u - motor_viscous * motor_guess) / motor_inertia
+            motor_seen, motor_guess, now = observe_motor(
+                motor_seen, motor_guess, motor_read, nominal, motor_alpha, motor_lambda, h
+            )
+            motor_control = motor_control + share * (now - motor_control)
+            nominal = -load_viscous * load_guess / load_inertia
+            load_seen, load_guess, now = observe_load(load_seen, load_guess, load_read, nominal, load_alpha, load_lambda, h)
+            load_control = load_control + share * (now - load_control)
+            if i >= start:
+                motor_torque, load_torque = -motor_inertia * motor_control, load_share * load_control
+                s0 = s0 + twist * twist
+                s1 = s1 + twist * bend
+                s2 = s2 + bend * bend
+                s3 = s3 + twist * motor_torque
+                s4 = s4 + bend * motor_torque
+                s5 = s5 + twist * load_torque
+                s6 = s6 + bend * load_torque
+            z = motor_read - ratio * load_read
+            twist = twist + share * (z - twist)
+            bend = bend - share * (four * tanh(bow * z) + bend)
+        return s0, s1, s2, s3, s4, s5, s6, s7, s8
 
-    def _solved(self, dead_zone: float) -> Plant:
-        from scipy.integrate import solve_ivp
-
-        c, method = self._c, self._solver or "RK45"
-        ratio, gap, slope = c["gear_ratio"], 4.0 * dead_zone, 0.5 * c["slope"]
-
-        def rates(t: float, x: np.ndarray, torque: float) -> list[float]:
-            motor, motor_rate, load, load_rate = x.tolist()
-            z = motor - ratio * load
-            through = c["stiffness"] * (z - gap * math.tanh(slope * z))
-            faster = (torque - through - c["motor_viscous"] * motor_rate) / c["motor_inertia"]
-            return [motor_rate, faster, load_rate, (ratio * through - c["load_viscous"] * load_rate) / c["load_inertia"]]
-
-        def step(state: State, torque: float) -> State:
-            found = solve_ivp(rates, (0.0, c["period"]), state, method, args=(torque,), rtol=1e-6, atol=1e-9)
-            return found.y[:, -1].tolist()
-
-        return step
+    return run
 
 
-class _Euler:
-    """Explicit super-twisting (7)-(8) of one side."""
+def moreau(tanh: Callable) -> Callable:
+    """One step of the plant: drift, kick, drift."""
 
-    def __init__(self, lambda_: Any, alpha: Any, period: Any, velocity: Any, functions: Functions):
-        self.lambda_, self.alpha, self.period = lambda_, alpha, period
-        self.sqrt, self.sign = functions.sqrt, functions.sign
-        self.position, self.velocity = 0.0 * velocity, velocity
+    def step(motor, motor_rate, load, load_rate, torque, gap, of_plant):
+        half, ratio, stiffness, bow, motor_less, motor_more, load_less, load_more = of_plant
+        motor, load = motor + half * motor_rate, load + half * load_rate
+        z = motor - ratio * load
+        through = stiffness * (z - gap * tanh(bow * z))
+        motor_rate = (motor_less * motor_rate + torque - through) / motor_more
+        load_rate = (load_less * load_rate + ratio * through) / load_more
+        return motor + half * motor_rate, motor_rate, load + half * load_rate, load_rate
 
-    def step(self, reading: Any, nominal: Any) -> Any:
-        """Take in a reading; the equivalent control."""
-        error = reading - self.position
-        switch = self.sign(error)
-        control = self.alpha * switch
-        self.position = self.position + self.period * (self.velocity + self.lambda_ * switch * self.sqrt(abs(error)))
-        self.velocity = self.velocity + self.period * (nominal + control)
-        return control
+    return step
+
+
+def super_twisting(sqrt: Callable, sign: Callable) -> Callable:
+    """One step of an explicit observer (7)-(8): position and velocity for the next sample, and the equivalent control."""
+
+    def observe(seen, guess, reading, nominal, alpha, lambda_, h):
+        error = reading - seen
+        switch = sign(error)
+        control = alpha * switch
+        return seen + h * (guess + lambda_ * switch * sqrt(abs(error))), guess + h * (nominal + control), control
+
+    return observe
+
+
+def _solved(method: str) -> Callable:
+    """The plant from sample to sample by SciPy."""
+    from scipy.integrate import solve_ivp
+
+    c = constants()
+
+    def rates(t: float, x: np.ndarray, torque: float, gap: float) -> list[float]:
+        motor, motor_rate, load, load_rate = x.tolist()
+        z = motor - c["gear_ratio"] * load
+        through = c["stiffness"] * (z - gap * math.tanh(0.5 * c["slope"] * z))
+        faster = (torque - through - c["motor_viscous"] * motor_rate) / c["motor_inertia"]
+        load_faster = (c["gear_ratio"] * through - c["load_viscous"] * load_rate) / c["load_inertia"]
+        return [motor_rate, faster, load_rate, load_faster]
+
+    def step(motor, motor_rate, load, load_rate, torque, gap, of_plant):
+        start = motor, motor_rate, load, load_rate
+        found = solve_ivp(rates, (0.0, c["period"]), start, method, args=(torque, gap), rtol=1e-6, atol=1e-9)
+        return found.y[:, -1].tolist()
+
+    return step
 
 
 class _OpenSMC:
     """OpenSMC's Levant differentiator of first order: a super-twisting observer without a model, which is added."""
 
-    def __init__(self, lambda_: float, alpha: float, period: float, velocity: float, functions: Functions):
-        from opensmc.estimators.levant import LevantDifferentiator
+    def __init__(self, sign: Callable):
+        self._sign, self._estimator = sign, None
 
-        # its gains are lambdas[0] sqrt(L) and lambdas[1] L
-        self._estimator = LevantDifferentiator(order=1, L=1.0, lambdas=[lambda_, alpha], dt=period)
-        self._estimator._z = np.array([0.0, velocity])
-        self.alpha, self.period, self.sign = alpha, period, functions.sign
+    def observe(self, seen, guess, reading, nominal, alpha, lambda_, h):
+        if self._estimator is None:
+            from opensmc.estimators.levant import LevantDifferentiator
 
-    @property
-    def velocity(self) -> float:
-        return float(self._estimator._z[1])
-
-    def step(self, reading: float, nominal: float) -> float:
-        error = reading - float(self._estimator._z[0])
+            # its gains are lambdas[0] sqrt(L) and lambdas[1] L
+            self._estimator = LevantDifferentiator(order=1, L=1.0, lambdas=[lambda_, alpha], dt=h)
+            self._estimator._z = np.array([seen, guess])
         self._estimator.estimate(0.0, None, None, y=reading)
-        self._estimator._z[1] += self.period * nominal
-        return self.alpha * self.sign(error)
+        self._estimator._z[1] += h * nominal
+        position, velocity = self._estimator._z.tolist()
+        return position, velocity, alpha * self._sign(reading - seen)
