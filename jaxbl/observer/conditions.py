@@ -113,8 +113,20 @@ def _log_peak_ratio(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
     return gain - half * (_arc(half, one, c1 - half**2) + _arc(-half, one, below))
 
 
-_HALVINGS = 12
-_NEWTON = 2
+def bisect(holds: Callable[[Values], Values], high: Values, halvings: int) -> tuple[Values, Values]:
+    """Bounds of the least number between 0 and `high` from which on something holds, after so many halvings."""
+
+    def halve(bounds: tuple[Values, Values], _: None) -> tuple[tuple[Values, Values], None]:
+        low, high = bounds
+        middle = 0.5 * (low + high)
+        good = holds(middle)
+        return (jnp.where(good, low, middle), jnp.where(good, middle, high)), None
+
+    return jax.lax.scan(halve, (jnp.zeros_like(high), high), length=halvings)[0]
+
+
+_HALVINGS, _NEWTON = 12, 2
+"""Bisection until Newton's method converges, and its steps up to rounding; a last one carries the derivatives."""
 
 
 @jax.jit
@@ -129,16 +141,8 @@ def least_lambda_exact(alpha: Values, f_plus: Values) -> Values:
     ratio = jnp.where(known, alpha, 2.0) / jnp.where(known, f_plus, 1.0)
     one = jnp.ones_like(ratio)
     fixed = jax.lax.stop_gradient(ratio)
-
-    def halve(bounds: tuple[Values, Values], _: None) -> tuple[tuple[Values, Values], None]:
-        low, high = bounds
-        middle = 0.5 * (low + high)
-        converges = peak_ratio(middle, fixed, one) < 1.0
-        return (jnp.where(converges, low, middle), jnp.where(converges, middle, high)), None
-
     # rho is zero, so below one, at lambda^2 = 4 c2
-    upper = jnp.sqrt(8.0 * (fixed + 1.0))
-    (low, high), _ = jax.lax.scan(halve, (jnp.zeros_like(ratio), upper), length=_HALVINGS)
+    low, high = bisect(lambda one_lambda: peak_ratio(one_lambda, fixed, one) < 1.0, jnp.sqrt(8.0 * (fixed + 1.0)), _HALVINGS)
 
     def newton(least: Values, ratio: Values) -> Values:
         value, slope = jax.jvp(lambda x: _log_peak_ratio(x, ratio, one), (least,), (one,))
@@ -215,14 +219,6 @@ def _lowest_ray(lambda_: Values, c1: Values) -> Values:
     return jnp.where(real, -c1 / (half + jnp.sqrt(jnp.where(real, half**2 - c1, 0.0))), -jnp.inf)
 
 
-def _sliding_speed(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
-    """Least x2 / sqrt(x1) from which d = +f leads to the origin without passing x = 0; inf where there is none.
-
-    On the faster of the two rays, x1' = p sqrt(x1), x2 is (p + lambda) sqrt(x1), which is minus the slower one's root.
-    """
-    return -_lowest_ray(lambda_, 2.0 * _margin(alpha, f_plus))
-
-
 def _at_root(lambda_: Values, c1: Values, ray: Values, eps: float) -> Values:
     """Whether a ray is the root's or below, to some eps of the squares whose difference p^2 + lambda p + c1 is."""
     half = 0.5 * lambda_
@@ -231,8 +227,8 @@ def _at_root(lambda_: Values, c1: Values, ray: Values, eps: float) -> Values:
     return (least >= 0.0) & ((ray <= _lowest_ray(lambda_, c1)) | near)
 
 
-_RAYS = 17
-_ROUNDS = 5
+_RAYS, _ROUNDS = 17, 5
+"""Of a grid, and grids: the last one's step is 1 / 65 536 of the range of rays, and the time is stationary in them."""
 
 
 def slowest_ray(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
@@ -301,8 +297,9 @@ def convergence_time_worst(
     away = position_error != 0.0
     y = jnp.where(away, jnp.sqrt(jnp.where(away, jnp.abs(position_error), 1.0)), 0.0)
     first = _passage(lambda_, alpha, f_plus, y + zero, x2 + zero, ray)
-    # a start beyond the root's ray returns to it under d = +f, and holds on to the origin
-    slides = x2 + zero > _sliding_speed(lambda_, alpha, f_plus) * y
+    # a start beyond the faster root's ray, x2 = (p + lambda) sqrt(x1), returns to it under d = +f, and holds on to the
+    # origin; p + lambda is minus the slower one's root
+    slides = x2 + zero > -_lowest_ray(lambda_, 2.0 * _margin(alpha, f_plus)) * y
     longest = jnp.maximum(first.time + first.speed * a_peak, jnp.where(slides, x2 / _margin(alpha, f_plus), 0.0))
     moving = (x2 != 0.0) | away
     return jnp.where(converges, jnp.where(moving, longest, 0.0), jnp.inf)

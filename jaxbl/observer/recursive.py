@@ -114,14 +114,6 @@ class Identifier(eqx.Module):
         )
         return IdentifierState(state.regressors, *settled, weight=jnp.ones_like(state.weight))
 
-    def information(self, state: IdentifierState) -> Float[Array, "n n"]:
-        """The information matrix sum(phi phi^T)."""
-        n = len(state.regressors)
-        upper = jnp.stack(_values(state, state.information))
-        rows, columns = jnp.triu_indices(n)
-        matrix = jnp.zeros((n, n), upper.dtype).at[rows, columns].set(upper)
-        return matrix.at[columns, rows].set(upper)
-
     def estimate(self, state: IdentifierState, law: AbstractTransmission) -> dict[str, dict[str, Number]]:
         """Parameters of the law by each side: {"motor": {"stiffness": ..., "dead_zone": ..., "half_gap": ...}, ...}.
 

@@ -6,18 +6,22 @@ is known. A half cycle begins and ends at x1 = 0; the next one is its mirror ima
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from .conditions import Values
+from .conditions import Values, bisect
 
-# part of the fastest time constant that a step takes: the peak ratio is then good to about 1e-7
 _STEP = 0.1
+"""Part of the fastest time constant that a step takes: the peak ratio is then good to about 1e-7."""
 _MOST_STEPS = 20_000
+"""Of a quarter cycle: two thousand time constants, after which it has ended, or nears the origin along a ray."""
 _GONE = 1e-6
+"""Error, over that at the start, from which on the way to the origin is known: its time is added in closed form."""
 _HALVINGS = 28
+"""The last interval is 4 / 2^28 = 1.5e-8 of sqrt(alpha + f)."""
 
 
 class HalfCycle(NamedTuple):
@@ -106,13 +110,13 @@ def half_cycle(
 
 def _runge_kutta(slope: Callable[[_State], _State], s: _State, h: Values) -> _State:
     def moved(by: Values, k: _State) -> _State:
-        return _State(*(x + by * d for x, d in zip(s, k, strict=True)))
+        return jax.tree.map(lambda x, d: x + by * d, s, k)
 
     k1 = slope(s)
     k2 = slope(moved(0.5 * h, k1))
     k3 = slope(moved(0.5 * h, k2))
     k4 = slope(moved(h, k3))
-    return _State(*(x + h / 6.0 * (a + 2.0 * b + 2.0 * c + d) for x, a, b, c, d in zip(s, k1, k2, k3, k4, strict=True)))
+    return jax.tree.map(lambda x, a, b, c, d: x + h / 6.0 * (a + 2.0 * b + 2.0 * c + d), s, k1, k2, k3, k4)
 
 
 def _march(
@@ -126,26 +130,23 @@ def _march(
     """March until `event` falls through zero. Returns the state there, and whether it came to that."""
     zero = jnp.zeros_like(state.y)
 
-    def advance(carry: tuple[_State, Values, Values, Values]) -> tuple[_State, Values, Values, Values]:
+    def advance(carry: tuple[Any, ...]) -> tuple[Any, ...]:
         state, going, met, count = carry
         new = _runge_kutta(slope, state, step_size(state))
         crosses = event(new) <= 0.0
         moves = going & ~crosses
-        state = _State(*(jnp.where(moves, b, a) for a, b in zip(state, new, strict=True)))
+        state = jax.tree.map(partial(jnp.where, moves), new, state)
         return state, moves & ~gone(state), met | (going & crosses), count + 1
 
-    def unfinished(carry: tuple[_State, Values, Values, Values]) -> Values:
-        return jnp.any(carry[1]) & (carry[3] < _MOST_STEPS)
-
-    going = jnp.asarray(goes) & (zero == 0.0)
-    state, _, met, _ = jax.lax.while_loop(unfinished, advance, (state, going, zero > 0.0, jnp.asarray(0)))
+    begin = state, jnp.asarray(goes) & (zero == 0.0), zero > 0.0, jnp.asarray(0)
+    state, _, met, _ = jax.lax.while_loop(lambda carry: jnp.any(carry[1]) & (carry[3] < _MOST_STEPS), advance, begin)
     # the last step ends at the event
     h = 0.5 * step_size(state)
     for _ in range(6):
         at, rate = jax.jvp(lambda h: event(_runge_kutta(slope, state, h)), (h,), (jnp.ones_like(h),))
         h = jnp.clip(h - at / jnp.where(rate < 0.0, rate, -jnp.inf), 0.0, step_size(state))
     last = _runge_kutta(slope, state, h)
-    return _State(*(jnp.where(met, b, a) for a, b in zip(state, last, strict=True))), met
+    return jax.tree.map(partial(jnp.where, met), last, state), met
 
 
 def least_lambda_simulated(
@@ -163,12 +164,6 @@ def least_lambda_simulated(
     def shrinks(lambda_: Values) -> Values:
         return half_cycle(lambda_, alpha, f_plus, damping=damping, speed=speed).ratio < 1.0
 
-    def halve(bounds: tuple[Values, Values], _: None) -> tuple[tuple[Values, Values], None]:
-        low, high = bounds
-        middle = 0.5 * (low + high)
-        good = shrinks(middle)
-        return (jnp.where(good, low, middle), jnp.where(good, middle, high)), None
-
-    (low, found), _ = jax.lax.scan(halve, (jnp.zeros_like(high), high), length=_HALVINGS)
+    low, found = bisect(shrinks, high, _HALVINGS)
     found = jnp.where(low == 0.0, jnp.where(shrinks(jnp.zeros_like(found)), 0.0, found), found)
     return jnp.where(shrinks(high), found, jnp.inf)

@@ -1,6 +1,7 @@
 """What `jaxbl bench` leaves: table, `bench.json`, a bar chart, and throughput against lanes."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -108,6 +109,6 @@ def throughput_lines(result: BenchResult) -> list[str]:
 def write_bench_report(result: BenchResult, folder: Path) -> list[str]:
     """Write `bench.json` and figures. Returns the lines for the terminal."""
     make_folder(folder)
-    write_atomic(folder / "bench.json", json.dumps(result.plain(), indent=2, ensure_ascii=False))
+    write_atomic(folder / "bench.json", json.dumps(asdict(result), indent=2, ensure_ascii=False))
     save_all(draw_throughput(result), folder)
     return throughput_lines(result)

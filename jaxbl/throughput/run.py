@@ -6,7 +6,7 @@ import platform
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
@@ -118,10 +118,6 @@ class BenchResult:
     curve: list[dict[str, Any]]
     study: list[dict[str, Any]]
     left_out: dict[str, str]
-
-    def plain(self) -> dict[str, Any]:
-        """As `bench.json` has it."""
-        return asdict(self)
 
     def speed(self, name: str, precision: str) -> float | None:
         """Lane-steps per second of an entry, None if it did not run."""

@@ -38,9 +38,17 @@ def identify(identifier, law, z, torques, time_constant=0.0, dtype=jnp.float64, 
             state, _ = jax.lax.scan(one, state, samples)
         else:
             state, _ = jax.lax.scan(blockwise, state, jax.tree.map(lambda x: x.reshape(-1, block), samples))
-        return identifier.information(state), identifier.estimate(state, law), identifier.excitation(state)
+        return matrix_of(state), identifier.estimate(state, law), identifier.excitation(state)
 
     return jax.jit(run)()
+
+
+def matrix_of(state):
+    """The information matrix from its upper triangle."""
+    n = len(state.regressors)
+    upper = jnp.stack([one.value(state.weight) for one in state.information])
+    rows, columns = jnp.triu_indices(n)
+    return jnp.zeros((n, n), upper.dtype).at[rows, columns].set(upper).at[columns, rows].set(upper)
 
 
 def record(law, size=4000, noise=0.05, seed=0):

@@ -134,7 +134,8 @@ def test_recorded_positions_give_the_estimates_of_the_run_that_produced_them(dis
             for side in (signals.motor, signals.load)
         ]
         read = {side: signals.side(side).measured for side in experiment.sides}
-        return (signals.time, signals.input, read), (kept, experiment.identifier.information(state.identifier))
+        information = [one.value(state.identifier.weight) for one in state.identifier.information]
+        return (signals.time, signals.input, read), (kept, information)
 
     _, ((time, torque, measured), simulated) = eqx.filter_jit(lambda e: scan(e, jnp.asarray(5), record=keep))(experiment)
 

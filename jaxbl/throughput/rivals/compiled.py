@@ -75,21 +75,8 @@ def _blocked(precision: str) -> Callable[..., np.ndarray]:
     def run(steps, start, window, torque, motor_noise, load_noise, c, values):  # pragma: no cover
         lanes = values.shape[1]
         out = np.zeros((9, lanes))
-        (
-            h,
-            motor_inertia,
-            motor_viscous,
-            load_inertia,
-            load_viscous,
-            ratio,
-            stiffness,
-            slope,
-            share,
-            miss,
-            zero,
-            half,
-            four,
-        ) = c
+        h, motor_inertia, motor_viscous, load_inertia, load_viscous, ratio = c[:6]
+        stiffness, slope, share, miss, zero, half, four = c[6:]
         one, bow = half + half, half * slope
         motor_mass, motor_drag = motor_inertia / h, half * motor_viscous
         load_mass, load_drag = load_inertia / h, half * load_viscous

@@ -76,21 +76,8 @@ def loop(tanh: Callable, plant: Callable, observe_motor: Callable, observe_load:
         steps, start, window, torque, motor_noise, load_noise, c,
         motor_alpha, motor_lambda, load_alpha, load_lambda, dead_zone, noise, total,
     ):  # fmt: skip
-        (
-            h,
-            motor_inertia,
-            motor_viscous,
-            load_inertia,
-            load_viscous,
-            ratio,
-            stiffness,
-            slope,
-            share,
-            miss,
-            zero,
-            half,
-            four,
-        ) = c
+        h, motor_inertia, motor_viscous, load_inertia, load_viscous, ratio = c[:6]
+        stiffness, slope, share, miss, zero, half, four = c[6:]
         gap, load_noise_level, bow, load_share = four * dead_zone, noise / ratio, half * slope, load_inertia / ratio
         motor_mass, motor_drag = motor_inertia / h, half * motor_viscous
         load_mass, load_drag = load_inertia / h, half * load_viscous
