@@ -333,7 +333,7 @@ def plot(results: list[tuple[Problem, list[Row]]], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     from jaxbl.report.figures import save
-    from jaxbl.report.style import COLOURS, style
+    from jaxbl.report.figures import COLOURS, style
 
     with style():
         figure, axes = plt.subplots(1, len(results), figsize=(4.3 * len(results), 4.4))

@@ -3,6 +3,9 @@
 The public names are loaded on first use, so that `import jaxbl` and the command line's help do not wait for JAX.
 """
 
+import ast
+from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -40,48 +43,18 @@ if TYPE_CHECKING:
     from .sweeps.trial import run as run
     from .throughput import bench as bench
 
+# the imports above, by name: one list for type checkers and for loading
 _WHERE = {
-    "InputError": "errors",
-    "NoResult": "errors",
-    "Inspection": "records",
-    "LogTable": "records",
-    "Record": "records",
-    "inspect": "records",
-    "read_record": "records",
-    "write_diagnosis_report": "report.diagnose",
-    "write_identification_report": "report.identify",
-    "write_inspection_report": "report.inspect",
-    "write_sweep_report": "report.sweep",
-    "write_trial_report": "report.simulate",
-    "write_tune_report": "report.tune",
-    "write_verify_report": "report.verify",
-    "Config": "config",
-    "read_config": "config",
-    "Diagnosis": "diagnosis.diagnose",
-    "diagnose": "diagnosis.diagnose",
-    "Identification": "identification.identify",
-    "identify": "identification.identify",
-    "Law": "gains.accuracy_laws",
-    "accuracy_laws": "gains.accuracy_laws",
-    "StudyResult": "sweeps.sweep",
-    "dry_run": "sweeps.sweep",
-    "load": "sweeps.sweep",
-    "sweep": "sweeps.sweep",
-    "Trial": "sweeps.trial",
-    "run": "sweeps.trial",
-    "Tuning": "gains.tune",
-    "tune": "gains.tune",
-    "bench": "throughput",
-    "Verdict": "gains.verify",
-    "verify": "gains.verify",
+    one.name: node.module
+    for node in ast.walk(ast.parse(Path(__file__).read_text(encoding="utf-8")))
+    if isinstance(node, ast.ImportFrom) and node.level
+    for one in node.names
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in _WHERE:
         raise AttributeError(f"module 'jaxbl' has no attribute '{name}'")
-    from importlib import import_module
-
     return getattr(import_module(f".{_WHERE[name]}", __name__), name)
 
 

@@ -12,7 +12,6 @@ from .report.diagnose import probability, rms_text
 from .workers import Progress, each, forget_programs, worth
 
 _LOGS = (".csv", ".parquet", ".mat")
-_VERDICTS = {"explained": "explained", "no_discrepancy": "no discrepancy", "unknown_effect": "unknown effect"}
 
 
 class LogJob(NamedTuple):
@@ -28,11 +27,7 @@ class LogJob(NamedTuple):
 def read_batch(source: Path, model: Path | None, out: Path, *, overwrite: bool) -> list[LogJob]:
     """The logs of a folder, each with its model and a folder for its results.
 
-    Args:
-        source: folder of the logs; `NAME.toml` beside a log is its model, `holdout/NAME.*` its hold-out log.
-        model: of the logs that have none of their own.
-        out: folder for the results.
-        overwrite: whether results of other logs may be replaced.
+    `NAME.toml` beside a log is its model (`model` where there is none), `holdout/NAME.*` its hold-out log.
 
     Raises:
         InputError: there is no log, a log has no model, or two logs have one name.
@@ -61,7 +56,8 @@ def run_batch(work: list[LogJob], out: Path, processes: int | None, progress: Pr
     make_folder(out)
     progress(0, len(work))
     rows = []
-    for row in each(_diagnosed, work, worth(len(work)) if processes is None else min(processes, len(work))):
+    processes = worth(len(work)) if processes is None else min(processes, len(work))
+    for row in each(_diagnosed, work, processes):
         rows.append(row)
         progress(len(rows), len(work))
     pd.DataFrame(rows).to_csv(out / "batch.csv", index=False)
@@ -112,5 +108,5 @@ def batch_lines(rows: list[dict[str, Any]]) -> list[str]:
             continue
         named = f"{row['findings']} ({probability(row['confidence'])})" if row["findings"] else ""
         gap = f"{rms_text(row['theta_e_before'])} -> {rms_text(row['theta_e_after'])} ({rms_text(row['theta_e_floor'])})"
-        lines.append(f"{row['log']:<{width}}  {_VERDICTS[row['verdict']]:<14}  {named}  theta_e {gap}")
+        lines.append(f"{row['log']:<{width}}  {row['verdict'].replace('_', ' '):<14}  {named}  theta_e {gap}")
     return lines

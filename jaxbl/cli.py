@@ -10,14 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .errors import InputError
-from .terminal import duration, end_at_once_if_interrupted, naming, running, with_exit_code
+from .errors import InputError, NoResult
+from .terminal import duration, naming, running
 
 if TYPE_CHECKING:
-    from jaxbl.gains.tune import Tuning
-    from jaxbl.gains.verify import Verdict
     from jaxbl.sweeps.programs import Backend
-    from jaxbl.sweeps.sweep import StudyResult
 
     from .config import Config
 
@@ -33,19 +30,20 @@ ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML stu
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="DIR", help="folder for the results [default: results/<config name>]")
 ]
-LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="CSV, Parquet, MATLAB or JSON file", show_default=False)]
-LogOutOption = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", help="folder for the results [default: results/<log name>]")
-]
-LogOverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="write into a folder that holds results of another log")
-]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="remove the results of another study from the folder")]
 BackendOption = Annotated[
     str | None,
     typer.Option(
         "--backend", metavar="NAME", help="fused: one compiled loop; scan: XLA's own loop [default: the faster here]"
     ),
+]
+_FORMATS = "CSV, Parquet, MATLAB or JSON file"
+LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help=_FORMATS, show_default=False)]
+LogOutOption = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="folder for the results [default: results/<log name>]")
+]
+LogOverwriteOption = Annotated[
+    bool, typer.Option("--overwrite", help="write into a folder that holds results of another log")
 ]
 
 
@@ -93,6 +91,7 @@ def simulate(
 
 @app.command()
 def sweep(
+    context: typer.Context,
     config: ConfigArgument,
     out: OutOption = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="print the expected cost, and stop")] = False,
@@ -100,18 +99,14 @@ def sweep(
     backend: BackendOption = None,
 ) -> None:
     """Simulate all points of a study: metrics, maps, report. Continues an interrupted sweep."""
-    _start_jax()
+    study, chosen = _study(config, backend)
     from jaxbl.sweeps.metrics import metric_columns
     from jaxbl.sweeps.points import Points
-    from jaxbl.sweeps.programs import backend_of
     from jaxbl.sweeps.sweep import sweep as run_sweep
 
-    from .config import read_config
     from .report.maps import check_figures
     from .report.sweep import write_sweep_report
 
-    chosen = backend_of(backend, "--backend")
-    study = read_config(config)
     if not study.axes and study.sweep.seeds == 1:
         raise InputError(f"{config}: axes: the study has none; add [[axes]], or use 'jaxbl simulate'")
     with naming(config):
@@ -120,7 +115,7 @@ def sweep(
         if dry_run:
             _print_cost(study, chosen)
             return
-    _compute("sweep", config, study, out, overwrite, chosen, run_sweep, write_sweep_report)
+    _compute(context, config, study, out, overwrite, chosen, run_sweep, write_sweep_report)
 
 
 def _print_cost(study: "Config", backend: "Backend | None") -> None:
@@ -141,38 +136,51 @@ def _print_cost(study: "Config", backend: "Backend | None") -> None:
 
 @app.command()
 def tune(
-    config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOption = False, backend: BackendOption = None
+    context: typer.Context,
+    config: ConfigArgument,
+    out: OutOption = None,
+    overwrite: OverwriteOption = False,
+    backend: BackendOption = None,
 ) -> None:
     """Choose lambda and alpha of both observers: gains.toml, comparison, report. Continues an interrupted search."""
-    _start_jax()
+    study, chosen = _study(config, backend)
     from jaxbl.gains.tune import tune as run_tune
-    from jaxbl.sweeps.programs import backend_of
 
-    from .config import read_config
     from .report.tune import write_tune_report
 
-    chosen = backend_of(backend, "--backend")
-    _compute("tune", config, read_config(config), out, overwrite, chosen, run_tune, write_tune_report)
+    _compute(context, config, study, out, overwrite, chosen, run_tune, write_tune_report)
 
 
 @app.command()
 def verify(
-    config: ConfigArgument, out: OutOption = None, overwrite: OverwriteOption = False, backend: BackendOption = None
+    context: typer.Context,
+    config: ConfigArgument,
+    out: OutOption = None,
+    overwrite: OverwriteOption = False,
+    backend: BackendOption = None,
 ) -> None:
     """Test the gain conditions by simulation: counterexamples, maps, report. Continues an interrupted verification."""
-    _start_jax()
+    study, chosen = _study(config, backend)
     from jaxbl.gains.verify import verify as run_verify
+
+    from .report.verify import write_verify_report
+
+    _compute(context, config, study, out, overwrite, chosen, run_verify, write_verify_report)
+
+
+def _study(config: Path, backend: str | None) -> tuple["Config", "Backend | None"]:
+    """A study, and the backend that is asked for."""
+    _start_jax()
     from jaxbl.sweeps.programs import backend_of
 
     from .config import read_config
-    from .report.verify import write_verify_report
 
     chosen = backend_of(backend, "--backend")
-    _compute("verify", config, read_config(config), out, overwrite, chosen, run_verify, write_verify_report)
+    return read_config(config), chosen
 
 
 def _compute(
-    command: str,
+    context: typer.Context,
     config: Path,
     study: "Config",
     out: Path | None,
@@ -181,20 +189,25 @@ def _compute(
     run: Callable[..., Any],
     write_report: Callable[[Any, Path], list[str]],
 ) -> None:
-    """Run a command on a study that continues where an interrupted call stopped, and write its report."""
+    """Run a command on a study that continues where an interrupted call stopped, write its report, and say what it took."""
     folder = _folder(config, out)
-    words = [command, str(config), *(["--backend", backend] if backend else [])]
-    with running(words, config, folder) as progress:
+    with running(context, config, folder) as progress:
         result = run(study, folder, progress=progress, overwrite=overwrite, backend=backend)
-    _print(write_report(result, folder), folder, result)
+    from .fused import SCANNED
+
+    lines = write_report(result, folder)
+    cost = getattr(result, "cost", None)
+    if cost and cost["lanes"]:
+        compiling, computing = duration(cost["compile_seconds"]), duration(cost["run_seconds"])
+        lines.append(f"Compiled in {compiling}, ran {cost['lanes']:.0f} lanes in {computing}.")
+    _print([*lines, *(SCANNED % what for what in result.scanned)], folder)
 
 
 @app.command()
 def inspect(
     log: LogArgument,
     model: Annotated[
-        Path | None,
-        typer.Option("--model", metavar="TOML", help="study, or a file with [log] alone: how to read the log"),
+        Path | None, typer.Option("--model", metavar="TOML", help="study, or a file with [log] alone: how to read the log")
     ] = None,
     out: LogOutOption = None,
     overwrite: LogOverwriteOption = False,
@@ -217,17 +230,13 @@ def inspect(
 
 @app.command()
 def identify(
-    log: Annotated[
-        list[Path],
-        typer.Argument(metavar="LOG...", help="CSV, Parquet, MATLAB or JSON files of one machine", show_default=False),
-    ],
+    context: typer.Context,
+    log: Annotated[list[Path], typer.Argument(metavar="LOG...", help=f"{_FORMATS}s of one machine", show_default=False)],
     model: Annotated[
-        Path,
-        typer.Option("--model", metavar="TOML", help="study with nominal parameters, and [log]", show_default=False),
+        Path, typer.Option("--model", metavar="TOML", help="study with nominal parameters, and [log]", show_default=False)
     ],
     holdout: Annotated[
-        Path | None,
-        typer.Option("--holdout", metavar="LOG2", help="log of the same machine to test the fit on"),
+        Path | None, typer.Option("--holdout", metavar="LOG2", help="log of the same machine to test the fit on")
     ] = None,
     profile: Annotated[
         bool | None, typer.Option("--profile", help="add profile-likelihood intervals", show_default=False)
@@ -243,47 +252,42 @@ def identify(
 
     task = read_identification_task(log, model, holdout=holdout, profile=profile)
     folder = _folder(log[0], out)
-    words = ["identify", *map(str, log), *_words({"--model": model, "--holdout": holdout, "--profile": profile})]
     result = folder / "identification.json"
-    lines, _ = _fit(
-        words, task, run_identification, model, result, overwrite, write_identification_report, identification_lines
-    )
-    _print(lines, folder)
+    summary = _fit(context, task, run_identification, model, result, overwrite, write_identification_report)
+    _print(identification_lines(summary), folder)
 
 
 def _fit(
-    words: list[str],
+    context: typer.Context,
     task: Any,
     run_task: Callable[..., Any],
     model: Path,
     result: Path,
     overwrite: bool,
     write_report: Callable[[Any, Path], list[str]],
-    lines_of: Callable[[dict[str, Any]], list[str]],
-) -> tuple[list[str], dict[str, Any]]:
-    """Fit a model to logs and write the results; what an earlier call found is read. Returns the lines and the summary."""
+) -> dict[str, Any]:
+    """Fit a model to logs and write the results; what an earlier call found is read. Returns the summary."""
     from .files import claim_log_folder, finished_summary, removed_if_empty
 
     folder = result.parent
     claim_log_folder(folder, task.record.path, overwrite=overwrite)
     summary = finished_summary(result, task.identity)
-    if summary is not None:
-        return lines_of(summary), summary
-    words = words + ["--overwrite"] * overwrite
-    with removed_if_empty(folder), running(words, model, folder, unit="steps", kept=False) as progress:
-        found = run_task(task, progress)
-        return write_report(found, folder), found.summary
+    if summary is None:
+        with removed_if_empty(folder), running(context, model, folder, unit="steps", kept=False) as progress:
+            found = run_task(task, progress)
+            write_report(found, folder)
+        summary = found.summary
+    return summary
 
 
 @app.command()
 def diagnose(
+    context: typer.Context,
     log: Annotated[
-        list[Path] | None,
-        typer.Argument(metavar="[LOG...]", help="CSV, Parquet, MATLAB or JSON files of one machine", show_default=False),
+        list[Path] | None, typer.Argument(metavar="[LOG...]", help=f"{_FORMATS}s of one machine", show_default=False)
     ] = None,
     model: Annotated[
-        Path | None,
-        typer.Option("--model", metavar="TOML", help="study with nominal parameters, [uncertainty] and [log]"),
+        Path | None, typer.Option("--model", metavar="TOML", help="study with nominal parameters, [uncertainty] and [log]")
     ] = None,
     holdout: Annotated[
         Path | None,
@@ -298,8 +302,7 @@ def diagnose(
         ),
     ] = None,
     jobs: Annotated[
-        int | None,
-        typer.Option("--jobs", metavar="N", min=1, help="processes for --batch [default: one a core]"),
+        int | None, typer.Option("--jobs", metavar="N", min=1, help="processes for --batch [default: one a core]")
     ] = None,
     next_experiment: Annotated[
         Path | None,
@@ -314,9 +317,7 @@ def diagnose(
     max_travel: Annotated[
         float | None,
         typer.Option(
-            "--max-travel",
-            metavar="RAD",
-            help="limit of its motor travel (m on a linear axis) [default: the log's]",
+            "--max-travel", metavar="RAD", help="limit of its motor travel (m on a linear axis) [default: the log's]"
         ),
     ] = None,
     out: LogOutOption = None,
@@ -332,7 +333,7 @@ def diagnose(
         if log or holdout is not None or next_experiment is not None:
             raise InputError("--batch FOLDER takes no logs, --holdout or --next-experiment; give these one by one")
         _start_jax()
-        _diagnose_batch(batch, model, out if out is not None else Path("results") / batch.name, jobs, overwrite)
+        _diagnose_batch(context, batch, model, out if out is not None else Path("results") / batch.name, jobs, overwrite)
         return
     if jobs is not None:
         raise InputError("--jobs goes with --batch: one log is one process's work")
@@ -347,13 +348,9 @@ def diagnose(
 
     task = read_diagnosis_task(log, model, holdout=holdout)
     folder = _folder(log[0], out)
-    options = {
-        "--model": model, "--holdout": holdout, "--next-experiment": next_experiment, "--max-torque": max_torque,
-        "--max-travel": max_travel,
-    }  # fmt: skip
-    words = ["diagnose", *map(str, log), *_words(options)]
     result = folder / "diagnosis.json"
-    lines, summary = _fit(words, task, run_diagnosis, model, result, overwrite, write_diagnosis_report, diagnosis_lines)
+    summary = _fit(context, task, run_diagnosis, model, result, overwrite, write_diagnosis_report)
+    lines = diagnosis_lines(summary)
     if next_experiment is not None:
         from jaxbl.diagnosis.next_experiment import Limits, write_next_experiment
 
@@ -361,29 +358,19 @@ def diagnose(
     _print(lines, folder)
 
 
-def _diagnose_batch(source: Path, model: Path | None, out: Path, jobs: int | None, overwrite: bool) -> None:
+def _diagnose_batch(
+    context: typer.Context, source: Path, model: Path | None, out: Path, jobs: int | None, overwrite: bool
+) -> None:
     from .batch import batch_lines, read_batch, run_batch
 
     work = read_batch(source, model, out, overwrite=overwrite)
-    words = ["diagnose", *_words({"--batch": source, "--model": model, "--jobs": jobs, "--overwrite": overwrite})]
-    with running(words, model or source, out, unit="logs") as progress:
+    with running(context, model or source, out, unit="logs") as progress:
         rows = run_batch(work, out, jobs, progress)
     for line in batch_lines(rows):
         typer.echo(line)
     typer.echo(f"{out / 'batch.csv'}")
     if all(row["refused"] for row in rows):
         raise typer.Exit(2)
-
-
-def _words(options: dict[str, Any]) -> list[str]:
-    """Options as they are typed; those that were not given are left out."""
-    words = []
-    for name, value in options.items():
-        if value is True:
-            words.append(name)
-        elif value is not None and value is not False:
-            words += [name, f"{value:g}" if isinstance(value, float) else str(value)]
-    return words
 
 
 @app.command()
@@ -413,6 +400,7 @@ def plot(
 
 @app.command()
 def bench(
+    context: typer.Context,
     quick: Annotated[
         bool, typer.Option("--quick", help="take less than a minute: shorter runs, the others in one precision")
     ] = False,
@@ -431,7 +419,7 @@ def bench(
     make_folder(out)
     if any(out.iterdir()) and not (out / "bench.json").exists():
         raise InputError(f"{out}: is not empty and holds no benchmark; choose another folder with --out")
-    with removed_if_empty(out), running(["bench", *["--quick"] * quick], out, out, unit="parts", kept=False) as progress:
+    with removed_if_empty(out), running(context, out, out, unit="parts", kept=False) as progress:
         result = run_bench(quick=quick, progress=progress)
     for line in write_bench_report(result, out):
         typer.echo(line)
@@ -457,26 +445,34 @@ def _start_jax() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
-def _print(lines: list[str], folder: Path, computed: "StudyResult | Tuning | Verdict | None" = None) -> None:
-    """Print what was found, what it took to compute, and where the report is."""
-    from .fused import SCANNED
-
-    for line in lines:
+def _print(lines: list[str], folder: Path) -> None:
+    """Print what was found, and where the report is."""
+    for line in [*lines, str(folder / "report.html")]:
         typer.echo(line)
-    cost = getattr(computed, "cost", None)
-    if cost and cost["lanes"]:
-        compiling, computing = duration(cost["compile_seconds"]), duration(cost["run_seconds"])
-        typer.echo(f"Compiled in {compiling}, ran {cost['lanes']:.0f} lanes in {computing}.")
-    for what in computed.scanned if computed is not None else ():
-        typer.echo(SCANNED % what)
-    typer.echo(f"{folder / 'report.html'}")
 
 
 def main(run: Callable[[], object] = app) -> None:
     """Run a command: exit 0 done, 1 failed, 2 bad input (one line), 130 interrupted."""
-    with_exit_code(run)
+    try:
+        run()
+    except (InputError, NoResult) as error:
+        typer.echo(f"jaxbl: {error}", err=True)
+        sys.exit(2 if isinstance(error, InputError) else 1)
+    except KeyboardInterrupt:
+        typer.echo("interrupted", err=True)
+        sys.exit(130)
 
 
 def program() -> None:
-    """Entry point: as :func:`main`, and an interrupt ends the process at once."""
-    end_at_once_if_interrupted(main)
+    """Entry point: as :func:`main`, and an interrupt ends the process without taking down the interpreter.
+
+    Threads of XLA may still compute then, and would crash when their memory is freed.
+    """
+    try:
+        main()
+    except SystemExit as end:
+        if end.code != 130:
+            raise
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(130)

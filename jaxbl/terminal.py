@@ -1,10 +1,9 @@
-"""What a command does around its work: progress bar, interrupts, messages of bad input, exit codes."""
+"""What a command does around its work: progress bar, interrupts, and names in front of messages of bad input."""
 
-import os
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from .errors import InputError, NoResult
+from .errors import InputError
 
 if TYPE_CHECKING:
     from .workers import Progress
@@ -30,21 +29,14 @@ def naming(config: Path, folder: Path | None = None) -> Iterator[None]:
 
 
 @contextmanager
-def running(words: list[str], config: Path, folder: Path, *, unit: str = "runs", kept: bool = True) -> "Iterator[Progress]":
-    """Around a long computation: messages name the config, progress is shown, and an interrupt says how to go on.
+def running(
+    context: typer.Context, config: Path, folder: Path, *, unit: str = "runs", kept: bool = True
+) -> "Iterator[Progress]":
+    """Around a long computation: messages name the config, progress in `unit` is shown, and an interrupt (exit 130) says how
+    to go on, and whether what is finished is `kept` in the folder.
 
     Foreign code may swallow an interrupt, or turn it into another error: it is remembered, and raised at the next progress
     or error.
-
-    Args:
-        words: the command line, without the folder.
-        config: the study.
-        folder: of the results.
-        unit: what the progress counts.
-        kept: whether what is finished stays in the folder.
-
-    Raises:
-        Exit: with 130 after an interrupt.
     """
     interrupted = False
 
@@ -69,12 +61,25 @@ def running(words: list[str], config: Path, folder: Path, *, unit: str = "runs",
     except BaseException as error:
         if not (interrupted or isinstance(error, KeyboardInterrupt)):
             raise
-        resume = shlex.join(["jaxbl", *words, "--out", str(folder)])
         state = "what is finished is kept. Go on with" if kept else "nothing was written. Start again with"
-        typer.echo(f"interrupted; {state}: {resume}", err=True)
+        typer.echo(f"interrupted; {state}: {_call_again(context, folder)}", err=True)
         raise typer.Exit(130) from None
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def _call_again(context: typer.Context, folder: Path) -> str:
+    """The command line of this call, with the folder of its results."""
+    words = ["jaxbl", str(context.info_name)]
+    for one in context.command.params:
+        source, value = context.get_parameter_source(str(one.name)), context.params.get(str(one.name))
+        if one.name == "out" or source is None or source.name != "COMMANDLINE":
+            continue
+        if one.param_type_name == "option":
+            words.append(one.opts[0])
+        if value is not True:
+            words += map(str, value if isinstance(value, list | tuple) else [value])
+    return shlex.join([*words, "--out", str(folder)])
 
 
 @contextmanager
@@ -103,30 +108,3 @@ def duration(seconds: float) -> str:
     if seconds < 6000.0:
         return f"{seconds / 60.0:.0f} min"
     return f"{seconds / 3600.0:.1f} h"
-
-
-def with_exit_code(run: Callable[[], object]) -> None:
-    """Run a command: exit 0 done, 1 failed, 2 bad input (one line), 130 interrupted."""
-    try:
-        run()
-    except (InputError, NoResult) as error:
-        typer.echo(f"jaxbl: {error}", err=True)
-        sys.exit(2 if isinstance(error, InputError) else 1)
-    except KeyboardInterrupt:
-        typer.echo("interrupted", err=True)
-        sys.exit(130)
-
-
-def end_at_once_if_interrupted(run: Callable[[], object]) -> None:
-    """Run a command; after an interrupt end the process without taking down the interpreter.
-
-    Threads of XLA may still compute then, and would crash when their memory is freed.
-    """
-    try:
-        run()
-    except SystemExit as end:
-        if end.code != 130:
-            raise
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(130)

@@ -41,12 +41,9 @@ def worth(jobs: int) -> int:
 
 
 def each(function: Callable[[Job], Result], jobs: Sequence[Job], processes: int) -> Iterator[Result]:
-    """Results of a function, in the order of its arguments.
+    """Results of a function (importable by name), in the order of its arguments, by so many processes; 1 is this one.
 
-    Args:
-        function: importable by name if there are several processes.
-        jobs: its arguments.
-        processes: that share the work; 1 is this one. An interrupt reaches the jobs under way, and no further ones begin.
+    An interrupt reaches the jobs under way, and no further ones begin.
 
     Raises:
         NoResult: a process was killed.

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxbl.report.figures import save
-from jaxbl.report.style import COLOURS, style
+from jaxbl.report.figures import COLOURS, style
 
 from .effects import LEVELS
 from .scoring import TARGETS, Outcome, calibration, calibration_error, confusion, wilson

@@ -4,43 +4,38 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from matplotlib.figure import Figure
-
 from jaxbl.files import make_folder, write_atomic
 from jaxbl.throughput.run import CEILING, OURS, PRECISIONS, SCAN, BenchResult
 
-from .figures import Drawn
+from .figures import COLOURS, Drawn, style, subplots
 from .page import save_all
-from .style import COLOURS, style
 
-_COLUMNS: list[str] = ["", "bits", "lanes", "lane-steps/s", "median", "of C++", "first call", "deviation"]
+_COLUMNS = ["", "bits", "lanes", "lane-steps/s", "median", "of C++", "first call", "deviation"]
 
 
+@style()
 def draw_throughput(result: BenchResult) -> list[Drawn]:
     """The figures of a benchmark."""
-    with style():
-        return [_bars(result), _curve(result)]
+    return [_bars(result), _curve(result)]
 
 
 def _bars(result: BenchResult) -> Drawn:
     names = list(dict.fromkeys(row.name for row in result.rows))
     names.sort(key=lambda name: result.speed(name, "float32") or result.speed(name, "float64") or 0.0)
-    figure = Figure(figsize=(8.0, 0.42 * len(names) + 1.1))
-    axes = figure.add_subplot()
+    figure, (ax,) = subplots(8.0, 0.42 * len(names) + 1.1)
     height = 0.38
     for shift, precision, alpha in ((height / 2, "float32", 1.0), (-height / 2, "float64", 0.45)):
         for i, name in enumerate(names):
             speed = result.speed(name, precision)
             if speed is not None:
                 colour = COLOURS[1] if name.startswith("jaxbl") else COLOURS[0]
-                axes.barh(i + shift, speed, height, color=colour, alpha=alpha)
-                axes.text(1.15 * speed, i + shift, f"{speed:.2g}", va="center", fontsize=7)
-    axes.set_xscale("log")
-    axes.set_yticks(range(len(names)), names)
-    axes.grid(axis="y", visible=False)
-    top = max(row.lane_steps_per_second for row in result.rows)
-    axes.set_xlim(right=12.0 * top)
-    axes.set_xlabel("lane-steps per second (log scale); upper bar float32, lower bar float64")
+                ax.barh(i + shift, speed, height, color=colour, alpha=alpha)
+                ax.text(1.15 * speed, i + shift, f"{speed:.2g}", va="center", fontsize=7)
+    label = "lane-steps per second (log scale); upper bar float32, lower bar float64"
+    ax.set(xscale="log", xlabel=label)
+    ax.set_yticks(range(len(names)), names)
+    ax.set_xlim(right=12.0 * max(row.lane_steps_per_second for row in result.rows))
+    ax.grid(axis="y", visible=False)
     caption = (
         "The paper's chain on many lanes by each program. A lane-step is one sample of one lane: plant, two observers, "
         "filter and both identifiers. Longer bars are faster; from one grid line to the next is a factor of ten."
@@ -49,19 +44,16 @@ def _bars(result: BenchResult) -> Drawn:
 
 
 def _curve(result: BenchResult) -> Drawn:
-    figure = Figure(figsize=(7.0, 3.8))
-    axes = figure.add_subplot()
+    figure, (ax,) = subplots(7.0, 3.8)
     for name, colour in ((CEILING, COLOURS[0]), (OURS, COLOURS[1]), (SCAN, COLOURS[2])):
         for precision, line in zip(PRECISIONS, ("-", "--"), strict=True):
             points = [point for point in result.curve if (point["name"], point["precision"]) == (name, precision)]
             lanes, speeds = [p["lanes"] for p in points], [p["lane_steps_per_second"] for p in points]
             if points:
-                axes.plot(lanes, speeds, line, color=colour, marker="o", markersize=3, label=f"{name}, {precision}")
-    axes.set_xscale("log", base=2)
-    axes.set_yscale("log")
-    axes.set_xlabel("lanes")
-    axes.set_ylabel("lane-steps per second")
-    axes.legend()
+                ax.plot(lanes, speeds, line, color=colour, marker="o", markersize=3, label=f"{name}, {precision}")
+    ax.set_xscale("log", base=2)
+    ax.set(yscale="log", xlabel="lanes", ylabel="lane-steps per second")
+    ax.legend()
     caption = (
         "Throughput over the number of lanes. On the left the fixed cost of a call and of a block of samples limits it, on "
         "the right caches and memory."
@@ -69,29 +61,22 @@ def _curve(result: BenchResult) -> Drawn:
     return Drawn("lanes", figure, caption)
 
 
-def table(result: BenchResult) -> list[list[str]]:
+def _table(result: BenchResult) -> list[list[str]]:
     """Header and rows of the table, as text."""
     rows = [_COLUMNS]
     for row in result.rows:
         ceiling = result.speed(CEILING, row.precision)
+        share = f"{row.lane_steps_per_second / ceiling:.2g}" if ceiling else "–"
+        speeds = f"{row.lane_steps_per_second:.3g}", f"{row.median_lane_steps_per_second:.3g}", share
         rows.append(
-            [
-                row.name,
-                row.precision[-2:],
-                str(row.lanes),
-                f"{row.lane_steps_per_second:.3g}",
-                f"{row.median_lane_steps_per_second:.3g}",
-                f"{row.lane_steps_per_second / ceiling:.2g}" if ceiling else "–",
-                f"{row.first_seconds:.2f} s",
-                f"{row.deviation:.1g}",
-            ]
+            [row.name, row.precision[-2:], str(row.lanes), *speeds, f"{row.first_seconds:.2f} s", f"{row.deviation:.1g}"]
         )
     return rows
 
 
 def throughput_lines(result: BenchResult) -> list[str]:
     """The benchmark for the terminal."""
-    rows = table(result)
+    rows = _table(result)
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = [
         "  ".join(cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True)))

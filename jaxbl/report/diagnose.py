@@ -6,17 +6,14 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from jaxbl.diagnosis.diagnose import Diagnosis
-from jaxbl.diagnosis.residuals import narrowed
 from jaxbl.identification.logs import unit_on
 
-from .figures import Drawn, outline, stacked_axes
+from .figures import COLOURS, FAINT, MISSING, Drawn, legend, style, subplots, with_unit
 from .log_results import write_log_results
 from .page import PageTable
-from .residuals import draw_residuals, missing_quantity
-from .style import COLOURS, FAINT, LEGEND_ABOVE, MISSING, style, with_unit
+from .residuals import draw_residuals, missing_quantity, plot_torque
 
 _BEFORE, _AFTER, _FLOOR, _HELD = COLOURS[1], COLOURS[0], COLOURS[6], COLOURS[4]
 _CHANNELS = {
@@ -83,20 +80,20 @@ def _gap_lines(gap: Mapping[str, Any]) -> list[str]:
         place = f"On {Path(gap['holdout']['file']).name}"
     else:
         place = f"On the last part of the log ({gap['holdout']['from']:.4g} to {gap['holdout']['to']:.4g} s), held out"
+
+    def change(name: str, before: Mapping[str, float | None], after: Mapping[str, float | None]) -> str:
+        return f"{name} {rms_text(before[name])} -> {rms_text(after[name])} {units[name]}"
+
     errors = [
-        f"{name} {rms_text(before[name])} -> {rms_text(after[name])} {units[name]} (noise {rms_text(floor[name])})"
+        f"{change(name, before, after)} (noise {rms_text(floor[name])})"
         for name in before
         if not name.startswith("velocity")
     ]
     lines = [f"{place}, over windows of {gap['holdout']['window']:.2g} s, rms: {'; '.join(errors)}."]
     run = gap["free_run"]
     if "after" in run:
-        parts = [
-            f"{name} {rms_text(run['before'][name])} -> {rms_text(one)} {units[name]}"
-            for name, one in run["after"].items()
-            if not name.startswith("velocity")
-        ]
-        lines.append(f"In one free run: {'; '.join(parts)}.")
+        changes = [change(name, run["before"], run["after"]) for name in run["after"] if not name.startswith("velocity")]
+        lines.append(f"In one free run: {'; '.join(changes)}.")
     elif run:
         lines.append(f"No free run is compared: {run['why_not']}.")
     return lines
@@ -166,28 +163,28 @@ def _finding_tables(summary: Mapping[str, Any]) -> list[PageTable]:
 
 def _gap_table(gap: Mapping[str, Any]) -> PageTable:
     controls = gap["controls"]
-    rows: list[list[object]] = []
-    for name, before in gap["holdout_rmse_before"].items():
-        others = [one["rmse"].get(name) for one in controls.values()]
-        rows.append([_CHANNELS[name], gap["units"][name], before, gap["holdout_rmse_after"][name], gap["noise_floor"][name]])
-        rows[-1] += others
+    rows = [
+        [_CHANNELS[name], gap["units"][name], before, gap["holdout_rmse_after"][name], gap["noise_floor"][name]]
+        + [one["rmse"].get(name) for one in controls.values()]
+        for name, before in gap["holdout_rmse_before"].items()
+    ]
     return PageTable("Held-out data, rms", ["channel", "unit", "before", "after", "noise", *controls], rows)
 
 
 def _number_table(summary: Mapping[str, Any]) -> PageTable:
-    rows: list[list[object]] = [
+    rows = [
         [path, one["nominal"], one["value"], one["standard_error"], one["unit"]]
         for path, one in summary["parameters"].items()
     ]
     return PageTable("Parameters of the model", ["parameter", "as given", "fitted", "standard error", "unit"], rows)
 
 
+@style()
 def draw_diagnosis(found: Diagnosis) -> list[Drawn]:
     """All figures of a diagnosis."""
     unit = unit_on(found.record, "motor.torque", "N m")
-    with style():
-        drawn = [_verdict(found.summary), _over_time(found)]
-    return [*drawn, *draw_residuals(found.residuals, found.coordinates, found.located, unit, found.observed)]
+    residuals = draw_residuals(found.residuals, found.coordinates, found.located, unit, found.observed)
+    return [_verdict(found.summary), _over_time(found), *residuals]
 
 
 def _verdict(summary: Mapping[str, Any]) -> Drawn:
@@ -196,8 +193,7 @@ def _verdict(summary: Mapping[str, Any]) -> Drawn:
     names = list(gap["holdout_rmse_before"])
     bars = _bars(summary)
     height = max(0.55 * len(names) + 1.9, 0.42 * len(bars) + 1.9)
-    figure = Figure(figsize=(11.0, height), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=[2.3, 1.0])
+    figure, (left, right) = subplots(11.0, height, columns=2, width_ratios=[2.3, 1.0])
     _gap_panel(left, gap, names)
     _chances_panel(right, bars)
     caption = (
@@ -210,10 +206,10 @@ def _verdict(summary: Mapping[str, Any]) -> Drawn:
 
 
 def _gap_panel(ax: Axes, gap: Mapping[str, Any], names: list[str]) -> None:
-    floor = gap["noise_floor"]
+    floor = np.array([gap["noise_floor"][name] for name in names])
 
     def over(errors: Mapping[str, float | None]) -> np.ndarray:
-        return np.array([np.nan if errors.get(name) is None else errors[name] / floor[name] for name in names], float)  # type: ignore[operator]
+        return np.array([errors.get(name) for name in names], float) / floor
 
     rows = np.arange(len(names))
     before, after = over(gap["holdout_rmse_before"]), over(gap["holdout_rmse_after"])
@@ -221,6 +217,9 @@ def _gap_panel(ax: Axes, gap: Mapping[str, Any], names: list[str]) -> None:
         # an arrow for a change of less than 25 % would be shorter than its head
         if np.isfinite([start, stop]).all() and abs(np.log(start / stop)) > 0.25:
             ax.annotate("", (stop, row), (start, row), arrowprops={"arrowstyle": "-|>", "color": FAINT, "lw": 1.2})
+    ax.plot(before, rows, "D", color=_BEFORE, ms=7, ls="none", label="before", zorder=4)
+    ax.plot(after, rows, "o", color=_AFTER, ms=7, ls="none", label="after", zorder=5)
+    ax.axvline(1.0, color=_FLOOR, lw=1.6, label="noise")
     markers = {"wrong": ("x", "another effect"), "permuted": ("+", "shuffled in time")}
     every = [before, after]
     for name, control in gap["controls"].items():
@@ -229,27 +228,20 @@ def _gap_panel(ax: Axes, gap: Mapping[str, Any], names: list[str]) -> None:
             label = f"{label} ({control['effect']})"
         every.append(over(control["rmse"]))
         ax.plot(every[-1], rows + 0.24, marker, color=FAINT, ms=7, mew=1.6, ls="none", label=f"control: {label}")
-    ax.plot(before, rows, "D", color=_BEFORE, ms=7, ls="none", label="before", zorder=4)
-    ax.plot(after, rows, "o", color=_AFTER, ms=7, ls="none", label="after", zorder=5)
-    ax.axvline(1.0, color=_FLOOR, lw=1.6, label="noise")
-    ax.set_xscale("log")
     values = np.concatenate(every)
     values = values[np.isfinite(values) & (values > 0.0)]
-    ax.set_xlim(0.5 * min(float(values.min(initial=1.0)), 1.0), 2.0 * max(float(values.max(initial=1.0)), 3.0))
-    ax.set_ylim(len(names) - 0.4, -0.6)
+    ax.set(
+        xscale="log",
+        xlim=(0.5 * min(float(values.min(initial=1.0)), 1.0), 2.0 * max(float(values.max(initial=1.0)), 3.0)),
+        ylim=(len(names) - 0.4, -0.6),
+        xlabel="rms error on held-out data over noise",
+    )
     labels = [
-        f"{_CHANNELS[name]}\n{rms_text(gap['holdout_rmse_before'][name])} → {rms_text(gap['holdout_rmse_after'][name])} "
-        f"{gap['units'][name]}"
-        for name in names
+        f"{_CHANNELS[name]}\n{rms_text(start)} → {rms_text(gap['holdout_rmse_after'][name])} {gap['units'][name]}"
+        for name, start in gap["holdout_rmse_before"].items()
     ]
     ax.set_yticks(rows, labels, fontsize=9)
-    ax.set_xlabel("rms error on held-out data over noise")
-    handles, texts = ax.get_legend_handles_labels()
-    order = sorted(range(len(texts)), key=lambda i: texts[i].startswith("control"))
-    ax.legend(
-        [handles[i] for i in order], [texts[i] for i in order], ncols=3, loc="lower left", bbox_to_anchor=(-0.02, 1.0),
-        borderaxespad=0.2, columnspacing=1.2,
-    )  # fmt: skip
+    legend(ax, 3, loc="lower left", bbox_to_anchor=(-0.02, 1.0), borderaxespad=0.2)
 
 
 def _bars(summary: Mapping[str, Any]) -> list[tuple[str, float, bool]]:
@@ -279,32 +271,17 @@ def _chances_panel(ax: Axes, bars: list[tuple[str, float, bool]]) -> None:
 
 def _over_time(found: Diagnosis) -> Drawn:
     """Missing torque of each side, before and after."""
-    figure, axes = stacked_axes(len(found.pairs), 2.4)
+    figure, axes = subplots(9.0, 2.4 * len(found.pairs) + 0.6, len(found.pairs), sharex=True)
     for ax, (side, pieces) in zip(axes, found.pairs.items(), strict=True):
         unit = unit_on(found.record, f"{side}.torque", "N m")
-        cutoff = found.located[side].bandwidth
-        labelled: set[str] = set()
+        bandwidth = found.located[side].bandwidth
         for before, after, held in pieces:
-            low, _ = narrowed(before, cutoff)
-            rest, _ = narrowed(after, cutoff)
-            for one, colour, label in ((low, _BEFORE, "before"), (rest, _AFTER, "after")):
-                at = outline(one.torque)
-                time, band = one.time[at], 2.0 * one.deviation[at]
-                ax.plot(time, one.torque[at], color=colour, lw=0.9, label=None if label in labelled else label)
-                labelled.add(label)
-            ax.fill_between(
-                time, -band, band, color=MISSING, alpha=0.6, lw=0.0, zorder=3,
-                label=None if "noise" in labelled else "± 2 noise",
-            )  # fmt: skip
-            labelled.add("noise")
-            if held and any(not other for _, _, other in pieces):
-                ax.axvspan(
-                    before.time[0], before.time[-1], color=_HELD, alpha=0.18, lw=0.0, zorder=0,
-                    label=None if "held" in labelled else "held out",
-                )  # fmt: skip
-                labelled.add("held")
+            plot_torque(ax, before, bandwidth, noise=False, color=_BEFORE, lw=0.9, label="before")
+            plot_torque(ax, after, bandwidth, color=_AFTER, lw=0.9, label="after")
+            if held and not all(other for _, _, other in pieces):
+                ax.axvspan(before.time[0], before.time[-1], color=_HELD, alpha=0.18, lw=0.0, zorder=0, label="held out")
         ax.set_ylabel(with_unit(f"{side}:\nmissing {missing_quantity(unit)}", unit))
-        ax.legend(ncols=4, **LEGEND_ABOVE)
+        legend(ax, 4)
     axes[-1].set_xlabel("time (s)")
     which = f"Held-out log {found.holdout.path.name}: t" if found.summary["gap"]["holdout"]["separate"] else "T"
     caption = (

@@ -1,17 +1,47 @@
-"""Figures before they are placed on a page: names and captions, files, and long signals in few points."""
+"""What figures share: how they look, their axes, names and files, and long signals in few points."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import matplotlib as mpl
 import numpy as np
+from cycler import cycler
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-
-from .style import style
+from matplotlib.lines import Line2D
 
 SIDES = ("motor", "load")
+
+# Okabe and Ito, in an order that also parts in grey
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+SIDE_COLOURS = {"motor": COLOURS[0], "load": COLOURS[1], "transmission": COLOURS[2]}
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+MAP = "viridis"
+MISSING = "#BDBDBD"
+FAINT = "#8C8C8C"
+"""Grey of zero lines, arrows and clouds of points behind a line."""
 LINE_POINTS = 2400
 """Points of a line: a page is about 1000 pixels wide, and each pixel needs a least and a largest value."""
+
+_SETTINGS: Any = {
+    "font.size": 10,
+    "axes.titlesize": 10,
+    "axes.labelsize": 10,
+    "legend.fontsize": 9,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#DDDDDD",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "lines.linewidth": 1.4,
+    "figure.constrained_layout.use": True,
+    "savefig.dpi": 150,
+    "axes.prop_cycle": cycler(color=COLOURS),
+}
 
 
 class Drawn(NamedTuple):
@@ -22,36 +52,60 @@ class Drawn(NamedTuple):
     caption: str
 
 
+@contextlib.contextmanager
+def style() -> Iterator[None]:
+    """The settings that figures are made under; also a decorator of what makes them."""
+    with mpl.rc_context(_SETTINGS):
+        yield
+
+
+def with_unit(label: str, unit: str) -> str:
+    """A label with its unit in brackets, if it has one."""
+    return f"{label} ({unit})" if unit else label
+
+
+@style()
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG, making its folder. Returns the path."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with style():
-        figure.savefig(path)
+    figure.savefig(path)
     return path
 
 
-def stacked_axes(rows: int, height: float, width: float = 9.0, sharex: bool = True):
-    """A figure of axes one above the other. Returns the figure and a flat array of its axes.
-
-    Args:
-        rows: number of axes.
-        height: of each, in inches.
-        width: of the figure, in inches.
-        sharex: one time axis for all.
-    """
-    figure = Figure(figsize=(width, height * rows + 0.6), layout="constrained")
-    axes = figure.subplots(rows, 1, sharex=sharex, squeeze=False).ravel()
-    figure.align_ylabels(axes)
+def subplots(width: float, height: float, rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, list[Axes]]:
+    """A figure of so many inches, and its axes row by row; `how` is matplotlib's."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, **how).ravel().tolist()
+    if columns == 1:
+        figure.align_ylabels(axes)
     return figure, axes
 
 
-def outline(values: np.ndarray, points: int = LINE_POINTS) -> np.ndarray:
-    """Indices `(n,)` that draw the same line: all of a short signal, least and largest of each bin of a long one.
+def legend(ax: Axes, columns: int = 1, of: Sequence[Axes] = (), **how: Any) -> None:
+    """A legend above the axes, where it hides no line, with each label (also of the axes `of`) once."""
+    named = {}
+    for one in of or (ax,):
+        handles, labels = one.get_legend_handles_labels()
+        named |= dict(zip(labels, handles, strict=True))
+    place: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1, "columnspacing": 1.2}
+    ax.legend(named.values(), named.keys(), ncols=columns, **place | how)
 
-    Args:
-        values: a signal `(samples,)`; NaN is skipped.
-        points: about as many indices are returned where the signal has more than twice as many samples.
-    """
+
+def mark(
+    ax: Axes, place: tuple[float, float], marker: str, label: str, size: float, colour: str = "white", held: bool = True
+) -> Line2D:
+    """Mark a point; if `held`, on the edge of the axes where it lies outside. Returns the legend's handle."""
+    x, y = place
+    if held:
+        x, y = np.clip(x, *ax.get_xlim()), np.clip(y, *ax.get_ylim())
+    look: dict[str, Any] = {"ls": "", "marker": marker, "mfc": colour, "mec": "black", "mew": 1.2}
+    ax.plot(x, y, clip_on=False, zorder=6, ms=size, **look)
+    off = "" if np.allclose((x, y), place) else ", off the map"
+    return Line2D([], [], label=f"{label}{off}", ms=min(size, 10.0), **look)
+
+
+def outline(values: np.ndarray, points: int = LINE_POINTS) -> np.ndarray:
+    """Indices that draw the same line: all, or least and largest of each bin of a signal of over `2 * points` samples."""
     if len(values) <= 2 * points:
         return np.arange(len(values))
     size = -(-len(values) // (points // 2))
@@ -69,13 +123,10 @@ def outline(values: np.ndarray, points: int = LINE_POINTS) -> np.ndarray:
 def limits(
     *values: np.ndarray, share: float = 0.001, room: float = 0.12, shown: Sequence[float] = ()
 ) -> tuple[float, float] | None:
-    """Ends of an axis that a few outliers do not set; None where no value is finite.
+    """Ends of an axis that a few outliers do not set; None (matplotlib's own ends) where no value is finite.
 
-    Args:
-        values: signals to be drawn, in the axis's unit.
-        share: of the values that may lie outside at each end.
-        room: added at each end, as a share of the span.
-        shown: values that lie inside in any case.
+    `share` of the values may lie outside at each end, `room` is added there as a share of the span, and `shown` lie inside
+    in any case.
     """
     finite = np.concatenate([one[np.isfinite(one)] for one in values])
     if not len(finite):

@@ -101,32 +101,26 @@ def _on_holdout(holdout: dict[str, Any]) -> list[str]:
 _COLUMNS = ["path", "value", "standard error", "95 % from", "to"]
 
 
-def _rows(parameters: dict[str, Any]) -> list[list[object]]:
-    return [[path, one["value"], one["standard_error"], *one["interval"]] for path, one in parameters.items()]
+def _row(path: str, one: dict[str, Any]) -> list[Any]:
+    return [path, one["value"], one["standard_error"], *one["interval"]]
 
 
 def _parameter_table(summary: dict[str, Any]) -> PageTable:
     parameters = summary["parameters"]
-    rows = [
-        [*row, one.get("unit", ""), one.get("nominal")]
-        for row, one in zip(_rows(parameters), parameters.values(), strict=True)
-    ]
+    rows = [[*_row(path, one), one.get("unit", ""), one.get("nominal")] for path, one in parameters.items()]
     columns = [*_COLUMNS, "unit", "nominal"]
     if any("profile_interval" in one for one in parameters.values()):
         columns += ["by profile from", "to"]
-        for row, one in zip(rows, parameters.values(), strict=True):
-            row += one.get("profile_interval", [None, None])
+        rows = [row + one.get("profile_interval", [None, None]) for row, one in zip(rows, parameters.values(), strict=True)]
     return PageTable("Parameters", columns, rows)
 
 
 def _regression_table(regression: dict[str, Any]) -> PageTable:
     by = "with the measured transmitted torque" if regression["measured_transmitted_torque"] else "at smoothed motion"
     title = f"Least squares on the equations of motion, {by}, up to {regression['bandwidth']:.3g} Hz"
-    return PageTable(title, _COLUMNS, _rows(regression["parameters"]))
+    return PageTable(title, _COLUMNS, [_row(path, one) for path, one in regression["parameters"].items()])
 
 
 def _recursive_table(found: Identification) -> PageTable:
-    rows: list[list[object]] = [
-        [name, *(sides[side] for side in SIDES)] for name, sides in found.summary["method"]["recursive"].items()
-    ]
+    rows = [[name, *(sides[side] for side in SIDES)] for name, sides in found.summary["method"]["recursive"].items()]
     return PageTable("Recursive identification, at the end of the log", ["", *(f"by the {side}" for side in SIDES)], rows)

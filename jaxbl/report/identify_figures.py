@@ -15,9 +15,8 @@ from jaxbl.drive.parameters import parameters
 from jaxbl.identification.identify import Identification
 from jaxbl.identification.logs import unit_on
 
-from .figures import LINE_POINTS, SIDES, Drawn, limits, outline, stacked_axes
+from .figures import COLOURS, FAINT, LINE_POINTS, SIDE_COLOURS, Drawn, legend, limits, outline, style, subplots, with_unit
 from .log_signals import LogSignals
-from .style import COLOURS, FAINT, LEGEND_ABOVE, SIDE_COLOURS, style, with_unit
 
 Array = np.ndarray
 
@@ -30,33 +29,27 @@ _GROWING, _FALLING = COLOURS[2], COLOURS[3]
 _DENSITY = ListedColormap(mpl.colormaps["Greys"](np.linspace(0.25, 0.75, 64)))
 
 
+@style()
 def draw_identification(found: Identification) -> list[Drawn]:
     """All figures of an identification."""
     log = LogSignals(found)
-    with style():
-        drawn = [_intervals(found), _residuals(log), _velocities(log)]
-        if log.geared:
-            drawn += [_torque(log), _hysteresis(log), _limit_cycle(log)]
-        else:
-            drawn += [_resistance(log), _friction(log)]
-        if found.summary["method"]["recursive"]:
-            drawn.append(_path(log))
-    return drawn
+    drawn = [_intervals(found), _residuals(log), _velocities(log)]
+    drawn += [_torque(log), _hysteresis(log), _limit_cycle(log)] if log.geared else [_resistance(log), _friction(log)]
+    return [*drawn, _path(log)] if found.summary["method"]["recursive"] else drawn
 
 
-def _draw(ax: Axes, log: LogSignals, values: Array, rows: slice | None = None, label: str | None = None, **how: Any) -> None:
+def _draw(ax: Axes, log: LogSignals, values: Array, rows: slice | None = None, **how: Any) -> None:
     """A signal over time: broken at gaps, and by the extremes of its bins where it is long."""
     total = sum(part.stop - part.start for part in log.parts(rows))
     for part in log.parts(rows):
         at = part.start + outline(values[part], max(LINE_POINTS * (part.stop - part.start) // total, 8))
-        ax.plot(log.time[at], values[at], label=label, **how)
-        label = None
+        ax.plot(log.time[at], values[at], **how)
 
 
-def _shade_detail(ax: Axes, log: LogSignals) -> None:
-    """Shade the part that is shown in detail above."""
-    if not log.whole:
-        ax.axvspan(*log.span, color=COLOURS[5], alpha=0.25, lw=1.5)
+def _finish(ax: Axes, label: str, ends: tuple[float, float] | None, columns: int = 1) -> None:
+    """Label, ends and legend of an axis of values."""
+    ax.set(ylabel=label, ylim=ends)
+    legend(ax, columns)
 
 
 def _with_error(value: float, error: float, unit: str) -> str:
@@ -75,22 +68,18 @@ def _intervals(found: Identification) -> Drawn:
     }
     held = [path for path in found.summary["held"] if path not in fitted]
     names = [*fitted, *held]
-    figure = Figure(figsize=(9.0, 1.1 + 0.4 * len(names)), layout="constrained")
-    ax = figure.subplots()
+    figure, (ax,) = subplots(9.0, 1.1 + 0.4 * len(names))
     beside: Any = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": 9}
     shown = [0.0]
     for i, one in enumerate(fitted.values()):
         size = abs(one["nominal"]) or abs(one["value"]) or 1.0
-        low, middle, high = (
-            100.0 * (end - one["nominal"]) / size for end in (one["interval"][0], one["value"], one["interval"][1])
-        )
+        low, middle, high = (100.0 * (end - one["nominal"]) / size for end in np.insert(one["interval"], 1, one["value"]))
         ax.plot([low, high], [i, i], color=COLOURS[0], lw=5.0, alpha=0.45, solid_capstyle="butt")
         ax.plot([low, middle, high], [i] * 3, "|", color=COLOURS[0], ms=11, mew=1.6)
         ax.plot(middle, i, "o", color=COLOURS[0], ms=5)
         shown += [max(low, middle - 100.0), min(high, middle + 100.0)]
         half = 0.5 * abs(one["interval"][1] - one["interval"][0])
-        text = _with_error(one["value"], half, one.get("unit", ""))
-        ax.annotate(text, (1.01, i), **beside)
+        ax.annotate(_with_error(one["value"], half, one.get("unit", "")), (1.01, i), **beside)
     for i in range(len(fitted), len(names)):
         ax.plot(0.0, i, "o", mfc="white", mec=FAINT, ms=6)
         ax.annotate("held at nominal: not seen in this log", (1.01, i), color="#555555", **beside)
@@ -111,15 +100,15 @@ def _intervals(found: Identification) -> Drawn:
 
 def _residuals(log: LogSignals) -> Drawn:
     residual = log.found.summary["residual"]
-    figure, axes = stacked_axes(len(residual), 2.0)
+    figure, axes = subplots(9.0, 2.0 * len(residual) + 0.6, len(residual), sharex=True)
     for ax, (side, one) in zip(axes, residual.items(), strict=True):
         unit, values = log.unit[side], log[f"{side}.residual"]
         label = f"rms {one['rms']:.2g} {unit}, {one['rms'] / one['noise']:.3g} times the noise"
         _draw(ax, log, values, color=SIDE_COLOURS[side], lw=0.7, label=label)
         for sign in (-2.0, 2.0):
-            ax.axhline(sign * one["noise"], color=_MODEL, lw=0.9, ls="--", label="± 2 noise" if sign > 0.0 else None)
+            ax.axhline(sign * one["noise"], color=_MODEL, lw=0.9, ls="--", label="± 2 noise")
         ax.set_ylabel(f"{side}:\nmeasured − model ({unit})")
-        ax.legend(ncols=2, **LEGEND_ABOVE)
+        legend(ax, 2)
     axes[-1].set_xlabel("time (s)")
     caption = (
         "Measured position less that of the fitted model, window by window. Noise alone leaves the dashed lines in one "
@@ -128,18 +117,20 @@ def _residuals(log: LogSignals) -> Drawn:
     return Drawn("residuals", figure, caption)
 
 
-def _both(log: LogSignals, columns: int, height: float) -> tuple[Figure, Any]:
-    """Rows of axes: the detail above the whole record; one time axis if they are the same."""
-    figure = Figure(figsize=(9.0, height), layout="constrained")
-    axes = figure.subplots(2, columns, squeeze=False, sharex="col" if log.whole else False, height_ratios=(3, 2))
-    for above, below in axes.T:
-        if not log.whole:
-            above.set_xlim(*log.span)
-            above.set_xlabel("time (s)")
-            below.set_xlim(log.time[0], log.time[-1])
-        _shade_detail(below, log)
-        below.set_xlabel("time (s)" if log.whole else "time (s), all of the record")
-    return figure, axes
+def _both(log: LogSignals, columns: int, height: float) -> tuple[Figure, list[tuple[Axes, Axes]]]:
+    """Pairs of axes: the detail above differences over the whole record; one time axis if they are the same."""
+    shared = "col" if log.whole else False
+    figure, axes = subplots(9.0, height, 2, columns, sharex=shared, height_ratios=(3, 2))
+    pairs = list(zip(axes[:columns], axes[columns:], strict=True))
+    for above, below in pairs:
+        below.axhline(0.0, color=FAINT, lw=0.8, zorder=0)
+        if log.whole:
+            below.set_xlabel("time (s)")
+        else:
+            above.set(xlim=log.span, xlabel="time (s)")
+            below.set(xlim=(log.time[0], log.time[-1]), xlabel="time (s), all of the record")
+            below.axvspan(*log.span, color=COLOURS[5], alpha=0.25, lw=1.5)
+    return figure, pairs
 
 
 def _where(log: LogSignals) -> str:
@@ -150,25 +141,17 @@ def _where(log: LogSignals) -> str:
 
 
 def _velocities(log: LogSignals) -> Drawn:
-    figure, axes = _both(log, len(log.sides), 4.6)
-    for i, side in enumerate(log.sides):
-        above, below = axes[:, i]
+    figure, pairs = _both(log, len(log.sides), 4.6)
+    for side, (above, below) in zip(log.sides, pairs, strict=True):
         smoothed, estimate, unit = log[f"{side}.velocity"], log[f"{side}.velocity_estimate"], f"{log.unit[side]}/s"
         _draw(above, log, estimate, log.detail, color=SIDE_COLOURS[side], lw=2.6, alpha=0.75, label="observer")
         _draw(above, log, smoothed, log.detail, color=_MODEL, lw=0.9, label="smoother")
-        above.set_ylabel(f"{side} velocity ({unit})")
-        if ends := limits(smoothed[log.detail], estimate[log.settled] if log.whole else estimate[log.detail]):
-            above.set_ylim(*ends)
-        above.legend(ncols=2, **LEGEND_ABOVE)
+        _finish(above, f"{side} velocity ({unit})", limits(smoothed[log.detail], estimate[log.line]), 2)
         error = estimate - smoothed
         share = log.rms(error) / (log.rms(smoothed) or 1.0)
         label = f"rms {log.rms(error):.2g} {unit} ({100.0 * share:.2g} %)"
         _draw(below, log, error, color=SIDE_COLOURS[side], lw=0.8, label=label)
-        below.axhline(0.0, color=FAINT, lw=0.8, zorder=0)
-        if ends := limits(error[log.settled], room=0.4):
-            below.set_ylim(*ends)
-        below.set_ylabel(f"difference ({unit})")
-        below.legend(**LEGEND_ABOVE)
+        _finish(below, f"difference ({unit})", limits(error[log.settled], room=0.4))
     caption = (
         "Velocities by the observers, which use past samples only, and by the zero-phase smoother, which uses the whole log "
         f"(cf. Figs. 18, 19, 22 and 23). Below: observer − smoother; rms without the first tenth.{_where(log)}"
@@ -177,8 +160,7 @@ def _velocities(log: LogSignals) -> Drawn:
 
 
 def _torque(log: LogSignals) -> Drawn:
-    figure, axes = _both(log, 1, 5.4)
-    above, below = axes[:, 0]
+    figure, ((above, below),) = _both(log, 1, 5.4)
     reference, name = (log.law, "law") if log.measured is None else (log.measured, "measured")
     # the noisier one first, so that it does not hide the other
     for side in sorted(log.sides, key=lambda side: -log.rms(log.torques[side] - reference)):
@@ -192,17 +174,10 @@ def _torque(log: LogSignals) -> Drawn:
         error = log.law - log.measured
         _draw(below, log, error, color=_MODEL, lw=0.8, label=f"law − measured, rms {log.rms(error):.2g} {log.torque_unit}")
     _draw(above, log, log.law, log.detail, color=_MODEL, lw=1.0, ls="--", label="fitted law at the measured twist")
-    shown = log.settled if log.whole else log.detail
     signals = [*log.torques.values(), log.law, *([] if log.measured is None else [log.measured])]
-    if ends := limits(*(one[shown] for one in signals)):
-        above.set_ylim(*ends)
-    if ends := limits(*(one[log.settled] - reference[log.settled] for one in signals), room=0.3):
-        below.set_ylim(*ends)
-    below.axhline(0.0, color=FAINT, lw=0.8, zorder=0)
-    above.set_ylabel(f"transmitted torque ({log.torque_unit})")
-    below.set_ylabel(f"difference ({log.torque_unit})")
-    above.legend(ncols=4, **LEGEND_ABOVE)
-    below.legend(ncols=3, **LEGEND_ABOVE)
+    errors = [one[log.settled] - reference[log.settled] for one in signals]
+    _finish(above, f"transmitted torque ({log.torque_unit})", limits(*(one[log.line] for one in signals)), 4)
+    _finish(below, f"difference ({log.torque_unit})", limits(*errors, room=0.3), 3)
     caption = (
         "Transmitted torque: by the equivalent control of each side less the fitted effects on that side, and by the fitted "
         "law at the measured twist, all behind the same low-pass. Where a side differs from the law, the law or that side's "
@@ -243,10 +218,6 @@ def _plane_note(log: LogSignals) -> str:
     return f"The line is {low:.4g} to {high:.4g} s, where the motion is largest; grey is all but the first tenth."
 
 
-def _line(log: LogSignals) -> slice:
-    return log.settled if log.whole else log.detail
-
-
 def _mean_over(twist: Array, torque: Array, rows: Array, span: tuple[float, float]) -> tuple[Array, Array]:
     """Mean torque of some rows in bins of twist; NaN in bins of fewer than four samples."""
     bins = int(np.clip(len(rows) // 15, 24, 80))
@@ -263,21 +234,18 @@ def _hysteresis(log: LogSignals) -> Drawn:
     if log.measured is not None:
         panels.append(("measured", log.measured, _MEASURED))
     across, up = limits(log.twist[log.settled]), limits(*(one[log.settled] for _, one, _ in panels))
-    figure = Figure(figsize=(9.0, 4.4), layout="constrained")
-    axes = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False).ravel()
+    figure, axes = subplots(9.0, 4.4, columns=len(panels), sharex=True, sharey=True)
     rate = log.low_passed(log.rate)
     for ax, (name, torque, colour) in zip(axes, panels, strict=True):
         _shade_gap(ax, log)
         if across and up:
             _cloud(ax, log, log.twist, torque, (across, up))
             ax.set(xlim=across, ylim=up)
-            for growing, shade in ((True, _GROWING), (False, _FALLING)):
-                rows = np.arange(len(rate))[log.settled]
-                rows = rows[((rate[rows] > 0.0) == growing) & np.isfinite(torque[rows])]
-                ax.plot(
-                    *_mean_over(log.twist, torque, rows, across), color=shade, lw=2.4, alpha=0.9, zorder=3,
-                    label=f"mean, twist {'growing' if growing else 'falling'}",
-                )  # fmt: skip
+            rows = np.arange(len(rate))[log.settled]
+            rows = rows[np.isfinite(torque[rows])]
+            for word, shade, chosen in (("growing", _GROWING, rate[rows] > 0.0), ("falling", _FALLING, ~(rate[rows] > 0.0))):
+                mean = _mean_over(log.twist, torque, rows[chosen], across)
+                ax.plot(*mean, color=shade, lw=2.4, alpha=0.9, zorder=3, label=f"mean, twist {word}")
             twist = np.linspace(*across, 400)
             ax.plot(twist, log.law_at(twist), color=_MODEL, lw=1.2, ls="--", zorder=4, label="fitted law")
         ax.set_title(name, color=colour, loc="left")
@@ -294,8 +262,7 @@ def _hysteresis(log: LogSignals) -> Drawn:
 
 def _limit_cycle(log: LogSignals) -> Drawn:
     unit, twist = log.unit["motor"], log["twist"]
-    figure = Figure(figsize=(9.0, 4.2), layout="constrained")
-    ax = figure.subplots()
+    figure, (ax,) = subplots(9.0, 4.2)
     across, up = limits(twist[log.settled]), limits(log.rate[log.settled])
     _shade_gap(ax, log)
     if across and up:
@@ -304,12 +271,11 @@ def _limit_cycle(log: LogSignals) -> Drawn:
         else:
             _cloud(ax, log, twist, log.rate, (across, up))
         ax.set(xlim=across, ylim=up)
-    rows = _line(log)
-    ax.plot(twist[rows], log.rate[rows], color=COLOURS[3], lw=1.4, zorder=3)
+    ax.plot(twist[log.line], log.rate[log.line], color=COLOURS[3], lw=1.4, zorder=3)
     ax.axhline(0.0, color=FAINT, lw=0.8, zorder=0.6)
     ax.set(xlabel=f"twist θe − N₀ θs ({unit})", ylabel=f"twist rate by the smoother ({unit}/s)")
     if log.plant.half_gap:
-        ax.legend(**LEGEND_ABOVE)
+        legend(ax)
     caption = (
         "Limit cycle: rate of the twist over the twist (cf. Fig. 28), run through clockwise. "
         + ("Free flight crosses the shaded gap; outside of it the gear is in contact. " if log.plant.half_gap else "")
@@ -321,23 +287,15 @@ def _limit_cycle(log: LogSignals) -> Drawn:
 def _resistance(log: LogSignals) -> Drawn:
     """Of a rigid drive: the torque beyond its nominal equation, over time."""
     unit, estimate, effects = log.torque_unit, log["motor.torque_estimate"], log.effects("motor")
-    figure, axes = _both(log, 1, 5.0)
-    above, below = axes[:, 0]
+    figure, ((above, below),) = _both(log, 1, 5.0)
     _draw(above, log, estimate, log.detail, color=SIDE_COLOURS["motor"], lw=2.2, alpha=0.75, label="observer")
     fitted = np.zeros(len(estimate)) if effects is None else effects
     _draw(above, log, fitted, log.detail, color=_MODEL, lw=1.0, ls="--", label="fitted effects")
     error = estimate - fitted
     _draw(below, log, error, color=SIDE_COLOURS["motor"], lw=0.8, label=f"rms {log.rms(error):.2g} {unit}")
-    below.axhline(0.0, color=FAINT, lw=0.8, zorder=0)
-    if ends := limits(estimate[_line(log)], fitted[_line(log)]):
-        above.set_ylim(*ends)
-    if ends := limits(error[log.settled], room=0.3):
-        below.set_ylim(*ends)
     what = "force" if unit == "N" else "torque"
-    above.set_ylabel(f"resisting {what} ({unit})")
-    below.set_ylabel(f"difference ({unit})")
-    above.legend(ncols=2, **LEGEND_ABOVE)
-    below.legend(**LEGEND_ABOVE)
+    _finish(above, f"resisting {what} ({unit})", limits(estimate[log.line], fitted[log.line]), 2)
+    _finish(below, f"difference ({unit})", limits(error[log.settled], room=0.3))
     caption = (
         f"The {what} beyond inertia and viscous friction, by the equivalent control of the observer and by the fitted "
         f"effects, behind the same low-pass. Below: observer − effects; rms without the first tenth.{_where(log)}"
@@ -352,17 +310,16 @@ def _friction(log: LogSignals) -> Drawn:
     velocity = log.low_passed(log["motor.velocity"])
     across, up = limits(velocity[rows]), limits(estimate[rows])
     what = "force" if unit == "N" else "torque"
-    figure = Figure(figsize=(9.0, 4.2), layout="constrained")
-    ax = figure.subplots()
+    figure, (ax,) = subplots(9.0, 4.2)
     if across and up:
         _cloud(ax, log, velocity, estimate, (across, up))
         ax.set(xlim=across, ylim=up)
-    shown = _line(log)
+    shown = log.line
     ax.plot(velocity[shown], estimate[shown], color=SIDE_COLOURS["motor"], lw=0.8, alpha=0.8, zorder=3, label="observer")
     if effects is not None:
         ax.plot(velocity[shown], effects[shown], color=_MODEL, lw=1.2, zorder=4, label="fitted effects")
     ax.set(xlabel=f"velocity by the smoother ({log.unit['motor']}/s)", ylabel=f"resisting {what} ({unit})")
-    ax.legend(ncols=2, **LEGEND_ABOVE)
+    legend(ax, 2)
     caption = (
         f"The {what} beyond inertia and viscous friction over velocity, behind the same low-pass: friction as the log "
         f"shows it, and as fitted. The low-pass slants the reversals. {_plane_note(log)}"
@@ -372,13 +329,13 @@ def _friction(log: LogSignals) -> Drawn:
 
 def _path(log: LogSignals) -> Drawn:
     found, names = log.found, list(log.found.summary["method"]["recursive"])
-    figure, axes = stacked_axes(len(names), 2.1)
+    figure, axes = subplots(9.0, 2.1 * len(names) + 0.6, len(names), sharex=True)
     late = slice((log.observed.start + log.observed.stop) // 2, log.observed.stop)
     # what a law derives from its own parameters is an angle, as they are
     units = {field.name: about.unit for field, about in parameters(log.experiment.transmission)}
     for ax, name in zip(axes, names, strict=True):
         ends, lines = [], []
-        for side in SIDES:
+        for side in log.sides:
             values = log[f"{side}.{name}"]
             _draw(ax, log, values, log.observed, color=SIDE_COLOURS[side], label=f"recursive, {side} side")
             ends.append(values[late])
@@ -389,11 +346,9 @@ def _path(log: LogSignals) -> Drawn:
             ax.axhline(fitted["value"], color=_MODEL, lw=1.0, ls="--", label="trajectory fit, 95 %")
             ends.append(np.array(fitted["interval"]))
             lines.append(fitted["value"])
-        if ends_of_axis := limits(*ends, share=0.02, room=0.25, shown=lines):
-            ax.set_ylim(*ends_of_axis)
-        ax.set_ylabel(with_unit(name.replace("_", " "), unit_on(found.record, path, units.get(name, "rad"))))
-    labelled = {label: line for ax in axes for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    axes[0].legend(labelled.values(), labelled.keys(), ncols=3, **LEGEND_ABOVE)
+        label = with_unit(name.replace("_", " "), unit_on(found.record, path, units.get(name, "rad")))
+        ax.set(ylabel=label, ylim=limits(*ends, share=0.02, room=0.25, shown=lines))
+    legend(axes[0], 3, of=axes)
     axes[-1].set_xlabel("time (s)")
     caption = (
         "The paper's recursive identification (27)-(28) on the equivalent control of both sides, and the trajectory fit "

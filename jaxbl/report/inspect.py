@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import tomli_w
-from matplotlib.figure import Figure
 
 from jaxbl.files import plain, write_atomic
 from jaxbl.records import POSITION_CHANNELS, Inspection, Record
@@ -14,16 +13,18 @@ from jaxbl.records.inspection import main_side, velocity
 from jaxbl.records.signal_quality import longest, low_passed, spectrum
 from jaxbl.records.time_stamps import GAP
 
-from .figures import Drawn, stacked_axes
+from .figures import COLOURS, FAINT, Drawn, legend, style, subplots
 from .page import PageTable, write_report
-from .style import COLOURS, FAINT, LEGEND_ABOVE, style
 
 _POINTS = 6000
 """Points of a line: a page is about 1000 pixels wide."""
 _LINES = 25
 """Lines printed at most: a terminal shows about that many."""
-_LABELS = {"u": "input u", "theta_e": "motor θe", "theta_s": "load θs", "transmitted": "transmitted"}
-_COLOUR = {"u": COLOURS[6], "theta_e": COLOURS[0], "theta_s": COLOURS[1], "transmitted": COLOURS[2]}
+_CHANNELS = {
+    "u": ("input u", COLOURS[6]), "theta_e": ("motor θe", COLOURS[0]), "theta_s": ("load θs", COLOURS[1]),
+    "transmitted": ("transmitted", COLOURS[2]),
+}  # fmt: skip
+"""Label and colour of each channel."""
 
 
 def write_inspection_report(inspection: Inspection, folder: Path) -> list[str]:
@@ -31,13 +32,10 @@ def write_inspection_report(inspection: Inspection, folder: Path) -> list[str]:
     record = inspection.record
     text = json.dumps(plain(inspection.to_dict()), indent=2, ensure_ascii=False)
     write_atomic(folder / "inspection.json", text)
+    judgements = [(one.quantity, one.answer, one.why) for one in inspection.judgements]
     tables = [
-        PageTable(
-            "What the log can identify",
-            ["quantity", "", "why"],
-            [[j.quantity, j.answer, j.why] for j in inspection.judgements],
-        ),
-        PageTable("Channels", list(_CHANNEL_COLUMNS), [list(row) for row in _channel_rows(record)]),
+        PageTable("What the log can identify", ["quantity", "", "why"], judgements),
+        PageTable("Channels", _CHANNEL_COLUMNS, list(_channel_rows(record))),
     ]
     table = tomli_w.dumps({"log": inspection.log.model_dump(exclude_none=True)})
     write_report(folder, record.path.name, [_headline(record)], draw_inspection(inspection), tables, table, record.notes)
@@ -83,17 +81,17 @@ def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
+@style()
 def draw_inspection(inspection: Inspection) -> list[Drawn]:
     """All figures of an inspected log."""
     record = inspection.record
-    with style():
-        drawn = [_channels(record), _spectra(record)]
-        if record.torque is not None and np.ptp(record.torque):
-            drawn.append(_torque_over_velocity(record))
-        if inspection.twist is not None:
-            drawn.append(_twist(inspection))
-        if not record.findings.sampling.even:
-            drawn.append(_intervals(record))
+    drawn = [_channels(record), _spectra(record)]
+    if record.torque is not None and np.ptp(record.torque):
+        drawn.append(_torque_over_velocity(record))
+    if inspection.twist is not None:
+        drawn.append(_twist(inspection))
+    if not record.findings.sampling.even:
+        drawn.append(_intervals(record))
     return drawn
 
 
@@ -112,28 +110,29 @@ def _channels(record: Record) -> Drawn:
     values = _values(record)
     side = main_side(record)
     unit = record.findings.channels[POSITION_CHANNELS[side]].unit
-    rows = [(_LABELS[n], record.findings.channels[n].unit, v, _COLOUR[n]) for n, v in values.items()]
-    rows.append((f"{side} velocity", f"{unit}/s", velocity(record, side), COLOURS[3]))
-    figure, axes = stacked_axes(len(rows), 1.5, width=7.0)
+    channels = [(_CHANNELS[n][0], record.findings.channels[n].unit, v, _CHANNELS[n][1]) for n, v in values.items()]
+    rows = [*channels, (f"{side} velocity", f"{unit}/s", velocity(record, side), COLOURS[3])]
+    figure, axes = subplots(7.0, 1.5 * len(rows) + 0.6, len(rows), sharex=True)
     for ax, (label, unit, signal, colour) in zip(axes, rows, strict=True):
         for segment in record.segments:
             at = _shown(record, segment)
             ax.plot(record.time[at], signal[at], color=colour, lw=0.9)
         ax.set_ylabel(f"{label}\n({unit})")
     axes[-1].set_xlabel("time (s)")
-    return Drawn(
-        "channels", figure, f"The channels over time, and the velocity by differences of the low-passed {side} position."
-    )
+    caption = f"The channels over time, and the velocity by differences of the low-passed {side} position."
+    return Drawn("channels", figure, caption)
 
 
 def _spectra(record: Record) -> Drawn:
     values = {n: v for n, v in _values(record).items() if np.ptp(v)}
     part = longest(record.segments)
-    figure, axes = stacked_axes(len(values), 2.1, width=7.0)
+    figure, axes = subplots(7.0, 2.1 * len(values) + 0.6, len(values), sharex=True)
     for ax, (name, signal) in zip(axes, values.items(), strict=True):
         channel = record.findings.channels[name]
         frequency, density = spectrum(signal[part], record.sample_period)
-        ax.loglog(frequency, np.sqrt(density), color=_COLOUR[name], lw=1.0)
+        label, colour = _CHANNELS[name]
+        ax.loglog(frequency, np.sqrt(density), color=colour, lw=1.0)
+        ax.set_ylabel(f"{label}\n({channel.unit}/√Hz)")
         if channel.noise:
             floor = channel.noise * np.sqrt(2.0 * record.sample_period)
             ax.axhline(floor, color="#555555", lw=1.0, ls="--", label=f"noise {channel.noise:.2g} {channel.unit} rms")
@@ -141,13 +140,11 @@ def _spectra(record: Record) -> Drawn:
             what = "of velocity's power" if name.startswith("theta") else "of power"
             label = f"95 % {what} below {channel.bandwidth:.3g} Hz"
             ax.axvline(channel.bandwidth, color="#555555", lw=1.0, ls=":", label=label)
-        ax.set_ylabel(f"{_LABELS[name]}\n({channel.unit}/√Hz)")
         if channel.noise or channel.bandwidth:
-            ax.legend(ncols=2, **LEGEND_ABOVE)
+            legend(ax, 2)
     axes[-1].set_xlabel("frequency (Hz)")
-    return Drawn(
-        "spectra", figure, "Amplitude spectral densities (Welch), the noise floor, and the bandwidth of each channel."
-    )
+    caption = "Amplitude spectral densities (Welch), the noise floor, and the bandwidth of each channel."
+    return Drawn("spectra", figure, caption)
 
 
 def _torque_over_velocity(record: Record) -> Drawn:
@@ -156,20 +153,17 @@ def _torque_over_velocity(record: Record) -> Drawn:
     channel = record.findings.channels[POSITION_CHANNELS[side]]
     dynamics = record.findings.dynamics
     speed = velocity(record, side)
-    torque, label = record.torque.copy(), "torque u"
-    edge = 0
-    sure = dynamics is not None and dynamics.values[0] > 4.0 * dynamics.errors[0] and dynamics.shares[0] > 0.05
-    if sure:
-        assert dynamics is not None
+    torque, label, less, edge = record.torque.copy(), "torque u", "", 0
+    if dynamics is not None and dynamics.values[0] > 4.0 * dynamics.errors[0] and dynamics.shares[0] > 0.05:
         for s in record.segments:
             # the same low-pass as that of the acceleration
             torque[s] = low_passed(torque[s], 4.0 * channel.bandwidth, record.sample_period)
             torque[s] -= dynamics.values[0] * np.gradient(speed[s], record.sample_period)
         label = "u less inertia torque"
+        less = f" Less the torque of an inertia of {dynamics.values[0]:.4g}: a rough estimate, not an identification."
         # transients of the filter
         edge = round(1.0 / (4.0 * channel.bandwidth * record.sample_period))
-    figure = Figure(figsize=(7.0, 3.4), layout="constrained")
-    ax = figure.subplots()
+    figure, (ax,) = subplots(7.0, 3.4)
     inner = [slice(s.start + edge, s.stop - edge) for s in record.segments if s.stop - s.start > 4 * edge]
     at = np.concatenate([np.arange(len(record.time))[_shown(record, s)] for s in inner or record.segments])
     ax.plot(speed[at], torque[at], ".", ms=1.6, color=COLOURS[0], alpha=0.5)
@@ -180,11 +174,6 @@ def _torque_over_velocity(record: Record) -> Drawn:
     margin = 0.15 * (high - low)
     ax.set(xlabel=f"{side} velocity ({channel.unit}/s)", ylabel=f"{label} ({record.findings.channels['u'].unit})",
            ylim=(low - margin, high + margin))  # fmt: skip
-    less = (
-        f" Less the torque of an inertia of {dynamics.values[0]:.4g}: a rough estimate, not an identification."
-        if sure and dynamics
-        else ""
-    )
     return Drawn("torque_over_velocity", figure, f"Torque over velocity: friction, as far as this log shows it.{less}")
 
 
@@ -196,25 +185,22 @@ def _twist(inspection: Inspection) -> Drawn:
     panels = [(record.positions["load"], f"load position θs ({record.findings.channels['theta_s'].unit})")]
     if torque is not None and np.ptp(torque):
         name = "u" if record.transmitted is None else "transmitted"
-        panels.insert(0, (torque, f"{_LABELS[name]} ({record.findings.channels[name].unit})"))
-    figure = Figure(figsize=(7.0, 3.6), layout="constrained")
-    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False).ravel()
+        panels.insert(0, (torque, f"{_CHANNELS[name][0]} ({record.findings.channels[name].unit})"))
+    figure, axes = subplots(7.0, 3.6, columns=len(panels), sharey=True)
     at = np.concatenate([np.arange(len(record.time))[_shown(record, s)] for s in record.segments])
     gearing = record.findings.gearing
-    by_load = gearing is not None and gearing.flank == "load"
-    if by_load:
-        assert gearing is not None
-        sides = np.searchsorted(gearing.flank_times, record.time[at]) % 2 == 0
-        names = ("load on its first side", "on the other")
+    if gearing is not None and gearing.flank == "load":
+        split, names = "the side that the load pulls to", ("load on its first side", "on the other")
+        chosen = np.searchsorted(gearing.flank_times, record.time[at]) % 2 == 0
     else:
-        sides, names = velocity(record, "load")[at] > 0.0, ("forwards", "backwards")
+        split, names = "the direction of motion", ("forwards", "backwards")
+        chosen = velocity(record, "load")[at] > 0.0
     for ax, (x, label) in zip(axes, panels, strict=True):
-        for chosen, colour, name in ((sides, COLOURS[0], names[0]), (~sides, COLOURS[1], names[1])):
-            ax.plot(x[at][chosen], twist[at][chosen], ".", ms=1.8, color=colour, alpha=0.6, label=name)
+        for rows, colour, name in zip((at[chosen], at[~chosen]), COLOURS, names, strict=False):
+            ax.plot(x[rows], twist[rows], ".", ms=1.8, color=colour, alpha=0.6, label=name)
         ax.set_xlabel(label)
     axes[0].set_ylabel(f"θe − N₀ θs about its median ({unit})")
-    axes[-1].legend(ncols=2, markerscale=5, **LEGEND_ABOVE)
-    split = "the side that the load pulls to" if by_load else "the direction of motion"
+    legend(axes[-1], 2, markerscale=5)
     caption = (
         f"Twist θe − N₀ θs with N₀ = {inspection.gear_ratio:.5g}, by {split}. Over torque: the loop's "
         "width shows lost motion and friction, its slope compliance. Over position: a periodic twist shows eccentricity of "
@@ -227,12 +213,11 @@ def _intervals(record: Record) -> Drawn:
     ends, intervals = np.cumsum(record.intervals), 1e3 * record.intervals
     inside = record.intervals <= GAP * record.findings.sampling.median_period
     ends, intervals = ends[inside], intervals[inside]
-    figure = Figure(figsize=(7.0, 2.6), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True)
+    figure, (left, right) = subplots(7.0, 2.6, columns=2, width_ratios=(3, 1), sharey=True)
     left.plot(ends, intervals, ".", ms=2.0, color=COLOURS[0])
     left.axhline(1e3 * record.findings.sampling.median_period, color=COLOURS[1], lw=1.0, ls="--", label="median")
     left.set(xlabel="time (s)", ylabel="interval\n(ms)")
-    left.legend(**LEGEND_ABOVE)
+    legend(left)
     right.hist(intervals, bins=60, orientation="horizontal", color=COLOURS[0])
     right.set(xlabel="samples (1)")
     return Drawn("intervals", figure, "Intervals between raw time stamps, before resampling; gaps are left out.")

@@ -8,11 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.drive.effects import AbstractEffect
-from jaxbl.drive.plant import Plant
 from jaxbl.identification.identify import Identification
 from jaxbl.records import POSITION_CHANNELS
-from jaxbl.simulate import Experiment
 
 from .figures import SIDES
 
@@ -26,9 +23,6 @@ _SETTLING = 0.1
 
 class LogSignals:
     """Signals of a log, of the observers that ran on it and of the fitted model, as the figures compare them.
-
-    Args:
-        found: of `jaxbl identify`.
 
     Attributes:
         sides: that have an observer.
@@ -46,12 +40,11 @@ class LogSignals:
         channels = self.record.findings.channels
         self.unit = {side: channels[POSITION_CHANNELS[side]].unit for side in self.sides}
         self.torque_unit = "N" if self.unit["motor"] == "m" else "N m"
-        self.experiment: Experiment = found.model.build()
-        self.plant: Plant = self.experiment.plant
+        self.experiment = found.model.build()
+        self.plant = self.experiment.plant
         self.observed = max(self.record.segments, key=lambda one: one.stop - one.start)
-        self.settled = slice(
-            self.observed.start + int(_SETTLING * (self.observed.stop - self.observed.start)), self.observed.stop
-        )
+        first, last = self.observed.start, self.observed.stop
+        self.settled = slice(first + int(_SETTLING * (last - first)), last)
 
     def __getitem__(self, name: str) -> Array:
         """A column of the trace."""
@@ -78,6 +71,11 @@ class LogSignals:
     def whole(self) -> bool:
         """Whether the part shown in detail is the whole observed part."""
         return self.detail == self.observed
+
+    @property
+    def line(self) -> slice:
+        """What is drawn as a line over the other points: the part shown in detail, without the observers' beginning."""
+        return self.settled if self.whole else self.detail
 
     @cached_property
     def span(self) -> tuple[float, float]:
@@ -113,16 +111,15 @@ class LogSignals:
 
     def law_at(self, twist: Array) -> Array:
         """Torque of the fitted transmission at rest, without transmission errors."""
-        effects = tuple(
-            one for one in self.plant.effects if type(one).transmission_error is AbstractEffect.transmission_error
-        )
+        # without a transmission error an effect answers the number 0.0, whatever the position
+        known = [(one, one.transmission_error(one.init(), jnp.zeros(()))) for one in self.plant.effects]
+        effects = tuple(one for one, error in known if not isinstance(error, jax.Array))
         plant = dataclasses.replace(self.plant, effects=effects)
         with jax.enable_x64(True):
             rest = {side: jnp.asarray(0.0) for side in SIDES}
             states = tuple(effect.init() for effect in effects)
-            found = jax.vmap(lambda z: plant.transmitted({"motor": z, "load": jnp.zeros_like(z)}, rest, states)[0])(
-                jnp.asarray(twist)
-            )
+            position = {"motor": jnp.asarray(twist), "load": jnp.zeros(len(twist))}
+            found, _ = jax.vmap(lambda at: plant.transmitted(at, rest, states))(position)
         return np.asarray(found)
 
     def effects(self, side: str) -> Array | None:
@@ -133,11 +130,10 @@ class LogSignals:
     @cached_property
     def torques(self) -> dict[str, Array]:
         """Transmitted torque by each side: its observer's estimate less the fitted effects on that side."""
-        found = {}
+        found = {side: self[f"{side}.torque_estimate"] for side in self.sides}
         for side in self.sides:
-            effects = self.effects(side)
-            share = 0.0 if effects is None else effects / float(self.plant.drive.torque_gain(side))
-            found[side] = self[f"{side}.torque_estimate"] + share
+            if (effects := self.effects(side)) is not None:
+                found[side] = found[side] + effects / float(self.plant.drive.torque_gain(side))
         return found
 
     @cached_property

@@ -5,6 +5,7 @@
 # pyright: reportReturnType=false
 
 import re
+import textwrap
 from collections.abc import Mapping
 from typing import Any
 
@@ -29,9 +30,10 @@ from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 from jaxbl.validation import nearest
 
-from .figures import SIDES, Drawn
+from .figures import COLOURS, MAP, MARKERS, MISSING, SIDES, Drawn, style, subplots, with_unit
 from .refined_maps import Filling, on_coarse_values
-from .style import COLOURS, HATCH, MAP, MISSING, style, with_unit
+
+_HATCH = (1.0, 1.0, 1.0, 0.45)
 
 _CURVES = {
     "davila_fridman": ("-", "#FF5FA2"),
@@ -40,12 +42,13 @@ _CURVES = {
     "moreno_osorio": ((0, (5, 1, 1, 1)), "#B6F09C"),
     "exact": (":", "#FFD400"),
 }
+"""Dashes and colour of each gain condition's curve."""
 
 
 def default_figures(config: Config) -> list[FigureTable]:
     """Figures for a study that asks for none: a heatmap over its last two axes, or lines over its one."""
     varying = [
-        axis
+        axis.path
         for axis in config.axes
         if axis.values is None or (len(axis.values) > 1 and not any(isinstance(v, str) for v in axis.values))
     ]
@@ -53,9 +56,8 @@ def default_figures(config: Config) -> list[FigureTable]:
         return []
     value = "motor.velocity_rmse"
     if len(varying) == 1:
-        return [FigureTable(kind="line", x=varying[0].path, value=value)]
-    x, y, *rest = (axis.path for axis in reversed(varying))
-    return [FigureTable(kind="heatmap", x=x, y=y, value=value, facet=rest[0] if rest else None)]
+        return [FigureTable(kind="line", x=varying[0], value=value)]
+    return [FigureTable(kind="heatmap", x=varying[-1], y=varying[-2], value=value, facet=(None, None, *varying)[-3])]
 
 
 def draw(result: StudyResult) -> list[Drawn]:
@@ -68,7 +70,7 @@ def draw(result: StudyResult) -> list[Drawn]:
     figures = config.figures or default_figures(config)
     check_figures(config, figures, result.columns)
     points = Points(config) if config.sweep.refine is not None else None
-    drawn, names = [], set()
+    drawn: list[Drawn] = []
     laws = accuracy_laws(result, figures)
     for i, figure in enumerate(figures):
         wanted = {figure.value, "finite", *(f"{side}.{name}" for side in SIDES for name in ("converged", "f_plus"))}
@@ -81,11 +83,8 @@ def draw(result: StudyResult) -> list[Drawn]:
             drawing = _laws(config, frame, figure, [law for law in laws if law.figure == i])
         else:
             drawing = _lines(config, selected(config, frame, figure), figure)
-        name, count = drawing.name, 2
-        while name in names:
-            name, count = f"{drawing.name}-{count}", count + 1
-        names.add(name)
-        drawn.append(drawing._replace(name=name))
+        same = sum(one.name.partition("-")[0] == drawing.name for one in drawn)
+        drawn.append(drawing._replace(name=f"{drawing.name}-{same + 1}") if same else drawing)
     return drawn
 
 
@@ -110,6 +109,14 @@ def check_figures(config: Config, figures: list[FigureTable], columns: list[str]
 
 def _label(config: Config, path: str) -> str:
     return with_unit(path, numeric_paths(config)[path].unit)
+
+
+def _with_value(config: Config, path: str, value: Any) -> str:
+    return f"{path} = {_text(value)} {numeric_paths(config)[path].unit}".rstrip()
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
 
 
 def _value_label(value: str) -> str:
@@ -189,25 +196,29 @@ def _is_log(config: Config, path: str, values: np.ndarray) -> bool:
 def _panels(config: Config, frame: pd.DataFrame, facet: str | None) -> list[tuple[str, pd.DataFrame]]:
     if facet is None:
         return [("", frame)]
-    unit = numeric_paths(config)[facet].unit
-    return [
-        (f"{facet} = {value if isinstance(value, str) else f'{value:g}'} {unit}".strip(), part)
-        for value, part in frame.groupby(facet, sort=True)
-    ]
+    return [(_with_value(config, facet, value), part) for value, part in frame.groupby(facet, sort=True)]
 
 
-def _grid_of_axes(count: int, width: float, height: float, extra: float = 0.0) -> tuple[Figure, list[Axes]]:
+def _grid_of_axes(
+    config: Config,
+    spec: FigureTable,
+    count: int,
+    panel: tuple[float, float],
+    ylabel: str,
+    *,
+    single: tuple[float, float] | None = None,
+    beside: float = 0.0,
+) -> tuple[Figure, list[Axes]]:
+    """Axes of so many panels, with labels where they are seen; sizes of a panel, of a single one, beside all (inches)."""
     columns = 2 if count == 4 else min(count, 3)
     rows = -(-count // columns)
-    figure = Figure(figsize=(width * columns + extra, height * rows + 0.7), layout="constrained")
-    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    flat = list(axes.ravel())
-    for unused in flat[count:]:
-        unused.set_visible(False)
-    for column in range(columns):
-        last = max(i for i in range(column, count, columns))
-        flat[last].tick_params(labelbottom=True)
-    return figure, flat[:count]
+    size = (panel[0] * columns + beside, panel[1] * rows + 0.7) if single is None or count > 1 else single
+    figure, axes = subplots(*size, rows, columns, sharex=True, sharey=True)
+    for i, ax in enumerate(axes):
+        ax.set_visible(i < count)
+        ax.tick_params(labelbottom=i + columns >= count)
+        ax.set(xlabel=_label(config, spec.x), ylabel="" if i % columns else ylabel)
+    return figure, list(axes[:count])
 
 
 def _table(part: pd.DataFrame, keys: list[str], value: str) -> pd.Series:
@@ -216,53 +227,55 @@ def _table(part: pd.DataFrame, keys: list[str], value: str) -> pd.Series:
     return table if value == "finite" else table.where(_reduce(part, keys, "finite") == 1.0)
 
 
+@style()
 def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable, points: Points | None) -> Drawn:
     """A map; with `points` of a refined study, those that were not simulated show the nearest that was."""
     assert spec.y is not None
-    with style():
-        panels = _panels(config, frame, spec.facet)
-        keys = [spec.y, spec.x]
-        filling = None
-        if points is not None:
-            filling = Filling(points, frame, spec.x, spec.y)
-            others = [axis.path for axis in config.axes if axis.path not in (*keys, spec.facet)]
-            panels = [(title, filling.complete(part, others)) for title, part in panels]
-        tables = [_table(part, keys, spec.value) for _, part in panels]
-        norm = (
-            Normalize(0.0, 1.0)
-            if is_boolean(spec.value)
-            else color_norm(np.concatenate([t.to_numpy(float) for t in tables]), spec.scale)
-        )
-        figure, axes = _grid_of_axes(len(panels), 3.5, 3.4, extra=1.0)
-        handles: list[Any] = []
-        curves: list[Any] = []
-        gridded = config.sweep.design == "grid"
-        missing = diverged = 0
-        for ax, (title, part), table in zip(axes, panels, tables, strict=True):
-            xs, ys, hatch = _map_panel(ax, config, part, table, spec, norm, filling)
-            handles = handles or hatch
-            missing += int(table.isna().sum())
-            diverged += int((_reduce(part, keys, "finite")[table.isna()] < 1.0).sum())
-            under = []
-            if gridded and (best := _best(table, part, spec)) is not None:
-                ax.plot(best[0], best[1], "*", ms=13, mfc="white", mec="black", mew=1.0, clip_on=False, zorder=5)
-                under.append(f"best ★ {best[2]:.2g} {metric_of(spec.value).unit}".rstrip())
-            if spec.overlays:
-                # most points of a refined study lie at its boundary: the median is that of the coarse grid
-                bound = _bound(part if points is None else part[points.always_simulated(part)], spec)
-                curves = _overlay(ax, bound, spec, xs, ys)
-                under.append(f"f⁺ = {bound:.3g} rad/s²")
-            ax.set_title("\n".join(line for line in (title, ",  ".join(under)) if line))
-        if missing:
-            word = "diverged" if diverged == missing else "not converged" if "time" in spec.value else "undefined"
-            label = f"{word} ({missing} points)"
-            cross = Line2D([], [], color=MISSING, ls="", marker="x", label=label)
-            curves.append(Patch(facecolor=MISSING, label=label) if gridded else cross)
-        bar = figure.colorbar(ScalarMappable(norm, MAP), ax=axes, pad=0.02, aspect=28, extend=_extend(tables, norm))
-        bar.set_label(_wrap(_value_label(spec.value)))
-        if handles := [*handles, *curves]:
-            columns = max(int(figure.get_figwidth() / 2.4), 1)
-            figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), columns))
+    panels = _panels(config, frame, spec.facet)
+    keys = [spec.y, spec.x]
+    filling = None
+    if points is not None:
+        filling = Filling(points, frame, spec.x, spec.y)
+        others = [axis.path for axis in config.axes if axis.path not in (*keys, spec.facet)]
+        panels = [(title, filling.complete(part, others)) for title, part in panels]
+    tables = [_table(part, keys, spec.value) for _, part in panels]
+    values = np.concatenate([table.to_numpy(float) for table in tables])
+    norm = Normalize(0.0, 1.0) if is_boolean(spec.value) else color_norm(values, spec.scale)
+    figure, axes = _grid_of_axes(config, spec, len(panels), (3.5, 3.4), _label(config, spec.y), beside=1.0)
+    hatches, curves = [], []
+    gridded = config.sweep.design == "grid"
+    missing = diverged = 0
+    for ax, (title, part), table in zip(axes, panels, tables, strict=True):
+        xs, ys, hatch = _map_panel(ax, config, part, table, spec, norm, filling)
+        hatches = hatches or hatch
+        missing += int(table.isna().sum())
+        diverged += int((_reduce(part, keys, "finite")[table.isna()] < 1.0).sum())
+        under = []
+        if gridded and (best := _best(table, part, spec)) is not None:
+            ax.plot(best[0], best[1], "*", ms=13, mfc="white", mec="black", mew=1.0, clip_on=False, zorder=5)
+            under.append(f"best ★ {best[2]:.2g} {metric_of(spec.value).unit}".rstrip())
+        if spec.overlays:
+            # most points of a refined study lie at its boundary: the median is that of the coarse grid
+            bound = _bound(part if points is None else part[points.always_simulated(part)], spec)
+            alpha_is_x = spec.x.endswith(".alpha")
+            alphas = xs if alpha_is_x else ys
+            conditions = {name: CONDITIONS[name] for name in spec.overlays}
+            curves = condition_curves(ax, conditions, bound, (alphas[0], alphas[-1]), alpha_is_x)
+            under.append(f"f⁺ = {bound:.3g} rad/s²")
+        ax.set_title("\n".join(line for line in (title, ",  ".join(under)) if line))
+    handles: list[Any] = [*hatches, *curves]
+    if missing:
+        word = "diverged" if diverged == missing else "not converged" if "time" in spec.value else "undefined"
+        label = f"{word} ({missing} points)"
+        cross = Line2D([], [], color=MISSING, ls="", marker="x", label=label)
+        handles.append(Patch(facecolor=MISSING, label=label) if gridded else cross)
+    # a logarithmic scale begins at the smallest positive value
+    extend = "min" if np.nanmin(values, initial=np.inf) < norm.vmin else "neither"  # type: ignore[operator]
+    label = _wrap(_value_label(spec.value))
+    figure.colorbar(ScalarMappable(norm, MAP), ax=axes, pad=0.02, aspect=28, extend=extend, label=label)
+    if handles:
+        most = max(int(figure.get_figwidth() / 2.4), 1)
+        figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), most))
     caption = f"{_value_label(spec.value)} over {spec.x} and {spec.y}{_over(config, frame, spec)}."
     return Drawn(_file_name(spec), figure, caption)
 
@@ -279,34 +292,38 @@ def _map_panel(
     """Cells of a grid, or dots of a quasi-random design. Returns the values of both axes and the legend's handles."""
     assert spec.y is not None
     ax.grid(False)
-    if filling is None:
-        xs, ys = (np.sort(part[path].unique()).astype(float) for path in (spec.x, spec.y))
+    gridded = config.sweep.design == "grid"
+    if gridded:
+        xs, ys, grid = _dense(table, filling)
     else:
-        xs, ys, grid = filling.dense(table)
+        xs, ys = (np.unique(part[path].to_numpy(float)) for path in (spec.x, spec.y))
     logs = [_is_log(config, path, values) for path, values in ((spec.x, xs), (spec.y, ys))]
     ax.set(xscale="log" if logs[0] else "linear", yscale="log" if logs[1] else "linear")
     edges = cell_edges(xs, logs[0]), cell_edges(ys, logs[1])
     handles = []
-    if config.sweep.design == "grid":
-        if filling is None:
-            grid = table.unstack().to_numpy(float)
+    if gridded:
         ax.set_facecolor(MISSING)
         ax.pcolormesh(*edges, grid, cmap=MAP, norm=norm, rasterized=True)
         side = spec.value.partition(".")[0]
         column = f"{side}.converged"
         if column in part and spec.value != column:
-            shares = _reduce(part, [spec.y, spec.x], column)
-            share = shares.unstack().to_numpy(float) if filling is None else filling.dense(shares)[2]
+            *_, share = _dense(_reduce(part, [spec.y, spec.x], column), filling)
             handles = hatch_failures(ax, (xs, ys), edges, share, f"{side} not converged")
     else:
         shown = _shown(part, spec.value)
         there, gone = part[shown.notna()], part[shown.isna()]
         ax.scatter(there[spec.x], there[spec.y], c=shown[shown.notna()], cmap=MAP, norm=norm, s=16, linewidths=0)
         ax.plot(gone[spec.x], gone[spec.y], "x", ms=4, color=MISSING)
-    ax.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]], xlabel=_label(config, spec.x))
-    if ax.get_subplotspec().is_first_col():  # type: ignore[union-attr]
-        ax.set_ylabel(_label(config, spec.y))
+    ax.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
     return xs, ys, handles
+
+
+def _dense(table: pd.Series, filling: Filling | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Values of x `(columns,)` and y `(rows,)`, and a table over (y, x) as a matrix `(rows, columns)`."""
+    if filling is not None:
+        return filling.dense(table)
+    grid = table.unstack()
+    return grid.columns.to_numpy(float), grid.index.to_numpy(float), grid.to_numpy(float)
 
 
 def hatch_failures(
@@ -318,12 +335,7 @@ def hatch_failures(
 ) -> list[Patch]:
     """Hatch the cells of a map in which less than half of the runs pass. Returns the legend's handles.
 
-    Args:
-        ax: of the map.
-        centres: of the cells, along x `(columns,)` and y `(rows,)`.
-        edges: of the cells, along x `(columns + 1,)` and y `(rows + 1,)`.
-        share: of the runs that pass `(rows, columns)`.
-        label: of the hatching.
+    `centres` and `edges` are those of the cells along x and y, `share` of the runs that pass is `(rows, columns)`.
     """
     if not share.min() < 0.5:
         return []
@@ -331,7 +343,7 @@ def hatch_failures(
     share = np.pad(share, 1, mode="edge")
     xs, ys = (np.concatenate([e[:1], c, e[-1:]]) for c, e in zip(centres, edges, strict=True))
     hatched = ax.contourf(xs, ys, share, levels=[-1.0, 0.5], colors="none", hatches=["//"])
-    hatched.set(edgecolor=HATCH, linewidth=0.0)
+    hatched.set(edgecolor=_HATCH, linewidth=0.0)
     if share.max() >= 0.5:
         lines = ax.contour(xs, ys, share, levels=[0.5], colors="white", linewidths=1.8)
         lines.set_path_effects([path_effects.Stroke(linewidth=3.2, foreground="black"), path_effects.Normal()])
@@ -345,13 +357,6 @@ def _shown(part: pd.DataFrame, value: str) -> pd.Series:
         return values
     values = values.abs() if _is_magnitude(value) else values
     return values.where(part["finite"].astype(bool)).replace([np.inf, -np.inf], np.nan)
-
-
-def _extend(tables: list[pd.Series], norm: Normalize) -> str:
-    values = np.concatenate([t.to_numpy(float) for t in tables])
-    below = bool(np.nanmin(values, initial=np.inf) < norm.vmin)  # type: ignore[operator]
-    above = bool(np.nanmax(values, initial=-np.inf) > norm.vmax)  # type: ignore[operator]
-    return {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}[below, above]
 
 
 def _best(table: pd.Series, part: pd.DataFrame, spec: FigureTable) -> tuple[float, float, float] | None:
@@ -374,15 +379,6 @@ def _bound(part: pd.DataFrame, spec: FigureTable) -> float:
     return float((converged if len(converged) else part)[f"{side}.f_plus"].median())
 
 
-def _overlay(ax: Axes, bound: float, spec: FigureTable, xs: np.ndarray, ys: np.ndarray) -> list[Line2D]:
-    """Curves of the gain conditions for one f_plus."""
-    alpha_is_x = spec.x.endswith(".alpha")
-    alphas = xs if alpha_is_x else ys
-    return condition_curves(
-        ax, {name: CONDITIONS[name] for name in spec.overlays}, bound, (alphas.min(), alphas.max()), alpha_is_x
-    )
-
-
 def condition_curves(
     ax: Axes, conditions: Mapping[str, Condition], bound: float, alphas: tuple[float, float], alpha_is_x: bool = True
 ) -> list[Line2D]:
@@ -401,72 +397,54 @@ def condition_curves(
     return handles
 
 
+@style()
 def _lines(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
-    with style():
-        panels = _panels(config, frame, spec.facet)
-        figure, axes = _grid_of_axes(len(panels), 4.2, 3.4)
-        if len(panels) == 1:
-            figure.set_size_inches(6.4, 4.2)
-        shown = _shown(frame, spec.value)
-        sampled, band = spec.x in _sampled(config), ""
-        for ax, (title, part) in zip(axes, panels, strict=True):
-            groups = [("", part)] if spec.series is None else list(part.groupby(spec.series, sort=True))
-            for i, (name, group) in enumerate(groups):
-                values = shown.loc[group.index]
-                by_x = values.groupby(group[spec.x], sort=True)
-                middle = by_x.mean() if is_boolean(spec.value) else by_x.median()
-                colour = COLOURS[i % len(COLOURS)]
-                label = None if spec.series is None else f"{name if isinstance(name, str) else f'{name:g}'}"
-                ax.plot(middle.index, middle, "o" if sampled else "o-", ms=3.5, color=colour, label=label)
-                if (by_x.size() > 1).any() and not is_boolean(spec.value):
-                    band = "; band: least to largest"
-                    ax.fill_between(middle.index, by_x.min(), by_x.max(), color=colour, alpha=0.18, linewidth=0)
-            xs = np.sort(part[spec.x].unique()).astype(float)
-            log = _is_log(config, spec.x, xs)
-            if log:
-                ax.set_xscale("log")
-            ax.set_xlim(*cell_edges(xs, log)[[0, -1]])
-            if isinstance(color_norm(shown.to_numpy(float), spec.scale), LogNorm):
-                ax.set_yscale("log")
-            ax.set_title(title)
-            ax.set_xlabel(_label(config, spec.x))
-            if ax.get_subplotspec().is_first_col():  # type: ignore[union-attr]
-                ax.set_ylabel(_wrap(_value_label(spec.value)))
-        if spec.series is not None:
-            axes[-1].legend(title=_label(config, spec.series))
+    panels = _panels(config, frame, spec.facet)
+    figure, axes = _grid_of_axes(config, spec, len(panels), (4.2, 3.4), _wrap(_value_label(spec.value)), single=(6.4, 4.2))
+    shown = _shown(frame, spec.value)
+    sampled, band = spec.x in _sampled(config), ""
+    for ax, (title, part) in zip(axes, panels, strict=True):
+        groups = [("", part)] if spec.series is None else list(part.groupby(spec.series, sort=True))
+        for i, (name, group) in enumerate(groups):
+            by_x = shown.loc[group.index].groupby(group[spec.x], sort=True)
+            middle = by_x.mean() if is_boolean(spec.value) else by_x.median()
+            colour = COLOURS[i % len(COLOURS)]
+            label = None if spec.series is None else _text(name)
+            ax.plot(middle.index, middle, "o" if sampled else "o-", ms=3.5, color=colour, label=label)
+            if (by_x.size() > 1).any() and not is_boolean(spec.value):
+                band = "; band: least to largest"
+                ax.fill_between(middle.index, by_x.min(), by_x.max(), color=colour, alpha=0.18, linewidth=0)
+        xs = np.unique(part[spec.x].to_numpy(float))
+        log = _is_log(config, spec.x, xs)
+        if log:
+            ax.set_xscale("log")
+        if isinstance(color_norm(shown.to_numpy(float), spec.scale), LogNorm):
+            ax.set_yscale("log")
+        ax.set(xlim=cell_edges(xs, log)[[0, -1]], title=title)
+    if spec.series is not None:
+        axes[-1].legend(title=_label(config, spec.series))
     caption = f"{_value_label(spec.value)} over {spec.x}{_where(config, spec)}{_over(config, frame, spec)}{band}."
     return Drawn(_file_name(spec), figure, caption)
 
 
-_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
-
-
+@style()
 def _laws(config: Config, frame: pd.DataFrame, spec: FigureTable, laws: list[Law]) -> Drawn:
     """Points of lines that theory gives a slope for, with the lines fitted."""
-    with style():
-        facets = list(dict.fromkeys(None if spec.facet is None else law.where[spec.facet] for law in laws))
-        figure, axes = _grid_of_axes(len(facets), 4.2, 3.8)
-        if len(facets) == 1:
-            figure.set_size_inches(7.2, 4.8)
-        for ax, facet in zip(axes, facets, strict=True):
-            there = [law for law in laws if facet is None or law.where[spec.facet] == facet]
-            ax.set_xscale("log")
-            ax.set_yscale("log")
-            drawn = [_law(ax, law, i) for i, law in enumerate(there)]
-            xs = np.concatenate([law.x_values for law in there])
-            if len(xs):
-                ax.set_xlim(*cell_edges(np.unique(xs), log=True)[[0, -1]])
-            if len(ys := np.concatenate(drawn)):
-                # the lines of theory run on beyond the points
-                ax.set_ylim(ys.min() / 2.0, ys.max() * 2.0)
-            else:
-                ax.text(0.5, 0.5, "nothing above zero to draw", ha="center", transform=ax.transAxes)
-            if facet is not None:
-                ax.set_title(f"{spec.facet} = {_figure(facet)} {_unit(config, spec.facet)}".strip())
-            ax.set_xlabel(_label(config, spec.x))
-            if ax.get_subplotspec().is_first_col():  # type: ignore[union-attr]
-                ax.set_ylabel(_wrap(_value_label(spec.value)))
-            ax.legend(loc="best", handlelength=1.6, title=f"slope (theory {spec.theory:g}, dashed)")
+    facets = list(dict.fromkeys(None if spec.facet is None else law.where[spec.facet] for law in laws))
+    figure, axes = _grid_of_axes(config, spec, len(facets), (4.2, 3.8), _wrap(_value_label(spec.value)), single=(7.2, 4.8))
+    for ax, facet in zip(axes, facets, strict=True):
+        there = [law for law in laws if spec.facet is None or law.where[spec.facet] == facet]
+        ax.set(xscale="log", yscale="log", title="" if spec.facet is None else _with_value(config, spec.facet, facet))
+        drawn = [_law(ax, law, i) for i, law in enumerate(there)]
+        xs = np.concatenate([law.x_values for law in there])
+        if len(xs):
+            ax.set_xlim(*cell_edges(np.unique(xs), log=True)[[0, -1]])
+        if len(ys := np.concatenate(drawn)):
+            # the lines of theory run on beyond the points
+            ax.set_ylim(ys.min() / 2.0, ys.max() * 2.0)
+        else:
+            ax.text(0.5, 0.5, "nothing above zero to draw", ha="center", transform=ax.transAxes)
+        ax.legend(loc="best", handlelength=1.6, title=f"slope (theory {spec.theory:g}, dashed)")
     caption = (
         f"{_value_label(spec.value)} over {spec.x}{_where(config, spec)}; geometric mean over {config.sweep.seeds} "
         f"{'seed' if config.sweep.seeds == 1 else 'seeds'}. Lines: least squares over the filled points; hollow points lie "
@@ -477,9 +455,9 @@ def _laws(config: Config, frame: pd.DataFrame, spec: FigureTable, laws: list[Law
 
 def _law(ax: Axes, law: Law, i: int) -> np.ndarray:
     """One line: points, fit, and theory's slope through the middle of the fit. Returns the y drawn."""
-    colour, marker = COLOURS[i % len(COLOURS)], _MARKERS[i % len(_MARKERS)]
+    colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
     x, y, inside = law.x_values, law.y_values, law.inside
-    name = ", ".join(map(_figure, law.series.values()))
+    name = ", ".join(map(_text, law.series.values()))
     seen = np.isfinite(y) & (y > 0.0)
     ax.plot(x[seen & ~inside], y[seen & ~inside], marker, ms=6, mfc="none", color=colour)
     ax.plot(x[inside], y[inside], marker, ms=6 if i == 0 else 3.5, color=colour)
@@ -490,8 +468,7 @@ def _law(ax: Axes, law: Law, i: int) -> np.ndarray:
         return y[seen]
     ends = x[[law.fit.first, law.fit.last]]
     label = f"{law.fit.slope:.3f} ± {law.fit.standard_error:.1g}"
-    label = f"{name}: {label}" if name else label
-    ax.plot(ends, law.fit(ends), "-", marker=marker, markevery=[], color=colour, label=label)
+    ax.plot(ends, law.fit(ends), "-", color=colour, marker=marker, markevery=[], label=f"{name}: {label}" if name else label)
     centre = float(np.sqrt(ends[0] * ends[1]))
     around = np.array([x[0] / 10.0, x[-1] * 10.0])
     ax.plot(
@@ -500,25 +477,14 @@ def _law(ax: Axes, law: Law, i: int) -> np.ndarray:
     return y[seen]
 
 
-def _figure(value: Any) -> str:
-    return value if isinstance(value, str) else f"{value:g}"
-
-
-def _unit(config: Config, path: str | None) -> str:
-    return "" if path is None else numeric_paths(config)[path].unit
-
-
 def _where(config: Config, spec: FigureTable) -> str:
     """What a figure fixes, for its caption."""
-    values = fixed_values(config, spec).items()
-    fixed = [f"{path} = {_figure(value)} {_unit(config, path)}".rstrip() for path, value in values]
+    fixed = [_with_value(config, path, value) for path, value in fixed_values(config, spec).items()]
     return f" where {', '.join(fixed)}" if fixed else ""
 
 
-def _wrap(label: str, width: int = 48) -> str:
-    import textwrap
-
-    return "\n".join(textwrap.wrap(label, width))
+def _wrap(label: str) -> str:
+    return "\n".join(textwrap.wrap(label, 48))
 
 
 def _file_name(spec: FigureTable) -> str:

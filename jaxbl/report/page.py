@@ -25,8 +25,8 @@ class PageTable(NamedTuple):
     """A table of a report: heading, column names, rows of cells."""
 
     heading: str
-    columns: list[str]
-    rows: list[list[object]]
+    columns: Sequence[str]
+    rows: Sequence[Sequence[object]]
 
 
 def write_report(
@@ -38,16 +38,9 @@ def write_report(
     config: str,
     remarks: Sequence[str] = (),
 ) -> list[str]:
-    """Write figures into `figures/` and `report.html`. Returns lead and remarks, the lines for the terminal.
+    """Write figures into `figures/`, and `report.html` with what was found (`lead`) and remarks in sentences.
 
-    Args:
-        folder: exists.
-        title: of the page.
-        lead: what was found, in sentences.
-        drawn: figures, in the order of the page.
-        tables: below the figures.
-        config: the study as TOML.
-        remarks: what else there is to know, in sentences.
+    Returns lead and remarks, the lines for the terminal.
     """
     page = html(title, lead, remarks, save_all(drawn, folder), tables, config)
     write_atomic(folder / "report.html", page)
@@ -90,7 +83,6 @@ def html(
 
 
 def _cell(value: object) -> str:
-    if isinstance(value, bool) or value is None or isinstance(value, str):
-        text = {True: "yes", False: "no", None: "–"}.get(value, value) if not isinstance(value, str) else value
-        return f"<td>{escape(str(text))}</td>"
-    return f'<td class="number">{value:.4g}</td>'
+    if isinstance(value, bool) or value is None:
+        value = {True: "yes", False: "no", None: "–"}[value]
+    return f"<td>{escape(value)}</td>" if isinstance(value, str) else f'<td class="number">{value:.4g}</td>'

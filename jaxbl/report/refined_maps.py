@@ -3,10 +3,6 @@
 Without refinement in its neighbourhood that is a vertex of the coarse grid: its block is one coarse cell, centred on it.
 """
 
-# pandas' own annotations are wider than what its methods return
-# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
-# pyright: reportReturnType=false
-
 from typing import NamedTuple
 
 import numpy as np
@@ -43,14 +39,7 @@ class _Axis(NamedTuple):
 
 
 class Filling:
-    """The plane of a map over two axes of a refined study.
-
-    Args:
-        points: points of the study.
-        frame: its rows.
-        x: path of the horizontal axis.
-        y: path of the vertical axis.
-    """
+    """The plane of a map over two axes (paths `x` and `y`) of a refined study, by the rows that it has."""
 
     def __init__(self, points: Points, frame: pd.DataFrame, x: str, y: str):
         assert points.refinement is not None
@@ -60,7 +49,7 @@ class Filling:
             if path in points.refinement.paths:
                 self.axes.append(_Axis(path, points.values(path), [1 << depth - level for level in range(depth + 1)]))
             else:
-                self.axes.append(_Axis(path, np.sort(frame[path].unique()).astype(float), [1] * (depth + 1)))
+                self.axes.append(_Axis(path, np.unique(frame[path].to_numpy(float)), [1] * (depth + 1)))
         self.levels = depth + 1
 
     def _keys(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -118,4 +107,4 @@ def on_coarse_values(points: Points, frame: pd.DataFrame, drawn: list[str]) -> p
     for path in points.refinement.paths:
         if path not in drawn:
             kept &= np.isin(frame[path], points.values(path)[::stride])
-    return frame[kept]
+    return frame.loc[kept]

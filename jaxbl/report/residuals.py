@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from textwrap import fill
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from jaxbl.diagnosis.coordinates import CoordinateValues
 from jaxbl.diagnosis.localise import SIGNIFICANT, Coordinate, Localised, residual_spectrum
@@ -13,8 +13,7 @@ from jaxbl.diagnosis.observer_residual import Observed
 from jaxbl.diagnosis.residuals import Residual, narrowed
 from jaxbl.diagnosis.sentences import sentence_of
 
-from .figures import Drawn, outline, stacked_axes
-from .style import COLOURS, FAINT, LEGEND_ABOVE, MISSING, SIDE_COLOURS, style, with_unit
+from .figures import COLOURS, FAINT, MISSING, SIDE_COLOURS, Drawn, legend, outline, style, subplots, with_unit
 
 _CLOUD = 4000
 """Dots of a cloud; more would cover each other."""
@@ -28,6 +27,7 @@ _LABELLED = 0.1
 """Least share of the power of a peak with a label; labels of smaller ones would cover each other."""
 
 
+@style()
 def draw_residuals(
     residuals: Mapping[str, Sequence[Residual]],
     coordinates: Mapping[str, Sequence[Mapping[str, CoordinateValues]]],
@@ -35,25 +35,19 @@ def draw_residuals(
     unit: str = "N m",
     observed: Mapping[str, Sequence[Observed]] | None = None,
 ) -> list[Drawn]:
-    """All figures of residual torques.
-
-    Args:
-        residuals: by equation, of each part of the record.
-        coordinates: by equation, of each part (:func:`jaxbl.diagnosis.localise.coordinates_of`).
-        found: where they occur, by equation.
-        unit: of the torques.
-        observed: the same torques by the observers, of each part; those of an observer that does not converge are not drawn.
-    """
-    with style():
-        drawn = [_over_time(residuals, found, unit, observed or {})]
-        drawn += [_over_coordinates(residuals[name], coordinates[name], found[name], unit) for name in residuals]
-        drawn.append(_spectra(residuals, found, unit))
-    return drawn
+    """All figures of residual torques: by equation, of each part of the record; with the same torques by the observers."""
+    over = [_over_coordinates(residuals[name], coordinates[name], found[name], unit) for name in residuals]
+    return [_over_time(residuals, found, unit, observed or {}), *over, _spectra(residuals, found, unit)]
 
 
-def _shown(residual: Residual, found: Localised) -> tuple[Residual, np.ndarray]:
-    """A residual after the low-pass that the analysis used, and the indices of its samples."""
-    return narrowed(residual, found.bandwidth)
+def plot_torque(ax: Axes, residual: Residual, bandwidth: float, *, noise: bool = True, **how: Any) -> None:
+    """Plot a residual over time behind the low-pass that the analysis used, and its noise as a band."""
+    low, _ = narrowed(residual, bandwidth)
+    at = outline(low.torque)
+    ax.plot(low.time[at], low.torque[at], **how)
+    if noise:
+        band = 2.0 * low.deviation[at]
+        ax.fill_between(low.time[at], -band, band, color=MISSING, alpha=0.75, lw=0.0, zorder=3, label="± 2 noise")
 
 
 def _over_time(
@@ -62,26 +56,21 @@ def _over_time(
     unit: str,
     observed: Mapping[str, Sequence[Observed]],
 ) -> Drawn:
-    figure, axes = stacked_axes(len(residuals), 2.3)
+    figure, axes = subplots(9.0, 2.3 * len(residuals) + 0.6, len(residuals), sharex=True)
     for ax, (name, parts) in zip(axes, residuals.items(), strict=True):
         one = found[name]
-        for i, part in enumerate(parts):
-            low, _ = _shown(part, one)
-            at = outline(low.torque)
-            time, band = low.time[at], 2.0 * low.deviation[at]
-            ax.plot(time, low.torque[at], color=SIDE_COLOURS[name], lw=0.9, label="missing" if i == 0 else None, zorder=2)
-            ax.fill_between(time, -band, band, color=MISSING, alpha=0.75, lw=0.0, zorder=3, label=None if i else "± 2 noise")
+        for part in parts:
+            plot_torque(ax, part, one.bandwidth, color=SIDE_COLOURS[name], lw=0.9, label="missing")
         estimates = observed.get(name, ())
-        if all(part.converged for part in estimates):
-            for i, part in enumerate(estimates):
-                low, _ = _shown(part.residual, one)
-                at = outline(low.torque)
-                label = None if i else f"by its observer (noise {low.deviation[0]:.2g} {unit})"
-                ax.plot(low.time[at], low.torque[at], color=_MEAN, lw=0.5, label=label, zorder=4)
+        if estimates and all(part.converged for part in estimates):
+            first, _ = narrowed(estimates[0].residual, one.bandwidth)
+            label = f"by its observer (noise {first.deviation[0]:.2g} {unit})"
+            for part in estimates:
+                plot_torque(ax, part.residual, one.bandwidth, noise=False, color=_MEAN, lw=0.5, label=label, zorder=4)
         ax.axhline(0.0, color=FAINT, lw=0.8, zorder=1)
         ax.set_ylabel(with_unit(f"{name}:\nmissing {missing_quantity(unit)}", unit))
         ax.set_title(f"{fill(sentence_of(one, unit), _WIDTH)}\n", loc="left", fontsize=9)
-        ax.legend(ncols=3, **LEGEND_ABOVE)
+        legend(ax, 3)
     axes[-1].set_xlabel("time (s)")
     caption = (
         "Torque that the model lacks (inertia times acceleration less all modelled torques, positive forward), after the "
@@ -111,9 +100,8 @@ def _over_coordinates(
     parts: Sequence[Residual], coordinates: Sequence[Mapping[str, CoordinateValues]], found: Localised, unit: str
 ) -> Drawn:
     shown = _panels(found)
-    figure = Figure(figsize=(3.2 * len(shown) + 0.6, 3.5), layout="constrained")
-    axes = figure.subplots(1, len(shown), sharey=True, squeeze=False).ravel()
-    lows = [_shown(part, found) for part in parts]
+    figure, axes = subplots(3.2 * len(shown) + 0.6, 3.5, columns=len(shown), sharey=True)
+    lows = [narrowed(part, found.bandwidth) for part in parts]
     torque = np.concatenate([low.torque for low, _ in lows])
     noise = float(np.sqrt(np.mean(np.concatenate([low.deviation for low, _ in lows]) ** 2)))
     every = max(len(torque) // _CLOUD, 1)
@@ -127,8 +115,7 @@ def _over_coordinates(
         )  # fmt: skip
         _means(ax, one)
         ax.locator_params(axis="x", nbins=5)
-        symbol = f" {one.symbol}" if one.symbol else ""
-        ax.set_xlabel(with_unit(f"{one.name}{symbol}", one.unit))
+        ax.set_xlabel(with_unit(f"{one.name} {one.symbol}".rstrip(), one.unit))
         ax.set_title(
             f"explains {100.0 * one.explained:.0f} %", loc="left", fontsize=10,
             fontweight="bold" if one is best and one.explained > 0.0 else "normal",
@@ -136,8 +123,7 @@ def _over_coordinates(
     axes[0].set_ylabel(with_unit(f"{found.name}: missing {missing_quantity(unit)}", unit))
     limit = 1.15 * max(float(np.quantile(np.abs(torque), 0.998)), 2.5 * noise)
     axes[0].set_ylim(-limit, limit)
-    handles = axes[0].get_legend_handles_labels()
-    figure.legend(*handles, ncols=2, loc="outside lower right")
+    figure.legend(*axes[0].get_legend_handles_labels(), ncols=2, loc="outside lower right")
     sentence = sentence_of(found, unit)
     caption = (
         f"{sentence[:1].upper()}{sentence[1:]}. Dots are samples, black marks the means of bins "
@@ -159,7 +145,7 @@ def _means(ax: Axes, one: Coordinate) -> None:
 
 
 def _spectra(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, Localised], unit: str) -> Drawn:
-    figure, axes = stacked_axes(len(residuals), 2.5, sharex=False)
+    figure, axes = subplots(9.0, 2.5 * len(residuals) + 0.6, len(residuals))
     for ax, (name, parts) in zip(axes, residuals.items(), strict=True):
         longest = max(parts, key=lambda part: len(part.time))
         frequency, power, floor = residual_spectrum(longest)
@@ -171,16 +157,15 @@ def _spectra(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, Lo
         ax.loglog(frequency, size * np.sqrt(floor), color=_MEAN, lw=1.2, ls="--", label="noise")
         ax.set_ylim(0.2 * size * np.sqrt(np.min(floor)), 3.0 * size * np.sqrt(np.max([np.max(power), np.max(floor)])))
         ax.axvline(found[name].bandwidth, color=FAINT, lw=0.9, ls=":", label="end of the band analysed")
-        for peak in [one for one in found[name].peaks if not one.in_motion and one.excess_z > SIGNIFICANT][:3]:
-            if peak.power_share < _LABELLED:
-                continue
+        narrow = [one for one in found[name].peaks if not one.in_motion and one.excess_z > SIGNIFICANT]
+        for peak in [one for one in narrow[:3] if one.power_share >= _LABELLED]:
             ax.annotate(
                 f"{peak.frequency:.4g} Hz\n{peak.amplitude:.2g} {unit}", (peak.frequency, peak.amplitude),
                 xytext=(5, 2), textcoords="offset points", fontsize=8, va="center",
             )  # fmt: skip
             ax.plot(peak.frequency, peak.amplitude, "v", ms=5, color=_MEAN)
         ax.set_ylabel(with_unit(f"{name}:\namplitude per line", unit))
-        ax.legend(ncols=3, **LEGEND_ABOVE)
+        legend(ax, 3)
     axes[-1].set_xlabel("frequency (Hz)")
     caption = (
         "Spectrum of the missing torque and of its noise. The noise of an acceleration grows with the square of the "

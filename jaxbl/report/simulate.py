@@ -6,16 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from jaxbl.drive.parameters import parameters
 from jaxbl.files import write_atomic
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.trial import Trial
 
-from .figures import SIDES, Drawn
+from .figures import COLOURS, FAINT, SIDE_COLOURS, SIDES, Drawn, legend, style, subplots, with_unit
 from .page import PageTable, write_report
-from .style import COLOURS, FAINT, LEGEND_ABOVE, SIDE_COLOURS, style, with_unit
 
 _TRUE, _OBSERVED = COLOURS[6], COLOURS[1]
 _POINTS = 6000
@@ -31,56 +29,41 @@ def write_trial_report(trial: Trial, folder: Path) -> list[str]:
     draft.replace(folder / "trace.parquet")
     metrics = trial.summary["metrics"]
     sides = [side for side in SIDES if f"{side}.converged" in metrics]
-    tables = [
-        PageTable(
-            "Metrics",
-            ["", *sides, "unit", "meaning"],
-            [
-                [name, *(metrics.get(f"{side}.{name}") for side in sides), about.unit, about.doc]
-                for name, about in SIDE_METRICS.items()
-                if f"motor.{name}" in metrics
-            ],
-        )
+    rows = [
+        [name, *(metrics.get(f"{side}.{name}") for side in sides), about.unit, about.doc]
+        for name, about in SIDE_METRICS.items()
+        if f"motor.{name}" in metrics
     ]
+    tables = [PageTable("Metrics", ["", *sides, "unit", "meaning"], rows)]
     lead = []
     if identified := trial.summary["identified"]:
         rows = [[name, values["true"], *(values[side] for side in sides)] for name, values in identified.items()]
         tables.insert(0, PageTable("Identified", ["", "true", *sides], rows))
-        for name, values in identified.items():
-            found = ", ".join(f"{_number(values[side])} ({side})" for side in sides)
-            lead.append(f"{name}: {found}; true {values['true']:.4g}")
+        for name, _, *values in rows:
+            texts = ("undetermined" if value is None else f"{value:.4g}" for value in values)
+            found = ", ".join(f"{text} ({side})" for text, side in zip(texts, sides, strict=True))
+            lead.append(f"{name}: {found}; true {identified[name]['true']:.4g}")
     title, text = trial.config.title or "Run", trial.config.to_toml()
     return write_report(folder, title, lead, draw_trial(trial), tables, text, trial.summary["remarks"])
 
 
-def _number(value: float | None) -> str:
-    return "undetermined" if value is None else f"{value:.4g}"
-
-
+@style()
 def draw_trial(trial: Trial) -> list[Drawn]:
     """All figures of a run."""
     trace = trial.trace.iloc[:: max(len(trial.trace) // _POINTS, 1)]
     sides = [side for side in SIDES if f"{side}.position" in trace]
-    with style():
-        drawn = [_input(trace)]
-        for side in sides:
-            for quantity, unit in (("velocity", "rad/s"), ("position", "rad")):
-                drawn.append(_observed(trace, side, quantity, unit))
-        drawn.append(_torque(trace, sides))
-        if len(sides) == 2:
-            drawn += [_identified(trial, trace, sides), _hysteresis(trace), _limit_cycle(trace)]
+    drawn = [_input(trace)]
+    for side in sides:
+        drawn += [_observed(trace, side, quantity, unit) for quantity, unit in (("velocity", "rad/s"), ("position", "rad"))]
+    drawn.append(_torque(trace, sides))
+    if len(sides) == 2:
+        last = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]]
+        drawn += [_identified(trial, trace, last, sides), _hysteresis(last), _limit_cycle(last)]
     return drawn
 
 
-def _axes(rows: int = 1, columns: int = 1, height: float = 3.2, sharex: bool = True):
-    figure = Figure(figsize=(7.0, height), layout="constrained")
-    axes = figure.subplots(rows, columns, sharex=sharex, squeeze=False).ravel()
-    figure.align_ylabels(axes)
-    return figure, axes
-
-
 def _input(trace: pd.DataFrame) -> Drawn:
-    figure, (ax,) = _axes(height=2.4)
+    figure, (ax,) = subplots(7.0, 2.4)
     ax.plot(trace["t"], trace["u"], color=_TRUE)
     ax.set(xlabel="time (s)", ylabel="input torque u (N m)")
     return Drawn("input", figure, "Input torque (analogue of Fig. 7).")
@@ -95,12 +78,12 @@ _FIGURES = {
 
 
 def _observed(trace: pd.DataFrame, side: str, quantity: str, unit: str) -> Drawn:
-    figure, (above, below) = _axes(rows=2, height=4.4)
+    figure, (above, below) = subplots(7.0, 4.4, 2, sharex=True)
     true, estimate = trace[f"{side}.{quantity}"], trace[f"{side}.{quantity}_estimate"]
     above.plot(trace["t"], estimate, color=_OBSERVED, lw=2.4, alpha=0.8, label="observer")
     above.plot(trace["t"], true, color=_TRUE, lw=1.0, label="true")
     above.set(ylabel=f"{side} {quantity} ({unit})")
-    above.legend(ncols=2, **LEGEND_ABOVE)
+    legend(above, 2)
     below.plot(trace["t"], true - estimate, color=COLOURS[0])
     below.axhline(0.0, color=FAINT, lw=0.8)
     below.set(xlabel="time (s)", ylabel=f"error ({unit})")
@@ -111,7 +94,7 @@ def _observed(trace: pd.DataFrame, side: str, quantity: str, unit: str) -> Drawn
 
 
 def _torque(trace: pd.DataFrame, sides: list[str]) -> Drawn:
-    figure, (above, below) = _axes(rows=2, height=4.4)
+    figure, (above, below) = subplots(7.0, 4.4, 2, sharex=True)
     for side in sides:
         estimate, colour = trace[f"{side}.torque_estimate"], SIDE_COLOURS[side]
         above.plot(trace["t"], estimate, color=colour, lw=2.0, alpha=0.75, label=f"from the {side} observer")
@@ -119,44 +102,42 @@ def _torque(trace: pd.DataFrame, sides: list[str]) -> Drawn:
     above.plot(trace["t"], trace["torque"], color=_TRUE, lw=1.0, label="true")
     name = "transmitted torque C" if len(sides) == 2 else "disturbance torque"
     above.set(ylabel=f"{name} (N m)")
-    above.legend(ncols=3, **LEGEND_ABOVE)
+    legend(above, 3)
     below.axhline(0.0, color=FAINT, lw=0.8)
     below.set(xlabel="time (s)", ylabel="error (N m)")
     return Drawn("torque", figure, f"The {name}, true and by the equivalent controls (17) (analogue of Fig. 16).")
 
 
-def _identified(trial: Trial, trace: pd.DataFrame, sides: list[str]) -> Drawn:
+def _identified(trial: Trial, trace: pd.DataFrame, last: pd.DataFrame, sides: list[str]) -> Drawn:
     names = list(trial.summary["identified"])
     # what a law derives from its own parameters is an angle, as they are
     units = {field.name: about.unit for field, about in parameters(trial.config.build().transmission)}
-    figure, axes = _axes(rows=len(names), height=2.0 * len(names) + 0.6)
+    figure, axes = subplots(7.0, 2.0 * len(names) + 0.6, len(names), sharex=True)
     for ax, name in zip(axes, names, strict=True):
         true = trial.summary["identified"][name]["true"]
         for side in sides:
             ax.plot(trace["t"], trace[f"{side}.{name}"], color=SIDE_COLOURS[side], label=f"{side} identifier")
         ax.axhline(true, color=_TRUE, lw=1.0, ls="--", label="true")
         # the estimates of the first half still converge: the second half sets the scale
-        late = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]][[f"{side}.{name}" for side in sides]]
-        largest = float((late - true).abs().max(axis=None))
+        largest = float((last[[f"{side}.{name}" for side in sides]] - true).abs().max(axis=None))
         reach = max(2.0 * largest if np.isfinite(largest) else 0.0, 0.02 * abs(true), 1e-12)
         ax.set(ylabel=with_unit(name.replace("_", " "), units.get(name, "rad")), ylim=(true - reach, true + reach))
-    axes[0].legend(ncols=3, **LEGEND_ABOVE)
+    legend(axes[0], 3)
     axes[-1].set_xlabel("time (s)")
     return Drawn("dead_zone", figure, "Identified transmission parameters over time (27)-(28) (analogue of Fig. 16).")
 
 
-def _hysteresis(trace: pd.DataFrame) -> Drawn:
-    figure, (left, right) = _axes(columns=2, height=3.4, sharex=False)
-    last = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]]
+def _hysteresis(last: pd.DataFrame) -> Drawn:
+    figure, (left, right) = subplots(7.0, 3.4, columns=2)
     for side in SIDES:
         left.plot(last["z"], last[f"{side}.torque_estimate"], color=SIDE_COLOURS[side], lw=1.6, alpha=0.75, label=side)
     left.plot(last["z"], last["torque"], ".", ms=1.5, color=_TRUE, label="true")
     left.set(xlabel="twist z = θe − N₀ θs (rad)", ylabel="transmitted torque C (N m)")
-    left.legend(ncols=3, loc="lower left", bbox_to_anchor=(-0.1, 1.0), borderaxespad=0.1, columnspacing=0.8)
+    legend(left, 3, loc="lower left", bbox_to_anchor=(-0.1, 1.0), columnspacing=0.8)
     right.plot(last["theta_e"], last["theta_s"], color=_OBSERVED, lw=1.8, label="measured")
     right.plot(last["motor.position_estimate"], last["load.position_estimate"], color=_TRUE, lw=0.8, label="observed")
     right.set(xlabel="motor position θe (rad)", ylabel="load position θs (rad)")
-    right.legend(ncols=2, **LEGEND_ABOVE)
+    legend(right, 2)
     caption = (
         "Torque over twist (chatter and lag of the estimates widen the loop), and load over motor position. Second half of "
         "the run (analogue of Fig. 17)."
@@ -164,13 +145,12 @@ def _hysteresis(trace: pd.DataFrame) -> Drawn:
     return Drawn("hysteresis", figure, caption)
 
 
-def _limit_cycle(trace: pd.DataFrame) -> Drawn:
-    figure, (left, right) = _axes(columns=2, height=3.4, sharex=False)
-    last = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]]
+def _limit_cycle(last: pd.DataFrame) -> Drawn:
+    figure, (left, right) = subplots(7.0, 3.4, columns=2)
     for ax, side, angle in ((left, "motor", "θe"), (right, "load", "θs")):
-        observed = (last[f"{side}.position_estimate"], last[f"{side}.velocity_estimate"])
-        ax.plot(*observed, color=_OBSERVED, lw=2.2, alpha=0.8, label="observed")
+        position, velocity = last[f"{side}.position_estimate"], last[f"{side}.velocity_estimate"]
+        ax.plot(position, velocity, color=_OBSERVED, lw=2.2, alpha=0.8, label="observed")
         ax.plot(last[f"{side}.position"], last[f"{side}.velocity"], color=_TRUE, lw=0.9, label="true")
         ax.set(xlabel=f"{side} position {angle} (rad)", ylabel=f"{side} velocity (rad/s)")
-    left.legend(ncols=2, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.1)
+    legend(left, 2, loc="lower left", bbox_to_anchor=(0.0, 1.0))
     return Drawn("limit_cycle", figure, "Velocity over position, second half of the run: the limit cycle (cf. Fig. 28).")

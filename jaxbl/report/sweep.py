@@ -5,6 +5,7 @@
 # pyright: reportReturnType=false
 
 import json
+from itertools import product
 from pathlib import Path
 
 import pandas as pd
@@ -49,9 +50,8 @@ def headline(result: StudyResult) -> list[str]:
     points = Points(result.config) if refined else None
     even = frame if points is None else frame[points.always_simulated(frame)]
     shares = ", ".join(f"{100 * even[f'{side}.converged'].mean():.1f} % ({side})" for side in sides)
-    if points is None:
-        lines = [f"{len(frame)} runs. The observers converged in {shares} of them."]
-    else:
+    lines = [f"{len(frame)} runs. The observers converged in {shares} of them."]
+    if points is not None:
         simulated = len(frame) // result.config.sweep.seeds
         share = 100 * simulated / len(points)
         lines = [
@@ -60,8 +60,9 @@ def headline(result: StudyResult) -> list[str]:
         ]
     if isinstance(result.source, Store):
         manifest = result.source.manifest
-        if len(frame) < manifest["rows"] or (refined and not manifest["finished"]):
-            more = " so far" if refined and not manifest["finished"] else ""
+        going = refined and not manifest["finished"]
+        if going or len(frame) < manifest["rows"]:
+            more = " so far" if going else ""
             lines.append(f"The study is not finished: it has {manifest['rows']} runs{more}. Go on with 'jaxbl sweep'.")
     diverged = int((~frame["finite"].astype(bool)).sum())
     if diverged:
@@ -93,11 +94,9 @@ def _law_lines(laws: list[Law]) -> list[str]:
 
 def _why(law: Law) -> str:
     """Why a law ends below and above; the end of the sweep is named only where both ends are that."""
-    below, above = law.stops["below"], law.stops["above"]
-    if below == above:
-        return below
-    ends = {"below": below, "above": above}.items()
-    return "; ".join(f"{end}: {reason}" for end, reason in ends if reason != END_OF_SWEEP)
+    if law.stops["below"] == law.stops["above"]:
+        return law.stops["below"]
+    return "; ".join(f"{end}: {law.stops[end]}" for end in ("below", "above") if law.stops[end] != END_OF_SWEEP)
 
 
 def _slope_of(law: Law) -> str:
@@ -112,22 +111,21 @@ def _place(law: Law) -> str:
 
 
 def _law_table(laws: list[Law]) -> PageTable:
-    rows: list[list[object]] = []
+    rows = []
     for law in laws:
-        fit = law.fit
-        ends = (
-            "–" if law.range is None else f"{law.range[0]:g} to {law.range[1]:g} ({law.inside.sum()})".replace(" ", "\u00a0")
-        )
-        slope = "no law" if fit is None else _slope_of(law).replace(" ", "\u00a0")
-        halves = "–" if fit is None else f"{fit.halves[0]:.2f}, {fit.halves[1]:.2f}".replace(" ", "\u00a0")
-        line = f"{law.value} over {law.x}"
+        line, slope, halves, ends = f"{law.value} over {law.x}", "no law", "–", "–"
+        if law.fit is not None:
+            slope, halves = _slope_of(law), f"{law.fit.halves[0]:.2f}, {law.fit.halves[1]:.2f}"
+        if law.range is not None:
+            ends = f"{law.range[0]:g} to {law.range[1]:g} ({law.inside.sum()})"
+        slope, halves, ends = (text.replace(" ", "\u00a0") for text in (slope, halves, ends))
         rows.append([line, _place(law), law.theory, slope, halves, law.agrees, ends, _why(law)])
     columns = ["error", "where", "theory", "slope", "halves", "agrees", "range (points)", "why it ends there"]
     return PageTable("Accuracy laws", columns, rows)
 
 
 def _axes_table(result: StudyResult) -> PageTable:
-    rows: list[list[object]] = []
+    rows = []
     for axis in result.config.axes:
         column = result.read([axis.path])[axis.path]
         ends = ["–", "–"] if not pd.api.types.is_numeric_dtype(column) else [column.min(), column.max()]
@@ -136,13 +134,12 @@ def _axes_table(result: StudyResult) -> PageTable:
 
 
 def _metric_table(result: StudyResult) -> PageTable:
-    rows: list[list[object]] = []
-    for side in SIDES:
-        for name, about in SIDE_METRICS.items():
-            column = f"{side}.{name}"
-            if column in result.columns:
-                values = result.read([column])[column].astype(float)
-                values = values[values.abs() < float("inf")]
-                quantiles = [values.quantile(q) if len(values) else None for q in (0.05, 0.5, 0.95)]
-                rows.append([column, *quantiles, about.unit, about.doc])
+    rows = []
+    for side, (name, about) in product(SIDES, SIDE_METRICS.items()):
+        column = f"{side}.{name}"
+        if column in result.columns:
+            values = result.read([column])[column].astype(float)
+            values = values[values.abs() < float("inf")]
+            quantiles = [values.quantile(q) if len(values) else None for q in (0.05, 0.5, 0.95)]
+            rows.append([column, *quantiles, about.unit, about.doc])
     return PageTable("Metrics over all runs", ["metric", "5 %", "median", "95 %", "unit", "meaning"], rows)

@@ -1,6 +1,7 @@
 """What `jaxbl tune` leaves to be read: the objective over the gains, error over convergence time, comparisons."""
 
 import json
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
@@ -18,24 +18,18 @@ from jaxbl.gains.tune_summary import called_gains
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
-from .figures import SIDES, Drawn
+from .figures import COLOURS, MAP, MARKERS, MISSING, SIDES, Drawn, mark, style, subplots, with_unit
 from .maps import cell_edges, color_norm, condition_curves, hatch_failures
 from .page import PageTable, write_report
-from .style import COLOURS, MAP, MISSING, style, with_unit
 
-_MARKS = ("o", "s", "^", "D", "v", "P", "X")
 _CONDITIONS = {name: CONDITIONS[name] for name in ("davila_fridman", "seeber_horn", "exact")}
 
 
+@style()
 def draw_tuning(tuning: Tuning) -> list[Drawn]:
     """All figures of a tuning."""
     sides = [side for side in SIDES if side in tuning.candidates]
-    with style():
-        return [
-            *(_map(tuning, side) for side in sides),
-            *(_front(tuning, side) for side in sides),
-            _comparison(tuning, sides),
-        ]
+    return [*(_map(tuning, side) for side in sides), *(_front(tuning, side) for side in sides), _comparison(tuning, sides)]
 
 
 def _label(tuning: Tuning) -> str:
@@ -44,9 +38,9 @@ def _label(tuning: Tuning) -> str:
 
 
 def _others(tuning: Tuning, side: str) -> list[tuple[str, str, dict[str, Any]]]:
-    """Name, mark and figures on the study's own excitation of the gains that the tuned ones are compared with."""
+    """Name, marker and figures on the study's own excitation of the gains that the tuned ones are compared with."""
     rows = [row for row in tuning.summary["named"] if row["side"] == side and row["name"] != "tuned"]
-    return [(row["name"], _MARKS[i % len(_MARKS)], row) for i, row in enumerate(rows)]
+    return [(row["name"], MARKERS[i % len(MARKERS)], row) for i, row in enumerate(rows)]
 
 
 def _map(tuning: Tuning, side: str) -> Drawn:
@@ -61,12 +55,11 @@ def _map(tuning: Tuning, side: str) -> Drawn:
     xs, ys = table.columns.to_numpy(float), table.index.to_numpy(float)
     grid = table.to_numpy(float)
     norm = color_norm(grid, "log")
-    figure = Figure(figsize=(6.6, 5.4), layout="constrained")
-    ax = figure.subplots()
+    edges = cell_edges(xs, True), cell_edges(ys, True)
+    figure, (ax,) = subplots(6.6, 5.4)
     ax.grid(False)
     ax.set_facecolor(MISSING)
-    ax.set(xscale="log", yscale="log")
-    edges = cell_edges(xs, True), cell_edges(ys, True)
+    ax.set(xscale="log", yscale="log", xlabel="α / f⁺", ylabel="λ / √f⁺ (λ in √rad/s)")
     ax.pcolormesh(*edges, grid, cmap=MAP, norm=norm, rasterized=True)
     handles: list[Any] = [*hatch_failures(ax, (xs, ys), edges, feasible.to_numpy(float), "constraints not met")]
     handles += condition_curves(ax, _CONDITIONS, 1.0, (edges[0][0], edges[0][-1]))
@@ -75,19 +68,14 @@ def _map(tuning: Tuning, side: str) -> Drawn:
         ax.add_patch(Rectangle((left, low), right - left, high - low, fill=False, ec="white", ls="--", lw=1.2))
         handles.append(Patch(fill=False, ec="#777777", ls="--", label="first zoom"))
     gains = summary["gains"][side]
-    ends = [(e[0], e[-1]) for e in edges]
-    for name, mark, row in _others(tuning, side):
-        place = (row["alpha"] / bound, row["lambda"] / np.sqrt(bound))
-        shown = [float(np.clip(value, *limits)) for value, limits in zip(place, ends, strict=True)]
-        off = "" if np.allclose(shown, place) else ", off the map"
-        handles.append(_mark(ax, shown, mark, 8, f"{name}{off}"))
-    handles.append(_mark(ax, (gains["alpha_ratio"], gains["lambda_ratio"]), "*", 15, "tuned"))
-    ax.set(xlim=ends[0], ylim=ends[1], xlabel="α / f⁺", ylabel="λ / √f⁺ (λ in √rad/s)")
+    ax.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
+    for name, marker, row in _others(tuning, side):
+        handles.append(mark(ax, (row["alpha"] / bound, row["lambda"] / np.sqrt(bound)), marker, name, 8))
+    handles.append(mark(ax, (gains["alpha_ratio"], gains["lambda_ratio"]), "*", "tuned", 15))
     ax.set_title(
         f"{side}: tuned ★ λ = {gains['lambda']:.3g} √rad/s, α = {gains['alpha']:.3g} rad/s²,  f⁺ = {bound:.3g} rad/s²"
     )
-    bar = figure.colorbar(ScalarMappable(norm, MAP), ax=ax, pad=0.02, aspect=28)
-    bar.set_label(_label(tuning))
+    figure.colorbar(ScalarMappable(norm, MAP), ax=ax, pad=0.02, aspect=28, label=_label(tuning))
     if np.isnan(grid).any():
         handles.append(Patch(facecolor=MISSING, label=f"diverged ({int(np.isnan(grid).sum())} points)"))
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
@@ -98,39 +86,31 @@ def _map(tuning: Tuning, side: str) -> Drawn:
     return Drawn(f"tuning_{side}", figure, caption)
 
 
-def _mark(ax: Axes, place: Any, mark: str, size: float, label: str) -> Line2D:
-    """One point, and its entry of the legend."""
-    look: dict[str, Any] = {"ls": "", "marker": mark, "ms": size, "mfc": "white", "mec": "black", "mew": 1.2}
-    ax.plot(*([value] for value in place), clip_on=False, zorder=6, **look)
-    look["ms"] = min(size, 10.0)
-    return Line2D([], [], label=label, **look)
-
-
 def _front(tuning: Tuning, side: str) -> Drawn:
     summary = tuning.summary
     feasible = tuning.candidates[side].query("feasible")
     front = pd.DataFrame(summary["pareto"][side])
-    figure = Figure(figsize=(6.6, 4.4), layout="constrained")
-    ax = figure.subplots()
+    figure, (ax,) = subplots(6.6, 4.4)
     ax.plot(
         feasible["convergence_time"], feasible["error"], ".", ms=3.5, color=MISSING, label="gains that meet all constraints"
     )
     ax.step(front["convergence_time"], front["error"], "o-", where="post", ms=3.5, color=COLOURS[0],
             label="none better in both")  # fmt: skip
     times, errors = list(feasible["convergence_time"]), list(feasible["error"])
-    handles = list(ax.get_legend_handles_labels()[0])
+    handles = ax.get_legend_handles_labels()[0]
     metric, margins = f"{summary['objective']}_rmse", summary["margins"]
-    for name, mark, row in _others(tuning, side):
+    for name, marker, row in _others(tuning, side):
         time, error = row["convergence_time"]["worst"], row[metric]["worst"]
         if time is None or error is None:
             handles.append(Line2D([], [], ls="", marker="", label=f"{name}: {100 * row['converged']:.3g} % converge"))
             continue
         kept = row["margin_alpha"] >= margins["alpha"] and row["margin_exact"] >= margins["exact"]
-        handles.append(_mark(ax, (time, error), mark, 8, name if kept else f"{name}, margins not met"))
+        label = name if kept else f"{name}, margins not met"
+        handles.append(mark(ax, (time, error), marker, label, 8, held=False))
         times.append(time)
         errors.append(error)
     found = summary["achieved"][side]
-    handles.append(_mark(ax, (found["convergence_time"], found[metric]), "*", 15, "tuned"))
+    handles.append(mark(ax, (found["convergence_time"], found[metric]), "*", "tuned", 15, held=False))
     for values, scale in ((times, ax.set_xscale), (errors, ax.set_yscale)):
         if min(values) > 0.0 and max(values) > 10.0 * min(values):
             scale("log")
@@ -143,39 +123,13 @@ def _front(tuning: Tuning, side: str) -> Drawn:
 def _comparison(tuning: Tuning, sides: list[str]) -> Drawn:
     rows, metric = tuning.summary["holdout"]["rows"], f"{tuning.summary['objective']}_rmse"
     names = list(dict.fromkeys(row["name"] for row in rows))
-    figure = Figure(figsize=(4.6 * len(sides) + 0.6, 1.8 + 0.62 * len(names)), layout="constrained")
-    axes = figure.subplots(2, len(sides), sharey=True, squeeze=False)
-    for column, side in enumerate(sides):
-        found = {row["name"]: row for row in rows if row["side"] == side}
-        for ax, figure_name, label in ((axes[0, column], metric, _label(tuning)),
-                                       (axes[1, column], "convergence_time", "worst convergence time (s)")):  # fmt: skip
-            values = [found[name][figure_name] for name in names]
-            shown = [v["worst"] for v in values if v["worst"] is not None]
-            log = bool(shown) and min(shown) > 0.0 and max(shown) > 30.0 * min(shown)
-            if log:
-                ax.set_xscale("log")
-            for i, (name, value) in enumerate(zip(names, values, strict=True)):
-                row = found[name]
-                if value["worst"] is None:
-                    text = f"converged in {100 * row['converged']:.3g} %" if row["finite"] == 1.0 else "diverged"
-                    ax.annotate(
-                        text, (0.01, i), xycoords=("axes fraction", "data"), va="center", color="#555555", fontsize=9
-                    )
-                    continue
-                whole = row["converged"] == 1.0
-                ax.barh(i, value["worst"], 0.62, color=COLOURS[1] if name == "tuned" else COLOURS[5],
-                        hatch=None if whole else "//", edgecolor="white", linewidth=0.0)  # fmt: skip
-                if value["median"] is not None:
-                    ax.plot([value["median"]], [i], "|", ms=12, mew=1.6, color="black")
-                ax.annotate(f" {value['worst']:.3g}", (value["worst"], i), va="center", fontsize=9)
-            if shown:
-                low = 0.5 * min(v["median"] or v["worst"] for v in values if v["worst"]) if log else 0.0
-                ax.set_xlim(low, max(shown) * (3.0 if log else 1.22) or 1.0)
-            ax.set_xlabel(label)
-            ax.grid(axis="y", visible=False)
-        axes[0, column].set_title(side)
-    axes[0, 0].set_yticks(range(len(names)), names)
-    axes[0, 0].invert_yaxis()
+    figure, axes = subplots(4.6 * len(sides) + 0.6, 1.8 + 0.62 * len(names), 2, len(sides), sharey=True)
+    compared = ((metric, _label(tuning)), ("convergence_time", "worst convergence time (s)"))
+    for ax, ((key, label), side) in zip(axes, product(compared, sides), strict=True):
+        _bars(ax, key, [row for row in rows if row["side"] == side])
+        ax.set(xlabel=label, title=side if key == metric else "")
+    axes[0].set_yticks(range(len(names)), names)
+    axes[0].invert_yaxis()
     held = tuning.summary["holdout"]
     where = "the study's excitation with other noise" if held["same_excitation"] else "the held-out excitation"
     caption = (
@@ -183,6 +137,28 @@ def _comparison(tuning: Tuning, sides: list[str]) -> Drawn:
         "of all runs, and the median (stroke). Hatched: some runs did not converge."
     )
     return Drawn("tuning_holdout", figure, caption)
+
+
+def _bars(ax: Axes, key: str, rows: list[dict[str, Any]]) -> None:
+    """Bars of a figure's worst value for each of the gains, with a stroke at the median."""
+    shown = [row[key]["worst"] for row in rows if row[key]["worst"] is not None]
+    log = bool(shown) and min(shown) > 0.0 and max(shown) > 30.0 * min(shown)
+    ax.set_xscale("log" if log else "linear")
+    for i, row in enumerate(rows):
+        worst, median = row[key]["worst"], row[key]["median"]
+        if worst is None:
+            text = f"converged in {100 * row['converged']:.3g} %" if row["finite"] == 1.0 else "diverged"
+            ax.annotate(text, (0.01, i), xycoords=("axes fraction", "data"), va="center", color="#555555", fontsize=9)
+            continue
+        colour, hatch = COLOURS[1] if row["name"] == "tuned" else COLOURS[5], None if row["converged"] == 1.0 else "//"
+        ax.barh(i, worst, 0.62, color=colour, hatch=hatch, edgecolor="white", linewidth=0.0)
+        if median is not None:
+            ax.plot(median, i, "|", ms=12, mew=1.6, color="black")
+        ax.annotate(f" {worst:.3g}", (worst, i), va="center", fontsize=9)
+    if shown:
+        low = 0.5 * min(row[key]["median"] or row[key]["worst"] for row in rows if row[key]["worst"]) if log else 0.0
+        ax.set_xlim(low, max(shown) * (3.0 if log else 1.22) or 1.0)
+    ax.grid(axis="y", visible=False)
 
 
 def write_tune_report(tuning: Tuning, folder: Path) -> list[str]:
@@ -203,13 +179,14 @@ def write_tune_report(tuning: Tuning, folder: Path) -> list[str]:
 
 def gains_toml(summary: dict[str, Any]) -> str:
     """The chosen gains as TOML that a study can `include`; comments say what they were chosen for."""
-    margins, lines = summary["margins"], []
-    title = " ".join(summary["title"].split())
-    lines.append(f"# Gains chosen by 'jaxbl tune'{f' for: {title}' if title else ''}")
-    lines.append(f"# Objective: {summary['objective_metric']}; {_runs_behind(summary)}.")
-    asked = f"alpha / f+ {margins['alpha']:g}, lambda over the least of the exact condition {margins['exact']:g}"
-    lines.append(f"# Margins asked for: {asked}.")
-    lines.append('# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.')
+    margins, title = summary["margins"], " ".join(summary["title"].split())
+    lines = [
+        f"# Gains chosen by 'jaxbl tune'{f' for: {title}' if title else ''}",
+        f"# Objective: {summary['objective_metric']}; {_runs_behind(summary)}.",
+        f"# Margins asked for: alpha / f+ {margins['alpha']:g}, lambda over the least of the exact condition "
+        f"{margins['exact']:g}.",
+        '# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.',
+    ]
     for side, gains in summary["gains"].items():
         found = summary["achieved"][side]
         lines += [
@@ -228,8 +205,7 @@ def gains_toml(summary: dict[str, Any]) -> str:
 def _runs_behind(summary: dict[str, Any]) -> str:
     first, last = summary["seeds"]
     seeds, drives = last - first + 1, len(summary["scenarios"])
-    parts = [f"{seeds} noise seed{'s' * (seeds > 1)}", f"{drives} drive{'s' * (drives > 1)}"]
-    return " and ".join(parts)
+    return f"{seeds} noise seed{'s' * (seeds > 1)} and {drives} drive{'s' * (drives > 1)}"
 
 
 def _holdout_title(summary: dict[str, Any]) -> str:
@@ -273,7 +249,7 @@ def _tune_headline(summary: dict[str, Any]) -> list[str]:
 
 
 def _gains_table(summary: dict[str, Any]) -> PageTable:
-    rows: list[list[object]] = []
+    rows = []
     for side, gains in summary["gains"].items():
         found, step = summary["achieved"][side], summary["resolution"][side]
         rows.append(
@@ -287,7 +263,7 @@ def _gains_table(summary: dict[str, Any]) -> PageTable:
 
 
 def _comparison_table(heading: str, found: list[dict[str, Any]]) -> PageTable:
-    rows: list[list[object]] = [
+    rows = [
         [row["side"], row["name"], row["lambda"], row["alpha"], 100.0 * row["converged"],
          *(row[name][how] for name in ("velocity_rmse", "torque_rmse") for how in ("worst", "median")),
          row["convergence_time"]["worst"], row["margin_alpha"], row["margin_exact"], row["peak_ratio"]]

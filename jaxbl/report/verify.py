@@ -4,6 +4,7 @@
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
 # pyright: reportReturnType=false
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -12,51 +13,38 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from jaxbl.gains.error_system import conditions_of
 from jaxbl.gains.verify import Verdict, judged_sides
 from jaxbl.observer.conditions import CONDITIONS
 
-from .figures import Drawn
+from .figures import COLOURS, MAP, MISSING, Drawn, mark, style, subplots
 from .maps import condition_curves
 from .page import PageTable, write_report
-from .style import COLOURS, MAP, MISSING, style
 
 _USUAL = ("usual pair (1.5, 1.1)", 1.1, 1.5)
 _MARKERS = ("*", "P", "D", "^", "v", "X", "s")
-_LEVELS = {
-    "drive": "drive: ideal encoders, implicit observer",
-    "sampled": "sampled: as the study has it",
-}
+_LEVELS = {"drive": "drive: ideal encoders, implicit observer", "sampled": "sampled: as the study has it"}
 _ALPHA, _LAMBDA = "α / f⁺", "λ / √f⁺"
 
 
+@style()
 def draw_verdict(verdict: Verdict) -> list[Drawn]:
     """All figures of a verification."""
-    with style():
-        return [
-            _atlas(verdict),
-            *([_damping(verdict)] if verdict.normalised.damped else []),
-            *(_levels(verdict, side) for side in judged_sides(verdict.config)),
-            _conservatism(verdict),
-            _claimed(verdict),
-        ]
+    damping = [_damping(verdict)] if verdict.normalised.damped else []
+    levels = [_levels(verdict, side) for side in judged_sides(verdict.config)]
+    return [_atlas(verdict), *damping, *levels, _conservatism(verdict), _claimed(verdict)]
 
 
-def _mark(ax: Axes, verdict: Verdict, dark: bool = False) -> list[Line2D]:
-    """Mark the usual pair and the study's marks, those off the map on its edge. Returns the legend's handles."""
-    handles = []
-    (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
-    marks = [mark for mark in verdict.summary["marks"] if mark["alpha_ratio"] is not None]
-    places = [_USUAL, *((mark["name"], mark["alpha_ratio"], mark["lambda_ratio"]) for mark in marks)]
-    for i, (name, alpha, lambda_) in enumerate(places):
-        x, y = np.clip(alpha, left, right), np.clip(lambda_, low, high)
-        look = {"marker": _MARKERS[i % len(_MARKERS)], "ms": 12, "mfc": COLOURS[4] if dark else "white", "mec": "black"}
-        ax.plot(x, y, ls="", clip_on=False, zorder=6, **look)
-        handles.append(Line2D([], [], ls="", label=name if (x, y) == (alpha, lambda_) else f"{name} (off the map)", **look))
-    return handles
+def _marks(ax: Axes, verdict: Verdict, colour: str = "white") -> list[Line2D]:
+    """Mark the usual pair and the study's marks. Returns the legend's handles."""
+    marks = [one for one in verdict.summary["marks"] if one["alpha_ratio"] is not None]
+    places = [_USUAL, *((one["name"], one["alpha_ratio"], one["lambda_ratio"]) for one in marks)]
+    return [
+        mark(ax, place, marker, name, 12, colour)
+        for (name, *place), marker in zip(places, itertools.cycle(_MARKERS), strict=False)
+    ]
 
 
 def _axes_of_plane(ax: Axes, xs: np.ndarray, ys: np.ndarray) -> None:
@@ -68,8 +56,7 @@ def _axes_of_plane(ax: Axes, xs: np.ndarray, ys: np.ndarray) -> None:
 
 def _atlas(verdict: Verdict) -> Drawn:
     found = verdict.normalised
-    figure = Figure(figsize=(7.6, 6.6), layout="constrained")
-    ax = figure.subplots()
+    figure, (ax,) = subplots(7.6, 6.6)
     ax.grid(False)
     norm = LogNorm(0.05, 20.0)
     shown = np.clip(found.ratio, 1e-6, 1e6)
@@ -79,9 +66,8 @@ def _atlas(verdict: Verdict) -> Drawn:
     step = max(len(found.alpha) // 24, 1)
     look = {"marker": "o", "ms": 5, "mfc": "white", "mec": "black", "ls": ""}
     ax.plot(found.alpha[::step], found.boundary[::step], **look, zorder=5)
-    handles += [Line2D([], [], label="simulated boundary", **look), *_mark(ax, verdict)]
-    ax.set_ylabel(_LAMBDA)
-    ax.set_title("Error system under its worst disturbance: below the boundary it grows")
+    handles += [Line2D([], [], label="simulated boundary", **look), *_marks(ax, verdict)]
+    ax.set(ylabel=_LAMBDA, title="Error system under its worst disturbance: below the boundary it grows")
     bar = figure.colorbar(ScalarMappable(norm, "PuOr_r"), ax=ax, pad=0.02, aspect=30, extend="both")
     bar.set_label("ratio ρ of successive velocity peaks, simulated")
     bar.ax.axhline(1.0, color="black", lw=1.0)
@@ -95,15 +81,13 @@ def _atlas(verdict: Verdict) -> Drawn:
 
 def _damping(verdict: Verdict) -> Drawn:
     found = verdict.normalised
-    figure = Figure(figsize=(7.0, 4.8), layout="constrained")
-    ax = figure.subplots()
+    figure, (ax,) = subplots(7.0, 4.8)
     for i, (damping, boundary) in enumerate(sorted({0.0: found.boundary, **found.damped}.items())):
         label = "no friction (exact condition)" if damping == 0.0 else f"friction number {damping:g}"
-        ax.plot(
-            found.alpha, np.where(boundary > 0.0, boundary, np.nan), color=COLOURS[i % len(COLOURS)], lw=2.0, label=label
-        )
+        least = np.where(boundary > 0.0, boundary, np.nan)
+        ax.plot(found.alpha, least, color=COLOURS[i % len(COLOURS)], lw=2.0, label=label)
     _axes_of_plane(ax, found.alpha, found.lambda_)
-    handles = [*ax.get_legend_handles_labels()[0], *_mark(ax, verdict, dark=True)]
+    handles = [*ax.get_legend_handles_labels()[0], *_marks(ax, verdict, COLOURS[4])]
     ax.set_ylabel("least λ / √f⁺ that shrinks the error")
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
     caption = (
@@ -113,18 +97,21 @@ def _damping(verdict: Verdict) -> Drawn:
     return Drawn("friction", figure, caption)
 
 
+def _normalised(frame: pd.DataFrame, side: str) -> tuple[pd.Series, pd.Series]:
+    """Gains of runs in units of each run's own true f_plus."""
+    bound = frame[f"{side}.f_plus"]
+    return frame[f"observer.{side}.alpha"] / bound, frame[f"observer.{side}.lambda"] / np.sqrt(bound)
+
+
 def _levels(verdict: Verdict, side: str) -> Drawn:
     """Share of converged runs over the gains in units of each run's own true f_plus."""
-    figure = Figure(figsize=(9.4, 5.2), layout="constrained")
-    axes = figure.subplots(1, len(verdict.levels), sharex=True, sharey=True, squeeze=False)[0]
+    figure, axes = subplots(9.4, 5.2, columns=len(verdict.levels), sharex=True, sharey=True)
     planes = {}
     for level, frame in verdict.levels.items():
-        bound = frame[f"{side}.f_plus"]
-        alpha, lambda_ = frame[f"observer.{side}.alpha"] / bound, frame[f"observer.{side}.lambda"] / np.sqrt(bound)
+        alpha, lambda_ = _normalised(frame, side)
         good = np.isfinite(alpha) & np.isfinite(lambda_) & (lambda_ > 0.0)
         planes[level] = (alpha[good], lambda_[good], frame[f"{side}.converged"].astype(float)[good])
-    alphas = np.concatenate([plane[0] for plane in planes.values()])
-    lambdas = np.concatenate([plane[1] for plane in planes.values()])
+    alphas, lambdas, _ = (np.concatenate(parts) for parts in zip(*planes.values(), strict=True))
     if not alphas.size:
         axes[0].text(0.5, 0.5, "no run has a finite bound f⁺ and lambda > 0", ha="center", transform=axes[0].transAxes)
         return Drawn(f"levels_{side}", figure, f"Runs of the drive, {side} observer: none to be drawn.")
@@ -144,14 +131,12 @@ def _levels(verdict: Verdict, side: str) -> Drawn:
         if len(wrong):
             about = {"level": level, "side": side, "bound": "true", "condition": "exact"}
             wrong = wrong[np.logical_and.reduce([wrong[name] == value for name, value in about.items()])]
-            bound = wrong[f"{side}.f_plus"]
-            place = wrong[f"observer.{side}.alpha"] / bound, wrong[f"observer.{side}.lambda"] / np.sqrt(bound)
-            ax.plot(*place, "x", ms=2.5, mew=0.7, color=COLOURS[1])
+            ax.plot(*_normalised(wrong, side), "x", ms=2.5, mew=0.7, color=COLOURS[1])
         ax.set_title(f"{_LEVELS[level]}\n{len(wrong)} failed though ρ < 1")
     axes[0].set_ylabel(_LAMBDA)
     handles.append(Line2D([], [], ls="", marker="x", color=COLOURS[1], label="failed though ρ < 1"))
-    bar = figure.colorbar(ScalarMappable(Normalize(0.0, 1.0), MAP), ax=axes, pad=0.02, aspect=30)
-    bar.set_label(f"share of runs in which the {side} observer converged")
+    label = f"share of runs in which the {side} observer converged"
+    figure.colorbar(ScalarMappable(Normalize(0.0, 1.0), MAP), ax=axes, pad=0.02, aspect=30, label=label)
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     caption = (
         f"Runs of the drive, {side} observer, each in units of its own true f⁺, on the axes of the atlas. A real input is "
@@ -160,19 +145,21 @@ def _levels(verdict: Verdict, side: str) -> Drawn:
     return Drawn(f"levels_{side}", figure, caption)
 
 
+def _name(level: dict[str, Any]) -> str:
+    return ", ".join(level[key] for key in ("level", "side") if level.get(key))
+
+
 def _conservatism(verdict: Verdict) -> Drawn:
     levels = verdict.summary["levels"]
-    figure = Figure(figsize=(7.0, 0.9 + 0.62 * len(CONDITIONS)), layout="constrained")
-    ax = figure.subplots()
+    figure, (ax,) = subplots(7.0, 0.9 + 0.62 * len(CONDITIONS))
     for i, level in enumerate(levels):
-        label = level["level"] if level.get("side") is None else f"{level['level']}, {level['side']}"
         colour, shift = COLOURS[i % len(COLOURS)], 0.16 * (i - 0.5 * (len(levels) - 1))
         for k, entry in enumerate(level["conditions"]):
             median, largest = entry["conservatism"]["median"], entry["conservatism"]["max"]
             if median is None:
                 continue
             ax.plot([median, largest], [k + shift] * 2, color=colour, lw=2.0)
-            ax.plot(median, k + shift, "o", color=colour, ms=7, label=label if k == 0 else None)
+            ax.plot(median, k + shift, "o", color=colour, ms=7, label=_name(level) if k == 0 else None)
             censored = entry["conservatism"]["at_least"] > 0
             ax.plot(largest, k + shift, ">" if censored else "|", color=colour, ms=6 if censored else 9)
     ax.axvline(1.0, color="black", lw=0.8)
@@ -189,8 +176,7 @@ def _conservatism(verdict: Verdict) -> Drawn:
 
 
 def _claimed(verdict: Verdict) -> Drawn:
-    figure = Figure(figsize=(7.0, 3.4), layout="constrained")
-    ax = figure.subplots()
+    figure, (ax,) = subplots(7.0, 3.4)
     ratios = {}
     for side in judged_sides(verdict.config):
         for level, frame in verdict.levels.items():
@@ -233,10 +219,9 @@ def write_verify_report(verdict: Verdict, folder: Path) -> list[str]:
 def _headline(verdict: Verdict) -> list[str]:
     lines = []
     for level in verdict.summary["levels"]:
-        name = level["level"] if level.get("side") is None else f"{level['level']}, {level['side']}"
         wrong = [entry for entry in level["conditions"] if entry["counterexamples"]]
         kind = "cells" if level.get("side") is None else "runs"
-        line = f"{name}: {level['cells']} {kind}, of which {level['converged']} converge, "
+        line = f"{_name(level)}: {level['cells']} {kind}, of which {level['converged']} converge, "
         if not wrong:
             line += "with no counterexample to any condition."
         else:
@@ -270,25 +255,24 @@ def _headline(verdict: Verdict) -> list[str]:
 
 def _mark_lines(verdict: Verdict) -> list[str]:
     lines = []
-    for mark in verdict.summary["marks"]:
-        rho = mark["peak_ratio"]
-        if mark["alpha_ratio"] is None:
-            lines.append(f"{mark['name']}: the run diverged.")
+    for one in verdict.summary["marks"]:
+        rho = one["peak_ratio"]
+        if one["alpha_ratio"] is None:
+            lines.append(f"{one['name']}: the run diverged.")
             continue
-        line = f"{mark['name']}: α / f⁺ = {mark['alpha_ratio']:.3g}, λ / √f⁺ = {mark['lambda_ratio']:.3g}; "
+        line = f"{one['name']}: α / f⁺ = {one['alpha_ratio']:.3g}, λ / √f⁺ = {one['lambda_ratio']:.3g}; "
         if rho is None:
             line += "α is below the true f⁺: no condition can hold."
         elif rho < 1.0:
             line += f"ρ = {rho:.3g}: any disturbance within f⁺ dies out in finite time."
         else:
+            ended = "; the run did not converge."
+            if one["converged"]:
+                ended = f": the run here converged, after {one['convergence_time']:.3g} s."
             line += (
                 f"ρ = {rho:.3g}: the worst disturbance enlarges the velocity error to "
-                f"{mark['upheld_velocity_error']:.3g} rad/s, where friction balances it. Under a constant disturbance each "
-                f"peak is {mark['peak_ratio_constant']:.3g} times the last (friction number {mark['damping']:.2g})"
-            )
-            seconds = mark["convergence_time"]
-            line += (
-                f": the run here converged, after {seconds:.3g} s." if mark["converged"] else "; the run did not converge."
+                f"{one['upheld_velocity_error']:.3g} rad/s, where friction balances it. Under a constant disturbance each "
+                f"peak is {one['peak_ratio_constant']:.3g} times the last (friction number {one['damping']:.2g}){ended}"
             )
         lines.append(line)
     return lines
@@ -298,7 +282,7 @@ def _level_table(level: dict[str, Any]) -> PageTable:
     name = "Normalised error system, worst disturbance"
     if level["level"] != "normalised":
         name = f"{_LEVELS[level['level']].capitalize()}; {level['side']} observer"
-    rows: list[list[object]] = []
+    rows = []
     for entry in level["conditions"]:
         counts, ratio = (entry[key] for key in ("holds", "counterexamples", "fails_but_converged")), entry["conservatism"]
         rows.append([entry["title"], *counts, ratio["median"], ratio["max"], ratio["at_least"] > 0])
@@ -311,9 +295,7 @@ def _claimed_tables(level: dict[str, Any]) -> list[PageTable]:
     if not (inputs := level.get("claimed_bound", {}).get("by_input")):
         return []
     keys = list(inputs[0]["input"])
-    rows: list[list[object]] = [
-        [*row["input"].values(), row["converged_runs"], row["true"], row["claimed"], row["too_small"]] for row in inputs
-    ]
+    rows = [[*row["input"].values(), row["converged_runs"], row["true"], row["claimed"], row["too_small"]] for row in inputs]
     heading = f"True and claimed bound by input: {level['level']}, {level['side']}"
     return [PageTable(heading, [*keys, "runs", "median true f⁺", "2 max |acceleration|", "share too small"], rows)]
 
@@ -335,7 +317,7 @@ def _mark_table(verdict: Verdict) -> PageTable:
         "converged": "converged",
         "convergence_time": "after (s)",
     }
-    rows: list[list[object]] = [[mark["name"], *(mark[key] for key in keys)] for mark in verdict.summary["marks"]]
+    rows = [[one["name"], *(one[key] for key in keys)] for one in verdict.summary["marks"]]
     return PageTable("Marked gains, run on the study's drive with ideal encoders", ["", *keys.values()], rows)
 
 
@@ -345,7 +327,7 @@ def _counterexample_table(verdict: Verdict) -> PageTable:
     keys = ["level", "side", "condition", "cause"]
     counts = found.groupby(keys, sort=False).size().sort_values(ascending=False)
     examples = found.drop_duplicates(keys).set_index(keys)
-    rows: list[list[object]] = []
+    rows = []
     for key, count in counts.items():
         example = examples.loc[key]
         rows.append([*key, int(count), *(_plain(example[path]) for path in paths)])

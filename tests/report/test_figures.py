@@ -10,7 +10,7 @@ from jaxbl.report.figures import limits, outline
 
 
 def test_the_base_and_the_report_of_inspect_need_no_jax():
-    modules = ["page", "style", "figures", "inspect"]
+    modules = ["page", "figures", "inspect"]
     code = f"import sys, {', '.join('jaxbl.report.' + name for name in modules)}; print('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
 
