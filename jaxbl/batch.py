@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from .errors import InputError
-from .files import claim_log_folder, finished_summary, make_folder, removed_if_empty
+from .files import make_folder, results_of
 from .report.diagnose import probability, rms_text
 from .workers import Progress, each, forget_programs, worth
 
@@ -72,14 +72,8 @@ def _diagnosed(job: LogJob) -> dict[str, Any]:
     forget_programs()
     try:
         task = read_diagnosis_task(job.log, job.model, holdout=job.holdout)
-        claim_log_folder(job.folder, job.log, overwrite=job.overwrite)
-        summary = finished_summary(job.folder / "diagnosis.json", task.identity)
-        if summary is None:
-            with removed_if_empty(job.folder):
-                found = run_diagnosis(task)
-                write_diagnosis_report(found, job.folder)
-            summary = found.summary
-        return batch_row(job.log, summary)
+        file = job.folder / "diagnosis.json"
+        return batch_row(job.log, results_of(task, file, run_diagnosis, write_diagnosis_report, overwrite=job.overwrite))
     except InputError as error:
         return batch_row(job.log, None, str(error))
 

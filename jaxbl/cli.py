@@ -5,6 +5,7 @@ import math
 import os
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -248,36 +249,15 @@ def identify(
     _start_jax()
     from jaxbl.identification.identify import read_identification_task, run_identification
 
+    from .files import results_of
     from .report.identify import identification_lines, write_identification_report
 
     task = read_identification_task(log, model, holdout=holdout, profile=profile)
     folder = _folder(log[0], out)
-    result = folder / "identification.json"
-    summary = _fit(context, task, run_identification, model, result, overwrite, write_identification_report)
+    with running(context, model, folder, unit="steps", kept=False) as progress:
+        run, file = partial(run_identification, progress=progress), folder / "identification.json"
+        summary = results_of(task, file, run, write_identification_report, overwrite=overwrite)
     _print(identification_lines(summary), folder)
-
-
-def _fit(
-    context: typer.Context,
-    task: Any,
-    run_task: Callable[..., Any],
-    model: Path,
-    result: Path,
-    overwrite: bool,
-    write_report: Callable[[Any, Path], list[str]],
-) -> dict[str, Any]:
-    """Fit a model to logs and write the results; what an earlier call found is read. Returns the summary."""
-    from .files import claim_log_folder, finished_summary, removed_if_empty
-
-    folder = result.parent
-    claim_log_folder(folder, task.record.path, overwrite=overwrite)
-    summary = finished_summary(result, task.identity)
-    if summary is None:
-        with removed_if_empty(folder), running(context, model, folder, unit="steps", kept=False) as progress:
-            found = run_task(task, progress)
-            write_report(found, folder)
-        summary = found.summary
-    return summary
 
 
 @app.command()
@@ -344,12 +324,14 @@ def diagnose(
     _start_jax()
     from jaxbl.diagnosis.diagnose import read_diagnosis_task, run_diagnosis
 
+    from .files import results_of
     from .report.diagnose import diagnosis_lines, write_diagnosis_report
 
     task = read_diagnosis_task(log, model, holdout=holdout)
     folder = _folder(log[0], out)
-    result = folder / "diagnosis.json"
-    summary = _fit(context, task, run_diagnosis, model, result, overwrite, write_diagnosis_report)
+    with running(context, model, folder, unit="steps", kept=False) as progress:
+        run, file = partial(run_diagnosis, progress=progress), folder / "diagnosis.json"
+        summary = results_of(task, file, run, write_diagnosis_report, overwrite=overwrite)
     lines = diagnosis_lines(summary)
     if next_experiment is not None:
         from jaxbl.diagnosis.next_experiment import Limits, write_next_experiment

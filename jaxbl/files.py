@@ -3,7 +3,7 @@
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -101,13 +101,23 @@ def log_named_in(file: Path) -> str | None:
         return None
 
 
-def finished_summary(file: Path, identity: str) -> dict[str, Any] | None:
-    """What an earlier call found for the same question; None where there is none."""
-    try:
+def results_of(
+    task: Any, file: Path, run: Callable[[Any], Any], write: Callable[[Any, Path], object], *, overwrite: bool
+) -> dict[str, Any]:
+    """Do a task on a log and write the results beside `file`, their summary; read it where an earlier call has found it.
+
+    Raises:
+        InputError: as :func:`claim_log_folder`, or as the task does.
+    """
+    claim_log_folder(file.parent, task.record.path, overwrite=overwrite)
+    with suppress(OSError, InputError):
         found = read_json(file)
-    except (OSError, InputError):
-        return None
-    return found if found.get("identity") == identity else None
+        if found.get("identity") == task.identity:
+            return found
+    with removed_if_empty(file.parent):
+        done = run(task)
+        write(done, file.parent)
+    return done.summary
 
 
 @contextmanager

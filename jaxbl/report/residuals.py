@@ -133,11 +133,10 @@ def _over_coordinates(
     return Drawn(f"residual_{found.name}", figure, caption)
 
 
-def _means(ax: Axes, one: Coordinate) -> None:
-    x = np.array([0.5 * (region.low + region.high) for region in one.regions])  # pyright: ignore
-    y = np.array([region.mean for region in one.regions])
-    error = np.array([region.mean_error for region in one.regions])
-    sure = np.array([abs(region.mean_z) > 3.0 for region in one.regions])
+def _means(ax: Axes, coordinate: Coordinate) -> None:
+    rows = [(0.5 * (one.low + one.high), one.mean, one.mean_error, one.mean_z) for one in coordinate.regions]  # pyright: ignore
+    x, y, error, z = np.array(rows).reshape(-1, 4).T
+    sure = np.abs(z) > 3.0
     ax.plot(x, y, color=_MEAN, lw=1.0, alpha=0.7, zorder=3)
     ax.errorbar(x, y, 2.0 * error, fmt="none", ecolor=_MEAN, elinewidth=1.2, zorder=3)
     ax.plot(x[sure], y[sure], "o", ms=4.0, color=_MEAN, zorder=4, label="bin mean")

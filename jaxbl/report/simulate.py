@@ -1,7 +1,6 @@
 """What `jaxbl simulate` leaves to be read. The figures are the analogues of Figs. 7 to 17 and 28 of the paper."""
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +23,7 @@ def write_trial_report(trial: Trial, folder: Path) -> list[str]:
     """Write trace, summary, figures and report of a run into a folder that exists. Returns the lines for the terminal."""
     # the summary first: it is what makes the folder this study's
     write_atomic(folder / "summary.json", json.dumps(trial.summary, indent=2, ensure_ascii=False))
-    draft = folder / f".trace.{os.getpid()}.draft"
-    trial.trace.to_parquet(draft, index=False)
-    draft.replace(folder / "trace.parquet")
+    write_atomic(folder / "trace.parquet", trial.trace.to_parquet(index=False))
     metrics = trial.summary["metrics"]
     sides = [side for side in SIDES if f"{side}.converged" in metrics]
     rows = [

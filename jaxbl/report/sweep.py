@@ -2,7 +2,6 @@
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
-# pyright: reportReturnType=false
 
 import json
 from itertools import product

@@ -46,14 +46,11 @@ def _others(tuning: Tuning, side: str) -> list[tuple[str, str, dict[str, Any]]]:
 def _map(tuning: Tuning, side: str) -> Drawn:
     summary, bound = tuning.summary, tuning.summary["f_plus"][side]
     coarse = tuning.candidates[side].query("stage == 0")
-    table, feasible = (
-        coarse.assign(feasible=coarse["feasible"].astype(float)).pivot_table(
-            index="lambda_ratio", columns="alpha_ratio", values=value, dropna=False
-        )
-        for value in ("error", "feasible")
+    tables = coarse.astype({"feasible": float}).pivot_table(
+        index="lambda_ratio", columns="alpha_ratio", values=["error", "feasible"], dropna=False
     )
-    xs, ys = table.columns.to_numpy(float), table.index.to_numpy(float)
-    grid = table.to_numpy(float)
+    grid, feasible = tables["error"].to_numpy(float), tables["feasible"].to_numpy(float)
+    xs, ys = tables["error"].columns.to_numpy(float), tables.index.to_numpy(float)
     norm = color_norm(grid, "log")
     edges = cell_edges(xs, True), cell_edges(ys, True)
     figure, (ax,) = subplots(6.6, 5.4)
@@ -61,7 +58,7 @@ def _map(tuning: Tuning, side: str) -> Drawn:
     ax.set_facecolor(MISSING)
     ax.set(xscale="log", yscale="log", xlabel="α / f⁺", ylabel="λ / √f⁺ (λ in √rad/s)")
     ax.pcolormesh(*edges, grid, cmap=MAP, norm=norm, rasterized=True)
-    handles: list[Any] = [*hatch_failures(ax, (xs, ys), edges, feasible.to_numpy(float), "constraints not met")]
+    handles: list[Any] = [*hatch_failures(ax, (xs, ys), edges, feasible, "constraints not met")]
     handles += condition_curves(ax, _CONDITIONS, 1.0, (edges[0][0], edges[0][-1]))
     for window in summary["stages"][1:2]:
         (left, right), (low, high) = window[side]["alpha_ratio"], window[side]["lambda_ratio"]
@@ -96,7 +93,6 @@ def _front(tuning: Tuning, side: str) -> Drawn:
     )
     ax.step(front["convergence_time"], front["error"], "o-", where="post", ms=3.5, color=COLOURS[0],
             label="none better in both")  # fmt: skip
-    times, errors = list(feasible["convergence_time"]), list(feasible["error"])
     handles = ax.get_legend_handles_labels()[0]
     metric, margins = f"{summary['objective']}_rmse", summary["margins"]
     for name, marker, row in _others(tuning, side):
@@ -107,12 +103,10 @@ def _front(tuning: Tuning, side: str) -> Drawn:
         kept = row["margin_alpha"] >= margins["alpha"] and row["margin_exact"] >= margins["exact"]
         label = name if kept else f"{name}, margins not met"
         handles.append(mark(ax, (time, error), marker, label, 8, held=False))
-        times.append(time)
-        errors.append(error)
     found = summary["achieved"][side]
     handles.append(mark(ax, (found["convergence_time"], found[metric]), "*", "tuned", 15, held=False))
-    for values, scale in ((times, ax.set_xscale), (errors, ax.set_yscale)):
-        if min(values) > 0.0 and max(values) > 10.0 * min(values):
+    for (low, high), scale in ((ax.dataLim.intervalx, ax.set_xscale), (ax.dataLim.intervaly, ax.set_yscale)):
+        if low > 0.0 and high > 10.0 * low:
             scale("log")
     ax.set(xlabel="worst convergence time (s)", ylabel=_label(tuning), title=side)
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
