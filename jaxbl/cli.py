@@ -29,19 +29,17 @@ app = typer.Typer(
 
 ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML study", show_default=False)]
 OutOption = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", help="folder for the results [default: results/<config name>]")
+    Path | None, typer.Option(metavar="DIR", help="folder for the results [default: results/<config name>]")
 ]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="remove the results of another study from the folder")]
 BackendOption = Annotated[
     str | None,
-    typer.Option(
-        "--backend", metavar="NAME", help="fused: one compiled loop; scan: XLA's own loop [default: the faster here]"
-    ),
+    typer.Option(metavar="NAME", help="fused: one compiled loop; scan: XLA's own loop [default: the faster here]"),
 ]
 _FORMATS = "CSV, Parquet, MATLAB or JSON file"
 LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help=_FORMATS, show_default=False)]
 LogOutOption = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", help="folder for the results [default: results/<log name>]")
+    Path | None, typer.Option(metavar="DIR", help="folder for the results [default: results/<log name>]")
 ]
 LogOverwriteOption = Annotated[
     bool, typer.Option("--overwrite", help="write into a folder that holds results of another log")
@@ -208,7 +206,7 @@ def _compute(
 def inspect(
     log: LogArgument,
     model: Annotated[
-        Path | None, typer.Option("--model", metavar="TOML", help="study, or a file with [log] alone: how to read the log")
+        Path | None, typer.Option(metavar="TOML", help="study, or a file with [log] alone: how to read the log")
     ] = None,
     out: LogOutOption = None,
     overwrite: LogOverwriteOption = False,
@@ -234,11 +232,9 @@ def identify(
     context: typer.Context,
     log: Annotated[list[Path], typer.Argument(metavar="LOG...", help=f"{_FORMATS}s of one machine", show_default=False)],
     model: Annotated[
-        Path, typer.Option("--model", metavar="TOML", help="study with nominal parameters, and [log]", show_default=False)
+        Path, typer.Option(metavar="TOML", help="study with nominal parameters, and [log]", show_default=False)
     ],
-    holdout: Annotated[
-        Path | None, typer.Option("--holdout", metavar="LOG2", help="log of the same machine to test the fit on")
-    ] = None,
+    holdout: Annotated[Path | None, typer.Option(metavar="LOG2", help="log of the same machine to test the fit on")] = None,
     profile: Annotated[
         bool | None, typer.Option("--profile", help="add profile-likelihood intervals", show_default=False)
     ] = None,
@@ -267,38 +263,25 @@ def diagnose(
         list[Path] | None, typer.Argument(metavar="[LOG...]", help=f"{_FORMATS}s of one machine", show_default=False)
     ] = None,
     model: Annotated[
-        Path | None, typer.Option("--model", metavar="TOML", help="study with nominal parameters, [uncertainty] and [log]")
+        Path | None, typer.Option(metavar="TOML", help="study with nominal parameters, [uncertainty] and [log]")
     ] = None,
     holdout: Annotated[
         Path | None,
-        typer.Option(
-            "--holdout", metavar="LOG2", help="log of the same machine for the test [default: the last quarter of the log]"
-        ),
+        typer.Option(metavar="LOG2", help="log of the same machine for the test [default: the last quarter of the log]"),
     ] = None,
     batch: Annotated[
         Path | None,
-        typer.Option(
-            "--batch", metavar="FOLDER", help="diagnose every log of a folder; NAME.toml beside NAME.csv is its model"
-        ),
+        typer.Option(metavar="FOLDER", help="diagnose every log of a folder; NAME.toml beside NAME.csv is its model"),
     ] = None,
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", metavar="N", min=1, help="processes for --batch [default: one a core]")
-    ] = None,
+    jobs: Annotated[int | None, typer.Option(metavar="N", min=1, help="processes for --batch [default: one a core]")] = None,
     next_experiment: Annotated[
-        Path | None,
-        typer.Option(
-            "--next-experiment", metavar="FILE.csv", help="write an input that separates the effects this log cannot"
-        ),
+        Path | None, typer.Option(metavar="FILE.csv", help="write an input that separates the effects this log cannot")
     ] = None,
     max_torque: Annotated[
-        float | None,
-        typer.Option("--max-torque", metavar="N·m", help="limit of the next experiment's input [default: the log's]"),
+        float | None, typer.Option(metavar="N·m", help="limit of the next experiment's input [default: the log's]")
     ] = None,
     max_travel: Annotated[
-        float | None,
-        typer.Option(
-            "--max-travel", metavar="RAD", help="limit of its motor travel (m on a linear axis) [default: the log's]"
-        ),
+        float | None, typer.Option(metavar="RAD", help="limit of its motor travel (m on a linear axis) [default: the log's]")
     ] = None,
     out: LogOutOption = None,
     overwrite: LogOverwriteOption = False,
@@ -359,8 +342,7 @@ def _diagnose_batch(
 def plot(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder of a sweep", show_default=False)],
     config: Annotated[
-        Path | None,
-        typer.Option("--config", metavar="CONFIG", help="take title, notes and figures from this study"),
+        Path | None, typer.Option(metavar="CONFIG", help="take title, notes and figures from this study")
     ] = None,
 ) -> None:
     """Draw figures and report of a sweep again from its stored points, without simulating."""
@@ -386,7 +368,7 @@ def bench(
     quick: Annotated[
         bool, typer.Option("--quick", help="take less than a minute: shorter runs, the others in one precision")
     ] = False,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the results")] = Path("results/bench"),
+    out: Annotated[Path, typer.Option(metavar="DIR", help="folder for the results")] = Path("results/bench"),
 ) -> None:
     """Time the same work by jaxbl, C++, numba, diffrax, NumPy, SciPy and OpenSMC: table, chart, bench.json."""
     _start_jax()

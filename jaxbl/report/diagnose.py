@@ -11,8 +11,7 @@ from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.identification.logs import unit_on
 
 from .figures import COLOURS, FAINT, MISSING, Drawn, legend, style, subplots, with_unit
-from .log_results import write_log_results
-from .page import PageTable
+from .page import PageTable, write_log_results
 from .residuals import draw_residuals, missing_quantity, plot_torque
 
 _BEFORE, _AFTER, _FLOOR, _HELD = COLOURS[1], COLOURS[0], COLOURS[6], COLOURS[4]
@@ -28,9 +27,8 @@ def write_diagnosis_report(found: Diagnosis, folder: Path) -> list[str]:
     They are put there together when all are drawn. Returns the lines for the terminal.
     """
     tables = [*_finding_tables(found.summary), _gap_table(found.summary["gap"]), _number_table(found.summary)]
-    title = found.config.title or f"Diagnosis of {found.record.path.name}"
     lead, remarks = _headline(found.summary), _remarks(found.summary)
-    return write_log_results(found, folder, "diagnosis.json", title, lead, draw_diagnosis(found), tables, remarks)
+    return write_log_results(found, folder, "diagnosis", lead, draw_diagnosis(found), tables, remarks)
 
 
 def diagnosis_lines(summary: dict[str, Any]) -> list[str]:

@@ -8,8 +8,7 @@ from jaxbl.identification.search import NOISE_ALONE
 
 from .figures import SIDES
 from .identify_figures import draw_identification
-from .log_results import write_log_results
-from .page import PageTable
+from .page import PageTable, write_log_results
 
 
 def write_identification_report(found: Identification, folder: Path) -> list[str]:
@@ -22,9 +21,8 @@ def write_identification_report(found: Identification, folder: Path) -> list[str
         tables.append(_regression_table(found.summary["method"]["regression"]))
     if found.summary["method"]["recursive"]:
         tables.append(_recursive_table(found))
-    title = found.config.title or f"Identification from {found.record.path.name}"
     lead, remarks = _headline(found.summary), _remarks(found.summary)
-    return write_log_results(found, folder, "identification.json", title, lead, draw_identification(found), tables, remarks)
+    return write_log_results(found, folder, "identification", lead, draw_identification(found), tables, remarks)
 
 
 def identification_lines(summary: dict[str, Any]) -> list[str]:

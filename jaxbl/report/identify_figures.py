@@ -73,7 +73,8 @@ def _intervals(found: Identification) -> Drawn:
     shown = [0.0]
     for i, one in enumerate(fitted.values()):
         size = abs(one["nominal"]) or abs(one["value"]) or 1.0
-        low, middle, high = (100.0 * (end - one["nominal"]) / size for end in np.insert(one["interval"], 1, one["value"]))
+        ends = one["interval"][0], one["value"], one["interval"][1]
+        low, middle, high = (100.0 * (end - one["nominal"]) / size for end in ends)
         ax.plot([low, high], [i, i], color=COLOURS[0], lw=5.0, alpha=0.45, solid_capstyle="butt")
         ax.plot([low, middle, high], [i] * 3, "|", color=COLOURS[0], ms=11, mew=1.6)
         ax.plot(middle, i, "o", color=COLOURS[0], ms=5)

@@ -1,7 +1,7 @@
 """Figures, table and report of an inspected log."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -101,9 +101,10 @@ def _values(record: Record) -> dict[str, np.ndarray]:
     return found if record.transmitted is None else found | {"transmitted": record.transmitted}
 
 
-def _shown(record: Record, segment: slice) -> slice:
-    """No more points than a page shows, in proportion to the segment."""
-    return slice(segment.start, segment.stop, max(len(record.time) // _POINTS, 1))
+def _shown(record: Record, segments: Sequence[slice]) -> np.ndarray:
+    """Indices of samples: no more than a page shows, in proportion to the segments."""
+    every = max(len(record.time) // _POINTS, 1)
+    return np.concatenate([np.arange(one.start, one.stop, every) for one in segments])
 
 
 def _channels(record: Record) -> Drawn:
@@ -115,7 +116,7 @@ def _channels(record: Record) -> Drawn:
     figure, axes = subplots(7.0, 1.5 * len(rows) + 0.6, len(rows), sharex=True)
     for ax, (label, unit, signal, colour) in zip(axes, rows, strict=True):
         for segment in record.segments:
-            at = _shown(record, segment)
+            at = _shown(record, [segment])
             ax.plot(record.time[at], signal[at], color=colour, lw=0.9)
         ax.set_ylabel(f"{label}\n({unit})")
     axes[-1].set_xlabel("time (s)")
@@ -165,7 +166,7 @@ def _torque_over_velocity(record: Record) -> Drawn:
         edge = round(1.0 / (4.0 * channel.bandwidth * record.sample_period))
     figure, (ax,) = subplots(7.0, 3.4)
     inner = [slice(s.start + edge, s.stop - edge) for s in record.segments if s.stop - s.start > 4 * edge]
-    at = np.concatenate([np.arange(len(record.time))[_shown(record, s)] for s in inner or record.segments])
+    at = _shown(record, inner or record.segments)
     ax.plot(speed[at], torque[at], ".", ms=1.6, color=COLOURS[0], alpha=0.5)
     ax.axhline(0.0, color=FAINT, lw=0.8)
     ax.axvline(0.0, color=FAINT, lw=0.8)
@@ -187,7 +188,7 @@ def _twist(inspection: Inspection) -> Drawn:
         name = "u" if record.transmitted is None else "transmitted"
         panels.insert(0, (torque, f"{_CHANNELS[name][0]} ({record.findings.channels[name].unit})"))
     figure, axes = subplots(7.0, 3.6, columns=len(panels), sharey=True)
-    at = np.concatenate([np.arange(len(record.time))[_shown(record, s)] for s in record.segments])
+    at = _shown(record, record.segments)
     gearing = record.findings.gearing
     if gearing is not None and gearing.flank == "load":
         split, names = "the side that the load pulls to", ("load on its first side", "on the other")

@@ -1,14 +1,22 @@
-"""A plain HTML page in one file: headline, remarks, figures, tables, config."""
+"""The files of a report: a plain HTML page that holds everything, figures, and the results of a log, whole or not at all."""
 
 import base64
+import json
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
-from typing import NamedTuple
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, NamedTuple
+
+import tomli_w
 
 from jaxbl.files import write_atomic
 
 from .figures import Drawn, save
+
+if TYPE_CHECKING:
+    from jaxbl.diagnosis.diagnose import Diagnosis
+    from jaxbl.identification.identify import Identification
 
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 2rem auto; max-width: 72rem; padding: 0 1rem; }
@@ -50,6 +58,44 @@ def write_report(
 def save_all(drawn: Sequence[Drawn], folder: Path) -> list[tuple[Path, str]]:
     """Write figures into the folder's `figures/`. Returns their files and captions."""
     return [(save(one.figure, folder / "figures" / f"{one.name}.png"), one.caption) for one in drawn]
+
+
+def write_log_results(
+    found: "Identification | Diagnosis",
+    folder: Path,
+    name: str,
+    lead: Sequence[str],
+    drawn: Sequence[Drawn],
+    tables: Sequence[PageTable],
+    remarks: Sequence[str],
+) -> list[str]:
+    """Write the summary (`name`.json), `model.toml`, `trace.parquet`, figures and report into a folder that exists.
+
+    The files appear there once all are written, the summary last: it says that the results are complete. Returns the lines
+    for the terminal.
+    """
+    title = found.config.title or f"{name.capitalize()} of {found.record.path.name}"
+    with TemporaryDirectory(dir=folder, prefix=".draft.") as place:
+        draft = Path(place)
+        found.trace.to_parquet(draft / "trace.parquet", index=False)
+        model = _model_text(found)
+        (draft / "model.toml").write_text(model, encoding="utf-8")
+        lines = write_report(draft, title, lead, drawn, tables, model, remarks)
+        (draft / f"{name}.json").write_text(json.dumps(found.summary, indent=1, ensure_ascii=False), encoding="utf-8")
+        for file in sorted(draft.rglob("*"), key=lambda one: one.name == f"{name}.json"):
+            if file.is_file():
+                target = folder / file.relative_to(draft)
+                target.parent.mkdir(exist_ok=True)
+                file.replace(target)
+    return lines
+
+
+def _model_text(found: "Identification | Diagnosis") -> str:
+    """The fitted study as TOML; where the log has no gaps, its excitation is the torque of `trace.parquet` beside it."""
+    data = found.model.resolved()
+    if found.replays:
+        data["excitation"] = {"kind": "recorded", "file": "trace.parquet", "time_column": "t", "torque_column": "u"}
+    return tomli_w.dumps(data)
 
 
 def html(
