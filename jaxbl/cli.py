@@ -5,7 +5,6 @@ import math
 import os
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -251,8 +250,10 @@ def identify(
     task = read_identification_task(log, model, holdout=holdout, profile=profile)
     folder = _folder(log[0], out)
     with running(context, model, folder, unit="steps", kept=False) as progress:
-        run, file = partial(run_identification, progress=progress), folder / "identification.json"
-        summary = results_of(task, file, run, write_identification_report, overwrite=overwrite)
+        file = folder / "identification.json"
+        summary = results_of(
+            task, file, lambda task: run_identification(task, progress), write_identification_report, overwrite=overwrite
+        )
     _print(identification_lines(summary), folder)
 
 
@@ -313,8 +314,10 @@ def diagnose(
     task = read_diagnosis_task(log, model, holdout=holdout)
     folder = _folder(log[0], out)
     with running(context, model, folder, unit="steps", kept=False) as progress:
-        run, file = partial(run_diagnosis, progress=progress), folder / "diagnosis.json"
-        summary = results_of(task, file, run, write_diagnosis_report, overwrite=overwrite)
+        file = folder / "diagnosis.json"
+        summary = results_of(
+            task, file, lambda task: run_diagnosis(task, progress), write_diagnosis_report, overwrite=overwrite
+        )
     lines = diagnosis_lines(summary)
     if next_experiment is not None:
         from jaxbl.diagnosis.next_experiment import Limits, write_next_experiment
