@@ -332,8 +332,7 @@ def plot(results: list[tuple[Problem, list[Row]]], path: Path) -> None:
     """Error over cost, one panel a problem."""
     import matplotlib.pyplot as plt
 
-    from jaxbl.report.figures import save
-    from jaxbl.report.figures import COLOURS, style
+    from jaxbl.report.figures import COLOURS, save, style
 
     with style():
         figure, axes = plt.subplots(1, len(results), figsize=(4.3 * len(results), 4.4))

@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxbl.report.figures import save
-from jaxbl.report.figures import COLOURS, style
+from jaxbl.report.figures import COLOURS, save, style
 
 from .effects import LEVELS
 from .scoring import TARGETS, Outcome, calibration, calibration_error, confusion, wilson
