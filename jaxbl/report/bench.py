@@ -4,13 +4,11 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from jaxbl.files import make_folder, write_atomic
+from jaxbl.files import write_atomic
 from jaxbl.throughput.run import CEILING, OURS, PRECISIONS, SCAN, BenchResult
 
 from .figures import COLOURS, Drawn, style, subplots
 from .page import save_all
-
-_COLUMNS = ["", "bits", "lanes", "lane-steps/s", "median", "of C++", "first call", "deviation"]
 
 
 @style()
@@ -63,7 +61,7 @@ def _curve(result: BenchResult) -> Drawn:
 
 def _table(result: BenchResult) -> list[list[str]]:
     """Header and rows of the table, as text."""
-    rows = [_COLUMNS]
+    rows = [["", "bits", "lanes", "lane-steps/s", "median", "of C++", "first call", "deviation"]]
     for row in result.rows:
         ceiling = result.speed(CEILING, row.precision)
         share = f"{row.lane_steps_per_second / ceiling:.2g}" if ceiling else "–"
@@ -92,8 +90,7 @@ def throughput_lines(result: BenchResult) -> list[str]:
 
 
 def write_bench_report(result: BenchResult, folder: Path) -> list[str]:
-    """Write `bench.json` and figures. Returns the lines for the terminal."""
-    make_folder(folder)
+    """Write `bench.json` and figures into a folder that exists. Returns the lines for the terminal."""
     write_atomic(folder / "bench.json", json.dumps(asdict(result), indent=2, ensure_ascii=False))
     save_all(draw_throughput(result), folder)
     return throughput_lines(result)

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.identification.logs import unit_on
 
-from .figures import COLOURS, FAINT, MISSING, Drawn, legend, style, subplots, with_unit
+from .figures import COLOURS, FAINT, MISSING, Drawn, legend, stacked, style, subplots, with_unit
 from .page import PageTable, write_log_results
 from .residuals import draw_residuals, missing_quantity, plot_torque
 
@@ -269,7 +269,7 @@ def _chances_panel(ax: Axes, bars: list[tuple[str, float, bool]]) -> None:
 
 def _over_time(found: Diagnosis) -> Drawn:
     """Missing torque of each side, before and after."""
-    figure, axes = subplots(9.0, 2.4 * len(found.pairs) + 0.6, len(found.pairs), sharex=True)
+    figure, axes = stacked(len(found.pairs), 2.4)
     for ax, (side, pieces) in zip(axes, found.pairs.items(), strict=True):
         unit = unit_on(found.record, f"{side}.torque", "N m")
         bandwidth = found.located[side].bandwidth
@@ -280,7 +280,6 @@ def _over_time(found: Diagnosis) -> Drawn:
                 ax.axvspan(before.time[0], before.time[-1], color=_HELD, alpha=0.18, lw=0.0, zorder=0, label="held out")
         ax.set_ylabel(with_unit(f"{side}:\nmissing {missing_quantity(unit)}", unit))
         legend(ax, 4)
-    axes[-1].set_xlabel("time (s)")
     which = f"Held-out log {found.holdout.path.name}: t" if found.summary["gap"]["holdout"]["separate"] else "T"
     caption = (
         f"{which}orque that the model lacks, as given and with the missing effects added, after the low-pass that shows it "

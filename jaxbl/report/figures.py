@@ -81,6 +81,15 @@ def subplots(width: float, height: float, rows: int = 1, columns: int = 1, **how
     return figure, axes
 
 
+def stacked(
+    count: int, height: float, xlabel: str = "time (s)", *, width: float = 9.0, sharex: bool = True
+) -> tuple[Figure, list[Axes]]:
+    """A figure of axes one above the other, each so many inches high, and what the lowest says of x."""
+    figure, axes = subplots(width, height * count + 0.6, count, sharex=sharex)
+    axes[-1].set_xlabel(xlabel)
+    return figure, axes
+
+
 def legend(ax: Axes, columns: int = 1, of: Sequence[Axes] = (), **how: Any) -> None:
     """A legend above the axes, where it hides no line, with each label (also of the axes `of`) once."""
     named = {}
@@ -104,8 +113,12 @@ def mark(
     return Line2D([], [], label=f"{label}{off}", ms=min(size, 10.0), **look)
 
 
-def outline(values: np.ndarray, points: int = LINE_POINTS) -> np.ndarray:
-    """Indices that draw the same line: all, or least and largest of each bin of a signal of over `2 * points` samples."""
+def outline(values: np.ndarray, points: int = LINE_POINTS, share: float = 1.0) -> np.ndarray:
+    """Indices that draw the same line: all, or least and largest of each bin of a signal of over `2 * points` samples.
+
+    Of a line in several parts, each has its share of the points.
+    """
+    points = max(int(share * points), 8)
     if len(values) <= 2 * points:
         return np.arange(len(values))
     size = -(-len(values) // (points // 2))

@@ -15,7 +15,7 @@ from jaxbl.drive.parameters import parameters
 from jaxbl.identification.identify import Identification
 from jaxbl.identification.logs import unit_on
 
-from .figures import COLOURS, FAINT, LINE_POINTS, SIDE_COLOURS, Drawn, legend, limits, outline, style, subplots, with_unit
+from .figures import COLOURS, FAINT, SIDE_COLOURS, Drawn, legend, limits, outline, stacked, style, subplots, with_unit
 from .log_signals import LogSignals
 
 Array = np.ndarray
@@ -42,7 +42,7 @@ def _draw(ax: Axes, log: LogSignals, values: Array, rows: slice | None = None, *
     """A signal over time: broken at gaps, and by the extremes of its bins where it is long."""
     total = sum(part.stop - part.start for part in log.parts(rows))
     for part in log.parts(rows):
-        at = part.start + outline(values[part], max(LINE_POINTS * (part.stop - part.start) // total, 8))
+        at = part.start + outline(values[part], share=(part.stop - part.start) / total)
         ax.plot(log.time[at], values[at], **how)
 
 
@@ -101,7 +101,7 @@ def _intervals(found: Identification) -> Drawn:
 
 def _residuals(log: LogSignals) -> Drawn:
     residual = log.found.summary["residual"]
-    figure, axes = subplots(9.0, 2.0 * len(residual) + 0.6, len(residual), sharex=True)
+    figure, axes = stacked(len(residual), 2.0)
     for ax, (side, one) in zip(axes, residual.items(), strict=True):
         unit, values = log.unit[side], log[f"{side}.residual"]
         label = f"rms {one['rms']:.2g} {unit}, {one['rms'] / one['noise']:.3g} times the noise"
@@ -110,7 +110,6 @@ def _residuals(log: LogSignals) -> Drawn:
             ax.axhline(sign * one["noise"], color=_MODEL, lw=0.9, ls="--", label="± 2 noise")
         ax.set_ylabel(f"{side}:\nmeasured − model ({unit})")
         legend(ax, 2)
-    axes[-1].set_xlabel("time (s)")
     caption = (
         "Measured position less that of the fitted model, window by window. Noise alone leaves the dashed lines in one "
         "sample of twenty; longer swings beyond them are an effect that the model lacks."
@@ -330,7 +329,7 @@ def _friction(log: LogSignals) -> Drawn:
 
 def _path(log: LogSignals) -> Drawn:
     found, names = log.found, list(log.found.summary["method"]["recursive"])
-    figure, axes = subplots(9.0, 2.1 * len(names) + 0.6, len(names), sharex=True)
+    figure, axes = stacked(len(names), 2.1)
     late = slice((log.observed.start + log.observed.stop) // 2, log.observed.stop)
     # what a law derives from its own parameters is an angle, as they are
     units = {field.name: about.unit for field, about in parameters(log.experiment.transmission)}
@@ -350,7 +349,6 @@ def _path(log: LogSignals) -> Drawn:
         label = with_unit(name.replace("_", " "), unit_on(found.record, path, units.get(name, "rad")))
         ax.set(ylabel=label, ylim=limits(*ends, share=0.02, room=0.25, shown=lines))
     legend(axes[0], 3, of=axes)
-    axes[-1].set_xlabel("time (s)")
     caption = (
         "The paper's recursive identification (27)-(28) on the equivalent control of both sides, and the trajectory fit "
         "with its interval. The scale is that of the second half of the record."

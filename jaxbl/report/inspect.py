@@ -13,7 +13,7 @@ from jaxbl.records.inspection import main_side, velocity
 from jaxbl.records.signal_quality import longest, low_passed, spectrum
 from jaxbl.records.time_stamps import GAP
 
-from .figures import COLOURS, FAINT, Drawn, legend, style, subplots
+from .figures import COLOURS, FAINT, Drawn, legend, limits, stacked, style, subplots
 from .page import PageTable, write_report
 
 _POINTS = 6000
@@ -113,13 +113,12 @@ def _channels(record: Record) -> Drawn:
     unit = record.findings.channels[POSITION_CHANNELS[side]].unit
     channels = [(_CHANNELS[n][0], record.findings.channels[n].unit, v, _CHANNELS[n][1]) for n, v in values.items()]
     rows = [*channels, (f"{side} velocity", f"{unit}/s", velocity(record, side), COLOURS[3])]
-    figure, axes = subplots(7.0, 1.5 * len(rows) + 0.6, len(rows), sharex=True)
+    figure, axes = stacked(len(rows), 1.5, width=7.0)
     for ax, (label, unit, signal, colour) in zip(axes, rows, strict=True):
         for segment in record.segments:
             at = _shown(record, [segment])
             ax.plot(record.time[at], signal[at], color=colour, lw=0.9)
         ax.set_ylabel(f"{label}\n({unit})")
-    axes[-1].set_xlabel("time (s)")
     caption = f"The channels over time, and the velocity by differences of the low-passed {side} position."
     return Drawn("channels", figure, caption)
 
@@ -127,7 +126,7 @@ def _channels(record: Record) -> Drawn:
 def _spectra(record: Record) -> Drawn:
     values = {n: v for n, v in _values(record).items() if np.ptp(v)}
     part = longest(record.segments)
-    figure, axes = subplots(7.0, 2.1 * len(values) + 0.6, len(values), sharex=True)
+    figure, axes = stacked(len(values), 2.1, "frequency (Hz)", width=7.0)
     for ax, (name, signal) in zip(axes, values.items(), strict=True):
         channel = record.findings.channels[name]
         frequency, density = spectrum(signal[part], record.sample_period)
@@ -143,7 +142,6 @@ def _spectra(record: Record) -> Drawn:
             ax.axvline(channel.bandwidth, color="#555555", lw=1.0, ls=":", label=label)
         if channel.noise or channel.bandwidth:
             legend(ax, 2)
-    axes[-1].set_xlabel("frequency (Hz)")
     caption = "Amplitude spectral densities (Welch), the noise floor, and the bandwidth of each channel."
     return Drawn("spectra", figure, caption)
 
@@ -171,10 +169,9 @@ def _torque_over_velocity(record: Record) -> Drawn:
     ax.axhline(0.0, color=FAINT, lw=0.8)
     ax.axvline(0.0, color=FAINT, lw=0.8)
     # a few samples at sharp corners of the motion would set the scale
-    low, high = np.quantile(torque[at], [0.002, 0.998])
-    margin = 0.15 * (high - low)
-    ax.set(xlabel=f"{side} velocity ({channel.unit}/s)", ylabel=f"{label} ({record.findings.channels['u'].unit})",
-           ylim=(low - margin, high + margin))  # fmt: skip
+    ends = limits(torque[at], share=0.002, room=0.15)
+    torque_unit = record.findings.channels["u"].unit
+    ax.set(xlabel=f"{side} velocity ({channel.unit}/s)", ylabel=f"{label} ({torque_unit})", ylim=ends)
     return Drawn("torque_over_velocity", figure, f"Torque over velocity: friction, as far as this log shows it.{less}")
 
 

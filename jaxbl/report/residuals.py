@@ -13,7 +13,7 @@ from jaxbl.diagnosis.observer_residual import Observed
 from jaxbl.diagnosis.residuals import Residual, narrowed
 from jaxbl.diagnosis.sentences import sentence_of
 
-from .figures import COLOURS, FAINT, MISSING, SIDE_COLOURS, Drawn, legend, outline, style, subplots, with_unit
+from .figures import COLOURS, FAINT, MISSING, SIDE_COLOURS, Drawn, legend, outline, stacked, style, subplots, with_unit
 
 _CLOUD = 4000
 """Dots of a cloud; more would cover each other."""
@@ -56,7 +56,7 @@ def _over_time(
     unit: str,
     observed: Mapping[str, Sequence[Observed]],
 ) -> Drawn:
-    figure, axes = subplots(9.0, 2.3 * len(residuals) + 0.6, len(residuals), sharex=True)
+    figure, axes = stacked(len(residuals), 2.3)
     for ax, (name, parts) in zip(axes, residuals.items(), strict=True):
         one = found[name]
         for part in parts:
@@ -71,7 +71,6 @@ def _over_time(
         ax.set_ylabel(with_unit(f"{name}:\nmissing {missing_quantity(unit)}", unit))
         ax.set_title(f"{fill(sentence_of(one, unit), _WIDTH)}\n", loc="left", fontsize=9)
         legend(ax, 3)
-    axes[-1].set_xlabel("time (s)")
     caption = (
         "Torque that the model lacks (inertia times acceleration less all modelled torques, positive forward), after the "
         "low-pass that shows it most clearly. The grey band is twice the standard deviation of the noise."
@@ -144,7 +143,7 @@ def _means(ax: Axes, coordinate: Coordinate) -> None:
 
 
 def _spectra(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, Localised], unit: str) -> Drawn:
-    figure, axes = subplots(9.0, 2.5 * len(residuals) + 0.6, len(residuals))
+    figure, axes = stacked(len(residuals), 2.5, "frequency (Hz)", sharex=False)
     for ax, (name, parts) in zip(axes, residuals.items(), strict=True):
         longest = max(parts, key=lambda part: len(part.time))
         frequency, power, floor = residual_spectrum(longest)
@@ -165,7 +164,6 @@ def _spectra(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, Lo
             ax.plot(peak.frequency, peak.amplitude, "v", ms=5, color=_MEAN)
         ax.set_ylabel(with_unit(f"{name}:\namplitude per line", unit))
         legend(ax, 3)
-    axes[-1].set_xlabel("frequency (Hz)")
     caption = (
         "Spectrum of the missing torque and of its noise. The noise of an acceleration grows with the square of the "
         "frequency, up to the smoother's bandwidth; power above the dashed line is missing from the model. Marked: narrow "

@@ -11,7 +11,7 @@ from jaxbl.files import write_atomic
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.trial import Trial
 
-from .figures import COLOURS, FAINT, SIDE_COLOURS, SIDES, Drawn, legend, style, subplots, with_unit
+from .figures import COLOURS, FAINT, SIDE_COLOURS, SIDES, Drawn, legend, stacked, style, subplots, with_unit
 from .page import PageTable, write_report
 
 _TRUE, _OBSERVED = COLOURS[6], COLOURS[1]
@@ -75,7 +75,7 @@ _FIGURES = {
 
 
 def _observed(trace: pd.DataFrame, side: str, quantity: str, unit: str) -> Drawn:
-    figure, (above, below) = subplots(7.0, 4.4, 2, sharex=True)
+    figure, (above, below) = stacked(2, 1.9, width=7.0)
     true, estimate = trace[f"{side}.{quantity}"], trace[f"{side}.{quantity}_estimate"]
     above.plot(trace["t"], estimate, color=_OBSERVED, lw=2.4, alpha=0.8, label="observer")
     above.plot(trace["t"], true, color=_TRUE, lw=1.0, label="true")
@@ -83,7 +83,7 @@ def _observed(trace: pd.DataFrame, side: str, quantity: str, unit: str) -> Drawn
     legend(above, 2)
     below.plot(trace["t"], true - estimate, color=COLOURS[0])
     below.axhline(0.0, color=FAINT, lw=0.8)
-    below.set(xlabel="time (s)", ylabel=f"error ({unit})")
+    below.set(ylabel=f"error ({unit})")
     return Drawn(
         f"{side}_{quantity}", figure,
         f"{side.capitalize()} {quantity}, true and observed, and the error (analogue of {_FIGURES[side, quantity]}).",
@@ -91,7 +91,7 @@ def _observed(trace: pd.DataFrame, side: str, quantity: str, unit: str) -> Drawn
 
 
 def _torque(trace: pd.DataFrame, sides: list[str]) -> Drawn:
-    figure, (above, below) = subplots(7.0, 4.4, 2, sharex=True)
+    figure, (above, below) = stacked(2, 1.9, width=7.0)
     for side in sides:
         estimate, colour = trace[f"{side}.torque_estimate"], SIDE_COLOURS[side]
         above.plot(trace["t"], estimate, color=colour, lw=2.0, alpha=0.75, label=f"from the {side} observer")
@@ -101,7 +101,7 @@ def _torque(trace: pd.DataFrame, sides: list[str]) -> Drawn:
     above.set(ylabel=f"{name} (N m)")
     legend(above, 3)
     below.axhline(0.0, color=FAINT, lw=0.8)
-    below.set(xlabel="time (s)", ylabel="error (N m)")
+    below.set(ylabel="error (N m)")
     return Drawn("torque", figure, f"The {name}, true and by the equivalent controls (17) (analogue of Fig. 16).")
 
 
@@ -109,7 +109,7 @@ def _identified(trial: Trial, trace: pd.DataFrame, last: pd.DataFrame, sides: li
     names = list(trial.summary["identified"])
     # what a law derives from its own parameters is an angle, as they are
     units = {field.name: about.unit for field, about in parameters(trial.config.build().transmission)}
-    figure, axes = subplots(7.0, 2.0 * len(names) + 0.6, len(names), sharex=True)
+    figure, axes = stacked(len(names), 2.0, width=7.0)
     for ax, name in zip(axes, names, strict=True):
         true = trial.summary["identified"][name]["true"]
         for side in sides:
@@ -120,7 +120,6 @@ def _identified(trial: Trial, trace: pd.DataFrame, last: pd.DataFrame, sides: li
         reach = max(2.0 * largest if np.isfinite(largest) else 0.0, 0.02 * abs(true), 1e-12)
         ax.set(ylabel=with_unit(name.replace("_", " "), units.get(name, "rad")), ylim=(true - reach, true + reach))
     legend(axes[0], 3)
-    axes[-1].set_xlabel("time (s)")
     return Drawn("dead_zone", figure, "Identified transmission parameters over time (27)-(28) (analogue of Fig. 16).")
 
 

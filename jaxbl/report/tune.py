@@ -124,11 +124,10 @@ def _comparison(tuning: Tuning, sides: list[str]) -> Drawn:
         ax.set(xlabel=label, title=side if key == metric else "")
     axes[0].set_yticks(range(len(names)), names)
     axes[0].invert_yaxis()
-    held = tuning.summary["holdout"]
-    where = "the study's excitation with other noise" if held["same_excitation"] else "the held-out excitation"
+    first, last = tuning.summary["holdout"]["seeds"]
     caption = (
-        f"The gains on {where} ({held['excitation']['kind']}, noise seeds {held['seeds'][0]} to {held['seeds'][1]}): worst "
-        "of all runs, and the median (stroke). Hatched: some runs did not converge."
+        f"The gains {_where(tuning.summary)}, noise seeds {first} to {last}: worst of all runs, and the median (stroke). "
+        "Hatched: some runs did not converge."
     )
     return Drawn("tuning_holdout", figure, caption)
 
@@ -163,7 +162,7 @@ def write_tune_report(tuning: Tuning, folder: Path) -> list[str]:
     write_atomic(folder / "tuning.json", json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False))
     tables = [
         _gains_table(summary),
-        _comparison_table(f"{_holdout_title(summary)}, worst and median of all runs", summary["holdout"]["rows"]),
+        _comparison_table(f"{_where(summary).capitalize()}, worst and median of all runs", summary["holdout"]["rows"]),
         _comparison_table("On the study's own excitation, worst and median of all runs", summary["named"]),
         *_pareto_tables(summary),
     ]
@@ -202,11 +201,11 @@ def _runs_behind(summary: dict[str, Any]) -> str:
     return f"{seeds} noise seed{'s' * (seeds > 1)} and {drives} drive{'s' * (drives > 1)}"
 
 
-def _holdout_title(summary: dict[str, Any]) -> str:
+def _where(summary: dict[str, Any]) -> str:
+    """Which runs were held out."""
     held = summary["holdout"]
-    if held["same_excitation"]:
-        return "On the study's excitation with other noise"
-    return f"On the held-out excitation ({held['excitation']['kind']})"
+    other = f"on the held-out excitation ({held['excitation']['kind']})"
+    return "on the study's excitation with other noise" if held["same_excitation"] else other
 
 
 def _tune_headline(summary: dict[str, Any]) -> list[str]:
@@ -221,8 +220,7 @@ def _tune_headline(summary: dict[str, Any]) -> list[str]:
             f"{found[metric]:.3g} {unit} rms, converged after "
             f"{found['convergence_time']:.3g} s, the worst of {_runs_behind(summary)}."
         )
-    where = _holdout_title(summary)
-    where = where[0].lower() + where[1:]
+    where = _where(summary)
     rows = {(row["name"], row["side"]): row for row in summary["holdout"]["rows"]}
     for side, others in summary["holdout"]["factors"].items():
         parts = []

@@ -325,12 +325,9 @@ def _counterexample_table(verdict: Verdict) -> PageTable:
     found = verdict.counterexamples[verdict.counterexamples["bound"] == "true"]
     paths = [axis.path for axis in verdict.config.axes if axis.path in found]
     keys = ["level", "side", "condition", "cause"]
-    counts = found.groupby(keys, sort=False).size().sort_values(ascending=False)
-    examples = found.drop_duplicates(keys).set_index(keys)
     rows = []
-    for key, count in counts.items():
-        example = examples.loc[key]
-        rows.append([*key, int(count), *(_plain(example[path]) for path in paths)])
+    for key, part in sorted(found.groupby(keys, sort=False), key=lambda pair: -len(pair[1])):
+        rows.append([*key, len(part), *(_plain(part[path].iloc[0]) for path in paths)])
     head = [*keys, "runs", *(f"e.g. {path}" for path in paths)]
     return PageTable("Counterexamples by cause (all of them, with all figures: counterexamples.parquet)", head, rows)
 
