@@ -44,9 +44,7 @@ Key = tuple[str | int, ...]
 def first_error(error: ValidationError, location: list[str | int] | None = None) -> tuple[Key, str]:
     """The first error: the key that is wrong, and one line that says so.
 
-    Args:
-        error: what pydantic found.
-        location: the key, where pydantic's own has more in it than keys.
+    `location` is the key, where pydantic's own has more in it than keys.
     """
     first = error.errors()[0]
     location = list(first["loc"]) if location is None else location

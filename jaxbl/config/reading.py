@@ -105,14 +105,9 @@ def _localise(data: dict[str, Any], folder: Path) -> None:
 
 
 def _included(data: dict[str, Any], name: str, folder: Path, chain: list[Path], origins: dict[Key, str]) -> dict[str, Any]:
-    """The data with the files that it includes merged in.
+    """The data with the files that it includes (from `folder`) merged in; `name` is what messages call it.
 
-    Args:
-        data: a config, of which `include` is taken out.
-        name: how messages call it.
-        folder: where the included files are looked for.
-        chain: files that led here.
-        origins: gets the file that each key of an included file came from.
+    `chain` are the files that led here; `origins` gets the file that each key came from.
     """
     files = data.pop("include", [])
     files = [files] if isinstance(files, str) else files

@@ -31,13 +31,10 @@ class Table(StrictTable):
 
 
 def table_for(module: type, factory: Callable[..., Any] | None = None, base: type[Table] = Table, **tag: str) -> type[Table]:
-    """Generate the config table of a module class from its declared parameters.
+    """Generate the config table of a module class from its declared parameters (:mod:`jaxbl.drive.parameters`).
 
-    Args:
-        module: class with fields declared by :func:`jaxbl.drive.parameters.parameter` or `option`.
-        factory: what the table builds; left out: the class.
-        base: table with further keys.
-        **tag: a key with one value, by which a table is told from others (`kind="sine"`).
+    The table builds the class, or what `factory` makes of its numbers. It has further keys from `base`, and one with a
+    single value that tells it from others (`kind="sine"`).
     """
     fields: dict[str, Any] = {key: (Literal[value], ...) for key, value in tag.items()}
     for field, known in parameters(module):

@@ -144,10 +144,8 @@ def fit_power_law(x: np.ndarray, y: np.ndarray, usable: np.ndarray | None = None
     from the line, and halves whose slopes differ by at most :data:`LARGEST_BEND` or two standard errors of that difference.
     Of runs over the same ratio of x the one with the least scatter is taken.
 
-    Args:
-        x: float array (points,), positive, increasing.
-        y: float array (points,); points that are not positive and finite break a run.
-        usable: bool array (points,); others break a run too.
+    `x` is positive and increasing, `(points,)`; points whose y is not positive and finite, or that are not `usable`, break a
+    run.
     """
     good = np.isfinite(y) & (y > 0.0) & (True if usable is None else usable)
     log_x, log_y = np.log(x), np.log(np.where(good, y, 1.0))

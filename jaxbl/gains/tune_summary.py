@@ -43,13 +43,8 @@ def pareto_front(candidates: pd.DataFrame) -> pd.DataFrame:
 
 
 class Summary:
-    """Plain data of a finished search, as in `tuning.json`.
-
-    Args:
-        search: with all its stages run.
-        named: a row for each of the gains compared and each side (:func:`compared_figures`), on the study's own runs.
-        held_out: the same on the held-out ones.
-    """
+    """Plain data of a finished search, as in `tuning.json`; with a row (:func:`compared_figures`) for each of the gains
+    compared and each side, on the study's own runs (`named`) and on the held-out ones."""
 
     def __init__(self, search: "Search", named: list[dict[str, Any]], held_out: list[dict[str, Any]]):
         self.search, self.table, self.config = search, search.table, search.scenarios.config

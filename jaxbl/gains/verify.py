@@ -202,13 +202,11 @@ def _judge(config: Config, level: str, side: str, frame: pd.DataFrame) -> tuple[
             strict = np.isfinite(ratios) & (ratios > 1.0)
             entry = counted(config, name, holds, converged)
             if bound == "true":
-                entry["conservatism"] = {
-                    "median": np.median(ratios[strict]) if strict.any() else None,
-                    "max": ratios[strict].max() if strict.any() else None,
-                    "columns": int(strict.sum()),
-                    # the least lambda of the grid worked: the true ratio is larger
-                    "at_least": int((strict & (lambda_[position] <= smallest)).sum()),
-                }
+                columns = pd.Series(ratios[strict])
+                # the least lambda of the grid worked: the true ratio is larger
+                at_least = int((strict & (lambda_[position] <= smallest)).sum())
+                entry["conservatism"] = {"median": columns.median(), "max": columns.max(), "columns": len(columns)}
+                entry["conservatism"]["at_least"] = at_least
             summaries[bound].append(entry)
             if failed.any():
                 extra = {"level": level, "side": side, "condition": name, "bound": bound}
@@ -241,14 +239,12 @@ def _by_input(config: Config, worked: pd.DataFrame, bounds: dict[str, str]) -> l
     """True and claimed bound (medians, rad/s^2) for each combination of what excites the drive, over runs that converged."""
     kinds = ("excitation.", "transmission.", "drive.")
     keys = [axis.path for axis in config.axes if axis.path.startswith(kinds) and axis.path in worked]
-    found = []
-    for values, part in worked.groupby(keys, sort=True) if keys else []:
-        found.append(
-            {
-                "input": dict(zip(keys, values, strict=True)),
-                "converged_runs": len(part),
-                **{bound: part[column].median() for bound, column in bounds.items()},
-                "too_small": float(part["too_small"].mean()),
-            }
-        )
-    return found
+    return [
+        {
+            "input": dict(zip(keys, values, strict=True)),
+            "converged_runs": len(part),
+            **{bound: part[column].median() for bound, column in bounds.items()},
+            "too_small": float(part["too_small"].mean()),
+        }
+        for values, part in (worked.groupby(keys, sort=True) if keys else [])
+    ]

@@ -13,15 +13,10 @@ _SIZES = 1024, 8192
 
 
 def in_pieces(function: Callable[..., Any], columns: Sequence[np.ndarray], devices: Sequence[Any] | None = None) -> Any:
-    """Apply an elementwise function to columns, piece by piece.
+    """Apply an elementwise function to columns `(n,)`, piece by piece, on some devices (all local ones if left out).
 
-    Args:
-        function: of arrays of one shape, to any pytree of such; compiled (`jax.jit`) once for all calls.
-        columns: shape (n,) each.
-        devices: that share the pieces; all local ones if left out.
-
-    Returns:
-        What the function gives, of NumPy arrays of shape (n,).
+    The function takes arrays of one shape and gives any pytree of such; compiled by `jax.jit`, it is compiled once for all
+    calls. The result has NumPy arrays `(n,)` in their place.
     """
     count = len(columns[0])
     devices = list(jax.local_devices() if devices is None else devices)

@@ -47,12 +47,8 @@ class Refinement(NamedTuple):
 class Points:
     """All points of a study, first axis slowest, structural axes outermost.
 
-    Attributes:
-        paths: axis paths in the order of the config.
-        groups: one for each combination of structural values.
-        lanes: points of each group.
-        coarse_lanes: points of each group that are always simulated: all of them, or the coarse grid of a refined study.
-        refinement: how the study is refined, if it is.
+    Each group, one for each combination of structural values, has `lanes` points. `coarse_lanes` of them are always
+    simulated: all, or the coarse grid of a refined study.
     """
 
     def __init__(self, config: Config):

@@ -1,7 +1,7 @@
 """Compiled programs for the chunks of a study: the scan by XLA, or the fused loop."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -19,17 +19,14 @@ if TYPE_CHECKING:
     from jaxbl.fused.passage import Passage
 
 Backend = Literal["fused", "scan"]
-BACKENDS: tuple[Backend, ...] = ("fused", "scan")
+BACKENDS: tuple[Backend, ...] = get_args(Backend)
 
 
 def backend_of(name: str | None, given: str = "backend") -> Backend | None:
     """A backend by its name, None for none. Raises `InputError` for another; `given` is what it was given as."""
-    for backend in BACKENDS:
-        if backend == name:
-            return backend
-    if name is not None:
+    if name is not None and name not in BACKENDS:
         raise InputError(f"{given}: there is no {name!r}; one of {', '.join(BACKENDS)}")
-    return None
+    return name
 
 
 class Layout(NamedTuple):
@@ -40,14 +37,9 @@ class Layout(NamedTuple):
 
 
 class Program(NamedTuple):
-    """What runs a chunk.
-
-    Attributes:
-        run: from values by path `(points,)` and seeds `(seeds,)` to figures `(seeds, points)` and gains, which have these
-            axes or fit them.
-        megabytes: of memory that it takes.
-        instead: what the fused loop does not know, where the scan takes its place.
-    """
+    """What runs a chunk: `run` maps values by path `(points,)` and seeds `(seeds,)` to figures `(seeds, points)` and gains,
+    which have these axes or fit them; it takes `megabytes` of memory. Where the scan takes the fused loop's place, `instead`
+    says what the loop does not know."""
 
     run: Callable[[dict[str, np.ndarray], np.ndarray], tuple[dict[str, Any], dict[str, ObserverGains]]]
     megabytes: float
@@ -56,7 +48,6 @@ class Program(NamedTuple):
 
 _FUSED, _SCAN = (0.5, 0.9e-3), (1.5, 3.1e-3)
 """Microseconds that a sample costs, and each of its lanes, on one core (benchmarks/NOTES.md)."""
-
 
 _GPU_SEEDS = 8
 """Seeds a chunk up to which a GPU gets the fused loop: some 1 us a sample each, where a step of the scan takes 8 (published
@@ -86,15 +77,9 @@ def compile_program(
     *,
     insist: bool = False,
 ) -> Program:
-    """Compile one. Call inside :func:`jaxbl.sweeps.engine.precision`.
+    """Compile one, inside :func:`jaxbl.config.precision`; `columns` is an example of the values, `(points,)` by path.
 
-    Args:
-        experiment: with array leaves.
-        layout: of its chunks.
-        devices: that share a chunk.
-        backend: where the fused loop cannot run the step, or no lane differs from another, the scan takes its place.
-        columns: example of the values, `(points,)` by path.
-        insist: refuse that in place of it.
+    Where the fused loop cannot run the step, or no lane differs from another, the scan takes its place.
 
     Raises:
         InputError: the fused loop was insisted on and cannot be had.

@@ -52,11 +52,7 @@ class CellGrid:
     """A fine grid of vertices, some of whose axes are refined: every 2^depth-th vertex along them is on the coarse grid.
 
     Cells span the refined axes; along the others every value has a grid of its own. A cell is known by its lower corner.
-
-    Args:
-        sizes: vertices along each axis of the coarse grid, last axis fastest.
-        refined: whether each axis is refined.
-        depth: how often the cells are halved.
+    `sizes` are those of the coarse grid, last axis fastest; `depth` says how often the cells of refined axes are halved.
     """
 
     def __init__(self, sizes: Sequence[int], refined: Sequence[bool], depth: int):
@@ -148,11 +144,8 @@ def refine(
 ) -> tuple[Indices, np.ndarray]:
     """Simulate a coarse grid and then, a batch at a time, what its boundaries need.
 
-    Args:
-        grid: the vertices.
-        evaluate: values of a batch of vertices, `(vertices, ...)`; called with the coarse grid first, never twice with a
-            vertex.
-        differ: whether the values of two ends disagree, for many edges at once.
+    `evaluate` gives the values of a batch of vertices, `(vertices, ...)`; it is called with the coarse grid first, and never
+    twice with a vertex. `differ` says whether the values of two ends disagree, for many edges at once.
 
     Returns:
         The vertices that were simulated, sorted, and their values.

@@ -172,11 +172,8 @@ class Store:
 
     def has(self, index: int) -> bool:
         """Whether a chunk is there and whole."""
-        path = self.part(index)
-        if not path.exists():
-            return False
         try:
-            return pq.read_metadata(path).num_rows > 0
+            return pq.read_metadata(self.part(index)).num_rows > 0
         except (OSError, ValueError):
             return False
 

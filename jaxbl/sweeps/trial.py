@@ -93,16 +93,9 @@ def _row(experiment: Experiment, state: State, signals: Signals) -> dict[str, An
     row["torque"] = signals.torque
     for side in experiment.sides:
         s = signals.side(side)
-        assert s.true is not None
-        row |= {
-            f"{side}.position": s.true.position,
-            f"{side}.velocity": s.true.velocity,
-            f"{side}.acceleration": s.true.acceleration,
-            f"{side}.position_estimate": s.position_estimate,
-            f"{side}.velocity_estimate": s.velocity_estimate,
-            f"{side}.equivalent_control": s.equivalent_control,
-            f"{side}.torque_estimate": s.torque_estimate,
-        }
+        true = {f"{side}.{name}": getattr(s.true, name) for name in ("position", "velocity", "acceleration")}
+        estimates = "position_estimate", "velocity_estimate", "equivalent_control", "torque_estimate"
+        row |= true | {f"{side}.{name}": getattr(s, name) for name in estimates}
     found = identified(experiment, state)
     for side in experiment.sides:
         row |= {f"{side}.{name}": value for name, value in found.get(side, {}).items()}
