@@ -7,8 +7,7 @@ Reference: A. Levant, Higher-order sliding modes, differentiation and output-fee
 """
 
 # pandas' own annotations are wider than what its methods return
-# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
-# pyright: reportReturnType=false
+# pyright: reportAttributeAccessIssue=false, reportReturnType=false
 
 import dataclasses
 import math

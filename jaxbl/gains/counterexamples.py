@@ -1,8 +1,7 @@
 """Runs in which a gain condition held and the observer failed: what made it fail, found by repeating them."""
 
 # pandas' own annotations are wider than what its methods return
-# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
-# pyright: reportReturnType=false
+# pyright: reportArgumentType=false, reportCallIssue=false
 
 import copy
 from typing import Any

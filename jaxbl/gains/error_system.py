@@ -1,10 +1,6 @@
 """The error system (34) with f_plus = 1 under its worst disturbance, over a plane of alpha / f_plus and lambda / √f_plus,
 and what the gain conditions ask for there."""
 
-# pandas' own annotations are wider than what its methods return
-# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
-# pyright: reportReturnType=false
-
 import dataclasses
 from collections.abc import Callable
 from functools import cache, partial

@@ -1,8 +1,5 @@
 """Gains that `[verify]` marks in the atlas: each run once, and judged."""
 
-# pandas' own annotations are wider than what its methods return
-# pyright: reportArgumentType=false
-
 from typing import Any
 
 import jax

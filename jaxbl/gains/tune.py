@@ -6,8 +6,7 @@ study of its own, kept in the folder's `tune/`: an interrupted search goes on wh
 """
 
 # pandas' own annotations are wider than what its methods return
-# pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false, reportReturnType=false
-# pyright: reportGeneralTypeIssues=false
+# pyright: reportCallIssue=false, reportGeneralTypeIssues=false
 
 import dataclasses
 import math

@@ -1,8 +1,7 @@
 """What a search for gains found: the numbers of `tuning.json`, and what a reader of them should know."""
 
 # pandas' own annotations are wider than what its methods return
-# pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false, reportReturnType=false
-# pyright: reportGeneralTypeIssues=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportReturnType=false
 
 import math
 from typing import TYPE_CHECKING, Any
@@ -50,6 +49,7 @@ class Summary:
         self.search, self.table, self.config = search, search.table, search.scenarios.config
         self.best = {side: search.best(side) for side in search.sides}
         self.named, self.rows = named, held_out
+        self.of = {side: {row["name"]: row for row in held_out if row["side"] == side} for side in search.sides}
         self.factors = {side: self._factors(side) for side in search.sides}
 
     def plain(self) -> dict[str, Any]:
@@ -94,22 +94,19 @@ class Summary:
         names = ["lambda", "alpha", "lambda_ratio", "alpha_ratio", "convergence_time", "error"]
         return plain(pareto_front(self.search.candidates[side])[names].to_dict("records"))
 
-    def row(self, name: str, side: str) -> dict[str, Any]:
-        return next(row for row in self.rows if (row["name"], row["side"]) == (name, side))
-
     def _factors(self, side: str) -> dict[str, Any]:
         """Other gains' figures over the tuned ones', on the held-out input; none for gains that do not always converge."""
-        tuned, out = self.row("tuned", side), {}
-        for row in self.rows:
-            if row["side"] != side or row["name"] == "tuned":
+        tuned, out = self.of[side]["tuned"], {}
+        for name, row in self.of[side].items():
+            if name == "tuned":
                 continue
             if row["converged"] < 1.0 or tuned["converged"] < 1.0:
-                who, share = min((row["name"], row["converged"]), ("tuned", tuned["converged"]), key=lambda pair: pair[1])
-                out[row["name"]] = {"why_none": f"{who}: converged in {100.0 * share:.3g} % of the runs"}
+                who, share = min((name, row["converged"]), ("tuned", tuned["converged"]), key=lambda pair: pair[1])
+                out[name] = {"why_none": f"{who}: converged in {100.0 * share:.3g} % of the runs"}
                 continue
-            out[row["name"]] = {
-                name: {how: _ratio(row[name][how], tuned[name][how]) for how in ("worst", "median")}
-                for name in ("velocity_rmse", "torque_rmse", "convergence_time")
+            out[name] = {
+                figure: {how: _ratio(row[figure][how], tuned[figure][how]) for how in ("worst", "median")}
+                for figure in ("velocity_rmse", "torque_rmse", "convergence_time")
             }
         return out
 
@@ -179,7 +176,7 @@ class Summary:
         return lines
 
     def _about_holdout(self, side: str) -> list[str]:
-        lines, tuned = [], self.row("tuned", side)
+        lines, tuned = [], self.of[side]["tuned"]
         bound, own = self.search.pilot[side]["holdout_f_plus"], self.search.f_plus[side]
         if bound > own:
             lines.append(
@@ -193,7 +190,7 @@ class Summary:
             )
         for name, found in self.factors[side].items():
             if "why_none" in found and tuned["converged"] == 1.0:
-                share = 100.0 * self.row(name, side)["converged"]
+                share = 100.0 * self.of[side][name]["converged"]
                 lines.append(
                     f"{side}: {called_gains(name)} converge in only {share:.3g} % of the held-out runs: no factor is stated."
                 )

@@ -6,8 +6,7 @@ true f_plus along its run. "sampled": the study as it stands, with its period, q
 """
 
 # pandas' own annotations are wider than what its methods return
-# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
-# pyright: reportReturnType=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
 
 import dataclasses
 import json
