@@ -12,7 +12,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -29,6 +29,9 @@ from .tune_summary import COMPARED, Summary, compared_figures
 
 Gains = dict[str, tuple[float, float]]
 """lambda (rad^0.5/s) and alpha (rad/s^2) of each side."""
+
+Window = dict[str, tuple[float, float]]
+"""Ends of the ratios searched on one side: alpha / f⁺ under `alpha`, lambda / √f⁺ under `lambda`."""
 
 USUAL_LAMBDA, USUAL_ALPHA = 1.5, 1.1
 """The usual rule (Levant 1998): lambda = 1.5 sqrt(f_plus), alpha = 1.1 f_plus."""
@@ -92,25 +95,6 @@ def tune(
     return Tuning(config, summary, search.candidates, stages.cost, tuple(stages.scanned))
 
 
-class Window(NamedTuple):
-    """Ends of the ratios searched on one side."""
-
-    alpha: tuple[float, float]
-    lambda_: tuple[float, float]
-
-    def around(self, alpha: float, lambda_: float, num: int, limits: "Window") -> "Window":
-        """One cell each way about a point, inside of `limits`."""
-        ends = []
-        for (low, high), centre, (least, largest) in zip(self, (alpha, lambda_), limits, strict=True):
-            cell = _cell((low, high), num)
-            ends.append((max(centre / cell, least), min(centre * cell, largest)))
-        return Window(*ends)
-
-    def plain(self) -> dict[str, list[float]]:
-        """The ends as JSON has them."""
-        return {"alpha_ratio": list(self.alpha), "lambda_ratio": list(self.lambda_)}
-
-
 def _cell(ends: tuple[float, float], num: int) -> float:
     """Ratio of neighbouring values."""
     return (ends[1] / ends[0]) ** (1.0 / (num - 1))
@@ -126,9 +110,9 @@ class Search:
         for side, bound in self.f_plus.items():
             if not bound > 0.0:
                 raise undisturbed(side)
-        self.limits = Window(
-            (table.alpha_ratio.start, table.alpha_ratio.stop), (table.lambda_ratio.start, table.lambda_ratio.stop)
-        )
+        self.limits: Window = {
+            gain: (span.start, span.stop) for gain, span in (("alpha", table.alpha_ratio), ("lambda", table.lambda_ratio))
+        }
         self.windows = [dict.fromkeys(self.sides, self.limits)]
         self.candidates: dict[str, pd.DataFrame] = {}
         seeds, lanes = scenarios.config.sweep.seeds, len(scenarios.names)
@@ -138,15 +122,9 @@ class Search:
         """Search. Raises `NoResult` where nothing is feasible."""
         for stage in range(self.table.refine + 1):
             if stage:
-                last = self.windows[-1]
-                if all(_cell(ends, self.table.num) - 1.0 < _FINEST for w in last.values() for ends in w):
+                if all(ratio - 1.0 < _FINEST for side in self.sides for ratio in self.cells(side).values()):
                     break
-                windows = {}
-                for side in self.sides:
-                    best = self.best(side)
-                    centre = best["alpha_ratio"], best["lambda_ratio"]
-                    windows[side] = last[side].around(*centre, self.table.num, self.limits)
-                self.windows.append(windows)
+                self.windows.append({side: self._zoomed(side) for side in self.sides})
             self._map(stage)
 
     def best(self, side: str) -> dict[str, Any]:
@@ -156,17 +134,25 @@ class Search:
 
     def cells(self, side: str) -> dict[str, float]:
         """Ratio of neighbouring values of each gain in the last stage."""
-        window, num = self.windows[-1][side], self.table.num
-        return {"alpha": _cell(window.alpha, num), "lambda": _cell(window.lambda_, num)}
+        return {gain: _cell(ends, self.table.num) for gain, ends in self.windows[-1][side].items()}
+
+    def _zoomed(self, side: str) -> Window:
+        """One cell each way about the best point so far, inside of the limits."""
+        best, window = self.best(side), {}
+        for gain, cell in self.cells(side).items():
+            centre, (least, largest) = best[f"{gain}_ratio"], self.limits[gain]
+            window[gain] = (max(centre / cell, least), min(centre * cell, largest))
+        return window
 
     def _map(self, stage: int) -> None:
         """Run the points of a stage and judge them."""
-        alphas, lambdas = {}, {}
+        axes: dict[str, dict[str, list[float]]] = {"alpha": {}, "lambda": {}}
         for side, window in self.windows[stage].items():
-            bound, num = self.f_plus[side], self.table.num
-            alphas[f"observer.{side}.alpha"] = (bound * np.geomspace(*window.alpha, num)).tolist()
-            lambdas[f"observer.{side}.lambda"] = (math.sqrt(bound) * np.geomspace(*window.lambda_, num)).tolist()
-        frame = self._sweep("coarse" if stage == 0 else f"refine-{stage}", [("alpha", alphas), ("lambda", lambdas)])
+            bound = self.f_plus[side]
+            for gain, scale in (("alpha", bound), ("lambda", math.sqrt(bound))):
+                values = scale * np.geomspace(*window[gain], self.table.num)
+                axes[gain][f"observer.{side}.{gain}"] = values.tolist()
+        frame = self._sweep("coarse" if stage == 0 else f"refine-{stage}", axes)
         for side in self.sides:
             new = self._judge(side, _worst(frame, side)).assign(stage=stage)
             old = self.candidates.get(side)
@@ -196,7 +182,7 @@ class Search:
         return {name: values.to_numpy(bool) for name, values in kept.items()}
 
     def _why_none(self, side: str) -> str:
-        found, limits = self.candidates[side], self.limits
+        found, alpha, lambda_ = self.candidates[side], self.limits["alpha"], self.limits["lambda"]
         run = self.scenarios.config.run
         least = {
             "converged": f" (least velocity error {found['velocity_rmse'].min():.3g} rad/s rms, "
@@ -211,8 +197,8 @@ class Search:
             for key, values in self.kept(found).items()
         )
         return (
-            f"{side}: none of the {len(found)} gains with alpha / f⁺ in {limits.alpha[0]:g} ... {limits.alpha[1]:g} and "
-            f"lambda / √f⁺ in {limits.lambda_[0]:g} ... {limits.lambda_[1]:g} (f⁺ = {self.f_plus[side]:.3g} rad/s²) keeps "
+            f"{side}: none of the {len(found)} gains with alpha / f⁺ in {alpha[0]:g} ... {alpha[1]:g} and "
+            f"lambda / √f⁺ in {lambda_[0]:g} ... {lambda_[1]:g} (f⁺ = {self.f_plus[side]:.3g} rad/s²) keeps "
             f"all constraints in all runs; how many keep each: {counts}"
         )
 
@@ -239,7 +225,7 @@ class Search:
             for side in self.sides
             for i, key in enumerate(("lambda", "alpha"))
         }
-        frame = self._sweep("holdout" if held_out else "named", [("gains", columns)], held_out=held_out)
+        frame = self._sweep("holdout" if held_out else "named", {"gains": columns}, held_out=held_out)
         rows = []
         for name, gains in named.items():
             for side, (lambda_, alpha) in gains.items():
@@ -249,7 +235,7 @@ class Search:
                 rows.append(compared_figures(name, side, runs, (lambda_, alpha)))
         return rows
 
-    def _sweep(self, name: str, axes: list[tuple[str, dict[str, list[float]]]], *, held_out: bool = False) -> pd.DataFrame:
+    def _sweep(self, name: str, axes: dict[str, dict[str, list[float]]], *, held_out: bool = False) -> pd.DataFrame:
         """Run one stage over scenarios and some axes that advance together."""
         config = self.scenarios.config
         data = config.resolved()
@@ -263,10 +249,9 @@ class Search:
         data["sweep"] |= {} if chunk is None else {"chunk": chunk}
         if held_out and self.table.holdout is not None:
             data["excitation"] = self.table.holdout.model_dump(by_alias=True, exclude_none=True)
-        together = [("scenario", self.scenarios.columns), *axes]
         data["axes"] = [
             {"path": path, "values": values, **({"zip": label} if len(columns) > 1 else {})}
-            for label, columns in together
+            for label, columns in ({"scenario": self.scenarios.columns} | axes).items()
             for path, values in columns.items()
         ]
         result = self.stages.run(data, name)

@@ -16,7 +16,7 @@ from jaxbl.observer.conditions import peak_ratio
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
 if TYPE_CHECKING:
-    from .tune import Search
+    from .tune import Search, Window
 
 COMPARED = (
     "converged",
@@ -69,9 +69,9 @@ class Summary:
             "margins": {"exact": table.margin_exact, "alpha": table.margin_alpha},
             "gains": {side: {key: float(self.best[side][key]) for key in keys} for side in sides},
             "achieved": {side: self._achieved(side) for side in sides},
-            "range": search.limits.plain() | {"num": table.num},
+            "range": _ratios(search.limits) | {"num": table.num},
             "resolution": {side: {key: ratio - 1.0 for key, ratio in search.cells(side).items()} for side in sides},
-            "stages": [{side: window.plain() for side, window in windows.items()} for windows in search.windows],
+            "stages": [{side: _ratios(window) for side, window in windows.items()} for windows in search.windows],
             "named": self.named,
             "holdout": {
                 "excitation": (table.holdout or self.config.excitation).model_dump(by_alias=True, exclude_none=True),
@@ -143,7 +143,7 @@ class Summary:
 
     def _about_optimum(self, side: str) -> list[str]:
         search, row, lines = self.search, self.best[side], []
-        gains = (("alpha", "alpha / f⁺", search.limits.alpha), ("lambda", "lambda / √f⁺", search.limits.lambda_))
+        gains = (("alpha", "alpha / f⁺", search.limits["alpha"]), ("lambda", "lambda / √f⁺", search.limits["lambda"]))
         for gain, label, (low, high) in gains:
             ratio, near = row[f"{gain}_ratio"], 1.01
             if gain == "alpha" and row["margin_alpha"] < self.table.margin_alpha * near:
@@ -219,6 +219,10 @@ def compared_figures(name: str, side: str, runs: pd.DataFrame, gains: tuple[floa
     worst["convergence_time_worst"] = figures["convergence_time_worst"].max()
     row |= worst if finite.all() else dict.fromkeys(worst)
     return plain(row | {"f_plus": bound, "peak_ratio": _peak_ratio(*gains, bound)})
+
+
+def _ratios(window: "Window") -> dict[str, list[float]]:
+    return {f"{gain}_ratio": list(ends) for gain, ends in window.items()}
 
 
 def _peak_ratio(lambda_: float, alpha: float, f_plus: float) -> float | None:

@@ -396,11 +396,8 @@ METRICS = Reducer(_init, _update, _result)
 
 def observer_gains(experiment: Experiment) -> dict[str, ObserverGains]:
     """Gains of the experiment's observers by side."""
-    observers = {side: getattr(experiment.observer, side) for side in experiment.sides}
-    return {
-        side: ObserverGains(*(getattr(observer, name) for name in ObserverGains._fields))
-        for side, observer in observers.items()
-    }
+    fields = ObserverGains._fields
+    return {s: ObserverGains(*(getattr(getattr(experiment.observer, s), f) for f in fields)) for s in experiment.sides}
 
 
 def with_conditions(figures: Mapping[str, Any], gains: dict[str, ObserverGains]) -> dict[str, np.ndarray]:

@@ -69,12 +69,8 @@ class CellGrid:
 
     def coarse(self, positions: np.ndarray) -> Indices:
         """Flat indices of vertices of the coarse grid, given by their positions in it."""
-        out = np.zeros(np.shape(positions), np.int64)
-        remaining = np.asarray(positions, np.int64)
-        for size, stride in reversed(list(zip(self.coarse_sizes, self._strides, strict=True))):
-            out += (remaining % size) * stride
-            remaining = remaining // size
-        return out
+        places = np.unravel_index(np.asarray(positions, np.int64), self.coarse_sizes)
+        return np.stack(places, axis=-1) @ np.array(self._strides, np.int64)
 
     def coarse_vertices(self) -> Indices:
         """All vertices of the coarse grid."""
