@@ -26,14 +26,9 @@ def keys_of(config: Config) -> list[str]:
 def explained(found: pd.DataFrame, study: Config, level: str, side: str, stages: Stages) -> pd.DataFrame:
     """Counterexamples of a level with a column that says what made the observer fail."""
     # a claimed bound that the true one exceeds, with the condition failing at the true one, is cause enough
-    true = set(zip(found["condition"][found["bound"] == "true"], found["row"][found["bound"] == "true"], strict=True))
-    excused = np.array(
-        [
-            bound == "claimed" and (condition, row) not in true
-            for bound, condition, row in zip(found["bound"], found["condition"], found["row"], strict=True)
-        ],
-        dtype=bool,
-    )
+    true = (found["bound"] == "true").to_numpy()
+    runs = pd.MultiIndex.from_frame(found[["condition", "row"]])
+    excused = ~true & ~runs.isin(runs[true])
     rest = found[~excused].drop_duplicates("row")
     causes = _causes(study, level, side, rest, stages) if len(rest) else pd.Series(dtype=object)
     cause = found["row"].map(dict(zip(rest["row"], causes, strict=True)))
@@ -49,6 +44,7 @@ def explained(found: pd.DataFrame, study: Config, level: str, side: str, stages:
 
 def _mended(run: dict[str, Any], level: str) -> dict[str, dict[str, Any]]:
     """What can make a run fail, with the keys that mend it; `run` as it stands in those runs."""
+    # a factor of four: enough for an error that follows duration or period to change clearly
     long, fine = 4.0 * run["duration"], run["sample_period"] / 4.0
     mended: dict[str, dict[str, Any]] = {"run too short": {"run.duration": long}}
     mended["period too long"] = {"run.sample_period": fine, "run.substeps": max(-(-run["substeps"] // 4), 1)}
@@ -83,7 +79,6 @@ def _causes(study: Config, level: str, side: str, rows: pd.DataFrame, stages: St
     kept = rows.iloc[np.unique(np.linspace(0, len(rows) - 1, _MOST_EXPLAINED).astype(int))]
     structural = list(Points(study).groups[0].structural)
     causes = pd.Series("not tried", index=rows.index, dtype=object)
-
     for number, (_, part) in enumerate(kept.groupby(structural, sort=False) if structural else [((), kept)]):
         name = f"{level}-{side}-{number}"
         fixed = {path: part[path].iloc[0] for path in structural}
