@@ -11,14 +11,25 @@ from .experiment import ExcitationTable
 from .tables import Table
 
 
-class AlphaRatioTable(Table):
+class _SpanTable(Table):
+    start: float
+    stop: float
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "_SpanTable":
+        if self.start >= self.stop:
+            raise wrong(f"start {self.start} should be less than stop {self.stop}")
+        return self
+
+
+class AlphaRatioTable(_SpanTable):
     """Range of alpha / f⁺ that is searched, in equal ratios."""
 
     start: float = Field(default=1.1, gt=1.0, le=1e9, description="least alpha / f⁺; no observer converges below 1")
     stop: float = Field(default=100.0, gt=1.0, le=1e9, description="largest alpha / f⁺")
 
 
-class LambdaRatioTable(Table):
+class LambdaRatioTable(_SpanTable):
     """Range of lambda / √f⁺ that is searched, in equal ratios."""
 
     start: float = Field(default=0.3, gt=0.0, le=1e9, description="least lambda / √f⁺")
@@ -74,10 +85,6 @@ class TuneTable(Table):
 
     @model_validator(mode="after")
     def _consistent(self) -> "TuneTable":
-        for key in ("alpha_ratio", "lambda_ratio"):
-            span = getattr(self, key)
-            if span.start >= span.stop:
-                raise wrong(f"{key}: start {span.start} should be less than stop {span.stop}")
         if self.alpha_ratio.stop < self.margin_alpha:
             raise wrong(
                 f"alpha_ratio: stop {self.alpha_ratio.stop} is below margin_alpha {self.margin_alpha}; it should be above it"
@@ -89,18 +96,12 @@ class TuneTable(Table):
         return self
 
 
-class RangeTable(Table):
+class RangeTable(_SpanTable):
     """Values between two ends, evenly spaced on a log scale."""
 
     start: float = Field(gt=0.0, description="first value")
     stop: float = Field(gt=0.0, description="last value")
     num: int = Field(ge=2, le=8192, description="number of values")
-
-    @model_validator(mode="after")
-    def _ordered(self) -> "RangeTable":
-        if self.start >= self.stop:
-            raise wrong(f"start {self.start} should be less than stop {self.stop}")
-        return self
 
     def values(self) -> np.ndarray:
         """The values, shape (num,)."""

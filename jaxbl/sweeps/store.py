@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 
-from jaxbl.config import Config, read_config
+from jaxbl.config import Config
 from jaxbl.errors import InputError
 from jaxbl.files import LOG_RESULTS, log_named_in, make_folder, read_json, write_atomic, write_table
 
@@ -149,9 +149,6 @@ class Store:
         if manifest.get("format") != FORMAT:
             raise InputError(f"{path}: has format {manifest.get('format')}; this version reads {FORMAT}")
         return cls(folder, manifest)
-
-    def config(self) -> Config:
-        return read_config(self.folder / "study.toml")
 
     @property
     def layout(self) -> Layout:

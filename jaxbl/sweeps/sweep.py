@@ -222,7 +222,7 @@ class _Run:
 def load(folder: str | Path) -> StudyResult:
     """Read a study's folder. Raises `InputError` where there is none."""
     store = Store.open(Path(folder))
-    return StudyResult(store.config(), store)
+    return StudyResult(read_config(store.folder / "study.toml"), store)
 
 
 def dry_run(study: str | Path | Mapping[str, Any] | Config, *, backend: Backend | None = None) -> SweepEstimate:

@@ -284,7 +284,7 @@ BAD = {
     "alpha range": (one_side(tune={"alpha_ratio": {"start": 1.0}}), "tune.alpha_ratio.start: should be greater than 1"),
     "empty range": (
         one_side(tune={"lambda_ratio": {"start": 3.0, "stop": 3.0}}),
-        "tune: lambda_ratio: start 3.0 should be less than stop 3.0",
+        "tune.lambda_ratio: start 3.0 should be less than stop 3.0",
     ),
     "range below the margin": (
         one_side(tune={"margin_alpha": 3.0, "alpha_ratio": {"stop": 2.0}}),
