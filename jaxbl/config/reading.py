@@ -40,7 +40,7 @@ def read_model(source: str | Path | Mapping[str, Any] | Config) -> tuple[Config,
     """
     if isinstance(source, Config):
         return source, frozenset()
-    data, name, origins = _read(source)
+    name, data, origins = _read(source)
     missing = set()
     if "excitation" not in data:
         missing.add("excitation")
@@ -51,20 +51,14 @@ def read_model(source: str | Path | Mapping[str, Any] | Config) -> tuple[Config,
         if isinstance(observer, dict) and side not in observer:
             missing.add(f"observer.{side}")
             observer[side] = dict(_UNGIVEN)
-    return _validate(data, name, origins), frozenset(missing)
+    return _validate(name, data, origins), frozenset(missing)
 
 
-def _read(source: str | Path | Mapping[str, Any]) -> tuple[dict[str, Any], str, dict[Key, str]]:
-    """Data of a study with what it includes, how messages call it, and the file that each key came from."""
+def _read(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any], dict[Key, str]]:
+    """How messages call a study, its data with what it includes, and the file that each key came from."""
     if isinstance(source, Mapping):
-        name, data, folder = "config", copy.deepcopy(dict(source)), Path()
-    else:
-        path = Path(source)
-        name, data, folder = str(path), _load(path), path.parent
-        _localise(data, folder)
-    origins: dict[Key, str] = {}
-    chain = [] if isinstance(source, Mapping) else [Path(source).resolve()]
-    return _included(data, name, folder, chain, origins), name, origins
+        return "config", *_included(copy.deepcopy(dict(source)), "config", Path(), [])
+    return str(Path(source)), *_file(Path(source), [])
 
 
 def read_log_config(path: Path) -> tuple[LogTable, float | None]:
@@ -73,11 +67,21 @@ def read_log_config(path: Path) -> tuple[LogTable, float | None]:
     Raises:
         InputError: unreadable file, bad TOML, unknown key, wrong type or range; one line that names file and key.
     """
-    data = _included(_load(path), str(path), path.parent, [path.resolve()], {})
+    data, _ = _file(path, [])
     if set(data) <= {"title", "notes", "log"}:
         return read_log_table(data.get("log"), str(path)), None
     config, _ = read_model(path)
     return config.log, None if config.drive.kind == "rigid" else config.drive.gear_ratio
+
+
+def _file(path: Path, chain: list[Path]) -> tuple[dict[str, Any], dict[Key, str]]:
+    """A TOML file with what it includes; `chain` are the files that led here. Files that it names become absolute."""
+    data = _load(path)
+    tune = data.get("tune")
+    for table in (data.get("excitation"), tune.get("holdout") if isinstance(tune, dict) else None):
+        if isinstance(table, dict) and isinstance(table.get("file"), str):
+            table["file"] = str((path.parent / table["file"]).resolve())
+    return _included(data, str(path), path.parent, [*chain, path.resolve()])
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -96,37 +100,23 @@ def _load(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: not valid TOML: {error}") from None
 
 
-def _localise(data: dict[str, Any], folder: Path) -> None:
-    """Make files that a config names relative to the folder it lies in."""
-    tune = data.get("tune")
-    for table in (data.get("excitation"), tune.get("holdout") if isinstance(tune, dict) else None):
-        if isinstance(table, dict) and isinstance(table.get("file"), str):
-            table["file"] = str((folder / table["file"]).resolve())
-
-
-def _included(data: dict[str, Any], name: str, folder: Path, chain: list[Path], origins: dict[Key, str]) -> dict[str, Any]:
-    """The data with the files that it includes (from `folder`) merged in; `name` is what messages call it.
-
-    `chain` are the files that led here; `origins` gets the file that each key came from.
-    """
+def _included(data: dict[str, Any], name: str, folder: Path, chain: list[Path]) -> tuple[dict[str, Any], dict[Key, str]]:
+    """The data with the files that it includes (from `folder`) merged in, and the file that each key came from."""
     files = data.pop("include", [])
     files = [files] if isinstance(files, str) else files
     if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
         raise InputError(f"{name}: include: should be a file name or an array of them, not {brief(files)}")
     merged: dict[str, Any] = {}
+    origins: dict[Key, str] = {}
     for file in files:
         path = folder / file
         if not path.exists():
             raise InputError(f"{name}: include: {path}: no such file")
         if path.resolve() in chain:
             raise InputError(f"{name}: include: {path} includes this file in turn; files should not include one another")
-        inner = _load(path)
-        _localise(inner, path.parent)
-        found: dict[Key, str] = {}
-        inner = _included(inner, str(path), path.parent, [*chain, path.resolve()], found)
-        _merge(merged, inner, origins, {key: str(path) for key in _keys(inner)} | found)
-    _merge(merged, data, origins, dict.fromkeys(_keys(data), name))
-    return merged
+        _merge(merged, *_file(path, chain), origins)
+    _merge(merged, data, dict.fromkeys(_keys(data), name), origins)
+    return merged, origins
 
 
 def _keys(data: Any, key: Key = ()) -> Iterator[Key]:
@@ -137,7 +127,7 @@ def _keys(data: Any, key: Key = ()) -> Iterator[Key]:
         yield from _keys(value, (*key, name))
 
 
-def _merge(into: dict[str, Any], data: dict[str, Any], origins: dict[Key, str], new: dict[Key, str], key: Key = ()) -> None:
+def _merge(into: dict[str, Any], data: dict[str, Any], new: dict[Key, str], origins: dict[Key, str], key: Key = ()) -> None:
     """Put the keys of `data` over those of `into`, and `new` over their `origins`."""
     for name, value in data.items():
         here, old = (*key, name), into.get(name)
@@ -148,21 +138,21 @@ def _merge(into: dict[str, Any], data: dict[str, Any], origins: dict[Key, str], 
             and isinstance(value, dict)
             and all(value.get(tag, old.get(tag)) == old.get(tag) for tag in ("kind", "law"))
         ):
-            _merge(old, value, origins, new, here)
+            _merge(old, value, new, origins, here)
         else:
             into[name] = copy.deepcopy(value)
             origins |= {place: file for place, file in new.items() if place[: len(here)] == here}
 
 
-def _validate(data: dict[str, Any], name: str = "", origins: Mapping[Key, str] | None = None) -> Config:
+def _validate(name: str, data: dict[str, Any], origins: Mapping[Key, str]) -> Config:
     try:
         return Config.model_validate(data)
     except ValidationError as error:
         place, text = _describe(error)
         # the file that the key came from, where that is not the one asked for
-        while place and origins is not None and place not in origins:
+        while place and place not in origins:
             place = place[:-1]
-        name = name if origins is None else origins.get(place, name)
+        name = origins.get(place, name)
         raise InputError(f"{name}: {text}" if name else text) from None
 
 
@@ -207,4 +197,4 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
         if type(target.get(key)) is int and isinstance(value, float) and value.is_integer():
             value = int(value)  # a whole number from start, stop and num
         target[key] = value
-    return _validate(data)
+    return _validate("", data, {})
