@@ -266,6 +266,7 @@ def forces_of(candidates: Sequence[Candidate], signals: MotionTorques, spare: in
 def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direction: jax.Array) -> jax.Array:
     """Torques of effects of one name, leaves of shape (effects,); shape (effects, samples, sides + 1)."""
     drive, sides = experiment.drive, experiment.sides
+    along = Path(part.time, part.torque, part.position, part.velocity)
 
     def one(effect: AbstractEffect) -> jax.Array:
         found = jnp.zeros((len(part.time), len(sides) + 1))
@@ -273,13 +274,11 @@ def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direct
         if place == "transmission":
             gear = tuple(one for one in experiment.effects if one.place == place and one.name != effect.name)
             both = (with_effects(experiment, some) for some in (gear, (*gear, effect)))
-            before, after = (
-                one.plant.transmitted(part.position, part.velocity, effect_path(one, Path.of(part))[0]) for one in both
-            )
+            before, after = (one.plant.transmitted(part.position, part.velocity, effect_path(one, along)[0]) for one in both)
             found = found.at[:, 0].set(before[0] - after[0])
             found = found.at[:, 1].set(after[1] * after[0] - before[1] * before[0])
             return found * part.weight[:, None]
-        (state,), acting = effect_path(with_effects(experiment, (effect,)), Path.of(part))
+        (state,), acting = effect_path(with_effects(experiment, (effect,)), along)
         if place == "actuator":
             found = found.at[:, -1].set(acting - part.torque)
         else:
@@ -296,7 +295,7 @@ def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direct
 def _needed(experiment: Experiment, part: Part) -> dict[str, jax.Array]:
     """Torque on each side that its motion does not take up, dry friction left out, N m."""
     plant = experiment.plant
-    states, torque = effect_path(experiment, Path.of(part))
+    states, torque = effect_path(experiment, Path(part.time, part.torque, part.position, part.velocity))
     acting = plant.torques(part.position, part.velocity, states, torque, part.time)
     found = {}
     for side in experiment.sides:

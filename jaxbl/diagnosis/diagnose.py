@@ -17,8 +17,7 @@ from jaxbl.config import Config
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
 from jaxbl.files import plain
-from jaxbl.identification.logs import Logs, arrays, gains_for
-from jaxbl.identification.task import stage_counter
+from jaxbl.identification.logs import Logs, arrays, gains_for, stage_counter
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress

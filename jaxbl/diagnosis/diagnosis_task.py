@@ -9,8 +9,7 @@ import numpy as np
 
 from jaxbl.config import Config, read_model
 from jaxbl.errors import InputError
-from jaxbl.identification.logs import Logs, read_logs
-from jaxbl.identification.task import LogTask
+from jaxbl.identification.logs import Logs, LogTask, read_logs
 from jaxbl.records import Record
 
 HELD_OUT = 0.25

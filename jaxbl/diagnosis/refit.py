@@ -146,7 +146,7 @@ class _Refiner:
         fit = Fit(
             jnp.asarray(point.theta), PlantState(dict.fromkeys(self.experiment.sides, jnp.zeros(1)), {}, ()),
             jnp.asarray(np.concatenate(residual)[None]), jnp.asarray(np.concatenate(jacobian)[None]),
-            jnp.asarray(0.0), jnp.asarray(0), jnp.asarray(True),
+            jnp.asarray(0.0), jnp.asarray(True),
         )  # fmt: skip
         found = _spread(fit)
         # samples that only fill up

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from scipy.ndimage import gaussian_filter1d
 
 from jaxbl.drive.plant import States
-from jaxbl.identification.regression import Kinematics, Path, effect_path
+from jaxbl.identification.regression import Kinematics, effect_path
 from jaxbl.identification.segments import Segment
 from jaxbl.identification.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, running_sum, smooth
 from jaxbl.simulate import Experiment
@@ -154,7 +154,7 @@ class _Acting(NamedTuple):
 
 
 def _acting(experiment: Experiment, side: str, part: Kinematics, smoothed: Smoothed) -> _Acting:
-    states, torque = effect_path(experiment, Path.of(part), from_rest=True)
+    states, torque = effect_path(experiment, part, from_rest=True)
     given = part.position, part.velocity, states, torque, part.time, part.transmitted
     total, level = jax.vmap(lambda *at: _torque(experiment, side, *at))(*given)
     inertia, velocity, acceleration = experiment.plant.inertia(side), part.velocity[side], part.acceleration[side]
@@ -190,7 +190,7 @@ def _side(
     experiment: Experiment, side: str, part: Kinematics, smoothed: dict[str, Smoothed]
 ) -> tuple[Array, dict[str, Array], dict[str, Array]]:
     """Missing torque, and the derivatives of the modelled torque by the positions and velocities, along a part."""
-    states, torque = effect_path(experiment, Path.of(part), from_rest=True)
+    states, torque = effect_path(experiment, part, from_rest=True)
     given = part.position, part.velocity, states, torque, part.time, part.transmitted
     acting = _acting(experiment, side, part, smoothed[side])
     period = (part.time[-1] - part.time[0]) / (len(part.time) - 1)
@@ -219,7 +219,7 @@ def _transmission(
     def of(position: dict, velocity: dict, states: States) -> Array:
         return experiment.plant.transmitted(position, velocity, states)[0]
 
-    given = part.position, part.velocity, effect_path(experiment, Path.of(part), from_rest=True)[0]
+    given = part.position, part.velocity, effect_path(experiment, part, from_rest=True)[0]
     slopes = jax.vmap(jax.jacfwd(of, argnums=(0, 1)))(*given)
     return part.transmitted - jax.vmap(of)(*given), *slopes
 

@@ -13,13 +13,11 @@ from jaxbl.drive.parameters import leaf_paths, set_leaves
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 
-from .intervals import UNSEEN, Refusal, Spread, interval, spread
-from .logs import decimation, unit_on
-from .profile import Profile
+from .intervals import UNSEEN, Profile, Refusal, Spread, interval, spread
+from .logs import LogTask, decimation, unit_on
 from .regression import Kinematics, errors, regress
 from .search import Found
 from .segments import long_enough, reading_noise, segments_of, windows_of
-from .task import LogTask
 from .trajectory import Fit, Free, projected_residual
 
 
@@ -32,14 +30,7 @@ def torque_errors(
 
 
 def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Experiment, samples: int) -> dict[str, Any]:
-    """How well the numbers found serve another log, beside the nominal ones.
-
-    Args:
-        config: the study.
-        record: the other log.
-        nominal, fitted: the model before and after.
-        samples: length of the windows, as far as the log has it.
-    """
+    """How well the numbers found serve another log, beside the nominal ones, in windows of `samples` where it is so long."""
     period = jnp.asarray(record.sample_period)
     rebased = [eqx.tree_at(lambda e: e.run.sample_period, one, period) for one in (nominal, fitted)]
     segments = segments_of(record, nominal.sides)
@@ -80,10 +71,8 @@ def _derived(experiment: Experiment, found: Found) -> dict[str, Any]:
     derived = {}
     for name, value in values.items():
         error = float(jnp.sqrt(slopes[name] @ found.spread.covariance @ slopes[name]))
-        derived[f"transmission.{name}"] = {
-            "value": float(value), "standard_error": error,
-            "interval": [float(value) - 1.96 * error, float(value) + 1.96 * error],
-        }  # fmt: skip
+        reach = [float(value) - 1.96 * error, float(value) + 1.96 * error]
+        derived[f"transmission.{name}"] = {"value": float(value), "standard_error": error, "interval": reach}
     return derived
 
 
@@ -143,14 +132,7 @@ def by_trajectories(found: Found, record: Record) -> dict[str, Any]:
 
 
 def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mapping[str, Profile]) -> dict[str, Any]:
-    """The summary but for `method`, `torque`, `gains` and `holdout`.
-
-    Args:
-        task: study and log.
-        fitted: the model with the numbers found.
-        found: the fit.
-        profiles: of the numbers, by path, if they were asked for.
-    """
+    """The summary but for `method`, `torque`, `gains` and `holdout`; profiles by path, if they were asked for."""
     noise = {side: float(one) for side, one in found.windows.noise.items()}
     record, width = task.record, np.asarray(found.spread.covariance)
     deviation = np.sqrt(np.diag(width))
@@ -179,7 +161,8 @@ def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mappin
             "matrix": width / np.outer(deviation, deviation),
         },
         "refused": [
-            {"direction": one.direction, "why": _why(one), "relative_deviation": one.deviation} for one in found.refused
+            {"direction": one.direction, "why": _why(one, fitted), "relative_deviation": one.deviation}
+            for one in found.refused
         ],
         "held": found.held,
         "condition": found.condition,
@@ -188,25 +171,27 @@ def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mappin
     }
 
 
-_HELP = {
-    "inertia": "faster changes of torque",
-    "viscous": "a wider range of speeds",
-    "stiffness": "larger torques through the gear, near its resonance",
-    "half_gap": "reversals that cross the gap",
-    "dead_zone": "reversals that cross the gap",
-    "slope": "slow passages through the gap",
-    "torque": "slow motion with reversals",
-    "relative": "a load or an inertia that is known",
+_SHOWN_BY = {
+    "kg m²": "faster changes of torque",
+    "N m s/rad": "a wider range of speeds",
+    "N m/rad": "larger torques through the gear, near its resonance",
+    "rad": "reversals that cross the gap",
+    "1/rad": "slow passages through the gap",
+    "N m": "slow motion with reversals",
+    "": "a load or an inertia that is known",
 }
+"""Unit of a number -> what motion, or what else, would show it."""
 
 
-def _why(refusal: Refusal) -> str:
-    names = list(refusal.direction)
+def _why(refusal: Refusal, experiment: Experiment) -> str:
+    names, about = list(refusal.direction), leaf_paths(experiment)
     if len(names) == 1:
         text = f"this log hardly depends on {names[0]}"
     else:
         text = "this log depends hardly on these changing together, by the shares given"
-    keys = dict.fromkeys(_HELP[key] for path in names for key in _HELP if path.endswith(key))
-    helps = f"; what would help: {', or '.join(keys)}" if keys else ""
+    # angles of effects that repeat with position have no motion of their own
+    units = [about[path].unit for path in names if about[path].role is None or about[path].role.kind != "angle"]
+    shown_by = dict.fromkeys(_SHOWN_BY[unit] for unit in units if unit in _SHOWN_BY)
+    helps = f"; what would help: {', or '.join(shown_by)}" if shown_by else ""
     size = f"{100.0 * refusal.deviation:.0f} %" if refusal.deviation < 100.0 else "anything"
     return f"{text}: it leaves {size} open (standard deviation){helps}"

@@ -21,12 +21,11 @@ from jaxbl.records import Record
 from jaxbl.workers import Progress
 
 from .identification_summary import by_regression, by_trajectories, on_holdout, summary_of, torque_errors
+from .intervals import profile
 from .log_columns import columns_of, observer_chain
-from .logs import Logs, arrays, decimation, default_paths, gains_for, on_record, read_logs
-from .profile import profile
-from .search import ParameterSearch, Settings
+from .logs import Logs, LogTask, arrays, decimation, default_paths, gains_for, on_record, read_logs, stage_counter
+from .search import ParameterSearch
 from .segments import long_enough, segments_of
-from .task import LogTask, stage_counter
 from .trajectory import free_parameters
 
 
@@ -103,11 +102,7 @@ _STAGES = 6
 
 
 def run_identification(task: LogTask, progress: Progress | None = None) -> Identification:
-    """Do what :func:`read_identification_task` read.
-
-    Args:
-        task: what to do.
-        progress: called with finished and total stages after each.
+    """Do what :func:`read_identification_task` read; `progress` is called with finished and total stages after each.
 
     Raises:
         InputError: a number that cannot be fitted, or a log that the model cannot follow.
@@ -122,8 +117,7 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
         segments = segments_of(record, nominal.sides)
         done()
         rest = config.log.initial_state == "rest"
-        how = Settings(settings.method, settings.window, settings.starts, settings.spread, settings.seed, rest)
-        found = ParameterSearch(nominal, segments, how, str(record.path)).run(free)
+        found = ParameterSearch(nominal, segments, settings, rest=rest, name=str(record.path)).run(free)
         done()
         values = {one.path: float(one.value(found.fit.theta[i])) for i, one in enumerate(found.free)}
         fitted = set_leaves(nominal, arrays(values))

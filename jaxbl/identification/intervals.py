@@ -1,6 +1,9 @@
 """How well fitted numbers are known: covariance with correlated residuals, intervals, what a record does not show.
 
-References: W. Newey, K. West, Econometrica 55 (1987); D. Andrews, Econometrica 59 (1991), for the bandwidth.
+Profile-likelihood intervals say how far one number can go before the fit, all others following, becomes too bad: right where
+the fit is not quadratic over the width of an interval, at the price of a few fits for each end.
+References: W. Newey, K. West, Econometrica 55 (1987); D. Andrews, Econometrica 59 (1991), for the bandwidth; D. Bates,
+D. Watts, Nonlinear Regression Analysis (1988), 6.1; D. Venzon, S. Moolgavkar, Appl. Stat. 37 (1988).
 """
 
 from collections.abc import Sequence
@@ -12,11 +15,19 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import stats
 
+from jaxbl.simulate import Experiment
+
 from .smoother import running_sum
-from .trajectory import Fit, Free
+from .trajectory import Fit, Free, Windows, fits
 
 UNSEEN = 0.5
 """Relative standard deviation beyond which a direction counts as not shown by the record."""
+_PASSES = 4
+"""Points on each side of the best value: as the root of the deviance is nearly straight, the last is close to the limit."""
+_FURTHEST = 3.0
+"""Largest step of theta from the best value: a factor of e^3."""
+_MOST_STEPS = 15
+"""Of the solver at each point: it starts where the one before ended."""
 
 
 class Spread(NamedTuple):
@@ -27,14 +38,12 @@ class Spread(NamedTuple):
         information: J^T J over the residuals' variance, shape (parameters, parameters).
         variance: mean square of the whitened residuals; 1 where noise alone is left.
         inflation: factor on the standard errors by the correlation of the residuals, shape (parameters,).
-        bandwidth: samples over which the residuals' correlation is summed.
     """
 
     covariance: Float[Array, "parameters parameters"]
     information: Float[Array, "parameters parameters"]
     variance: Float[Array, ""]
     inflation: Float[Array, " parameters"]
-    bandwidth: Float[Array, ""]
 
 
 @eqx.filter_jit
@@ -53,8 +62,7 @@ def spread(fit: Fit) -> Spread:
         windows * samples, parameters
     )
     variance = jnp.sum(fit.residual**2) / freedom
-    middle, bandwidth = _long_run(scores)
-    middle = middle * fit.residual.size / freedom
+    middle = _long_run(scores) * fit.residual.size / freedom
     inverse = _pseudo_inverse(normal / jnp.outer(size, size))
     plain = variance * inverse / jnp.outer(size, size)
     sandwich = inverse @ middle @ inverse / jnp.outer(size, size)
@@ -62,7 +70,7 @@ def spread(fit: Fit) -> Spread:
     # elimination of the initial states leaves a little negative correlation behind: nothing to gain confidence from
     more = jnp.maximum(1.0 / inflation, 1.0)
     covariance = sandwich * jnp.outer(more, more)
-    return Spread(covariance, normal / variance, variance, inflation * more, bandwidth)
+    return Spread(covariance, normal / variance, variance, inflation * more)
 
 
 def _pseudo_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -73,8 +81,8 @@ def _pseudo_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return (vectors * jnp.where(kept, 1.0 / jnp.where(kept, values, 1.0), 0.0)[None, :]) @ vectors.T
 
 
-def _long_run(scores: Float[Array, "samples parameters"]) -> tuple[Array, Array]:
-    """Sum of the autocovariances of a series under Bartlett's weights, times its length, and the bandwidth."""
+def _long_run(scores: Float[Array, "samples parameters"]) -> Float[Array, "parameters parameters"]:
+    """Sum of the autocovariances of a series under Bartlett's weights, times its length."""
     count = len(scores)
     square = jnp.sum(scores**2, axis=0)
     rho = jnp.sum(scores[1:] * scores[:-1], axis=0) / jnp.where(square > 0.0, square, 1.0)
@@ -88,12 +96,12 @@ def _long_run(scores: Float[Array, "samples parameters"]) -> tuple[Array, Array]
     total = jnp.concatenate([jnp.zeros((1, scores.shape[1])), running_sum(scores)])
     last = jnp.arange(2 * count)
     sums = total[jnp.clip(last, 0, count)] - total[jnp.clip(last - length, 0, count)]
-    return sums.T @ sums / length, length
+    return sums.T @ sums / length
 
 
-def interval(one: Free, theta: float, deviation: float, level: float = 0.95) -> tuple[float, float]:
-    """Confidence interval of a value, from its theta; never below zero where the value must be positive."""
-    reach = stats.norm.ppf(0.5 + 0.5 * level) * deviation
+def interval(one: Free, theta: float, deviation: float) -> tuple[float, float]:
+    """95 % interval of a value, from its theta; never below zero where the value must be positive."""
+    reach = stats.norm.ppf(0.5 + 0.5 * 0.95) * deviation
     low, high = (float(one.value(theta + side * reach)) for side in (-1.0, 1.0))
     return min(low, high), max(low, high)
 
@@ -122,3 +130,73 @@ def refusals(free: Sequence[Free], found: Spread) -> tuple[list[Refusal], float]
             shown = {one.path: float(x) for one, x in zip(free, vector, strict=True) if abs(x) >= 0.1}
             refused.append(Refusal(shown, float(deviation)))
     return refused, condition
+
+
+class Profile(NamedTuple):
+    """Profile of one number.
+
+    Attributes:
+        interval: where the deviance reaches its limit; an end is infinite (0 for positive numbers) where it does not within
+            a factor of e^3.
+        values: that were tried, in order, shape (n,).
+        deviance: increase of twice the negative log-likelihood there, correlation of the residuals counted, shape (n,).
+    """
+
+    interval: tuple[float, float]
+    values: np.ndarray
+    deviance: np.ndarray
+
+
+def profile(experiment: Experiment, free: Sequence[Free], windows: Windows, best: Fit, width: Spread) -> dict[str, Profile]:
+    """Profile every fitted number, for intervals of 95 %.
+
+    The likelihood counts residuals as many times as they are independent: its curvature is that of the covariance of
+    :func:`spread`.
+    """
+    count, limit = len(free), float(stats.chi2.ppf(0.95, 1))
+    centre, covariance = np.asarray(best.theta), np.asarray(width.covariance)
+    deviation = np.sqrt(np.diag(covariance))
+    # residuals of noise alone have variance 1; what one of them counts follows from its correlation with its neighbours
+    worth = float(width.variance) * np.asarray(width.inflation) ** 2
+
+    which = np.repeat(np.arange(count), 2)
+    sign = np.tile([-1.0, 1.0], count)
+    steps = np.sqrt(limit) * deviation[which]
+    others = covariance[:, which].T / np.diag(covariance)[which, None]
+    tried = [[(0.0, 0.0)] for _ in which]
+    for _ in range(_PASSES):
+        steps = np.minimum(steps, _FURTHEST)
+        thetas = centre[None, :] + (sign * steps)[:, None] * others
+        tries = fits(experiment, free, windows, thetas, _MOST_STEPS, np.eye(count, dtype=bool)[which])
+        cost, found = np.array([one.cost for one in tries]), np.array([one.theta for one in tries])
+        deviance = 2.0 * (cost - float(best.cost)) / worth[which]
+        for i, one in enumerate(deviance):
+            tried[i].append((float(steps[i]), float(one)))
+        # start the next fits where these ended
+        others = (found - centre[None, :]) / (sign * steps)[:, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            factor = np.sqrt(limit / np.maximum(deviance, 0.0))
+        steps = steps * np.clip(np.where(np.isfinite(factor), factor, 0.3), 0.3, 3.0)
+    return {one.path: _gathered(one, centre[i], tried[2 * i], tried[2 * i + 1], limit) for i, one in enumerate(free)}
+
+
+def _gathered(
+    one: Free, centre: float, below: list[tuple[float, float]], above: list[tuple[float, float]], limit: float
+) -> Profile:
+    lower, upper = (_end(points, limit) for points in (below, above))
+    points = sorted([(-step, d) for step, d in below] + [(step, d) for step, d in above[1:]])
+    low, high = (float(one.value(centre + step)) if np.isfinite(step) else step for step in (-lower, upper))
+    values = np.array([float(one.value(centre + step)) for step, _ in points])
+    return Profile((max(low, 0.0) if one.positive else low, high), values, np.array([d for _, d in points]))
+
+
+def _end(points: list[tuple[float, float]], limit: float) -> float:
+    """Step at which the root of the deviance, which is nearly straight, reaches that of its limit."""
+    steps, roots = (np.array(x) for x in zip(*sorted((s, np.sqrt(max(d, 0.0))) for s, d in points), strict=True))
+    goal = np.sqrt(limit)
+    beyond = np.flatnonzero(roots >= goal)
+    if len(beyond) == 0:
+        return np.inf if steps[-1] >= _FURTHEST else float(steps[-1] * goal / max(roots[-1], 1e-9))
+    at = int(beyond[0])
+    share = (goal - roots[at - 1]) / (roots[at] - roots[at - 1])
+    return float(steps[at - 1] + share * (steps[at] - steps[at - 1]))

@@ -17,17 +17,10 @@ from .segments import Segment
 
 
 def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, found: Found) -> dict[str, np.ndarray]:
-    """Columns of a log and its fit, each of shape (samples,).
+    """Columns of a log and its fit, each of shape (samples,); the segments cover all of the log.
 
-    Args:
-        record: the log.
-        segments: of the log; they cover all of it.
-        fitted: the model with the numbers found.
-        found: the fit.
-
-    Returns:
-        `t`, `u`, positions (`theta_e`, ...), `transmitted` where it was measured; `SIDE.velocity` and `SIDE.acceleration`
-        with their deviations; `SIDE.residual`, rad; the model's `torque` and `SIDE.effects`, N m.
+    `t`, `u`, positions (`theta_e`, ...), `transmitted` where it was measured; `SIDE.velocity` and `SIDE.acceleration` with
+    their deviations; `SIDE.residual`, rad; the model's `torque` and `SIDE.effects`, N m.
     """
     assert record.torque is not None
     columns = {"t": record.time, "u": record.torque}
@@ -44,17 +37,14 @@ def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, 
         column = np.full(len(record.time), np.nan)
         column[rows] = float(found.windows.noise[side]) * np.asarray(found.fit.residual[:, :, i]).ravel()
         columns[f"{side}.residual"] = column
-    return columns | _model_columns(fitted, segments)
-
-
-def _model_columns(fitted: Experiment, segments: Sequence[Segment]) -> dict[str, np.ndarray]:
-    """Torques by the fitted model at the smoothed motion, N m: the law's, and what effects take on each side."""
-    pieces: dict[str, list[np.ndarray]] = {}
-    for one in segments:
-        deviation = {side: smoothed.deviation(1) for side, smoothed in one.smoothed.items()}
-        for name, values in model_torques(fitted, one.kinematics, deviation).items():
-            pieces.setdefault("torque" if name == "transmission" else f"{name}.effects", []).append(np.asarray(values))
-    return {name: np.concatenate(values) for name, values in pieces.items()}
+    torques = [
+        model_torques(fitted, one.kinematics, {side: smoothed.deviation(1) for side, smoothed in one.smoothed.items()})
+        for one in segments
+    ]
+    for name in torques[0]:
+        column = "torque" if name == "transmission" else f"{name}.effects"
+        columns[column] = np.concatenate([np.asarray(one[name]) for one in torques])
+    return columns
 
 
 @eqx.filter_jit
@@ -80,23 +70,17 @@ def observer_chain(
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The paper's chain on the longest segment: observers, and the recursive identifier on their equivalent control.
 
-    Args:
-        experiment: with the observers' gains.
-        segments: of the log.
-        samples: of the log.
-
-    Returns:
-        Columns of shape (samples,), NaN elsewhere, and the identifier's numbers at the end, by name and side.
+    Columns of shape (samples,), NaN elsewhere, and the identifier's numbers at the end, by name and side.
     """
     longest = max(segments, key=len)
     readings = {side: jnp.asarray(longest.readings[side]) for side in experiment.sides}
     kept = _replayed(experiment, jnp.asarray(longest.torque), readings)
-    estimates = ("velocity_estimate", "torque_estimate")
-    leading = ["twist", *(f"{side}.{name}" for side in experiment.sides for name in estimates)]
-    columns = {}
-    for name in [*(name for name in leading if name in kept), *(name for name in kept if name not in leading)]:
-        columns[name] = np.full(samples, np.nan)
-        columns[name][longest.rows] = np.asarray(kept[name])
+    # compiled programs sort their results by name
+    estimates = [f"{side}.{name}" for side in experiment.sides for name in ("velocity_estimate", "torque_estimate")]
+    names = [*(["twist"] if "twist" in kept else []), *estimates]
+    columns = {name: np.full(samples, np.nan) for name in dict.fromkeys([*names, *kept])}
+    for name, column in columns.items():
+        column[longest.rows] = np.asarray(kept[name])
     found: dict[str, Any] = {}
     if experiment.transmission is not None:
         for name in experiment.transmission.truth():

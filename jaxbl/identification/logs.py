@@ -1,10 +1,14 @@
-"""What commands on measured logs share: reading, the study's experiment at a log's period, gains, units."""
+"""What commands on measured logs share: the task, reading, the study's experiment at a log's period, gains, units."""
 
 # arrays of numpy go where those of jax are asked for
 # pyright: reportArgumentType=false
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import hashlib
+import itertools
+import json
+from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 
 import equinox as eqx
@@ -17,12 +21,48 @@ from jaxbl.drive.parameters import get_leaf, leaf_paths
 from jaxbl.errors import InputError
 from jaxbl.records import POSITION_CHANNELS, Record, join, read_record
 from jaxbl.simulate import Experiment
+from jaxbl.workers import Progress
 
 from .observer_gains import ChosenGains, choose_gains
 from .segments import Segment
 from .trajectory import PHYSICAL, is_positive
 
 Logs = str | Path | Record | Sequence[str | Path | Record]
+
+
+@dataclasses.dataclass(frozen=True)
+class LogTask:
+    """A study and its log, and what is asked of them: everything that decides the result.
+
+    Attributes:
+        config: the study.
+        missing: tables that the study does not have (`excitation`, `observer.motor`, `observer.load`).
+        record: the log that numbers are fitted to.
+        holdout: what they are tried out on, or None.
+    """
+
+    config: Config
+    missing: frozenset[str]
+    record: Record
+    holdout: Record | None
+
+    @property
+    def identity(self) -> str:
+        """Hash of everything that decides the result."""
+        text = json.dumps([self.config.resolved(), sorted(self.missing), version("jaxbl")], sort_keys=True)
+        total = hashlib.sha256(text.encode())
+        for record in (self.record, self.holdout):
+            if record is not None:
+                total.update(str(record.segments).encode())
+                for values in (record.time, record.torque, *record.positions.values(), record.transmitted):
+                    total.update(b"" if values is None else np.ascontiguousarray(values).tobytes())
+        return total.hexdigest()[:16]
+
+
+def stage_counter(stages: int, progress: Progress | None) -> Callable[[], None]:
+    """A function to be called after each stage, which tells `progress` how many of them are finished."""
+    finished = itertools.count(1)
+    return lambda: progress(next(finished), stages) if progress is not None else None
 
 
 def read_logs(config: Config, logs: Logs, gear_tolerance: float = 0.0) -> Record:

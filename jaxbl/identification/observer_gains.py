@@ -43,12 +43,6 @@ class ChosenGains(NamedTuple):
     velocity_error: float
 
 
-def disturbance(experiment: Experiment, kinematics: Kinematics, side: str) -> Float[Array, " samples"]:
-    """Acceleration of a side that its observer's nominal model does not explain, rad/s^2."""
-    k = kinematics
-    return k.acceleration[side] - experiment.drive.acceleration(side, k.velocity[side], k.torque)
-
-
 @eqx.filter_jit
 def _misses(
     experiment: Experiment, kinematics: Kinematics, tried: dict[str, Array], readings: dict[str, Array]
@@ -72,21 +66,17 @@ def _misses(
 def choose_gains(
     experiment: Experiment, kinematics: Kinematics, measured: dict[str, Float[Array, " samples"]]
 ) -> dict[str, ChosenGains]:
-    """Choose the gains of all observers on a part of a record.
-
-    Args:
-        experiment: with array leaves.
-        kinematics: of the part, by the smoother.
-        measured: its positions in rad.
-    """
+    """Choose the gains of all observers on a part of a record, by the smoother's kinematics and the positions in rad."""
     count = min(len(kinematics.time), _MOST)
     k = jax.tree.map(lambda x: x[:count], kinematics)
     ends = slice(min(20, count // 10), count - min(20, count // 10))
-    f_plus = {side: float(jnp.max(jnp.abs(disturbance(experiment, k, side)[ends]))) for side in experiment.sides}
     alpha, factor = (jnp.asarray(x.ravel()) for x in np.meshgrid(_ALPHA, _LAMBDA))
-    tried = {}
-    for side, bound in f_plus.items():
-        bound = max(bound, np.finfo(float).tiny)
+    f_plus, tried = {}, {}
+    for side in experiment.sides:
+        # acceleration that the observer's nominal model does not explain
+        disturbance = k.acceleration[side] - experiment.drive.acceleration(side, k.velocity[side], k.torque)
+        f_plus[side] = float(jnp.max(jnp.abs(disturbance[ends])))
+        bound = max(f_plus[side], np.finfo(float).tiny)
         tried[f"observer.{side}.alpha"] = alpha * bound
         tried[f"observer.{side}.lambda"] = factor * least_lambda_exact(alpha * bound, jnp.full_like(alpha, bound))
 

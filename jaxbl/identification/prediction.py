@@ -8,7 +8,7 @@ References: L. Ljung, System Identification (1999), 7.4, 7.5; Y. Bar-Shalom, X.-
 """
 
 import dataclasses
-from functools import cache, partial
+from functools import cache
 
 import equinox as eqx
 import jax
@@ -52,19 +52,13 @@ def _sizes(experiment: Experiment, windows: Windows, gains: dict[str, Float[Arra
 
 
 def predictor(experiment: Experiment, windows: Windows) -> tuple[Windows, dict[str, float]]:
-    """The windows with the gain whose prediction errors are least, and their size as noise.
-
-    Args:
-        experiment: with the numbers found so far.
-        windows: the record.
-
-    Returns:
-        The windows, and each side's smoothness q h^3 / sigma^2.
-    """
+    """The windows with the gain whose prediction errors are least, and their size as noise; each side's q h^3 / sigma^2."""
     period = float(experiment.run.sample_period)
     count = len(windows.time)
     few = windows.only(np.unique(np.linspace(0, count - 1, min(count, _MOST_WINDOWS)).astype(int)))
-    gains_of = partial(_gains, period)
+
+    def gains_of(smoothness: list[float]) -> Float[Array, "n 2"]:
+        return jnp.asarray(np.stack([kalman_gain(one, period) for one in smoothness]))
 
     def best(candidates: list[dict[str, float]]) -> dict[str, float]:
         sizes = _sizes(experiment, few, {side: gains_of([c[side] for c in candidates]) for side in experiment.sides})
@@ -78,7 +72,3 @@ def predictor(experiment: Experiment, windows: Windows) -> tuple[Windows, dict[s
     windows = dataclasses.replace(windows, gain=gain)
     size = _sizes(experiment, windows, {side: one[None] for side, one in gain.items()})[0]
     return dataclasses.replace(windows, noise=dict(zip(experiment.sides, size, strict=True))), chosen
-
-
-def _gains(period: float, smoothness: list[float]) -> Float[Array, "n 2"]:
-    return jnp.asarray(np.stack([kalman_gain(one, period) for one in smoothness]))

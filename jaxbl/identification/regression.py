@@ -26,20 +26,29 @@ _PASSES = 3
 """Fits, each with the weights of the residuals of the one before."""
 
 
-class Kinematics(eqx.Module):
-    """Part of a record without gaps, with derivatives.
+class Path(eqx.Module):
+    """What effects see along a log.
 
     Attributes:
         time: s, shape (samples,).
-        torque: input in N m, its mean over the sampling period around each sample, shape (samples,).
-        position, velocity, acceleration: of each side; rad, rad/s, rad/s^2; shape (samples,).
-        transmitted: measured transmitted torque in N m, shape (samples,), or None.
+        torque: commanded, N m, shape (samples,).
+        position, velocity: of each side, rad and rad/s, shape (samples,).
     """
 
     time: Float[Array, " samples"]
     torque: Float[Array, " samples"]
     position: dict[str, Float[Array, " samples"]]
     velocity: dict[str, Float[Array, " samples"]]
+
+
+class Kinematics(Path):
+    """Part of a record without gaps, with derivatives; its torque is the mean over the period around each sample.
+
+    Attributes:
+        acceleration: of each side, rad/s^2, shape (samples,).
+        transmitted: measured transmitted torque in N m, shape (samples,), or None.
+    """
+
     acceleration: dict[str, Float[Array, " samples"]]
     transmitted: Float[Array, " samples"] | None = None
 
@@ -47,11 +56,8 @@ class Kinematics(eqx.Module):
 def kinematics_from(time: np.ndarray, torque: np.ndarray, states: Mapping[str, Any], transmitted: Any = None) -> Kinematics:
     """Kinematics of a part of a record.
 
-    Args:
-        time: even, s, shape (samples,).
-        torque: input held from each sample to the next, N m, shape (samples,).
-        states: position, velocity and acceleration of each side, shape (samples, 3).
-        transmitted: measured transmitted torque, N m, shape (samples,), or None.
+    The input torque is held from each sample to the next; `states` are position, velocity and acceleration of each side,
+    shape (samples, 3).
     """
     held = np.asarray(torque, float)
     before = np.concatenate([held[:1], held[:-1]])
@@ -79,7 +85,7 @@ def balance(experiment: Experiment, kinematics: Kinematics) -> dict[str, Balance
     A side's residual is the torque that the model has too much there: all torques less inertia times acceleration.
     """
     plant, drive, k = experiment.plant, experiment.drive, kinematics
-    states, torque = effect_path(experiment, Path.of(k), from_rest=True)
+    states, torque = effect_path(experiment, k, from_rest=True)
     found = {}
     if k.transmitted is not None and plant.transmission is not None:
         found["transmission"] = Balance(k.transmitted - _transmitted(plant, k, states), k.transmitted)
@@ -100,13 +106,10 @@ def model_torques(
 ) -> dict[str, Float[Array, " samples"]]:
     """Torques by a model at known kinematics, N m: `transmission`, and what effects take on each side that has any.
 
-    Args:
-        experiment: the model.
-        kinematics: of a part of a record.
-        deviation: standard deviation of the velocities, rad/s: dry friction goes through zero within it.
+    Within the standard deviation of the velocities, rad/s, dry friction goes through zero.
     """
     plant, k, found = experiment.plant, kinematics, {}
-    states, torque = effect_path(experiment, Path.of(k), from_rest=True)
+    states, torque = effect_path(experiment, k, from_rest=True)
     if plant.transmission is not None:
         found["transmission"] = _transmitted(plant, k, states)
     none = jnp.zeros_like(k.torque)
@@ -124,31 +127,11 @@ def model_torques(
 def transmitted(experiment: Experiment, k: Kinematics) -> Float[Array, " samples"]:
     """Transmitted torque by a model at known kinematics, N m."""
     gear = with_effects(experiment, tuple(one for one in experiment.effects if one.place == "transmission"))
-    return _transmitted(gear.plant, k, effect_path(gear, Path.of(k), from_rest=True)[0])
+    return _transmitted(gear.plant, k, effect_path(gear, k, from_rest=True)[0])
 
 
 def _transmitted(plant: Plant, k: Kinematics, states: States) -> Float[Array, " samples"]:
     return jax.vmap(plant.transmitted)(k.position, k.velocity, states)[0]
-
-
-class Path(NamedTuple):
-    """What effects see along a log.
-
-    Attributes:
-        time: s, shape (samples,).
-        torque: commanded, N m, shape (samples,).
-        position, velocity: of each side, rad and rad/s, shape (samples,).
-    """
-
-    time: Float[Array, " samples"]
-    torque: Float[Array, " samples"]
-    position: dict[str, Float[Array, " samples"]]
-    velocity: dict[str, Float[Array, " samples"]]
-
-    @classmethod
-    def of(cls, along: Any) -> "Path":
-        """Of anything that has these."""
-        return cls(along.time, along.torque, along.position, along.velocity)
 
 
 def settled(experiment: Experiment, torque: Float[Array, ""]) -> States:
@@ -209,36 +192,13 @@ def shortest(factor: int) -> int:
     return 1 if factor == 1 else 20 * factor + 1
 
 
-def regress(
-    experiment: Experiment,
-    free: Sequence[Free],
-    parts: Sequence[Kinematics],
-    factor: int,
-    theta: Float[Array, " parameters"] | None = None,
-) -> Fit:
-    """Least squares on all equations of motion, each weighted by what it leaves over.
-
-    Args:
-        experiment: with array leaves.
-        free: what is fitted.
-        parts: the record; parts shorter than :func:`shortest` must be left out.
-        factor: of the decimation.
-        theta: the start; left out, the nominal values.
-
-    Returns:
-        A fit whose residuals and derivatives have shape (1, samples, equations, ...), for
-        :func:`jaxbl.identification.intervals.spread`.
-    """
-    start = jnp.zeros(len(free)) if theta is None else theta
-    found, residual, jacobian, steps, ended = _regress(experiment, tuple(free), list(parts), factor, start)
-    return Fit(found, PlantState({}, {}, ()), residual[None], jacobian[None], 0.5 * jnp.sum(residual**2), steps, ended)
-
-
 @eqx.filter_jit
-def _regress(
-    experiment: Experiment, free: tuple[Free, ...], parts: list[Kinematics], factor: int, theta: Float[Array, " parameters"]
-) -> tuple[Array, Array, Array, Array, Array]:
-    """theta, residuals, their derivatives, steps, and whether the solver ended as it should."""
+def regress(experiment: Experiment, free: Sequence[Free], parts: Sequence[Kinematics], factor: int) -> Fit:
+    """Least squares on all equations of motion from the nominal values, each equation weighted by what it leaves over.
+
+    Parts shorter than :func:`shortest` for this decimation must be left out. Residuals and derivatives of the fit have shape
+    (1, samples, equations, ...), for :func:`jaxbl.identification.intervals.spread`.
+    """
     names = list(eqx.filter_eval_shape(balance, experiment, parts[0]))
 
     def left(theta: Array, _: None = None) -> Array:
@@ -253,11 +213,12 @@ def _regress(
     solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
 
     def again(_: Array, carry: tuple[Array, ...]) -> tuple[Array, ...]:
-        theta, _, steps, _ = carry
+        theta = carry[0]
         weights = 1.0 / jnp.maximum(jnp.sqrt(jnp.mean(left(theta) ** 2, axis=0)), jnp.finfo(float).tiny)
         solution = optx.least_squares(weighted, solver, theta, weights, max_steps=200, throw=False)
-        return solution.value, weights, steps + solution.stats["num_steps"], solution.result == optx.RESULTS.successful
+        return solution.value, weights, solution.result == optx.RESULTS.successful
 
-    first = theta, jnp.ones(len(names)), jnp.zeros((), int), jnp.asarray(True)
-    theta, weights, steps, ended = jax.lax.fori_loop(0, _PASSES, again, first)
-    return theta, left(theta) * weights[None, :], jax.jacfwd(left)(theta) * weights[None, :, None], steps, ended
+    first = jnp.zeros(len(free)), jnp.ones(len(names)), jnp.asarray(True)
+    theta, weights, ended = jax.lax.fori_loop(0, _PASSES, again, first)
+    residual, jacobian = left(theta) * weights[None, :], jax.jacfwd(left)(theta) * weights[None, :, None]
+    return Fit(theta, PlantState({}, {}, ()), residual[None], jacobian[None], 0.5 * jnp.sum(residual**2), ended)

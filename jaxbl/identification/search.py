@@ -1,12 +1,14 @@
 """From a record to numbers: several starts on short windows, the whole record from the best, and what it does not show."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.config.logs import IdentifyTable
 from jaxbl.errors import InputError
 from jaxbl.simulate import Experiment
 
@@ -30,29 +32,8 @@ NOISE_ALONE = 1.1
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
-    """How numbers are sought: as the study's `[identify]` and `[log]` tables say.
-
-    Attributes:
-        method: output error of free runs, or prediction error.
-        window: length of the windows in s, or None to choose it.
-        starts: number of starts.
-        spread: factor around the nominal numbers within which they lie.
-        seed: of the starts.
-        rest: whether the log begins at rest.
-    """
-
-    method: Literal["output_error", "prediction_error"]
-    window: float | None
-    starts: int
-    spread: float
-    seed: int
-    rest: bool
-
-
-@dataclasses.dataclass(frozen=True)
-class Found:
-    """The fit that was kept.
+class Fitted:
+    """A fit to all of a log.
 
     Attributes:
         free: numbers that were fitted.
@@ -60,10 +41,6 @@ class Found:
         spread: its covariance.
         windows: the record as it was fitted.
         firsts: row that each window begins with.
-        refused: directions that the record does not show.
-        held: numbers that were left at their nominal values therefore.
-        condition: of the information about all numbers asked for.
-        starts: cost and theta of each start, and whether it agrees with the best.
         smoothness: of each side's predictor; empty for output error.
         between: by how much theta differs between the window lengths that were tried; None if there was one.
     """
@@ -73,12 +50,8 @@ class Found:
     spread: Spread
     windows: Windows
     firsts: np.ndarray
-    refused: list[Refusal]
-    held: list[str]
-    condition: float
-    starts: list[dict[str, Any]]
     smoothness: dict[str, float]
-    between: np.ndarray | None
+    between: np.ndarray | None = None
 
     @property
     def samples(self) -> int:
@@ -86,15 +59,21 @@ class Found:
         return self.windows.torque.shape[1]
 
 
-class _Whole(NamedTuple):
-    """A fit to all of the record."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Found(Fitted):
+    """The fit that was kept, of the numbers that the log shows.
 
-    fit: Fit
-    spread: Spread
-    windows: Windows
-    firsts: np.ndarray
-    smoothness: dict[str, float]
-    between: np.ndarray | None = None
+    Attributes:
+        refused: directions that the record does not show.
+        held: numbers that were left at their nominal values therefore.
+        condition: of the information about all numbers asked for.
+        starts: cost and theta of each start, and whether it agrees with the best.
+    """
+
+    refused: list[Refusal]
+    held: list[str]
+    condition: float
+    starts: list[dict[str, Any]]
 
 
 def _nearest_turn(free: Sequence[Free], theta: np.ndarray) -> np.ndarray:
@@ -109,15 +88,18 @@ class ParameterSearch:
     Args:
         experiment: the nominal model, with array leaves; its sample period is that of the log.
         segments: of the log.
-        settings: how to search.
+        settings: `[identify]` of the study.
+        rest: whether the log begins at rest.
         name: of the log, for messages.
 
     Raises:
         InputError: windows of a length that the log does not allow.
     """
 
-    def __init__(self, experiment: Experiment, segments: Sequence[Segment], settings: Settings, name: str):
-        self.experiment, self.segments, self.settings, self.name = experiment, segments, settings, name
+    def __init__(
+        self, experiment: Experiment, segments: Sequence[Segment], settings: IdentifyTable, *, rest: bool, name: str
+    ):
+        self.experiment, self.segments, self.settings, self.rest, self.name = experiment, segments, settings, rest, name
         shortest, longest = min(map(len, segments)), max(map(len, segments))
         period = segments[0].period
         if settings.window is None:
@@ -141,28 +123,22 @@ class ParameterSearch:
             InputError: the model diverges.
         """
         theta, starts = self._coarse(free)
-        refused, held, first_condition = [], [], None
         kept = np.ones(len(free), bool)
-        while True:
-            found = self._whole(free, theta, kept)
-            left = tuple(one for one, is_kept in zip(free, kept, strict=True) if is_kept)
-            shown, condition = refusals(left, found.spread)
-            if first_condition is None:
-                refused, first_condition = shown, condition
-            if not shown or len(left) == 1:
-                break
-            worst = max(shown, key=lambda one: one.deviation)
+        found = self._whole(free, theta, kept)
+        refused, condition = refusals(found.free, found.spread)
+        held, left = [], refused
+        while left and len(found.free) > 1:
+            worst = max(left, key=lambda one: one.deviation)
             out = max(worst.direction, key=lambda path: abs(worst.direction[path]))
             held.append(out)
             kept &= np.array([one.path != out for one in free])
             theta = np.where(kept, theta, 0.0)
-        return Found(
-            left, found.fit, found.spread, found.windows, found.firsts, refused, held, first_condition, starts,
-            found.smoothness, found.between,
-        )  # fmt: skip
+            found = self._whole(free, theta, kept)
+            left, _ = refusals(found.free, found.spread)
+        return Found(**vars(found), refused=refused, held=held, condition=condition, starts=starts)
 
     def _cut(self, samples: int) -> tuple[Windows, np.ndarray]:
-        return windows_of(self.segments, self.experiment, samples, self.settings.rest)
+        return windows_of(self.segments, self.experiment, samples, self.rest)
 
     def _coarse(self, free: tuple[Free, ...]) -> tuple[np.ndarray, list[dict[str, Any]]]:
         """Best of several starts, on short windows from all over the record."""
@@ -187,13 +163,14 @@ class ParameterSearch:
         ]
         return _nearest_turn(free, found[best]), starts
 
-    def _whole(self, free: tuple[Free, ...], theta: np.ndarray, kept: np.ndarray) -> _Whole:
+    def _whole(self, free: tuple[Free, ...], theta: np.ndarray, kept: np.ndarray) -> Fitted:
         """Fit of the numbers that are kept to all of the record, in windows of the length that leaves them least open."""
 
         def fitted(windows: Windows) -> Fit:
             return fits(self.experiment, free, windows, theta[None], held=~kept[None])[0]
 
-        tried: list[tuple[float, _Whole]] = []
+        left = tuple(itertools.compress(free, kept))
+        tried: list[tuple[float, Fitted]] = []
         for samples in self.lengths:
             windows, firsts = self._cut(samples)
             smoothness: dict[str, float] = {}
@@ -205,14 +182,14 @@ class ParameterSearch:
             width = spread(found)
             size = float(jnp.sum(jnp.log(jnp.diag(width.covariance))))
             if np.isfinite(size):
-                tried.append((size, _Whole(found, width, windows, firsts, smoothness)))
+                tried.append((size, Fitted(left, found, width, windows, firsts, smoothness)))
         if not tried:
             raise InputError(f"{self.name}: the model diverges on this log; its nominal numbers should be nearer")
         best, *others = [one for _, one in sorted(tried, key=lambda pair: pair[0])]
         return _between(best, others[0]) if others else best
 
 
-def _between(best: _Whole, other: _Whole) -> _Whole:
+def _between(best: Fitted, other: Fitted) -> Fitted:
     """Count what another window length would have said, where the model leaves more than noise.
 
     Then each length finds other numbers, by more than noise does: free runs weigh what is missing by its duration.
@@ -223,4 +200,4 @@ def _between(best: _Whole, other: _Whole) -> _Whole:
         wide = width.covariance + jnp.asarray(np.outer(change, change))
         more = jnp.sqrt(jnp.diag(wide) / jnp.diag(width.covariance))
         width = width._replace(covariance=wide, inflation=width.inflation * more)
-    return best._replace(spread=width, between=change)
+    return dataclasses.replace(best, spread=width, between=change)

@@ -80,23 +80,18 @@ def long_enough(segments: Sequence[Segment], factor: int) -> list[Kinematics]:
 def windows_of(
     segments: Sequence[Segment], experiment: Experiment, samples: int, rest: bool = False
 ) -> tuple[Windows, np.ndarray]:
-    """A log in windows, segment by segment, and the row that each begins with.
+    """A log in windows of so many samples, segment by segment, and the row that each begins with.
 
-    Args:
-        segments: of the log.
-        experiment: says how effects begin.
-        samples: length of a window; segments that are shorter are left out.
-        rest: whether each segment begins at rest.
+    Shorter segments are left out; the experiment says how effects begin, `rest` whether each segment begins at rest.
     """
     pieces, firsts = [], []
     noise = reading_noise(segments)
     for one in segments:
         if len(one) < samples:
             continue
-        position = {side: motion.position for side, motion in one.smoothed.items()}
-        velocity = {side: motion.velocity for side, motion in one.smoothed.items()}
-        along = Path(jnp.asarray(one.time), jnp.asarray(one.torque), position, velocity)
-        start = PlantState(position, velocity, effect_path(experiment, along)[0])
+        k = one.kinematics
+        along = Path(k.time, jnp.asarray(one.torque), k.position, k.velocity)
+        start = PlantState(k.position, k.velocity, effect_path(experiment, along)[0])
         pieces.append(cut(one.torque, one.readings, one.period, start, noise, samples, float(one.time[0]), rest))
         firsts.append(one.rows.start + samples * np.arange(len(one) // samples))
     return Windows.join(pieces), np.concatenate(firsts)

@@ -122,21 +122,24 @@ def _first_state(position: Array, smoothness: Array) -> tuple[Array, Array]:
     return turned * (last.state + gain * last.innovation), _SPREAD**2 * covariance * jnp.outer(turned, turned)
 
 
-def _fit(position: Array, unit: Array, known: bool) -> tuple[Array, Array]:
-    """Smoothness q h^5 / sigma^2 and sigma of largest likelihood; `unit` is a first guess of sigma, or sigma itself."""
+def _fit(position: Array) -> tuple[Array, Array]:
+    """Smoothness q h^5 / sigma^2 and sigma of largest likelihood."""
+    # third differences of white noise have variance 20 sigma^2; smooth motion adds little to their median
+    third = jnp.diff(position, n=3)
+    median = jnp.median(jnp.abs(third)) / 0.6745
+    # more than half of a counter's readings may stand still
+    guess = jnp.where(median > 0.0, median, jnp.sqrt(jnp.mean(third**2))) / jnp.sqrt(20.0)
+    unit = jnp.maximum(guess, 1e-9 * jnp.ptp(position) + jnp.finfo(position.dtype).tiny)
     scaled = (position - position[0]) / unit
 
     def value(log_smoothness: Array) -> tuple[Array, Array]:
-        """Log-likelihood, concentrated where the noise is not known, and the noise over the unit."""
+        """Log-likelihood at the best noise, and that noise over the unit."""
         # the filter's gains do not depend on the unit, only its start does
         forward = _filter(scaled, jnp.exp(log_smoothness))
         # the first samples find the state
         e, s = forward.innovation[3:], forward.variance[3:]
-        square, sizes = jnp.sum(e**2 / s), jnp.sum(jnp.log(s))
-        if known:
-            return -0.5 * (square + sizes), jnp.ones_like(square)
-        variance = square / len(e)
-        return -0.5 * (len(e) * jnp.log(variance) + sizes), jnp.sqrt(variance)
+        variance = jnp.sum(e**2 / s) / len(e)
+        return -0.5 * (len(e) * jnp.log(variance) + jnp.sum(jnp.log(s))), jnp.sqrt(variance)
 
     def zoom(_: Array, given: tuple[Array, ...]) -> tuple[Array, ...]:
         low, high, _ = given
@@ -169,15 +172,11 @@ def _smoothed(position: Array, smoothness: Array, noise: Array, period: Array) -
     unit = noise * period ** jnp.array([0.0, -1.0, -2.0])
     state = state * unit[None, :]
     state = state.at[:, 0].add(position[0])
-    return Smoothed(
-        state,
-        covariance * jnp.outer(unit, unit)[None],
-        noise,
-        smoothness * noise**2 / period**5,
-        forward.innovation / jnp.sqrt(forward.variance),
-    )
+    innovations = forward.innovation / jnp.sqrt(forward.variance)
+    return Smoothed(state, covariance * jnp.outer(unit, unit)[None], noise, smoothness * noise**2 / period**5, innovations)
 
 
+@jax.jit
 def smooth(
     position: Float[Array, " samples"], period: float, *, noise: float | None = None, jerk: float | None = None
 ) -> Smoothed:
@@ -186,28 +185,13 @@ def smooth(
     Args:
         position: readings in rad (or m), at least 8 of them.
         period: sampling period in s.
-        noise: standard deviation of the readings' noise, quantisation included, in rad; left out, by maximum likelihood.
-        jerk: spectral density of the jerk in rad^2/s^5; left out, by maximum likelihood.
+        noise: standard deviation of the readings' noise, quantisation included, in rad.
+        jerk: spectral density of the jerk in rad^2/s^5; without it and the noise both are found by maximum likelihood.
     """
-    return _smooth(position, period, noise, jerk)
-
-
-@jax.jit
-def _smooth(position: Array, period: Array, noise: Array | None, jerk: Array | None) -> Smoothed:
     position = jnp.asarray(position, float)
-    if noise is None:
-        # third differences of white noise have variance 20 sigma^2; smooth motion adds little to their median
-        third = jnp.diff(position, n=3)
-        median = jnp.median(jnp.abs(third)) / 0.6745
-        # more than half of a counter's readings may stand still
-        guess = jnp.where(median > 0.0, median, jnp.sqrt(jnp.mean(third**2))) / jnp.sqrt(20.0)
-        unit = jnp.maximum(guess, 1e-9 * jnp.ptp(position) + jnp.finfo(position.dtype).tiny)
+    if noise is None or jerk is None:
+        smoothness, sigma = _fit(position)
     else:
-        unit = jnp.asarray(noise, float)
-    if jerk is None or noise is None:
-        smoothness, noise_ = _fit(position, unit, noise is not None)
-        if jerk is not None:
-            smoothness = jnp.asarray(jerk * period**5) / noise_**2
-    else:
-        smoothness, noise_ = jnp.asarray(jerk * period**5) / unit**2, unit
-    return _smoothed(position, smoothness, noise_, jnp.asarray(period, float))
+        sigma = jnp.asarray(noise, float)
+        smoothness = jnp.asarray(jerk * period**5) / sigma**2
+    return _smoothed(position, smoothness, sigma, jnp.asarray(period, float))

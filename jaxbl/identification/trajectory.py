@@ -69,12 +69,7 @@ class Free(NamedTuple):
 
 
 def free_parameters(experiment: Experiment, paths: Sequence[str], torque: float) -> tuple[Free, ...]:
-    """Describe the numbers that dotted paths name.
-
-    Args:
-        experiment: holds their nominal values.
-        paths: e.g. `transmission.stiffness`.
-        torque: size of the input, N m: the scale of torques whose nominal value is zero.
+    """Describe the numbers that dotted paths name; the input's size, N m, is the scale of torques whose nominal value is 0.
 
     Raises:
         InputError: unknown path, one that no trajectory depends on, or a positive number without a value to start from.
@@ -164,7 +159,6 @@ class Fit(eqx.Module):
         jacobian: its derivative by theta, what initial states could explain projected out;
             shape (windows, samples, sides, parameters).
         cost: half the sum of squared residuals.
-        steps: iterations.
         converged: whether the solver met its tolerance.
     """
 
@@ -173,7 +167,6 @@ class Fit(eqx.Module):
     residual: Float[Array, "windows samples sides"]
     jacobian: Float[Array, "windows samples sides parameters"]
     cost: Float[Array, ""]
-    steps: Array
     converged: Array
 
     def only(self, which: np.ndarray) -> "Fit":
@@ -194,9 +187,10 @@ def _residual(experiment: Experiment, start: PlantState, window: Windows) -> Flo
 
 
 class _Eliminated(NamedTuple):
-    start: Array
+    """The initial state of a window, the residuals from there, shape (samples, sides), and what that state can explain."""
+
+    start: PlantState
     residual: Array
-    """At that start, shape (samples, sides)."""
     basis: Array
 
 
@@ -257,7 +251,7 @@ def _eliminate(experiment: Experiment, window: Windows, passes: int, rest: bool)
     basis, _ = jnp.linalg.qr(found.slope / jnp.where(seen, size, jnp.inf)[None, :])
     # of a column of zeros the decomposition makes any direction
     basis = jnp.where(seen[None, :], basis, 0.0)
-    return _Eliminated(found.start, found.value.reshape(-1, len(experiment.sides)), basis)
+    return _Eliminated(unravel(found.start), found.value.reshape(-1, len(experiment.sides)), basis)
 
 
 def _without(basis: Array, values: Array) -> Array:
@@ -276,7 +270,7 @@ def projected_residual(
 
     def one(window: Windows) -> tuple[Array, PlantState]:
         found = _eliminate(experiment, window, passes, rest)
-        return _without(found.basis, found.residual), ravel_pytree(window.start)[1](found.start)
+        return _without(found.basis, found.residual), found.start
 
     return jax.vmap(one, in_axes=(_MAPPED,))(windows)
 
@@ -288,14 +282,13 @@ def _sloped(
 
     def one(window: Windows) -> tuple[Array, PlantState, Array]:
         found = _eliminate(with_fitted(experiment, free, theta), window, _INNER, False)
-        start = ravel_pytree(window.start)[1](found.start)
 
         def residual(theta: Array) -> tuple[Array, Array]:
-            value = _residual(with_fitted(experiment, free, theta), start, window)
+            value = _residual(with_fitted(experiment, free, theta), found.start, window)
             return value, value
 
         slope, value = jax.jacfwd(residual, has_aux=True)(theta)
-        return _without(found.basis, value), start, _without(found.basis, slope)
+        return _without(found.basis, value), found.start, _without(found.basis, slope)
 
     return jax.vmap(one, in_axes=(_MAPPED,))(windows)
 
@@ -332,13 +325,7 @@ def _reduced(
     """As many residuals as numbers, and one, with the same cost, gradient and normal matrix as all of them.
 
     All columns of the derivative in one run, nothing kept along the trajectories, no decomposition of tall matrices.
-
-    Args:
-        experiment: nominal.
-        free: what is fitted.
-        windows: the record.
-        theta: where, shape (parameters,).
-        moving: 1 for numbers that are fitted, 0 for those that are held; shape (parameters,).
+    `moving` is 1 for numbers that are fitted, 0 for those that are held; shape (parameters,).
     """
     value, start, slope = _sloped(experiment, free, windows, theta)
     each = jnp.sum(value**2, axis=(1, 2))
@@ -373,14 +360,8 @@ def _solve(
     """Levenberg-Marquardt: the initial states of the best numbers so far are the guess of the next.
 
     Damped steps and trust region are optimistix's; the loop is our own, as each step needs those states and ends by the
-    residuals' variance.
-
-    Args:
-        point: least squares at a theta, from a guess of the initial states.
-        theta: the start.
-        guess: of the initial states there.
-        most_steps: tried at most.
-        count: of the residuals that the sum of squares is of.
+    residuals' variance. `point` is the least squares at a theta, from a guess of the initial states; the sum of squares is
+    that of `count` residuals.
     """
     descent, region = optx.DampedNewtonDescent(linear_solver=lx.QR()), optx.ClassicalTrustRegion()
     shapes = jax.eval_shape(point, theta, guess)
@@ -451,7 +432,7 @@ def fit(
         return jnp.sum(value**2, axis=(1, 2)), start
 
     def again(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        theta, guess, left, round, steps, converged, _ = carry
+        theta, guess, left, round, converged, _ = carry
         # a window's initial state may be the best of its neighbourhood only
         other, start = anew(theta)
         gained = (round == 0) | jnp.any(left - other > _GAINED * jnp.sum(left) / count)
@@ -462,30 +443,17 @@ def fit(
         found = _solve(reduced, theta, guess, jnp.where(on, most_steps, 0), count)
         theta = jnp.where((moving > 0.0) & on, found.theta, theta)
         left, converged = jnp.where(on, found.squares, left), jnp.where(on, found.converged, converged)
-        return theta, found.start, left, round + 1, steps + found.steps, converged, on & (rounds > 1)
+        return theta, found.start, left, round + 1, converged, on & (rounds > 1)
 
-    zero = jnp.zeros((), int)
-    first = theta, windows.start, jnp.zeros(len(windows.time)), zero, zero, jnp.asarray(False), jnp.asarray(True)
+    first = theta, windows.start, jnp.zeros(len(windows.time)), jnp.zeros((), int), jnp.asarray(False), jnp.asarray(True)
     # the solver and the search of initial states stand in the program once: it takes long to compile
-    best, guess, _, _, steps, converged, _ = jax.lax.while_loop(lambda carry: carry[-1], again, first)
+    best, guess, _, _, converged, _ = jax.lax.while_loop(lambda carry: carry[-1], again, first)
     value, start, jacobian = _sloped(experiment, free, dataclasses.replace(windows, start=guess), best)
-    return Fit(best, start, value, jacobian, 0.5 * jnp.sum(value**2), steps, converged)
+    return Fit(best, start, value, jacobian, 0.5 * jnp.sum(value**2), converged)
 
 
 _fit = eqx.filter_jit(fit)
-
-
-@eqx.filter_jit
-def _batch(
-    experiment: Experiment,
-    free: tuple[Free, ...],
-    windows: Windows,
-    thetas: Float[Array, "fits parameters"],
-    most_steps: Int[Array, ""],
-    held: Bool[Array, "fits parameters"],
-    rounds: Int[Array, ""],
-) -> Fit:
-    return jax.vmap(lambda theta, held: fit(experiment, free, windows, theta, most_steps, held, rounds))(thetas, held)
+_batch = eqx.filter_jit(eqx.filter_vmap(fit, in_axes=(None, None, None, 0, None, 0, None)))
 
 
 def fits(
@@ -500,29 +468,22 @@ def fits(
     """Fits from several starts, by one compiled program for all calls with a record of this shape and these numbers.
 
     Some at a time on an accelerator, one by one on a processor: that is no faster with many, and each of a batch would run
-    as long as the slowest.
-
-    Args:
-        experiment: as of :func:`fit`.
-        free: what is fitted.
-        windows: the record.
-        thetas: the starts, shape (fits, parameters).
-        most_steps: of the solver, each time.
-        held: which numbers stay at the start, shape (fits, parameters); none if left out.
-        rounds: as of :func:`fit`.
+    as long as the slowest. Arguments as of :func:`fit`, starts and held numbers of shape (fits, parameters).
     """
     held = np.zeros(thetas.shape, bool) if held is None else held
-    most = jnp.asarray(most_steps), jnp.asarray(rounds)
-    if jax.default_backend() == "cpu":
-        given = [(jnp.asarray(theta), jnp.asarray(still)) for theta, still in zip(thetas, held, strict=True)]
-        return [_fit(experiment, tuple(free), windows, theta, most[0], still, most[1]) for theta, still in given]
-    found: list[Fit] = []
-    for first in range(0, len(thetas), _AT_ONCE):
-        # which bounds memory; the last ones are filled up
-        which = np.minimum(first + np.arange(_AT_ONCE), len(thetas) - 1)
+
+    def fitted(which: Any, fit: Callable[..., Fit]) -> Fit:
         start, still = jnp.asarray(thetas[which]), jnp.asarray(held[which])
-        some = _batch(experiment, tuple(free), windows, start, most[0], still, most[1])
-        found += [jax.tree.map(lambda x, i=i: x[i], some) for i in range(min(_AT_ONCE, len(thetas) - first))]
+        return fit(experiment, tuple(free), windows, start, jnp.asarray(most_steps), still, jnp.asarray(rounds))
+
+    count = len(thetas)
+    if jax.default_backend() == "cpu":
+        return [fitted(i, _fit) for i in range(count)]
+    found: list[Fit] = []
+    for first in range(0, count, _AT_ONCE):
+        # which bounds memory; the last ones are filled up
+        some = fitted(np.minimum(first + np.arange(_AT_ONCE), count - 1), _batch)
+        found += [jax.tree.map(lambda x, i=i: x[i], some) for i in range(min(_AT_ONCE, count - first))]
     return found
 
 
@@ -536,17 +497,10 @@ def cut(
     first: float = 0.0,
     rest: bool = False,
 ) -> Windows:
-    """Cut part of a record into as many windows as fit into it.
+    """Cut part of a record into as many windows of so many samples as fit into it, shapes and units as of :class:`Windows`.
 
-    Args:
-        torque: input in N m, shape (samples,).
-        measured: positions in rad.
-        period: sampling period in s.
-        start: states at all samples (:class:`jaxbl.simulate.PlantState`, leaves of shape (samples,)).
-        noise: standard deviation of each side's readings in rad.
-        samples: length of a window.
-        first: time of the first sample, s.
-        rest: whether the part begins at rest.
+    `start` are the states at all samples, :class:`jaxbl.simulate.PlantState` with leaves of shape (samples,); `first` is the
+    time of the first sample, s; `rest` says whether the part begins at rest.
     """
     count = len(torque) // samples
     standing = np.arange(count) == (0 if rest else -1)

@@ -3,9 +3,9 @@
 from .inspection import Inspection as Inspection
 from .inspection import Judgement as Judgement
 from .inspection import inspect as inspect
-from .join import join as join
 from .reader import Findings as Findings
 from .reader import Record as Record
+from .reader import join as join
 from .reader import read_log_table as read_log_table
 from .reader import read_record as read_record
 from .table import POSITION_CHANNELS as POSITION_CHANNELS

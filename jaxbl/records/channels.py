@@ -32,10 +32,9 @@ class RawChannel(NamedTuple):
 
 
 def read_channels(file: LogFile, table: LogTable, stamps: TimeStamps) -> dict[str, RawChannel]:
-    """All channels of a log at the rows that are read: theta_e, theta_s, u, transmitted, as far as they were recorded.
+    """Those of theta_e, theta_s, u, transmitted that a log has, at the rows that are read.
 
-    Raises:
-        InputError: a column is missing, or its values contradict the `[log]` table.
+    InputError where a column is missing, or its values contradict the `[log]` table.
     """
     found: dict[str, RawChannel] = {}
     linear = False

@@ -40,11 +40,7 @@ class LogFile:
         return InputError(f"{self.path}: {text}")
 
     def name(self, column: str | int, channel: str = "") -> str | int:
-        """The name of a column that is given by name or number.
-
-        Raises:
-            InputError: there is no such column; the nearest is named.
-        """
+        """The name of a column that is given by name or number; InputError names the nearest where there is none."""
         if column in self.columns:
             return column
         names = list(self.columns)
@@ -61,16 +57,8 @@ class LogFile:
             )
         raise self.wrong(f"no column '{column}'; {nearest(column, map(str, names))}{key}")
 
-    def raw(self, column: str | int, channel: str = "") -> np.ndarray:
-        """A column as it stands, shape (rows,)."""
-        return np.asarray(self.columns[self.name(column, channel)])
-
     def numbers(self, column: str | int, channel: str = "") -> np.ndarray:
-        """A column of finite numbers, shape (rows,).
-
-        Raises:
-            InputError: no such column, or something else in it; the first such row is named, counted from 1.
-        """
+        """A column of finite numbers, shape (rows,); InputError names the first row, counted from 1, that holds none."""
         name = self.name(column, channel)
         given = self.columns[name]
         values = np.asarray(pd.to_numeric(pd.Series(given), errors="coerce"), dtype=float)

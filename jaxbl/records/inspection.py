@@ -72,20 +72,7 @@ class Inspection:
             "channels": {name: asdict(channel) for name, channel in found.channels.items()},
             "gear_ratio": self.gear_ratio,
             "gearing": None if found.gearing is None else asdict(found.gearing),
-            "dynamics": None
-            if dynamics is None
-            else {
-                "terms": {
-                    name: {
-                        "value": float(dynamics.values[i]),
-                        "standard_error": float(dynamics.errors[i]),
-                        "inflation": float(dynamics.inflation[i]) if math.isfinite(dynamics.inflation[i]) else None,
-                        "share": float(dynamics.shares[i]),
-                    }
-                    for i, name in enumerate(dynamics.names)
-                },
-                "residual": dynamics.residual,
-            },
+            "dynamics": None if dynamics is None else dynamics.to_dict(),
             "reversals": self.reversals,
             "identifiable": [asdict(judgement) for judgement in self.judgements],
             "notes": list(record.notes),

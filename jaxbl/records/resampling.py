@@ -43,8 +43,9 @@ def resampled(
     is too short for period and skews.
     """
     times, values, parts, begin = [], {name: [] for name in channels}, [], 0
-    for part, first in zip(segments.parts, segments.starts, strict=True):
+    for part in segments.parts:
         stamps = segments.times[part]
+        first = float(stamps[0])
         if not interpolate and not any(skews.values()):
             grid = first + period * np.arange(len(stamps), dtype=float)
         else:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,20 @@ class RigidFit:
     skew: float
     skew_error: float
     residual: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in `inspection.json`; an inflation without limit is null."""
+        columns = (x.tolist() for x in (self.values, self.errors, self.inflation, self.shares))
+        terms = {
+            name: {
+                "value": value,
+                "standard_error": error,
+                "inflation": inflation if np.isfinite(inflation) else None,
+                "share": share,
+            }
+            for name, value, error, inflation, share in zip(self.names, *columns, strict=True)
+        }
+        return {"terms": terms, "residual": self.residual}
 
 
 def direction_of(velocity: np.ndarray) -> np.ndarray:

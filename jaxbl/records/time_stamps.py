@@ -68,7 +68,6 @@ class Segments(NamedTuple):
         times: s, shape (rows,); where the stamps are even, those of their grid.
         distinct: False for rows left out as their stamp is that of the row before, shape (rows of the time stamps,).
         parts: rows of each.
-        starts: time of the first sample of each, s.
         period: of the grid where the stamps are even, else their median interval, s.
         sampling: figures on the stamps.
     """
@@ -76,17 +75,12 @@ class Segments(NamedTuple):
     times: np.ndarray
     distinct: np.ndarray
     parts: list[slice]
-    starts: list[float]
     period: float
     sampling: Sampling
 
 
 def read_time_stamps(file: LogFile, table: LogTable) -> TimeStamps:
-    """The rows that `[log]` selects, and their times.
-
-    Raises:
-        InputError: time goes back or stands still, or too few rows are left.
-    """
+    """The rows that `[log]` selects, and their times; InputError where time does not increase, or too few are left."""
     stamps = _stamps(file, table.t or TimeTable())
     start = float(stamps[0])
     stamps = stamps - start
@@ -111,15 +105,12 @@ def _stamps(file: LogFile, table: TimeTable) -> np.ndarray:
     if len(stamps) < SHORTEST:
         raise file.wrong(f"has {len(stamps)} rows; a log needs at least {SHORTEST}")
     back = np.diff(stamps) < 0.0
-    if back.any():
-        row = int(np.argmax(back)) + 1
-        raise file.wrong(
-            f"column {file.name(table.column_or('t'))!r}, data row {row + 1}: time goes back from {stamps[row - 1]:.9g} s "
-            f"to {stamps[row]:.9g} s; stamps should increase"
-        )
-    if stamps[0] == stamps[-1]:
-        name = file.name(table.column_or("t"))
-        raise file.wrong(f"column {name!r} is {stamps[0]:g} s in all rows; stamps should increase")
+    if back.any() or stamps[0] == stamps[-1]:
+        wrong = f" is {stamps[0]:g} s in all rows"
+        if back.any():
+            row = int(np.argmax(back)) + 1
+            wrong = f", data row {row + 1}: time goes back from {stamps[row - 1]:.9g} s to {stamps[row]:.9g} s"
+        raise file.wrong(f"column {file.name(table.column_or('t'))!r}{wrong}; stamps should increase")
     return stamps
 
 
@@ -127,7 +118,7 @@ def _selected_rows(file: LogFile, table: LogTable, stamps: np.ndarray) -> np.nda
     """Numbers of the rows that `where`, `start` and `stop` leave; stamps from the first one on."""
     keep = np.ones(len(stamps), dtype=bool)
     for column, value in (table.where or {}).items():
-        given = file.same_length(file.raw(column), len(stamps), column)
+        given = file.same_length(np.asarray(file.columns[file.name(column)]), len(stamps), column)
         keep &= given == value
         if not keep.any():
             found = ", ".join(repr(v.item() if hasattr(v, "item") else v) for v in np.unique(given.astype(object))[:6])
@@ -146,11 +137,7 @@ def _selected_rows(file: LogFile, table: LogTable, stamps: np.ndarray) -> np.nda
 
 
 def split_at_gaps(file: LogFile, stamps: TimeStamps) -> Segments:
-    """Parts between gaps, without those that are too short and without repeated stamps.
-
-    Raises:
-        InputError: too few samples are left.
-    """
+    """Parts between gaps, without those that are too short and without repeated stamps; InputError where few are left."""
     times, rows = stamps.times, stamps.rows
     parts = _parts(times, stamps.gap)
     grids = [even_grid(times[p]) for p in parts if _is_long(p)]
@@ -179,12 +166,12 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> Segments:
             f"after data row {rows[widest] + 1}" + (f"; {left_out} samples between gaps were left out." if left_out else ".")
         )
     inside = intervals[intervals <= stamps.gap]
-    period, starts = stamps.median, [float(times[p.start]) for p in kept]
+    period = stamps.median
     if even:
         times = times.copy()
         for p, grid in zip(kept, grids, strict=True):
             times[p] = grid.first + grid.period * np.arange(_length(p))
-        period, starts = grids[kept.index(longest(kept))].period, [grid.first for grid in grids]
+        period = grids[kept.index(longest(kept))].period
     sampling = Sampling(
         samples=len(stamps.times),
         median_period=stamps.median,
@@ -194,7 +181,7 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> Segments:
         repeated=repeated,
         even=even,
     )
-    return Segments(times, distinct, kept, starts, period, sampling)
+    return Segments(times, distinct, kept, period, sampling)
 
 
 def _length(part: slice) -> int:

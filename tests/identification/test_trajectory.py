@@ -59,7 +59,7 @@ def recorded(kind, samples, period=PERIOD):
 
 
 def windows_of(torque, readings, noise, samples, period=PERIOD):
-    found = {side: smooth(values, period, noise=noise[side]) for side, values in readings.items()}
+    found = {side: smooth(values, period) for side, values in readings.items()}
     start = PlantState({s: x.position for s, x in found.items()}, {s: x.velocity for s, x in found.items()}, ())
     return cut(torque, readings, period, start, noise, samples)
 
@@ -212,13 +212,9 @@ def test_residual_correlation_widens_intervals():
         residual[i] = rho * residual[i - 1] + draws[i]
     ones = jnp.ones((10, samples // 10, 1, 1))
     rest = PlantState({"motor": jnp.zeros(10)}, {"motor": jnp.zeros(10)}, ())
-    found = spread(
-        Fit(jnp.zeros(1), rest, jnp.asarray(residual).reshape(10, -1, 1), ones, jnp.zeros(()), jnp.zeros(()), jnp.ones(()))
-    )
+    found = spread(Fit(jnp.zeros(1), rest, jnp.asarray(residual).reshape(10, -1, 1), ones, jnp.zeros(()), jnp.ones(())))
     np.testing.assert_allclose(found.inflation, np.sqrt((1.0 + rho) / (1.0 - rho)), rtol=0.1)
-    white = spread(
-        Fit(jnp.zeros(1), rest, jnp.asarray(draws).reshape(10, -1, 1), ones, jnp.zeros(()), jnp.zeros(()), jnp.ones(()))
-    )
+    white = spread(Fit(jnp.zeros(1), rest, jnp.asarray(draws).reshape(10, -1, 1), ones, jnp.zeros(()), jnp.ones(())))
     np.testing.assert_allclose(white.inflation, 1.0, rtol=0.05)
 
 

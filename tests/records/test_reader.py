@@ -11,7 +11,7 @@ from measured import COULOMB, EMPS, GEAR_RATIO, INERTIA, SERVO, VISCOUS, XL330, 
 from small_study import small
 
 from jaxbl.errors import InputError
-from jaxbl.records import LogTable, read_log_table, read_record
+from jaxbl.records import LogTable, join, read_log_table, read_record
 from jaxbl.sweeps.trial import run
 
 
@@ -594,3 +594,38 @@ def test_a_gear_ratio_that_is_a_little_off_is_noted_where_that_is_allowed(tmp_pa
     for gross in (1.3, -1.0, 1.0 / GEAR_RATIO**2):
         with pytest.raises(InputError, match=r"for each 1 of theta_s|times theta_s"):
             read_record(path, gear_ratio=gross * GEAR_RATIO, gear_tolerance=0.15)
+
+
+@pytest.fixture
+def logs(tmp_path):
+    def write(name, **how):
+        made(**how).to_csv(tmp_path / name, index=False)
+        return read_record(tmp_path / name)
+
+    return write
+
+
+def test_each_log_is_a_segment_with_its_own_rows(logs):
+    first, second = logs("a.csv", count=1500), logs("b.csv", count=2500, seed=1)
+    both = join([first, second])
+    assert len(both.time) == 4000
+    assert [(part.start, part.stop) for part in both.segments] == [(0, 1500), (1500, 4000)]
+    assert np.all(np.diff(both.time) > 0.0)
+    assert both.time[1500] > both.time[1499] + 5.0 * both.sample_period
+    for side in ("motor", "load"):
+        np.testing.assert_array_equal(both.positions[side][1500:], second.positions[side])
+    np.testing.assert_array_equal(both.torque, np.concatenate([first.torque, second.torque]))
+    assert both.notes[0] == "2 logs, one after the other: a.csv, b.csv."
+    assert join([first]) is first
+
+
+def test_logs_that_are_not_alike(logs, tmp_path):
+    first, slow = logs("a.csv"), logs("slow.csv", period=2e-3)
+    with pytest.raises(
+        InputError, match=r"slow\.csv: is sampled every 0\.002 s, .*a\.csv every 0\.001 s; \[log\] resample = "
+    ):
+        join([first, slow])
+    made().drop(columns="u").to_csv(tmp_path / "free.csv", index=False)
+    free = read_record(tmp_path / "free.csv", {"absent": ["u"]})
+    with pytest.raises(InputError, match=r"free\.csv: has no torque, which .*a\.csv has"):
+        join([first, free])

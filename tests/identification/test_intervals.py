@@ -9,8 +9,7 @@ from small_study import rigid
 
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
-from jaxbl.identification.intervals import interval, spread
-from jaxbl.identification.profile import profile
+from jaxbl.identification.intervals import interval, profile, spread
 from jaxbl.identification.trajectory import cut, fit, free_parameters
 
 PERIOD, SAMPLES, NOISE = 2e-3, 400, 1e-3
