@@ -29,14 +29,14 @@ NOISE, PERIOD = "encoders.noise", "run.sample_period"
 
 LEAST_POINTS = 4
 LEAST_SPAN = 10.0
-"""A law needs this many points over at least this ratio of x."""
+"""A law needs this many points, two for the slope of each half, over at least this ratio of x: a decade."""
 LARGEST_RESIDUAL = math.log(1.1)
 """No point of a law lies farther from its line, in ln y: 10 %."""
 LARGEST_BEND = 0.05
 """Slopes of the lower and upper half of a law differ by less, or by less than two standard errors."""
 END_OF_SWEEP = "end of the sweep"
 AGREEMENT = 0.1
-"""A slope this close to theory's agrees with it."""
+"""A slope this close to theory's agrees with it: theory's exponents (1/2, 1, 2) differ by far more."""
 
 _FLOAT = 10.0  # times the resolution: rounding then is 10 % of the error
 _FLOOR = 3.0  # times another cause's error: that is then a third of it, 6 % in a sum of squares

@@ -194,6 +194,7 @@ class Points:
 
 def _extremes(values: list[Any]) -> list[Any]:
     """The first, least and largest of many numbers: what a key may be is an interval. Other lists as they are."""
+    # each check builds a config, some milliseconds
     if len(values) <= 16 or any(isinstance(value, str) for value in values):
         return values
     return [values[0], min(values), max(values)]
