@@ -384,7 +384,7 @@ def stages():
             (whole, "observer_chain", "chain"),
             (whole, "by_regression", "regression"),
             (whole, "torque_errors", "torque errors"),
-            (log_columns, "_model_columns", "model columns"),
+            (whole, "columns_of", "columns of the trace"),
         ]
     )
 
