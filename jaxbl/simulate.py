@@ -267,7 +267,7 @@ def advance(
     return (state, tuple(r.update(experiment, t, index, signals) for r, t in zip(reducers, totals, strict=True))), signals
 
 
-def settled(experiment: Experiment, carry: Carry) -> Carry:
+def end_of_block(experiment: Experiment, carry: Carry) -> Carry:
     """What goes from one block of samples to the next: sums in float32 lose nothing over more than some thousand samples."""
     state, totals = carry
     if experiment.identifier is None or state.identifier is None:
@@ -362,7 +362,7 @@ def _scan(
     def block(carry: Carry, first: Array, length: int) -> tuple[Carry, Any]:
         indices = first + jnp.arange(length, dtype=jnp.int32)
         carry, kept = jax.lax.scan(sample, carry, (indices, samples(indices)))
-        return settled(experiment, carry), jax.tree.map(lambda x: x[::every], kept)
+        return end_of_block(experiment, carry), jax.tree.map(lambda x: x[::every], kept)
 
     length = block_length(steps) if record is None or every == 1 else every
     blocks, rest = divmod(steps, length)

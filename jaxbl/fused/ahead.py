@@ -14,7 +14,7 @@ from . import Unsupported
 from .llvm import Loop
 from .split import recursion
 
-Block = tuple[list[Any], list[Any], list[Any]]
+SharedBlock = tuple[list[Any], list[Any], list[Any]]
 """Next state of what lanes share, what follows a block of samples reads of it, and what each sample does."""
 
 
@@ -58,7 +58,7 @@ class Shared(NamedTuple):
         return jax.ShapeDtypeStruct(length, jnp.int32), dict.fromkeys(self.sides, noise)
 
 
-Ahead = Callable[[list[Any], int, int, int], Block]
+Ahead = Callable[[list[Any], int, int, int], SharedBlock]
 """From the state of what lanes share, seed, first sample and length of a block."""
 
 
@@ -66,14 +66,14 @@ class Scanned:
     """By XLA, sample by sample."""
 
     def __init__(self, shared: Shared, lengths: set[int]):
-        def block(state: list[Any], given: Any) -> Block:
+        def block(state: list[Any], given: Any) -> SharedBlock:
             state, handed = jax.lax.scan(shared.inner, state, given)
             return *shared.outer(state, ()), handed
 
         self._given = shared.given
         self._blocks = {n: jax.jit(block).lower(shared.state, shared.shapes(n)).compile() for n in lengths}
 
-    def __call__(self, state: list[Any], seed: int, first: int, length: int) -> Block:
+    def __call__(self, state: list[Any], seed: int, first: int, length: int) -> SharedBlock:
         return self._blocks[length](state, self._given(seed, first, length))
 
 
@@ -92,7 +92,7 @@ class Looped:
             self._loop = Loop(parts.step, np.dtype(float), carry=len(shared.state), lanes=1)
         self._outer = jax.jit(lambda state: shared.outer(state, ())).lower(shared.state).compile()
 
-    def __call__(self, state: list[Any], seed: int, first: int, length: int) -> Block:
+    def __call__(self, state: list[Any], seed: int, first: int, length: int) -> SharedBlock:
         direct, read = self._parallel[length](self._given(seed, first, length))
         carry = [np.array([leaf]) for leaf in state]
         kept = [np.empty(length, dtype) for dtype in self._dtypes]

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 Number = Float[Array, ""]
 
 LIMIT = 4.0
+"""Units in the last place that the tests allow."""
 
 
 def _polynomial(x: Number, coefficients: Sequence[float]) -> Number:
@@ -157,12 +158,5 @@ def rounded(x: Number) -> Number:
     return below + lax.select(rest == 0.5, odd, lax.convert_element_type(rest > 0.5, x.dtype))
 
 
-FUNCTIONS: dict[str, Callable[[Number], Number]] = {
-    "exp": exp,
-    "expm1": expm1,
-    "tanh": tanh,
-    "sin": sin,
-    "cos": cos,
-    "logistic": logistic,
-}
+FUNCTIONS: dict[str, Callable[[Number], Number]] = {one.__name__: one for one in (exp, expm1, tanh, sin, cos, logistic)}
 """By the name of the primitive that they stand for."""

@@ -79,10 +79,10 @@ def contracted(closed: ClosedJaxpr, multiply_add: Callable[..., Any]) -> ClosedJ
 
 def _callee(eqn: JaxprEqn) -> ClosedJaxpr | None:
     """What an equation calls, if it does nothing else."""
-    return parameter(eqn, "jaxpr", "call_jaxpr") if eqn.primitive.name in _CALLS else None
+    return parameter_of(eqn, "jaxpr", "call_jaxpr") if eqn.primitive.name in _CALLS else None
 
 
-def parameter(eqn: JaxprEqn, *names: str) -> Any:
+def parameter_of(eqn: JaxprEqn, *names: str) -> Any:
     """Of an equation, by the first of these names that it has."""
     for name in names:
         if name in eqn.params:
@@ -96,10 +96,10 @@ def repetition(eqn: JaxprEqn) -> tuple[int, ClosedJaxpr, int]:
     What a scan reads or writes once a step has an axis outside; scalars alone are fixed or carried. So nothing depends on
     how JAX counts them, which is not the same in 0.10 and 0.11.
     """
-    body, fixed = parameter(eqn, "jaxpr"), len(eqn.invars) - len(eqn.outvars)
+    body, fixed = parameter_of(eqn, "jaxpr"), len(eqn.invars) - len(eqn.outvars)
     if fixed < 0 or (len(body.in_avals), len(body.out_avals)) != (len(eqn.invars), len(eqn.outvars)):
         raise UnknownForm("scan that reads or makes others than its body")
-    return parameter(eqn, "length"), body, fixed
+    return parameter_of(eqn, "length"), body, fixed
 
 
 def _inlined(closed: ClosedJaxpr, functions: Functions, *arguments: Any) -> list[Any]:
@@ -132,7 +132,7 @@ def evaluate(
     for eqn in eqns:
         params = eqn.params
         if rewritten is not None and eqn.primitive.name == "scan":
-            params = params | {"jaxpr": rewritten(parameter(eqn, "jaxpr"))}
+            params = params | {"jaxpr": rewritten(parameter_of(eqn, "jaxpr"))}
         results = eqn.primitive.bind(*[value_of(env, v) for v in eqn.invars], **params)
         env |= dict(zip(eqn.outvars, results if eqn.primitive.multiple_results else [results], strict=True))
 

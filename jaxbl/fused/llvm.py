@@ -16,7 +16,7 @@ from llvmlite import binding, ir
 
 from . import Unsupported
 from .elementary import FUNCTIONS
-from .jaxprs import ClosedJaxpr, JaxprEqn, Literal, Var, parameter, repetition, substituted
+from .jaxprs import ClosedJaxpr, JaxprEqn, Literal, Var, parameter_of, repetition, substituted
 from .split import Around
 
 _INT, _BIT, _POINTER = ir.IntType(64), ir.IntType(1), ir.PointerType()
@@ -377,7 +377,7 @@ def _clamp(w: _Writer, eqn: JaxprEqn, low: Vector, a: Vector, high: Vector) -> V
 
 
 def _power(w: _Writer, eqn: JaxprEqn, a: Vector) -> Vector:
-    power = parameter(eqn, "y")
+    power = parameter_of(eqn, "y")
     if not 1 <= abs(power) <= 8:
         raise Unsupported(f"integer_pow by {power}")
     result = reduce(lambda x, y: w.build.fmul(x, y, flags=_FLAGS), [a] * abs(power))
@@ -443,7 +443,7 @@ _OF_FLOATS: dict[str, Callable[..., Vector]] = {
     "abs": _intrinsic("fabs"),
     **{name: _intrinsic(name) for name in ("sqrt", "floor", "ceil")},
     # lax.RoundingMethod: away from zero, to nearest even
-    "round": lambda w, eqn, a: w.intrinsic(("round", "rint")[int(parameter(eqn, "rounding_method"))], a),
+    "round": lambda w, eqn, a: w.intrinsic(("round", "rint")[int(parameter_of(eqn, "rounding_method"))], a),
     "sign": _sign,
     "max": _LARGER,
     "min": _SMALLER,

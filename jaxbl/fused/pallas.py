@@ -29,16 +29,10 @@ LANES = 128
 class Kernel:
     """A run of lanes side by side: a loop over samples, and what is done around each block of them.
 
-    Args:
-        body: jaxpr of one sample, scalars of one lane: values, carry, one sample's inputs -> carry.
-        around: what is done around a block of samples.
-        values: number of values; they differ from lane to lane.
-        size: lanes, a multiple of `LANES`.
-        steps, length: samples of a run and of a block; the last block has the rest.
-        interpret: run by Pallas's interpreter, on any device.
-
-    `arguments` are the shapes of what it is called with: values `(lanes,)` each; inputs of the body `(steps,)` each, of what
-    follows a block `(blocks,)`, of the finish `()`.
+    `body` is the jaxpr of one sample, scalars of one lane: `values` of them, carry, one sample's inputs -> carry. `size` is
+    the number of lanes (a multiple of `LANES`), `steps` and `length` are samples of a run and of a block; the last has the rest.
+    `interpret` runs it by Pallas's interpreter, on any device. `arguments` are the shapes of what it is called with: values
+    `(size,)` each; inputs of the body `(steps,)` each, of what follows a block `(blocks,)`, of the finish `()`.
     """
 
     def __init__(

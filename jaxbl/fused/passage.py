@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.drive.parameters import set_leaves
-from jaxbl.simulate import Experiment, Reducer, advance, begin, block_length, figures, settled
+from jaxbl.simulate import Experiment, Reducer, advance, begin, block_length, end_of_block, figures
 
 from .ahead import Shared, ahead_of_lanes, host
 from .llvm import Arrays, Loop, vector_lanes
@@ -31,19 +31,12 @@ class Block(NamedTuple):
 
 
 class Passage(abc.ABC):
-    """Simulates lanes of an experiment.
-
-    Made and called in the precision of the experiment (`jax.enable_x64`).
+    """Simulates lanes of an experiment; made and called in its precision (`jax.enable_x64`).
 
     Args:
-        experiment: with array leaves (:func:`jaxbl.drive.as_arrays`).
-        reducers: figures to compute along the run.
+        experiment, reducers: as of :func:`jaxbl.simulate.scan`.
         paths: of the leaves that differ from lane to lane.
-        lanes: how many there are; compiled for this number.
-        together: lanes that are computed together; their number is filled up to a multiple.
-
-    Attributes:
-        carried: numbers that a lane carries; what all share is not among them.
+        lanes: how many there are; compiled for this number, filled up to a multiple of those computed `together`.
 
     Raises:
         Unsupported: a step does something that a fused loop cannot do.
@@ -68,7 +61,7 @@ class Passage(abc.ABC):
             return advance(own(values), reducers, carry, *given)[0]
 
         def settle(values: list[Any], carry: Any, given: Any) -> Any:
-            return settled(own(values), carry)
+            return end_of_block(own(values), carry)
 
         def result(values: list[Any], carry: Any, given: Any) -> dict[str, Any]:
             return figures(own(values), reducers, carry)
@@ -78,6 +71,7 @@ class Passage(abc.ABC):
         carry = jax.eval_shape(start, values)
         kinds = carry_kinds(start, ((sample, given), (settle, ())), values)
         one = [leaf for leaf, kind in zip(jax.tree.leaves(carry), kinds, strict=True) if kind != Kind.LANE]
+        # by each lane; what all share is not among them
         self.carried = len(kinds) - len(one)
         begins, inner = split(start, values, (), (), [], kinds), split(sample, values, carry, given, kinds, kinds)
         outer, ends = split(settle, values, carry, (), kinds, kinds), split(result, values, carry, (), kinds)
@@ -95,12 +89,11 @@ class Passage(abc.ABC):
         """Figures `(lanes,)` of one seed, by name; `values` `(lanes,)` by path, in SI units."""
         # the figures that lanes share come with the last block
         shared: list[np.ndarray] = []
-        found = self._march(self.filled_up(values), self.blocks(seed, shared))
-        lanes, others = iter(found), iter(shared)
-        figures = {name: next(lanes if own else others) for name, own in self._of_lane.items()}
+        lanes = iter(self._march(self.filled_up(values), self.blocks(seed, shared)))
+        others = iter(shared)
         return {
-            name: figure[: self._lanes] if self._of_lane[name] else np.full(self._lanes, figure)
-            for name, figure in figures.items()
+            name: next(lanes)[: self._lanes] if own else np.full(self._lanes, next(others))
+            for name, own in self._of_lane.items()
         }
 
     def filled_up(self, values: dict[str, np.ndarray]) -> list[np.ndarray]:
@@ -167,8 +160,7 @@ class HostPassage(Passage):
 class DevicePassage(Passage):
     """By one kernel of an accelerator, which takes its lanes through the whole run; `interpret` runs it anywhere, slowly.
 
-    Attributes:
-        kernel: compiled; from values `(lanes,)`, lanes filled up, and `inputs` to the lanes' figures.
+    `kernel`, compiled, gives the lanes' figures from values `(lanes,)`, lanes filled up, and :meth:`inputs`.
     """
 
     def __init__(

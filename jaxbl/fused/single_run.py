@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.simulate import Experiment, Reducer, Signals, State, advance, begin, block_length, figures, settled
+from jaxbl.simulate import Experiment, Reducer, Signals, State, advance, begin, block_length, end_of_block, figures
 
 from . import Unsupported
 from .ahead import Shared, ahead_of_lanes, host
@@ -40,7 +40,7 @@ def recorded(
             return jax.tree.leaves(carry), list(row.values())
 
         def settle(state: Any, _: Any) -> tuple[list[Any], list[Any]]:
-            return jax.tree.leaves(settled(experiment, tree.unflatten(state))), []
+            return jax.tree.leaves(end_of_block(experiment, tree.unflatten(state))), []
 
         def result(*state: Any) -> dict[str, Any]:
             return figures(experiment, reducers, tree.unflatten(state))

@@ -174,17 +174,11 @@ def convergence_time_bound(
     return jnp.where(holds, peak / safe, jnp.inf)
 
 
-class _Passage(NamedTuple):
-    """From a point of the right half plane to the axis x = 0: time, and speed |x2| there (0 where it ends at the origin)."""
+def _passage(lambda_: Values, alpha: Values, f_plus: Values, y: Values, x2: Values, ray: Values) -> tuple[Values, Values]:
+    """Time from x1 = y^2 to the axis x = 0, and speed |x2| there (0 where it ends at the origin); ray <= 0, alpha > f.
 
-    time: Values
-    speed: Values
-
-
-def _passage(lambda_: Values, alpha: Values, f_plus: Values, y: Values, x2: Values, ray: Values) -> _Passage:
-    """Passage from x1 = y^2 under d = +f until x1' = ray sqrt(x1), and d = -f from there on; ray <= 0, alpha > f.
-
-    Along an arc of constant d, sqrt(v^2 + lambda v y + c y^2) falls by exp(-(lambda / 2) arc), and x2 linearly in time.
+    d = +f until x1' = ray sqrt(x1), and d = -f from there on. Along an arc of constant d, sqrt(v^2 + lambda v y + c y^2)
+    falls by exp(-(lambda / 2) arc), and x2 linearly in time.
     """
     c1, c2 = 2.0 * _margin(alpha, f_plus), 2.0 * (alpha + f_plus)
     half = 0.5 * lambda_
@@ -209,7 +203,7 @@ def _passage(lambda_: Values, alpha: Values, f_plus: Values, y: Values, x2: Valu
     level = jnp.where(homes, h**2 + d2 * y_turn**2, 1.0)
     speed = jnp.where(homes, jnp.sqrt(level) * jnp.exp(-half * jnp.where(homes, arc, 0.0)), 0.0)
     time = (x2 - x2_turn) / _margin(alpha, f_plus) + (x2_turn + speed) / (alpha + f_plus)
-    return _Passage(time, speed)
+    return time, speed
 
 
 def _lowest_ray(lambda_: Values, c1: Values) -> Values:
@@ -256,8 +250,8 @@ def slowest_ray(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
         return jnp.where(real, near, -jnp.sqrt(c1) * depth)
 
     def time(share: Values) -> Values:
-        passage = _passage(lambda_, alpha, f_plus, jnp.zeros_like(lambda_), jnp.ones_like(lambda_), ray(share))
-        return passage.time / jnp.maximum(1.0 - passage.speed, jnp.finfo(dtype).tiny)
+        time, speed = _passage(lambda_, alpha, f_plus, jnp.zeros_like(lambda_), jnp.ones_like(lambda_), ray(share))
+        return time / jnp.maximum(1.0 - speed, jnp.finfo(dtype).tiny)
 
     grid = jnp.linspace(0.0, 1.0, _RAYS, dtype=dtype)
 
@@ -289,18 +283,18 @@ def convergence_time_worst(
     """
     zero = jnp.zeros_like(jnp.asarray(lambda_ * alpha * f_plus * 1.0))
     ray = jax.lax.stop_gradient(slowest_ray(lambda_, alpha, f_plus))  # the time is stationary in it
-    cycle = _passage(lambda_, alpha, f_plus, zero, zero + 1.0, ray)
+    time, speed = _passage(lambda_, alpha, f_plus, zero, zero + 1.0, ray)
     converges = peak_ratio(lambda_, alpha, f_plus) < 1.0
-    a_peak = cycle.time / jnp.where(converges & (cycle.speed < 1.0), 1.0 - cycle.speed, 1.0)
+    a_peak = time / jnp.where(converges & (speed < 1.0), 1.0 - speed, 1.0)
     # the half planes mirror each other
     x2 = jnp.where(position_error == 0.0, jnp.abs(velocity_error), jnp.sign(position_error) * velocity_error)
     away = position_error != 0.0
     y = jnp.where(away, jnp.sqrt(jnp.where(away, jnp.abs(position_error), 1.0)), 0.0)
-    first = _passage(lambda_, alpha, f_plus, y + zero, x2 + zero, ray)
+    first, speed = _passage(lambda_, alpha, f_plus, y + zero, x2 + zero, ray)
     # a start beyond the faster root's ray, x2 = (p + lambda) sqrt(x1), returns to it under d = +f, and holds on to the
     # origin; p + lambda is minus the slower one's root
     slides = x2 + zero > -_lowest_ray(lambda_, 2.0 * _margin(alpha, f_plus)) * y
-    longest = jnp.maximum(first.time + first.speed * a_peak, jnp.where(slides, x2 / _margin(alpha, f_plus), 0.0))
+    longest = jnp.maximum(first + speed * a_peak, jnp.where(slides, x2 / _margin(alpha, f_plus), 0.0))
     moving = (x2 != 0.0) | away
     return jnp.where(converges, jnp.where(moving, longest, 0.0), jnp.inf)
 

@@ -15,7 +15,7 @@ from jaxbl.sweeps.engine import LANES_PER_DEVICE
 from .workload import FIGURES, RANGES, SEED, Chunked, Workload
 
 
-class Scanned(Chunked):
+class Scan(Chunked):
     """`lax.scan` and `vmap`, in chunks that stay in the caches, devices side by side."""
 
     def __init__(self, workload: Workload, devices: int):

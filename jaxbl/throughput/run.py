@@ -19,7 +19,7 @@ import numpy as np
 from jaxbl.errors import NoResult
 from jaxbl.workers import Progress, cores
 
-from .ours import Fused, Scanned
+from .ours import Fused, Scan
 from .rivals.compiled import Compiled, forget
 from .rivals.diffrax_euler import Diffrax
 from .rivals.native import Native, NoCompiler, compiler, library
@@ -57,8 +57,8 @@ def entries(folder: Path, count: int, devices: int) -> list[Entry]:
         Entry("c++, one core", lambda w: Native(w, 1, folder), many),
         Entry(OURS, lambda w: Fused(w, count), many),
         Entry("jaxbl fused, one core", lambda w: Fused(w, 1), many),
-        Entry(SCAN, lambda w: Scanned(w, devices), few),
-        Entry("jaxbl scan, one device", lambda w: Scanned(w, 1), few),
+        Entry(SCAN, lambda w: Scan(w, devices), few),
+        Entry("jaxbl scan, one device", lambda w: Scan(w, 1), few),
         Entry("numba, blocks of lanes", lambda w: Compiled(w, count, blocked=True), many, "numba"),
         Entry("numba, prange", lambda w: Compiled(w, count, blocked=False), few, "numba"),
         Entry("diffrax, Euler, one device", Diffrax, few, "diffrax"),
@@ -73,12 +73,9 @@ def entries(folder: Path, count: int, devices: int) -> list[Entry]:
 
 @dataclass
 class Row:
-    """What an entry took.
+    """What an entry took for a workload.
 
     Attributes:
-        name: of the entry.
-        precision: `float32` or `float64`.
-        lanes, steps: of the workload.
         first_seconds: of making it and calling it once: tracing and compilation included.
         deviation: largest median deviation of its figures from the reference, relative.
         seconds: of each round.
@@ -282,20 +279,14 @@ def _study(count: int, devices: int, able: set[str], lanes: int) -> list[dict[st
 
 def _machine(count: int) -> dict[str, Any]:
     packages = ["jax", "numpy", "scipy", "llvmlite", "numba", "diffrax", "opensmc"]
+    about = Path("/proc/cpuinfo")
+    lines = about.read_text().splitlines() if about.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return {
-        "processor": _processor(),
+        "processor": names[0] if names else platform.processor(),
         "cores": count,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "versions": {name: version(name) for name in packages if importlib.util.find_spec(name) is not None},
         "compiler": Path(found).name if (found := compiler()) else None,
     }
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()

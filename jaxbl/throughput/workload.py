@@ -34,6 +34,7 @@ _PERIOD, _MISS = 1e-3, 0.5
 """Sample period (s), velocity error of the motor's observer at t = 0 (rad/s)."""
 _DRIVE = {"motor_inertia": 0.05, "motor_viscous": 0.15, "load_inertia": 7.0, "load_viscous": 16.0, "gear_ratio": 5.0}
 _STIFFNESS, _SLOPE, _LOW_PASS = 1.0, 20.0, 0.01
+"""The paper's drive and law (N m/rad, 1/rad), and the low-pass of the equivalent control (s)."""
 
 
 def _rates(experiment: Experiment, total: dict[str, Any], index: Any, signals: Any) -> dict[str, Any]:

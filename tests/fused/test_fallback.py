@@ -20,8 +20,8 @@ def renamed(monkeypatch):
     def parameter(eqn, *names):
         return parameters(eqn, *(f"new_{name}" for name in names))
 
-    parameters = jaxprs.parameter
-    monkeypatch.setattr(jaxprs, "parameter", parameter)
+    parameters = jaxprs.parameter_of
+    monkeypatch.setattr(jaxprs, "parameter_of", parameter)
 
 
 def unread(monkeypatch):

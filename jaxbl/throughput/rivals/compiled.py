@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 
 from ..workload import Workload, identified_figures
-from .plain import loop, moreau, numbers_of, super_twisting
+from .plain import chain, moreau, numbers_of, super_twisting
 
 WIDTH = 64
 """Lanes of a block: several registers of the widest vectors, and a state that stays in the first cache."""
@@ -49,7 +49,7 @@ def _plain() -> Callable[..., np.ndarray]:
 
     compiled = njit(error_model="numpy")
     plant, observe = compiled(moreau(math.tanh)), compiled(super_twisting(math.sqrt, np.sign))
-    one = compiled(loop(math.tanh, plant, observe, observe))
+    one = compiled(chain(math.tanh, plant, observe, observe))
 
     @njit(parallel=True, error_model="numpy")
     def run(steps, start, window, torque, motor_noise, load_noise, c, values):  # pragma: no cover

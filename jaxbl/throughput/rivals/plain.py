@@ -6,23 +6,14 @@ solves, or whose observers are OpenSMC's. The same functions of numbers are what
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ..workload import Workload, constants, identified_figures
 
-
-class Functions(NamedTuple):
-    """Of numbers, or of arrays of them."""
-
-    tanh: Callable[[Any], Any]
-    sqrt: Callable[[Any], Any]
-    sign: Callable[[Any], Any]
-
-
-_ARRAYS = Functions(np.tanh, np.sqrt, np.sign)
-_NUMBERS = Functions(math.tanh, math.sqrt, lambda x: (x > 0.0) - (x < 0.0))
+_ARRAYS = np.tanh, np.sqrt, np.sign
+_NUMBERS = math.tanh, math.sqrt, lambda x: (x > 0.0) - (x < 0.0)
 
 
 def numbers_of(kind: Callable[[float], Any]) -> tuple[Any, ...]:
@@ -51,25 +42,27 @@ class Plain:
     ):
         self._workload, self._solver, self._library = workload, solver, library
         torque, noise = workload.inputs()
-        self._functions = _NUMBERS if numbers else _ARRAYS
+        self._numbers = numbers
         self._inputs = [x.tolist() if numbers else x for x in (torque, *noise.T)]
         values = [column[chosen] for column in workload.values().values()]
         self._values: list[Any] = [column.item() for column in values] if numbers else values
         self._constants = numbers_of(float if numbers else workload.dtype.type)
 
     def __call__(self) -> dict[str, np.ndarray]:
-        w = self._workload
-        plant = moreau(self._functions.tanh) if self._solver is None else _solved(self._solver)
-        motor = load = super_twisting(*self._functions[1:])
+        w, (tanh, sqrt, sign) = self._workload, _NUMBERS if self._numbers else _ARRAYS
+        plant = moreau(tanh) if self._solver is None else _solved(self._solver)
+        motor = load = super_twisting(sqrt, sign)
         if self._library:
-            motor, load = _OpenSMC(self._functions.sign).observe, _OpenSMC(self._functions.sign).observe
-        run = loop(self._functions.tanh, plant, motor, load)
-        total = 0.0 if self._functions is _NUMBERS else np.zeros(len(self._values[0]))
+            motor, load = _OpenSMC(sign).observe, _OpenSMC(sign).observe
+        run = chain(tanh, plant, motor, load)
+        total = 0.0 if self._numbers else np.zeros(len(self._values[0]))
         sums = run(w.steps, w.start, w.window, *self._inputs, self._constants, *self._values, total)
         return identified_figures(w, [np.atleast_1d(column) for column in sums])
 
 
-def loop(tanh: Callable, plant: Callable, observe_motor: Callable, observe_load: Callable) -> Callable[..., tuple[Any, ...]]:
+def chain(
+    tanh: Callable, plant: Callable, observe_motor: Callable, observe_load: Callable
+) -> Callable[..., tuple[Any, ...]]:
     """From inputs, constants and a lane's values to its nine sums, which begin with `total`."""
 
     def run(
