@@ -30,21 +30,13 @@ class Kernel:
     """A run of lanes side by side: a loop over samples, and what is done around each block of them.
 
     `body` is the jaxpr of one sample, scalars of one lane: `values` of them, carry, one sample's inputs -> carry. `size` is
-    the number of lanes (a multiple of `LANES`), `steps` and `length` are samples of a run and of a block; the last has the rest.
+    the number of lanes (a multiple of `LANES`), `steps` and `length` are samples of a run and of a block; the last has a rest.
     `interpret` runs it by Pallas's interpreter, on any device. `arguments` are the shapes of what it is called with: values
     `(size,)` each; inputs of the body `(steps,)` each, of what follows a block `(blocks,)`, of the finish `()`.
     """
 
     def __init__(
-        self,
-        body: ClosedJaxpr,
-        around: Around,
-        values: int,
-        size: int,
-        steps: int,
-        length: int,
-        *,
-        interpret: bool = False,
+        self, body: ClosedJaxpr, around: Around, values: int, size: int, steps: int, length: int, *, interpret: bool = False
     ):
         self._values, self._steps, self._length, self._interpret = values, steps, length, interpret
         own = values + len(body.out_avals)

@@ -44,11 +44,7 @@ class AbstractSuperTwisting(eqx.Module):
 
     @abc.abstractmethod
     def step(
-        self,
-        state: ObserverState,
-        measured: Float[Array, ""],
-        acceleration: Callable[[Scalar], Scalar],
-        step: Scalar,
+        self, state: ObserverState, measured: Float[Array, ""], acceleration: Callable[[Scalar], Scalar], step: Scalar
     ) -> tuple[ObserverState, Estimate]:
         """Take in one sample and predict the next.
 
@@ -105,10 +101,7 @@ class ImplicitSuperTwisting(AbstractSuperTwisting):
         # the estimate lags by half a step of the perturbation; the mean velocity over the coming step makes up for it,
         # else viscous friction of that lag would be taken for perturbation
         predicted = acceleration(velocity + step * (control + 0.5 * acceleration(velocity)))
-        new = ObserverState(
-            position + step * (velocity + 0.5 * step * predicted),
-            velocity + step * predicted,
-        )
+        new = ObserverState(position + step * (velocity + 0.5 * step * predicted), velocity + step * predicted)
         return new, Estimate(position, velocity, control)
 
 

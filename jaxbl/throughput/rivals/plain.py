@@ -60,9 +60,7 @@ class Plain:
         return identified_figures(w, [np.atleast_1d(column) for column in sums])
 
 
-def chain(
-    tanh: Callable, plant: Callable, observe_motor: Callable, observe_load: Callable
-) -> Callable[..., tuple[Any, ...]]:
+def chain(tanh: Callable, plant: Callable, observe_motor: Callable, observe_load: Callable) -> Callable:
     """From inputs, constants and a lane's values to its nine sums, which begin with `total`."""
 
     def run(
