@@ -18,8 +18,6 @@ ClosedJaxpr = Any
 """What `jax.make_jaxpr` gives: constants and a jaxpr until JAX 0.10, a jaxpr with them inside from 0.11 on."""
 _CALLS = ("jit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 """Primitives that only call another jaxpr."""
-Functions = Mapping[str, Callable[..., Any]]
-"""By the name of the primitive that they replace."""
 
 
 class UnknownForm(Exception):
@@ -31,7 +29,7 @@ def flat(function: Callable[..., Any], *examples: Any) -> ClosedJaxpr:
     return substituted(jax.make_jaxpr(function)(*examples), {})
 
 
-def substituted(closed: ClosedJaxpr, functions: Functions) -> ClosedJaxpr:
+def substituted(closed: ClosedJaxpr, functions: Mapping[str, Callable[..., Any]]) -> ClosedJaxpr:
     """The same without calls, and with functions in place of primitives of floating-point numbers, by their names."""
     leaves = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in closed.in_avals]
     found = jax.make_jaxpr(partial(_inlined, closed, functions))(*leaves)
@@ -102,7 +100,7 @@ def repetition(eqn: JaxprEqn) -> tuple[int, ClosedJaxpr, int]:
     return parameter_of(eqn, "length"), body, fixed
 
 
-def _inlined(closed: ClosedJaxpr, functions: Functions, *arguments: Any) -> list[Any]:
+def _inlined(closed: ClosedJaxpr, functions: Mapping[str, Callable[..., Any]], *arguments: Any) -> list[Any]:
     jaxpr = closed.jaxpr
     env = _given(closed, arguments)
     for eqn in jaxpr.eqns:

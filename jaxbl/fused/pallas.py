@@ -30,7 +30,7 @@ class Kernel:
     """A run of lanes side by side: a loop over samples, and what is done around each block of them.
 
     `body` is the jaxpr of one sample, scalars of one lane: `values` of them, carry, one sample's inputs -> carry. `size` is
-    the number of lanes (a multiple of `LANES`), `steps` and `length` are samples of a run and of a block; the last has a rest.
+    the number of lanes (a multiple of `LANES`), `steps` and `length` are samples of a run and of a block but its last.
     `interpret` runs it by Pallas's interpreter, on any device. `arguments` are the shapes of what it is called with: values
     `(size,)` each; inputs of the body `(steps,)` each, of what follows a block `(blocks,)`, of the finish `()`.
     """
