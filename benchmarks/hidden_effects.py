@@ -58,7 +58,7 @@ def oracle(case: Case) -> Mapping[str, float]:
     import numpy as np
 
     from jaxbl.diagnosis.diagnose import new_search, read_diagnosis_task
-    from jaxbl.diagnosis.proof import at_period, fit_model
+    from jaxbl.diagnosis.proof import fit_model
     from jaxbl.diagnosis.setup import set_up
 
     with tempfile.TemporaryDirectory() as folder:
@@ -67,7 +67,7 @@ def oracle(case: Case) -> Mapping[str, float]:
     with jax.enable_x64(True):
         setup = set_up(task)
         fitted = fit_model(new_search(setup), case.truth["effects"], np.zeros(len(setup.own)))
-        return setup.holdout.compare(at_period(fitted.experiment, setup.holdout.period)).errors
+        return setup.holdout.compare(fitted.experiment).errors
 
 
 def left(found: Sequence[Case], folder: Path) -> list[Outcome]:

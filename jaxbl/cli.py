@@ -320,9 +320,9 @@ def diagnose(
         )
     lines = diagnosis_lines(summary)
     if next_experiment is not None:
-        from jaxbl.diagnosis.next_experiment import Limits, write_next_experiment
+        from jaxbl.diagnosis.next_experiment import write_next_experiment
 
-        lines += write_next_experiment(folder, summary, task.record, next_experiment, Limits(max_torque, max_travel))
+        lines += write_next_experiment(folder, summary, task.record, next_experiment, max_torque, max_travel)
     _print(lines, folder)
 
 

@@ -9,95 +9,85 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
-from typing import ClassVar, Protocol
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from jaxbl.drive.effects import EFFECTS, AbstractEffect, ActuatorEffect, Motion, Numbers, Scales, make_effect
-from jaxbl.drive.parameters import Scalar, as_arrays
+from jaxbl.drive.effects import EFFECTS, AbstractEffect, Motion, Numbers, Scales, make_effect
+from jaxbl.drive.parameters import as_arrays
 from jaxbl.identification.regression import Path, effect_path
 from jaxbl.simulate import Experiment, with_effects
 
-from .linearised_segment import Part
+
+class Part(eqx.Module):
+    """A part of a record without gaps, and the model along it.
+
+    Attributes:
+        time: s, shape (samples,).
+        torque: input, N m, held from each sample to the next.
+        readings: position over its smoothed value, rad, shape (samples, sides).
+        position, velocity, acceleration: smoothed, of each side.
+        modelled: mean acceleration over the next period by the model, of each side: free of the readings' noise.
+        deviation: standard deviation of the smoothed velocity, of each side.
+        held: 1 where a side is not shown to move for a while, else 0.
+        step: A, shape (samples, states, states).
+        force: B, by torque on each side and by the input, shape (samples, states, sides + 1).
+        own: change of a step by each free number (theta), padded with zeros, shape (samples, states, numbers).
+        defect: model's step less the smoothed one, shape (samples, states).
+        weight: 1, or 0 where samples are padding.
+    """
+
+    time: Float[Array, " samples"]
+    torque: Float[Array, " samples"]
+    readings: Float[Array, "samples sides"]
+    position: dict[str, Float[Array, " samples"]]
+    velocity: dict[str, Float[Array, " samples"]]
+    acceleration: dict[str, Float[Array, " samples"]]
+    modelled: dict[str, Float[Array, " samples"]]
+    deviation: dict[str, Float[Array, " samples"]]
+    held: dict[str, Float[Array, " samples"]]
+    step: Float[Array, "samples states states"]
+    force: Float[Array, "samples states inputs"]
+    own: Float[Array, "samples states numbers"]
+    defect: Float[Array, "samples states"]
+    weight: Float[Array, " samples"]
+
+    def moving(self) -> "Part":
+        """Without the model's step: what torques along the motion need, of one shape whatever numbers are free."""
+        return eqx.tree_at(lambda part: (part.step, part.force, part.own, part.defect), self, (None,) * 4)
 
 
-class Candidate(Protocol):
-    """Torques that may be missing: some columns, and what is there without any of them."""
-
-    @property
-    def name(self) -> str:
-        """Of the effect."""
-        ...
-
-    @property
-    def width(self) -> int:
-        """Number of columns."""
-        ...
-
-    @property
-    def offset(self) -> bool:
-        """Whether something is there at coefficients of 0."""
-        ...
-
-    @property
-    def numbers(self) -> Callable[[Sequence[float]], Numbers | None]:
-        """The effect's numbers from the columns' coefficients; None where they are not allowed."""
-        ...
-
-    @property
-    def effects(self) -> tuple[AbstractEffect, ...]:
-        """Effects whose torques :meth:`columns` needs."""
-        ...
-
-    def columns(self, signals: "MotionTorques", torques: Sequence[np.ndarray]) -> np.ndarray:
-        """Columns in N m, shape (width, samples, sides + 1), and behind them what is there at coefficients of 0, if
-        anything is."""
-        ...
-
-
-@dataclasses.dataclass(frozen=True)
-class Variant:
-    """A candidate at given values of its numbers that are not linear.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Candidate:
+    """Torques that may be missing: columns with a coefficient each.
 
     Attributes:
         name: of the effect, e.g. `load.coulomb_friction`.
-        unit: for each column an effect and its size: the column is its torque over that size.
-        trial: in place of these, the effect at a trial value, and at values a little below and above.
-        numbers: the effect's numbers from the columns' coefficients; None where they are not allowed.
+        width: number of columns.
+        effects: effects whose torques the columns are made of.
+        columns: columns in N m, shape (width, samples, sides + 1), from a motion and these torques along it; behind them
+            what is there at coefficients of 0, if anything is.
+        numbers: the effect's numbers from the coefficients; None where they are not allowed.
+        offset: whether something is there at coefficients of 0.
     """
 
     name: str
-    unit: tuple[tuple[AbstractEffect, float], ...]
-    trial: tuple[AbstractEffect, AbstractEffect, AbstractEffect] | None
+    width: int
+    effects: tuple[AbstractEffect, ...]
+    columns: Callable[["MotionTorques", Sequence[np.ndarray]], np.ndarray]
     numbers: Callable[[Sequence[float]], Numbers | None]
-
-    @property
-    def width(self) -> int:
-        return len(self.unit) if self.trial is None else 1
-
-    @property
-    def offset(self) -> bool:
-        return self.trial is not None
-
-    @property
-    def effects(self) -> tuple[AbstractEffect, ...]:
-        """As of :class:`Candidate`."""
-        return tuple(effect for effect, _ in self.unit) if self.trial is None else self.trial
-
-    def columns(self, signals: "MotionTorques", torques: Sequence[np.ndarray]) -> np.ndarray:
-        """As :meth:`Candidate.columns`."""
-        if self.trial is None:
-            return np.stack([torque / size for torque, (_, size) in zip(torques, self.unit, strict=True)])
-        below, at, above = torques
-        return np.stack([(above - below) / (2.0 * _STEP), at])
+    offset: bool = False
 
 
 SHARE = 0.3
 """Prior size of an effect: share of the driving torque's rms."""
+_AT_ONCE = 6
+"""Effects of one name whose torques one compiled program computes."""
 _STEP = 0.02
+"""Change of the logarithm of a number by which the slope at a trial value is found."""
 SPACING = 0.3
 """Prior standard deviation of the logarithm of a number about its trial value."""
 
@@ -107,15 +97,9 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def variants_of(experiment: Experiment, lacking: Collection[str], scales: Callable[[str], Scales]) -> list[Variant]:
-    """Effects that a model lacks, variant by variant.
-
-    Args:
-        experiment: the model.
-        lacking: names of the effects.
-        scales: of the log, as an effect of a given name sees them.
-    """
-    found: list[Variant] = []
+def variants_of(experiment: Experiment, lacking: Collection[str], scales: Callable[[str], Scales]) -> list[Candidate]:
+    """Effects that a model lacks, variant by variant; `scales` of the log as an effect of a given name sees them."""
+    found: list[Candidate] = []
     for name in lacking:
         log = scales(name)
         # without an input nothing acts on it
@@ -124,7 +108,7 @@ def variants_of(experiment: Experiment, lacking: Collection[str], scales: Callab
     return found
 
 
-def _variants(name: str, log: Scales) -> Iterator[Variant]:
+def _variants(name: str, log: Scales) -> Iterator[Candidate]:
     """An effect at all values tried of the numbers that its torque is not proportional to."""
     roles = EFFECTS[name].roles()
     tried = [leaf for leaf, role in roles.items() if role.kind in ("harmonic", "frequency", "shape")]
@@ -133,17 +117,21 @@ def _variants(name: str, log: Scales) -> Iterator[Variant]:
         yield _proportional(name, known, log) if EFFECTS[name].sizes() else _trial(name, known)
 
 
-def _proportional(name: str, known: Numbers, log: Scales) -> Variant:
+def _proportional(name: str, known: Numbers, log: Scales) -> Candidate:
     """An effect with sizes: a column for each direction of them, two a quarter turn apart where its phase is not known."""
     cls = EFFECTS[name]
     roles, directions = cls.roles(), cls.directions()
     phase = next((leaf for leaf, role in roles.items() if role.kind == "angle"), None)
-    unit = []
+    effects, sizes = [], []
     for direction in directions:
         (size,) = {float(next(iter(roles[leaf].trials(log)))) for leaf in direction}
         numbers = dict.fromkeys(cls.sizes(), 0.0) | {leaf: size * share for leaf, share in direction.items()} | known
         turns = [{}] if phase is None else [{phase: 0.0}, {phase: 0.5 * math.pi}]
-        unit += [(_effect(name, numbers | turn), size) for turn in turns]
+        effects += [_effect(name, numbers | turn) for turn in turns]
+        sizes += [size] * len(turns)
+
+    def columns(_: MotionTorques, torques: Sequence[np.ndarray]) -> np.ndarray:
+        return np.stack([torque / size for torque, size in zip(torques, sizes, strict=True)])
 
     def numbers_of(values: Sequence[float]) -> Numbers | None:
         if phase is not None:
@@ -155,39 +143,32 @@ def _proportional(name: str, known: Numbers, log: Scales) -> Variant:
                 numbers[leaf] += value * share
         return numbers | known if cls.possible(numbers) else None
 
-    return Variant(name, tuple(unit), None, numbers_of)
+    return Candidate(name, len(effects), tuple(effects), columns, numbers_of)
 
 
-def _trial(name: str, known: Numbers) -> Variant:
+def _trial(name: str, known: Numbers) -> Candidate:
     """An effect without sizes: the first of its numbers about the value tried."""
     leaf, value = next(iter(known.items()))
-    below, at, above = (_effect(name, known | {leaf: value * math.exp(step)}) for step in (-_STEP, 0.0, _STEP))
+    tried = tuple(_effect(name, known | {leaf: value * math.exp(step)}) for step in (-_STEP, 0.0, _STEP))
+
+    def columns(_: MotionTorques, torques: Sequence[np.ndarray]) -> np.ndarray:
+        below, at, above = torques
+        return np.stack([(above - below) / (2.0 * _STEP), at])
 
     def numbers_of(values: Sequence[float]) -> Numbers | None:
         (change,) = values
         return known | {leaf: value * math.exp(change)} if abs(change) < 4.0 * SPACING else None
 
-    return Variant(name, (), (below, at, above), numbers_of)
+    return Candidate(name, 1, tried, columns, numbers_of, offset=True)
 
 
 def _effect(name: str, numbers: Numbers) -> AbstractEffect:
     return as_arrays(make_effect(name, **numbers), float)
 
 
-class _InputGain(ActuatorEffect):
-    """The input times a gain."""
-
-    kind: ClassVar[str] = "input_gain"
-    gain: Scalar
-
-    def actuate(self, state, torque, step):
-        return state, self.gain * torque
-
-
-def all_of_the_input() -> Variant:
+def all_of_the_input() -> Candidate:
     """The torque of the input once more."""
-    twice = _InputGain(jnp.asarray(2.0))
-    return Variant(twice.name, ((twice, 1.0),), None, lambda values: {})
+    return Candidate("input", 1, (), lambda signals, _: signals.placed(signals.torque[:, None], -1), lambda values: {})
 
 
 class MotionTorques:
@@ -199,12 +180,12 @@ class MotionTorques:
         self.count = len(part.time)
         self.real = np.asarray(part.weight) > 0.0
         self.torque = np.asarray(part.torque)
-        # what must be held where a side stands still
-        self.needed = {side: np.asarray(values) for side, values in _needed(experiment, part.moving()).items()}
-        self.direction = {side: self._direction(side) for side in self.sides}
-        self.known: dict[int, tuple[Candidate, np.ndarray]] = {}
+        needed = _needed(experiment, part.moving())
+        self.direction = {side: self._direction(side, np.asarray(needed[side])) for side in self.sides}
+        self.known: dict[Candidate, np.ndarray] = {}
 
-    def _direction(self, side: str) -> np.ndarray:
+    def _direction(self, side: str, needed: np.ndarray) -> np.ndarray:
+        """Direction of motion of a side, between -1 and 1; where it stands still, of the torque that holds it (`needed`)."""
         velocity, deviation = np.asarray(self.part.velocity[side]), np.asarray(self.part.deviation[side])
         period = float(self.part.time[1] - self.part.time[0])
         # the share of the time around a sample in forward motion less that in backward motion
@@ -215,8 +196,14 @@ class MotionTorques:
         if not held.any():
             return moving
         # a side that is held takes what it needs, up to the level
-        level = max(float(np.quantile(np.abs(self.needed[side][held]), 0.95)), np.finfo(float).tiny)
-        return np.where(held, np.clip(self.needed[side] / level, -1.0, 1.0), moving)
+        level = max(float(np.quantile(np.abs(needed[held]), 0.95)), np.finfo(float).tiny)
+        return np.where(held, np.clip(needed / level, -1.0, 1.0), moving)
+
+    def placed(self, columns: np.ndarray, at: int) -> np.ndarray:
+        """Columns of shape (samples, width) as torques on the side of an index, or of the input (-1); as :meth:`of`."""
+        found = np.zeros((columns.shape[1], self.count, len(self.sides) + 1))
+        found[:, :, at] = (columns * self.real[:, None]).T
+        return found
 
     def over(self, side: str) -> float:
         """Torque on a side for 1 N m at the motor."""
@@ -241,25 +228,14 @@ class MotionTorques:
         return found
 
 
-_AT_ONCE = 6
-
-
 def forces_of(candidates: Sequence[Candidate], signals: MotionTorques, spare: int = 0) -> np.ndarray:
     """Columns of candidates, one after the other, N m, and columns of zeros; shape (columns, samples, sides + 1)."""
-    widths = [one.width + one.offset for one in candidates]
-    found = np.zeros((sum(widths) + spare, signals.count, len(signals.sides) + 1))
-    new = [one for one in candidates if id(one) not in signals.known]
+    new = [one for one in candidates if one not in signals.known]
     torques = iter(signals.of([effect for one in new for effect in one.effects]))
-    at = 0
-    for one, width in zip(candidates, widths, strict=True):
-        # with the candidate itself, so that no other one gets its identity
-        _, columns = signals.known.get(id(one), (one, None))
-        if columns is None:
-            columns = one.columns(signals, [next(torques) for _ in one.effects])
-            signals.known[id(one)] = one, columns
-        found[at : at + width] = columns
-        at += width
-    return found
+    for one in new:
+        signals.known[one] = one.columns(signals, [next(torques) for _ in one.effects])
+    zeros = np.zeros((spare, signals.count, len(signals.sides) + 1))
+    return np.concatenate([*(signals.known[one] for one in candidates), zeros])
 
 
 @eqx.filter_jit

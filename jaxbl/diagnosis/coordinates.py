@@ -1,6 +1,6 @@
 """Coordinates of a log that a missing torque may depend on: speed, position, reversals, gap, load, time and others."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,29 +31,26 @@ class CoordinateValues(NamedTuple):
     symbol: str = ""
 
 
+_ANGLES = {"motor": "θe", "load": "θs"}
+
+
 def coordinates_of(
-    experiment: Experiment,
-    segment: Segment,
-    residual: Residual,
-    *,
-    rotating: bool | Mapping[str, bool] = True,
+    experiment: Experiment, segment: Segment, residual: Residual, sliding: Collection[str] = ()
 ) -> dict[str, CoordinateValues]:
     """Coordinates of a residual along its segment; of those that explain as much, the simpler ones first.
 
-    Args:
-        experiment: the model.
-        segment: of the log.
-        residual: along it.
-        rotating: whether positions are angles in rad; by side where they differ.
+    Positions of `sliding` sides are no angles.
     """
-    part = segment.kinematics
-    side = "motor" if residual.name == "transmission" else residual.name
-    turns = dict.fromkeys(part.position, rotating) if isinstance(rotating, bool) else rotating
-    length = "rad" if turns[side] else "m"
-    omega = "ω" if turns[side] else "v"
+    part, side = segment.kinematics, residual.name
+    length, omega = ("m", "v") if side in sliding else ("rad", "ω")
     velocity = np.asarray(part.velocity[side])
     deviation = np.asarray(segment.smoothed[side].deviation(1))
     still = np.abs(velocity) <= np.maximum(3.0 * deviation, 1e-3 * np.sqrt(np.mean(velocity**2)))
+
+    def position_of(one: str) -> CoordinateValues:
+        unit, symbol = ("m", "x") if one in sliding else ("rad", _ANGLES[one])
+        return CoordinateValues(np.asarray(part.position[one]), unit, symbol=symbol)
+
     found = {
         EVERYWHERE: CoordinateValues(np.zeros(len(velocity), int), classes=("everywhere",)),
         "direction": CoordinateValues(
@@ -66,41 +63,45 @@ def coordinates_of(
         found |= _gear_classes(experiment, part)
     found["|speed|"] = CoordinateValues(np.abs(velocity), f"{length}/s", symbol=f"|{omega}|")
     found["speed"] = CoordinateValues(velocity, f"{length}/s", symbol=omega)
-    for one in part.position:
+    for one in [name for name in part.position if name in (side, "load") and name not in sliding]:
         position = np.asarray(part.position[one])
-        if turns[one] and np.ptp(position) > 1.2 * 2.0 * np.pi and one in (side, "load"):
-            name = "turn" if one == side else f"{one} turn"
-            symbol = "θe mod 2π" if one == "motor" else "θs mod 2π"
-            found[name] = CoordinateValues(np.mod(position, 2.0 * np.pi), "rad", symbol=symbol)
-    symbol = ("θe" if side == "motor" else "θs") if turns[side] else "x"
-    found["position"] = CoordinateValues(np.asarray(part.position[side]), length, symbol=symbol)
+        if np.ptp(position) > 1.2 * 2.0 * np.pi:
+            name, turned = "turn" if one == side else f"{one} turn", np.mod(position, 2.0 * np.pi)
+            found[name] = CoordinateValues(turned, "rad", symbol=f"{_ANGLES[one]} mod 2π")
+    found["position"] = position_of(side)
     if side != "load" and geared:
-        found["load position"] = CoordinateValues(
-            np.asarray(part.position["load"]), "rad" if turns["load"] else "m", symbol="θs" if turns["load"] else "x"
-        )
+        found["load position"] = position_of("load")
+    unit, force = ("m", "N") if "motor" in sliding else ("rad", "N m")
     if geared:
         twist, rate = (np.asarray(experiment.plant.twist(one)) for one in (part.position, part.velocity))  # type: ignore[arg-type]
-        found["twist"] = CoordinateValues(twist, "rad" if turns["motor"] else "m", symbol="z")
-        found["twist rate"] = CoordinateValues(rate, "rad/s" if turns["motor"] else "m/s", symbol="ż")
-    unit = "N m" if turns["motor"] else "N"
+        found["twist"] = CoordinateValues(twist, unit, symbol="z")
+        found["twist rate"] = CoordinateValues(rate, f"{unit}/s", symbol="ż")
     if side == "motor":
-        found["input"] = CoordinateValues(np.asarray(part.torque), unit, symbol="u")
-    acceleration = np.asarray(part.acceleration[side])
-    if residual.name in experiment.sides:
-        # by the model: the measured one's noise is the residual's, and would be found there
-        acceleration = acceleration - residual.torque / float(experiment.plant.inertia(side))
+        found["input"] = CoordinateValues(np.asarray(part.torque), force, symbol="u")
+    # by the model: the measured one's noise is the residual's, and would be found there
+    acceleration = np.asarray(part.acceleration[side]) - residual.torque / float(experiment.plant.inertia(side))
     found["acceleration"] = CoordinateValues(acceleration, f"{length}/s²", symbol="a")
     found["time"] = CoordinateValues(np.asarray(part.time), "s", symbol="t")
     return found
 
 
+def all_coordinates(
+    experiment: Experiment,
+    segments: Sequence[Segment],
+    residuals: Mapping[str, Sequence[Residual]],
+    sliding: Collection[str],
+) -> dict[str, list[dict[str, CoordinateValues]]]:
+    """Those of each side's residuals (:func:`coordinates_of`), segment by segment."""
+    return {
+        side: [coordinates_of(experiment, segment, one, sliding) for segment, one in zip(segments, pieces, strict=True)]
+        for side, pieces in residuals.items()
+    }
+
+
 def _gear_classes(experiment: Experiment, part: Kinematics) -> dict[str, CoordinateValues]:
     """On which side of the gap the transmission is, and which way it is loaded."""
     found, plant = {}, experiment.plant
-    torque = part.transmitted
-    if torque is None:
-        torque = transmitted(experiment, part)
-    torque = np.asarray(torque)
+    torque = np.asarray(transmitted(experiment, part) if part.transmitted is None else part.transmitted)
     if plant.half_gap > 0.0:
         twist = np.asarray(plant.twist(part.position))  # type: ignore[arg-type]
         inside = np.where(np.abs(twist) < plant.half_gap, 1, np.where(twist > 0.0, 2, 0))

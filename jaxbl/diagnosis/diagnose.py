@@ -22,16 +22,16 @@ from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress
 
-from .coordinates import CoordinateValues, coordinates_of
-from .diagnosis_summary import extended_study, observers_say, rival_tables, summary_of, where_lacking
+from .coordinates import CoordinateValues, all_coordinates
+from .diagnosis_summary import extended_study, observers_say, rival_tables, summary_of, trace_of, where_lacking
 from .diagnosis_task import DiagnosisTask, read_diagnosis_task
-from .diagnosis_trace import trace_of
 from .effect_search import EffectSearch, Explanation
 from .localise import SIGNIFICANT, Localised, localise
 from .observer_residual import Observed, observed_torques
-from .proof import Proof, at_period
-from .residuals import Residual
-from .setup import Setup, rotating, set_up
+from .proof import Proof, free_values
+from .reference_log import at_period
+from .residuals import Residual, residual_torques
+from .setup import Setup, set_up
 
 _BOUND = 4.0
 """Standard deviations that the model's own numbers may be off where they are held."""
@@ -105,14 +105,12 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
     Raises:
         InputError: a model that diverges.
     """
-    config, record = task.config, task.record
     done = stage_counter(_STAGES, progress)
     with jax.enable_x64(True):
         setup = set_up(task)
-        nominal, segments, lacking = setup.nominal, setup.fitted.segments, setup.lacking
-        proof = Proof(task, setup)
+        proof = Proof(setup)
         done()
-        search, found = _explained(task, setup)
+        search, found = _explained(setup)
         done()
         fitted, after, withdrawn = proof.accepted(search, found)
         done()
@@ -120,38 +118,42 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
             found = search.without(found, withdrawn)
         gap = proof.gap(fitted, after, found.wrong)
         done()
-        lacking_after = setup.fitted.torques(fitted.experiment)
+        lacking_after = residual_torques(fitted.experiment, setup.fitted.segments)
+        on_log, on_holdout = _paired(setup.lacking, lacking_after), _paired(proof.before.torques, after.torques)
         _, gain_values = gains_for(task.missing, fitted.experiment, setup.recorded)
         observing = set_leaves(setup.bare, arrays(gain_values))
-        observed = _observed(task, setup, observing)
-        trace = trace_of(task, (lacking, lacking_after), (proof.before.torques, after.torques), observed)
+        observed = _observed(setup, observing)
+        trace = trace_of(setup, on_log, on_holdout, observed)
         done()
-        summary = summary_of(task, setup, fitted, found, withdrawn)
+        summary = summary_of(setup, fitted, found, withdrawn)
         about, notes = observers_say(observing, observed[0], setup)
         for side, one in about.items():
             summary["where"][side]["observed"] = one
         summary["notes"] += notes
         summary["gap"] = gap
         if found.verdict == "unknown_effect":
-            left = localise(fitted.experiment, lacking_after, segments, rotating=rotating(record, nominal))
-            summary["where_after"] = where_lacking(record, left)
+            segments = setup.fitted.segments
+            coordinates = all_coordinates(fitted.experiment, segments, lacking_after, setup.sliding)
+            left = localise(fitted.experiment, lacking_after, segments, coordinates)
+            summary["where_after"] = where_lacking(task.record, left)
         if found.wrong is not None:
-            summary["rival"] = rival_tables(config, setup.own, found.wrong)
-        model = extended_study(config, fitted.numbers, fitted.own | gain_values)
-        coordinates = _coordinates(task, setup)
+            summary["rival"] = rival_tables(task.config, setup.own, found.wrong)
+        model = extended_study(task.config, fitted.numbers, free_values(setup.own, fitted.theta) | gain_values)
         done()
-    replays = "excitation" in task.missing
     pairs = {
-        side: [
-            *((one, left, False) for one, left in zip(lacking[side], lacking_after[side], strict=True) if not task.separate),
-            *((one, left, True) for one, left in zip(proof.before.torques[side], after.torques[side], strict=True)),
-        ]
-        for side in lacking
+        side: [*((*one, False) for one in on_log[side] if not task.separate), *((*one, True) for one in on_holdout[side])]
+        for side in on_log
     }
     return Diagnosis(
-        config, model, record, task.holdout, plain(summary), trace, lacking, observed[0], coordinates, setup.located, pairs,
-        replays,
+        task.config, model, task.record, task.holdout, plain(summary), trace, setup.lacking, observed[0], setup.coordinates,
+        setup.located, pairs, replays="excitation" in task.missing,
     )  # fmt: skip
+
+
+def _paired(
+    before: Mapping[str, list[Residual]], after: Mapping[str, list[Residual]]
+) -> dict[str, list[tuple[Residual, Residual]]]:
+    return {side: list(zip(pieces, after[side], strict=True)) for side, pieces in before.items()}
 
 
 def new_search(setup: Setup, bound: float = np.inf) -> EffectSearch:
@@ -159,7 +161,7 @@ def new_search(setup: Setup, bound: float = np.inf) -> EffectSearch:
     return EffectSearch(setup.bare, setup.own, setup.prior.tolist(), setup.fitted.segments, bound)
 
 
-def _explained(task: DiagnosisTask, setup: Setup) -> tuple[EffectSearch, Explanation]:
+def _explained(setup: Setup) -> tuple[EffectSearch, Explanation]:
     """What the log says that the model lacks.
 
     Where two effects are missing at once, the model's own numbers may go wrong, and hide both. If they do, effects are
@@ -174,20 +176,16 @@ def _explained(task: DiagnosisTask, setup: Setup) -> tuple[EffectSearch, Explana
         if again.verdict != "unknown_effect" and other.plausible(again):
             search, found = other, again
     if found.verdict == "no_discrepancy":
-        _check_shown(task.record, setup, search.shown())
+        _check_shown(setup, search.linear({}, np.zeros(len(setup.own))).shown())
     return search, found
 
 
-def _check_shown(record: Record, setup: Setup, shown: float) -> None:
-    """Refuse to say that nothing is missing where noise hides everything.
-
-    Args:
-        record: the log.
-        setup: of the diagnosis.
-        shown: standard deviations by which the log shows its input.
-    """
+def _check_shown(setup: Setup, shown: float) -> None:
+    """Refuse to say that nothing is missing where noise hides everything, the input itself but for `shown` of its standard
+    deviations."""
     if shown * _HIDDEN >= SIGNIFICANT:
         return
+    record = setup.task.record
     noise = ", ".join(
         f"{value:.2g} {record.findings.channels[POSITION_CHANNELS[side]].unit} ({POSITION_CHANNELS[side]})"
         for side, value in setup.fitted.noise.items()
@@ -200,23 +198,9 @@ def _check_shown(record: Record, setup: Setup, shown: float) -> None:
     )
 
 
-def _coordinates(task: DiagnosisTask, setup: Setup) -> dict[str, list[dict[str, CoordinateValues]]]:
-    """Coordinates along the torques that the model as given lacks."""
-    turning = rotating(task.record, setup.nominal)
-    return {
-        side: [
-            coordinates_of(setup.nominal, segment, one, rotating=turning)
-            for segment, one in zip(setup.fitted.segments, pieces, strict=True)
-        ]
-        for side, pieces in setup.lacking.items()
-    }
-
-
-def _observed(
-    task: DiagnosisTask, setup: Setup, nominal: Experiment
-) -> tuple[dict[str, list[Observed]], dict[str, list[Observed]]]:
+def _observed(setup: Setup, nominal: Experiment) -> tuple[dict[str, list[Observed]], dict[str, list[Observed]]]:
     """What the observers see on the log, and on what was held out of it; nothing is decided by it."""
     held = {}
-    if not task.separate:
+    if not setup.task.separate:
         held = observed_torques(at_period(nominal, setup.holdout.period), setup.holdout.segments)
     return observed_torques(nominal, setup.fitted.segments), held

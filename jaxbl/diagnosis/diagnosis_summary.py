@@ -1,57 +1,57 @@
-"""What a diagnosis found: `diagnosis.json` with findings, numbers and notes, and the study with what was missing."""
+"""What a diagnosis found: `diagnosis.json` with findings, numbers and notes, `trace.parquet`, and the study with what was
+missing."""
+
+# pandas' own annotations are wider than what its methods return
+# pyright: reportArgumentType=false
 
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
+import pandas as pd
 
 from jaxbl.config import Config, read_config, with_values
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import parameters
 from jaxbl.identification.logs import unit_on
 from jaxbl.identification.trajectory import Free
-from jaxbl.records import Record
+from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 
-from .diagnosis_task import DiagnosisTask, input_rms
+from .diagnosis_task import input_rms
 from .effect_search import FAR, Explanation, Finding, Model
 from .localise import SIGNIFICANT, Localised
 from .neutral_effects import with_added
 from .observer_residual import Observed, compared
 from .proof import FittedModel, free_values
+from .residuals import Residual
 from .sentences import sentence_of
 from .setup import Setup
 
 
-def summary_of(
-    task: DiagnosisTask, setup: Setup, fitted: FittedModel, found: Explanation, withdrawn: Sequence[str]
-) -> dict[str, Any]:
-    """The summary but for the proof, and for what the observers say.
-
-    Args:
-        task: study and logs.
-        setup: of the diagnosis.
-        fitted: the model with what was found.
-        found: the explanation, without what was withdrawn.
-        withdrawn: effects that were found and withdrawn.
-    """
-    record, located = task.record, setup.located
+def summary_of(setup: Setup, fitted: FittedModel, found: Explanation, withdrawn: Sequence[str]) -> dict[str, Any]:
+    """The summary but for the proof, and for what the observers say; `withdrawn`: effects that were found, and that the
+    explanation is without."""
+    task, record, located = setup.task, setup.task.record, setup.located
     where = where_lacking(record, located)
-    values, errors = fitted.values, fitted.errors()
+    values, errors = free_values(fitted.free, fitted.theta), fitted.errors()
     notes = list(record.notes)
     if task.separate:
         notes += [f"{task.holdout.path.name}: {note}" for note in task.holdout.notes if note not in record.notes]
     notes += [f"{name} was found, and withdrawn: with it the held-out data are met no better." for name in withdrawn]
-    timed = [
-        one.effect for one in found.findings if any(r.kind == "frequency" for r in EFFECTS[one.effect].roles().values())
-    ]
-    if task.separate:
-        notes += [f"The phase of {name} is taken to be the same at the start of both logs." for name in timed]
+    for one in found.findings:
+        if task.separate and any(role.kind == "frequency" for role in EFFECTS[one.effect].roles().values()):
+            notes.append(f"The phase of {one.effect} is taken to be the same at the start of both logs.")
     if found.verdict == "no_discrepancy":
         notes += _least_seen(record, located)
-    own = [one for one in fitted.free if not any(one.path.startswith(f"effects.{name}.") for name in fitted.names)]
-    notes += _far_off(own, values, task.config.uncertainty.relative)
-    if setup.torque_noise > 0.0:
-        notes.append(_noise_note(record, setup.torque_noise))
+    notes += _far_off(setup.own, values, task.config.uncertainty.relative)
+    if (noise := setup.torque_noise) > 0.0:
+        notes.append(
+            f"The channel u carries noise of {noise:.2g} {unit_on(record, 'motor.torque', 'N m')} rms "
+            f"({noise / input_rms(record):.1%} of the input) that the drive does not feel: models are driven by u smoothed "
+            "between its jumps."
+        )
     return {
         "title": task.config.title,
         "identity": task.identity,
@@ -59,7 +59,7 @@ def summary_of(
         "samples": len(record.time),
         "sample_period": record.sample_period,
         "verdict": found.verdict,
-        "findings": [_finding(task, one, values, errors, where, located) for one in found.findings],
+        "findings": [_finding(record, one, values, errors, where) for one in found.findings],
         "parameters": {
             one.path: {
                 "value": values[one.path],
@@ -67,7 +67,7 @@ def summary_of(
                 "nominal": one.nominal,
                 "unit": unit_on(record, one.path, one.unit),
             }
-            for one in own
+            for one in setup.own
         },
         "where": where,
         "rest": {name: {"evidence": gain, "share": share} for name, (gain, share) in found.rest.items()},
@@ -77,26 +77,20 @@ def summary_of(
 
 
 def _finding(
-    task: DiagnosisTask,
-    one: Finding,
-    values: Mapping[str, float],
-    errors: Mapping[str, float],
-    where: Mapping[str, Any],
-    located: Mapping[str, Localised],
+    record: Record, one: Finding, values: Mapping[str, float], errors: Mapping[str, float], where: Mapping[str, Any]
 ) -> dict[str, Any]:
-    prefix, known = f"effects.{one.effect}", dict.fromkeys(one.numbers)
     units = {field.name: about.unit for field, about in parameters(EFFECTS[one.effect])}
     numbers = {
         leaf: {
-            "value": values.get(f"{prefix}.{leaf}", one.numbers[leaf]),
-            "standard_error": errors.get(f"{prefix}.{leaf}", 0.0),
-            "unit": unit_on(task.record, f"{one.effect}.{leaf}", units[leaf]),
+            "value": values.get(f"effects.{one.effect}.{leaf}", value),
+            "standard_error": errors.get(f"effects.{one.effect}.{leaf}", 0.0),
+            "unit": unit_on(record, f"{one.effect}.{leaf}", units[leaf]),
         }
-        for leaf in known
+        for leaf, value in one.numbers.items()
     }
     place = one.effect.partition(".")[0]
-    sides = {"motor": ["motor"], "actuator": ["motor"]}.get(place, ["load"] if place == "load" else list(located))
-    sides = [side for side in sides if side in located] or list(located)
+    side = "motor" if place == "actuator" else place
+    sides = [side] if side in where else list(where)
     return {
         "effect": one.effect,
         "confidence": one.confidence,
@@ -127,34 +121,20 @@ def _far_off(own: Sequence[Free], values: Mapping[str, float], uncertainty: floa
     return lines
 
 
-def _noise_note(record: Record, noise: float) -> str:
-    unit = unit_on(record, "motor.torque", "N m")
-    return (
-        f"The channel u carries noise of {noise:.2g} {unit} rms ({noise / input_rms(record):.1%} of the input) that the "
-        "drive does not feel: models are driven by u smoothed between its jumps."
-    )
-
-
 def _least_seen(record: Record, located: Mapping[str, Localised]) -> list[str]:
     """What would not have been seen."""
-    unit = {side: unit_on(record, f"{side}.torque", "N m") for side in located}
     lines = []
     for side, one in located.items():
-        least = SIGNIFICANT * one.coordinates["all"].regions[0].mean_error
-        lines.append(f"{side}: a steady torque of less than about {least:.2g} {unit[side]} would not have been seen.")
+        least, unit = SIGNIFICANT * one.coordinates["all"].regions[0].mean_error, unit_on(record, f"{side}.torque", "N m")
+        lines.append(f"{side}: a steady torque of less than about {least:.2g} {unit} would not have been seen.")
     return lines
 
 
 def observers_say(
     nominal: Experiment, observed: Mapping[str, Sequence[Observed]], setup: Setup
 ) -> tuple[dict[str, Any], list[str]]:
-    """What the observers say of the torques that the model as given lacks, by side, and notes where they say nothing.
-
-    Args:
-        nominal: the model with the observers' gains.
-        observed: what they see on the log, segment by segment.
-        setup: of the diagnosis.
-    """
+    """What the observers of a model with their gains say of the torques that it lacks as given, by side, and notes where
+    they say nothing."""
     found, notes = {}, []
     for side, pieces in observed.items():
         gains = getattr(nominal.observer, side)
@@ -172,17 +152,47 @@ def observers_say(
 
 def extended_study(config: Config, numbers: Mapping[str, Mapping[str, float]], values: Mapping[str, float]) -> Config:
     """The study with effects more, and with these numbers."""
-    return with_values(_with_effects(config.resolved(), numbers), values)
-
-
-def _with_effects(data: dict[str, Any], numbers: Mapping[str, Mapping[str, Any]]) -> Config:
+    data = config.resolved()
     added = [{"kind": name, **one} for name, one in numbers.items()]
     data["effects"] = with_added(data.get("effects", []), added, lambda one: one["kind"])
-    return read_config(data)
+    return with_values(read_config(data), values)
 
 
 def rival_tables(config: Config, own: Sequence[Free], rival: Model) -> dict[str, Any]:
     """The best model with another effect, as tables of a study."""
-    values = {path: float(value) for path, value in free_values(own, rival.theta).items()}
-    data = extended_study(config, {name: rival.numbers[name] for name in rival.names}, values).resolved()
+    data = extended_study(config, rival.numbers, free_values(own, rival.theta)).resolved()
     return {"effect": rival.names[-1]} | {key: data[key] for key in ("drive", "transmission", "effects") if key in data}
+
+
+Pairs = Mapping[str, Sequence[tuple[Residual, Residual]]]
+"""Torques that a model lacks as given and with the effects, by side, segment by segment."""
+
+
+def trace_of(
+    setup: Setup, fitted: Pairs, held: Pairs, observed: tuple[Mapping[str, list[Observed]], Mapping[str, list[Observed]]]
+) -> pd.DataFrame:
+    """One row a sample of the log, its held-out part included; of another log that was held out there is nothing.
+
+    `observed` is what the model as given lacks by the observers, on both parts.
+    """
+    task = setup.task
+    whole = task.record if task.separate else task.holdout
+    columns: dict[str, Any] = {"t": whole.time, "u": whole.torque}
+    columns |= {POSITION_CHANNELS[side]: whole.positions[side] for side in POSITION_CHANNELS if side in whole.positions}
+    columns["held_out"] = np.arange(len(whole.time)) >= len(task.record.time)
+    sources = [(task.record, fitted)] + ([] if task.separate else [(task.holdout, held)])
+    for side in fitted:
+        before, after, noise = np.full((3, len(whole.time)), np.nan)
+        for record, pairs in sources:
+            for rows, (one, left) in zip(record.segments, pairs[side], strict=True):
+                before[rows], after[rows], noise[rows] = one.torque, left.torque, one.deviation
+        columns |= {f"{side}.missing_before": before, f"{side}.missing_after": after, f"{side}.noise": noise}
+    for side in observed[0]:
+        torque, noise = np.full((2, len(whole.time)), np.nan)
+        for record, pieces in zip((task.record, task.holdout), observed, strict=True):
+            for part, one in zip(record.segments if pieces else (), pieces.get(side, ()), strict=True):
+                if one.converged:
+                    rows = slice(part.start + one.skipped, part.stop)
+                    torque[rows], noise[rows] = one.residual.torque, one.residual.deviation
+        columns |= {f"{side}.observed_before": torque, f"{side}.observed_noise": noise}
+    return pd.DataFrame(columns)

@@ -16,7 +16,7 @@ HELD_OUT = 0.25
 """Share of a log that is held out where there is no other one for it."""
 GEAR_TOLERANCE = 0.25
 """A missing effect (a soft shaft, a gap) shifts the ratio of both motions, on a short log by a fifth."""
-_FEWEST = 100
+_LEAST_SAMPLES = 100
 """Samples of a part of a log, and of what is held out: the smoother's ends, some ten samples each, are then a small part."""
 _ALIKE = 4.0
 """Factor between the inertias that two logs of one machine may show."""
@@ -61,11 +61,11 @@ def input_rms(record: Record) -> float:
 
 def _long(record: Record) -> Record:
     """Without parts that are too short for the equations of motion."""
-    parts = tuple(part for part in record.segments if part.stop - part.start >= _FEWEST)
+    parts = tuple(part for part in record.segments if part.stop - part.start >= _LEAST_SAMPLES)
     if not parts:
         raise InputError(
             f"{record.path}: its longest part has {max(part.stop - part.start for part in record.segments)} samples; "
-            f"at least {_FEWEST} are needed"
+            f"at least {_LEAST_SAMPLES} are needed"
         )
     return dataclasses.replace(record, segments=parts)
 
@@ -74,10 +74,10 @@ def split(record: Record) -> tuple[Record, Record]:
     """The samples to be fitted, and those held out: the last of the log, at their own times."""
     total = sum(part.stop - part.start for part in record.segments)
     left = round((1.0 - HELD_OUT) * total)
-    if HELD_OUT * total < _FEWEST:
+    if HELD_OUT * total < _LEAST_SAMPLES:
         raise InputError(
             f"{record.path}: {total} samples are too few to hold a quarter of them out; at least "
-            f"{int(np.ceil(_FEWEST / HELD_OUT))} are needed, or another log: --holdout"
+            f"{int(np.ceil(_LEAST_SAMPLES / HELD_OUT))} are needed, or another log: --holdout"
         )
     row = record.segments[-1].stop
     for part in record.segments:

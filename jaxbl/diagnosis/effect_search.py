@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import softmax
 
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import set_leaves
@@ -20,15 +21,13 @@ from jaxbl.identification.segments import Segment
 from jaxbl.identification.trajectory import WIDE, Free, free_parameters
 from jaxbl.simulate import Experiment
 
-from .candidates import SHARE, Candidate, Numbers, Variant, variants_of
-from .evidence import Scorer, Set
+from .candidates import SHARE, Candidate, Numbers, variants_of
+from .evidence import Evidence, evidence_of
 from .free_functions import functions_of
-from .linearised_model import DIVERGED, Linear
+from .linearised_model import DIVERGED, Linear, Predictor
 from .neutral_effects import candidates, complete
 from .refit import Refined, refined
-from .whittle import Spectrum
-
-Names = tuple[str, ...]
+from .whittle import Spectrum, spectrum_of
 
 VerdictName = Literal["explained", "no_discrepancy", "unknown_effect"]
 
@@ -45,7 +44,7 @@ FAR = 5.0
 _WEAK = 6.0
 """Standard errors of an effect's torque below which the effect is asked for once more: an error of the first fit may be as
 large."""
-_STEPS, _SETTLED = 15, 2e-3
+_REFIT_STEPS, _REFIT_SETTLED = 15, 2e-3
 """Gauss-Newton steps of a refit at most, and the relative change of all numbers below which it has ended. The last fit is
 exact (:mod:`.refit`); evidences are compared at this one."""
 _LEAST_GAIN = 1e-3
@@ -75,22 +74,22 @@ class Model:
     """A set of effects in the model, all numbers refitted.
 
     Attributes:
-        names: of the effects.
-        experiment: with all effects, those of `names` at `numbers`; its own numbers are the nominal ones.
         numbers: of the effects.
         theta: the nominal model's own numbers.
         log_evidence: nats; only differences count.
         log_likelihood: nats; as `log_evidence`.
-        linear: the model along the record.
+        linear: the model, which has all effects, those of other names at neutral numbers, along the record.
     """
 
-    names: Names
-    experiment: Experiment
     numbers: dict[str, Numbers]
     theta: np.ndarray
     log_evidence: float
     log_likelihood: float
     linear: Linear
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self.numbers)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,36 +131,22 @@ class Explanation:
     rest: dict[str, tuple[float, float]]
 
 
-class Refitted(NamedTuple):
-    """A model with the numbers of least prediction errors, and which of them were free: its own first."""
-
-    free: tuple[Free, ...]
-    refined: Refined
-
-
-class _Finalist(NamedTuple):
-    """One of the best candidates on the linearised model: its numbers, and the change of the model's own beside them."""
-
-    name: str
-    numbers: Numbers
-    own: np.ndarray
-    gain: float
-
-
 class _Scored(NamedTuple):
     """A candidate on the linearised model, judged by the density of its errors whatever the predictor and its variance.
 
     Attributes:
-        name: of the candidate.
         found: under a given deviation of the errors.
         count: of samples.
         deviation: of the errors by side, rad; its size, common to both sides, is then the one of largest likelihood.
+        name: of the candidate; empty where there is none.
+        variant: its index.
     """
 
-    name: str
-    found: Set
+    found: Evidence
     count: int
     deviation: np.ndarray
+    name: str = ""
+    variant: int = -1
 
     @property
     def log_likelihood(self) -> float:
@@ -181,19 +166,14 @@ class _Tried(NamedTuple):
     gain: float
     numbers: Numbers
 
-    @property
-    def size(self) -> int:
-        return len(self.numbers)
-
 
 class _Point(NamedTuple):
     """A model at some numbers: sum of squares with the prior's, and the linear step from there."""
 
-    experiment: Experiment
     linear: Linear
     values: dict[str, Numbers]
     theta: np.ndarray
-    found: Set
+    found: Evidence
     cost: float
 
 
@@ -211,10 +191,8 @@ class EffectSearch:
         """Prepare to explain a record.
 
         Args:
-            experiment: the nominal model, with array leaves; its sample period is that of the record. Models of the
-                explanation have all effects, those that are not found at neutral numbers (:mod:`.neutral_effects`).
-            free: its own numbers that are not exactly known.
-            prior: relative standard deviation of each.
+            experiment: the nominal model, with array leaves; its sample period is that of the record.
+            free, prior: its own numbers that are not exactly known, and the relative standard deviation of each.
             segments: of the log.
             bound: standard deviations that each number may be off while effects are sought.
         """
@@ -224,23 +202,28 @@ class EffectSearch:
         self.segments = segments
         self.floor = FLOOR * sum(map(len, segments)) * len(experiment.sides)
         self._recent: dict[tuple, Linear] = {}
-        self._refitted: tuple[tuple, Refitted] | None = None
+        self._refitted: tuple[tuple, Refined] | None = None
 
-    def refitted(self, values: Mapping[str, Numbers], theta: np.ndarray) -> "Refitted":
-        """The model with some effects, with the numbers of least prediction errors (:mod:`.refit`)."""
+    def refitted(self, values: Mapping[str, Numbers], theta: np.ndarray) -> Refined:
+        """The model with some effects, with the numbers of least prediction errors (:mod:`.refit`), its own first."""
         key = _key(values, theta)
         if self._refitted is None or self._refitted[0] != key:
             experiment = with_numbers(self.nominal, values)
             added = free_parameters(experiment, paths_of(values), self._torque)
-            free, width = (*self.free, *added), np.concatenate([self.prior, np.full(len(added), WIDE)])
+            width = np.concatenate([self.prior, np.full(len(added), WIDE)])
             start = np.concatenate([theta, np.zeros(len(added))])
-            self._refitted = key, Refitted(free, refined(experiment, free, start, width, self.segments))
+            self._refitted = key, refined(experiment, (*self.free, *added), start, width, self.segments)
         return self._refitted[1]
 
     def plausible(self, found: Explanation) -> bool:
         """Whether the model's own numbers, fitted to the last digit, are where they may be by what is known of them."""
-        theta = self.refitted(found.model.numbers, found.model.theta).refined.theta[: len(self.free)]
+        theta = self.refitted(found.model.numbers, found.model.theta).theta[: len(self.free)]
         return bool(np.all(np.abs(theta) < FAR * self.prior))
+
+    @property
+    def _torque(self) -> float:
+        """Size of the input, N m."""
+        return float(np.std(np.concatenate([one.torque for one in self.segments])))
 
     def linear(self, values: Mapping[str, Numbers], theta: np.ndarray) -> Linear:
         """The model with some effects along the record."""
@@ -248,79 +231,52 @@ class EffectSearch:
         if key not in self._recent:
             if len(self._recent) == _RECENT:
                 self._recent.pop(next(iter(self._recent)))
-            self._recent[key] = self._linear(with_numbers(self.nominal, values), tuple(values), theta)
+            experiment = with_numbers(self.nominal, values)
+            added = free_parameters(experiment, paths_of(values), self._torque)
+            widths = [EFFECTS[name].roles()[leaf].width for name in values for leaf in _fitted_numbers(name)]
+            prior, at = np.concatenate([self.prior, widths]), np.concatenate([theta, np.zeros(len(added))])
+            bound = np.concatenate([np.full(len(self.free), self.bound), np.full(len(added), np.inf)])
+            self._recent[key] = Linear(experiment, (*self.free, *added), at, prior, self.segments, bound)
         return self._recent[key]
 
-    @property
-    def _torque(self) -> float:
-        """Size of the input, N m."""
-        return float(np.std(np.concatenate([one.torque for one in self.segments])))
-
-    def _linear(self, experiment: Experiment, names: Names, theta: np.ndarray) -> Linear:
-        paths = paths_of(names)
-        own = (*self.free, *free_parameters(experiment, paths, self._torque))
-        widths = [EFFECTS[name].roles()[leaf].width for name in names for leaf in _fitted(name)]
-        prior = np.concatenate([self.prior, widths])
-        centre = np.concatenate([-theta, np.zeros(len(paths))])
-        at = np.concatenate([theta, np.zeros(len(paths))])
-        bound = np.concatenate([np.full(len(self.free), self.bound), np.full(len(paths), np.inf)])
-        return Linear(experiment, own, at, prior, centre, self.segments, bound)
-
-    def refit(
-        self,
-        names: Names,
-        numbers: Mapping[str, Numbers],
-        theta: np.ndarray,
-        smoothness: Sequence[float],
-        deviation: np.ndarray,
-    ) -> Model:
+    def refit(self, values: Mapping[str, Numbers], theta: np.ndarray, predictor: Predictor) -> Model:
         """Put effects into the model and refit everything."""
-        values = {name: dict(numbers[name]) for name in names}
+        values = {name: dict(numbers) for name, numbers in values.items()}
         best: _Point | None = None
         change = np.zeros(0)
-        for _ in range(_STEPS):
-            point = self._point(names, values, theta, smoothness, deviation)
+        for _ in range(_REFIT_STEPS):
+            point = self._point(values, theta, predictor)
             if best is None or point.cost < best.cost:
                 if not np.isfinite(point.cost):
                     break
                 best, change = point, np.clip(point.found.own, -1.0, 1.0)
             else:
                 change = 0.25 * change
-            if np.max(np.abs(change), initial=0.0) < _SETTLED:
+            if np.max(np.abs(change), initial=0.0) < _REFIT_SETTLED:
                 break
             theta, values = self._moved(best, change)
-        if best is None:
-            return Model(names, point.experiment, values, theta, -np.inf, -np.inf, point.linear)
-        experiment, linear, found, values, theta = best.experiment, best.linear, best.found, best.values, best.theta
-        if not all(EFFECTS[name].possible(one) for name, one in values.items()):
-            return Model(names, experiment, values, theta, -np.inf, -np.inf, linear)
-        scored = _Scored("", found, linear.count, deviation)
-        evidence = scored.log_evidence + len(names) * ODDS - sum(linear.choices(name) for name in names)
-        return Model(names, experiment, values, theta, evidence, scored.log_likelihood, linear)
+        if best is None or not all(EFFECTS[name].possible(one) for name, one in best.values.items()):
+            last = best or point
+            return Model(last.values, last.theta, -np.inf, -np.inf, last.linear)
+        scored = _Scored(best.found, best.linear.count, predictor.deviation)
+        evidence = scored.log_evidence + len(values) * ODDS - sum(best.linear.choices(name) for name in values)
+        return Model(best.values, best.theta, evidence, scored.log_likelihood, best.linear)
 
-    def _point(
-        self,
-        names: Names,
-        values: dict[str, Numbers],
-        theta: np.ndarray,
-        smoothness: Sequence[float],
-        deviation: np.ndarray,
-    ) -> _Point:
+    def _point(self, values: dict[str, Numbers], theta: np.ndarray, predictor: Predictor) -> _Point:
         """Cost at some numbers, and where the linear step leads."""
-        experiment = with_numbers(self.nominal, values)
         linear = self.linear(values, theta)
-        columns = linear.columns((), smoothness, deviation)
-        scale, sizes = columns.scale.copy(), linear.sizes(names)
+        columns = linear.columns((), predictor.smoothness, predictor.deviation)
+        scale, sizes = columns.scale.copy(), {name: linear.size(name) for name in values}
         for i, one in enumerate(linear.free[len(self.free) :], 1 + len(self.free)):
             if one.role == "size":
                 scale[i] = sizes[_owner(one)[0]]
         found = None
         if np.max(np.abs(columns.products)) < DIVERGED and np.isfinite(scale[1:]).all():
-            found = Scorer(dataclasses.replace(columns, scale=scale), ())(())
+            found = evidence_of(dataclasses.replace(columns, scale=scale))
         if found is None:
-            return _Point(experiment, linear, values, theta, Set((), -np.inf, np.inf, (), np.zeros(0)), np.inf)
+            return _Point(linear, values, theta, Evidence(-np.inf, np.inf, {}, np.zeros(0)), np.inf)
         cost = float(columns.products[0, 0] + np.sum((theta / self.prior) ** 2))
-        return _Point(experiment, linear, values, theta, found, cost)
+        return _Point(linear, values, theta, found, cost)
 
     def _moved(self, point: _Point, change: np.ndarray) -> tuple[np.ndarray, dict[str, Numbers]]:
         count = len(self.free)
@@ -330,31 +286,24 @@ class EffectSearch:
             values[name][leaf] = float(one.value(by))
         return point.theta + change[:count], values
 
-    def shown(self) -> float:
-        """Standard deviations by which the record shows its input; infinite where it has none."""
-        linear = self.linear({}, np.zeros(len(self.free)))
-        return linear.shown(*linear.choose(())) if linear.driven else np.inf
-
     def run(self) -> Explanation:
         """Find what is missing."""
         theta = np.zeros(len(self.free))
-        linear = self.linear({}, theta)
-        smoothness, deviation = linear.choose(())
-        nominal = current = self.refit((), {}, theta, smoothness, deviation)
+        nominal = current = self.refit({}, theta, self.linear({}, theta).choose(()))
         found: dict[str, list[_Tried]] = {}
         wrong: Model | None = None
         rest: dict[str, tuple[float, float]] | None = None
         while len(found) < _MOST:
-            smoothness, tried = self._round(current)
+            predictor, tried = self._round(current)
             if not tried or tried[0][0] <= 0.0:
-                smoothness, tried = self._coloured_round(current)
+                predictor, tried = self._coloured_round(current)
             if not tried or tried[0][0] <= 0.0:
                 break
             (_, current), *others = tried
             record = [_Tried(model.names[-1], gain, model.numbers[model.names[-1]]) for gain, model in tried]
-            current, gone = self._pruned(current, smoothness)
+            current, gone = self._pruned(current, predictor.smoothness)
             found = {name: one for name, one in found.items() if name not in gone} | {record[0].name: record}
-            current, renamed = self._simplified(current, smoothness)
+            current, renamed = self._simplified(current, predictor.smoothness)
             found = {renamed.get(name, name): one for name, one in found.items()}
             for plain in renamed.values():
                 first, *rivals = found[plain]
@@ -383,30 +332,28 @@ class EffectSearch:
 
     def without(self, found: Explanation, names: Collection[str]) -> Explanation:
         """An explanation without some of its effects; free functions are fitted anew to what remains."""
-        model, kept = found.model, tuple(name for name in found.model.names if name not in names)
-        smoothness, deviation = model.linear.choose(())
+        model = found.model
+        kept = {name: numbers for name, numbers in model.numbers.items() if name not in names}
         # where nothing is kept, its own numbers have nothing to do with those beside effects
         theta = model.theta if kept else found.nominal.theta
-        model = self.refit(kept, {name: model.numbers[name] for name in kept}, theta, smoothness, deviation)
+        model = self.refit(kept, theta, model.linear.choose(()))
         rest = self.remainder(model)
         findings = tuple(one for one in found.findings if one.effect in kept)
         return Explanation(_verdict(_most(rest), findings), findings, model, found.nominal, None, rest)
 
-    def _fewest(
-        self, model: Model, found: dict[str, list["_Tried"]], left: float
-    ) -> tuple[Model, dict[str, list["_Tried"]]]:
+    def _fewest(self, model: Model, found: dict[str, list[_Tried]], left: float) -> tuple[Model, dict[str, list[_Tried]]]:
         """Where something unknown remains: only effects with a good part of its gain, and of those that differ by less than
         it the one with the fewest numbers, since spare numbers imitate the unknown."""
-        smoothness, deviation = model.linear.choose(())
+        predictor = model.linear.choose(())
         kept = {name: tried for name, tried in found.items() if tried[0].gain > _SHARE_OF_UNKNOWN * left}
-        numbers = {name: model.numbers[name] for name in kept}
-        model = self.refit(tuple(kept), numbers, model.theta, smoothness, deviation)
+        model = self.refit({name: model.numbers[name] for name in kept}, model.theta, predictor)
         for name, tried in list(kept.items()):
-            others = [one for one in tried[1:] if one.gain > tried[0].gain - left and one.size < tried[0].size]
+            fewer = [one for one in tried[1:] if len(one.numbers) < len(tried[0].numbers)]
+            others = [one for one in fewer if one.gain > tried[0].gain - left]
             others = [one for one in others if one.name not in kept and not _same(one.name, set(kept) - {name})]
-            for one in sorted(others, key=lambda one: (one.size, -one.gain))[:1]:
+            for one in sorted(others, key=lambda one: (len(one.numbers), -one.gain))[:1]:
                 numbers = {a: model.numbers[a] for a in model.names if a != name} | {one.name: one.numbers}
-                plainer = self.refit(tuple(numbers), numbers, model.theta, smoothness, deviation)
+                plainer = self.refit(numbers, model.theta, predictor)
                 if model.log_evidence - plainer.log_evidence < left:
                     model = plainer
                     kept = {(one.name if a == name else a): b for a, b in kept.items()}
@@ -417,34 +364,24 @@ class EffectSearch:
         """A model without the earlier effects that a later one has made needless, and their names."""
         gone: set[str] = set()
         for name in model.names[:-1]:
-            deviation = model.linear.deviation(smoothness)
-            less = self._needless(name, model.names, model.numbers, model.theta, smoothness, deviation)
+            less = self._needless(name, model.numbers, model.theta, model.linear.predictor(smoothness))
             if less is not None:
                 model, gone = less, gone | {name}
         return model, gone
 
-    def _needless(
-        self,
-        name: str,
-        names: Names,
-        numbers: Mapping[str, Numbers],
-        theta: np.ndarray,
-        smoothness: Sequence[float],
-        deviation: np.ndarray,
-    ) -> Model | None:
+    def _needless(self, name: str, numbers: Mapping[str, Numbers], theta: np.ndarray, predictor: Predictor) -> Model | None:
         """The model without one of its effects, all numbers refitted, if the effect gains nothing beside the others."""
-        full = self.refit(names, numbers, theta, smoothness, deviation)
-        less = self.refit(tuple(one for one in names if one != name), numbers, theta, smoothness, deviation)
+        full = self.refit(numbers, theta, predictor)
+        less = self.refit({one: values for one, values in numbers.items() if one != name}, theta, predictor)
         return less if self._gain(less, full) <= 0.0 else None
 
     def _settled(self, model: Model) -> Model:
         """A model without effects that are needless once all numbers are those of least prediction errors: one may only have
         compensated for an error of the fit along the smoothed motion."""
-        free, best = self.refitted(model.numbers, model.theta)
-        count = len(self.free)
+        best, count = self.refitted(model.numbers, model.theta), len(self.free)
         numbers = {name: dict(one) for name, one in model.numbers.items()}
         weak: set[str] = set()
-        for one, at, by in zip(free[count:], best.theta[count:], best.deviation[count:], strict=True):
+        for one, at, by in zip(best.linear.free[count:], best.theta[count:], best.deviation[count:], strict=True):
             name, leaf = _owner(one)
             numbers[name][leaf] = float(one.value(at))
             if one.role == "size" and abs(numbers[name][leaf]) < _WEAK * float(one.slope(at)) * by:
@@ -453,8 +390,7 @@ class EffectSearch:
         for name in sorted(weak, key=model.names.index, reverse=True):
             if len(model.names) == 1:
                 break
-            smoothness, deviation = self.linear(numbers, theta).choose(())
-            less = self._needless(name, model.names, numbers, theta, smoothness, deviation)
+            less = self._needless(name, numbers, theta, self.linear(numbers, theta).choose(()))
             if less is not None:
                 model, numbers, theta = less, less.numbers, less.theta
         return model
@@ -468,134 +404,135 @@ class EffectSearch:
                 plain = f"{name.partition('.')[0]}.{kind}"
                 if plain not in self.lacking or plain in model.names or name in renamed:
                     continue
-                deviation = model.linear.deviation(smoothness)
-                full = self.refit(model.names, model.numbers, model.theta, smoothness, deviation)
+                predictor = model.linear.predictor(smoothness)
+                full = self.refit(model.numbers, model.theta, predictor)
                 numbers = {plain if a == name else a: b for a, b in full.numbers.items()}
                 numbers[plain] = reduced(full.numbers[name])
-                less = self.refit(tuple(numbers), numbers, full.theta, smoothness, deviation)
+                less = self.refit(numbers, full.theta, predictor)
                 if self._gain(less, full) <= 0.0:
                     model, renamed = less, renamed | {name: plain}
         return model, renamed
 
-    def _round(self, current: Model) -> tuple[list[float], list[tuple[float, Model]]]:
+    def _round(self, current: Model) -> tuple[Predictor, list[tuple[float, Model]]]:
         """Models with one effect more, and their gains in evidence (nats), best first."""
-        smoothness, deviation = current.linear.choose(())
-        current = self.refit(current.names, current.numbers, current.theta, smoothness, deviation)
-        smoothness, deviation, finalists = self._screen(current, smoothness)
+        predictor = current.linear.choose(())
+        current = self.refit(current.numbers, current.theta, predictor)
+        predictor, finalists = self._screen(current, predictor)
         if not finalists:
-            return smoothness, []
-        base = self.refit(current.names, current.numbers, current.theta, smoothness, deviation)
+            return predictor, []
+        base = self.refit(current.numbers, current.theta, predictor)
         # under the predictor that suits it best
         base = max(base, current, key=lambda one: one.log_evidence)
         tried: list[tuple[float, Model]] = []
-        best = finalists[0].gain
-        for one in finalists:
+        best = finalists[0][0]
+        for screened, one in finalists:
             # those far behind are tried only if none before them gained
-            behind = one.gain < max(min(_BEHIND * best, best - _NEAR), 0.0)
+            behind = screened < max(min(_BEHIND * best, best - _NEAR), 0.0)
             if behind and any(gain > 0.0 for gain, _ in tried):
                 break
-            numbers = current.numbers | {one.name: one.numbers}
-            model = self.refit((*current.names, one.name), numbers, current.theta + one.own, smoothness, deviation)
+            model = self._with(current, one, predictor)
             gain = self._gain(base, model) if model.linear.share(one.name) > LEAST else -np.inf
             tried.append((gain, model))
-        return smoothness, sorted(tried, key=lambda pair: -pair[0])
+        return predictor, sorted(tried, key=lambda pair: -pair[0])
 
-    def _coloured_round(self, current: Model) -> tuple[list[float], list[tuple[float, Model]]]:
+    def _coloured_round(self, current: Model) -> tuple[Predictor, list[tuple[float, Model]]]:
         """As :meth:`_round` by Whittle's likelihood, where errors are not white; without those that gain nothing."""
         linear = current.linear
-        smoothness, deviation = linear.choose(())
-        spectrum = linear.spectrum(smoothness)
+        predictor = linear.choose(())
+        spectrum = spectrum_of(linear.left(predictor.smoothness))
         if not spectrum.coloured:
-            return smoothness, []
-        base, ranked = self._ranked(linear, self._variants(current), smoothness, spectrum)
+            return predictor, []
+        base, ranked = self._ranked(linear, self._variants(current), predictor.smoothness, spectrum)
         tried = []
         for one in ranked[:_FINALISTS]:
             gain = self._gain(base, one) + ODDS - linear.choices(one.name)
             if gain > 0.0:
-                numbers = current.numbers | {one.name: one.found.numbers[0]}
-                theta = current.theta + one.found.own[: len(self.free)]
-                model = self.refit((*current.names, one.name), numbers, theta, smoothness, deviation)
+                model = self._with(current, one, predictor)
                 if np.isfinite(model.log_evidence) and model.linear.share(one.name) > LEAST:
                     tried.append((gain, model))
-        return smoothness, sorted(tried, key=lambda pair: -pair[0])
+        return predictor, sorted(tried, key=lambda pair: -pair[0])
+
+    def _with(self, current: Model, one: _Scored, predictor: Predictor) -> Model:
+        """A model with one effect more, refitted from the numbers that the screening gave it."""
+        numbers = current.numbers | {one.name: one.found.numbers}
+        return self.refit(numbers, current.theta + one.found.own[: len(self.free)], predictor)
 
     def remainder(self, model: Model) -> dict[str, tuple[float, float]]:
         """Gain in evidence of free functions beside a model (nats), and their size over the driving torque, by name."""
         rest = self._remainder(model.linear)
         if _most(rest) > CLEAR:
             # errors of the smoothed motion cancel to first order only; along the predictor's own path nothing is approximate
-            rest = self._remainder(self.refitted(model.numbers, model.theta).refined.linear)
+            rest = self._remainder(self.refitted(model.numbers, model.theta).linear)
         return rest
 
     def _remainder(self, linear: Linear) -> dict[str, tuple[float, float]]:
-        smoothness, deviation = linear.choose(())
-        functions = functions_of(linear.signals)
-        columns = linear.columns(functions, smoothness, deviation)
+        predictor, functions = linear.choose(()), functions_of(linear.signals)
+        columns = linear.columns(functions, predictor.smoothness, predictor.deviation)
         gained = {}
         for i, one in enumerate(functions):
             best = (-np.inf, 0.0)
             for size in _SIZES:
                 scale = columns.scale.copy()
                 scale[list(columns.places[i])] *= size
-                scorer = Scorer(dataclasses.replace(columns, scale=scale), functions)
-                none, some = scorer(()), scorer((i,))
+                sized = dataclasses.replace(columns, scale=scale)
+                none, some = evidence_of(sized), evidence_of(sized, functions, i)
                 assert none is not None and some is not None
-                base, more = (_Scored("", found, linear.count, deviation) for found in (none, some))
+                base, more = (_Scored(found, linear.count, predictor.deviation) for found in (none, some))
                 best = max(best, (self._gain(base, more), size * SHARE))
             gained[one.name] = best
         return gained
 
-    def _gain(self, base: "Model | _Scored", model: "Model | _Scored") -> float:
+    def _gain(self, base: Model | _Scored, model: Model | _Scored) -> float:
         """Gain in evidence of a model's effect (nats), less what structure in the noise may bring (:data:`FLOOR`)."""
         explained = model.log_likelihood - base.log_likelihood
         gain = model.log_evidence - base.log_evidence
         return gain - min(max(explained, 0.0), self.floor) if np.isfinite(gain) else -np.inf
 
-    def _screen(self, model: Model, smoothness: list[float]) -> tuple[list[float], np.ndarray, list[_Finalist]]:
-        """The best candidates on the linearised model, and the predictor chosen with the first of them."""
+    def _screen(self, model: Model, predictor: Predictor) -> tuple[Predictor, list[tuple[float, _Scored]]]:
+        """The best candidates on the linearised model with their gains, and the predictor chosen with the first of them."""
         linear = model.linear
-        smoothness, deviation = linear.choose((), smoothness)
+        predictor = linear.choose((), predictor.smoothness)
         variants = self._variants(model)
-        _, ranked = self._ranked(linear, variants, smoothness, deviation)
+        _, ranked = self._ranked(linear, variants, predictor.smoothness, predictor.deviation)
         if not ranked:
-            return smoothness, deviation, []
+            return predictor, []
         # a predictor chosen without an effect compensates for it: the best ones are tried with predictors of their own
-        leaders = [linear.choose([variants[one.found.which[0]]]) for one in ranked[:_LEADERS]]
+        leaders = [linear.choose([variants[one.variant]]) for one in ranked[:_LEADERS]]
         few = {one.name for one in ranked[: 2 * _FINALISTS]}
         variants = [one for one in variants if one.name in few]
-        smoothness, deviation = min(leaders, key=lambda one: float(np.sum(np.log(one[1]))))
+        predictor = min(leaders, key=lambda one: float(np.sum(np.log(one.deviation))))
         # compared with the model without them under the same predictor
-        base, ranked = self._ranked(linear, variants, smoothness, deviation)
-        finalists = [
-            _Finalist(one.name, one.found.numbers[0], one.found.own[: len(self.free)], self._gain(base, one))
-            for one in ranked[:_FINALISTS]
-        ]
-        finalists = sorted((one for one in finalists if one.gain > _LEAST_GAIN), key=lambda one: -one.gain)
+        base, ranked = self._ranked(linear, variants, predictor.smoothness, predictor.deviation)
+        gains = [(self._gain(base, one), one) for one in ranked[:_FINALISTS]]
+        finalists = sorted((pair for pair in gains if pair[0] > _LEAST_GAIN), key=lambda pair: -pair[0])
         if finalists:
-            (best,) = (variants[one.found.which[0]] for one in ranked if one.name == finalists[0].name)
-            smoothness, deviation = linear.choose([best], smoothness)
-        return smoothness, deviation, finalists
+            best = variants[finalists[0][1].variant]
+            predictor = linear.choose([best], predictor.smoothness)
+        return predictor, finalists
 
-    def _variants(self, model: Model) -> list[Variant]:
+    def _variants(self, model: Model) -> list[Candidate]:
         """Effects that a model lacks, at what was chosen last for it."""
         lacking = [name for name in self.lacking if name not in model.names and not _same(name, model.names)]
-        return variants_of(model.experiment, lacking, model.linear.scales)
+        return variants_of(self.nominal, lacking, model.linear.scales)
 
     def _ranked(
         self, linear: Linear, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray | Spectrum
-    ) -> tuple["_Scored", list["_Scored"]]:
+    ) -> tuple[_Scored, list[_Scored]]:
         """The model without candidates, and with the best variant of each, best first."""
-        scorer = Scorer(linear.columns(variants, smoothness, noise), variants)
+        columns = linear.columns(variants, smoothness, noise)
         # errors over their spectrum are of size 1
         deviation = np.ones(len(linear.sides)) if isinstance(noise, Spectrum) else noise
-        none = scorer(())
+        none = evidence_of(columns)
         assert none is not None
-        allowed = [one for i in range(len(variants)) if (one := scorer((i,))) is not None]
+        each = [
+            _Scored(found, linear.count, deviation, one.name, i)
+            for i, one in enumerate(variants)
+            if (found := evidence_of(columns, variants, i)) is not None
+        ]
         best: dict[str, _Scored] = {}
-        for one in sorted(allowed, key=lambda one: -one.log_evidence):
-            name = variants[one.which[0]].name
-            best.setdefault(name, _Scored(name, one, linear.count, deviation))
-        return _Scored("", none, linear.count, deviation), list(best.values())
+        for one in sorted(each, key=lambda one: -one.found.log_evidence):
+            best.setdefault(one.name, one)
+        return _Scored(none, linear.count, deviation), list(best.values())
 
 
 def _same(name: str, others: Iterable[str]) -> bool:
@@ -621,26 +558,21 @@ def _finding(tried: Sequence[_Tried], model: Model, left: float) -> Finding:
     """The first of those tried, with its confidence; where something unknown remains, differences of evidence count less."""
     heat = left if left > CLEAR else 1.0
     # or nothing is missing
-    *chances, _ = _softmax(np.array([*(one.gain for one in tried), 0.0]) / heat)
+    *chances, _ = softmax(np.array([*(one.gain for one in tried), 0.0]) / heat)
     others = tuple((one.name, float(chance)) for one, chance in zip(tried[1:], chances[1:], strict=True))
     name = tried[0].name
     others = tuple(one for one in others if one[1] > _LEAST_CHANCE)
     return Finding(name, float(chances[0]), model.numbers[name], others)
 
 
-def _softmax(values: np.ndarray) -> np.ndarray:
-    weights = np.exp(values - np.max(values))
-    return weights / weights.sum()
-
-
-def _fitted(name: str) -> list[str]:
+def _fitted_numbers(name: str) -> list[str]:
     """The numbers of an effect that are fitted: a harmonic is a whole number."""
     return [leaf for leaf, role in EFFECTS[name].roles().items() if role.kind != "harmonic"]
 
 
 def paths_of(names: Iterable[str]) -> list[str]:
     """Dotted paths of the free numbers of effects."""
-    return [f"effects.{name}.{leaf}" for name in names for leaf in _fitted(name)]
+    return [f"effects.{name}.{leaf}" for name in names for leaf in _fitted_numbers(name)]
 
 
 def _owner(one: Free) -> tuple[str, str]:

@@ -1,9 +1,10 @@
-"""Which effects explain a record, and how surely: the evidence of sets of candidates.
+"""Which effect explains a record, and how surely: the evidence of candidates.
 
-Prediction errors are linear in everything (:mod:`.linearised_model`), so that a set of candidates costs one small linear
-solve. The model's own numbers take part with their prior; amplitudes have a broad one, which is the price of each column
-(Laplace's method; the model is linear, so that it is exact). References: D. MacKay, Bayesian interpolation, Neural
-Computation 4 (1992); R. Kass, A. Raftery, Bayes factors, JASA 90 (1995).
+Prediction errors are linear in everything (:mod:`.linearised_model`), so that a candidate costs one small linear solve. The
+model's own numbers take part with their prior; amplitudes have a broad one, which is the price of each column (Laplace's
+method; the model is linear, so that it is exact).
+References: D. MacKay, Bayesian interpolation, Neural Computation 4 (1992); R. Kass, A. Raftery, Bayes factors, J. American
+Statistical Association 90 (1995).
 """
 
 import dataclasses
@@ -43,106 +44,84 @@ class Products:
     twins: Mapping[int, tuple[int, float]] = dataclasses.field(default_factory=dict)
 
 
-@dataclasses.dataclass(frozen=True)
-class Set:
-    """Some candidates together.
+class Evidence(NamedTuple):
+    """What is in favour of a candidate, or of none.
 
     Attributes:
-        which: indices of variants.
-        log_evidence: of the set, nats; only differences count.
+        log_evidence: nats; only differences count.
         misfit: sum of squared errors over their variance.
-        numbers: of each candidate's effect.
+        numbers: of the candidate's effect.
         own: change of the model's own numbers (theta).
     """
 
-    which: tuple[int, ...]
     log_evidence: float
     misfit: float
-    numbers: tuple[Numbers, ...]
+    numbers: Numbers
     own: np.ndarray
 
 
-class Scorer:
-    """Evidence of sets, computed once each."""
-
-    def __init__(self, columns: Products, variants: Sequence[Candidate]):
-        self.columns, self.variants = columns, variants
-        self.base = np.arange(1, 1 + columns.own)
-        self.known: dict[tuple[int, ...], Set | None] = {}
-
-    def __call__(self, which: tuple[int, ...]) -> Set | None:
-        which = tuple(sorted(which))
-        if which not in self.known:
-            self.known[which] = self._score(which)
-        return self.known[which]
-
-    def _score(self, which: tuple[int, ...]) -> Set | None:
-        c = self.columns
-        chosen = np.concatenate([self.base, *(np.asarray(c.places[i]) for i in which)]).astype(int)
-        fixed = np.array([0, *(c.offsets[i] for i in which if c.offsets[i] >= 0)])
-        # what has no torque along this record has no coefficient either
-        values = np.zeros(len(c.scale))
-        variance, middle = c.scale**2, c.centre.copy()
-        alive = [int(k) for k in chosen if np.isfinite(c.scale[k])]
-        joined = [k for k in alive if k in c.twins]
-        for k in joined:
-            of, factor = c.twins[k]
-            variance[of] += factor**2 * variance[k]
-            middle[of] += factor * middle[k]
-        places, chosen = chosen, np.array([k for k in alive if k not in joined], int)
-        inner = c.products[np.ix_(chosen, chosen)]
-        towards = c.products[np.ix_(chosen, fixed)].sum(axis=1)
-        total = c.products[np.ix_(fixed, fixed)].sum()
-        spread, centre = np.sqrt(variance[chosen]), middle[chosen]
-        bound = np.where(chosen <= c.own, np.append(c.bound, np.inf)[np.minimum(chosen - 1, c.own)], np.inf)
-        free, coefficients = np.ones(len(chosen), bool), np.zeros(len(chosen))
-        while True:
-            known = np.where(free, 0.0, coefficients)
-            at = np.ix_(free, free)
-            rest = total + float(2.0 * towards @ known + known @ inner @ known)
-            solved = _solved(inner[at], (towards + inner @ known)[free], rest, spread[free], centre[free])
-            if solved is None:
-                return None
-            coefficients = known
-            coefficients[free] = solved.coefficients
-            away = (coefficients - centre) / spread
-            over = free & (np.abs(away) > bound)
-            if not over.any():
-                break
-            # what is beyond its bound stays at it
-            coefficients[over] = (centre + np.clip(away, -bound, bound) * spread)[over]
-            free &= ~over
-        values[chosen] = coefficients
-        # the sum's distance from its mean is shared out by the variances
-        away = values - middle
-        for k in joined:
-            of, factor = c.twins[k]
-            values[k] = c.centre[k] + factor * c.scale[k] ** 2 / variance[of] * away[of]
-            values[of] -= factor * values[k]
-        given = values[places]
-        numbers, place = [], len(self.base)
-        for i in which:
-            width = len(c.places[i])
-            found = self.variants[i].numbers(given[place : place + width].tolist())
-            if found is None:
-                return None
-            numbers.append(found)
-            place += width
-        held = float(np.sum(((coefficients - centre) / spread)[~free] ** 2))
-        evidence = -0.5 * (solved.cost + held + solved.determinant + 2.0 * float(np.sum(np.log(spread[free]))))
-        misfit = solved.cost - float(np.sum(((coefficients - centre) / spread)[free] ** 2))
-        return Set(which, evidence, misfit, tuple(numbers), values[self.base])
+def evidence_of(columns: Products, variants: Sequence[Candidate] = (), which: int | None = None) -> Evidence | None:
+    """Evidence of one of the candidates, or of the model without any; None where the numbers are not allowed."""
+    c = columns
+    places = [] if which is None else list(c.places[which])
+    fixed = np.array([0] if which is None or c.offsets[which] < 0 else [0, c.offsets[which]])
+    # what has no torque along this record has no coefficient either
+    alive = [k for k in (*range(1, 1 + c.own), *places) if np.isfinite(c.scale[k])]
+    variance, middle = c.scale**2, c.centre.copy()
+    joined = [k for k in alive if k in c.twins]
+    for k in joined:
+        of, factor = c.twins[k]
+        variance[of] += factor**2 * variance[k]
+        middle[of] += factor * middle[k]
+    chosen = np.array([k for k in alive if k not in joined], int)
+    bound = np.where(chosen <= c.own, np.append(c.bound, np.inf)[np.minimum(chosen - 1, c.own)], np.inf)
+    solved = _bounded(c.products, chosen, fixed, np.sqrt(variance[chosen]), middle[chosen], bound)
+    if solved is None:
+        return None
+    values = np.zeros(len(c.scale))
+    values[chosen], log_evidence, misfit = solved
+    # the sum's distance from its mean is shared out by the variances
+    away = values - middle
+    for k in joined:
+        of, factor = c.twins[k]
+        values[k] = c.centre[k] + factor * c.scale[k] ** 2 / variance[of] * away[of]
+        values[of] -= factor * values[k]
+    numbers = {} if which is None else variants[which].numbers(values[places].tolist())
+    return None if numbers is None else Evidence(log_evidence, misfit, numbers, values[1 : 1 + c.own])
 
 
-class _Solved(NamedTuple):
+def _bounded(
+    products: np.ndarray, chosen: np.ndarray, fixed: np.ndarray, spread: np.ndarray, centre: np.ndarray, bound: np.ndarray
+) -> tuple[np.ndarray, float, float] | None:
+    """Coefficients of chosen columns, none beyond its bound (in standard deviations of its prior), beside columns whose
+    coefficient is 1; log-evidence, and misfit."""
+    inner = products[np.ix_(chosen, chosen)]
+    towards, total = products[np.ix_(chosen, fixed)].sum(axis=1), products[np.ix_(fixed, fixed)].sum()
+    free, coefficients = np.ones(len(chosen), bool), np.zeros(len(chosen))
+    while True:
+        known = np.where(free, 0.0, coefficients)
+        rest = total + float(2.0 * towards @ known + known @ inner @ known)
+        solved = _solved(inner[np.ix_(free, free)], (towards + inner @ known)[free], rest, spread[free], centre[free])
+        if solved is None:
+            return None
+        coefficients = known
+        coefficients[free], cost, determinant = solved
+        away = (coefficients - centre) / spread
+        over = free & (np.abs(away) > bound)
+        if not over.any():
+            break
+        # what is beyond its bound stays at it
+        coefficients[over] = (centre + np.clip(away, -bound, bound) * spread)[over]
+        free &= ~over
+    held = float(np.sum(away[~free] ** 2))
+    evidence = -0.5 * (cost + held + determinant + 2.0 * float(np.sum(np.log(spread[free]))))
+    return coefficients, evidence, cost - float(np.sum(away[free] ** 2))
+
+
+def _solved(
+    inner: np.ndarray, towards: np.ndarray, total: float, spread: np.ndarray, centre: np.ndarray
+) -> tuple[np.ndarray, float, float] | None:
     """Coefficients of least squares with a prior, the least cost, and the logarithm of the determinant of the precision."""
-
-    coefficients: np.ndarray
-    cost: float
-    determinant: float
-
-
-def _solved(inner: np.ndarray, towards: np.ndarray, total: float, spread: np.ndarray, centre: np.ndarray) -> _Solved | None:
     precision = spread**-2.0
     matrix = inner + np.diag(precision)
     towards = towards - precision * centre
@@ -155,7 +134,7 @@ def _solved(inner: np.ndarray, towards: np.ndarray, total: float, spread: np.nda
     inside = solve_triangular(root, towards / size, lower=True)
     coefficients = -solve_triangular(root, inside, lower=True, trans=1) / size
     determinant = 2.0 * float(np.sum(np.log(np.diag(root)))) + 2.0 * float(np.sum(np.log(size)))
-    return _Solved(coefficients, total - float(inside @ inside), determinant)
+    return coefficients, total - float(inside @ inside), determinant
 
 
 def _root(unit: np.ndarray) -> np.ndarray | None:

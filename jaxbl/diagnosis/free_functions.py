@@ -4,92 +4,57 @@ They are candidates like any other, with many columns and an amplitude that the 
 them is an effect with a name; if one pays after all effects with names have had their turn, something else is missing.
 """
 
-import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.drive.effects import AbstractEffect
+from .candidates import Candidate, MotionTorques
 
-from .candidates import MotionTorques, Numbers
-
-KINDS = "time", "drift", "position", "place", "velocity", "memory"
-"""Torque over time; friction over time; torque over position; friction over position; torque over velocity; friction that
-yields before it slides."""
-_KNOTS = {"time": 120, "drift": 8, "position": 24, "place": 24, "velocity": 12, "memory": 4}
+_FUNCTIONS = {
+    "time": ("time", 120, False), "drift": ("time", 8, True), "position": ("position", 24, False),
+    "place": ("position", 24, True), "velocity": ("velocity", 12, False),
+}  # fmt: skip
+"""Coordinate of each function, its knots there, and whether it is a friction, against the direction of motion."""
 _LENGTHS = 0.1, 0.3, 0.6, 1.2
-"""Pre-sliding distances, over the standard deviation of the position."""
+"""Pre-sliding distances of the friction with a memory, over the standard deviation of the position."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Function:
-    """A free function of `kind` on a side, over a span of its coordinate."""
-
-    side: str
-    kind: str
-    span: tuple[float, float]
-
-    @property
-    def name(self) -> str:
-        return f"{self.side}.{self.kind}"
-
-    @property
-    def offset(self) -> bool:
-        return False
-
-    @property
-    def width(self) -> int:
-        return _KNOTS[self.kind]
-
-    def numbers(self, values: Sequence[float]) -> Numbers:
-        return {}
-
-    @property
-    def effects(self) -> tuple[AbstractEffect, ...]:
-        return ()
-
-    def columns(self, signals: MotionTorques, torques: Sequence[np.ndarray]) -> np.ndarray:
-        """As :meth:`.candidates.Candidate.columns`; N m."""
-        part, side = signals.part, self.side
-        position, velocity = np.asarray(part.position[side]), np.asarray(part.velocity[side])
-        direction = signals.direction[side]
-        match self.kind:
-            case "time":
-                columns = _hats(np.asarray(part.time), self.span, self.width)
-            case "drift":
-                columns = _hats(np.asarray(part.time), self.span, self.width) * direction[:, None]
-            case "position":
-                columns = _hats(position, self.span, self.width)
-            case "place":
-                columns = _hats(position, self.span, self.width) * direction[:, None]
-            case "velocity":
-                columns = _hats(velocity, self.span, self.width)
-            case _:
-                columns = _stops(position, np.array(_LENGTHS) * np.std(position[signals.real]))
-        found = np.zeros((self.width, signals.count, len(signals.sides) + 1))
-        found[:, :, signals.sides.index(side)] = -(columns * signals.real[:, None]).T
-        return found
-
-
-def functions_of(signals: Sequence[MotionTorques]) -> list[Function]:
-    """All of them, for a record in parts."""
+def functions_of(signals: Sequence[MotionTorques]) -> list[Candidate]:
+    """All of them, side by side, for a record in parts."""
     found = []
     for side in signals[0].sides:
-        position, velocity, time = (
-            np.concatenate([np.asarray(of(one))[one.real] for one in signals])
-            for of in (
-                lambda s, side=side: s.part.position[side],
-                lambda s, side=side: s.part.velocity[side],
-                lambda s: s.part.time,
-            )
-        )
-        spans = {"position": position, "place": position, "velocity": velocity, "time": time, "drift": time}
-        for kind in KINDS:
-            values = spans.get(kind, position)
-            found.append(Function(side, kind, (float(values.min()), float(values.max()))))
+        for kind, (name, knots, friction) in _FUNCTIONS.items():
+            along = np.concatenate([_coordinate(one, name, side)[one.real] for one in signals])
+            span = float(along.min()), float(along.max())
+
+            def hats(one: MotionTorques, name=name, span=span, knots=knots, friction=friction, side=side) -> np.ndarray:
+                found = _hats(_coordinate(one, name, side), span, knots)
+                return found * one.direction[side][:, None] if friction else found
+
+            found.append(_candidate(side, kind, knots, hats))
+
+        def stops(one: MotionTorques, side=side) -> np.ndarray:
+            position = _coordinate(one, "position", side)
+            return _stops(position, np.array(_LENGTHS) * np.std(position[one.real]))
+
+        found.append(_candidate(side, "memory", len(_LENGTHS), stops))
     return found
+
+
+def _candidate(side: str, kind: str, width: int, shape: Callable[[MotionTorques], np.ndarray]) -> Candidate:
+    """A torque on a side that is a sum of columns, shape (samples, width), each of height 1."""
+
+    def columns(signals: MotionTorques, _: Sequence[np.ndarray]) -> np.ndarray:
+        return signals.placed(-shape(signals), signals.sides.index(side))
+
+    return Candidate(f"{side}.{kind}", width, (), columns, lambda values: {})
+
+
+def _coordinate(signals: MotionTorques, name: str, side: str) -> np.ndarray:
+    values = getattr(signals.part, name)
+    return np.asarray(values[side] if isinstance(values, dict) else values)
 
 
 def _hats(values: np.ndarray, span: tuple[float, float], count: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from .whittle import spectrum_of, weighted_products
 
 _JUMP = 5.0
 """Standard deviations of the noise that a jump must stand out by."""
-_FEWEST = 8
+_LEAST_BETWEEN_JUMPS = 8
 """Samples between two jumps that can be smoothed."""
 _ORDER = 3
 """Of the differences that are penalised: what has no third difference, a parabola, stays as it is."""
@@ -33,8 +33,7 @@ def unfelt(given: Sequence[np.ndarray], smooth: Sequence[np.ndarray]) -> float:
     slow, does not matter.
 
     Args:
-        given, smooth: prediction errors of one model and gain under the input as recorded and smoothed, part by part, rad;
-            shape (samples, sides).
+        given, smooth: errors under the input as recorded and smoothed, part by part, rad; shape (samples, sides).
     """
     spectrum = spectrum_of(given)
     pairs = [np.stack([one, one - other], axis=2) for one, other in zip(given, smooth, strict=True)]
@@ -43,16 +42,11 @@ def unfelt(given: Sequence[np.ndarray], smooth: Sequence[np.ndarray]) -> float:
 
 
 def smoothed_input(torque: np.ndarray, noise: float) -> np.ndarray:
-    """An input smoothed between jumps, N m, shape (samples,).
-
-    Args:
-        torque: input of a segment, N m.
-        noise: its standard deviation, N m.
-    """
+    """The input of a segment smoothed between jumps; `noise`: its standard deviation, N m."""
     smooth = torque.copy()
     ends = [0, *input_jumps(torque, noise), len(torque)]
     for first, last in itertools.pairwise(ends):
-        if last - first >= _FEWEST:
+        if last - first >= _LEAST_BETWEEN_JUMPS:
             smooth[first:last] = _smooth_curve(torque[first:last])
     return smooth
 

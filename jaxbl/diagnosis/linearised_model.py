@@ -30,39 +30,17 @@ from jaxbl.fused.single_plant import Direction, slopes
 from jaxbl.identification.prediction import kalman_gain
 from jaxbl.identification.regression import Path, effect_path
 from jaxbl.identification.segments import Segment
-from jaxbl.identification.smoother import Smoothed
 from jaxbl.identification.trajectory import Free, with_fitted
 from jaxbl.simulate import Experiment, with_effects
 
-from .candidates import SHARE, SPACING, Candidate, MotionTorques, all_of_the_input, forces_of, rms
+from .candidates import SHARE, SPACING, Candidate, MotionTorques, Part, all_of_the_input, forces_of, rms
 from .evidence import Products
-from .linearised_segment import Part
 from .neutral_effects import bucket
-from .whittle import Spectrum, spectrum_of, weighted_products
+from .whittle import Spectrum, weighted_products
 
 _SAMPLES, _BLOCK, _NUMBERS = 1024, 128, 4
 """Least padded length of a part, so that records of about one length share their compiled programs; a block of it; multiple
 to which the number of free numbers is padded."""
-
-
-def linearise(
-    experiment: Experiment,
-    free: Sequence[Free],
-    theta: Float[np.ndarray, " numbers"],
-    segments: Sequence[Segment],
-) -> list[Part]:
-    """The model along each part of a record.
-
-    Args:
-        experiment: the model with all effects (:func:`.neutral_effects.complete`); its sample period is that of the record.
-        free: its own numbers.
-        theta: their values, which the model has.
-        segments: of the log.
-    """
-    sides = experiment.sides
-    added = tuple(_AddedTorque(side=side, torque=jnp.zeros(())) for side in sides)  # type: ignore[arg-type]
-    extended = with_effects(experiment, (*experiment.effects, *added))
-    return [_part(extended, free, theta, one.time, one.torque, one.readings, one.smoothed) for one in segments]
 
 
 class _AddedTorque(ConstantTorque):
@@ -71,28 +49,23 @@ class _AddedTorque(ConstantTorque):
     kind: ClassVar[str] = "added_torque"
 
 
-def _part(
-    experiment: Experiment,
-    free: Sequence[Free],
-    theta: np.ndarray,
-    time: np.ndarray,
-    torque: np.ndarray,
-    readings: dict[str, np.ndarray],
-    smoothed: dict[str, Smoothed],
-) -> Part:
-    count = len(time)
+def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segment: Segment) -> Part:
+    """A model along a segment, where its free numbers are at theta."""
+    sides, smoothed = experiment.sides, segment.smoothed
+    added = tuple(_AddedTorque(side=side, torque=jnp.zeros(())) for side in sides)  # type: ignore[arg-type]
+    experiment = with_effects(experiment, (*experiment.effects, *added))
+    count = len(segment)
     size = bucket(count, _SAMPLES)
 
     def padded(values: np.ndarray) -> np.ndarray:
         return np.concatenate([values, np.repeat(values[-1:], size - count, axis=0)])
 
-    sides = experiment.sides
     states = {side: padded(np.asarray(smoothed[side].state)) for side in sides}
     deviation = {side: padded(np.asarray(smoothed[side].deviation(1))) for side in sides}
     period = float(experiment.run.sample_period)
     held = {side: padded(np.asarray(smoothed[side].held(period), float)) for side in sides}
-    read = np.stack([padded(readings[side]) - states[side][:, 0] for side in sides], axis=1)
-    time, torque = padded(time), padded(torque)
+    read = np.stack([padded(segment.readings[side]) - states[side][:, 0] for side in sides], axis=1)
+    time, torque = padded(segment.time), padded(segment.torque)
     smooth: list[Any] = [{side: states[side][:, i] for side in sides} for i in range(3)]
     along = Path(*jax.tree.map(jnp.asarray, (time, torque, *smooth[:2])))
     effects, _ = effect_path(experiment, along)
@@ -273,6 +246,7 @@ class Predictor:
         given: sum of squared errors of each side as the model stands, the effects' own initial states at their best, rad^2;
             shape (sides,).
         squares: the least that changes of all numbers leave; as `given`.
+        deviation: rms of the errors that these leave, rad; as `given`.
         coefficients: of all columns, part by part; 1 first.
     """
 
@@ -282,12 +256,13 @@ class Predictor:
         self.given = np.sum([_as_it_stands(one, own_states) for one in grams], axis=0)
         sides, own, states, count = len(linear.sides), len(linear.free), linear.states, linear.count
         width = grams[0].shape[1] - 1 - states
+        # of a gain under which errors diverge, or all but: what is left is smaller than the rounding of their products
+        self.squares, self.coefficients = np.full(sides, np.inf), [np.zeros(one.shape[1]) for one in grams]
         if not np.max([np.max(np.abs(one)) for one in grams]) < DIVERGED:
-            self._nothing(grams)
             return
         weight = np.ones(sides)
         prior, centre = np.full(width, np.inf), np.zeros(width)
-        prior[:own], centre[:own] = linear.prior, linear.centre
+        prior[:own], centre[:own] = linear.prior, -linear.theta
         bound = np.concatenate([linear.bound, np.full(width - own, np.inf)])
         for turn in range(2):
             weighted = [np.einsum("s,scd->cd", weight, one) for one in grams]
@@ -295,23 +270,19 @@ class Predictor:
             variance = 1.0 if turn else max(total[0, 0] / (count * sides), 1e-300)
             lost = sum(_lost(one, states) for one in weighted) / variance
             if lost > _LOST or total[0, 0] < 0.0 or np.min(np.diag(total)[1:], initial=0.0) < 0.0:
-                self._nothing(grams)
                 return
-            found = _least_squares(total, variance / prior**2, centre, bound * prior)
-            free = np.concatenate([[1.0], found])
-            self.coefficients = [np.concatenate([free, -_response(one, states) @ free]) for one in weighted]
-            self.squares = np.sum(
-                [np.einsum("c,scd,d->s", at, one, at) for at, one in zip(self.coefficients, grams, strict=True)], axis=0
-            )
-            if not (self.squares > 0.0).all():
-                self._nothing(grams)
+            free = np.concatenate([[1.0], _least_squares(total, variance / prior**2, centre, bound * prior)])
+            coefficients = [np.concatenate([free, -_response(one, states) @ free]) for one in weighted]
+            left = [np.einsum("c,scd,d->s", at, one, at) for at, one in zip(coefficients, grams, strict=True)]
+            squares = np.sum(left, axis=0)
+            if not (squares > 0.0).all():
                 return
-            weight = count / self.squares
+            weight = count / squares
+        self.squares, self.coefficients = squares, coefficients
 
-    def _nothing(self, grams: list[np.ndarray]) -> None:
-        """Of a gain under which errors diverge, or all but: what is left is smaller than the rounding of their products."""
-        self.squares = np.full(len(self.smoothness), np.inf)
-        self.coefficients = [np.zeros(one.shape[1]) for one in grams]
+    @property
+    def deviation(self) -> np.ndarray:
+        return np.sqrt(self.squares / self.count)
 
     def cost(self, theta: np.ndarray, width: np.ndarray) -> float:
         """Minus twice the log-likelihood, with the prior's, that a step from theta promises."""
@@ -328,19 +299,25 @@ class Linear:
         free: Sequence[Free],
         theta: Float[np.ndarray, " numbers"],
         prior: np.ndarray,
-        centre: np.ndarray,
         segments: Sequence[Segment],
         bound: np.ndarray | None = None,
     ):
-        """Args as of :func:`linearise`; `prior` and `centre` are of the change of each number from theta, `bound` says how
-        many standard deviations it may be from `centre` (left out: any number)."""
+        """Linearise a model about the motion of a log.
+
+        Args:
+            experiment: the model with all effects (:func:`.neutral_effects.complete`); its sample period is that of the log.
+            free, theta: numbers that may change, and where they are.
+            prior: standard deviation of each theta about 0.
+            segments: of the log.
+            bound: how many standard deviations each may be from 0 at most; left out: any number.
+        """
         self.bound = np.full(len(free), np.inf) if bound is None else bound
-        self.free, self.theta, self.prior, self.centre = tuple(free), np.asarray(theta), prior, centre
+        self.free, self.theta, self.prior = tuple(free), np.asarray(theta), prior
         self.experiment = with_fitted(experiment, free, jnp.asarray(self.theta))
         self.period, self.sides = segments[0].period, experiment.sides
-        self.parts = linearise(self.experiment, free, self.theta, segments)
+        self.parts = [_part(self.experiment, free, self.theta, one) for one in segments]
         self.signals = [MotionTorques(self.experiment, part) for part in self.parts]
-        self.count = sum(int(np.asarray(one.weight).sum()) for one in self.parts)
+        self.count = sum(int(one.real.sum()) for one in self.signals)
         self.states = self.parts[0].defect.shape[1]
         self.drive, self.driven = self._drive()
         self._scales: dict[str, Scales] = {}
@@ -371,7 +348,7 @@ class Linear:
 
     def _scales_at(self, place: str) -> Scales:
         def joined(of) -> np.ndarray:
-            return np.concatenate([np.asarray(of(one))[np.asarray(one.weight) > 0.0] for one in self.parts])
+            return np.concatenate([np.asarray(of(one.part))[one.real] for one in self.signals])
 
         side = place if place in self.sides else "motor"
         position = joined(lambda part: part.position["load" if place == "transmission" else side])
@@ -412,16 +389,13 @@ class Linear:
 
     def predictor(self, smoothness: Sequence[float]) -> Predictor:
         """Prediction errors under a given gain."""
-        (found,) = self._predictors([list(smoothness)], [self._forces((), signals) for signals in self.signals])
+        (found,) = self._predictors([list(smoothness)], [self._forces((), one) for one in self.signals])
         return found
 
     def errors(self, smoothness: Sequence[float]) -> list[np.ndarray]:
         """Prediction errors under a given gain, part by part, rad; shape (samples, sides, columns)."""
         gain = self.gain(smoothness)
-        return [
-            np.asarray(_errors(part, gain, self._forces((), signals)))[:, :, self._some(0, 0)]
-            for part, signals in zip(self.parts, self.signals, strict=True)
-        ]
+        return [np.asarray(_errors(one.part, gain, self._forces((), one)))[:, :, self._some(0, 0)] for one in self.signals]
 
     def _some(self, forces: int, width: int) -> np.ndarray:
         """Products that are not there to fill up, some of the forces among them."""
@@ -429,14 +403,16 @@ class Linear:
         last = 1 + padded + width + np.arange(self.states)
         return np.concatenate([np.arange(1 + own), 1 + padded + np.arange(forces), last])
 
-    def choose(self, variants: Sequence[Candidate], near: list[float] | None = None) -> tuple[list[float], np.ndarray]:
-        """The predictor with the least errors, some candidates taken in: smoothness of each side, and errors' rms, rad.
+    def choose(self, variants: Sequence[Candidate], near: Sequence[float] | None = None) -> Predictor:
+        """The predictor with the least errors, some candidates taken in; the search begins at a smoothness of each side."""
+        if variants or near is not None:
+            self._last = self._search(variants, near)
+        else:
+            self._last = self._alone = self._alone or self._search((), None)
+        return self._last[0]
 
-        With `near`, the search begins there.
-        """
-        if not variants and near is None and self._alone is not None:
-            self._last = self._alone
-            return self._chosen(self._alone[0])
+    def _search(self, variants: Sequence[Candidate], near: Sequence[float] | None) -> tuple[Predictor, list[np.ndarray]]:
+        """The predictor with the least errors, and the candidates' torques."""
         forces = [self._forces(variants, signals) for signals in self.signals]
 
         def best(options: list[list[float]]) -> Predictor:
@@ -447,20 +423,14 @@ class Linear:
         if near is None:
             chosen = best([[float(q)] * len(self.sides) for q in _COARSE_SMOOTHNESS])
         else:
-            (chosen,) = self._predictors([near], forces)
+            (chosen,) = self._predictors([list(near)], forces)
         for i in range(len(self.sides)) if len(self.sides) > 1 or near is not None else ():
             now, least = chosen.smoothness, _COARSE_SMOOTHNESS[0]
             options = [[max(float(q * f), least) if j == i else q for j, q in enumerate(now)] for f in _FINE_SMOOTHNESS]
             other = best(options)
             if np.sum(np.log(other.squares)) < np.sum(np.log(chosen.squares)):
                 chosen = other
-        self._last = chosen, forces
-        if not variants and near is None:
-            self._alone = self._last
-        return self._chosen(chosen)
-
-    def _chosen(self, predictor: Predictor) -> tuple[list[float], np.ndarray]:
-        return predictor.smoothness, np.sqrt(predictor.squares / self.count)
+        return chosen, forces
 
     def _predictors(self, options: list[list[float]], forces: list[np.ndarray]) -> list[Predictor]:
         # one compiled program for a few and for all
@@ -477,23 +447,19 @@ class Linear:
         width = sum(one.width + one.offset for one in variants)
         return forces_of(variants, signals, bucket(width, _COLUMNS, 2) - width if width else 0)
 
-    def deviation(self, smoothness: Sequence[float]) -> np.ndarray:
-        """Rms of the prediction errors, rad, by side, with a given predictor."""
-        return np.sqrt(self.predictor(smoothness).squares / self.count)
-
     def frequencies(self, place: str) -> list[float]:
         """Frequencies (Hz) at which a disturbance of a side explains most, by the gradient of the errors' squares.
 
         Of the longest part, under what the last call of :meth:`choose` chose, and at what it left over.
         """
         assert self._last is not None
-        i = int(np.argmax([float(one.weight.sum()) for one in self.parts]))
+        i = int(np.argmax([one.real.sum() for one in self.signals]))
         part, side = self.parts[i], self.sides.index(place)
         predictor, forces = self._last
-        gain, deviation = self.gain(predictor.smoothness), np.sqrt(predictor.squares / self.count)
+        gain, deviation = self.gain(predictor.smoothness), predictor.deviation
         errors = np.asarray(_errors(part, gain, forces[i]))
         left = errors[:, :, self._some(len(forces[i]), len(forces[i]))] @ predictor.coefficients[i]
-        time, real = np.asarray(part.time), int(np.asarray(part.weight).sum())
+        time, real = np.asarray(part.time), int(self.signals[i].real.sum())
         span, top = real * self.period, self._highest
         few = np.geomspace(1.0 / span, top, _COARSE)
         phase = 2.0 * np.pi * few[:, None] * time[None, :]
@@ -523,18 +489,9 @@ class Linear:
         left = [one @ at for one, at in zip(errors, predictor.coefficients, strict=True)]
         return [one[signals.real] for one, signals in zip(left, self.signals, strict=True)]
 
-    def spectrum(self, smoothness: Sequence[float]) -> Spectrum:
-        """Of what is left."""
-        return spectrum_of(self.left(smoothness))
-
     def columns(self, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray | Spectrum) -> Products:
-        """Products of everything that the prediction errors are linear in, initial states eliminated.
-
-        Args:
-            variants: candidates, the columns of which are to be among them.
-            smoothness: of the predictor, by side.
-            noise: rms of its errors by side, rad, where they are white; or their spectrum.
-        """
+        """Products of everything that the prediction errors are linear in, columns of candidates among it, initial states
+        eliminated; `noise`: rms of the errors by side, rad, where they are white, or their spectrum."""
         gain, own = self.gain(smoothness), len(self.free)
         places, offsets, at = [], [], 1 + own
         for one in variants:
@@ -543,8 +500,8 @@ class Linear:
             offsets.append(at if one.offset else -1)
             at += one.offset
         total, power = np.zeros((at, at)), np.zeros(at - 1 - own)
-        for part, signals in zip(self.parts, self.signals, strict=True):
-            forces = self._forces(variants, signals)
+        for signals in self.signals:
+            part, forces = signals.part, self._forces(variants, signals)
             power += self._power(forces[: at - 1 - own], signals)
             some = self._some(at - 1 - own, len(forces))
             if isinstance(noise, Spectrum):
@@ -564,7 +521,7 @@ class Linear:
             elif (nominal := self.nominal(one.name)) is not None:
                 scale[list(place)] = np.minimum(scale[list(place)], OFF * nominal)
         centre = np.zeros(at)
-        centre[1 : 1 + own] = self.centre
+        centre[1 : 1 + own] = -self.theta
         return Products(total, own, tuple(places), tuple(offsets), scale, centre, self.bound, self._twins(variants, places))
 
     def _twins(self, variants: Sequence[Candidate], places: Sequence[tuple[int, ...]]) -> dict[int, tuple[int, float]]:
@@ -585,14 +542,12 @@ class Linear:
         over = np.array([*(signals.over(side) for side in self.sides), 1.0])
         return np.einsum("cts,cts->cs", torques, torques) @ over**-2.0
 
-    def shown(self, smoothness: Sequence[float], noise: np.ndarray) -> float:
-        """Standard deviations by which the errors show the input: a part of it is seen where that part of them is.
-
-        Args:
-            smoothness: of the predictor, by side.
-            noise: rms of its errors, by side, rad.
-        """
-        products = self.columns([all_of_the_input()], smoothness, noise).products
+    def shown(self) -> float:
+        """Standard deviations by which the errors show the input, each part of it beside those errors; infinite without."""
+        if not self.driven:
+            return np.inf
+        predictor = self.choose(())
+        products = self.columns([all_of_the_input()], predictor.smoothness, predictor.deviation).products
         return float(np.sqrt(products[-1, -1]))
 
     def share(self, name: str) -> float:
@@ -601,16 +556,13 @@ class Linear:
         power = sum(self._power(signals.of([effect])[0][None], signals)[0] for signals in self.signals)
         return float(np.sqrt(power / self.count)) / self.drive
 
-    def sizes(self, names: Sequence[str]) -> dict[str, float]:
-        """Prior relative standard deviation of the amplitudes of effects that the model has."""
-        found = {}
-        for name in names:
-            found[name] = SHARE / max(self.share(name), 1e-150)
-            if (nominal := self.nominal(name)) is not None:
-                effect = get_leaf(self.experiment, f"effects.{name}")
-                value = abs(float(getattr(effect, EFFECTS[name].sizes()[0])))
-                found[name] = min(found[name], OFF * nominal / max(value, 1e-300))
-        return found
+    def size(self, name: str) -> float:
+        """Prior relative standard deviation of the amplitudes of an effect that the model has."""
+        size, nominal = SHARE / max(self.share(name), 1e-150), self.nominal(name)
+        if nominal is None:
+            return size
+        value = abs(float(getattr(get_leaf(self.experiment, f"effects.{name}"), EFFECTS[name].sizes()[0])))
+        return min(size, OFF * nominal / max(value, 1e-300))
 
     def same(self, name: str) -> int | None:
         """Index of the model's own number that an effect is the error of."""
@@ -648,14 +600,12 @@ def _least_squares(total: np.ndarray, precision: np.ndarray, centre: np.ndarray,
         fixed |= over
 
 
-def _scaled(gram: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse of the products of the last columns, the initial states, which may be all but alike; and their size."""
+def _influence(gram: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
+    """Products of the last columns, the initial states, over their sizes; and these, infinite where a state does nothing."""
     inner = gram[-states:, -states:]
-    if not np.isfinite(inner).all():  # of a model that diverges
-        return np.zeros_like(inner), np.ones(states)
     size = np.sqrt(np.maximum(np.diag(inner), 0.0))
     size = np.where(size > _SILENT * np.max(size), size, np.inf)
-    return np.linalg.pinv(inner / np.outer(size, size), rcond=1e-12, hermitian=True), size
+    return inner / np.outer(size, size), size
 
 
 def _as_it_stands(grams: np.ndarray, states: int) -> np.ndarray:
@@ -672,18 +622,20 @@ def _as_it_stands(grams: np.ndarray, states: int) -> np.ndarray:
 
 def _lost(gram: np.ndarray, states: int) -> float:
     """What rounding may take off the square of the first column when the initial states are eliminated."""
-    inner = gram[-states:, -states:]
-    size = np.sqrt(np.maximum(np.diag(inner), 0.0))
-    real = size > _SILENT * np.max(size)
-    if not real.any() or not np.isfinite(inner).all():
+    unit, size = _influence(gram, states)
+    real = np.isfinite(size)
+    if not real.any():
         return 0.0
-    spread = np.abs(np.linalg.eigvalsh(inner[np.ix_(real, real)] / np.outer(size[real], size[real])))
+    spread = np.abs(np.linalg.eigvalsh(unit[np.ix_(real, real)]))
     return float(np.finfo(float).eps * gram[0, 0] * spread[-1] / max(spread[0], 1e-300))
 
 
 def _response(gram: np.ndarray, states: int) -> np.ndarray:
-    """What the initial states take off the other columns."""
-    inverse, size = _scaled(gram, states)
+    """What the initial states, which may be all but alike, take off the other columns."""
+    if not np.isfinite(gram[-states:, -states:]).all():  # of a model that diverges
+        return np.zeros_like(gram[-states:, :-states])
+    unit, size = _influence(gram, states)
+    inverse = np.linalg.pinv(unit, rcond=1e-12, hermitian=True)
     return (inverse @ (gram[-states:, :-states] / size[:, None])) / size[:, None]
 
 

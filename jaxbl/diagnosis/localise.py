@@ -18,16 +18,18 @@ from jaxbl.identification import regression
 from jaxbl.identification.segments import Segment
 from jaxbl.simulate import Experiment
 
-from .coordinates import CoordinateValues, coordinates_of
+from .coordinates import CoordinateValues
 from .residuals import Residual, narrowed, noise_spectrum
 
 _BINS = 24
 """Of a coordinate: fine enough for a picture, each with a few per cent of the samples."""
+_SLOW_SHARES = np.concatenate([[0.0, 0.01, 0.025, 0.05, 0.075], np.linspace(0.1, 1.0, 19)])
+"""Shares of the samples below the ends of bins of the size of the speed: finer where it is slow."""
 _COUNTS = (2, 4, 8, 16, 32, 64, 128)
 """Numbers of bins that functions of a coordinate are tried with."""
 _BLOCKS, _FOLDS = 40, 5
 """Blocks of time, and sets of them that a function is made from and tried on in turn."""
-_FEWEST = 4
+_LEAST_BLOCKS = 4
 """Blocks of time that a mean must come from to have a scatter."""
 _LEVEL_UNKNOWN = 0.05
 """Relative uncertainty of the noise's deviation."""
@@ -35,7 +37,7 @@ SIGNIFICANT = 4.5
 """Standard deviations beyond which a region counts: several hundred regions are looked at."""
 RESOLUTION = 5e-4
 """Share of the driving torque below which sampling alone may be what is missing."""
-_CLEAR = 10.0
+_LOUD = 10.0
 """Power over the noise's from which on no narrower low-pass is tried."""
 _PEAKS, _NARROW, _AROUND = 5, 10.0, 20
 """Peaks at most; power of one over the median of its neighbours; neighbours on each side."""
@@ -125,10 +127,10 @@ class Peak:
 
 @dataclasses.dataclass(frozen=True)
 class Localised:
-    """Where one equation lacks torque. Numbers only: `dataclasses.asdict` makes it JSON.
+    """Where one side lacks torque. Numbers only: `dataclasses.asdict` makes it JSON.
 
     Attributes:
-        name: `motor`, `load` or `transmission`.
+        name: of the side.
         bandwidth: of what is looked at, Hz.
         rms, noise: of residual and noise within it, N m.
         missing: rms beyond the noise, N m.
@@ -160,6 +162,7 @@ class _Joined:
         ends = np.cumsum([0, *(len(one.time) for one in residuals)])
         self.slices = [slice(a, b) for a, b in itertools.pairwise(ends)]
         self.count = int(ends[-1])
+        self.power, self.noise = float(np.sum(self.torque**2)), float(np.sum(self.deviation**2))
         self.sizes = [2 ** int(np.ceil(np.log2(2 * len(one.time)))) for one in residuals]
         self.spectra = [
             [noise_spectrum(one.correlation**power, size) for one, size in zip(residuals, self.sizes, strict=True)]
@@ -184,8 +187,7 @@ class _Joined:
     @cached_property
     def z(self) -> float:
         """Significance of all power beyond the noise's."""
-        power, noise = np.array([np.sum(self.torque**2)]), np.array([np.sum(self.deviation**2)])
-        return float(_excess_z(power, noise, self.variance(np.ones((1, self.count)), 2))[0])
+        return float(_excess_z(self.power, self.noise, self.variance(np.ones((1, self.count)), 2))[0])
 
     def variance(self, masks: np.ndarray, power: int) -> np.ndarray:
         """Variance by noise of sums of residuals (1), or of their squares (2), over each of some sets of samples."""
@@ -199,7 +201,7 @@ class _Joined:
         return power * total
 
 
-def _excess_z(power: np.ndarray, noise: np.ndarray, variance: np.ndarray) -> np.ndarray:
+def _excess_z(power: np.ndarray | float, noise: np.ndarray | float, variance: np.ndarray | float) -> np.ndarray:
     """Significance of sums of squares beyond the noise's, whose variance is given (Wilson and Hilferty)."""
     noise = np.where(noise > 0.0, noise, 1.0)
     small = (variance / noise**2 + (2.0 * _LEVEL_UNKNOWN) ** 2) / 9.0
@@ -209,32 +211,27 @@ def _excess_z(power: np.ndarray, noise: np.ndarray, variance: np.ndarray) -> np.
 def locate(
     residuals: Sequence[Residual], coordinates: Sequence[Mapping[str, CoordinateValues]], *, floor: float = 0.0
 ) -> Localised:
-    """Where one equation lacks torque.
+    """Where one side lacks torque.
 
-    Of several low-passes the one is taken behind which the power stands out most from the noise.
-
-    Args:
-        residuals: of each part of the record.
-        coordinates: of each, the simpler of equals first (:func:`coordinates_of`).
-        floor: torque below which nothing is said to be missing, N m.
+    Of several low-passes the one is taken behind which the power stands out most from the noise. Below the torque `floor`
+    (N m) nothing is said to be missing.
     """
     widest = max(one.bandwidth for one in residuals)
     shortest = min(one.time[-1] - one.time[0] for one in residuals)
-    best: tuple[float, _Joined, list[np.ndarray]] | None = None
+    best: tuple[_Joined, list[np.ndarray]] | None = None
     for octave in range(7):
         cutoff = widest / 2.0**octave
         if cutoff * shortest < 20.0 and best is not None:
             break
         pairs = [narrowed(one, cutoff) for one in residuals]
         joined = _Joined([low for low, _ in pairs])
-        z = joined.z
         # a wider one shows more: a narrower one must be worth it
-        if best is None or z > 1.15 * max(best[0], SIGNIFICANT):
-            best = z, joined, [at for _, at in pairs]
-        if np.sum(joined.torque**2) > _CLEAR * np.sum(joined.deviation**2):
+        if best is None or joined.z > 1.15 * max(best[0].z, SIGNIFICANT):
+            best = joined, [at for _, at in pairs]
+        if joined.power > _LOUD * joined.noise:
             break
     assert best is not None
-    z, joined, at = best
+    joined, at = best
     names = [name for name in coordinates[0] if all(name in one for one in coordinates)]
     values = {
         name: coordinates[0][name]._replace(
@@ -242,7 +239,7 @@ def locate(
         )
         for name in names
     }
-    power, noise = float(np.sum(joined.torque**2)), float(np.sum(joined.deviation**2))
+    power, noise, z = joined.power, joined.noise, joined.z
     excess = max(power - noise, _LEVEL_UNKNOWN * noise)
     found = {name: _over_coordinate(name, one, joined, excess) for name, one in values.items()}
     longest = int(np.argmax([len(one.time) for one in residuals]))
@@ -262,44 +259,41 @@ def locate(
     )  # fmt: skip
 
 
-def _bin_edges(values: np.ndarray, count: int, by_time: bool) -> np.ndarray:
-    """Ends of bins: equal numbers of samples in each; for time and turns equal widths."""
-    low, high = float(np.min(values)), float(np.max(values))
-    if by_time or high <= low:
-        return np.linspace(low, max(high, np.nextafter(low, np.inf)), count + 1)
-    edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, count + 1)))
-    return edges if len(edges) > 1 else np.array([low, high])
+def _binned(name: str, one: CoordinateValues, shares: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, int]:
+    """Ends of bins, the bin of each sample, and the number of bins; a class is a bin without ends.
+
+    Bins hold shares of the samples, those of time and turns shares of the width.
+    """
+    if one.classes:
+        return None, np.asarray(one.values), len(one.classes)
+    low, high = float(np.min(one.values)), float(np.max(one.values))
+    if name == "time" or name.endswith("turn") or high <= low:
+        edges = np.linspace(low, max(high, np.nextafter(low, np.inf)), len(shares))
+    else:
+        edges = np.unique(np.quantile(one.values, shares))
+    count = len(edges) - 1
+    return edges, np.clip(np.searchsorted(edges, one.values, "right") - 1, 0, count - 1), count
 
 
 def _over_coordinate(name: str, one: CoordinateValues, joined: _Joined, excess: float) -> Coordinate:
-    even = name == "time" or name.endswith("turn")
-    if one.classes:
-        labels, edges, index = list(one.classes), None, np.asarray(one.values)
-        count = len(labels)
-    else:
-        edges = _bin_edges(one.values, _BINS, even)
-        if name == "|speed|":
-            # finer where it is slow
-            shares = np.concatenate([[0.0, 0.01, 0.025, 0.05, 0.075], np.linspace(0.1, 1.0, 19)])
-            edges = np.unique(np.quantile(one.values, shares))
-        labels, count = [""] * (len(edges) - 1), len(edges) - 1
-        index = np.clip(np.searchsorted(edges, one.values, "right") - 1, 0, count - 1)
+    edges, index, count = _binned(name, one, _SLOW_SHARES if name == "|speed|" else np.linspace(0.0, 1.0, _BINS + 1))
     masks = (index[None, :] == np.arange(count)[:, None]).astype(float)
     number = np.maximum(masks.sum(axis=1), 1.0)
     power, noise = masks @ joined.torque**2, masks @ joined.deviation**2
     z = _excess_z(power, noise, joined.variance(masks, 2))
     mean = (masks @ joined.torque) / number
     error, mean_z = _mean_error(joined, index, count, mean, number, np.sqrt(joined.variance(masks, 1)) / number, name)
+    labels = one.classes or ("",) * count
+    ends = [(None, None)] * count if edges is None else list(itertools.pairwise(edges.tolist()))
     regions = tuple(
         Region(
-            labels[i], None if edges is None else float(edges[i]), None if edges is None else float(edges[i + 1]),
-            float(number[i] / joined.count), float((power[i] - noise[i]) / excess), float((power[i] - noise[i]) / number[i]),
-            float(z[i]), float(mean[i]), float(error[i]), float(mean_z[i]),
+            labels[i], *ends[i], float(number[i] / joined.count), float((power[i] - noise[i]) / excess),
+            float((power[i] - noise[i]) / number[i]), float(z[i]), float(mean[i]), float(error[i]), float(mean_z[i]),
         )
         for i in range(count)
         if masks[i].any()
     )  # fmt: skip
-    return Coordinate(name, one.unit, one.symbol, regions, _explained_share(name, one, joined, excess, even))
+    return Coordinate(name, one.unit, one.symbol, regions, _explained_share(name, one, joined, excess))
 
 
 def _mean_error(
@@ -309,11 +303,7 @@ def _mean_error(
     if name == "time":
         # each moment comes but once
         return by_noise, mean / np.maximum(by_noise, np.finfo(float).tiny)
-    cell = joined.block * count + index
-    size = joined.blocks * count
-    sums, numbers = (
-        np.bincount(cell, weights, minlength=size).reshape(joined.blocks, count) for weights in (joined.torque, None)
-    )
+    sums, numbers = _sums(joined.torque, joined.block, joined.blocks, index, count)
     visits = np.sum(numbers > 0, axis=0)
     # blocks with few samples of a bin are no block of their own
     weight = np.sum(numbers, axis=0) ** 2 / np.maximum(np.sum(numbers.astype(float) ** 2, axis=0), 1.0)
@@ -321,13 +311,20 @@ def _mean_error(
     scatter = np.sum((sums - mean * numbers) ** 2, axis=0) * (freedom + 1.0) / freedom
     by_scatter = np.sqrt(scatter) / number
     square = np.bincount(index, joined.torque**2, minlength=count)[:count] / number
-    enough = (visits >= _FEWEST) & (weight >= 0.75 * _FEWEST)
+    enough = (visits >= _LEAST_BLOCKS) & (weight >= 0.75 * _LEAST_BLOCKS)
     by_scatter = np.where(enough, by_scatter, np.maximum(by_scatter, np.sqrt(square)))
     error = np.maximum(np.maximum(by_noise, by_scatter), np.finfo(float).tiny)
     t = mean / error
     # Wallace: Student's t as a normal number
     normal = np.sign(t) * (8.0 * freedom + 1.0) / (8.0 * freedom + 3.0) * np.sqrt(freedom * np.log1p(t**2 / freedom))
     return error, np.where(by_noise >= by_scatter, t, normal)
+
+
+def _sums(torque: np.ndarray, row: np.ndarray, rows: int, index: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray]:
+    """Sums over the samples of each row (block or fold) and bin, and their numbers; shape (rows, bins)."""
+    cell = row * bins + index
+    found = [np.bincount(cell, weights, minlength=rows * bins).reshape(rows, bins) for weights in (torque, None)]
+    return found[0], found[1]
 
 
 def _folds(joined: _Joined, name: str, count: int) -> np.ndarray:
@@ -341,29 +338,21 @@ def _folds(joined: _Joined, name: str, count: int) -> np.ndarray:
     return fold
 
 
-def _explained_share(name: str, one: CoordinateValues, joined: _Joined, excess: float, even: bool) -> float:
+def _explained_share(name: str, one: CoordinateValues, joined: _Joined, excess: float) -> float:
     if joined.z < SIGNIFICANT:
         # nothing to be shared out
         return 0.0
     best = 0.0
-    counts = [len(one.classes)] if one.classes else [n for n in _COUNTS if n <= max(joined.effective / 10.0, 2.0)]
+    counts = [1] if one.classes else [n for n in _COUNTS if n <= max(joined.effective / 10.0, 2.0)]
     if name == "time":
         counts = [n for n in counts if n * _FOLDS <= max(joined.effective / 10.0, 10.0)]
     for count in counts:
-        if one.classes:
-            index, bins = np.asarray(one.values), count
-        else:
-            edges = _bin_edges(one.values, count, even)
-            bins = len(edges) - 1
-            index = np.clip(np.searchsorted(edges, one.values, "right") - 1, 0, bins - 1)
+        _, index, bins = _binned(name, one, np.linspace(0.0, 1.0, count + 1))
         fold = _folds(joined, name, bins)
-        cell = fold * bins + index
-        sums, numbers = (
-            np.bincount(cell, weights, minlength=_FOLDS * bins).reshape(_FOLDS, bins) for weights in (joined.torque, None)
-        )
+        sums, numbers = _sums(joined.torque, fold, _FOLDS, index, bins)
         others = np.sum(numbers, axis=0) - numbers
         predicted = ((np.sum(sums, axis=0) - sums) / np.maximum(others, 1))[fold, index]
-        gained = np.sum(joined.torque**2) - np.sum((joined.torque - predicted) ** 2)
+        gained = joined.power - np.sum((joined.torque - predicted) ** 2)
         best = max(best, float(gained))
     return min(best / excess, 1.0)
 
@@ -384,10 +373,9 @@ def _spectrum(one: Residual, speed: np.ndarray | None, low: Residual) -> tuple[t
         inside = (frequency >= begin) & (frequency < end)
         if np.count_nonzero(inside) < 2:
             continue
-        level = np.array([np.sum(floor[inside])])
         # neighbours of a Hann window share 1.5 bins
-        z = _excess_z(np.array([np.sum(power[inside])]), level, np.array([1.5 * np.sum(floor[inside] ** 2)]))
-        bands.append(Band(float(begin), float(end), float(np.sum(beyond[inside])) / total, float(z[0])))
+        z = _excess_z(np.sum(power[inside]), np.sum(floor[inside]), 1.5 * np.sum(floor[inside] ** 2))
+        bands.append(Band(float(begin), float(end), float(np.sum(beyond[inside])) / total, float(z)))
     motion = None
     if speed is not None:
         moving = np.asarray(speed) - np.mean(speed)
@@ -438,24 +426,13 @@ def localise(
     experiment: Experiment,
     residuals: Mapping[str, Sequence[Residual]],
     segments: Sequence[Segment],
-    *,
-    rotating: bool | Mapping[str, bool] = True,
+    coordinates: Mapping[str, Sequence[Mapping[str, CoordinateValues]]],
 ) -> dict[str, Localised]:
-    """Where each equation lacks torque, by equation.
-
-    Args:
-        experiment: the model.
-        residuals: of each equation, segment by segment (:func:`jaxbl.diagnosis.residuals.residual_torques`).
-        segments: of the log.
-        rotating: whether positions are angles in rad; by side where they differ.
-    """
+    """Where each side lacks torque, by its residuals (:func:`.residuals.residual_torques`), segment by segment, and the
+    coordinates along them (:func:`.coordinates.all_coordinates`)."""
     found = {}
     balance = eqx.filter_jit(regression.balance)
-    for name, pieces in residuals.items():
-        coordinates = [
-            coordinates_of(experiment, segment, one, rotating=rotating)
-            for segment, one in zip(segments, pieces, strict=True)
-        ]
-        driving = np.concatenate([np.asarray(balance(experiment, one.kinematics)[name].drive) for one in segments])
-        found[name] = locate(pieces, coordinates, floor=RESOLUTION * float(np.sqrt(np.mean(driving**2))))
+    for side, pieces in residuals.items():
+        driving = np.concatenate([np.asarray(balance(experiment, one.kinematics)[side].drive) for one in segments])
+        found[side] = locate(pieces, coordinates[side], floor=RESOLUTION * float(np.sqrt(np.mean(driving**2))))
     return found

@@ -1,54 +1,99 @@
-"""The experiment that would part effects that a log does not: what `jaxbl diagnose --next-experiment` writes."""
+"""The experiment that would part effects that a log does not: what `jaxbl diagnose --next-experiment` writes.
+
+It is the input on which the two models differ most, within given limits.
+References: G. Box, W. Hill, Discrimination among mechanistic models, Technometrics 9 (1967); W. Hunter, A. Reiner, Designs
+for discriminating between two rival models, Technometrics 7 (1965).
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+from jaxtyping import Array, Float
+from scipy.signal import max_len_seq
 
 from jaxbl.config import Config, read_config
-from jaxbl.diagnosis.discriminating_input import Input, parting
+from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
 from jaxbl.identification.logs import on_record
 from jaxbl.identification.segments import reading_noise, segments_of
 from jaxbl.records import Record
+from jaxbl.simulate import Experiment, trajectory
 
-_CLEAR = 10.0
+_KINDS = "sine", "multisine", "chirp", "steps"
+_SHARES = 0.01, 0.03, 0.1, 0.25, 0.5, 0.75, 1.0
+"""Amplitudes, over the largest torque allowed."""
+_FREQUENCIES = 6
+"""Tried of each kind, evenly spaced in their logarithm."""
+_HARMONICS = 8
+"""Of a multisine, with Schroeder's phases (IEEE Trans. Information Theory 16, 1970)."""
+_LONGEST = 10.0
+"""Duration at most, s."""
+_DECISIVE = 10.0
 """Nats from which on an experiment decides between two effects: refitted numbers cost some of them."""
 
 
-class Limits(NamedTuple):
-    """What an experiment may ask of the machine; None: no more than the log.
+class Input(NamedTuple):
+    """An input that was tried.
 
     Attributes:
-        torque: largest, N m.
-        travel: of the motor, rad.
+        kind: sine, multisine, chirp or steps.
+        amplitude: largest torque, N m.
+        frequency: Hz; of a multisine the lowest, of a chirp the first, of steps one over twice their length.
+        torque: shape (samples,).
+        apart: nats by which readings of it favour one model over the other: half the sum of squares of the difference of
+            their positions, over the variance of the readings' noise.
     """
 
-    torque: float | None = None
-    travel: float | None = None
+    kind: str
+    amplitude: float
+    frequency: float
+    torque: np.ndarray
+    apart: float
 
 
-_LOGS = Limits()
-
-
-def next_experiment(summary: Mapping[str, Any], model: Config, record: Record, limits: Limits = _LOGS) -> Input | None:
-    """The input on which the first finding and its best alternative differ most; None where no input stays within limits.
+def write_next_experiment(
+    folder: Path,
+    summary: Mapping[str, Any],
+    record: Record,
+    path: Path,
+    torque: float | None = None,
+    travel: float | None = None,
+) -> list[str]:
+    """Write the input as CSV with columns t (s) and u (N m). Returns lines for the terminal.
 
     Args:
-        summary: of a diagnosis that has a tie (:func:`tied`).
-        model: the extended model.
+        folder: results of the diagnosis.
+        summary: its `diagnosis.json`.
         record: the log.
-        limits: of the machine.
+        path: the file to be written.
+        torque, travel: as of :func:`next_experiment`.
+
+    Raises:
+        InputError: the file cannot be written.
     """
-    rival = summary["rival"]
-    data = model.resolved() | {key: rival[key] for key in ("drive", "transmission", "effects") if key in rival}
-    with jax.enable_x64(True):
-        one, other = (on_record(each, record) for each in (model, read_config(data)))
-        noise = reading_noise(segments_of(record, one.sides))
-        return parting(one, other, record, noise, limits.torque, limits.travel)
+    pair = tied(summary)
+    if pair is None:
+        return ["Nothing is tied: no experiment is needed to part effects, and none was written."]
+    found = next_experiment(summary, read_config(folder / "model.toml"), record, torque, travel)
+    if found is None:
+        return [f"No input stays within the torque and travel allowed that would part {pair[0]} from {pair[1]}."]
+    time = record.sample_period * np.arange(len(found.torque))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pd.DataFrame({"t": time, "u": found.torque}).to_csv(path, index=False, float_format="%.9g")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+    clear = "" if found.apart > _DECISIVE else ": too little; --max-torque and --max-travel allow for more"
+    return [
+        f"To part {pair[0]} from {pair[1]}: {found.kind} of {found.amplitude:.3g} N m, {found.frequency:.3g} Hz, "
+        f"{time[-1] + record.sample_period:.3g} s; it would separate them by up to {found.apart:.2g} nats{clear}: {path}"
+    ]
 
 
 def tied(summary: Mapping[str, Any]) -> tuple[str, str] | None:
@@ -59,35 +104,100 @@ def tied(summary: Mapping[str, Any]) -> tuple[str, str] | None:
     return findings[-1]["effect"], summary["rival"]["effect"]
 
 
-def write_next_experiment(
-    folder: Path, summary: Mapping[str, Any], record: Record, path: Path, limits: Limits = _LOGS
-) -> list[str]:
-    """Write the input as CSV with columns t (s) and u (N m). Returns lines for the terminal.
+def next_experiment(
+    summary: Mapping[str, Any], model: Config, record: Record, torque: float | None = None, travel: float | None = None
+) -> Input | None:
+    """The input on which the last finding and its best alternative differ most; None where no input stays within limits.
 
     Args:
-        folder: results of the diagnosis.
-        summary: its `diagnosis.json`.
+        summary: of a diagnosis that has a tie (:func:`tied`).
+        model: the extended model.
         record: the log.
-        path: the file to be written.
-        limits: of the machine.
-
-    Raises:
-        InputError: the file cannot be written.
+        torque: largest that is allowed, N m; left out: that of the log.
+        travel: of the motor that is allowed, rad (the load may move as far over the gear); left out: those of the log.
     """
-    pair = tied(summary)
-    if pair is None:
-        return ["Nothing is tied: no experiment is needed to part effects, and none was written."]
-    found = next_experiment(summary, read_config(folder / "model.toml"), record, limits)
-    if found is None:
-        return [f"No input stays within the torque and travel allowed that would part {pair[0]} from {pair[1]}."]
-    time = record.sample_period * np.arange(len(found.torque))
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        pd.DataFrame({"t": time, "u": found.torque}).to_csv(path, index=False, float_format="%.9g")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
-    clear = "" if found.apart > _CLEAR else ": too little; --max-torque and --max-travel allow for more"
-    return [
-        f"To part {pair[0]} from {pair[1]}: {found.kind} of {found.amplitude:.3g} N m, {found.frequency:.3g} Hz, "
-        f"{time[-1] + record.sample_period:.3g} s; it would separate them by up to {found.apart:.2g} nats{clear}: {path}"
-    ]
+    rival = summary["rival"]
+    data = model.resolved() | {key: rival[key] for key in ("drive", "transmission", "effects") if key in rival}
+    with jax.enable_x64(True):
+        models = [on_record(each, record) for each in (model, read_config(data))]
+        return _parting(models, record, torque, travel)
+
+
+def _parting(models: list[Experiment], record: Record, torque: float | None, travel: float | None) -> Input | None:
+    """The input on which two models' positions differ most, within torque and travel; None where all go beyond.
+
+    Both begin at rest in the middle of the log's motion. What another initial position or speed would make of the
+    difference does not count.
+    """
+    assert record.torque is not None
+    one = models[0]
+    noise = reading_noise(segments_of(record, one.sides))
+    tried = _inputs(record, float(np.max(np.abs(record.torque))) if torque is None else torque)
+    torques = jnp.asarray(np.stack([each.torque for each in tried]))
+    start = {
+        side: jnp.asarray(float(np.median(np.concatenate([values[part] for part in record.segments]))))
+        for side, values in record.positions.items()
+        if side in one.sides
+    }
+    if len(start) == 2:
+        start["motor"] = start["load"] * jnp.asarray(float(one.drive.ratio("load")))
+    paths = [_runs(model, start, torques) for model in models]
+    apart, inside = np.zeros(len(tried)), np.ones(len(tried), bool)
+    for side in one.sides:
+        if travel is None:
+            reach = max(float(np.ptp(record.positions[side][part])) for part in record.segments)
+        else:
+            reach = travel / (abs(float(one.drive.ratio(side))) if side != "motor" else 1.0)
+        first, second = (np.asarray(path[side]) for path in paths)
+        for path in (first, second):
+            finite = np.isfinite(path).all(axis=1)
+            inside &= finite & (np.ptp(np.where(np.isfinite(path), path, 0.0), axis=1) <= reach)
+        difference = np.where(np.isfinite(second - first), second - first, 0.0)
+        line = np.vander(np.linspace(-1.0, 1.0, difference.shape[1]), 2)
+        basis, _ = np.linalg.qr(line)
+        left = difference - (difference @ basis) @ basis.T
+        apart += 0.5 * np.sum((left / noise[side]) ** 2, axis=1)
+    if not inside.any():
+        return None
+    best = int(np.argmax(np.where(inside, apart, -1.0)))
+    return tried[best]._replace(apart=float(apart[best]))
+
+
+def _inputs(record: Record, largest: float) -> list[Input]:
+    """Inputs of up to a torque (N m), at the period of a log: kinds, amplitudes and frequencies."""
+    period = record.sample_period
+    # gaps of a log are no part of it
+    duration = min(sum(part.stop - part.start for part in record.segments) * period, _LONGEST)
+    time = period * np.arange(round(duration / period))
+    top = min(0.02 / period, 10.0)
+    found = []
+    for frequency in np.geomspace(min(2.0 / duration, 0.5 * top), top, _FREQUENCIES):
+        for kind in _KINDS:
+            wave = _wave(kind, time, float(frequency))
+            wave = wave / np.max(np.abs(wave))
+            found += [Input(kind, share * largest, float(frequency), share * largest * wave, 0.0) for share in _SHARES]
+    return found
+
+
+def _wave(kind: str, time: np.ndarray, frequency: float) -> np.ndarray:
+    if kind == "sine":
+        return np.sin(2.0 * np.pi * frequency * time)
+    if kind == "multisine":
+        k = np.arange(1, _HARMONICS + 1)
+        phases = -np.pi * k * (k - 1.0) / _HARMONICS
+        return np.sum(np.cos(2.0 * np.pi * frequency * k[:, None] * time[None, :] + phases[:, None]), axis=0)
+    if kind == "chirp":
+        # over a decade
+        return np.sin(2.0 * np.pi * frequency * (1.0 + 4.5 * time / time[-1]) * time)
+    bits, _ = max_len_seq(7)
+    return 2.0 * bits[np.floor(2.0 * frequency * time + 1e-9).astype(int) % len(bits)] - 1.0
+
+
+@eqx.filter_jit
+def _runs(
+    experiment: Experiment, position: dict[str, Array], torques: Float[Array, "inputs samples"]
+) -> dict[str, Float[Array, "inputs samples"]]:
+    rest = experiment.plant.init(experiment.initial)
+    still = jax.tree.map(jnp.zeros_like, position)
+    start = PlantState(position, still, rest.effects)
+    return jax.vmap(lambda torque: trajectory(experiment, start, torque).position)(torques)

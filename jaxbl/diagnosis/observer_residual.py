@@ -6,6 +6,7 @@ has, transmission and effects at the smoothed motion, besides its nominal equati
 Otherwise the whole transmitted torque would go through the observer, whose lag on it would be taken for missing torque.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -31,7 +32,7 @@ _DRAWS = 6
 """Runs over the smoothed motion with drawn noise, by which the observers' own is measured: its deviation to a tenth."""
 _SETTLING = 10.0
 """Time constants of the equivalent control's low-pass that are left out at the beginning of a part."""
-_FEWEST = 20
+_LEAST_SKIPPED = 20
 """Samples that are left out at least, where there is no low-pass: the observer's own reaching phase."""
 _STUCK = 0.9
 """Share of alpha: a mean control beyond is a switching term that does not switch."""
@@ -68,9 +69,7 @@ def observed_torques(experiment: Experiment, segments: Sequence[Segment]) -> dic
     observers over the smoothed motion with independent white noise of the readings' size: they are not linear, and their
     noise depends on the motion. What differs between these runs is noise.
 
-    Args:
-        experiment: the model, with array leaves and the observers' gains; its sample period is that of the record.
-        segments: of the log.
+    The model has array leaves, the observers' gains, and the sample period of the record.
     """
     found: dict[str, list[Observed]] = {side: [] for side in experiment.sides}
     bare = eqx.tree_at(lambda e: e.identifier, experiment, None, is_leaf=lambda x: x is None)
@@ -134,14 +133,14 @@ def _share(experiment: Experiment) -> float:
 def _observed(experiment: Experiment, side: str, part: Kinematics, controls: np.ndarray) -> Observed:
     share, period = _share(experiment), float(experiment.run.sample_period)
     constant = float(experiment.equivalent_control.time_constant)
-    skipped = min(max(math.ceil(_SETTLING / share), _FEWEST), len(part.time) // 4)
+    skipped = min(max(math.ceil(_SETTLING / share), _LEAST_SKIPPED), len(part.time) // 4)
     torque = float(experiment.drive.inertia(side)) * controls[:, skipped:]
     if not np.isfinite(torque).all():
         torque = np.full_like(torque, np.nan)
     # the mean takes its share of each
     noise = np.sqrt(_DRAWS / (_DRAWS - 1.0)) * (torque[1:] - np.mean(torque[1:], axis=0))
     count = noise.shape[1]
-    lags = min(max(math.ceil(_MEMORY / share), 10 * _FEWEST), count)
+    lags = min(max(math.ceil(_MEMORY / share), 10 * _LEAST_SKIPPED), count)
     size = 2 ** math.ceil(math.log2(2 * count))
     products = np.fft.irfft(np.mean(np.abs(np.fft.rfft(noise, size)) ** 2, axis=0))[:lags] / count
     least = np.finfo(float).tiny
@@ -152,7 +151,7 @@ def _observed(experiment: Experiment, side: str, part: Kinematics, controls: np.
         side, np.asarray(part.time)[skipped:], torque[0], np.full(count, deviation), correlation,
         min(1.0 / (2.0 * np.pi * constant), 0.5 / period) if constant > 0.0 else 0.5 / period,
     )  # fmt: skip
-    width = max(math.ceil(5.0 / share), _FEWEST)
+    width = max(math.ceil(5.0 / share), _LEAST_SKIPPED)
     mean = np.abs(uniform_filter1d(controls[0, skipped:], width))
     stuck = float(np.mean(mean > _STUCK * float(getattr(experiment.observer, side).alpha)))
     return Observed(residual, skipped, stuck)
@@ -161,13 +160,8 @@ def _observed(experiment: Experiment, side: str, part: Kinematics, controls: np.
 def compared(
     experiment: Experiment, observed: Sequence[Observed], residuals: Sequence[Residual], cutoff: float
 ) -> dict[str, Any]:
-    """The observers' residual of a side beside the smoother's, both behind both low-passes: the observers' and a common one.
-
-    Args:
-        experiment: whose observers these are.
-        observed: of each part.
-        residuals: the smoother's, of each part.
-        cutoff: of the common low-pass, Hz.
+    """The observers' residual of a side beside the smoother's, both behind both low-passes: the observers' and a common one
+    (`cutoff`, Hz); part by part.
 
     Returns:
         `converged`; `rms` of the observers' residual and of its `noise`, N m; `correlation` (about zero) with the
@@ -181,10 +175,7 @@ def compared(
     for one, smooth in zip(observed, residuals, strict=True):
         late = lfilter([share], [1.0, share - 1.0], smooth.torque, zi=[(1.0 - share) * smooth.torque[0]])[0]
         low, _ = narrowed(one.residual, cutoff)
-        beside = Residual(
-            smooth.name, one.residual.time, late[one.skipped :], one.residual.deviation, one.residual.correlation,
-            one.residual.bandwidth,
-        )  # fmt: skip
+        beside = dataclasses.replace(one.residual, torque=late[one.skipped :])
         own.append(low.torque)
         noise.append(low.deviation)
         other.append(narrowed(beside, cutoff)[0].torque)

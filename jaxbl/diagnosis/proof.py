@@ -3,19 +3,17 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.drive.parameters import get_leaf, leaf_paths, set_leaves
+from jaxbl.drive.parameters import get_leaf, leaf_paths
 from jaxbl.identification.logs import unit_on
 from jaxbl.identification.trajectory import Free
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
-from .diagnosis_task import DiagnosisTask, input_rms
+from .diagnosis_task import input_rms
 from .effect_search import EffectSearch, Explanation, Model
-from .reference_log import Comparison, predictable
+from .reference_log import PREDICTABLE, Comparison
 from .setup import Setup
 
 _WORSE, _WORSE_SPEED = 1.02, 1.05
@@ -41,17 +39,6 @@ class FittedModel(NamedTuple):
     deviation: np.ndarray
 
     @property
-    def values(self) -> dict[str, float]:
-        """All fitted numbers, by path."""
-        return {one.path: float(one.value(self.theta[i])) for i, one in enumerate(self.free)}
-
-    @property
-    def own(self) -> dict[str, float]:
-        """Values of the nominal model's own numbers."""
-        added = tuple(f"effects.{name}." for name in self.names)
-        return {path: value for path, value in self.values.items() if not path.startswith(added)}
-
-    @property
     def numbers(self) -> dict[str, dict[str, float]]:
         """All numbers of the effects, those that were not free among them."""
         effects = {name: get_leaf(self.experiment, f"effects.{name}") for name in self.names}
@@ -62,20 +49,15 @@ class FittedModel(NamedTuple):
         return {one.path: float(one.slope(self.theta[i])) * self.deviation[i] for i, one in enumerate(self.free)}
 
 
-def free_values(free: Sequence[Free], theta: np.ndarray) -> dict[str, Any]:
-    """Values of free numbers, by path."""
-    return {one.path: jnp.asarray(one.value(theta[i])) for i, one in enumerate(free)}
-
-
-def at_period(experiment: Experiment, period: float) -> Experiment:
-    """A model at the sampling period of another log, s."""
-    return eqx.tree_at(lambda e: e.run.sample_period, experiment, jnp.asarray(period))
+def free_values(free: Sequence[Free], theta: np.ndarray) -> dict[str, float]:
+    """Values of free numbers, by path; theta may have others behind them."""
+    return {one.path: float(one.value(theta[i])) for i, one in enumerate(free)}
 
 
 def fit_model(search: EffectSearch, numbers: Mapping[str, Mapping[str, float]], theta: np.ndarray) -> FittedModel:
     """A model with some effects, its own numbers and theirs fitted from given ones."""
-    free, found = search.refitted({name: dict(one) for name, one in numbers.items()}, theta)
-    return FittedModel(tuple(numbers), found.experiment, free, found.theta, found.deviation)
+    found = search.refitted({name: dict(one) for name, one in numbers.items()}, theta)
+    return FittedModel(tuple(numbers), found.experiment, found.linear.free, found.theta, found.deviation)
 
 
 class Proof:
@@ -86,14 +68,10 @@ class Proof:
         noise: of each channel there: what a perfect model would leave.
     """
 
-    def __init__(self, task: DiagnosisTask, setup: Setup):
-        self.task, self.setup, self.other = task, setup, setup.holdout
-        self.before = self.other.compare(self._at(setup.nominal))
+    def __init__(self, setup: Setup):
+        self.setup, self.other = setup, setup.holdout
+        self.before = self.other.compare(setup.nominal)
         self.noise = self.other.noise_floor(self.before.torques)
-
-    def _at(self, experiment: Experiment) -> Experiment:
-        """A model at the period of what was held out."""
-        return at_period(experiment, self.other.period)
 
     def accepted(self, search: EffectSearch, found: Explanation) -> tuple[FittedModel, Comparison, list[str]]:
         """The model with what was found, how it compares, and the effects that are withdrawn: with them it is worse."""
@@ -101,7 +79,7 @@ class Proof:
         while True:
             base = found.model if names else found.nominal
             fitted = fit_model(search, {name: base.numbers[name] for name in names}, base.theta)
-            after = self.other.compare(self._at(fitted.experiment))
+            after = self.other.compare(fitted.experiment)
             if not self._worse(after) and (names or is_better(after.errors, self.before.errors)):
                 return fitted, after, withdrawn
             if not names:
@@ -121,19 +99,14 @@ class Proof:
         )
 
     def gap(self, fitted: FittedModel, after: Comparison, rival: Model | None) -> dict[str, Any]:
-        """Errors on held-out data before and after, the noise, and controls.
-
-        Args:
-            fitted: the model with what was found.
-            after: how it compares.
-            rival: the best model with a wrong effect, or None.
-        """
-        record, other, nominal = self.task.holdout, self.other, self.setup.nominal
-        part = record.segments
+        """Errors on held-out data before and after, the noise, and controls: the best model with a wrong effect (`rival`),
+        and what the model lacks in the wrong order."""
+        task, other, nominal = self.setup.task, self.other, self.setup.nominal
+        record, part = task.holdout, task.holdout.segments
         found: dict[str, Any] = {
             "holdout": {
                 "file": str(record.path.resolve()),
-                "separate": self.task.separate,
+                "separate": task.separate,
                 "from": float(record.time[part[0].start]),
                 "to": float(record.time[part[-1].stop - 1]),
                 "window": other.samples * other.period,
@@ -147,22 +120,21 @@ class Proof:
             "free_run": {},
             "controls": {},
         }
-        runs = {"before": nominal, "after": fitted.experiment}
-        for name, one in runs.items():
-            errors, growth = other.free_run(self._at(one))
-            if not predictable(growth):
+        for name, one in (("before", nominal), ("after", fitted.experiment)):
+            errors, growth = other.free_run(one)
+            if not growth < PREDICTABLE:
                 found["free_run"] = {"why_not": "small changes of the initial speed grow to the size of the motion"}
                 break
             found["free_run"][name] = errors
         if rival is not None:
-            wrong = set_leaves(rival.experiment, free_values(self.setup.own, rival.theta))
-            found["controls"]["wrong"] = {"effect": rival.names[-1], "rmse": other.compare(self._at(wrong)).errors}
+            errors = other.compare(rival.linear.experiment).errors
+            found["controls"]["wrong"] = {"effect": rival.names[-1], "rmse": errors}
         if fitted.names:
             added = {
                 side: [one.torque - left.torque for one, left in zip(pieces, after.torques[side], strict=True)]
                 for side, pieces in self.before.torques.items()
             }
-            found["controls"]["permuted"] = {"rmse": other.permuted(self._at(nominal), added).errors}
+            found["controls"]["permuted"] = {"rmse": other.permuted(nominal, added).errors}
         return found
 
 

@@ -29,14 +29,19 @@ from .residuals import Residual, narrowed, residual_torques
 
 WINDOW = 0.5
 """Length of the short windows, s: several periods of a drive's resonance, and too short to drift far."""
-_FEWEST = 20
+_LEAST_IN_WINDOW = 20
 """Samples of a window at least: ten times the states that are fitted to it."""
-_BLOCK = 0.5
+_SHUFFLED = 0.5
 """Length of the blocks that a permuted residual is made of, s: longer than a torque's own changes last."""
-_PREDICTABLE = 0.02
+PREDICTABLE = 0.02
 """Share of the motion that the initial speed's uncertainty may grow to where a free run is to say anything."""
 _STATES, _STATES_OF_ONE_RUN = 8, 3
 """Initial states tried for each window, and for a free run, which determines its own much better."""
+
+
+def at_period(experiment: Experiment, period: float) -> Experiment:
+    """A model at the sampling period of another log, s."""
+    return eqx.tree_at(lambda e: e.run.sample_period, experiment, jnp.asarray(period))
 
 
 class Comparison(NamedTuple):
@@ -78,60 +83,61 @@ class ReferenceLog:
     @property
     def samples(self) -> int:
         """Length of a window."""
-        return min(max(round(WINDOW / self.period), _FEWEST), max(map(len, self.segments)))
+        return min(max(round(WINDOW / self.period), _LEAST_IN_WINDOW), max(map(len, self.segments)))
 
     def noise_floor(self, torques: Mapping[str, Sequence[Residual]]) -> dict[str, float]:
         """Noise of each channel: what a perfect model would leave."""
         found = {POSITION_CHANNELS[side]: noise for side, noise in self.noise.items()}
         for side in self.noise:
             found[f"velocity_{side}"] = _rms([np.asarray(one.smoothed[side].deviation(1)) for one in self.segments])
-        for side, pieces in torques.items():
-            found[f"torque_{side}"] = _rms([narrowed(one, self.bandwidth[side])[0].deviation for one in pieces])
-        return found
+        return found | self._torque_figures(torques, "deviation")
 
-    def torque_errors(self, torques: Mapping[str, Sequence[Residual]]) -> dict[str, float]:
-        """Rms missing torque of each side behind the low-pass, N m."""
+    def _torque_figures(self, torques: Mapping[str, Sequence[Residual]], name: str = "torque") -> dict[str, float]:
+        """Rms of missing torques, or of their noise, behind the low-pass, N m."""
         return {
-            f"torque_{side}": _rms([narrowed(one, self.bandwidth[side])[0].torque for one in pieces])
+            f"torque_{side}": _rms([getattr(narrowed(one, self.bandwidth[side])[0], name) for one in pieces])
             for side, pieces in torques.items()
         }
 
-    def torques(self, experiment: Experiment) -> dict[str, list[Residual]]:
-        """Torques that a model lacks on each side."""
-        found = residual_torques(experiment, self.segments)
-        return {side: found[side] for side in experiment.sides if side in found}
-
-    def windows(self, experiment: Experiment, samples: int) -> tuple[Windows, np.ndarray]:
+    def windows(self, experiment: Experiment) -> tuple[Windows, np.ndarray]:
         """The log in windows, some of them only to fill up, and the row that each of the others begins with."""
-        windows, firsts = windows_of(self.segments, experiment, samples, self.rest)
+        windows, firsts = windows_of(self.segments, experiment, self.samples, self.rest)
         return windows.padded(bucket(len(firsts), 1)), firsts
 
     def largest_departures(self, experiment: Experiment) -> dict[str, float]:
         """How far a model departs from each side's motion on short windows from the smoothed states, over its range."""
-        windows, _ = self.windows(experiment, self.samples)
-        apart = _largest_departures(experiment, windows)
-        ranges = {side: max(float(np.ptp(one.readings[side])) for one in self.segments) for side in apart}
-        return {side: float(np.nan_to_num(float(one), nan=np.inf)) / ranges[side] for side, one in apart.items()}
+        windows, _ = self.windows(experiment)
+        simulated, found = _paths(experiment, windows, windows.start).position, {}
+        for side in experiment.sides:
+            apart = float(jnp.max(jnp.abs(simulated[side] - windows.measured[side])))
+            found[side] = np.nan_to_num(apart, nan=np.inf) / max(float(np.ptp(one.readings[side])) for one in self.segments)
+        return found
 
-    def compare(self, experiment: Experiment) -> Comparison:
-        """Errors of a model on short windows, and the torques that it lacks."""
-        driven = self._driven(experiment, {})
-        windows, firsts = self.windows(driven, self.samples)
-        torques = self.torques(experiment)
-        errors = self._errors(driven, windows, firsts, _STATES)
-        return Comparison(errors | self.torque_errors(torques), torques)
+    def compare(self, experiment: Experiment, added: Mapping[str, np.ndarray] | None = None) -> Comparison:
+        """Errors of a model at this log's period on short windows, and the torques that it lacks; `added`: torques on its
+        sides besides, N m, sample by sample from the first to the last."""
+        experiment = at_period(experiment, self.period)
+        driven = self._driven(experiment, added or {})
+        torques = residual_torques(experiment, self.segments)
+        for side, table in (added or {}).items():
+            pieces = zip(torques[side], self._rows(), strict=True)
+            torques[side] = [dataclasses.replace(one, torque=one.torque - table[rows]) for one, rows in pieces]
+        errors = self._errors(driven, *self.windows(driven), _STATES)
+        return Comparison(errors | self._torque_figures(torques), torques)
 
-    def _driven(self, experiment: Experiment, tables: Mapping[str, np.ndarray]) -> Experiment:
+    def _rows(self) -> list[np.ndarray]:
+        """Sampling periods from the log's first sample to each sample, segment by segment."""
+        return [np.round((one.time - self.segments[0].time[0]) / self.period).astype(int) for one in self.segments]
+
+    def _driven(self, experiment: Experiment, added: Mapping[str, np.ndarray]) -> Experiment:
         """A model with known torques on its sides, sample by sample; none where there is no table."""
         begin, end = self.segments[0].time[0], self.segments[-1].time[-1]
         period, first = (jnp.asarray(float(one)) for one in (self.period, begin))
-        count = round(float(end - begin) / self.period) + 1
-        known = []
+        count, known = bucket(round(float(end - begin) / self.period) + 1, 256), []
         for side in experiment.sides:
-            table = np.zeros(bucket(count, 256))
-            given = tables.get(side, np.zeros(0))
-            table[: len(given)] = given
-            known.append(_KnownTorque(side=side, torque=jnp.asarray(table), first=first, period=period))  # type: ignore[arg-type]
+            table = added.get(side, np.zeros(0))
+            table = jnp.asarray(np.pad(table, (0, count - len(table))))
+            known.append(_KnownTorque(side=side, torque=table, first=first, period=period))  # type: ignore[arg-type]
         return with_effects(experiment, (*known, *experiment.effects))
 
     def free_run(self, experiment: Experiment) -> tuple[dict[str, float], float]:
@@ -140,7 +146,7 @@ class ReferenceLog:
         The latter over the motion's; large where a free run cannot be predicted. Up to a ninth at the end may be left out,
         so that compiled programs serve logs of several lengths.
         """
-        longest = max(map(len, self.segments))
+        experiment, longest = at_period(experiment, self.period), max(map(len, self.segments))
         spare = max(longest.bit_length() - 4, 0)
         windows, firsts = windows_of(self.segments, experiment, longest >> spare << spare, self.rest)
         windows, firsts = windows.only(np.arange(1)).padded(1), firsts[:1]
@@ -155,53 +161,26 @@ class ReferenceLog:
         rows = firsts[:, None] + np.arange(windows.torque.shape[1])[None, :]
         residual, start = _residuals(experiment, windows, passes, self.rest)
         residual = np.asarray(residual)[: len(firsts)]
-        if alone:
-            velocity = {side: one[None] for side, one in _run(experiment, windows, start).velocity.items()}
-        else:
-            velocity = {
-                side: np.asarray(one)[: len(firsts)] for side, one in _velocities(experiment, windows, start).items()
-            }
-        found = {}
-        for i, side in enumerate(experiment.sides):
-            found[POSITION_CHANNELS[side]] = self.noise[side] * _rms([residual[:, :, i]])
+        run = _run(experiment, windows, start) if alone else _paths(experiment, windows, start)
+        found = {
+            POSITION_CHANNELS[side]: self.noise[side] * _rms([residual[:, :, i]]) for i, side in enumerate(experiment.sides)
+        }
         for side in experiment.sides:
             smoothed = np.full(self.segments[-1].rows.stop, np.nan)
             for one in self.segments:
                 smoothed[one.rows] = np.asarray(one.smoothed[side].velocity)
-            found[f"velocity_{side}"] = _rms([np.asarray(velocity[side]) - smoothed[rows]])
+            found[f"velocity_{side}"] = _rms([np.asarray(run.velocity[side])[: len(firsts)] - smoothed[rows]])
         return found
 
-    def permuted(self, experiment: Experiment, added: Mapping[str, Sequence[np.ndarray]], seed: int = 0) -> Comparison:
-        """Errors of a model with a known torque that is the right one in the wrong order: blocks of time, shuffled.
-
-        Args:
-            experiment: the nominal model.
-            added: torque that the extended model adds on each side, segment by segment, N m.
-            seed: of the order.
-        """
-        time = np.concatenate([one.time for one in self.segments])
-        at = np.round((time - time[0]) / self.period).astype(int)
-        size = max(round(_BLOCK / self.period), 1)
-        order = _order(len(time), size, np.random.default_rng(seed))
-        tables, torques = {}, {}
-        before = self.torques(experiment)
-        for side in experiment.sides:
-            shuffled = np.concatenate(list(added[side]))[order]
-            tables[side] = np.zeros(at[-1] + 1)
-            tables[side][at] = shuffled
-            ends = np.cumsum([len(one.time) for one in before[side]])[:-1]
-            torques[side] = [
-                dataclasses.replace(one, torque=one.torque - piece)
-                for one, piece in zip(before[side], np.split(shuffled, ends), strict=True)
-            ]
-        model = self._driven(experiment, tables)
-        windows, firsts = self.windows(model, self.samples)
-        return Comparison(self._errors(model, windows, firsts, _STATES) | self.torque_errors(torques), torques)
-
-
-def predictable(growth: float) -> bool:
-    """Whether a free run with this growth (:meth:`ReferenceLog.free_run`) says anything."""
-    return bool(growth < _PREDICTABLE)
+    def permuted(self, experiment: Experiment, added: Mapping[str, Sequence[np.ndarray]]) -> Comparison:
+        """Errors of the nominal model with what the extended one adds on each side, N m, segment by segment, in the wrong
+        order: blocks of time, shuffled."""
+        at = np.concatenate(self._rows())
+        order = _order(len(at), max(round(_SHUFFLED / self.period), 1), np.random.default_rng(0))
+        tables = {side: np.zeros(at[-1] + 1) for side in experiment.sides}
+        for side, table in tables.items():
+            table[at] = np.concatenate(list(added[side]))[order]
+        return self.compare(experiment, tables)
 
 
 class _KnownTorque(SideEffect):
@@ -234,26 +213,15 @@ def _residuals(experiment: Experiment, windows: Windows, passes: int, rest: bool
 
 
 @eqx.filter_jit
-def _velocities(experiment: Experiment, windows: Windows, start: PlantState) -> dict[str, Array]:
-    def one(start: PlantState, torque: Array, time: Array) -> dict[str, Array]:
-        return trajectory(experiment, start, torque, time).velocity
-
-    return jax.vmap(one)(start, windows.torque, windows.time)
+def _paths(experiment: Experiment, windows: Windows, start: PlantState) -> PlantState:
+    """States along each window."""
+    return jax.vmap(lambda *given: trajectory(experiment, *given))(start, windows.torque, windows.time)
 
 
 def _run(experiment: Experiment, windows: Windows, start: PlantState) -> PlantState:
-    """Path of the first window alone."""
+    """States along the only window: one run of many samples takes less time than :func:`_paths`."""
     start, torque, time = jax.tree.map(lambda x: np.asarray(x)[0], (start, windows.torque, windows.time))
-    return path(experiment, start, torque, time)
-
-
-@eqx.filter_jit
-def _largest_departures(experiment: Experiment, windows: Windows) -> dict[str, Array]:
-    def one(start: PlantState, torque: Array, time: Array) -> dict[str, Array]:
-        return trajectory(experiment, start, torque, time).position
-
-    simulated = jax.vmap(one)(windows.start, windows.torque, windows.time)
-    return {side: jnp.max(jnp.abs(simulated[side] - windows.measured[side])) for side in experiment.sides}
+    return jax.tree.map(lambda x: x[None], path(experiment, start, torque, time))
 
 
 def _growth(experiment: Experiment, windows: Windows, deviation: dict[str, float]) -> float:

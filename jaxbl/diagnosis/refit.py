@@ -42,7 +42,7 @@ class Refined(NamedTuple):
         deviation: standard deviation of theta, of data and prior together.
         smoothness: of the predictor, by side.
         start: positions and velocities at the first sample of each part, side by side, rad and rad/s.
-        linear: the model along the path of its predictor.
+        linear: the model along the path of its predictor, with the numbers that were free.
     """
 
     experiment: Experiment
@@ -75,13 +75,9 @@ class _Refiner:
         first = [{side: np.asarray(segment.smoothed[side].state[0]) for side in sides} for segment in self.segments]
         return [np.array([one[side][order] for order in (0, 1) for side in sides]) for one in first]
 
-    def at(self, theta: np.ndarray, start: list[np.ndarray], smoothness: Sequence[float] | None) -> _Point:
-        """Prediction errors along the path of the predictor; of the best, where no smoothness is given."""
-        segments = self.segments if smoothness is None else self._path(theta, start, smoothness)
-        linear = Linear(self.experiment, self.free, theta, self.width, -theta, segments)
-        if smoothness is None:
-            smoothness, _ = linear.choose(())
-            return self.at(theta, start, smoothness)
+    def at(self, theta: np.ndarray, start: list[np.ndarray], smoothness: Sequence[float]) -> _Point:
+        """Prediction errors along the path of the predictor."""
+        linear = Linear(self.experiment, self.free, theta, self.width, self._path(theta, start, smoothness))
         predictor = linear.predictor(smoothness)
         cost = float(linear.count * np.sum(np.log(predictor.given)) + np.sum((theta / self.width) ** 2))
         return _Point(theta, start, linear, predictor, cost if np.isfinite(cost) else np.inf)
@@ -112,11 +108,12 @@ class _Refiner:
         return found
 
     def run(self, theta: np.ndarray) -> _Point:
-        best = self.at(theta, self.start(), None)
+        smoothness = Linear(self.experiment, self.free, theta, self.width, self.segments).choose(()).smoothness
+        best = self.at(theta, self.start(), smoothness)
         for i in range(_ROUNDS):
             if i:
-                best = self.at(best.theta, best.start, best.linear.choose(())[0])
-            smoothness = best.predictor.smoothness
+                smoothness = best.linear.choose(()).smoothness
+                best = self.at(best.theta, best.start, smoothness)
             share = 1.0
             for _ in range(_STEPS):
                 if best.cost - best.predictor.cost(best.theta, self.width) < _SETTLED or share < 1e-3:
@@ -163,15 +160,7 @@ _spread = eqx.filter_jit(spread)
 def refined(
     experiment: Experiment, free: Sequence[Free], theta: np.ndarray, width: np.ndarray, segments: Sequence[Segment]
 ) -> Refined:
-    """Refine the numbers of a model.
-
-    Args:
-        experiment: the model with all effects (:func:`.neutral_effects.complete`); its sample period is that of the log.
-        free: numbers to be refined.
-        theta: where they start, shape (numbers,).
-        width: standard deviation of the prior of each theta about 0.
-        segments: of the log.
-    """
+    """Refine the numbers of a model from theta; arguments as of :class:`.linearised_model.Linear` (`width`: its `prior`)."""
     refiner = _Refiner(experiment, free, width, segments)
     best = refiner.run(np.asarray(theta))
     model = with_fitted(experiment, free, jnp.asarray(best.theta))

@@ -10,22 +10,23 @@ from jaxbl.errors import InputError
 from jaxbl.identification.logs import default_paths, on_record
 from jaxbl.identification.segments import Segment, segments_of
 from jaxbl.identification.trajectory import Free, free_parameters
-from jaxbl.records import POSITION_CHANNELS, Record
+from jaxbl.records import POSITION_CHANNELS
 from jaxbl.simulate import Experiment
 
+from .coordinates import CoordinateValues, all_coordinates
 from .diagnosis_task import DiagnosisTask, input_rms
 from .input_noise import smoothed_input, unfelt
 from .linearised_model import Linear
 from .localise import Localised, localise
 from .neutral_effects import complete
 from .reference_log import WINDOW, ReferenceLog
-from .residuals import Residual, white_noise
+from .residuals import Residual, residual_torques, white_noise
 
 _DIVERGED = 10.0
 """Departure from the motion on short windows, over its range, from which on a model counts as diverging."""
 _NOISY = 1e-3
 """Noise over the input's rms from which on it is asked whether the drive felt it."""
-_CLEAR = 3.0
+_SHOWN = 3.0
 """Nats from which on it counts as shown that the drive did not: odds of twenty."""
 
 
@@ -33,6 +34,8 @@ class Setup(NamedTuple):
     """The nominal model and the logs.
 
     Attributes:
+        task: study and logs.
+        sliding: sides whose positions are no angles.
         bare: the model as given.
         nominal: the same with all effects at neutral numbers.
         own: its numbers that are not exactly known.
@@ -41,10 +44,13 @@ class Setup(NamedTuple):
         fitted: that log, with the input that drives models.
         holdout: what is held out.
         lacking: torques that the model lacks on the log, by side, segment by segment.
+        coordinates: along these torques.
         located: where it lacks them, by side.
         torque_noise: of the channel that recorded the input, N m, which both logs are without; 0 where the drive felt it.
     """
 
+    task: DiagnosisTask
+    sliding: list[str]
     bare: Experiment
     nominal: Experiment
     own: tuple[Free, ...]
@@ -53,6 +59,7 @@ class Setup(NamedTuple):
     fitted: ReferenceLog
     holdout: ReferenceLog
     lacking: dict[str, list[Residual]]
+    coordinates: dict[str, list[dict[str, CoordinateValues]]]
     located: dict[str, Localised]
     torque_noise: float
 
@@ -77,17 +84,16 @@ def set_up(task: DiagnosisTask) -> Setup:
     noise, segments = _torque_noise(input_rms(record), nominal, own, recorded), recorded
     if noise > 0.0:
         segments, held = (_quiet(some, noise) for some in (recorded, held))
-    lacking = ReferenceLog(segments, {}, rest).torques(nominal)
-    located = localise(nominal, lacking, segments, rotating=rotating(record, nominal))
+    lacking = residual_torques(nominal, segments)
+    sliding = [side for side in nominal.sides if record.findings.channels[POSITION_CHANNELS[side]].unit == "m"]
+    coordinates = all_coordinates(nominal, segments, lacking, sliding)
+    located = localise(nominal, lacking, segments, coordinates)
     bandwidth = {name: one.bandwidth for name, one in located.items()}
     fitted = ReferenceLog(segments, bandwidth, rest)
     holdout = ReferenceLog(held, bandwidth, rest and task.separate)
-    return Setup(bare, nominal, own, prior, recorded, fitted, holdout, lacking, located, noise)
-
-
-def rotating(record: Record, experiment: Experiment) -> dict[str, bool]:
-    """Whether each side's positions are angles."""
-    return {side: record.findings.channels[POSITION_CHANNELS[side]].unit != "m" for side in experiment.sides}
+    return Setup(
+        task, sliding, bare, nominal, own, prior, recorded, fitted, holdout, lacking, coordinates, located, noise
+    )  # fmt: skip
 
 
 def _quiet(segments: Sequence[Segment], noise: float) -> list[Segment]:
@@ -96,22 +102,16 @@ def _quiet(segments: Sequence[Segment], noise: float) -> list[Segment]:
 
 
 def _torque_noise(size: float, nominal: Experiment, own: Sequence[Free], segments: Sequence[Segment]) -> float:
-    """Noise of the channel that recorded the input, N m, where the drive does not feel it; 0 where it does.
-
-    Args:
-        size: rms of the input, N m.
-        nominal: the model.
-        own: its numbers.
-        segments: of the log.
-    """
+    """Noise of the channel that recorded the input, N m, where the drive does not feel it; 0 where it does, or where it is
+    small beside the input's rms `size`."""
     noise = white_noise([one.torque for one in segments])
     if not _NOISY * size < noise:
         return 0.0
     # the model as given: numbers that may change would absorb some of the noise
     none, width = np.zeros(len(own)), np.ones(len(own))
-    given, smooth = (Linear(nominal, own, none, width, none, some, none) for some in (segments, _quiet(segments, noise)))
-    smoothness, _ = given.choose(())
-    return noise if unfelt(given.left(smoothness), smooth.left(smoothness)) > _CLEAR else 0.0
+    given, smooth = (Linear(nominal, own, none, width, some, none) for some in (segments, _quiet(segments, noise)))
+    smoothness = given.choose(()).smoothness
+    return noise if unfelt(given.left(smoothness), smooth.left(smoothness)) > _SHOWN else 0.0
 
 
 def _check_order(bare: Experiment, nominal: Experiment) -> None:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-_BANDS, _FEWEST = 24, 12
+_BANDS, _LEAST_FREQUENCIES = 24, 12
 """Bands of a spectrum, evenly spaced in the logarithm of the frequency; frequencies in one of them."""
 
 
@@ -64,12 +64,8 @@ def spectrum_of(errors: Sequence[np.ndarray]) -> Spectrum:
 
 
 def weighted_products(errors: np.ndarray, spectrum: Spectrum) -> np.ndarray:
-    """Products of columns of errors with one another, each frequency over its power; shape (columns, columns).
-
-    Args:
-        errors: rad, shape (samples, sides, columns).
-        spectrum: of what they leave.
-    """
+    """Products of columns of errors, shape (samples, sides, columns), with one another, each frequency over its power in the
+    spectrum of what they leave; shape (columns, columns)."""
     found = np.zeros((errors.shape[2], errors.shape[2]))
     size = np.sqrt(_weights(len(errors))[:, None] / spectrum.at(len(errors)))
     for side in range(errors.shape[1]):
@@ -92,10 +88,10 @@ def _weights(samples: int) -> np.ndarray:
 
 
 def _edges(count: int) -> list[int]:
-    """Of bands of growing width, none of fewer frequencies than :data:`_FEWEST` if there are as many."""
+    """Of bands of growing width, none of fewer frequencies than :data:`_LEAST_FREQUENCIES` if there are as many."""
     found = [0]
-    for edge in np.round(np.geomspace(_FEWEST, count, _BANDS)).astype(int):
-        if edge - found[-1] >= _FEWEST:
+    for edge in np.round(np.geomspace(_LEAST_FREQUENCIES, count, _BANDS)).astype(int):
+        if edge - found[-1] >= _LEAST_FREQUENCIES:
             found.append(int(edge))
     if len(found) == 1:
         return [0, count]

@@ -13,7 +13,7 @@ import jaxbl.diagnosis.effect_search as explain
 from jaxbl.config import read_config
 from jaxbl.diagnosis.diagnose import diagnose, run_diagnosis
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task, split
-from jaxbl.diagnosis.next_experiment import Limits, next_experiment, tied, write_next_experiment
+from jaxbl.diagnosis.next_experiment import next_experiment, tied, write_next_experiment
 from jaxbl.diagnosis.observer_residual import observed_torques
 from jaxbl.diagnosis.proof import is_better
 from jaxbl.diagnosis.setup import set_up
@@ -216,9 +216,9 @@ def test_a_tie_has_an_experiment(logs, found, tmp_path):
     best = next_experiment(summary, found.model, record)
     assert best is not None and best.apart > 10.0
     assert np.max(np.abs(best.torque)) <= largest + 1e-12
-    less = next_experiment(summary, found.model, record, Limits(torque=0.1 * largest, travel=0.5))
+    less = next_experiment(summary, found.model, record, torque=0.1 * largest, travel=0.5)
     assert less is not None and less.apart < best.apart and np.max(np.abs(less.torque)) <= 0.1 * largest + 1e-12
-    assert next_experiment(summary, found.model, record, Limits(travel=1e-9)) is None
+    assert next_experiment(summary, found.model, record, travel=1e-9) is None
     write_diagnosis_report(found, tmp_path)
     (line,) = write_next_experiment(tmp_path, summary, record, tmp_path / "new" / "next.csv")
     assert line.startswith(f"To part motor.coulomb_friction from motor.quadratic_drag: {best.kind} of ")
@@ -238,7 +238,7 @@ def test_what_is_tied_is_parted_by_the_experiment_that_is_asked_for(tmp_path):
     found = run_diagnosis(task)
     pair = tied(found.summary)
     assert pair is not None and set(pair) == {"motor.coulomb_friction", "motor.viscous_friction"}
-    best = next_experiment(found.summary, found.model, task.record, Limits(travel=6.0))
+    best = next_experiment(found.summary, found.model, task.record, travel=6.0)
     assert best is not None and best.apart > 100.0
     driven(best.torque, [friction], 1e-3, 3).write(other)
     (one,) = diagnose([log, other], model(), holdout=holdout).summary["findings"]

@@ -50,8 +50,7 @@ def linear(tmp_path, sides, change=lambda e: e, theta=0.0, disturbed=0.0):
         smoothed[side] = one._replace(state=one.state + wave * np.array([1e-7, 1e-6, 1e-5]))
     segment = dataclasses.replace(segment, smoothed=smoothed)
     at = np.full(len(free), theta)
-    prior, centre = np.full(len(free), 0.02), np.zeros(len(free))
-    return Linear(change(experiment), free, at, prior, centre, [segment])
+    return Linear(change(experiment), free, at, np.full(len(free), 0.02), [segment])
 
 
 def errors(model, forces=None):
@@ -165,7 +164,7 @@ def test_what_rounding_takes_is_known(growth):
 
 def test_a_gain_under_which_rounding_would_decide_is_left_out(tmp_path, monkeypatch):
     model = linear(tmp_path, 1)
-    smoothness, _ = model.choose(())
+    smoothness = model.choose(()).smoothness
     assert np.isfinite(model.predictor(smoothness).squares).all()
     monkeypatch.setattr(module, "_LOST", 0.0)
     assert not np.isfinite(model.predictor(smoothness).squares).any()

@@ -10,7 +10,7 @@ from small_study import rigid, small
 from trace_segment import segment_of
 
 from jaxbl.config import prepare, read_config
-from jaxbl.diagnosis.coordinates import CoordinateValues, coordinates_of
+from jaxbl.diagnosis.coordinates import CoordinateValues, all_coordinates, coordinates_of
 from jaxbl.diagnosis.localise import SIGNIFICANT, localise, locate
 from jaxbl.diagnosis.residuals import Residual, residual_torques
 from jaxbl.diagnosis.sentences import sentence_of
@@ -184,7 +184,7 @@ def residuals_of(true, model):
 def test_a_geared_drive_with_hidden_friction_on_its_load():
     hidden = [{"kind": "load.coulomb_friction", "torque": 0.8}]
     experiment, residuals, segment = residuals_of(small(SETTINGS, effects=hidden, **GEARED), small(SETTINGS, **GEARED))
-    found = localise(experiment, residuals, [segment])
+    found = localise(experiment, residuals, [segment], all_coordinates(experiment, [segment], residuals, ()))
     assert not found["motor"].significant
     assert "by the direction of motion" in sentence_of(found["load"])
     backward, *_, forward = found["load"].coordinates["direction"].regions
@@ -197,7 +197,7 @@ def test_coordinates_know_turning_from_sliding():
     moving = rigid(SETTINGS, excitation={"kind": "multisine", "amplitude": 3.0, "frequency": 0.2})
     experiment, residuals, segment = residuals_of(moving, moving)
     turning = coordinates_of(experiment, segment, residuals["motor"][0])
-    sliding = coordinates_of(experiment, segment, residuals["motor"][0], rotating=False)
+    sliding = coordinates_of(experiment, segment, residuals["motor"][0], ["motor"])
     assert turning["speed"].unit == "rad/s" and sliding["speed"].unit == "m/s"
     assert "turn" in turning and "turn" not in sliding and "gap" not in turning
     assert np.ptp(turning["turn"].values) <= 2.0 * np.pi
