@@ -44,7 +44,12 @@ def summary_of(setup: Setup, fitted: FittedModel, found: Explanation, withdrawn:
         if task.separate and any(role.kind == "frequency" for role in EFFECTS[one.effect].roles().values()):
             notes.append(f"The phase of {one.effect} is taken to be the same at the start of both logs.")
     if found.verdict == "no_discrepancy":
-        notes += _least_seen(record, located)
+        for side, one in located.items():
+            least, unit = (
+                SIGNIFICANT * one.coordinates["all"].regions[0].mean_error,
+                unit_on(record, f"{side}.torque", "N m"),
+            )
+            notes.append(f"{side}: a steady torque of less than about {least:.2g} {unit} would not have been seen.")
     notes += _far_off(setup.own, values, task.config.uncertainty.relative)
     if (noise := setup.torque_noise) > 0.0:
         notes.append(
@@ -118,15 +123,6 @@ def _far_off(own: Sequence[Free], values: Mapping[str, float], uncertainty: floa
                 f"{one.path} had to change by {change:+.0%}, {abs(change) / uncertainty:.0f} times its [uncertainty]: "
                 "findings and it may compensate each other. Noise of the torque channel does it, or too small a relative."
             )
-    return lines
-
-
-def _least_seen(record: Record, located: Mapping[str, Localised]) -> list[str]:
-    """What would not have been seen."""
-    lines = []
-    for side, one in located.items():
-        least, unit = SIGNIFICANT * one.coordinates["all"].regions[0].mean_error, unit_on(record, f"{side}.torque", "N m")
-        lines.append(f"{side}: a steady torque of less than about {least:.2g} {unit} would not have been seen.")
     return lines
 
 
