@@ -30,6 +30,10 @@ AXES = [listed(ALPHA, 5.0, 9.0, 20.0)]
 GAINS = [listed(ALPHA, 5.0, 9.0), listed(LAMBDA, 3.0, 6.0)]
 
 
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
 def jaxbl(*arguments, cwd, **environment):
     """The command as a process of its own, its output in pipes."""
     return subprocess.run(
@@ -121,9 +125,6 @@ def test_interrupted_sweep_says_how_to_go_on(tmp_path):
 
 
 def test_interrupt_anywhere_else():
-    def interrupt():
-        raise KeyboardInterrupt
-
     with pytest.raises(SystemExit) as end:
         cli.main(interrupt)
     assert end.value.code == 130
@@ -306,9 +307,6 @@ def test_verify_leaves_a_verdict_counterexamples_figures_and_report(call, tmp_pa
 
 
 def test_an_interrupted_verification_says_how_to_go_on(call, tmp_path, monkeypatch):
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
     write(tmp_path, rigid(axes=GAINS))
     monkeypatch.setattr(Engine, "run", interrupt)
     code, _, errors = call("verify", "study.toml", "--out", "out", "--backend", "scan")
@@ -363,9 +361,6 @@ def test_a_search_that_finds_nothing_leaves_no_gains_and_exits_1(tmp_path, monke
 
 
 def test_an_interrupted_search_says_how_to_go_on(call, tmp_path, monkeypatch):
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
     write(tmp_path, tunable())
     monkeypatch.setattr(Engine, "run", interrupt)
     code, _, errors = call("tune", "study.toml", "--out", "out")
@@ -508,14 +503,17 @@ def test_a_refined_sweep_from_the_command_line(call, tmp_path):
     assert drawn == second
 
 
+# of one length and structure: what one test has compiled serves the others
+AXIS = rigid(
+    {"run.duration": 0.6, "encoders.noise": 1e-5, "excitation.frequency": 4.0, "run.substeps": 2},
+    effects=[{"kind": "motor.coulomb_friction", "torque": 0.02}],
+    identify={"starts": 1, "window": 0.1},
+)
+
+
 @pytest.mark.slow
 def test_a_log_is_identified(call, tmp_path):
-    study = rigid(
-        {"run.duration": 0.6, "encoders.noise": 1e-5, "excitation.frequency": 4.0, "run.substeps": 2},
-        effects=[{"kind": "motor.coulomb_friction", "torque": 0.02}],
-        identify={"starts": 1, "window": 0.1},
-    )
-    write(tmp_path, study, "axis.toml")
+    write(tmp_path, AXIS, "axis.toml")
     assert call("simulate", "axis.toml", "--out", "made")[0] == 0
     pd.read_parquet("made/trace.parquet")[["t", "u", "theta_e"]].to_csv("axis.csv", index=False)
     code, lines, _ = call("identify", "axis.csv", "--model", "axis.toml")
@@ -529,7 +527,7 @@ def test_a_log_is_identified(call, tmp_path):
     assert call("identify", "axis.csv", "--model", "axis.toml") == (code, lines, [])
     assert (tmp_path / "results/axis/identification.json").stat().st_mtime_ns == finished
     assert call("simulate", "results/axis/model.toml", "--out", "again")[0] == 0
-    write(tmp_path, study | {"identify": {"parameters": ["drive.mass"]}}, "wrong.toml")
+    write(tmp_path, AXIS | {"identify": {"parameters": ["drive.mass"]}}, "wrong.toml")
     with pytest.raises(InputError, match=r"^wrong\.toml: 'drive\.mass' is no number of the plant; fitted can be: "):
         call("identify", "axis.csv", "--model", "wrong.toml", "--out", "new")
     with pytest.raises(InputError, match=r"^none\.csv: no such file"):
@@ -545,7 +543,7 @@ IDENTIFY = ["identify", "an axis.csv", "--model", "axis.toml"]
 @pytest.fixture
 def axis(tmp_path):
     """A log and its study."""
-    write(tmp_path, rigid({"run.duration": 0.6}, identify={"starts": 1, "window": 0.1}), "axis.toml")
+    write(tmp_path, AXIS, "axis.toml")
     time = np.arange(600) * 1e-3
     log = pd.DataFrame(
         {"t": time, "u": np.cos(20.0 * time), "theta_e": -0.05 * np.cos(20.0 * time) + 1e-5 * np.cos(1e6 * time)}
@@ -553,27 +551,28 @@ def axis(tmp_path):
     log.to_csv(tmp_path / "an axis.csv", index=False)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("place", ["jaxbl.identification.identify.run_identification", "jaxbl.report.page.html"])
-def test_an_interrupted_identification_writes_nothing_and_says_how_to_start_again(place, axis, call, tmp_path, monkeypatch):
-    def interrupt(*_):
-        raise KeyboardInterrupt
+AGAIN = "interrupted; nothing was written. Start again with: jaxbl identify 'an axis.csv' --model axis.toml"
 
-    told = "interrupted; nothing was written. Start again with: jaxbl identify 'an axis.csv' --model axis.toml"
+
+def test_an_interrupted_identification_says_how_to_start_again(axis, call, tmp_path, monkeypatch):
+    monkeypatch.setattr("jaxbl.identification.identify.run_identification", interrupt)
+    more = ["--holdout", "an axis.csv", "--profile"]
+    assert call(*IDENTIFY, *more) == (130, [], [f"{AGAIN} {shlex.join(more)} --out 'results/an axis'"])
+    assert left(tmp_path / "results") == []
+
+
+@pytest.mark.slow
+def test_an_interrupt_of_the_report_leaves_what_another_call_has_found(axis, call, tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
-        patched.setattr(place, interrupt)
-        assert call(*IDENTIFY, "--out", "out") == (130, [], [f"{told} --out out"])
+        patched.setattr("jaxbl.report.page.html", interrupt)
+        assert call(*IDENTIFY, "--out", "out") == (130, [], [f"{AGAIN} --out out"])
         assert not (tmp_path / "out").exists()
-        more = ["--holdout", "an axis.csv", "--profile"]
-        assert call(*IDENTIFY, *more) == (130, [], [f"{told} {shlex.join(more)} --out 'results/an axis'"])
-    if place.endswith("html"):
-        # what another call has found stays as it is
-        assert call(*IDENTIFY, "--out", "out")[0] == 0
-        before = {name: (tmp_path / "out" / name).read_bytes() for name in left(tmp_path / "out")}
-        write(tmp_path, rigid({"run.duration": 0.6}, identify={"starts": 1, "window": 0.15}), "axis.toml")
-        monkeypatch.setattr(place, interrupt)
-        assert call(*IDENTIFY, "--out", "out") == (130, [], [f"{told} --out out"])
-        assert {name: (tmp_path / "out" / name).read_bytes() for name in left(tmp_path / "out")} == before
+    assert call(*IDENTIFY, "--out", "out")[0] == 0
+    before = {name: (tmp_path / "out" / name).read_bytes() for name in left(tmp_path / "out")}
+    write(tmp_path, AXIS | {"title": "another"}, "axis.toml")
+    monkeypatch.setattr("jaxbl.report.page.html", interrupt)
+    assert call(*IDENTIFY, "--out", "out") == (130, [], [f"{AGAIN} --out out"])
+    assert {name: (tmp_path / "out" / name).read_bytes() for name in left(tmp_path / "out")} == before
 
 
 def test_an_interrupt_while_numbers_are_sought(axis, tmp_path):
@@ -691,9 +690,6 @@ def test_what_cannot_be_diagnosed_is_told(arguments, message, axis, quick, call,
 
 
 def test_an_interrupted_diagnosis_writes_nothing_and_says_how_to_start_again(axis, call, tmp_path, monkeypatch):
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
     monkeypatch.setattr("jaxbl.diagnosis.diagnose.run_diagnosis", interrupt)
     told = "interrupted; nothing was written. Start again with: jaxbl diagnose 'an axis.csv' --model axis.toml --out out"
     assert call(*DIAGNOSE, "--out", "out") == (130, [], [told])

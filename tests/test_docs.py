@@ -8,11 +8,11 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import pytest
 from test_public import FLOORS
 from typer.main import get_command
@@ -170,12 +170,14 @@ def environment(folder):
     site = folder / "site"
     site.mkdir()
     (site / "sitecustomize.py").write_text(f"import sys\nsys.modules.update(dict.fromkeys({hidden!r}))\n")
-    cache = {
-        "JAX_COMPILATION_CACHE_DIR": str(ROOT / ".cache" / "jax"),
+    # compiled programs of other pages and tests serve where the devices are the same
+    shared = {
+        "JAX_COMPILATION_CACHE_DIR": jax.config.values["jax_compilation_cache_dir"],
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05",
+        "JAX_NUM_CPU_DEVICES": str(len(jax.devices())),
     }
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    return os.environ | cache | {"PATH": path, "PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])}
+    return os.environ | shared | {"PATH": path, "PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])}
 
 
 def test_demo_is_this_command():
@@ -183,24 +185,12 @@ def test_demo_is_this_command():
     assert recipe.replace("$(BIN)/", "") == INSTEAD["make demo"]
 
 
-@pytest.fixture(scope="module")
-def running(request, tmp_path_factory):
-    """The pages that are to be tested, run two at a time: one alone leaves a core idle for much of its time."""
-    chosen = [item.callspec.params["page"] for item in request.session.items if item.name.startswith("test_page_runs")]
-    with ThreadPoolExecutor(2) as pool:
-        yield {page: pool.submit(run_page, page, tmp_path_factory.mktemp(page.stem)) for page in chosen}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("page", sorted(PAGES, key=lambda page: -len(blocks_of(page))), ids=name)
-def test_page_runs_as_written(page, running):
-    running[page].result()
-
-
-def run_page(page, folder):
+def test_page_runs_as_written(page, tmp_path):
     """Blocks of one page in order, in a folder with the studies of a clone; TOML blocks of the tutorial make `axis.toml`."""
-    env = environment(folder)
-    clone = folder / "clone"
+    env = environment(tmp_path)
+    clone = tmp_path / "clone"
     clone.mkdir()
     shutil.copytree(ROOT / "sweeps", clone / "sweeps")
     for language, text in blocks_of(page):
