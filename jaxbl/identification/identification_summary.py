@@ -13,6 +13,7 @@ from jaxbl.drive.parameters import leaf_paths, set_leaves
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 
+from .compilation import jit
 from .intervals import UNSEEN, Profile, Refusal, Spread, interval, spread
 from .logs import LogTask, decimation, unit_on
 from .regression import Kinematics, errors, regress
@@ -37,7 +38,7 @@ def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Expe
     noise = reading_noise(segments)
     longest = max(map(len, segments))
     windows, _ = windows_of(segments, nominal, min(samples, longest), config.log.initial_state == "rest")
-    left = [eqx.filter_jit(projected_residual)(one, windows)[0] for one in rebased]
+    left = [jit(projected_residual)(one, windows)[0] for one in rebased]
     position = {}
     for i, side in enumerate(nominal.sides):
         before, after = (noise[side] * float(jnp.sqrt(jnp.mean(one[:, :, i] ** 2))) for one in left)

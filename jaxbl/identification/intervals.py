@@ -9,7 +9,6 @@ D. Watts, Nonlinear Regression Analysis (1988), 6.1; D. Venzon, S. Moolgavkar, A
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -17,6 +16,7 @@ from scipy import stats
 
 from jaxbl.simulate import Experiment
 
+from .compilation import jit
 from .smoother import running_sum
 from .trajectory import Fit, Free, Windows, fits
 
@@ -46,7 +46,7 @@ class Spread(NamedTuple):
     inflation: Float[Array, " parameters"]
 
 
-@eqx.filter_jit
+@jit
 def spread(fit: Fit) -> Spread:
     """Covariance of theta by the sandwich J+ E[r r^T] J+^T, the middle by Newey and West with Andrews' bandwidth.
 

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment, Signals, State, replay
 
+from .compilation import jit
 from .regression import model_torques
 from .search import Found
 from .segments import Segment
@@ -47,7 +47,7 @@ def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, 
     return columns
 
 
-@eqx.filter_jit
+@jit
 def _replayed(experiment: Experiment, torque: jax.Array, measured: dict[str, jax.Array]) -> dict[str, jax.Array]:
     def keep(state: State, signals: Signals) -> dict[str, Any]:
         row: dict[str, Any] = {}

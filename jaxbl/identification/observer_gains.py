@@ -7,7 +7,6 @@ convergence condition (:func:`jaxbl.observer.conditions.least_lambda_exact`) for
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +16,7 @@ from jaxbl.drive.parameters import set_leaves
 from jaxbl.observer.conditions import least_lambda_exact
 from jaxbl.simulate import Experiment, Signals, State, replay
 
+from .compilation import jit
 from .regression import Kinematics
 
 _ALPHA = np.geomspace(1.1, 6.0, 10)
@@ -43,7 +43,7 @@ class ChosenGains(NamedTuple):
     velocity_error: float
 
 
-@eqx.filter_jit
+@jit
 def _misses(
     experiment: Experiment, kinematics: Kinematics, tried: dict[str, Array], readings: dict[str, Array]
 ) -> dict[str, Array]:

@@ -10,7 +10,6 @@ References: L. Ljung, System Identification (1999), 7.4, 7.5; Y. Bar-Shalom, X.-
 import dataclasses
 from functools import cache
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +18,7 @@ from scipy.linalg import solve_discrete_are
 
 from jaxbl.simulate import Experiment
 
+from .compilation import jit
 from .trajectory import Windows, projected_residual
 
 _COARSE = 10.0 ** np.arange(-12.0, 1.0)
@@ -39,7 +39,7 @@ def kalman_gain(smoothness: float, period: float) -> np.ndarray:
     return gain * np.array([1.0, 1.0 / period])
 
 
-@eqx.filter_jit
+@jit
 def _sizes(experiment: Experiment, windows: Windows, gains: dict[str, Float[Array, "n 2"]]) -> Float[Array, "n sides"]:
     """Rms prediction error of each side in rad, for several gains."""
     noise = jnp.stack([windows.noise[side] for side in experiment.sides])

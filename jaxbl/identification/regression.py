@@ -20,6 +20,7 @@ from scipy import signal
 from jaxbl.drive.plant import Plant, PlantState, States
 from jaxbl.simulate import Experiment, with_effects
 
+from .compilation import jit
 from .trajectory import WIDE, Fit, Free, with_fitted
 
 _PASSES = 3
@@ -100,7 +101,7 @@ def balance(experiment: Experiment, kinematics: Kinematics) -> dict[str, Balance
     return found
 
 
-@eqx.filter_jit
+@jit
 def model_torques(
     experiment: Experiment, kinematics: Kinematics, deviation: dict[str, Float[Array, " samples"]]
 ) -> dict[str, Float[Array, " samples"]]:
@@ -139,7 +140,7 @@ def settled(experiment: Experiment, torque: Float[Array, ""]) -> States:
     return tuple(effect.settled(torque) for effect in experiment.effects)
 
 
-@eqx.filter_jit
+@jit
 def effect_path(experiment: Experiment, path: Path, from_rest: bool = False) -> tuple[States, Float[Array, " samples"]]:
     """The effects' own states at each sample of a known motion, and the torque (N m) that acts.
 
@@ -178,7 +179,7 @@ def errors(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> 
     """How far a model misses the torques, after decimation: rms in N m, and relative to the driving torque's rms."""
     found: dict[str, list[Balance]] = {}
     for part in parts:
-        for name, one in eqx.filter_jit(balance)(experiment, part).items():
+        for name, one in jit(balance)(experiment, part).items():
             found.setdefault(name, []).append(Balance(decimate(one.residual, factor), decimate(one.drive, factor)))
     figures = {}
     for name, pieces in found.items():
@@ -192,7 +193,7 @@ def shortest(factor: int) -> int:
     return 1 if factor == 1 else 20 * factor + 1
 
 
-@eqx.filter_jit
+@jit
 def regress(experiment: Experiment, free: Sequence[Free], parts: Sequence[Kinematics], factor: int) -> Fit:
     """Least squares on all equations of motion from the nominal values, each equation weighted by what it leaves over.
 

@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .compilation import jit
+
 _SMOOTHNESS = 1e-14, 1e4
 """Range of q h^5 / sigma^2 that is searched: time constants of the smoother from 200 periods to a fraction of one."""
 _GRID = 19
@@ -176,7 +178,7 @@ def _smoothed(position: Array, smoothness: Array, noise: Array, period: Array) -
     return Smoothed(state, covariance * jnp.outer(unit, unit)[None], noise, smoothness * noise**2 / period**5, innovations)
 
 
-@jax.jit
+@jit
 def smooth(
     position: Float[Array, " samples"], period: float, *, noise: float | None = None, jerk: float | None = None
 ) -> Smoothed:

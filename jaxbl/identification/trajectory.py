@@ -26,6 +26,8 @@ from jaxbl.drive.parameters import Parameter, get_leaf, leaf_paths, set_leaves
 from jaxbl.errors import InputError
 from jaxbl.simulate import Experiment, PlantState, trajectory
 
+from .compilation import jit
+
 _INNER = 2
 """Initial states tried at each step of the fit."""
 _RIDGE = 1e-10
@@ -452,8 +454,8 @@ def fit(
     return Fit(best, start, value, jacobian, 0.5 * jnp.sum(value**2), converged)
 
 
-_fit = eqx.filter_jit(fit)
-_batch = eqx.filter_jit(eqx.filter_vmap(fit, in_axes=(None, None, None, 0, None, 0, None)))
+_fit = jit(fit)
+_batch = jit(eqx.filter_vmap(fit, in_axes=(None, None, None, 0, None, 0, None)))
 
 
 def fits(

@@ -1,0 +1,43 @@
+"""Compilation of programs that run only a few times, as those of identification and diagnosis do.
+
+They compile for many seconds and run for less than one: options under which XLA compiles fast are worth more here than its
+fastest code. The engine of sweeps does not use them.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+import equinox as eqx
+import jax
+from jax.core import Tracer
+
+P = ParamSpec("P")
+Result = TypeVar("Result")
+
+
+@functools.cache
+def _options() -> dict[str, bool]:
+    """XLA's former emitters take half the time of today's (benchmarks/NOTES.md); JAX 0.12 and later have them no more."""
+    options = {"xla_cpu_use_fusion_emitters": False}
+    try:
+        jax.jit(lambda x: x + 1.0, compiler_options=options)(0.0)
+    except jax.errors.JaxRuntimeError:
+        return {}
+    return options
+
+
+def jit(function: Callable[P, Result]) -> Callable[P, Result]:
+    """`equinox.filter_jit` that compiles fast; in another program, whose options hold, the function as it is."""
+
+    @functools.cache
+    def compiled() -> Callable[P, Result]:
+        # equinox hands what it does not know itself to `jax.jit`
+        return eqx.filter_jit(function, compiler_options=_options())  # pyright: ignore[reportCallIssue]
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> Result:
+        inside = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs)))
+        return (function if inside else compiled())(*args, **kwargs)
+
+    return call
