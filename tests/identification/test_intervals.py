@@ -1,6 +1,5 @@
 """Profile-likelihood intervals: those of the covariance where the fit is quadratic, and the right ones where it is not."""
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,6 +8,7 @@ from small_study import rigid
 
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
+from jaxbl.identification.compilation import jit
 from jaxbl.identification.intervals import interval, profile, spread
 from jaxbl.identification.trajectory import cut, fit, free_parameters
 
@@ -35,7 +35,7 @@ def record(seed=0, size=0.2, drag=0.15):
 def fitted(paths, windows):
     experiment = prepare(read_config(rigid({"run.sample_period": PERIOD, "run.substeps": 1})))
     free = free_parameters(experiment, paths, 1.0)
-    found = eqx.filter_jit(fit)(experiment, free, windows, jnp.zeros(len(free)))
+    found = jit(fit)(experiment, free, windows, jnp.zeros(len(free)))
     return experiment, free, found
 
 
@@ -60,7 +60,7 @@ def test_where_it_is_not_the_profile_follows_the_likelihood():
     width = spread(found)
     ends = profile(experiment, free, windows, found, width)["drive.motor_viscous"].interval
     scale = float(width.variance) * float(width.inflation[1]) ** 2
-    again = eqx.filter_jit(lambda theta: fit(experiment, free, windows, theta, 60, jnp.array([False, True])).cost)
+    again = jit(lambda theta: fit(experiment, free, windows, theta, 60, jnp.array([False, True])).cost)
 
     def excess(value):
         theta = jnp.array([float(found.theta[0]), np.log(value / 0.15)])

@@ -1,6 +1,5 @@
 """The predictor's gain against an iterated Kalman filter, and prediction errors where a disturbance acts."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,6 +7,7 @@ from small_study import rigid
 
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
+from jaxbl.identification.compilation import jit
 from jaxbl.identification.intervals import spread
 from jaxbl.identification.prediction import kalman_gain, predictor
 from jaxbl.identification.smoother import smooth
@@ -61,7 +61,7 @@ def windows_of(torque, readings, samples):
 @pytest.mark.slow
 def test_with_a_disturbance_prediction_errors_tell_more_than_free_runs():
     experiment, free = experiment_and_free()
-    fitted = jax.jit(lambda windows: fit(experiment, free, windows, jnp.zeros(2)))
+    fitted = jit(lambda windows: fit(experiment, free, windows, jnp.zeros(2)))
     errors, widths = {"free": [], "predicted": []}, {"free": [], "predicted": []}
     force = 1e-4
     for seed in range(8):

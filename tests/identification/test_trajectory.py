@@ -1,6 +1,5 @@
 """Trajectory fits against truth from another integrator, and against one joint least-squares problem by SciPy."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +12,7 @@ from small_study import rigid, small
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
+from jaxbl.identification.compilation import jit
 from jaxbl.identification.intervals import refusals, spread
 from jaxbl.identification.smoother import smooth
 from jaxbl.identification.trajectory import Fit, _Point, _solve, cut, fit, free_parameters, with_fitted
@@ -78,10 +78,10 @@ def test_agrees_with_one_least_squares_problem_over_parameters_and_states():
     experiment = drive(2)
     free = free_parameters(experiment, list(TRUE), 1.0)
     windows = windows_of(torque, noisy(states, noise, jax.random.key(0)), noise, 100)
-    found = eqx.filter_jit(lambda t: fit(experiment, free, windows, t))(0.1 * jnp.ones(len(free)))
+    found = jit(lambda t: fit(experiment, free, windows, t))(0.1 * jnp.ones(len(free)))
     assert bool(found.converged)
 
-    @jax.jit
+    @jit
     def residual(both):
         at = with_fitted(experiment, free, both[:6])
         starts = both[6:].reshape(4, 4)
@@ -96,7 +96,7 @@ def test_agrees_with_one_least_squares_problem_over_parameters_and_states():
 
     guess = windows.start
     first = np.stack([guess.position["motor"], guess.position["load"], guess.velocity["motor"], guess.velocity["load"]], -1)
-    jacobian = jax.jit(jax.jacfwd(residual))
+    jacobian = jit(jax.jacfwd(residual))
     joint = least_squares(
         residual, np.concatenate([0.1 * np.ones(6), first.ravel()]), jacobian, method="lm", xtol=1e-12, ftol=1e-12
     )
@@ -107,7 +107,7 @@ def test_agrees_with_one_least_squares_problem_over_parameters_and_states():
     np.testing.assert_allclose(np.sqrt(np.diag(plain)), deviation, rtol=0.02)
 
 
-@eqx.filter_jit
+@jit
 def _many(experiment, free, torque, states, keys):
     """Numbers found from one motion under several realisations of the noise, and their covariances."""
     noise = {"motor": 3e-4, "load": 6e-5}
@@ -157,9 +157,9 @@ def test_the_gap_at_1_khz_by_the_fit_and_by_the_chain_of_the_paper():
         return replay(experiment, jnp.asarray(torque), noisy(states, noise, key), record=last, every=len(torque) - 1)[1]
 
     keys = jax.random.split(jax.random.key(11), 40)
-    fitted = jnp.exp(eqx.filter_jit(jax.vmap(by_fit))(keys)) - 1.0
+    fitted = jnp.exp(jit(jax.vmap(by_fit))(keys)) - 1.0
     assert np.abs(fitted[:, 5]).max() < 0.005, fitted[:, 5]
-    chain = jax.tree.map(lambda x: x[:, -1], eqx.filter_jit(jax.vmap(by_chain))(keys))
+    chain = jax.tree.map(lambda x: x[:, -1], jit(jax.vmap(by_chain))(keys))
     size = {
         side: {name: float(jnp.sqrt(jnp.mean((chain[side][name] / true - 1.0) ** 2))) for name, true in
                (("stiffness", 60.0), ("half_gap", 0.08))} for side in chain
@@ -188,7 +188,7 @@ def test_scales_that_one_record_cannot_part_are_refused():
         smoothed = smooth(readings["motor"], PERIOD)
         start = PlantState({"motor": smoothed.position}, {"motor": smoothed.velocity}, ((), ()))
         windows = cut(torque, readings, PERIOD, start, {"motor": 1e-5}, 250)
-        return free, eqx.filter_jit(fit)(experiment, free, windows, jnp.zeros(len(free)))
+        return free, jit(fit)(experiment, free, windows, jnp.zeros(len(free)))
 
     free, found = fitted(paths)
     refused, condition = refusals(free, spread(found))
