@@ -1,12 +1,8 @@
 """Settings of all tests: float64 unless a test asks otherwise, no silent rank promotion, two CPU devices."""
 
-import os
 import sys
 from collections import Counter
 from pathlib import Path
-
-# workers share the cores: threads of NumPy's linear algebra would wait for one another
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
 import pytest
