@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Motion, Numbers, Scales, make_effect
 from jaxbl.drive.parameters import as_arrays
+from jaxbl.identification.compilation import jit
 from jaxbl.identification.regression import Path, effect_path
 from jaxbl.simulate import Experiment, with_effects
 
@@ -238,7 +239,7 @@ def forces_of(candidates: Sequence[Candidate], signals: MotionTorques, spare: in
     return np.concatenate([*(signals.known[one] for one in candidates), zeros])
 
 
-@eqx.filter_jit
+@jit
 def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direction: jax.Array) -> jax.Array:
     """Torques of effects of one name, leaves of shape (effects,); shape (effects, samples, sides + 1)."""
     drive, sides = experiment.drive, experiment.sides
@@ -267,7 +268,7 @@ def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direct
     return jax.vmap(one)(effects)
 
 
-@eqx.filter_jit
+@jit
 def _needed(experiment: Experiment, part: Part) -> dict[str, jax.Array]:
     """Torque on each side that its motion does not take up, dry friction left out, N m."""
     plant = experiment.plant

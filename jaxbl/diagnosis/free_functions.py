@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.identification.compilation import jit
+
 from .candidates import Candidate, MotionTorques
 
 _FUNCTIONS = {
@@ -70,7 +72,7 @@ def _stops(position: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     return np.asarray(_stopped(jnp.asarray(steps)))
 
 
-@jax.jit
+@jit
 def _stopped(steps: jax.Array) -> jax.Array:
     def sample(now: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
         now = jnp.clip(now + step, -1.0, 1.0)

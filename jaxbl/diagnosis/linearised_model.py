@@ -27,6 +27,7 @@ from jaxbl.drive.effects import EFFECTS, ConstantTorque, Scales
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import Direction, slopes
+from jaxbl.identification.compilation import jit
 from jaxbl.identification.prediction import kalman_gain
 from jaxbl.identification.regression import Path, effect_path
 from jaxbl.identification.segments import Segment
@@ -161,7 +162,7 @@ def _start(states: int, width: int) -> Array:
     return jnp.zeros((states, width)).at[:, width - states :].set(jnp.eye(states))
 
 
-@jax.jit
+@jit
 def _errors(part: Part, gain: Array, forces: Array) -> Array:
     """Prediction errors, rad, by side; columns as of :func:`_known`; shape (samples, sides, columns)."""
     known = _known(part, forces)
@@ -169,7 +170,7 @@ def _errors(part: Part, gain: Array, forces: Array) -> Array:
     return _recursion(part, gain_matrix(gain, states), _start(states, width), known)[1]
 
 
-@jax.jit
+@jit
 def _grams(part: Part, gains: Array, forces: Array) -> Array:
     """Products of the columns of the prediction errors with one another, rad^2, for several gains, by side;
     shape (gains, sides, columns, columns)."""
@@ -200,7 +201,7 @@ def _grams(part: Part, gains: Array, forces: Array) -> Array:
     return shared(gains, blocks, forces)
 
 
-@jax.jit
+@jit
 def _gradient(part: Part, gain: Array, left: Array) -> Array:
     """Derivative of the sum of products of errors with `left` by the torque at each sample, shape (samples, sides + 1)."""
     states, sides = part.defect.shape[1], left.shape[1]

@@ -11,10 +11,10 @@ import itertools
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 
-import equinox as eqx
 import numpy as np
 
 from jaxbl.identification import regression
+from jaxbl.identification.compilation import jit
 from jaxbl.identification.segments import Segment
 from jaxbl.simulate import Experiment
 
@@ -431,7 +431,7 @@ def localise(
     """Where each side lacks torque, by its residuals (:func:`.residuals.residual_torques`), segment by segment, and the
     coordinates along them (:func:`.coordinates.all_coordinates`)."""
     found = {}
-    balance = eqx.filter_jit(regression.balance)
+    balance = jit(regression.balance)
     for side, pieces in residuals.items():
         driving = np.concatenate([np.asarray(balance(experiment, one.kinematics)[side].drive) for one in segments])
         found[side] = locate(pieces, coordinates[side], floor=RESOLUTION * float(np.sqrt(np.mean(driving**2))))

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +19,7 @@ from scipy.signal import max_len_seq
 from jaxbl.config import Config, read_config
 from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
+from jaxbl.identification.compilation import jit
 from jaxbl.identification.logs import on_record
 from jaxbl.identification.segments import reading_noise, segments_of
 from jaxbl.records import Record
@@ -193,7 +193,7 @@ def _wave(kind: str, time: np.ndarray, frequency: float) -> np.ndarray:
     return 2.0 * bits[np.floor(2.0 * frequency * time + 1e-9).astype(int) % len(bits)] - 1.0
 
 
-@eqx.filter_jit
+@jit
 def _runs(
     experiment: Experiment, position: dict[str, Array], torques: Float[Array, "inputs samples"]
 ) -> dict[str, Float[Array, "inputs samples"]]:

@@ -20,6 +20,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter
 from scipy.signal.windows import parzen
 
+from jaxbl.identification.compilation import jit
 from jaxbl.identification.regression import Kinematics
 from jaxbl.identification.segments import Segment
 from jaxbl.identification.smoother import Smoothed
@@ -88,7 +89,7 @@ def observed_torques(experiment: Experiment, segments: Sequence[Segment]) -> dic
     return found
 
 
-@eqx.filter_jit
+@jit
 def _known_acceleration(experiment: Experiment, side: str, part: Kinematics, smoothed: Smoothed) -> Float[Array, " samples"]:
     """Acceleration beyond the nominal one that a side's observer is given, rad/s^2."""
     return _held(*beyond_nominal(experiment, side, part, smoothed)) / experiment.drive.inertia(side)
@@ -106,7 +107,7 @@ def _held(smooth: Float[Array, " samples"], friction: Float[Array, " samples"]) 
     return jnp.append(0.5 * (torque[:-1] + torque[1:]), torque[-1])
 
 
-@eqx.filter_jit
+@jit
 def _controls(
     experiment: Experiment, torque: Array, readings: dict[str, Array], known: dict[str, Array], part: Kinematics
 ) -> dict[str, Float[Array, "runs samples"]]:

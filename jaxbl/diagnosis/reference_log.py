@@ -19,6 +19,7 @@ from jaxbl.drive.effects import SideEffect
 from jaxbl.drive.parameters import Scalar
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import path
+from jaxbl.identification.compilation import jit
 from jaxbl.identification.segments import Segment, reading_noise, windows_of
 from jaxbl.identification.trajectory import Windows, projected_residual
 from jaxbl.records import POSITION_CHANNELS
@@ -206,13 +207,13 @@ def _order(count: int, size: int, random: np.random.Generator) -> np.ndarray:
     return np.concatenate([blocks[i] for i in source])[:count]
 
 
-@eqx.filter_jit
+@jit
 def _residuals(experiment: Experiment, windows: Windows, passes: int, rest: bool) -> tuple[Array, PlantState]:
     """Position residuals over the noise from the best initial states, and these."""
     return projected_residual(experiment, windows, passes, rest)
 
 
-@eqx.filter_jit
+@jit
 def _paths(experiment: Experiment, windows: Windows, start: PlantState) -> PlantState:
     """States along each window."""
     return jax.vmap(lambda *given: trajectory(experiment, *given))(start, windows.torque, windows.time)

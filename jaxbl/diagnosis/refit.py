@@ -11,12 +11,12 @@ import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import path
+from jaxbl.identification.compilation import jit
 from jaxbl.identification.intervals import spread
 from jaxbl.identification.regression import settled
 from jaxbl.identification.segments import Segment
@@ -154,7 +154,7 @@ class _Refiner:
         return np.sqrt(np.maximum(np.diag(inverse @ (information @ sandwich @ information + prior) @ inverse), 0.0))
 
 
-_spread = eqx.filter_jit(spread)
+_spread = jit(spread)
 
 
 def refined(

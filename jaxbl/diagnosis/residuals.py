@@ -12,13 +12,13 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.ndimage import gaussian_filter1d
 
+from jaxbl.identification.compilation import jit
 from jaxbl.identification.regression import Kinematics, effect_path
 from jaxbl.identification.segments import Segment
 from jaxbl.identification.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, running_sum, smooth
@@ -142,7 +142,7 @@ def _acting(
     return total, friction, jnp.where(held, 0.0, 2.0 * level * (1.0 - jnp.abs(passage)) / step)
 
 
-@eqx.filter_jit
+@jit
 def beyond_nominal(
     experiment: Experiment, side: str, part: Kinematics, smoothed: Smoothed
 ) -> tuple[Float[Array, " samples"], Float[Array, " samples"]]:
@@ -158,7 +158,7 @@ def beyond_nominal(
     return total - added - nominal, friction
 
 
-@eqx.filter_jit
+@jit
 def _side(
     experiment: Experiment, side: str, part: Kinematics, smoothed: Smoothed
 ) -> tuple[Array, dict[str, Array], dict[str, Array]]:

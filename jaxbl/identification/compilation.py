@@ -6,13 +6,12 @@ fastest code. The engine of sweeps does not use them.
 
 import functools
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 from jax.core import Tracer
 
-P = ParamSpec("P")
 Result = TypeVar("Result")
 
 
@@ -27,16 +26,16 @@ def _options() -> dict[str, bool]:
     return options
 
 
-def jit(function: Callable[P, Result]) -> Callable[P, Result]:
+def jit(function: Callable[..., Result]) -> Callable[..., Result]:
     """`equinox.filter_jit` that compiles fast; in another program, whose options hold, the function as it is."""
 
     @functools.cache
-    def compiled() -> Callable[P, Result]:
+    def compiled() -> Callable[..., Result]:
         # equinox hands what it does not know itself to `jax.jit`
         return eqx.filter_jit(function, compiler_options=_options())  # pyright: ignore[reportCallIssue]
 
     @functools.wraps(function)
-    def call(*args: P.args, **kwargs: P.kwargs) -> Result:
+    def call(*args: Any, **kwargs: Any) -> Result:
         inside = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs)))
         return (function if inside else compiled())(*args, **kwargs)
 
