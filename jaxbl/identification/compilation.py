@@ -15,15 +15,18 @@ from jax.core import Tracer
 Result = TypeVar("Result")
 
 
+_FAST = {"xla_cpu_use_fusion_emitters": False}
+"""XLA's former emitters compile in half the time of today's (benchmarks/NOTES.md)."""
+
+
 @functools.cache
 def _options() -> dict[str, bool]:
-    """XLA's former emitters take half the time of today's (benchmarks/NOTES.md); JAX 0.12 and later have them no more."""
-    options = {"xla_cpu_use_fusion_emitters": False}
+    """The fast options where JAX has them (0.12 has not), else none."""
     try:
-        jax.jit(lambda x: x + 1.0, compiler_options=options)(0.0)
+        jax.jit(lambda x: x + 1.0, compiler_options=_FAST)(0.0)
     except jax.errors.JaxRuntimeError:
         return {}
-    return options
+    return _FAST
 
 
 def jit(function: Callable[..., Result]) -> Callable[..., Result]:
