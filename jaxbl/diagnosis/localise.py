@@ -107,7 +107,7 @@ class Band:
 
 
 @dataclasses.dataclass(frozen=True)
-class Peak:
+class SpectralPeak:
     """A narrow peak of the spectrum.
 
     Attributes:
@@ -149,7 +149,7 @@ class Localised:
     significant: bool
     coordinates: dict[str, Coordinate]
     bands: tuple[Band, ...]
-    peaks: tuple[Peak, ...]
+    peaks: tuple[SpectralPeak, ...]
 
 
 class _Joined:
@@ -357,7 +357,7 @@ def _explained_share(name: str, one: CoordinateValues, joined: _Joined, excess: 
     return min(best / excess, 1.0)
 
 
-def _spectrum(one: Residual, speed: np.ndarray | None, low: Residual) -> tuple[tuple[Band, ...], tuple[Peak, ...]]:
+def _spectrum(one: Residual, speed: np.ndarray | None, low: Residual) -> tuple[tuple[Band, ...], tuple[SpectralPeak, ...]]:
     """Bands and narrow peaks in the spectrum of a part; shares are of the power that its low-passed version shows."""
     frequency, power, floor = residual_spectrum(one)
     count, resolution = len(one.time), frequency[1]
@@ -380,7 +380,7 @@ def _spectrum(one: Residual, speed: np.ndarray | None, low: Residual) -> tuple[t
     if speed is not None:
         moving = np.asarray(speed) - np.mean(speed)
         motion = np.abs(np.fft.rfft(moving * np.hanning(count))) ** 2
-    peaks: list[Peak] = []
+    peaks: list[SpectralPeak] = []
     taken = np.arange(len(power)) < 3
     for at in np.argsort(-power):
         if len(peaks) == _PEAKS:
@@ -396,7 +396,7 @@ def _spectrum(one: Residual, speed: np.ndarray | None, low: Residual) -> tuple[t
         here = float(np.sum(np.maximum(beyond[near], 0.0)))
         share = here / max(total, here)
         moved = motion is not None and float(np.sum(motion[near]) / np.sum(motion)) > 0.2 * share
-        peaks.append(Peak(float(frequency[at]), float(np.sqrt(2.0 * here / count)), share, z, moved))
+        peaks.append(SpectralPeak(float(frequency[at]), float(np.sqrt(2.0 * here / count)), share, z, moved))
     return tuple(bands), tuple(peaks)
 
 

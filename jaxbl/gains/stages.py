@@ -10,7 +10,7 @@ from jaxbl.config import Config
 from jaxbl.errors import InputError
 from jaxbl.files import make_folder, read_json, write_atomic
 from jaxbl.sweeps.programs import Backend, backend_of
-from jaxbl.sweeps.store import claim, mark
+from jaxbl.sweeps.store import claim, manifest_head
 from jaxbl.sweeps.sweep import StudyResult, sweep
 from jaxbl.workers import Progress
 
@@ -60,7 +60,7 @@ class Stages:
         """Write the manifest, which makes the folder this study's, with something that was found before the stages."""
         if self.folder is not None:
             make_folder(self.folder)
-            manifest = mark(self._config, self._command) | found | {"backend": self._backend}
+            manifest = manifest_head(self._config, self._command) | found | {"backend": self._backend}
             write_atomic(self.folder / "manifest.json", json.dumps(manifest, indent=2))
 
     def place(self, *names: str) -> Path | None:

@@ -9,7 +9,7 @@ from . import lost_motion
 from .least_squares import jackknifed
 from .lost_motion import LostMotion
 from .rigid_body import direction_of
-from .signal_quality import SHORTEST, ChannelFigures, bandwidth, interpolated, longest, low_passed, settled
+from .signal_quality import SHORTEST, ChannelFigures, bandwidth, interpolated, longest, low_passed, without_ends
 
 HARMONICS = 8
 """Terms of the cosine series over position: eccentricity and the first harmonics of gear and encoder errors."""
@@ -205,7 +205,7 @@ def _lost_motion(
     for s, load in zip(segments, aligned, strict=True):
         smooth = low_passed(load, cutoff, period)
         velocity = np.gradient(smooth, period)
-        cut = settled(len(smooth), cutoff, period)
+        cut = without_ends(len(smooth), cutoff, period)
         parts.append(
             np.stack([times[s], motor[s] - ratio * load, smooth, velocity, np.gradient(velocity, period)], axis=1)[cut]
         )
@@ -295,7 +295,7 @@ def _gear_fit(
         velocity = np.gradient(smooth, times[s])
         parts.append(np.stack([smooth, velocity, np.gradient(velocity, times[s])]))
         smooth_motor.append(low_passed(motor[s], cutoff, period))
-    inner = [settled(len(signal), cutoff, period) for signal in smooth_motor]
+    inner = [without_ends(len(signal), cutoff, period) for signal in smooth_motor]
 
     def joined(signals: list[np.ndarray]) -> np.ndarray:
         return np.concatenate([signal[..., cut] for signal, cut in zip(signals, inner, strict=True)], axis=-1)

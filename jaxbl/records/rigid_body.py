@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .least_squares import jackknifed
-from .signal_quality import SHORTEST, bandwidth, longest, low_passed, settled
+from .signal_quality import SHORTEST, bandwidth, longest, low_passed, without_ends
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence
         acceleration = np.gradient(velocity, period)
         direction = low_passed(direction_of(velocity), cutoff, period)
         held = low_passed(torque[s], cutoff, period)
-        cut = settled(len(smooth), cutoff, period)
+        cut = without_ends(len(smooth), cutoff, period)
         columns = [acceleration, velocity, direction, smooth, np.ones_like(smooth), -np.gradient(held, period)]
         all_rows.append(np.stack(columns, axis=1)[cut])
         targets.append(held[cut])

@@ -174,7 +174,7 @@ def low_passed(values: np.ndarray, cutoff: float, period: float) -> np.ndarray:
     return sosfiltfilt(sections, values, axis=0, padlen=min(len(values) - 1, round(2.0 / (cutoff * period))))
 
 
-def settled(samples: int, cutoff: float, period: float) -> slice:
+def without_ends(samples: int, cutoff: float, period: float) -> slice:
     """The samples of a segment without its ends, where :func:`low_passed` and differences have not settled."""
     edge = min(round(1.0 / (cutoff * period)), samples // 8) + 2
     return slice(edge, samples - edge)

@@ -34,6 +34,7 @@ from .figures import COLOURS, MAP, MARKERS, MISSING, SIDES, Drawn, style, subplo
 from .refined_maps import Filling, on_coarse_values
 
 _HATCH = (1.0, 1.0, 1.0, 0.45)
+"""White that lets the colour beneath be read."""
 
 _CURVES = {
     "davila_fridman": ("-", "#FF5FA2"),

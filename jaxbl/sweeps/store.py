@@ -57,7 +57,7 @@ def _name_by_content(data: dict[str, Any], excitation: Any) -> None:
         data["file"] = hashlib.sha256(record.times.tobytes() + record.torques.tobytes()).hexdigest()
 
 
-def mark(config: Config, command: str) -> dict[str, Any]:
+def manifest_head(config: Config, command: str) -> dict[str, Any]:
     """What a command's marker says of its study: its own identity, and that of the study's single run."""
     own = {} if command == "simulate" else {"identity": identity(config, command)}
     return own | {"single_run": identity(config, "simulate"), "title": config.title}
@@ -123,7 +123,7 @@ class Store:
         else:
             manifest = {
                 "format": FORMAT,
-                **mark(config, "sweep"),
+                **manifest_head(config, "sweep"),
                 "layout": layout._asdict(),
                 "backend": backend,
                 "parts": parts,

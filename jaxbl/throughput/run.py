@@ -31,6 +31,7 @@ Runner = Callable[[], dict[str, np.ndarray]]
 CEILING, OURS, SCAN = "c++, all cores", "jaxbl fused, all cores", "jaxbl scan, all devices"
 PRECISIONS = ("float32", "float64")
 _REFERENCE_LANES = 64
+"""Lanes, spread over all, that are compared with the reference: it is slow."""
 _TOLERANCE = {
     "float64": dict.fromkeys(("velocity_rmse", "stiffness", "dead_zone"), 1e-8),
     # rounding decides some signs of a switching term; an error of one sample follows

@@ -20,6 +20,7 @@ from jaxbl.simulate import Experiment, Reducer, Run, State, unit_noise
 from jaxbl.sweeps.metrics import window_start
 
 SEED = 0
+"""Of the encoders' noise: any one, the same for all."""
 SIDES = ("motor", "load")
 RANGES = {
     "observer.motor.alpha": (8.0, 40.0),

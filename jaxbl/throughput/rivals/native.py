@@ -16,6 +16,7 @@ _FLAGS = ("-std=c++20", "-O3", "-march=native", "-fno-math-errno", "-fno-trappin
 """Fused multiply-add as the compiler likes (GCC's default), but no reordering: sums are compensated."""
 _SOURCE = Path(__file__).with_name("chain.cpp")
 SUMS = 9
+"""Results of a lane, as chain.cpp numbers them."""
 
 
 class _Constants(ctypes.Structure):
