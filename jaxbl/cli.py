@@ -408,8 +408,8 @@ def _start_jax() -> None:
         # of this Python's own: another one packs programs otherwise
         cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "jaxbl" / sys.implementation.cache_tag
         jax.config.update("jax_compilation_cache_dir", str(cache))
-        # also what takes less than a second: a study has several of them
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+        # also what takes less than a second: a study has many of them
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def _print(lines: list[str], folder: Path) -> None:

@@ -1,8 +1,16 @@
 """Settings of all tests: float64 unless a test asks otherwise, no silent rank promotion, two CPU devices."""
 
+import os
 import sys
 from collections import Counter
 from pathlib import Path
+
+# what one worker, command or run has compiled serves the others of this Python; another one packs programs otherwise
+os.environ |= {
+    "JAX_NUM_CPU_DEVICES": "2",
+    "JAX_COMPILATION_CACHE_DIR": str(Path(__file__).parents[1] / ".cache" / "jax" / sys.implementation.cache_tag),
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+}
 
 import jax
 import pytest
@@ -12,11 +20,6 @@ from jaxbl.workers import forget_programs
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
-jax.config.update("jax_num_cpu_devices", 2)
-# what one worker or run has compiled serves the others of this Python; another one packs programs otherwise
-cache = Path(__file__).parents[1] / ".cache" / "jax" / sys.implementation.cache_tag
-jax.config.update("jax_compilation_cache_dir", str(cache))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
 
 # a crowded machine is no failure
 settings.register_profile("patient", deadline=None)

@@ -12,7 +12,6 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import pytest
 from test_public import FLOORS
 from typer.main import get_command
@@ -170,14 +169,8 @@ def environment(folder):
     site = folder / "site"
     site.mkdir()
     (site / "sitecustomize.py").write_text(f"import sys\nsys.modules.update(dict.fromkeys({hidden!r}))\n")
-    # compiled programs of other pages and tests serve where the devices are the same
-    shared = {
-        "JAX_COMPILATION_CACHE_DIR": jax.config.values["jax_compilation_cache_dir"],
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05",
-        "JAX_NUM_CPU_DEVICES": str(len(jax.devices())),
-    }
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    return os.environ | shared | {"PATH": path, "PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])}
+    return os.environ | {"PATH": path, "PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])}
 
 
 def test_demo_is_this_command():

@@ -396,10 +396,16 @@ class Linear:
     def errors(self, smoothness: Sequence[float]) -> list[np.ndarray]:
         """Prediction errors under a given gain, part by part, rad; shape (samples, sides, columns)."""
         gain = self.gain(smoothness)
-        return [np.asarray(_errors(one.part, gain, self._forces((), one)))[:, :, self._some(0, 0)] for one in self.signals]
+        none = [self._forces((), one) for one in self.signals]
+        errors = [_errors(one.part, gain, forces) for one, forces in zip(self.signals, none, strict=True)]
+        return [np.asarray(one)[:, :, self._taken(forces)] for one, forces in zip(errors, none, strict=True)]
+
+    def _taken(self, forces: np.ndarray) -> np.ndarray:
+        """As :meth:`_some`, with all forces of candidates; without candidates they are there to fill up."""
+        return self._some(len(forces) if forces.any() else 0, len(forces))
 
     def _some(self, forces: int, width: int) -> np.ndarray:
-        """Products that are not there to fill up, some of the forces among them."""
+        """Columns that are not there to fill up, some of the forces among them."""
         own, padded = len(self.free), self.parts[0].own.shape[2]
         last = 1 + padded + width + np.arange(self.states)
         return np.concatenate([np.arange(1 + own), 1 + padded + np.arange(forces), last])
@@ -439,14 +445,15 @@ class Linear:
         gains = jnp.stack([self.gain(options[min(i, len(options) - 1)]) for i in range(count)])
         grams = []
         for part, force in zip(self.parts, forces, strict=True):
-            some = self._some(len(force), len(force))
+            some = self._taken(force)
             grams.append(np.asarray(_grams(part, gains, force))[:, :, some[:, None], some])
         return [Predictor(self, one, [gram[i] for gram in grams]) for i, one in enumerate(options)]
 
     def _forces(self, variants: Sequence[Candidate], signals: MotionTorques) -> np.ndarray:
-        """Torques of candidates, padded with columns of zeros; shape (columns, samples, sides + 1)."""
+        """Torques of candidates, padded with columns of zeros, so that few programs serve all; shape (columns, samples,
+        sides + 1)."""
         width = sum(one.width + one.offset for one in variants)
-        return forces_of(variants, signals, bucket(width, _COLUMNS, 2) - width if width else 0)
+        return forces_of(variants, signals, bucket(width, _COLUMNS, 2) - width)
 
     def frequencies(self, place: str) -> list[float]:
         """Frequencies (Hz) at which a disturbance of a side explains most, by the gradient of the errors' squares.
@@ -459,7 +466,7 @@ class Linear:
         predictor, forces = self._last
         gain, deviation = self.gain(predictor.smoothness), predictor.deviation
         errors = np.asarray(_errors(part, gain, forces[i]))
-        left = errors[:, :, self._some(len(forces[i]), len(forces[i]))] @ predictor.coefficients[i]
+        left = errors[:, :, self._taken(forces[i])] @ predictor.coefficients[i]
         time, real = np.asarray(part.time), int(self.signals[i].real.sum())
         span, top = real * self.period, self._highest
         few = np.geomspace(1.0 / span, top, _COARSE)

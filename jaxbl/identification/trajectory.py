@@ -182,6 +182,7 @@ def with_fitted(experiment: Experiment, free: Sequence[Free], theta: Float[Array
     return set_leaves(experiment, {one.path: one.value(theta[i]) for i, one in enumerate(free)})
 
 
+@eqx.filter_jit
 def _residual(experiment: Experiment, start: PlantState, window: Windows) -> Float[Array, "samples sides"]:
     simulated = trajectory(experiment, start, window.torque, window.time, window.measured, window.gain).position
     sides = [(window.measured[side] - simulated[side]) / window.noise[side] for side in experiment.sides]
