@@ -1,6 +1,5 @@
 """The whole chain: the figures it has to reach, its noise, lanes, records, derivatives, and an independent copy of it."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +11,7 @@ from scipy.signal import lfilter
 
 from jaxbl.drive import Encoders, Initial, Rigid, set_leaves
 from jaxbl.drive.effects import ConstantTorque, CoulombFriction
+from jaxbl.identification.compilation import jit
 from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, Observers
 from jaxbl.simulate import Reducer, initial_state, replay, scan, trajectory, unit_noise
 from jaxbl.sweeps.metrics import METRICS
@@ -23,12 +23,12 @@ def everything(state, signals):
     return signals
 
 
-@eqx.filter_jit
+@jit
 def figures(experiment, seed=SEED):
     return scan(experiment, seed, (METRICS,))[0]
 
 
-@eqx.filter_jit
+@jit
 def trace(experiment, seed=SEED, every=1):
     return scan(experiment, seed, record=everything, every=every)[1]
 
@@ -41,7 +41,7 @@ def identification_errors(result):
 
 
 def test_torque_of_the_implicit_observer_needs_no_low_pass():
-    result, torque = eqx.filter_jit(lambda e: scan(e, SEED, (METRICS,), record=lambda s, g: g.torque))(paper())
+    result, torque = jit(lambda e: scan(e, SEED, (METRICS,), record=lambda s, g: g.torque))(paper())
     rms = np.sqrt(np.mean(np.square(torque[15_000:])))
     assert result["motor.torque_rmse"] < 0.01 * rms
     assert result["load.torque_rmse"] < 0.01 * rms
@@ -208,7 +208,7 @@ def test_lanes_equal_single_runs(discretisation):
     """Also where a plant that no axis varies is simulated once for all lanes."""
     experiment = paper(discretisation, time_constant=0.01, start=0.2, steps=600, velocity_error=0.5)
     for values in (lane_values(7), dict(list(lane_values(7).items())[:3])):
-        lanes = jax.jit(jax.vmap(lambda v: scan(set_leaves(experiment, v), SEED, (METRICS,))[0]))(values)
+        lanes = jit(jax.vmap(lambda v: scan(set_leaves(experiment, v), SEED, (METRICS,))[0]))(values)
         for i in (0, 3, 6):
             single = figures(set_leaves(experiment, {path: value[i] for path, value in values.items()}))
             for name, value in single.items():
@@ -220,7 +220,7 @@ def test_lanes_equal_single_runs(discretisation):
 def test_a_diverging_lane_leaves_its_neighbours_alone():
     experiment = paper(time_constant=0.01, start=0.1, steps=300, noise=1e-4)
     stiffness = jnp.asarray([1.0, 1e9, 2.0])
-    run = jax.jit(jax.vmap(lambda k: scan(set_leaves(experiment, {"transmission.stiffness": k}), SEED, (METRICS,))[0]))
+    run = jit(jax.vmap(lambda k: scan(set_leaves(experiment, {"transmission.stiffness": k}), SEED, (METRICS,))[0]))
     lanes, calm = run(stiffness), run(jnp.asarray([1.0, 1.5, 2.0]))
     np.testing.assert_array_equal(lanes["finite"], [True, False, True])
     assert np.all(calm["finite"])
@@ -274,7 +274,7 @@ def test_reducers_see_every_sample_whatever_is_recorded():
     )
     experiment = paper(steps=523, substeps=1)
     for record, every in ((None, 1), (everything, 1), (everything, 10)):
-        out, _ = jax.jit(lambda e, record=record, every=every: scan(e, SEED, (count,), record, every))(experiment)
+        out, _ = jit(lambda e, record=record, every=every: scan(e, SEED, (count,), record, every))(experiment)
         assert out == {"sum": 523 * 522 // 2}
 
 
@@ -289,12 +289,12 @@ def test_derivatives_through_the_run(discretisation):
         return motor.true.position, motor.position_estimate, motor.velocity_estimate, motor.torque_estimate
 
     one = jnp.asarray(1.0)
-    _, slopes = jax.jit(lambda: jax.jvp(run, (one,), (one,)))()
+    _, slopes = jit(lambda: jax.jvp(run, (one,), (one,)))()
     assert all(np.all(np.isfinite(slope)) for slope in slopes)
-    compiled = jax.jit(run)
+    compiled = jit(run)
     change = (compiled(one + 1e-5)[0] - compiled(one - 1e-5)[0]) / 2e-5
     np.testing.assert_allclose(slopes[0], change, rtol=1e-5, atol=1e-12)
-    gradient = jax.jit(jax.grad(lambda k: run(k)[0][-1] + run(k)[2][-1]))(one)
+    gradient = jit(jax.grad(lambda k: run(k)[0][-1] + run(k)[2][-1]))(one)
     np.testing.assert_allclose(gradient, slopes[0][-1] + slopes[2][-1], rtol=1e-9)
 
 
@@ -306,7 +306,7 @@ def test_one_compilation_serves_all_values():
         traces += 1
         return scan(experiment, SEED)[0]
 
-    compiled = eqx.filter_jit(counted)
+    compiled = jit(counted)
     for noise in (0.0, 1e-4, 1e-3):
         compiled(paper(noise=noise, steps=64, substeps=1))
     assert traces == 1
@@ -317,7 +317,7 @@ def test_a_replayed_record_gives_what_the_observers_gave(every):
     experiment = paper(noise=1e-4, start=0.1, steps=700)
     seen = trace(experiment)
     measured = {side: seen.side(side).measured for side in experiment.sides}
-    run = eqx.filter_jit(lambda *given: replay(*given, record=everything, every=every, state=initial_state(experiment)))
+    run = jit(lambda *given: replay(*given, record=everything, every=every, state=initial_state(experiment)))
     _, again = run(experiment, seen.input, measured)
     for side in experiment.sides:
         mine, theirs = again.side(side), seen.side(side)
@@ -333,7 +333,7 @@ def test_what_observers_are_told_is_not_in_their_equivalent_control():
     measured = {side: seen.side(side).measured for side in experiment.sides}
     # of the true acceleration, its mean over each sampling period
     known = {side: seen.side(side).true.perturbation for side in experiment.sides}
-    run = eqx.filter_jit(lambda *given: replay(*given, record=everything, state=initial_state(experiment), known=known))
+    run = jit(lambda *given: replay(*given, record=everything, state=initial_state(experiment), known=known))
     _, told = run(experiment, seen.input, measured)
     for side in experiment.sides:
         plain = seen.side(side).equivalent_control[500:]
@@ -343,7 +343,7 @@ def test_what_observers_are_told_is_not_in_their_equivalent_control():
 def test_a_trajectory_is_the_plant_of_the_whole_chain():
     experiment = paper(steps=300)
     seen = trace(experiment)
-    states = jax.jit(lambda u: trajectory(experiment, experiment.plant.init(experiment.initial), u))(seen.input)
+    states = jit(lambda u: trajectory(experiment, experiment.plant.init(experiment.initial), u))(seen.input)
     for side in experiment.sides:
         np.testing.assert_allclose(states.position[side], seen.side(side).true.position, rtol=1e-12, atol=1e-14)
         np.testing.assert_allclose(states.velocity[side], seen.side(side).true.velocity, rtol=1e-12, atol=1e-14)
