@@ -409,7 +409,7 @@ def test_default_folder():
 @pytest.mark.parametrize(
     ("name", "command"),
     [
-        ("gain_map", "sweep"),
+        # gain_map is run by tests/test_docs.py, as the README says
         ("load_gains", "sweep"),
         ("gain_boundary", "sweep"),
         ("paper_table1", "simulate"),

@@ -200,4 +200,4 @@ def test_page_runs_as_written(page, tmp_path):
 
 def run(words, folder, env):
     done = subprocess.run(words, cwd=folder, env=env, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, f"{words[-1]}\n{done.stdout}\n{done.stderr}"
+    assert (done.returncode, done.stderr) == (0, ""), f"{words[-1]}\n{done.stdout}\n{done.stderr}"
