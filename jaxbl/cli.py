@@ -400,8 +400,9 @@ def _start_jax() -> None:
     """Use every core as a device, and keep compiled programs between runs."""
     import jax
 
-    from .workers import cores
+    from .workers import collect_rarely, cores
 
+    collect_rarely()
     if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
         jax.config.update("jax_num_cpu_devices", cores())
     if jax.config.values["jax_compilation_cache_dir"] is None:

@@ -104,7 +104,8 @@ def log_named_in(file: Path) -> str | None:
 def results_of(
     task: Any, file: Path, run: Callable[[Any], Any], write: Callable[[Any, Path], object], *, overwrite: bool
 ) -> dict[str, Any]:
-    """Do a task on a log and write the results beside `file`, their summary; read it where an earlier call has found it.
+    """Do a task on a log, write its results into the folder of `file`, and return their summary. Where an earlier call left
+    the summary of the same task in `file`, that is read instead.
 
     Raises:
         InputError: as :func:`claim_log_folder`, or as the task does.

@@ -62,18 +62,18 @@ def running(
         if not (interrupted or isinstance(error, KeyboardInterrupt)):
             raise
         state = "what is finished is kept. Go on with" if kept else "nothing was written. Start again with"
-        typer.echo(f"interrupted; {state}: {_call_again(context, folder)}", err=True)
+        typer.echo(f"interrupted; {state}: {_call_again(context, folder, kept=kept)}", err=True)
         raise typer.Exit(130) from None
     finally:
         signal.signal(signal.SIGINT, before)
 
 
-def _call_again(context: typer.Context, folder: Path) -> str:
-    """The command line of this call, with the folder of its results."""
+def _call_again(context: typer.Context, folder: Path, *, kept: bool) -> str:
+    """The command line of this call, with the folder of its results; what is `kept` there is not to be overwritten."""
     words = ["jaxbl", str(context.info_name)]
     for one in context.command.params:
         source, value = context.get_parameter_source(str(one.name)), context.params.get(str(one.name))
-        if one.name == "out" or source is None or source.name != "COMMANDLINE":
+        if one.name in ("out", "overwrite" if kept else "out") or source is None or source.name != "COMMANDLINE":
             continue
         if one.param_type_name == "option":
             words.append(one.opts[0])

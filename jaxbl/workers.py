@@ -1,5 +1,6 @@
 """Independent jobs on all cores, in processes of their own: progress, interrupts, and memory of compiled programs."""
 
+import gc
 import multiprocessing
 import os
 import signal
@@ -83,9 +84,16 @@ def _interrupted(number: int, frame: object) -> None:
         raise KeyboardInterrupt
 
 
+def collect_rarely() -> None:
+    """Look for unreachable objects less often: what JAX makes while it traces lives on, and searching it takes a tenth of a
+    command's time (benchmarks/NOTES.md)."""
+    gc.set_threshold(200_000, 50, 100)
+
+
 def _prepare(cache: str | None, least: float) -> None:
     import jax
 
+    collect_rarely()
     signal.signal(signal.SIGINT, _interrupted)
     # nothing else tells a process that the one it works for was killed
     threading.Thread(target=_end_with_parent, daemon=True).start()

@@ -16,8 +16,9 @@ import jax
 import pytest
 from hypothesis import settings
 
-from jaxbl.workers import forget_programs
+from jaxbl.workers import collect_rarely, forget_programs
 
+collect_rarely()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 

@@ -181,8 +181,8 @@ def _explained(setup: Setup) -> tuple[EffectSearch, Explanation]:
 
 
 def _check_shown(setup: Setup, shown: float) -> None:
-    """Refuse to say that nothing is missing where noise hides everything, the input itself but for `shown` of its standard
-    deviations."""
+    """Refuse to say that nothing is missing where noise hides everything; `shown`: standard deviations by which the log
+    shows its input."""
     if shown * _HIDDEN >= SIGNIFICANT:
         return
     record = setup.task.record

@@ -106,7 +106,7 @@ def _finding(
 
 
 def where_lacking(record: Record, located: Mapping[str, Localised]) -> dict[str, Any]:
-    """Where a model lacks torque, by equation, with sentences in the log's units."""
+    """Where a model lacks torque, by side, with sentences in the log's units."""
     return {
         name: dataclasses.asdict(one) | {"sentence": sentence_of(one, unit_on(record, f"{name}.torque", "N m"))}
         for name, one in located.items()

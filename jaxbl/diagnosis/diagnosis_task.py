@@ -46,7 +46,7 @@ def read_diagnosis_task(
     config, missing = read_model(model)
     record = read_logs(config, log, GEAR_TOLERANCE)
     if holdout is None:
-        record, other = without_last_quarter(record)
+        record, other = split_off_last_quarter(record)
     else:
         other = read_logs(config, holdout, GEAR_TOLERANCE)
         _check_machine(record, other)
@@ -70,7 +70,7 @@ def _long(record: Record) -> Record:
     return dataclasses.replace(record, segments=parts)
 
 
-def without_last_quarter(record: Record) -> tuple[Record, Record]:
+def split_off_last_quarter(record: Record) -> tuple[Record, Record]:
     """The samples to be fitted, and those held out: the last of the log, at their own times."""
     total = sum(part.stop - part.start for part in record.segments)
     left = round((1.0 - HELD_OUT) * total)

@@ -398,11 +398,13 @@ class Linear:
         gain = self.gain(smoothness)
         none = [self._forces((), one) for one in self.signals]
         errors = [_errors(one.part, gain, forces) for one, forces in zip(self.signals, none, strict=True)]
-        return [np.asarray(one)[:, :, self._taken(forces)] for one, forces in zip(errors, none, strict=True)]
+        some = self._taken(none)
+        return [np.asarray(one)[:, :, some] for one in errors]
 
-    def _taken(self, forces: np.ndarray) -> np.ndarray:
-        """As :meth:`_some`, with all forces of candidates; without candidates they are there to fill up."""
-        return self._some(len(forces) if forces.any() else 0, len(forces))
+    def _taken(self, forces: Sequence[np.ndarray]) -> np.ndarray:
+        """As :meth:`_some`, with all forces of candidates, part by part; without candidates they are there to fill up."""
+        # a candidate may do nothing in one part
+        return self._some(len(forces[0]) if any(one.any() for one in forces) else 0, len(forces[0]))
 
     def _some(self, forces: int, width: int) -> np.ndarray:
         """Columns that are not there to fill up, some of the forces among them."""
@@ -443,9 +445,8 @@ class Linear:
         # one compiled program for a few and for all
         count = len(_COARSE_SMOOTHNESS) if 1 < len(options) < len(_COARSE_SMOOTHNESS) else len(options)
         gains = jnp.stack([self.gain(options[min(i, len(options) - 1)]) for i in range(count)])
-        grams = []
+        grams, some = [], self._taken(forces)
         for part, force in zip(self.parts, forces, strict=True):
-            some = self._taken(force)
             grams.append(np.asarray(_grams(part, gains, force))[:, :, some[:, None], some])
         return [Predictor(self, one, [gram[i] for gram in grams]) for i, one in enumerate(options)]
 
@@ -466,7 +467,7 @@ class Linear:
         predictor, forces = self._last
         gain, deviation = self.gain(predictor.smoothness), predictor.deviation
         errors = np.asarray(_errors(part, gain, forces[i]))
-        left = errors[:, :, self._taken(forces[i])] @ predictor.coefficients[i]
+        left = errors[:, :, self._taken(forces)] @ predictor.coefficients[i]
         time, real = np.asarray(part.time), int(self.signals[i].real.sum())
         span, top = real * self.period, self._highest
         few = np.geomspace(1.0 / span, top, _COARSE)
@@ -533,7 +534,7 @@ class Linear:
         return Products(total, own, tuple(places), tuple(offsets), scale, centre, self.bound, self._twins(variants, places))
 
     def _twins(self, variants: Sequence[Candidate], places: Sequence[tuple[int, ...]]) -> dict[int, tuple[int, float]]:
-        """Products that are those of other numbers: the error of a number that is free acts as that number does."""
+        """Columns that are those of other numbers: the error of a number that is free acts as that number does."""
         slopes = [float(one.slope(self.theta[i])) for i, one in enumerate(self.free)]
         found = {}
         for one, place in zip(variants, places, strict=True):
@@ -551,7 +552,7 @@ class Linear:
         return np.einsum("cts,cts->cs", torques, torques) @ over**-2.0
 
     def shown(self) -> float:
-        """Standard deviations by which the errors show the input, each part of it beside those errors; infinite without."""
+        """Standard deviations by which the prediction errors show the input; infinite where the record has none."""
         if not self.driven:
             return np.inf
         predictor = self.choose(())

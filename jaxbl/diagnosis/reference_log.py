@@ -111,7 +111,8 @@ class ReferenceLog:
         simulated, found = _paths(experiment, windows, windows.start).position, {}
         for side in experiment.sides:
             apart = float(jnp.max(jnp.abs(simulated[side] - windows.measured[side])))
-            found[side] = np.nan_to_num(apart, nan=np.inf) / max(float(np.ptp(one.readings[side])) for one in self.segments)
+            span = max(float(np.ptp(one.readings[side])) for one in self.segments)
+            found[side] = apart / span if np.isfinite(apart) else np.inf
         return found
 
     def compare(self, experiment: Experiment, added: Mapping[str, np.ndarray] | None = None) -> Comparison:

@@ -16,7 +16,6 @@ import numpy as np
 
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import path
-from jaxbl.identification.compilation import jit
 from jaxbl.identification.intervals import spread
 from jaxbl.identification.regression import settled
 from jaxbl.identification.segments import Segment
@@ -145,16 +144,13 @@ class _Refiner:
             jnp.asarray(np.concatenate(residual)[None]), jnp.asarray(np.concatenate(jacobian)[None]),
             jnp.asarray(0.0), jnp.asarray(True),
         )  # fmt: skip
-        found = _spread(fit)
+        found = spread(fit)
         # samples that only fill up
         real = linear.count / fit.residual[0, :, 0].size
         information, sandwich = real * np.asarray(found.information), np.asarray(found.covariance)
         prior = np.diag(self.width**-2.0)
         inverse = np.linalg.inv(information + prior)
         return np.sqrt(np.maximum(np.diag(inverse @ (information @ sandwich @ information + prior) @ inverse), 0.0))
-
-
-_spread = jit(spread)
 
 
 def refined(

@@ -32,7 +32,7 @@ _LARGEST = 2**18
 
 @dataclasses.dataclass(frozen=True)
 class Residual:
-    """Torque that a model lacks in one equation, along a part of a record without gaps.
+    """Torque that a model lacks on a side, along a part of a record without gaps.
 
     Attributes:
         name: of the side.
@@ -107,7 +107,7 @@ def as_smoothed(
     rate = running_sum(values - steady) * period
     position = jnp.concatenate([jnp.zeros(1), running_sum(rate)[:-1] * period])
     # second differences of the position are the values
-    return steady + smooth(position, period, noise=smoothed.noise, jerk=smoothed.jerk).acceleration  # type: ignore[arg-type]
+    return steady + smooth(position, period, known=(smoothed.noise, smoothed.jerk)).acceleration
 
 
 def _mean_around(values: Float[Array, " samples"]) -> Float[Array, " samples"]:

@@ -32,8 +32,8 @@ _PLACE = {
 
 
 def sentence_of(found: Localised, unit: str = "N m") -> str:
-    """One sentence: which equation, where, and how much of the residual power lies there."""
-    side = found.name if found.name == "transmission" else f"{found.name} side"
+    """One sentence: which side, where, and how much of the residual power lies there."""
+    side = f"{found.name} side"
     if not found.significant:
         return f"{side}: nothing beyond noise ({found.noise:.2g} {unit} rms up to {found.bandwidth:.3g} Hz)"
     size = f"{found.missing:.2g} {unit} rms"

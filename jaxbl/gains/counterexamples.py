@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config, read_config
+from jaxbl.files import plain
 from jaxbl.sweeps.points import Points
 
 from .stages import Stages
@@ -66,7 +67,7 @@ def _with(tables: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
         if value is None:
             table.pop(key, None)
         else:
-            table[key] = value.item() if isinstance(value, np.generic) else value
+            table[key] = plain(value)
     return data
 
 
@@ -116,4 +117,6 @@ def repeated(
     data["sweep"] = {key: data["sweep"][key] for key in ("seeds", "first_seed")}
     frame = stages.rerun(read_config(data), "causes", name.replace(" ", "_"))
     labels, asked = (pd.MultiIndex.from_frame(runs[[*paths, "seed"]]) for runs in (frame, rows))
-    return frame.iloc[labels.get_indexer(asked)]
+    places = labels.get_indexer(asked)
+    assert (places >= 0).all(), "every run was asked for"
+    return frame.iloc[places]

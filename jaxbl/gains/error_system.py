@@ -1,5 +1,5 @@
 """The error system (34) with f_plus = 1 under its worst disturbance, over a plane of alpha / f_plus and lambda / √f_plus,
-and what the gain conditions ask for there."""
+and what the gain conditions ask for, there and anywhere."""
 
 import dataclasses
 from collections.abc import Callable

@@ -16,7 +16,7 @@ from jaxbl.workers import Progress
 
 
 class Stages:
-    """The studies of `tune` or `verify`, kept in a folder of this name in the study's folder; without one nothing is kept.
+    """The studies of `tune` or `verify`, kept in the folder `out`/`command`; without `out` nothing is kept.
 
     Raises:
         InputError: the folder holds something else, or was begun with another backend: all of it is by one.

@@ -91,7 +91,7 @@ def tune(
     if found is None:
         stages.keep(pilot=search.pilot)
     search.run()
-    summary = Summary(search, search.compare(held_out=False), search.compare(held_out=True)).plain()
+    summary = Summary(search, search.compare(held_out=False), search.compare(held_out=True)).data()
     return Tuning(config, summary, search.candidates, stages.cost, tuple(stages.scanned))
 
 

@@ -49,11 +49,11 @@ class Summary:
         self.search, self.table, self.config = search, search.table, search.scenarios.config
         self.best = {side: search.best(side) for side in search.sides}
         self.named, self.rows = named, held_out
-        self.of = {side: {row["name"]: row for row in held_out if row["side"] == side} for side in search.sides}
+        self.held_out = {side: {row["name"]: row for row in held_out if row["side"] == side} for side in search.sides}
         self.factors = {side: self._factors(side) for side in search.sides}
 
-    def plain(self) -> dict[str, Any]:
-        """All of it."""
+    def data(self) -> dict[str, Any]:
+        """What `tuning.json` holds."""
         search, table, sides = self.search, self.table, self.search.sides
         first, seeds = self.config.sweep.first_seed, self.config.sweep.seeds
         unit = SIDE_METRICS[f"{table.objective}_rmse"].unit
@@ -96,8 +96,8 @@ class Summary:
 
     def _factors(self, side: str) -> dict[str, Any]:
         """Other gains' figures over the tuned ones', on the held-out input; none for gains that do not always converge."""
-        tuned, out = self.of[side]["tuned"], {}
-        for name, row in self.of[side].items():
+        tuned, out = self.held_out[side]["tuned"], {}
+        for name, row in self.held_out[side].items():
             if name == "tuned":
                 continue
             if row["converged"] < 1.0 or tuned["converged"] < 1.0:
@@ -176,7 +176,7 @@ class Summary:
         return lines
 
     def _about_holdout(self, side: str) -> list[str]:
-        lines, tuned = [], self.of[side]["tuned"]
+        lines, tuned = [], self.held_out[side]["tuned"]
         bound, own = self.search.pilot[side]["holdout_f_plus"], self.search.f_plus[side]
         if bound > own:
             lines.append(
@@ -190,7 +190,7 @@ class Summary:
             )
         for name, found in self.factors[side].items():
             if "why_none" in found and tuned["converged"] == 1.0:
-                share = 100.0 * self.of[side][name]["converged"]
+                share = 100.0 * self.held_out[side][name]["converged"]
                 lines.append(
                     f"{side}: {called_gains(name)} converge in only {share:.3g} % of the held-out runs: no factor is stated."
                 )

@@ -1,7 +1,7 @@
 """Compilation of programs that run only a few times, as those of identification and diagnosis do.
 
-They compile for many seconds and run for less than one: options under which XLA compiles fast are worth more here than its
-fastest code. The engine of sweeps does not use them.
+They compile for longer than they run: options under which XLA compiles fast are worth more here than its fastest code.
+The engine of sweeps does not use them.
 """
 
 import functools
@@ -30,7 +30,8 @@ def _options() -> dict[str, bool]:
 
 
 def jit(function: Callable[..., Result]) -> Callable[..., Result]:
-    """`equinox.filter_jit` that compiles fast; in another program, whose options hold, the function as it is."""
+    """`equinox.filter_jit` that compiles fast. Inside `jax.jit`, `vmap` or a derivative it is the function as it is: call
+    these from within a compiled function."""
 
     @functools.cache
     def compiled() -> Callable[..., Result]:

@@ -14,7 +14,7 @@ from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 
 from .compilation import jit
-from .intervals import UNSEEN, Profile, Refusal, Spread, interval, spread
+from .intervals import NORMAL, UNSEEN, Profile, Refusal, Spread, interval, spread
 from .logs import LogTask, decimation, unit_on
 from .regression import Kinematics, errors, regress
 from .search import Found
@@ -72,7 +72,7 @@ def _derived(experiment: Experiment, found: Found) -> dict[str, Any]:
     derived = {}
     for name, value in values.items():
         error = float(jnp.sqrt(slopes[name] @ found.spread.covariance @ slopes[name]))
-        reach = [float(value) - 1.96 * error, float(value) + 1.96 * error]
+        reach = [float(value) - NORMAL * error, float(value) + NORMAL * error]
         derived[f"transmission.{name}"] = {"value": float(value), "standard_error": error, "interval": reach}
     return derived
 
@@ -162,8 +162,7 @@ def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mappin
             "matrix": width / np.outer(deviation, deviation),
         },
         "refused": [
-            {"direction": one.direction, "why": _why(one, fitted), "relative_deviation": one.deviation}
-            for one in found.refused
+            {"direction": one.direction, "why": _why(one), "relative_deviation": one.deviation} for one in found.refused
         ],
         "held": found.held,
         "condition": found.condition,
@@ -173,26 +172,25 @@ def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mappin
 
 
 _SHOWN_BY = {
-    "kg m²": "faster changes of torque",
-    "N m s/rad": "a wider range of speeds",
-    "N m/rad": "larger torques through the gear, near its resonance",
-    "rad": "reversals that cross the gap",
-    "1/rad": "slow passages through the gap",
-    "N m": "slow motion with reversals",
-    "": "a load or an inertia that is known",
+    "inertia": "faster changes of torque",
+    "viscous": "a wider range of speeds",
+    "stiffness": "larger torques through the gear, near its resonance",
+    "half_gap": "reversals that cross the gap",
+    "dead_zone": "reversals that cross the gap",
+    "slope": "slow passages through the gap",
+    "torque": "slow motion with reversals",
+    "relative": "a load or an inertia that is known",
 }
-"""Unit of a number -> what motion, or what else, would show it."""
+"""End of a number's path -> what motion, or what else, would show it."""
 
 
-def _why(refusal: Refusal, experiment: Experiment) -> str:
-    names, about = list(refusal.direction), leaf_paths(experiment)
+def _why(refusal: Refusal) -> str:
+    names = list(refusal.direction)
     if len(names) == 1:
         text = f"this log hardly depends on {names[0]}"
     else:
         text = "this log depends hardly on these changing together, by the shares given"
-    # angles of effects that repeat with position have no motion of their own
-    units = [about[path].unit for path in names if about[path].role is None or about[path].role.kind != "angle"]
-    shown_by = dict.fromkeys(_SHOWN_BY[unit] for unit in units if unit in _SHOWN_BY)
+    shown_by = dict.fromkeys(_SHOWN_BY[key] for path in names for key in _SHOWN_BY if path.endswith(key))
     helps = f"; what would help: {', or '.join(shown_by)}" if shown_by else ""
     size = f"{100.0 * refusal.deviation:.0f} %" if refusal.deviation < 100.0 else "anything"
     return f"{text}: it leaves {size} open (standard deviation){helps}"

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy import stats
+from scipy.special import chdtri, ndtri
 
 from jaxbl.simulate import Experiment
 
@@ -20,6 +20,8 @@ from .compilation import jit
 from .smoother import running_sum
 from .trajectory import Fit, Free, Windows, fits
 
+NORMAL = float(ndtri(0.975))
+"""Standard errors on either side of a value that a 95 % interval reaches to."""
 UNSEEN = 0.5
 """Relative standard deviation beyond which a direction counts as not shown by the record."""
 _PASSES = 4
@@ -101,7 +103,7 @@ def _long_run(scores: Float[Array, "samples parameters"]) -> Float[Array, "param
 
 def interval(one: Free, theta: float, deviation: float) -> tuple[float, float]:
     """95 % interval of a value, from its theta; never below zero where the value must be positive."""
-    reach = stats.norm.ppf(0.5 + 0.5 * 0.95) * deviation
+    reach = NORMAL * deviation
     low, high = (float(one.value(theta + side * reach)) for side in (-1.0, 1.0))
     return min(low, high), max(low, high)
 
@@ -153,7 +155,7 @@ def profile(experiment: Experiment, free: Sequence[Free], windows: Windows, best
     The likelihood counts residuals as many times as they are independent: its curvature is that of the covariance of
     :func:`spread`.
     """
-    count, limit = len(free), float(stats.chi2.ppf(0.95, 1))
+    count, limit = len(free), float(chdtri(1.0, 0.05))
     centre, covariance = np.asarray(best.theta), np.asarray(width.covariance)
     deviation = np.sqrt(np.diag(covariance))
     # residuals of noise alone have variance 1; what one of them counts follows from its correlation with its neighbours

@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxbl.drive.parameters import Scalar
+
 from .compilation import jit
 
 _SMOOTHNESS = 1e-14, 1e4
@@ -180,20 +182,20 @@ def _smoothed(position: Array, smoothness: Array, noise: Array, period: Array) -
 
 @jit
 def smooth(
-    position: Float[Array, " samples"], period: float, *, noise: float | None = None, jerk: float | None = None
+    position: Float[Array, " samples"], period: float | Scalar, *, known: tuple[Scalar, Scalar] | None = None
 ) -> Smoothed:
     """Smooth one evenly sampled position channel.
 
     Args:
         position: readings in rad (or m), at least 8 of them.
         period: sampling period in s.
-        noise: standard deviation of the readings' noise, quantisation included, in rad.
-        jerk: spectral density of the jerk in rad^2/s^5; without it and the noise both are found by maximum likelihood.
+        known: standard deviation of the readings' noise, quantisation included, in rad, and spectral density of the jerk in
+            rad^2/s^5; left out, both are found by maximum likelihood.
     """
     position = jnp.asarray(position, float)
-    if noise is None or jerk is None:
+    if known is None:
         smoothness, sigma = _fit(position)
     else:
-        sigma = jnp.asarray(noise, float)
-        smoothness = jnp.asarray(jerk * period**5) / sigma**2
+        sigma, jerk = (jnp.asarray(one, float) for one in known)
+        smoothness = jerk * period**5 / sigma**2
     return _smoothed(position, smoothness, sigma, jnp.asarray(period, float))

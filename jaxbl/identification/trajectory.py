@@ -475,9 +475,9 @@ def fits(
     """
     held = np.zeros(thetas.shape, bool) if held is None else held
 
-    def fitted(which: Any, fit: Callable[..., Fit]) -> Fit:
+    def fitted(which: Any, program: Callable[..., Fit]) -> Fit:
         start, still = jnp.asarray(thetas[which]), jnp.asarray(held[which])
-        return fit(experiment, tuple(free), windows, start, jnp.asarray(most_steps), still, jnp.asarray(rounds))
+        return program(experiment, tuple(free), windows, start, jnp.asarray(most_steps), still, jnp.asarray(rounds))
 
     count = len(thetas)
     if jax.default_backend() == "cpu":

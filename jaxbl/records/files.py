@@ -107,7 +107,7 @@ def _columns(path: Path) -> dict[str | int, Any]:
         with _reading("Parquet"):
             frame = pd.read_parquet(path)
         return {str(name): frame[name].to_numpy() for name in frame.columns}
-    # MATLAB 7.3 puts half a kilobyte before it
+    # an HDF5 file begins so; MATLAB 7.3 puts half a kilobyte of text before that
     if b"\x89HDF" in (content[:4], content[512:516]):
         return _hdf5(path)
     if suffix == ".mat":

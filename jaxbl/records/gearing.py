@@ -31,7 +31,7 @@ class Gearing(LostMotion):
         skew: by how much the stamps of theta_s are later than its readings, s, against those of theta_e; None where the
             log does not show it.
         skew_error: standard error.
-        residual: rms of the residual, at the motor, over the rms of theta_e about its mean.
+        residual: rms of the residual, at the motor, over the rms of theta_e about its mean; so is `twist_residual`.
         twist: range of theta_e - ratio theta_s, with the ratio that is expected, if one is; at the motor.
         least_twist: range of the twist with the ratio that was found.
         motion: range of theta_e.
@@ -106,8 +106,8 @@ def fit_gearing(
     if not np.isfinite(slopes).all():
         return None
     left, slope = target - rows[:, :4] @ slopes, float(slopes[0])
-    spread = float(np.std(target)) or 1e-300
-    residual = float(np.sqrt(np.mean(left**2))) / spread
+    spread = float(np.std(target))
+    residual = _rms(left) / spread if spread else np.inf
     # encoders are not late by many periods; and at one speed, to and fro, a delay looks like lost motion
     alike = abs(float(rows[:, 1] @ rows[:, 2])) / float(np.linalg.norm(rows[:, 1]) * np.linalg.norm(rows[:, 2]) + 1e-300)
     known = known and residual < UNRELATED and abs(skew) < 10.0 * period and alike < 0.97
@@ -123,14 +123,15 @@ def fit_gearing(
     slow = min(width, _width(motor[part], period) or width)
     lost = _lost_motion(times, motor, aligned, usable, period, 4.0 * slow, ratio, turn, wide=wide)
     if lost is None:
+        # no flank is in contact for long: from the rough regression
         lost = LostMotion.from_motion(2.0 * float(found[2]) * float(np.sign(found[0])), 2.0 * float(errors[2]))
     # how the gap is crossed is not modelled: 0.5 % of the gap, as found on motions of several frequencies
-    speed = float(np.sqrt(np.mean(rows[:, 1] ** 2)))
+    speed = _rms(rows[:, 1])
     skew_error = float(np.hypot(errors[1], 0.005 * lost.lost_motion / speed) / abs(found[0]))
     # with a gap as large as the motion a delay cannot be found
     known = known and not wide
     return Gearing(
-        **vars(replace(lost, twist_residual=lost.twist_residual / spread)),
+        **vars(replace(lost, twist_residual=lost.twist_residual / spread if spread else np.inf)),
         ratio=slope,
         ratio_error=float(np.hypot(slope_errors[0], slope * least / motion if wide else 0.0)),
         skew=skew if known else None,
@@ -249,7 +250,7 @@ def _lost_motion(
         return found.between(alone) if found and alone else found
     if found is None or found.lost_motion_error > 0.25 * abs(found.lost_motion):
         # at one speed, delays and wind-up look like lost motion: take a delay to be no more than a period
-        delay = ratio * period * float(np.sqrt(np.mean(velocity**2)))
+        delay = ratio * period * _rms(velocity)
         still = lost_motion.by_motion(twist, np.delete(terms, 1, axis=1), flank, clear, beside=delay)
         if still is not None and (found is None or still.lost_motion_error < 0.5 * found.lost_motion_error):
             found = still
@@ -260,7 +261,7 @@ def _lost_motion(
 
 
 def _rms(values: np.ndarray) -> float:
-    """Of a signal; never zero."""
+    """Root mean square; never zero, so that one can divide by it."""
     return float(np.sqrt(np.mean(values**2))) + 1e-300
 
 

@@ -23,10 +23,10 @@ class LostMotion:
         flank: what decides the flank: the direction of motion (with the load's inertia), or a load torque that changes its
             sign at some times, beside errors that repeat with position and direction.
         flank_changes: number of changes of the flank, from which the lost motion is found.
-        flank_times: times of these, s from the first sample, where the load made them.
-        lost_motion_range: 10 % and 90 % quantiles over the positions, where the load torque changes its sign.
-        twist_residual: rms of the twist that lost motion and wind-up do not explain; in a `Gearing` over the rms of theta_e
-            about its mean.
+        flank_times: times of these where the load made them, s; in a record from its first sample.
+        lost_motion_range: 10 % and 90 % quantiles over the positions, where the load torque changes its sign; else the
+            value.
+        twist_residual: rms of the twist that lost motion and wind-up do not explain.
     """
 
     lost_motion: float
@@ -38,12 +38,12 @@ class LostMotion:
     lost_motion_range: tuple[float, float]
     twist_residual: float
 
-    @classmethod
+    @staticmethod
     def from_motion(
-        cls, value: float, error: float, residual: float = math.inf, changes: int = 0, freedom: int = BLOCKS - 1
+        value: float, error: float, residual: float = math.inf, changes: int = 0, freedom: int = BLOCKS - 1
     ) -> "LostMotion":
-        """Where the direction of motion decides the flank; of no changes where no flank is in contact for long."""
-        return cls(value, error, _interval(value, error, freedom), "motion", changes, (), (value, value), residual)
+        """Where the direction of motion decides the flank."""
+        return LostMotion(value, error, _interval(value, error, freedom), "motion", changes, (), (value, value), residual)
 
     def between(self, other: "LostMotion") -> "LostMotion":
         """Anywhere between two that rest on different assumptions."""
@@ -226,7 +226,7 @@ def by_load(
 ) -> LostMotion | None:
     """From what changes between passes over the same places in the same direction; None where nothing clearly does.
 
-    Position and velocity are the load's, which repeats after a `turn`; None on a linear axis.
+    Position and velocity are the load's; gear and encoders repeat after a `turn` of it, None on a linear axis.
     """
     cells = _cells(times, twist, position, velocity, turn)
     if cells is None or len(cells.twist) < 24:

@@ -219,7 +219,7 @@ def _figures(file: LogFile, name: str, raw: RawChannel, segments: Segments, sour
 
 
 _PAUSE = 10
-"""Periods between logs that are joined: more than any gap that is bridged."""
+"""Periods between logs that are joined."""
 
 
 def join(records: Sequence[Record]) -> Record:

@@ -16,7 +16,7 @@ SIDES = ("motor", "load")
 
 # Okabe and Ito, in an order that also parts in grey
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-SIDE_COLOURS = {"motor": COLOURS[0], "load": COLOURS[1], "transmission": COLOURS[2]}
+SIDE_COLOURS = {"motor": COLOURS[0], "load": COLOURS[1]}
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 MAP = "viridis"
 MISSING = "#BDBDBD"

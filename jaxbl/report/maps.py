@@ -210,7 +210,8 @@ def _grid_of_axes(
     single: tuple[float, float] | None = None,
     beside: float = 0.0,
 ) -> tuple[Figure, list[Axes]]:
-    """Axes of so many panels, with labels where they are seen; sizes of a panel, of a single one, beside all (inches)."""
+    """Axes of so many panels, y label and numbers on the outer ones only; sizes (inches) of a panel, of one alone, and
+    beside all."""
     columns = 2 if count == 4 else min(count, 3)
     rows = -(-count // columns)
     size = (panel[0] * columns + beside, panel[1] * rows + 0.7) if single is None or count > 1 else single

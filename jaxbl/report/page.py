@@ -60,6 +60,9 @@ def save_all(drawn: Sequence[Drawn], folder: Path) -> list[tuple[Path, str]]:
     return [(save(one.figure, folder / "figures" / f"{one.name}.png"), one.caption) for one in drawn]
 
 
+_TITLES = {"identification": "Identification from", "diagnosis": "Diagnosis of"}
+
+
 def write_log_results(
     found: "Identification | Diagnosis",
     folder: Path,
@@ -74,7 +77,7 @@ def write_log_results(
     The files appear there once all are written, the summary last: it says that the results are complete. Returns the lines
     for the terminal.
     """
-    title = found.config.title or f"{name.capitalize()} of {found.record.path.name}"
+    title = found.config.title or f"{_TITLES[name]} {found.record.path.name}"
     with TemporaryDirectory(dir=folder, prefix=".draft.") as place:
         draft = Path(place)
         found.trace.to_parquet(draft / "trace.parquet", index=False)

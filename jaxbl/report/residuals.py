@@ -35,7 +35,8 @@ def draw_residuals(
     unit: str = "N m",
     observed: Mapping[str, Sequence[Observed]] | None = None,
 ) -> list[Drawn]:
-    """All figures of residual torques: by equation, of each part of the record; with the same torques by the observers."""
+    """All figures of residual torques (in `unit`): by side, of each part of the record; with the same torques by the
+    observers (`observed`) where these converge."""
     over = [_over_coordinates(residuals[name], coordinates[name], found[name], unit) for name in residuals]
     return [_over_time(residuals, found, unit, observed or {}), *over, _spectra(residuals, found, unit)]
 

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.drive.parameters import parameters
-from jaxbl.files import write_atomic
+from jaxbl.files import write_atomic, write_table
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.trial import Trial
 
@@ -23,7 +23,7 @@ def write_trial_report(trial: Trial, folder: Path) -> list[str]:
     """Write trace, summary, figures and report of a run into a folder that exists. Returns the lines for the terminal."""
     # the summary first: it is what makes the folder this study's
     write_atomic(folder / "summary.json", json.dumps(trial.summary, indent=2, ensure_ascii=False))
-    write_atomic(folder / "trace.parquet", trial.trace.to_parquet(index=False))
+    write_table(folder / "trace.parquet", trial.trace)
     metrics = trial.summary["metrics"]
     sides = [side for side in SIDES if f"{side}.converged" in metrics]
     rows = [

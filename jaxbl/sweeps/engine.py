@@ -65,7 +65,7 @@ def layout_for(config: Config, points: Points, devices: list[Any], backend: Back
 def _refined_layout(config: Config, devices: int, chunk: int | None) -> Layout:
     """Several seeds before whole rows of points: a batch has few points, and needs all seeds of them."""
     capacity = chunk or _REFINED_LANES_PER_DEVICE * devices
-    # leaves at least 64 points of each chunk to every device
+    # as many seeds as leave every device 64 points of a chunk
     seeds = min(config.sweep.seeds, max(capacity // (64 * devices), 1))
     return Layout(seeds, max(math.ceil(capacity / seeds / devices), 2) * devices)
 

@@ -36,9 +36,10 @@ class Metric(abc.ABC):
     doc: ClassVar[str]
 
     @classmethod
-    def of(cls, name: str, unit: str, label: str, doc: str, **methods: Any) -> type[Self]:
-        """A metric of this kind, with what the kind leaves open (`signal` of an rms or peak, `judge` of gains)."""
-        found: Any = type(name, (cls,), {"name": name, "unit": unit, "label": label, "doc": doc, **methods})
+    def of(cls, name: str, unit: str, label: str, doc: str, **rest: Any) -> type[Self]:
+        """A metric of this kind, with what the kind leaves open (`signal` of an rms or peak, `factor` of a
+        peak, `judge` of gains)."""
+        found: Any = type(name, (cls,), {"name": name, "unit": unit, "label": label, "doc": doc, **rest})
         return found
 
     def applies(self, experiment: Experiment) -> bool:

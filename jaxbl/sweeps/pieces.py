@@ -15,8 +15,8 @@ _SIZES = 1024, 8192
 def in_pieces(function: Callable[..., Any], columns: Sequence[np.ndarray], devices: Sequence[Any] | None = None) -> Any:
     """Apply an elementwise function to columns `(n,)`, piece by piece, on some devices (all local ones if left out).
 
-    The function takes arrays of one shape and gives any pytree of such; compiled by `jax.jit`, it is compiled once for all
-    calls. The result has NumPy arrays `(n,)` in their place.
+    The function takes arrays of one shape and gives any pytree of such; wrap it in `jax.jit`: all pieces have one of two
+    shapes. The result has NumPy arrays `(n,)` in their place.
     """
     count = len(columns[0])
     devices = list(jax.local_devices() if devices is None else devices)

@@ -15,16 +15,17 @@ import numpy as np
 from jaxbl.config import TOLERANCE, AxisTable, Config, with_values
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.errors import InputError
+from jaxbl.files import plain
 from jaxbl.validation import nearest
 
 from .metrics import metric_columns
 from .refine import CellGrid, Criterion
 
 AxisColumns = dict[str, np.ndarray]
-"""Values of axes that advance together, by path: columns of equal length."""
+"""Values by axis path, columns of equal length: of axes that advance together, or of points."""
 
 _MOST_RUNS = 1e10
-"""Days of computing on the fastest machines (benchmarks/NOTES.md): more is a slip in the axes."""
+"""A day of computing on two cores, of runs of 20 000 samples (docs/speed.md): more is a slip in the axes."""
 _MOST_VALUES = 10_000_000
 """Of one axis: its values are kept."""
 
@@ -82,7 +83,7 @@ class Points:
         self.groups = []
         for index in range(_points_of(structural)):
             values = {path: column[0] for path, column in _take(structural, np.array([index])).items()}
-            values = {path: v.item() if isinstance(v, np.generic) else v for path, v in values.items()}
+            values = {path: plain(v) for path, v in values.items()}
             self.groups.append(Group(with_values(base, values), values))
 
     def __len__(self) -> int:

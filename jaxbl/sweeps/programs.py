@@ -79,7 +79,8 @@ def compile_program(
 ) -> Program:
     """Compile one, inside :func:`jaxbl.config.precision`; `columns` is an example of the values, `(points,)` by path.
 
-    Where the fused loop cannot run the step, or no lane differs from another, the scan takes its place.
+    Where the fused loop cannot run the step, or no lane differs from another, the scan takes its place; with `insist` that
+    is refused.
 
     Raises:
         InputError: the fused loop was insisted on and cannot be had.

@@ -58,9 +58,8 @@ def _name_by_content(data: dict[str, Any], excitation: Any) -> None:
 
 
 def manifest_head(config: Config, command: str) -> dict[str, Any]:
-    """What a command's marker says of its study: its own identity, and that of the study's single run."""
-    own = {} if command == "simulate" else {"identity": identity(config, command)}
-    return own | {"single_run": identity(config, "simulate"), "title": config.title}
+    """What a command's manifest says of its study: its own identity, and that of the study's single run."""
+    return {"identity": identity(config, command), "single_run": identity(config, "simulate"), "title": config.title}
 
 
 def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bool = False) -> None:

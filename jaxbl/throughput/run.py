@@ -6,6 +6,7 @@ import platform
 import statistics
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, partial
 from importlib.metadata import version
@@ -280,8 +281,9 @@ def _study(count: int, devices: int, able: set[str], lanes: int) -> list[dict[st
 
 def _machine(count: int) -> dict[str, Any]:
     packages = ["jax", "numpy", "scipy", "llvmlite", "numba", "diffrax", "opensmc"]
-    about = Path("/proc/cpuinfo")
-    lines = about.read_text().splitlines() if about.exists() else []
+    lines: list[str] = []
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return {
         "processor": names[0] if names else platform.processor(),

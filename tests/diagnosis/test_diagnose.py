@@ -12,7 +12,7 @@ import jaxbl.diagnosis.diagnosis_summary as summary_module
 import jaxbl.diagnosis.effect_search as explain
 from jaxbl.config import read_config
 from jaxbl.diagnosis.diagnose import diagnose, run_diagnosis
-from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task, without_last_quarter
+from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task, split_off_last_quarter
 from jaxbl.diagnosis.next_experiment import next_experiment, tied, write_next_experiment
 from jaxbl.diagnosis.observer_residual import observed_torques
 from jaxbl.diagnosis.proof import is_better
@@ -95,7 +95,7 @@ def test_what_is_held_out_keeps_its_times_and_is_not_fitted(logs, found):
     assert task.holdout.segments == (slice(1500, 2000),)
     np.testing.assert_array_equal(task.holdout.time, whole.time)
     parts = dataclasses.replace(whole, segments=(slice(0, 700), slice(800, 1200), slice(1300, 2000)))
-    first, last = without_last_quarter(parts)
+    first, last = split_off_last_quarter(parts)
     assert first.segments == (slice(0, 700), slice(800, 1200), slice(1300, 1550))
     assert last.segments == (slice(1550, 2000),) and len(first.time) == 1550
     trace = found.trace

@@ -50,7 +50,7 @@ def batch(readings):
 
 def test_agrees_with_least_squares_over_all_states():
     _, readings = motion(1, 120)
-    found = smooth(jnp.asarray(readings), PERIOD, noise=NOISE, jerk=JERK)
+    found = smooth(jnp.asarray(readings), PERIOD, known=(NOISE, JERK))
     state, covariance = batch(readings)
     deviation = np.sqrt(np.einsum("tii->ti", covariance))
     # a hundredth of the backward filter's information counts twice at the first sample

@@ -193,7 +193,7 @@ def test_scales_that_one_record_cannot_part_are_refused():
     (direction,) = refused
     assert set(direction.direction) == set(paths)
     np.testing.assert_allclose(list(direction.direction.values()), 1.0, rtol=0.05)
-    # the gain held
+    # without the gain's column
     known = np.arange(3)
     refused, condition = refusals(free[:3], spread(found.only(known)))
     assert refused == []

@@ -101,7 +101,7 @@ def test_a_chunk_that_is_not_whole_is_computed_again(copy, finished, computed, d
     elif damage == "empty":
         part.touch()
     elif damage == "draft only":
-        part.with_suffix(".draft").write_bytes(content[:100])
+        part.with_name(f".{part.name}.1").write_bytes(content[:100])
     if damage in ("truncated", "empty"):
         with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged; run 'jaxbl sweep' again"):
             _ = load(copy).frame
