@@ -37,7 +37,8 @@ def setting(sides):
     return experiment, run(data, seed=1).trace
 
 
-def linear(tmp_path, sides, change=lambda e: e, theta=0.0, disturbed=0.0):
+def linear(tmp_path, sides, change=lambda e: e, theta=0.0, disturbed=0.0, idle=0):
+    """The model along a log, and `idle` times along the same without an input."""
     experiment, trace = setting(sides)
     log = tmp_path / "log.csv"
     trace[["t", "u", "theta_e", *(["theta_s"] if sides == 2 else [])]].to_csv(log, index=False)
@@ -50,7 +51,8 @@ def linear(tmp_path, sides, change=lambda e: e, theta=0.0, disturbed=0.0):
         smoothed[side] = one._replace(state=one.state + wave * np.array([1e-7, 1e-6, 1e-5]))
     segment = dataclasses.replace(segment, smoothed=smoothed)
     at = np.full(len(free), theta)
-    return Linear(change(experiment), free, at, np.full(len(free), 0.02), [segment])
+    segments = [segment, *([dataclasses.replace(segment, torque=np.zeros(len(segment)))] * idle)]
+    return Linear(change(experiment), free, at, np.full(len(free), 0.02), segments)
 
 
 def errors(model, forces=None):
@@ -141,6 +143,16 @@ def test_products_are_those_of_the_errors(tmp_path, sides):
     found = model.columns((), [1e-6] * sides, np.ones(sides)).products
     every = errors(model)
     assert found == pytest.approx(every.T @ every, rel=1e-6, abs=1e-9 * np.max(found))
+
+
+def test_a_candidate_may_act_in_one_part_only(tmp_path):
+    model = linear(tmp_path, 1, idle=1)
+    variants = variants_of(model.experiment, ["actuator.gain_error"], model.scales)
+    acting, idle = model.choose(variants).coefficients
+    assert np.isfinite(acting).all()
+    assert len(acting) == len(idle)
+    # one gain for both parts
+    np.testing.assert_array_equal(acting[: -model.states], idle[: -model.states])
 
 
 @pytest.mark.parametrize("growth", [0.0, 5.0, 10.0, 15.0, 20.0, 25.0])
