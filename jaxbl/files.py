@@ -113,12 +113,19 @@ def results_of(
     claim_log_folder(file.parent, task.record.path, overwrite=overwrite)
     with suppress(OSError, InputError):
         found = read_json(file)
-        if found.get("identity") == task.identity:
+        if found.get("identity") == task.identity and _is_newest(file):
             return found
     with removed_if_empty(file.parent):
         done = run(task)
         write(done, file.parent)
     return done.summary
+
+
+def _is_newest(summary: Path) -> bool:
+    """Whether the report beside a summary is its own: it is written before, that of another command in this folder later."""
+    with suppress(OSError):
+        return (summary.parent / "report.html").stat().st_mtime_ns <= summary.stat().st_mtime_ns
+    return False
 
 
 @contextmanager

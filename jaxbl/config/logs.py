@@ -11,7 +11,10 @@ class UncertaintyTable(Table):
     """How well the drive's numbers are known. Accepted in every study; simulate and sweep do not use it, tune can."""
 
     relative: float = Field(default=0.02, gt=0.0, description="relative standard deviation of every number not in exact")
-    exact: list[str] = Field(default=["drive.gear_ratio"], description="dotted paths of numbers that are known exactly")
+    exact: list[str] = Field(
+        default=["drive.gear_ratio"],
+        description="dotted paths of numbers that are known exactly, and names of effects that are surely not missing",
+    )
 
 
 class IdentifyTable(Table):

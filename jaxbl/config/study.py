@@ -80,7 +80,7 @@ class Config(Table):
         _check_effects(self)
         known = numeric_paths(self)
         for path in self.uncertainty.exact:
-            if path not in known and path != "drive.gear_ratio":
+            if path not in known and path != "drive.gear_ratio" and path not in EFFECTS:
                 raise wrong(f"uncertainty.exact: unknown path '{path}'; {nearest_path(path, known)}")
         return self
 

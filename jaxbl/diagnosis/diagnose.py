@@ -23,9 +23,11 @@ from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress
 
 from .coordinates import CoordinateValues, all_coordinates
-from .diagnosis_summary import extended_study, observers_say, rival_tables, summary_of, trace_of, where_lacking
+from .diagnosis_summary import extended_study, observers_say, rival_tables, summary_of, tested, trace_of, where_lacking
 from .diagnosis_task import DiagnosisTask, read_diagnosis_task
 from .effect_search import EffectSearch, Explanation
+from .expected_errors import expected_errors
+from .judgement import explained_share, judged
 from .localise import SIGNIFICANT, Localised, localise
 from .observer_residual import Observed, observed_torques
 from .proof import Proof, free_values
@@ -113,10 +115,13 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         search, found = _explained(setup)
         done()
         fitted, after, withdrawn = proof.accepted(search, found)
-        done()
         if withdrawn:
             found = search.without(found, withdrawn)
-        gap = proof.gap(fitted, after, found.wrong)
+        done()
+        expected = expected_errors(setup.holdout, fitted, after, proof.noise, setup.input_noise, found.model.linear.drive)
+        controls = proof.controls(search, fitted, after, found.wrong)
+        judgement = judged(found, fitted, after.errors, expected, controls, setup.prior)
+        found = judgement.found
         done()
         lacking_after = residual_torques(fitted.experiment, setup.fitted.segments)
         on_log, on_holdout = _paired(setup.lacking, lacking_after), _paired(proof.before.torques, after.torques)
@@ -130,7 +135,8 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         for side, one in about.items():
             summary["where"][side]["observed"] = one
         summary["notes"] += notes
-        summary["gap"] = gap
+        summary["explained_share"] = explained_share(setup.nominal, proof.before.errors, after.errors, expected)
+        summary["gap"] = proof.gap(fitted, after) | tested(judgement, expected, controls)
         if found.verdict == "unknown_effect":
             segments = setup.fitted.segments
             coordinates = all_coordinates(fitted.experiment, segments, lacking_after, setup.sliding)
@@ -158,22 +164,23 @@ def _paired(
 
 def new_search(setup: Setup, bound: float = np.inf) -> EffectSearch:
     """The search for effects on the log; `bound`: standard deviations that the model's own numbers may be off."""
-    return EffectSearch(setup.bare, setup.own, setup.prior.tolist(), setup.fitted.segments, bound)
+    exact = setup.task.config.uncertainty.exact
+    return EffectSearch(setup.bare, setup.own, setup.prior.tolist(), setup.fitted.segments, bound, exact)
 
 
 def _explained(setup: Setup) -> tuple[EffectSearch, Explanation]:
     """What the log says that the model lacks.
 
     Where two effects are missing at once, the model's own numbers may go wrong, and hide both. If they do, effects are
-    sought with these numbers held near to what is known of them; what that finds counts if it explains the log, with
-    numbers that stay there without being held.
+    sought with these numbers held near to what is known of them; what that finds counts if its numbers stay there without
+    being held, beside something unknown too: numbers that cannot be explain nothing.
     """
     search = new_search(setup)
     found = search.run()
     if not search.plausible(found):
         other = new_search(setup, _BOUND)
         again = other.run()
-        if again.verdict != "unknown_effect" and other.plausible(again):
+        if other.plausible(again):
             search, found = other, again
     if found.verdict == "no_discrepancy":
         _check_shown(setup, search.linear({}, np.zeros(len(setup.own))).shown())

@@ -20,11 +20,13 @@ from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 
 from .diagnosis_task import input_rms
-from .effect_search import FAR, Explanation, Finding, Model
+from .effect_search import Explanation, Finding, Model
+from .expected_errors import LEVEL, Expected
+from .judgement import Judgement
 from .localise import SIGNIFICANT, Localised
 from .neutral_effects import with_added
 from .observer_residual import Observed, compared
-from .proof import FittedModel, free_values
+from .proof import Control, FittedModel, free_values
 from .residuals import Residual
 from .sentences import sentence_of
 from .setup import Setup
@@ -50,8 +52,7 @@ def summary_of(setup: Setup, fitted: FittedModel, found: Explanation, withdrawn:
                 unit_on(record, f"{side}.torque", "N m"),
             )
             notes.append(f"{side}: a steady torque of less than about {least:.2g} {unit} would not have been seen.")
-    notes += _far_off(setup.own, values, task.config.uncertainty.relative)
-    if (noise := setup.torque_noise) > 0.0:
+    if (noise := setup.input_noise.unfelt) > 0.0:
         notes.append(
             f"The channel u carries noise of {noise:.2g} {unit_on(record, 'motor.torque', 'N m')} rms "
             f"({noise / input_rms(record):.1%} of the input) that the drive does not feel: models are driven by u smoothed "
@@ -105,25 +106,29 @@ def _finding(
     }
 
 
+def tested(judgement: Judgement, expected: Mapping[str, Expected], controls: Sequence[Control]) -> dict[str, Any]:
+    """What the held-out errors of a complete model would be, which of them are larger, and the controls."""
+    return {
+        "expected": {name: one._asdict() for name, one in expected.items()},
+        "test": {
+            "level": LEVEL,
+            "failed": judgement.failed,
+            "far": judgement.far,
+            "chance": judgement.chance,
+            "remainder": judgement.remainder,
+        },
+        "controls": {
+            one.kind: {"rmse": one.errors, "z": one.z} | ({"effect": one.effect} if one.effect else {}) for one in controls
+        },
+    }
+
+
 def where_lacking(record: Record, located: Mapping[str, Localised]) -> dict[str, Any]:
     """Where a model lacks torque, by side, with sentences in the log's units."""
     return {
         name: dataclasses.asdict(one) | {"sentence": sentence_of(one, unit_on(record, f"{name}.torque", "N m"))}
         for name, one in located.items()
     }
-
-
-def _far_off(own: Sequence[Free], values: Mapping[str, float], uncertainty: float) -> list[str]:
-    """Which numbers of the model ended where they hardly can be, as it says itself."""
-    lines = []
-    for one in own:
-        change = values[one.path] / one.nominal - 1.0 if one.nominal else 0.0
-        if abs(change) > FAR * uncertainty:
-            lines.append(
-                f"{one.path} had to change by {change:+.0%}, {abs(change) / uncertainty:.0f} times its [uncertainty]: "
-                "findings and it may compensate each other. Noise of the torque channel does it, or too small a relative."
-            )
-    return lines
 
 
 def observers_say(

@@ -25,7 +25,7 @@ from .candidates import SHARE, Candidate, Numbers, variants_of
 from .evidence import Evidence, evidence_of
 from .free_functions import functions_of
 from .linearised_model import DIVERGED, Linear, Predictor
-from .neutral_effects import candidates, complete
+from .neutral_effects import candidates, complete, corrected
 from .refit import Refined, refined
 from .whittle import Spectrum, spectrum_of
 
@@ -187,6 +187,7 @@ class EffectSearch:
         prior: Sequence[float],
         segments: Sequence[Segment],
         bound: float = np.inf,
+        exact: Collection[str] = (),
     ):
         """Prepare to explain a record.
 
@@ -195,10 +196,11 @@ class EffectSearch:
             free, prior: its own numbers that are not exactly known, and the relative standard deviation of each.
             segments: of the log.
             bound: standard deviations that each number may be off while effects are sought.
+            exact: dotted paths of numbers that are known, and names of effects that are surely not missing.
         """
         self.bound = bound
         self.nominal, self.free, self.prior = complete(experiment), tuple(free), np.asarray(prior)
-        self.lacking = candidates(experiment)
+        self.lacking = [name for name in candidates(experiment) if name not in exact and corrected(name) not in exact]
         self.segments = segments
         self.floor = FLOOR * sum(map(len, segments)) * len(experiment.sides)
         self._recent: dict[tuple, Linear] = {}

@@ -36,7 +36,7 @@ from jaxbl.simulate import Experiment, with_effects
 
 from .candidates import SHARE, SPACING, Candidate, MotionTorques, Part, all_of_the_input, forces_of, rms
 from .evidence import Products
-from .neutral_effects import bucket
+from .neutral_effects import bucket, corrected
 from .whittle import Spectrum, weighted_products
 
 _SAMPLES, _BLOCK, _NUMBERS = 1024, 128, 4
@@ -575,19 +575,14 @@ class Linear:
 
     def same(self, name: str) -> int | None:
         """Index of the model's own number that an effect is the error of."""
-        path = f"drive.{name.partition('.')[0]}_{_corrected(name)}"
+        path = corrected(name)
         return next((i for i, one in enumerate(self.free) if one.path == path), None)
 
     def nominal(self, name: str) -> float | None:
         """The number of the drive that an effect is the error of, if it is one and is not zero."""
-        number = _corrected(name)
-        value = 0.0 if number is None else float(getattr(self.experiment.drive, number)(name.partition(".")[0]))
+        path = corrected(name)
+        value = 0.0 if path is None else float(get_leaf(self.experiment, path))
         return value if value > 0.0 else None
-
-
-def _corrected(name: str) -> str | None:
-    """The drive's number that an effect is the error of, if any."""
-    return EFFECTS[name].corrects if name in EFFECTS else None
 
 
 def _least_squares(total: np.ndarray, precision: np.ndarray, centre: np.ndarray, reach: np.ndarray) -> np.ndarray:

@@ -30,6 +30,12 @@ def candidates(experiment: Experiment) -> list[str]:
     return names
 
 
+def corrected(name: str) -> str | None:
+    """Dotted path of the drive's number that an effect is the error of; None where it is of none."""
+    number = EFFECTS[name].corrects if name in EFFECTS else None
+    return None if number is None else f"drive.{name.partition('.')[0]}_{number}"
+
+
 def complete(experiment: Experiment) -> Experiment:
     """A model with all effects that it lacks at neutral numbers; array leaves."""
     added = [as_arrays(make_effect(name, **EFFECTS[name].neutral()), float) for name in candidates(experiment)]

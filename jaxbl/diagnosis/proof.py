@@ -20,6 +20,10 @@ _WORSE, _WORSE_SPEED = 1.02, 1.05
 """Errors of a model over those of the one given, or over the noise, up to which it is no worse: what numbers fitted on other
 data cost; of speeds the noise is known less well."""
 
+_BLOCKS = 16
+"""Of held-out data, over which errors are compared: many enough for a standard error, and longer than errors are correlated
+in most logs."""
+
 
 class FittedModel(NamedTuple):
     """A model with some effects, all numbers fitted.
@@ -29,14 +33,14 @@ class FittedModel(NamedTuple):
         experiment: the model.
         free: numbers that were fitted, its own first.
         theta: of these.
-        deviation: standard deviation of theta.
+        covariance: of theta.
     """
 
     names: tuple[str, ...]
     experiment: Experiment
     free: tuple[Free, ...]
     theta: np.ndarray
-    deviation: np.ndarray
+    covariance: np.ndarray
 
     @property
     def numbers(self) -> dict[str, dict[str, float]]:
@@ -46,7 +50,8 @@ class FittedModel(NamedTuple):
 
     def errors(self) -> dict[str, float]:
         """Standard errors of the values."""
-        return {one.path: float(one.slope(self.theta[i])) * self.deviation[i] for i, one in enumerate(self.free)}
+        deviation = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return {one.path: float(one.slope(self.theta[i])) * deviation[i] for i, one in enumerate(self.free)}
 
 
 def free_values(free: Sequence[Free], theta: np.ndarray) -> dict[str, float]:
@@ -57,7 +62,24 @@ def free_values(free: Sequence[Free], theta: np.ndarray) -> dict[str, float]:
 def fit_model(search: EffectSearch, numbers: Mapping[str, Mapping[str, float]], theta: np.ndarray) -> FittedModel:
     """A model with some effects, its own numbers and theirs fitted from given ones."""
     found = search.refitted({name: dict(one) for name, one in numbers.items()}, theta)
-    return FittedModel(tuple(numbers), found.experiment, found.linear.free, found.theta, found.deviation)
+    return FittedModel(tuple(numbers), found.experiment, found.linear.free, found.theta, found.covariance)
+
+
+class Control(NamedTuple):
+    """What must not do as well on what was held out as the model with effects.
+
+    Attributes:
+        kind: `wrong`, the best model with another effect in place of the last, or `permuted`, the torque that the effects
+            add, shuffled in time.
+        errors: rms, by channel.
+        z: standard errors by which the squared errors of the model with effects are smaller.
+        effect: the other one.
+    """
+
+    kind: str
+    errors: dict[str, float]
+    z: float
+    effect: str = ""
 
 
 class Proof:
@@ -87,7 +109,7 @@ class Proof:
             withdrawn.append(names[-1])
             names = names[:-1]
         own = self.setup.own
-        given = FittedModel((), self.setup.nominal, own, np.zeros(len(own)), self.setup.prior)
+        given = FittedModel((), self.setup.nominal, own, np.zeros(len(own)), np.diag(self.setup.prior**2))
         return given, self.before, withdrawn
 
     def _worse(self, after: Comparison) -> bool:
@@ -98,9 +120,37 @@ class Proof:
             for name, value in after.errors.items()
         )
 
-    def gap(self, fitted: FittedModel, after: Comparison, rival: Model | None) -> dict[str, Any]:
-        """Errors on held-out data before and after, the noise, and controls: the best model with a wrong effect (`rival`),
-        and what the model lacks in the wrong order."""
+    def controls(self, search: EffectSearch, fitted: FittedModel, after: Comparison, rival: Model | None) -> list[Control]:
+        """Controls of a model with effects; `rival`: the best one with a wrong effect, whose numbers are fitted as well."""
+        if not fitted.names:
+            return []
+        found = []
+        if rival is not None:
+            other = self.other.compare(fit_model(search, rival.numbers, rival.theta).experiment)
+            found.append(Control("wrong", other.errors, self._beaten(other, after), rival.names[-1]))
+        added = {
+            side: [one.torque - left.torque for one, left in zip(pieces, after.torques[side], strict=True)]
+            for side, pieces in self.before.torques.items()
+        }
+        shuffled = self.other.permuted(self.setup.nominal, added)
+        if shuffled is not None:
+            found.append(Control("permuted", shuffled.errors, self._beaten(shuffled, after)))
+        return found
+
+    def _beaten(self, control: Comparison, after: Comparison) -> float:
+        """Standard errors by which a model beats a control, block by block, each channel over its noise."""
+        gains = np.zeros(_BLOCKS)
+        for name, noise in self.noise.items():
+            if not name.startswith("velocity"):
+                with np.errstate(invalid="ignore", over="ignore"):
+                    more = np.square(control.samples[name] / noise) - np.square(after.samples[name] / noise)
+                    gains += [float(np.mean(one)) for one in np.array_split(more.ravel(), _BLOCKS)]
+        if not np.isfinite(gains).all():
+            return np.inf
+        return float(np.mean(gains) / max(np.std(gains, ddof=1) / np.sqrt(_BLOCKS), np.finfo(float).tiny))
+
+    def gap(self, fitted: FittedModel, after: Comparison) -> dict[str, Any]:
+        """Errors on held-out data before and after, and the noise."""
         task, other, nominal = self.setup.task, self.other, self.setup.nominal
         record, part = task.holdout, task.holdout.segments
         found: dict[str, Any] = {
@@ -118,7 +168,6 @@ class Proof:
             "holdout_rmse_after": after.errors,
             "noise_floor": self.noise,
             "free_run": {},
-            "controls": {},
         }
         for name, one in (("before", nominal), ("after", fitted.experiment)):
             errors, growth = other.free_run(one)
@@ -126,15 +175,6 @@ class Proof:
                 found["free_run"] = {"why_not": "small changes of the initial speed grow to the size of the motion"}
                 break
             found["free_run"][name] = errors
-        if rival is not None:
-            errors = other.compare(rival.linear.experiment).errors
-            found["controls"]["wrong"] = {"effect": rival.names[-1], "rmse": errors}
-        if fitted.names:
-            added = {
-                side: [one.torque - left.torque for one, left in zip(pieces, after.torques[side], strict=True)]
-                for side, pieces in self.before.torques.items()
-            }
-            found["controls"]["permuted"] = {"rmse": other.permuted(nominal, added).errors}
         return found
 
 

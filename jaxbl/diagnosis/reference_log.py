@@ -34,6 +34,8 @@ _LEAST_IN_WINDOW = 20
 """Samples of a window at least: ten times the states that are fitted to it."""
 _SHUFFLED = 0.5
 """Length of the blocks that a permuted residual is made of, s: longer than a torque's own changes last."""
+_STEADY = 0.3
+"""Change by the shuffling, over the torque, up to which it is no control: of unrelated torques it is 1.4."""
 PREDICTABLE = 0.02
 """Share of the motion that the initial speed's uncertainty may grow to where a free run is to say anything."""
 _STATES, _STATES_OF_ONE_RUN = 8, 3
@@ -51,10 +53,13 @@ class Comparison(NamedTuple):
     Attributes:
         errors: rms, by channel (`theta_e`, `theta_s`, `velocity_motor`, ..., `torque_motor`, ...).
         torques: that the model lacks, by side, segment by segment.
+        samples: the errors one by one, in the order of time; of positions and speeds shape (windows, samples), of torques
+            behind the low-pass (samples,).
     """
 
     errors: dict[str, float]
     torques: dict[str, list[Residual]]
+    samples: dict[str, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,12 +96,12 @@ class ReferenceLog:
         found = {POSITION_CHANNELS[side]: noise for side, noise in self.noise.items()}
         for side in self.noise:
             found[f"velocity_{side}"] = _rms([np.asarray(one.smoothed[side].deviation(1)) for one in self.segments])
-        return found | self._torque_figures(torques, "deviation")
+        return found | {name: _rms([one]) for name, one in self._narrowed(torques, "deviation").items()}
 
-    def _torque_figures(self, torques: Mapping[str, Sequence[Residual]], name: str = "torque") -> dict[str, float]:
-        """Rms of missing torques, or of their noise, behind the low-pass, N m."""
+    def _narrowed(self, torques: Mapping[str, Sequence[Residual]], name: str = "torque") -> dict[str, np.ndarray]:
+        """Missing torques, or their noise, behind the low-pass, N m."""
         return {
-            f"torque_{side}": _rms([getattr(narrowed(one, self.bandwidth[side])[0], name) for one in pieces])
+            f"torque_{side}": np.concatenate([getattr(narrowed(one, self.bandwidth[side])[0], name) for one in pieces])
             for side, pieces in torques.items()
         }
 
@@ -124,8 +129,8 @@ class ReferenceLog:
         for side, table in (added or {}).items():
             pieces = zip(torques[side], self._rows(), strict=True)
             torques[side] = [dataclasses.replace(one, torque=one.torque - table[rows]) for one, rows in pieces]
-        errors = self._errors(driven, *self.windows(driven), _STATES)
-        return Comparison(errors | self._torque_figures(torques), torques)
+        samples = self._samples(driven, *self.windows(driven), _STATES) | self._narrowed(torques)
+        return Comparison(_all_rms(samples), torques, samples)
 
     def _rows(self) -> list[np.ndarray]:
         """Sampling periods from the log's first sample to each sample, segment by segment."""
@@ -152,37 +157,38 @@ class ReferenceLog:
         spare = max(longest.bit_length() - 4, 0)
         windows, firsts = windows_of(self.segments, experiment, longest >> spare << spare, self.rest)
         windows, firsts = windows.only(np.arange(1)).padded(1), firsts[:1]
-        errors = self._errors(experiment, windows, firsts, _STATES_OF_ONE_RUN, alone=True)
+        errors = _all_rms(self._samples(experiment, windows, firsts, _STATES_OF_ONE_RUN, alone=True))
         first = next(one for one in self.segments if one.rows.start == firsts[0])
         deviation = {side: float(np.median(np.asarray(one.deviation(1)))) for side, one in first.smoothed.items()}
         return errors, _growth(experiment, windows, deviation)
 
-    def _errors(
+    def _samples(
         self, experiment: Experiment, windows: Windows, firsts: np.ndarray, passes: int, *, alone: bool = False
-    ) -> dict[str, float]:
+    ) -> dict[str, np.ndarray]:
+        """Errors of positions and speeds, shape (windows, samples)."""
         rows = firsts[:, None] + np.arange(windows.torque.shape[1])[None, :]
         residual, start = _residuals(experiment, windows, passes, self.rest)
         residual = np.asarray(residual)[: len(firsts)]
         run = _run(experiment, windows, start) if alone else _paths(experiment, windows, start)
-        found = {
-            POSITION_CHANNELS[side]: self.noise[side] * _rms([residual[:, :, i]]) for i, side in enumerate(experiment.sides)
-        }
+        found = {POSITION_CHANNELS[side]: self.noise[side] * residual[:, :, i] for i, side in enumerate(experiment.sides)}
         for side in experiment.sides:
             smoothed = np.full(self.segments[-1].rows.stop, np.nan)
             for one in self.segments:
                 smoothed[one.rows] = np.asarray(one.smoothed[side].velocity)
-            found[f"velocity_{side}"] = _rms([np.asarray(run.velocity[side])[: len(firsts)] - smoothed[rows]])
+            found[f"velocity_{side}"] = np.asarray(run.velocity[side])[: len(firsts)] - smoothed[rows]
         return found
 
-    def permuted(self, experiment: Experiment, added: Mapping[str, Sequence[np.ndarray]]) -> Comparison:
+    def permuted(self, experiment: Experiment, added: Mapping[str, Sequence[np.ndarray]]) -> Comparison | None:
         """Errors of the nominal model with what the extended one adds on each side, N m, segment by segment, in the wrong
-        order: blocks of time, shuffled."""
+        order: blocks of time, shuffled. None where that makes no difference, as with a constant."""
         at = np.concatenate(self._rows())
         order = _order(len(at), max(round(_SHUFFLED / self.period), 1), np.random.default_rng(0))
-        tables = {side: np.zeros(at[-1] + 1) for side in experiment.sides}
+        tables, changed = {side: np.zeros(at[-1] + 1) for side in experiment.sides}, False
         for side, table in tables.items():
-            table[at] = np.concatenate(list(added[side]))[order]
-        return self.compare(experiment, tables)
+            torque = np.concatenate(list(added[side]))
+            table[at] = torque[order]
+            changed |= _rms([torque[order] - torque]) > _STEADY * _rms([torque])
+        return self.compare(experiment, tables) if changed else None
 
 
 class _KnownTorque(SideEffect):
@@ -236,6 +242,10 @@ def _growth(experiment: Experiment, windows: Windows, deviation: dict[str, float
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         change = {side: _rms([np.asarray(other[side] - one[side])]) / step for side in experiment.sides}
         return float(np.max([change[side] / np.std(windows.measured[side][0]) for side in experiment.sides]))
+
+
+def _all_rms(samples: Mapping[str, np.ndarray]) -> dict[str, float]:
+    return {name: _rms([one]) for name, one in samples.items()}
 
 
 def _rms(pieces: Sequence[np.ndarray]) -> float:

@@ -38,7 +38,7 @@ class Refined(NamedTuple):
     Attributes:
         experiment: with these numbers.
         theta: of the free ones.
-        deviation: standard deviation of theta, of data and prior together.
+        covariance: of theta, of data and prior together.
         smoothness: of the predictor, by side.
         start: positions and velocities at the first sample of each part, side by side, rad and rad/s.
         linear: the model along the path of its predictor, with the numbers that were free.
@@ -46,10 +46,15 @@ class Refined(NamedTuple):
 
     experiment: Experiment
     theta: np.ndarray
-    deviation: np.ndarray
+    covariance: np.ndarray
     smoothness: list[float]
     start: list[np.ndarray]
     linear: Linear
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """Standard deviation of theta."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
 
 class _Point(NamedTuple):
@@ -127,8 +132,8 @@ class _Refiner:
                     share *= 0.25
         return best
 
-    def deviation(self, point: _Point) -> np.ndarray:
-        """Standard deviations of theta: of the errors, which may be correlated, and the prior together."""
+    def covariance(self, point: _Point) -> np.ndarray:
+        """Covariance of theta: of the errors, which may be correlated, and the prior together."""
         linear, own, sides = point.linear, len(self.free), len(self.experiment.sides)
         residual, jacobian = [], []
         for errors in linear.errors(point.predictor.smoothness):
@@ -150,7 +155,7 @@ class _Refiner:
         information, sandwich = real * np.asarray(found.information), np.asarray(found.covariance)
         prior = np.diag(self.width**-2.0)
         inverse = np.linalg.inv(information + prior)
-        return np.sqrt(np.maximum(np.diag(inverse @ (information @ sandwich @ information + prior) @ inverse), 0.0))
+        return inverse @ (information @ sandwich @ information + prior) @ inverse
 
 
 def refined(
@@ -160,4 +165,4 @@ def refined(
     refiner = _Refiner(experiment, free, width, segments)
     best = refiner.run(np.asarray(theta))
     model = with_fitted(experiment, free, jnp.asarray(best.theta))
-    return Refined(model, best.theta, refiner.deviation(best), best.predictor.smoothness, best.start, best.linear)
+    return Refined(model, best.theta, refiner.covariance(best), best.predictor.smoothness, best.start, best.linear)

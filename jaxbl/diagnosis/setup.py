@@ -30,6 +30,18 @@ _SHOWN = 3.0
 """Nats from which on it counts as shown that the drive did not: odds of twenty."""
 
 
+class InputNoise(NamedTuple):
+    """White noise of the channel that recorded the input.
+
+    Attributes:
+        unfelt: what the drive surely did not feel, N m; models are driven by an input without it.
+        possible: what it may not have felt, N m: all of it unless it surely did.
+    """
+
+    unfelt: float
+    possible: float
+
+
 class Setup(NamedTuple):
     """The nominal model and the logs.
 
@@ -46,7 +58,7 @@ class Setup(NamedTuple):
         lacking: torques that the model lacks on the log, by side, segment by segment.
         coordinates: along these torques.
         located: where it lacks them, by side.
-        torque_noise: of the channel that recorded the input, N m, which both logs are without; 0 where the drive felt it.
+        input_noise: of the channel that recorded the input.
     """
 
     task: DiagnosisTask
@@ -61,7 +73,7 @@ class Setup(NamedTuple):
     lacking: dict[str, list[Residual]]
     coordinates: dict[str, list[dict[str, CoordinateValues]]]
     located: dict[str, Localised]
-    torque_noise: float
+    input_noise: InputNoise
 
 
 def set_up(task: DiagnosisTask) -> Setup:
@@ -81,9 +93,9 @@ def set_up(task: DiagnosisTask) -> Setup:
     rest = config.log.initial_state == "rest"
     recorded, held = (segments_of(one, nominal.sides) for one in (record, task.holdout))
     _check_stable(task, nominal, ReferenceLog(recorded, {}, rest))
-    noise, segments = _torque_noise(input_rms(record), nominal, own, recorded), recorded
-    if noise > 0.0:
-        segments, held = (_quiet(some, noise) for some in (recorded, held))
+    noise, segments = _input_noise(input_rms(record), nominal, own, recorded), recorded
+    if noise.unfelt > 0.0:
+        segments, held = (_quiet(some, noise.unfelt) for some in (recorded, held))
     lacking = residual_torques(nominal, segments)
     sliding = [side for side in nominal.sides if record.findings.channels[POSITION_CHANNELS[side]].unit == "m"]
     coordinates = all_coordinates(nominal, segments, lacking, sliding)
@@ -101,17 +113,18 @@ def _quiet(segments: Sequence[Segment], noise: float) -> list[Segment]:
     return [dataclasses.replace(one, torque=smoothed_input(one.torque, noise)) for one in segments]
 
 
-def _torque_noise(size: float, nominal: Experiment, own: Sequence[Free], segments: Sequence[Segment]) -> float:
-    """Noise of the channel that recorded the input, N m, where the drive does not feel it; 0 where it does, or where it is
-    small beside the input's rms `size`."""
+def _input_noise(size: float, nominal: Experiment, own: Sequence[Free], segments: Sequence[Segment]) -> InputNoise:
+    """Noise of the channel that recorded the input, and whether the drive felt it; where it is small beside the input's rms
+    `size`, that is not asked."""
     noise = white_noise([one.torque for one in segments])
     if not _NOISY * size < noise:
-        return 0.0
+        return InputNoise(0.0, noise)
     # the model as given: numbers that may change would absorb some of the noise
     none, width = np.zeros(len(own)), np.ones(len(own))
     given, smooth = (Linear(nominal, own, none, width, some, none) for some in (segments, _quiet(segments, noise)))
     smoothness = given.choose(()).smoothness
-    return noise if unfelt(given.left(smoothness), smooth.left(smoothness)) > _SHOWN else 0.0
+    shown = unfelt(given.left(smoothness), smooth.left(smoothness))
+    return InputNoise(noise if shown > _SHOWN else 0.0, noise if shown > -_SHOWN else 0.0)
 
 
 def _check_order(bare: Experiment, nominal: Experiment) -> None:

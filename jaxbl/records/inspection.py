@@ -234,9 +234,11 @@ def _stiffness(record: Record, speed: np.ndarray, ratio: float, noise: float) ->
         targets.append(smooth[:, 0])
         rows.append(np.column_stack([smooth[:, 1:], np.ones(len(smooth))]))
     found, errors = jackknifed(np.concatenate(targets), np.concatenate(rows))
+    if not np.isfinite(found[0]):
+        return Judgement("stiffness", "weak", "the log is too short to see how the twist follows the torque")
     reach = abs(float(found[0])) * float(np.std(torque))
     unit = record.findings.channels["theta_e"].unit
-    if not np.isfinite(found[0]) or found[0] < 5.0 * errors[0] or reach < noise:
+    if found[0] < 5.0 * errors[0] or reach < noise:
         return Judgement("stiffness", "weak", f"the twist hardly follows the torque (it winds up {reach:.2g} {unit} rms)")
     return Judgement(
         "stiffness", "yes", f"the twist follows the torque: {reach:.2g} {unit} rms against a noise of {noise:.2g}"

@@ -44,21 +44,60 @@ def _headline(summary: dict[str, Any]) -> list[str]:
         if one["alternatives"]:
             others = ", ".join(f"{other['effect']} ({probability(other['confidence'])})" for other in one["alternatives"])
             lines.append(f"  Not ruled out by this log: {others}.")
-    return [*lines, *_gap_lines(summary["gap"])]
+    return [*lines, *_reasons(summary), *_gap_lines(summary["gap"])]
+
+
+_NO_MORE = "no more is left on data not used for the fit than noise and the uncertainty of the model's numbers account for"
 
 
 def verdict_sentence(summary: Mapping[str, Any]) -> str:
     """The verdict in one sentence."""
     names = " and ".join(one["effect"] for one in summary["findings"])
+    them = "it" if len(summary["findings"]) == 1 else "them"
     if summary["verdict"] == "explained":
-        them = "it" if len(summary["findings"]) == 1 else "them"
-        return f"Explained: the model lacks {names}; with {them} only noise remains."
+        return f"Explained: the model lacks {names}; with {them}, {_NO_MORE}."
     if summary["verdict"] == "no_discrepancy":
-        return "No discrepancy: the residual of the model is noise."
+        return f"No discrepancy: {_NO_MORE}."
     where = "; ".join(one["sentence"] for one in summary.get("where_after", summary["where"]).values())
-    if names:
-        return f"Unknown effect: the model lacks {names}, which explains a part only. The residual that remains: {where}."
-    return f"Unknown effect: no known effect explains the residual: {where}."
+    if not names:
+        return f"Unknown: no known effect explains what is missing: {where}."
+    share, test = _share(summary["explained_share"]), summary["gap"]["test"]
+    rest = ", but not in a way that can be right"
+    if test["failed"] or test["remainder"]:
+        rest = f". The rest is none of the known effects: {where}"
+    return (
+        f"Partly explained: the model lacks {names}; with {them}, {share} of the missing torque is explained on data not "
+        f"used for the fit{rest}."
+    )
+
+
+def _share(value: float | None) -> str:
+    return "none" if value is None or value < 0.005 else f"{100.0 * value:.{0 if value < 0.99 else 1}f} %"
+
+
+def _reasons(summary: Mapping[str, Any]) -> list[str]:
+    """Why a model does not count as complete, one line each."""
+    gap, test, lines = summary["gap"], summary["gap"]["test"], []
+    if test["failed"]:
+        over = [
+            f"{name} {rms_text(gap['holdout_rmse_after'][name])} {gap['units'][name]} "
+            f"(at most {rms_text(gap['expected'][name]['limit'])})"
+            for name in test["failed"]
+        ]
+        lines.append(
+            "More is left than noise, the uncertainty of the numbers and torques too small to be named account for "
+            f"({100.0 * test['level']:.0f} % test): {'; '.join(over)}."
+        )
+    for path, z in test["far"].items():
+        number = summary["parameters"][path]
+        change = f" by {number['value'] / number['nominal'] - 1.0:+.0%}" if number["nominal"] else ""
+        lines.append(
+            f"{path} had to change{change}, {abs(z):.0f} times its [uncertainty]: findings and it may compensate each "
+            "other. Noise of the torque channel does it, or too small a relative."
+        )
+    if test["chance"]:
+        lines.append("Shuffled in time, the torque that was added does as well.")
+    return lines
 
 
 def _number(leaf: str, one: Mapping[str, Any]) -> str:
@@ -116,14 +155,25 @@ def _remarks(summary: dict[str, Any]) -> list[str]:
             f"Remaining: {_FREE.get(kind, kind)} on the {side} side ({100.0 * one['share']:.2g} % of the driving torque, "
             f"evidence {one['evidence']:.3g} nats)."
         )
+    after = summary["gap"]["holdout_rmse_after"]
     for name, control in summary["gap"]["controls"].items():
         effect = f" ({control['effect']})" if "effect" in control else ""
-        channel = next(iter(control["rmse"]))
+        channel = max(summary["gap"]["expected"], key=lambda name: _worse(control["rmse"], after, name))
         what = {"wrong": "the best model with another effect", "permuted": "the missing torque shuffled in time"}[name]
         left = control["rmse"][channel]
-        error = "diverges" if left is None else f"leaves {rms_text(left)} {summary['gap']['units'][channel]} in {channel}"
+        error = "diverges"
+        if left is not None:
+            beaten = f"{abs(control['z']):.1f} standard errors {'worse' if control['z'] > 0.0 else 'better'}"
+            unit = summary["gap"]["units"][channel]
+            error = f"leaves {rms_text(left)} {unit} in {channel} in place of {rms_text(after[channel])}; it is {beaten}"
         lines.append(f"Control: {what}{effect} {error}.")
     return [*lines, *summary["notes"]]
+
+
+def _worse(control: Mapping[str, float | None], after: Mapping[str, float | None], name: str) -> float:
+    """How much larger a control's error is; most where it diverges."""
+    one, other = control[name], after[name]
+    return np.inf if one is None or other is None else one / max(other, np.finfo(float).tiny)
 
 
 def _by_observer(side: str, where: Mapping[str, Any], units: Mapping[str, str]) -> str:
@@ -163,10 +213,12 @@ def _gap_table(gap: Mapping[str, Any]) -> PageTable:
     controls = gap["controls"]
     rows = [
         [_CHANNELS[name], gap["units"][name], before, gap["holdout_rmse_after"][name], gap["noise_floor"][name]]
+        + [gap["expected"].get(name, {}).get("limit")]
         + [one["rmse"].get(name) for one in controls.values()]
         for name, before in gap["holdout_rmse_before"].items()
     ]
-    return PageTable("Held-out data, rms", ["channel", "unit", "before", "after", "noise", *controls], rows)
+    head = ["channel", "unit", "before", "after", "noise", "complete model at most", *controls]
+    return PageTable("Held-out data, rms", head, rows)
 
 
 def _number_table(summary: Mapping[str, Any]) -> PageTable:
@@ -196,9 +248,10 @@ def _verdict(summary: Mapping[str, Any]) -> Drawn:
     _chances_panel(right, bars)
     caption = (
         f"{verdict_sentence(summary)} Left: rms error on held-out data over the channel's noise; arrows lead from the model "
-        "as given to the model with the missing effects. Black line: noise, the error of a perfect model. Controls, which "
-        "must not help: the best model with another effect, and the added torque shuffled in time. Right: probability of "
-        "each effect, and of the effects that this log does not rule out instead."
+        "as given to the model with the missing effects. Black line: noise; bars: the most that noise, the uncertainty of "
+        "the numbers and torques too small to be named leave of a complete model. Controls, which must do worse: "
+        "another effect at its best, and the added torque shuffled in time. Right: probability of each effect, and of those "
+        "that this log does not rule out instead."
     )
     return Drawn("gap", figure, caption)
 
@@ -218,8 +271,10 @@ def _gap_panel(ax: Axes, gap: Mapping[str, Any], names: list[str]) -> None:
     ax.plot(before, rows, "D", color=_BEFORE, ms=7, ls="none", label="before", zorder=4)
     ax.plot(after, rows, "o", color=_AFTER, ms=7, ls="none", label="after", zorder=5)
     ax.axvline(1.0, color=_FLOOR, lw=1.6, label="noise")
+    limits = np.array([gap["expected"].get(name, {}).get("limit", np.nan) for name in names], float) / floor
+    ax.plot(limits, rows, "|", color=_FLOOR, ms=16, mew=2.0, ls="none", label="a complete model at most", zorder=3)
     markers = {"wrong": ("x", "another effect"), "permuted": ("+", "shuffled in time")}
-    every = [before, after]
+    every = [before, after, limits]
     for name, control in gap["controls"].items():
         marker, label = markers[name]
         if "effect" in control:

@@ -22,7 +22,8 @@ _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 2rem auto; max-width: 72rem; padding: 0 1rem; }
 h1 { font-size: 1.6rem; margin-bottom: 0.2rem; } h2 { font-size: 1.2rem; margin-top: 2rem; }
 .lead { font-size: 1.1rem; } figure { margin: 1rem 0 1.5rem; } figcaption { color: #555; font-size: 0.95rem; }
-img { max-width: 100%; height: auto; } table { border-collapse: collapse; font-size: 0.95rem; }
+img { max-width: 100%; height: auto; }
+table { border-collapse: collapse; font-size: 0.95rem; display: block; overflow-x: auto; }
 th, td { padding: 0.25rem 0.8rem; border-bottom: 1px solid #ddd; text-align: left; }
 td.number { text-align: right; font-variant-numeric: tabular-nums; }
 pre { background: #f5f5f5; padding: 1rem; overflow-x: auto; font-size: 0.85rem; }

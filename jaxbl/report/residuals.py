@@ -144,6 +144,7 @@ def _means(ax: Axes, coordinate: Coordinate) -> None:
 
 
 def _spectra(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, Localised], unit: str) -> Drawn:
+    marked = False
     figure, axes = stacked(len(residuals), 2.5, "frequency (Hz)", sharex=False)
     for ax, (name, parts) in zip(axes, residuals.items(), strict=True):
         longest = max(parts, key=lambda part: len(part.time))
@@ -163,11 +164,13 @@ def _spectra(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, Lo
                 xytext=(5, 2), textcoords="offset points", fontsize=8, va="center",
             )  # fmt: skip
             ax.plot(peak.frequency, peak.amplitude, "v", ms=5, color=_MEAN)
+            marked = True
         ax.set_ylabel(with_unit(f"{name}:\namplitude per line", unit))
         legend(ax, 3)
     caption = (
         "Spectrum of the missing torque and of its noise. The noise of an acceleration grows with the square of the "
-        "frequency, up to the smoother's bandwidth; power above the dashed line is missing from the model. Marked: narrow "
-        "peaks that the motion does not have."
+        "frequency, up to the smoother's bandwidth; power above the dashed line is missing from the model."
     )
+    if marked:
+        caption += " Marked: narrow peaks that the motion does not have."
     return Drawn("residual_spectrum", figure, caption)

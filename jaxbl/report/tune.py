@@ -125,9 +125,10 @@ def _comparison(tuning: Tuning, sides: list[str]) -> Drawn:
     axes[0].set_yticks(range(len(names)), names)
     axes[0].invert_yaxis()
     first, last = tuning.summary["holdout"]["seeds"]
+    seeds = f"seeds {first} to {last}" if last > first else f"seed {first}"
     caption = (
-        f"The gains {_where(tuning.summary)}, noise seeds {first} to {last}: worst of all runs, and the median (stroke). "
-        "Hatched: some runs did not converge."
+        f"The gains {_where(tuning.summary)}, noise {seeds}: worst of all runs, and the median (stroke). Hatched: some runs did "
+        "not converge."
     )
     return Drawn("tuning_holdout", figure, caption)
 

@@ -246,11 +246,11 @@ def _headline(verdict: Verdict) -> list[str]:
         if claimed["too_small"] is not None and level["level"] == "drive":
             # where nothing accelerates there is no factor
             most = claimed["true_over_claimed"]["max"]
-            lines.append(
-                f"{level['side']}: the paper's bound f⁺, twice the largest acceleration, is too small in "
-                f"{100.0 * claimed['too_small']:.0f} % of the converged runs"
-                + ("." if most is None else f", by a factor of up to {most:.3g}.")
-            )
+            share = f"is too small in {100.0 * claimed['too_small']:.0f} % of the converged runs"
+            if claimed["too_small"] == 0.0:
+                share = "is large enough in all converged runs"
+            size = "" if most is None else f"; the true bound is up to {most:.3g} times as large"
+            lines.append(f"{level['side']}: the bound f⁺ as twice the largest acceleration {share}{size}.")
     return lines
 
 

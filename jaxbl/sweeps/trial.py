@@ -176,7 +176,7 @@ def _remarks(experiment: Experiment, last: dict[str, Any], metrics: dict[str, An
             if values is None or values["least_lambda"]["exact"] is None:
                 continue
             missed = [
-                f"{CONDITIONS[name].title} by a factor of {least / found['lambda']:.3g} (more than {least:.3g})"
+                f"{CONDITIONS[name].title} by a factor of {least / found['lambda']:.4g} (more than {least:.4g})"
                 for name, least in values["least_lambda"].items()
                 if found["lambda"] <= least
             ]

@@ -11,7 +11,7 @@ from hidden_log import FRICTION, driven, logged, model
 import jaxbl.diagnosis.diagnosis_summary as summary_module
 import jaxbl.diagnosis.effect_search as explain
 from jaxbl.config import read_config
-from jaxbl.diagnosis.diagnose import diagnose, run_diagnosis
+from jaxbl.diagnosis.diagnose import diagnose, new_search, run_diagnosis
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task, split_off_last_quarter
 from jaxbl.diagnosis.next_experiment import next_experiment, tied, write_next_experiment
 from jaxbl.diagnosis.observer_residual import observed_torques
@@ -19,7 +19,6 @@ from jaxbl.diagnosis.proof import is_better
 from jaxbl.diagnosis.setup import set_up
 from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.errors import InputError
-from jaxbl.identification.trajectory import Free
 from jaxbl.records import read_record
 from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
 
@@ -70,7 +69,8 @@ def test_the_motion_tells_whether_noise_of_the_input_was_felt(felt, tmp_path):
     task = read_diagnosis_task(tmp_path / "axis.csv", model())
     with jax.enable_x64(True):
         setup = set_up(task)
-    assert setup.torque_noise == (0.0 if felt else pytest.approx(0.02, rel=0.1))
+    expected = 0.0 if felt else pytest.approx(0.02, rel=0.1)
+    assert setup.input_noise == (expected, expected)
     for log, record in ((setup.fitted, task.record), (setup.holdout, task.holdout)):
         ((segment,), (rows,)) = log.segments, record.segments
         assert np.array_equal(segment.torque, record.torque[rows]) is felt
@@ -154,11 +154,23 @@ def test_the_model_that_was_found_lacks_nothing_on_another_log(logs, found, tmp_
     assert friction.torque == pytest.approx(FRICTION["torque"], rel=0.02)
 
 
-def test_a_number_that_ends_far_from_what_is_known_of_it_is_told():
-    own = [Free("drive.motor_inertia", "kg m²", 0.02, 0.02, True), Free("drive.motor_viscous", "N m s/rad", 0.0, 1.0, False)]
-    assert summary_module._far_off(own, {"drive.motor_inertia": 0.021, "drive.motor_viscous": 0.1}, 0.02) == []
-    (note,) = summary_module._far_off(own, {"drive.motor_inertia": 0.01, "drive.motor_viscous": 0.0}, 0.02)
-    assert note.startswith("drive.motor_inertia had to change by -50%, 25 times its [uncertainty]")
+def test_what_is_known_exactly_is_no_candidate(logs):
+    known = {"relative": 0.02, "exact": ["drive.motor_inertia", "actuator.gain_error"]}
+    task = read_diagnosis_task(logs / "axis.csv", model(uncertainty=known))
+    with jax.enable_x64(True):
+        lacking = new_search(set_up(task)).lacking
+    assert not {"motor.inertia", "actuator.gain_error"} & set(lacking)
+    assert {"motor.viscous_friction", "motor.coulomb_friction"} <= set(lacking)
+
+
+def test_a_steady_torque_is_no_other_one_when_shuffled(logs):
+    task = read_diagnosis_task(logs / "axis.csv", model())
+    with jax.enable_x64(True):
+        setup = set_up(task)
+        (segment,) = setup.holdout.segments
+        assert setup.holdout.permuted(setup.nominal, {"motor": [np.full(len(segment), 0.1)]}) is None
+        wave = np.sin(np.linspace(0.0, 20.0, len(segment)))
+        assert setup.holdout.permuted(setup.nominal, {"motor": [wave]}) is not None
 
 
 def test_new_numbers_are_better_all_in_all():

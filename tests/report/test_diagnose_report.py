@@ -37,6 +37,8 @@ SUMMARY = {
     ],
     "where": {"motor": {"sentence": "motor side: nothing beyond noise"}, "load": {"sentence": "load side, here"}},
     "rest": {"load.drift": {"evidence": -3.0, "share": 0.001}, "load.time": {"evidence": None, "share": 0.0}},
+    "explained_share": 0.83,
+    "parameters": {"drive.motor_inertia": {"value": 0.01, "nominal": 0.02}},
     "withdrawn": [],
     "notes": ["A note."],
     "gap": {
@@ -46,9 +48,15 @@ SUMMARY = {
         "holdout_rmse_after": scaled(0.011),
         "noise_floor": scaled(0.01),
         "free_run": {"before": ERRORS, "after": scaled(0.02)},
+        "expected": {
+            name: {"noise": 0.01 * value, "open": 0.0, "least": 0.0, "limit": 0.012 * value}
+            for name, value in ERRORS.items()
+            if not name.startswith("velocity")
+        },
+        "test": {"level": 0.01, "failed": [], "far": {}, "chance": False, "remainder": False},
         "controls": {
-            "wrong": {"effect": "load.stribeck_friction", "rmse": scaled(0.3)},
-            "permuted": {"rmse": scaled(1.4) | {"theta_e": None}},
+            "wrong": {"effect": "load.stribeck_friction", "rmse": scaled(0.3), "z": 12.3},
+            "permuted": {"rmse": scaled(1.4) | {"theta_e": None}, "z": float("inf")},
         },
     },
 }
@@ -60,12 +68,17 @@ def changed(**keys):
 
 def test_the_headline_has_verdict_numbers_and_gap():
     lines = diagnosis_lines(SUMMARY)
-    assert lines[0] == "Explained: the model lacks load.coulomb_friction; with it only noise remains."
+    assert lines[0] == (
+        "Explained: the model lacks load.coulomb_friction; with it, no more is left on data not used for the fit than noise "
+        "and the uncertainty of the model's numbers account for."
+    )
     assert lines[1] == "load.coulomb_friction (confidence 0.93): torque = 0.274 ± 0.0021 N m."
     assert lines[2] == "  Not ruled out by this log: load.stribeck_friction (0.07)."
     assert lines[3].startswith("On other.csv, over windows of 0.5 s, rms: theta_e 0.1 -> 0.0011 rad (noise 0.001); theta_s ")
     assert lines[4].startswith("In one free run: theta_e 0.1 -> 0.002 rad;")
-    assert "Control: the best model with another effect (load.stribeck_friction) leaves 0.03 rad in theta_e." in lines
+    (line,) = (line for line in lines if line.startswith("Control: the best model"))
+    assert line.startswith("Control: the best model with another effect (load.stribeck_friction) leaves ")
+    assert line.endswith("; it is 12.3 standard errors worse.")
     assert "Control: the missing torque shuffled in time diverges." in lines
     assert lines[-1] == "A note."
 
@@ -92,12 +105,34 @@ def test_other_verdicts_say_what_is_left():
     assert diagnosis_lines(changed(verdict="no_discrepancy", findings=[]))[0].startswith("No discrepancy: ")
     rest = {"load.drift": {"evidence": 30.0, "share": 0.01}}
     lines = diagnosis_lines(changed(verdict="unknown_effect", findings=[], rest=rest))
-    assert lines[0].startswith("Unknown effect: no known effect explains the residual: motor side")
+    assert lines[0].startswith("Unknown: no known effect explains what is missing: motor side")
     assert any(line.startswith("Remaining: a drifting friction on the load side (1 % of") for line in lines)
-    partly = changed(verdict="unknown_effect", where_after={"load": {"sentence": "load side, there"}})
-    assert diagnosis_lines(partly)[0].endswith("explains a part only. The residual that remains: load side, there.")
     gap = SUMMARY["gap"] | {"free_run": {"why_not": "it is chaotic"}}
     assert "No free run is compared: it is chaotic." in diagnosis_lines(changed(gap=gap))
+
+
+def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
+    def lines(share=0.83, **test):
+        gap = SUMMARY["gap"] | {"test": SUMMARY["gap"]["test"] | test}
+        where = {"load": {"sentence": "load side, there"}}
+        return diagnosis_lines(changed(verdict="unknown_effect", where_after=where, gap=gap, explained_share=share))
+
+    partly = (
+        "Partly explained: the model lacks load.coulomb_friction; with it, {} of the missing torque is explained on data "
+    )
+    rest = "not used for the fit. The rest is none of the known effects: load side, there."
+    first, _, _, second, *_ = lines(failed=["theta_e"])
+    assert first == partly.format("83 %") + rest
+    assert second == (
+        "More is left than noise, the uncertainty of the numbers and torques too small to be named account for (1 % test): "
+        "theta_e 0.0011 rad (at most 0.0012)."
+    )
+    assert lines(share=0.9987, remainder=True)[0] == partly.format("99.9 %") + rest
+    assert lines(share=-0.2, remainder=True)[0] == partly.format("none") + rest
+    first, _, _, second, *_ = lines(far={"drive.motor_inertia": -25.0})
+    assert first == partly.format("83 %") + "not used for the fit, but not in a way that can be right."
+    assert second.startswith("drive.motor_inertia had to change by -50%, 25 times its [uncertainty]: findings and it may")
+    assert lines(chance=True)[3] == "Shuffled in time, the torque that was added does as well."
 
 
 @pytest.mark.parametrize("findings", [SUMMARY["findings"], []], ids=["some", "none"])

@@ -1,0 +1,109 @@
+"""What a complete model would leave on held-out data, and whether a model leaves more.
+
+A complete model is off by the noise of the readings, by noise of the input that the drive did not feel, by what the fit
+leaves open of its numbers, and by torques too small to be named. The second and third are drawn at random, and the model
+compared with itself: a posterior predictive check.
+Reference: A. Gelman et al., Bayesian Data Analysis (2013), 6.3.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.special import gammaincinv
+
+from jaxbl.identification.segments import Segment
+from jaxbl.identification.trajectory import with_fitted
+
+from .effect_search import LEAST
+from .input_noise import smoothed_input
+from .proof import FittedModel
+from .reference_log import Comparison, ReferenceLog
+from .setup import InputNoise
+
+LEVEL = 0.01
+"""Probability that a complete model fails the test in a channel."""
+_DRAWS = 6
+"""Of numbers and input noise: their mean square is then known within a factor of two, which is a small part of the error of
+most logs."""
+_NOISE_ERROR = 0.1
+"""Relative error of a channel's noise: what quantisation and its estimate from the readings leave open."""
+
+
+class Expected(NamedTuple):
+    """Error of a complete model in a channel, in the channel's unit.
+
+    Attributes:
+        noise: rms by the readings' noise.
+        open: rms by the numbers that the fit leaves open, and by noise of the input.
+        least: rms by a torque of :data:`LEAST` of the driving torque, which is too small to be named.
+        limit: rms that a complete model exceeds with probability :data:`LEVEL`.
+    """
+
+    noise: float
+    open: float
+    least: float
+    limit: float
+
+
+def expected_errors(
+    log: ReferenceLog, fitted: FittedModel, base: Comparison, floor: Mapping[str, float], noise: InputNoise, driving: float
+) -> dict[str, Expected]:
+    """Errors of a model if it is complete, in positions and missing torques; speeds are the positions' over again.
+
+    Args:
+        log: held out.
+        fitted, base: the model, and how it compares.
+        floor: noise of each channel there.
+        noise: of the input.
+        driving: torque that drives the machine, rms, N m.
+    """
+    random = np.random.default_rng(0)
+    values, vectors = np.linalg.eigh(fitted.covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+
+    def apart(other: Comparison) -> dict[str, float]:
+        return {name: float(np.mean((one - base.samples[name]) ** 2)) for name, one in other.samples.items()}
+
+    drawn = []
+    for _ in range(_DRAWS):
+        theta = fitted.theta + root @ random.standard_normal(len(root))
+        model = with_fitted(fitted.experiment, fitted.free, jnp.asarray(theta))
+        segments = [_disturbed(one, noise, random) for one in log.segments]
+        drawn.append(apart(dataclasses.replace(log, segments=segments).compare(model)))
+    least = LEAST * driving
+    segments = [dataclasses.replace(one, torque=one.torque + least) for one in log.segments]
+    small = apart(dataclasses.replace(log, segments=segments).compare(fitted.experiment))
+    for side in fitted.experiment.sides:
+        small[f"torque_{side}"] = (least * float(fitted.experiment.drive.ratio(side))) ** 2
+    found = {}
+    for name in floor:
+        if not name.startswith("velocity"):
+            squares = np.array([one[name] for one in drawn])
+            limit = ((1.0 + _NOISE_ERROR) * floor[name]) ** 2 + small[name] + _quantile(squares)
+            found[name] = Expected(floor[name], float(np.sqrt(np.mean(squares))), small[name] ** 0.5, limit**0.5)
+    return found
+
+
+def failed(errors: Mapping[str, float], expected: Mapping[str, Expected]) -> list[str]:
+    """Channels in which a model leaves more than a complete one would."""
+    return [name for name, one in expected.items() if not errors[name] <= one.limit]
+
+
+def _disturbed(segment: Segment, noise: InputNoise, random: np.random.Generator) -> Segment:
+    """A segment with other noise of its input, smoothed as the input was."""
+    torque = segment.torque + noise.possible * random.standard_normal(len(segment))
+    return dataclasses.replace(segment, torque=smoothed_input(torque, noise.unfelt) if noise.unfelt > 0.0 else torque)
+
+
+def _quantile(squares: Sequence[float] | np.ndarray) -> float:
+    """Value that a sum of squares exceeds with probability :data:`LEVEL`, from a few of them: by the gamma distribution of
+    the same mean and variance (Satterthwaite)."""
+    mean, variance = float(np.mean(squares)), float(np.var(squares, ddof=1))
+    if not 0.0 < mean < np.inf or variance == 0.0:
+        return mean
+    # never narrower than half a degree of freedom, the square of one normal number
+    shape = max(mean**2 / variance, 0.5)
+    return mean / shape * float(gammaincinv(shape, 1.0 - LEVEL))

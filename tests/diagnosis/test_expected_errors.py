@@ -1,0 +1,56 @@
+"""What a complete model leaves on held-out data: truth from the bench's own simulator."""
+
+import jax
+import numpy as np
+import pytest
+from hidden_log import FRICTION, logged, model
+from scipy import stats
+
+from jaxbl.diagnosis.diagnose import new_search
+from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
+from jaxbl.diagnosis.expected_errors import LEVEL, _quantile, expected_errors, failed
+from jaxbl.diagnosis.proof import Proof, fit_model
+from jaxbl.diagnosis.setup import set_up
+
+
+def tested(folder, log, effects):
+    """Errors of a model with some effects on the last quarter of a log, and what is expected of a complete one."""
+    log.write(folder / "axis.csv")
+    task = read_diagnosis_task(folder / "axis.csv", model())
+    with jax.enable_x64(True):
+        setup = set_up(task)
+        proof = Proof(setup)
+        fitted = fit_model(new_search(setup), effects, np.zeros(len(setup.own)))
+        after = setup.holdout.compare(fitted.experiment)
+        expected = expected_errors(setup.holdout, fitted, after, proof.noise, setup.input_noise, 0.5)
+    return after.errors, expected
+
+
+@pytest.mark.parametrize("torque_noise", [0.0, 0.02])
+def test_a_complete_model_passes_and_an_incomplete_one_fails(torque_noise, tmp_path):
+    log = logged(torque_noise=torque_noise)
+    errors, expected = tested(tmp_path, log, {"motor.coulomb_friction": {"torque": FRICTION["torque"]}})
+    assert set(expected) == {"theta_e", "torque_motor"}
+    assert failed(errors, expected) == []
+    # an input with noise that the drive has not felt moves the model, by as much as is expected
+    position = expected["theta_e"]
+    if torque_noise:
+        assert errors["theta_e"] > 3.0 * position.noise
+        assert errors["theta_e"] == pytest.approx(position.open, rel=0.6)
+    errors, expected = tested(tmp_path, log, {})
+    assert failed(errors, expected) == ["theta_e", "torque_motor"]
+
+
+def test_torques_too_small_to_be_named_do_not_fail_a_model(tmp_path):
+    errors, expected = tested(tmp_path, logged(), {"motor.coulomb_friction": {"torque": FRICTION["torque"]}})
+    assert expected["torque_motor"].least == pytest.approx(0.5e-3)
+    more = errors | {"torque_motor": 1.05 * expected["torque_motor"].limit}
+    assert failed(more, expected) == ["torque_motor"]
+    assert failed(errors | {"theta_e": np.inf}, expected) == ["theta_e"]
+
+
+@pytest.mark.parametrize("freedom", [1, 4, 30])
+def test_the_quantile_is_that_of_sums_of_squares(freedom):
+    drawn = stats.chi2.rvs(freedom, scale=3.0, size=4000, random_state=1)
+    assert _quantile(drawn) == pytest.approx(stats.chi2.ppf(1.0 - LEVEL, freedom, scale=3.0), rel=0.1)
+    assert _quantile(np.full(6, 2.0)) == 2.0 and _quantile(np.zeros(6)) == 0.0
