@@ -127,8 +127,8 @@ def _comparison(tuning: Tuning, sides: list[str]) -> Drawn:
     first, last = tuning.summary["holdout"]["seeds"]
     seeds = f"seeds {first} to {last}" if last > first else f"seed {first}"
     caption = (
-        f"The gains {_where(tuning.summary)}, noise {seeds}: worst of all runs, and the median (stroke). Hatched: some runs did "
-        "not converge."
+        f"The gains {_where(tuning.summary)}, noise {seeds}: worst of all runs, and the median (stroke). Hatched: some runs "
+        "did not converge."
     )
     return Drawn("tuning_holdout", figure, caption)
 
