@@ -4,6 +4,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from jaxbl.identification.regression import Kinematics, transmitted
 from jaxbl.identification.segments import Segment
@@ -13,6 +14,11 @@ from .residuals import Residual
 
 EVERYWHERE = "all"
 """The coordinate that is the same all along a log."""
+
+
+_SLOWER = 3.0
+"""Factor between the bandwidths of a residual and of the acceleration it is looked at along: power of the noise of an
+acceleration grows with the fifth power of the bandwidth."""
 
 
 class CoordinateValues(NamedTuple):
@@ -78,8 +84,9 @@ def coordinates_of(
         found["twist rate"] = CoordinateValues(rate, f"{unit}/s", symbol="ż")
     if side == "motor":
         found["input"] = CoordinateValues(np.asarray(part.torque), force, symbol="u")
-    # by the model: the measured one's noise is the residual's, and would be found there
-    acceleration = np.asarray(part.acceleration[side]) - residual.torque / float(experiment.plant.inertia(side))
+    # the measured one's noise is the residual's, and would be found there
+    width = np.sqrt(np.log(2.0)) / (2.0 * np.pi * residual.bandwidth / _SLOWER * residual.period)
+    acceleration = gaussian_filter1d(np.asarray(part.acceleration[side]), width)
     found["acceleration"] = CoordinateValues(acceleration, f"{length}/s²", symbol="a")
     found["time"] = CoordinateValues(np.asarray(part.time), "s", symbol="t")
     return found

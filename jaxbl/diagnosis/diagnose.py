@@ -118,7 +118,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         if withdrawn:
             found = search.without(found, withdrawn)
         done()
-        expected = expected_errors(setup.holdout, fitted, after, proof.noise, setup.input_noise, found.model.linear.drive)
+        expected = expected_errors(setup.holdout, fitted, after, setup.input_noise, found.model.linear.drive)
         controls = proof.controls(search, fitted, after, found.wrong)
         judgement = judged(found, fitted, after.errors, expected, controls, setup.prior)
         found = judgement.found

@@ -28,8 +28,9 @@ LEVEL = 0.01
 _DRAWS = 6
 """Of numbers and input noise: their mean square is then known within a factor of two, which is a small part of the error of
 most logs."""
-_NOISE_ERROR = 0.1
-"""Relative error of a channel's noise: what quantisation and its estimate from the readings leave open."""
+_NOISE_ERROR, _TORQUE_NOISE_ERROR = 0.25, 0.5
+"""Relative error of a channel's noise. That of positions, and of the input, is estimated from the readings, of which some are
+coarse. That of torques goes with the bandwidth to the power 2.5, which is estimated too, and jumps of friction are rounded."""
 
 
 class Expected(NamedTuple):
@@ -49,18 +50,17 @@ class Expected(NamedTuple):
 
 
 def expected_errors(
-    log: ReferenceLog, fitted: FittedModel, base: Comparison, floor: Mapping[str, float], noise: InputNoise, driving: float
+    log: ReferenceLog, fitted: FittedModel, base: Comparison, noise: InputNoise, driving: float
 ) -> dict[str, Expected]:
     """Errors of a model if it is complete, in positions and missing torques; speeds are the positions' over again.
 
     Args:
         log: held out.
         fitted, base: the model, and how it compares.
-        floor: noise of each channel there.
         noise: of the input.
         driving: torque that drives the machine, rms, N m.
     """
-    random = np.random.default_rng(0)
+    random, floor = np.random.default_rng(0), log.noise_floor(base.torques)
     values, vectors = np.linalg.eigh(fitted.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
 
@@ -82,7 +82,8 @@ def expected_errors(
     for name in floor:
         if not name.startswith("velocity"):
             squares = np.array([one[name] for one in drawn])
-            limit = ((1.0 + _NOISE_ERROR) * floor[name]) ** 2 + small[name] + _quantile(squares)
+            unsure = _TORQUE_NOISE_ERROR if name.startswith("torque") else _NOISE_ERROR
+            limit = (1.0 + unsure) ** 2 * (floor[name] ** 2 + _quantile(squares)) + small[name]
             found[name] = Expected(floor[name], float(np.sqrt(np.mean(squares))), small[name] ** 0.5, limit**0.5)
     return found
 

@@ -5,17 +5,16 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
 
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.simulate import Experiment
 
-from .effect_search import FAR, Explanation, Finding
+from .effect_search import FAR, Explanation, Finding, Model
 from .expected_errors import Expected, failed
 from .proof import Control, FittedModel
 
 _BEATEN = 2.0
-"""Standard errors by which the shuffled torque must be beaten: 2 % by chance."""
+"""Standard errors by which a control must be beaten: 2 % by chance."""
 
 
 class Judgement(NamedTuple):
@@ -60,27 +59,39 @@ def judged(
     chance = any(one.kind == "permuted" and one.z < _BEATEN for one in controls)
     findings = found.findings
     for one in controls:
-        if one.kind == "wrong":
-            findings = tuple(_shared(each, one) if each.effect == fitted.names[-1] else each for each in findings)
+        if one.kind == "wrong" and found.wrong is not None:
+            last = fitted.names[-1]
+            findings = tuple(
+                _shared(each, found.model, found.wrong, one.z) if each.effect == last else each for each in findings
+            )
     verdict = "unknown_effect" if left or far or chance else found.verdict
     return Judgement(
         dataclasses.replace(found, verdict=verdict, findings=findings), left, far, chance, found.verdict == "unknown_effect"
     )
 
 
-def _shared(finding: Finding, rival: Control) -> Finding:
-    """A finding that is no surer than held-out data say: by them its effect is better with the probability of its z."""
-    name = finding.effect.partition(".")[2]
-    if name in EFFECTS[rival.effect].special_cases or rival.effect == finding.effect:
+def _shared(finding: Finding, model: Model, wrong: Model, z: float) -> Finding:
+    """A finding whose effect was preferred to another one (`wrong`) by the log, as far as held-out data agree.
+
+    What the numbers' prior says for it stands; what the fit says counts in full only if it shows on the held-out data, too.
+    """
+    rival = wrong.names[-1]
+    if finding.effect.partition(".")[2] in EFFECTS[rival].special_cases:
         # a more general effect does as well by its nature
         return finding
-    most = float(ndtr(rival.z))
-    if finding.confidence <= most:
+    fit = max(model.log_likelihood - wrong.log_likelihood, 0.0)
+    nats = model.log_evidence - wrong.log_evidence - fit * (1.0 - float(np.clip(z / _BEATEN, 0.0, 1.0)))
+    nats -= 0.5 * min(z, 0.0) ** 2
+    chances = dict(finding.alternatives)
+    weight = float(finding.confidence * np.exp(np.clip(-nats, -700.0, 700.0)))
+    if weight <= chances.get(rival, 0.0):
         return finding
-    others = dict(finding.alternatives)
-    others[rival.effect] = others.get(rival.effect, 0.0) + finding.confidence - most
+    total = 1.0 - chances.get(rival, 0.0) + weight
+    chances = {name: chance / total for name, chance in (chances | {rival: weight}).items()}
     return dataclasses.replace(
-        finding, confidence=most, alternatives=tuple(sorted(others.items(), key=lambda pair: -pair[1]))
+        finding,
+        confidence=finding.confidence / total,
+        alternatives=tuple(sorted(((name, float(one)) for name, one in chances.items()), key=lambda pair: -pair[1])),
     )
 
 

@@ -12,7 +12,7 @@ from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
 from .diagnosis_task import input_rms
-from .effect_search import EffectSearch, Explanation, Model
+from .effect_search import FLOOR, EffectSearch, Explanation, Model
 from .reference_log import PREDICTABLE, Comparison
 from .setup import Setup
 
@@ -72,7 +72,7 @@ class Control(NamedTuple):
         kind: `wrong`, the best model with another effect in place of the last, or `permuted`, the torque that the effects
             add, shuffled in time.
         errors: rms, by channel.
-        z: standard errors by which the squared errors of the model with effects are smaller.
+        z: standard errors by which the errors of the model with effects are smaller.
         effect: the other one.
     """
 
@@ -87,7 +87,7 @@ class Proof:
 
     Attributes:
         before: the model as given, on what was held out.
-        noise: of each channel there: what a perfect model would leave.
+        noise: of each channel there, as far as the model as given tells.
     """
 
     def __init__(self, setup: Setup):
@@ -138,16 +138,23 @@ class Proof:
         return found
 
     def _beaten(self, control: Comparison, after: Comparison) -> float:
-        """Standard errors by which a model beats a control, block by block, each channel over its noise."""
-        gains = np.zeros(_BLOCKS)
-        for name, noise in self.noise.items():
-            if not name.startswith("velocity"):
-                with np.errstate(invalid="ignore", over="ignore"):
-                    more = np.square(control.samples[name] / noise) - np.square(after.samples[name] / noise)
-                    gains += [float(np.mean(one)) for one in np.array_split(more.ravel(), _BLOCKS)]
-        if not np.isfinite(gains).all():
+        """By how many standard errors a model beats a control, block by block, each channel over the model's own noise.
+
+        By logarithms, since a few blocks may have most of the errors; what structure in the noise may bring is no gain.
+        """
+        costs = np.zeros((2, _BLOCKS))
+        for cost, one in zip(costs, (control, after), strict=True):
+            floor = self.other.noise_floor(one.torques)
+            for name in floor:
+                if not name.startswith("velocity"):
+                    with np.errstate(invalid="ignore", over="ignore"):
+                        blocks = np.array_split(np.square(one.samples[name] / floor[name]).ravel(), _BLOCKS)
+                    cost += [float(np.mean(block)) for block in blocks]
+        if not np.isfinite(costs[0]).all():
             return np.inf
-        return float(np.mean(gains) / max(np.std(gains, ddof=1) / np.sqrt(_BLOCKS), np.finfo(float).tiny))
+        gains = np.log(np.maximum(costs, np.finfo(float).tiny))
+        gains = gains[0] - gains[1]
+        return float(np.mean(gains) / np.hypot(np.std(gains, ddof=1) / np.sqrt(_BLOCKS), 2.0 * FLOOR))
 
     def gap(self, fitted: FittedModel, after: Comparison) -> dict[str, Any]:
         """Errors on held-out data before and after, and the noise."""
@@ -162,11 +169,11 @@ class Proof:
                 "window": other.samples * other.period,
                 "bandwidth": dict(other.bandwidth),
             },
-            "units": {name: _unit(record, name) for name in self.noise},
+            "units": {name: _unit(record, name) for name in after.errors},
             "driving": {"motor": input_rms(record)},
             "holdout_rmse_before": self.before.errors,
             "holdout_rmse_after": after.errors,
-            "noise_floor": self.noise,
+            "noise_floor": other.noise_floor(after.torques),
             "free_run": {},
         }
         for name, one in (("before", nominal), ("after", fitted.experiment)):

@@ -15,23 +15,28 @@ LIMITS = {"theta_e": Expected(1e-4, 0.0, 0.0, 1.2e-4), "torque_motor": Expected(
 NOISE = {"theta_e": 1e-4, "torque_motor": 0.01}
 
 
-def found(verdict="explained"):
-    nothing = SimpleNamespace()
-    finding = Finding(NAME, 0.98, {"torque": 0.1}, (("motor.viscous_friction", 0.02),))
-    return Explanation(verdict, (finding,), nothing, nothing, None, {})  # type: ignore[arg-type]
+def fit(log_likelihood, log_evidence, name=NAME):
+    return SimpleNamespace(names=(name,), log_likelihood=log_likelihood, log_evidence=log_evidence)
 
 
-def judge(errors=NOISE, theta=0.0, controls=(), verdict="explained"):
+def found(verdict="explained", fit_gain=50.0, prior_gain=0.0, rival="motor.viscous_friction"):
+    finding = Finding(NAME, 0.98, {"torque": 0.1}, (("motor.inertia", 0.02),))
+    model, wrong = fit(0.0, 0.0), fit(-fit_gain, -fit_gain - prior_gain, rival)
+    return Explanation(verdict, (finding,), model, model, wrong, {})  # type: ignore[arg-type]
+
+
+def judge(errors=NOISE, theta=0.0, controls=(), verdict="explained", **gains):
     fitted = SimpleNamespace(
         names=(NAME,), theta=np.array([theta, 1.0]), free=[SimpleNamespace(path="drive.motor_inertia")] * 2
     )
-    return judged(found(verdict), fitted, errors, LIMITS, controls, np.array([0.02]))  # type: ignore[arg-type]
+    return judged(found(verdict, **gains), fitted, errors, LIMITS, controls, np.array([0.02]))  # type: ignore[arg-type]
 
 
 def test_a_verdict_that_held_out_data_support_stays():
     controls = [Control("wrong", NOISE, 9.0, "motor.viscous_friction"), Control("permuted", NOISE, 4.0)]
     said = judge(controls=controls)
-    assert said.found == found() and (said.failed, said.far, said.chance, said.remainder) == ([], {}, False, False)
+    assert said.found.verdict == "explained" and said.found.findings[0].confidence == pytest.approx(0.98)
+    assert (said.failed, said.far, said.chance, said.remainder) == ([], {}, False, False)
 
 
 @pytest.mark.parametrize(
@@ -51,14 +56,28 @@ def test_one_reason_is_enough_against_it(given, reason):
     assert {key: getattr(said, key) for key in none} == none | reason
 
 
-def test_a_name_is_shared_with_an_effect_that_does_as_well():
-    (one,) = judge(controls=[Control("wrong", NOISE, 0.0, "motor.viscous_friction")]).found.findings
-    assert one.confidence == pytest.approx(0.5)
-    assert one.alternatives == (("motor.viscous_friction", pytest.approx(0.5)),)
-    (one,) = judge(controls=[Control("wrong", NOISE, -3.0, "motor.inertia")]).found.findings
-    assert one.confidence < 0.01 and one.alternatives[0] == ("motor.inertia", pytest.approx(0.98, abs=0.01))
+def shared(z, **gains):
+    (one,) = judge(
+        controls=[Control("wrong", NOISE, z, gains.get("rival", "motor.viscous_friction"))], **gains
+    ).found.findings
+    return one.confidence, dict(one.alternatives)
+
+
+def test_what_the_fit_says_counts_only_if_held_out_data_agree():
+    assert shared(2.0)[0] == pytest.approx(0.98)
+    confidence, others = shared(0.0)
+    assert confidence == pytest.approx(others["motor.viscous_friction"]) == pytest.approx(0.5, abs=0.01)
+    assert confidence + sum(others.values()) == pytest.approx(1.0)
+    assert shared(-3.0)[0] == pytest.approx(1.0 / (1.0 + np.exp(4.5)), abs=2e-3)
+
+
+def test_what_the_prior_says_stands():
+    assert shared(0.0, prior_gain=20.0)[0] == pytest.approx(0.98)
+
+
+def test_a_more_general_effect_takes_nothing_away():
     # dry friction is a Stribeck friction with equal levels
-    assert judge(controls=[Control("wrong", NOISE, 0.0, "motor.stribeck_friction")]).found == found()
+    assert shared(0.0, rival="motor.stribeck_friction") == (0.98, {"motor.inertia": 0.02})
 
 
 def test_the_explained_share_is_that_of_the_torques_power_beyond_what_a_complete_model_leaves():
