@@ -29,8 +29,9 @@ _DRAWS = 6
 """Of numbers and input noise: their mean square is then known within a factor of two, which is a small part of the error of
 most logs."""
 _NOISE_ERROR, _TORQUE_NOISE_ERROR = 0.25, 0.5
-"""Relative error of a channel's noise. That of positions, and of the input, is estimated from the readings, of which some are
-coarse. That of torques goes with the bandwidth to the power 2.5, which is estimated too, and jumps of friction are rounded."""
+"""Relative error of a channel's noise. That of positions, and of the input, is estimated from the readings, some of which
+are coarse. That of torques goes with the bandwidth to the power 2.5, which is an estimate, too; and the smoother rounds jumps
+of friction."""
 
 
 class Expected(NamedTuple):
