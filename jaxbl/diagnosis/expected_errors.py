@@ -30,7 +30,7 @@ _DRAWS = 6
 most logs."""
 _NOISE_ERROR, _TORQUE_NOISE_ERROR = 0.25, 0.5
 """Relative error of a channel's noise. That of positions, and of the input, is estimated from the readings, some of which
-are coarse. That of torques goes with the bandwidth to the power 2.5, which is an estimate, too; and the smoother rounds jumps
+are coarse. That of torques goes with the bandwidth to the power 2.5, which is an estimate, too; the smoother rounds jumps
 of friction."""
 
 
