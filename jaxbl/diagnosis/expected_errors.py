@@ -28,7 +28,7 @@ LEVEL = 0.01
 _DRAWS = 6
 """Of numbers and input noise: their mean square is then known within a factor of two, which is a small part of the error of
 most logs."""
-_NOISE_ERROR, _TORQUE_NOISE_ERROR = 0.25, 0.5
+_NOISE_ERROR, _TORQUE_NOISE_ERROR = 0.25, 1.0
 """Relative error of a channel's noise. That of positions, and of the input, is estimated from the readings, some of which
 are coarse. That of torques goes with the bandwidth to the power 2.5, which is an estimate, too; the smoother rounds jumps
 of friction."""
@@ -62,7 +62,7 @@ def expected_errors(
         driving: torque that drives the machine, rms, N m.
     """
     random, floor = np.random.default_rng(0), log.noise_floor(base.torques)
-    values, vectors = np.linalg.eigh(fitted.covariance)
+    values, vectors = np.linalg.eigh(fitted.white)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
 
     def apart(other: Comparison) -> dict[str, float]:

@@ -25,8 +25,8 @@ _CUTOFFS = np.geomspace(0.015, 2.0, 30)
 """Corner frequencies tried, rad a sample."""
 
 
-def unfelt(given: Sequence[np.ndarray], smooth: Sequence[np.ndarray]) -> float:
-    """Nats by which noise of the input did not drive the motion, rather than did.
+def unfelt(given: Sequence[np.ndarray], smooth: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Share of the noise of the input, in its power, that did not drive the motion, and its standard error.
 
     What both inputs' prediction errors differ by is what that noise does to them. It is in the errors of the recorded input
     if the drive has not felt it; each frequency counts by the power that is there, so that what the model lacks, which is
@@ -38,7 +38,8 @@ def unfelt(given: Sequence[np.ndarray], smooth: Sequence[np.ndarray]) -> float:
     spectrum = spectrum_of(given)
     pairs = [np.stack([one, one - other], axis=2) for one, other in zip(given, smooth, strict=True)]
     products = np.sum([weighted_products(pair, spectrum) for pair in pairs], axis=0)
-    return float(products[0, 1] - 0.5 * products[1, 1])
+    size = max(float(products[1, 1]), np.finfo(float).tiny)
+    return float(products[0, 1]) / size, size**-0.5
 
 
 def smoothed_input(torque: np.ndarray, noise: float) -> np.ndarray:

@@ -34,6 +34,7 @@ class FittedModel(NamedTuple):
         free: numbers that were fitted, its own first.
         theta: of these.
         covariance: of theta.
+        white: the same if prediction errors are white, as those of a complete model.
     """
 
     names: tuple[str, ...]
@@ -41,6 +42,7 @@ class FittedModel(NamedTuple):
     free: tuple[Free, ...]
     theta: np.ndarray
     covariance: np.ndarray
+    white: np.ndarray
 
     @property
     def numbers(self) -> dict[str, dict[str, float]]:
@@ -62,7 +64,7 @@ def free_values(free: Sequence[Free], theta: np.ndarray) -> dict[str, float]:
 def fit_model(search: EffectSearch, numbers: Mapping[str, Mapping[str, float]], theta: np.ndarray) -> FittedModel:
     """A model with some effects, its own numbers and theirs fitted from given ones."""
     found = search.refitted({name: dict(one) for name, one in numbers.items()}, theta)
-    return FittedModel(tuple(numbers), found.experiment, found.linear.free, found.theta, found.covariance)
+    return FittedModel(tuple(numbers), found.experiment, found.linear.free, found.theta, found.covariance, found.white)
 
 
 class Control(NamedTuple):
@@ -108,8 +110,9 @@ class Proof:
                 break
             withdrawn.append(names[-1])
             names = names[:-1]
-        own = self.setup.own
-        given = FittedModel((), self.setup.nominal, own, np.zeros(len(own)), np.diag(self.setup.prior**2))
+        own, known = self.setup.own, np.diag(self.setup.prior**2)
+        # nothing is missing of a complete model: the log says how well its numbers are known
+        given = FittedModel((), self.setup.nominal, own, np.zeros(len(own)), known, fitted.white)
         return given, self.before, withdrawn
 
     def _worse(self, after: Comparison) -> bool:

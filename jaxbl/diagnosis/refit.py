@@ -38,7 +38,8 @@ class Refined(NamedTuple):
     Attributes:
         experiment: with these numbers.
         theta: of the free ones.
-        covariance: of theta, of data and prior together.
+        covariance: of theta, of data and prior together; the errors may be correlated.
+        white: the same if they are not, as those of a complete model.
         smoothness: of the predictor, by side.
         start: positions and velocities at the first sample of each part, side by side, rad and rad/s.
         linear: the model along the path of its predictor, with the numbers that were free.
@@ -47,6 +48,7 @@ class Refined(NamedTuple):
     experiment: Experiment
     theta: np.ndarray
     covariance: np.ndarray
+    white: np.ndarray
     smoothness: list[float]
     start: list[np.ndarray]
     linear: Linear
@@ -132,8 +134,8 @@ class _Refiner:
                     share *= 0.25
         return best
 
-    def covariance(self, point: _Point) -> np.ndarray:
-        """Covariance of theta: of the errors, which may be correlated, and the prior together."""
+    def covariance(self, point: _Point) -> tuple[np.ndarray, np.ndarray]:
+        """Covariance of theta: of the errors, which may be correlated, and the prior together; and if they are not."""
         linear, own, sides = point.linear, len(self.free), len(self.experiment.sides)
         residual, jacobian = [], []
         for errors in linear.errors(point.predictor.smoothness):
@@ -155,7 +157,7 @@ class _Refiner:
         information, sandwich = real * np.asarray(found.information), np.asarray(found.covariance)
         prior = np.diag(self.width**-2.0)
         inverse = np.linalg.inv(information + prior)
-        return inverse @ (information @ sandwich @ information + prior) @ inverse
+        return inverse @ (information @ sandwich @ information + prior) @ inverse, inverse
 
 
 def refined(
@@ -165,4 +167,4 @@ def refined(
     refiner = _Refiner(experiment, free, width, segments)
     best = refiner.run(np.asarray(theta))
     model = with_fitted(experiment, free, jnp.asarray(best.theta))
-    return Refined(model, best.theta, refiner.covariance(best), best.predictor.smoothness, best.start, best.linear)
+    return Refined(model, best.theta, *refiner.covariance(best), best.predictor.smoothness, best.start, best.linear)

@@ -35,7 +35,7 @@ class InputNoise(NamedTuple):
 
     Attributes:
         unfelt: what the drive surely did not feel, N m; models are driven by an input without it.
-        possible: what it may not have felt, N m: all of it unless it surely did.
+        possible: what it may not have felt, N m.
     """
 
     unfelt: float
@@ -123,8 +123,11 @@ def _input_noise(size: float, nominal: Experiment, own: Sequence[Free], segments
     none, width = np.zeros(len(own)), np.ones(len(own))
     given, smooth = (Linear(nominal, own, none, width, some, none) for some in (segments, _quiet(segments, noise)))
     smoothness = given.choose(()).smoothness
-    shown = unfelt(given.left(smoothness), smooth.left(smoothness))
-    return InputNoise(noise if shown > _SHOWN else 0.0, noise if shown > -_SHOWN else 0.0)
+    share, error = unfelt(given.left(smoothness), smooth.left(smoothness))
+    # nats that it did not feel it, rather than did
+    shown = (share - 0.5) / error**2
+    possible = float(np.sqrt(np.clip(share + 2.0 * error, 0.0, 1.0)))
+    return InputNoise(noise if shown > _SHOWN else 0.0, possible * noise)
 
 
 def _check_order(bare: Experiment, nominal: Experiment) -> None:

@@ -59,6 +59,10 @@ class LogTask:
         return total.hexdigest()[:16]
 
 
+_MOST_STEPS = 1000
+"""Plant steps between two samples of a log at most: a drive moves through many of its time constants then."""
+
+
 def stage_counter(stages: int, progress: Progress | None) -> Callable[[], None]:
     """A function to be called after each stage, which tells `progress` how many of them are finished."""
     finished = itertools.count(1)
@@ -83,6 +87,12 @@ def _read_one(config: Config, log: str | Path, gear_tolerance: float) -> Record:
                 f"{record.path}: no {side} position ({POSITION_CHANNELS[side]}), which a {config.drive.kind} drive needs; "
                 f"the log has {', '.join(record.positions)}"
             )
+    step = config.run.sample_period / config.run.substeps
+    if record.sample_period > _MOST_STEPS * step:
+        raise InputError(
+            f"{record.path}: its samples are {record.sample_period:.4g} s apart, more than {_MOST_STEPS} plant steps of "
+            f"{step:.3g} s ([run]); where the stamps are not in s, [log] t.unit says so"
+        )
     if record.torque is None:
         notes = (*record.notes, "No input torque was recorded: the drive is taken to move freely, without one.")
         record = dataclasses.replace(record, torque=np.zeros(len(record.time)), notes=notes)

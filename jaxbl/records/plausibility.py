@@ -1,9 +1,12 @@
 """Whether a log fits what is said of it: motion at all, gear ratio, sign of the torque; and remarks on what is odd."""
 
+import itertools
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
+from .channels import RawChannel
 from .files import LogFile
 from .gearing import UNRELATED, Gearing, twist_noise
 from .resampling import Grid
@@ -20,6 +23,13 @@ def check_motion(file: LogFile, name: str, values: np.ndarray) -> None:
             f"{name} moves by only {round(np.ptp(values) / step)} steps of its resolution {step:.3g}; a log of a drive in "
             "motion is needed"
         )
+
+
+def check_distinct(file: LogFile, channels: Mapping[str, RawChannel]) -> None:
+    """Refuse two channels with the same readings."""
+    for (name, one), (other, two) in itertools.combinations(channels.items(), 2):
+        if np.array_equal(one.values, two.values, equal_nan=True) and np.any(one.values):
+            raise file.wrong(f"{name} and {other} are the same in every row; each needs a column of its own")
 
 
 def check_gear_ratio(

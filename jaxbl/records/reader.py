@@ -15,7 +15,15 @@ from jaxbl.validation import first_error
 from .channels import RawChannel, read_channels
 from .files import LogFile, read_log_file
 from .gearing import Gearing, fit_gearing
-from .plausibility import check_gear_ratio, check_motion, check_torque, note_channel, note_lost_motion, note_skew
+from .plausibility import (
+    check_distinct,
+    check_gear_ratio,
+    check_motion,
+    check_torque,
+    note_channel,
+    note_lost_motion,
+    note_skew,
+)
 from .resampling import Grid, resampled
 from .rigid_body import RigidFit, fit_rigid_drive
 from .signal_quality import ChannelFigures, channel_figures, longest
@@ -115,6 +123,7 @@ def read_record(
     # from columns to SI channels at the time stamps of the log
     stamps = read_time_stamps(file, table)
     channels = read_channels(file, table, stamps)
+    check_distinct(file, channels)
     segments = split_at_gaps(file, stamps)
     channels = {name: raw._replace(values=raw.values[segments.distinct]) for name, raw in channels.items()}
     encoders = [name for name in POSITION_CHANNELS.values() if name in channels]

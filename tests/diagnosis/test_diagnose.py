@@ -69,8 +69,9 @@ def test_the_motion_tells_whether_noise_of_the_input_was_felt(felt, tmp_path):
     task = read_diagnosis_task(tmp_path / "axis.csv", model())
     with jax.enable_x64(True):
         setup = set_up(task)
-    expected = 0.0 if felt else pytest.approx(0.02, rel=0.1)
-    assert setup.input_noise == (expected, expected)
+    assert setup.input_noise.unfelt == (0.0 if felt else pytest.approx(0.02, rel=0.1))
+    # by twice the standard error of what is known of it
+    assert setup.input_noise.possible == pytest.approx(0.01 if felt else 0.02, rel=0.1)
     for log, record in ((setup.fitted, task.record), (setup.holdout, task.holdout)):
         ((segment,), (rows,)) = log.segments, record.segments
         assert np.array_equal(segment.torque, record.torque[rows]) is felt

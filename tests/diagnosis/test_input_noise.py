@@ -72,7 +72,7 @@ def test_the_smooth_curve_is_one_of_least_penalised_squares():
 
 @pytest.mark.parametrize("felt", [False, True])
 def test_noise_is_found_in_the_errors_under_what_is_slow(felt):
-    """What the model lacks is a hundred times larger; the noise's own likelihood ratio is known where it alone is there."""
+    """What the model lacks is a hundred times larger; the error is known where the noise alone is there."""
     rng = np.random.default_rng(6)
     lacking = 1e-2 * np.stack(
         [np.sin(2.0 * np.pi * TIME), np.cos(4.0 * np.pi * TIME)], axis=1
@@ -81,8 +81,9 @@ def test_noise_is_found_in_the_errors_under_what_is_slow(felt):
     effect = np.convolve(1e-4 * rng.standard_normal(SAMPLES), [0.2, 0.5, 0.3], "same")[:, None] * np.array([1.0, 0.0])
     given = lacking + reading + effect * (not felt)
     smooth = given - effect
-    alone = (1.0 - 2.0 * felt) * 0.5 * np.sum(effect**2) / 1e-8
+    alone = 1e-4 / np.sqrt(np.sum(effect**2))
     parts = slice(0, 3000), slice(3000, SAMPLES)
-    found = unfelt([given[part] for part in parts], [smooth[part] for part in parts])
+    share, error = unfelt([given[part] for part in parts], [smooth[part] for part in parts])
+    assert share == pytest.approx(0.0 if felt else 1.0, abs=3.0 * error)
     # the given errors' spectrum holds the effect too, where that is not felt
-    assert 0.4 < found / alone < 1.2
+    assert 0.9 < error / alone < 1.6

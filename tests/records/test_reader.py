@@ -358,6 +358,11 @@ BAD = {
         {"where": {"mode": "stop"}},
         r"\[log\] where leaves no row: 'mode' is never 'stop'; values: 'run'",
     ),
+    "one column twice": (
+        changed(theta_s=lambda f: f["theta_e"]),
+        {},
+        "theta_e and theta_s are the same in every row; each needs a column of its own",
+    ),
     "all gaps": (
         changed(t=lambda f: f["t"] + np.floor(f["t"] / 0.02 + 1e-6)),
         {},
