@@ -234,6 +234,10 @@ BAD = {
         "'drive.mass' is no number of the plant; fitted can be: drive.motor_inertia",
     ),
     "window": (geared(identify={"window": 60.0}), r"identify.window: 60 s are 30000 samples; it should be between 20 "),
+    "far apart": (
+        geared({"run.sample_period": 1e-6, "run.substeps": 1, "run.duration": 1e-3}),
+        r"its samples are 0.002 s apart, more than 1000 plant steps of 1e-06 s \(\[run\]\); where the stamps are not in s",
+    ),
     "starts": (geared(identify={"starts": 0}), "identify.starts: should be greater than or equal to 1"),
 }
 
