@@ -52,7 +52,7 @@ _LEAST_GAIN = 1e-3
 _SHARE_OF_UNKNOWN = 0.2
 """An effect is named beside something unknown if its gain is this share of what a free function gains: known effects that
 only imitate the unknown one gain less."""
-_LEAST_CHANCE = 0.01
+LEAST_CHANCE = 0.01
 """Alternatives of a lower probability are not listed."""
 CLEAR = 100.0
 """Nats that a free function larger than :data:`LEAST` must gain to say that something else is missing: far beyond chance,
@@ -563,7 +563,7 @@ def _finding(tried: Sequence[_Tried], model: Model, left: float) -> Finding:
     *chances, _ = softmax(np.array([*(one.gain for one in tried), 0.0]) / heat)
     others = tuple((one.name, float(chance)) for one, chance in zip(tried[1:], chances[1:], strict=True))
     name = tried[0].name
-    others = tuple(one for one in others if one[1] > _LEAST_CHANCE)
+    others = tuple(one for one in others if one[1] > LEAST_CHANCE)
     return Finding(name, float(chances[0]), model.numbers[name], others)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.simulate import Experiment
 
-from .effect_search import FAR, Explanation, Finding, Model
+from .effect_search import FAR, LEAST_CHANCE, Explanation, Finding, Model
 from .expected_errors import Expected, failed
 from .proof import Control, FittedModel
 
@@ -84,7 +84,7 @@ def _shared(finding: Finding, model: Model, wrong: Model, z: float) -> Finding:
     nats -= 0.5 * min(z, 0.0) ** 2
     chances = dict(finding.alternatives)
     weight = float(finding.confidence * np.exp(np.clip(-nats, -700.0, 700.0)))
-    if weight <= chances.get(rival, 0.0):
+    if weight <= max(chances.get(rival, 0.0), LEAST_CHANCE):
         return finding
     total = 1.0 - chances.get(rival, 0.0) + weight
     chances = {name: chance / total for name, chance in (chances | {rival: weight}).items()}
