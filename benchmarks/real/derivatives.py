@@ -1,0 +1,162 @@
+"""A log as filtered derivatives, and the torques and terms of its equation of motion behind the same low-pass."""
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from scipy import signal
+
+from jaxbl.config import Config
+from jaxbl.identification.logs import on_record
+from jaxbl.identification.regression import Kinematics, balance
+from jaxbl.records import Record
+
+sys.path.append(str(Path(__file__).parents[1]))
+from filtered_derivatives import differentiated
+
+_ENDS = 1.5
+"""Left out at either end of a part, in periods of the cutoff: there the filter has readings on one side only."""
+_RATE = 4.0
+"""Samples that are kept, per period of the cutoff: twice what the low-pass leaves."""
+_HARMONICS = 40
+"""Most periods a turn that are tried: more than the poles, teeth and balls of small drives make."""
+_SLOW = (0.01, 0.03, 0.1, 0.3)
+"""Stribeck velocities that are tried, over the largest speed."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A log, or a part of it, without gaps.
+
+    Attributes:
+        kinematics: by Butterworth low-pass forth and back and central differences.
+        period: sampling period, s.
+        cutoff: of the low-pass, Hz.
+    """
+
+    kinematics: Kinematics
+    period: float
+    cutoff: float
+
+    def low_passed(self, values: np.ndarray) -> np.ndarray:
+        """Values behind the low-pass of the positions, without ends, and no more of them than needed; rows are samples."""
+        sections = signal.butter(4, min(2.0 * self.cutoff * self.period, 0.99), output="sos")
+        cut = round(_ENDS / (self.cutoff * self.period))
+        stride = max(int(1.0 / (_RATE * self.cutoff * self.period)), 1)
+        return signal.sosfiltfilt(sections, values, axis=0)[cut : len(values) - cut : stride]
+
+
+def parts_of(record: Record, sides: Sequence[str], cutoff: float) -> list[Part]:
+    """All parts of a log that are longer than what is left out at their ends."""
+    assert record.torque is not None
+    found = []
+    for rows in record.segments:
+        if (rows.stop - rows.start) * record.sample_period < 4.0 * _ENDS / cutoff:
+            continue
+        positions = {side: record.positions[side][rows] for side in sides}
+        with jax.enable_x64(True):
+            motion = differentiated(record.time[rows], record.torque[rows], positions, cutoff)
+        found.append(Part(motion, record.sample_period, cutoff))
+    return found
+
+
+def torque_error(model: Config | Mapping[str, Any], record: Record, parts: Sequence[Part]) -> np.ndarray:
+    """Torque on the motor side by which a model misses the equation of motion, behind the low-pass, N m."""
+    if not isinstance(model, Config):
+        from jaxbl.config import read_model
+
+        model = read_model(model)[0]
+    with jax.enable_x64(True):
+        experiment = on_record(model, record)
+        return np.concatenate(
+            [one.low_passed(np.asarray(balance(experiment, one.kinematics)["motor"].residual)) for one in parts]
+        )
+
+
+@dataclass(frozen=True)
+class Terms:
+    """The equation of motion of the motor side as a sum of terms with unknown factors.
+
+    Attributes:
+        target: input less the torques that are known, N m, shape (samples,).
+        names: of the terms; several columns may share a name, and are kept or left out together.
+        units: of each column's factor.
+        columns: behind the low-pass, shape (samples, columns).
+        base: names that are in the equation from the beginning, those of the nominal model.
+        exclusive: names of which the equation has one at most.
+    """
+
+    target: np.ndarray
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    columns: np.ndarray
+    base: tuple[str, ...]
+    exclusive: tuple[str, ...]
+
+    def of(self, names: Sequence[str]) -> np.ndarray:
+        """Indices of the columns of some terms."""
+        return np.array([i for i, name in enumerate(self.names) if name in names], dtype=int)
+
+
+def terms_of(parts: Sequence[Part], model: Config, linear: bool, spans: tuple[float, float]) -> Terms:
+    """Terms of a log.
+
+    Args:
+        parts: of the log.
+        model: nominal; says which terms are there from the beginning, and which inertia is known.
+        linear: whether positions are in m: a place then has no angle.
+        spans: largest speed and travel of the log that is fitted, which say what is tried.
+    """
+    drive = model.drive
+    known = drive.motor_inertia if "drive.motor_inertia" in model.uncertainty.exact else None
+    rigid = drive.kind == "rigid"
+    target, rows, names, units = [], [], [], []
+    force = "N" if linear else "N m"
+    for part in parts:
+        k = part.kinematics
+        q, v, a = (np.asarray(one["motor"]) for one in (k.position, k.velocity, k.acceleration))
+        columns = _columns(q, v, a, linear, spans)
+        if not rigid:
+            twist = q - np.asarray(k.position["load"]) * float(drive.gear_ratio)
+            rate = v - np.asarray(k.velocity["load"]) * float(drive.gear_ratio)
+            columns += [
+                ("twist", "N m/rad", twist),
+                ("twist rate", "N m s/rad", rate),
+                ("twist cubed", "N m/rad³", twist**3),
+            ]
+        if known is not None:
+            columns = columns[1:]
+        torque = np.asarray(k.torque) - (known or 0.0) * a
+        target.append(part.low_passed(torque))
+        rows.append(part.low_passed(np.stack([one for _, _, one in columns], axis=1)))
+        names, units = [one for one, _, _ in columns], [one.replace("N m", force) for _, one, _ in columns]
+    base = ([] if known is not None else ["inertia"]) + (["viscous"] if drive.motor_viscous > 0.0 else [])
+    base += [] if rigid else ["twist"]
+    slow = tuple(one for one in names if one.startswith("Stribeck"))
+    return Terms(np.concatenate(target), tuple(names), tuple(units), np.concatenate(rows), tuple(base), slow)
+
+
+def _columns(
+    q: np.ndarray, v: np.ndarray, a: np.ndarray, linear: bool, spans: tuple[float, float]
+) -> list[tuple[str, str, np.ndarray]]:
+    fastest, travel = spans
+    found = [
+        ("inertia", "kg m²" if not linear else "kg", a),
+        ("viscous", "N m s/rad" if not linear else "N s/m", v),
+        ("Coulomb", "N m", np.sign(v)),
+        ("constant", "N m", np.ones_like(v)),
+        ("quadratic drag", "N m s²/rad²" if not linear else "N s²/m²", v * np.abs(v)),
+        ("viscous by direction", "N m s/rad" if not linear else "N s/m", np.abs(v)),
+    ]
+    for share in _SLOW:
+        found.append((f"Stribeck at {share * fastest:.2g}", "N m", np.sign(v) * np.exp(-((v / (share * fastest)) ** 2))))
+    if not linear:
+        for n in range(1, _HARMONICS + 1):
+            # one whole wave, or it cannot be told from the slower terms; of gravity a pendulum shows less
+            if n == 1 or travel >= 2.0 * np.pi / n:
+                found += [(f"{n} a turn", "N m", np.sin(n * q)), (f"{n} a turn", "N m", np.cos(n * q))]
+    return found

@@ -1,0 +1,129 @@
+"""The bench of real machines: what does `jaxbl diagnose` say of recordings, and is it better than a plain regression?
+
+The recordings are no part of the project. `--data` names the folder with them; real/machines.py says which files, their
+SHA-256, the split into fitted and held-out logs, the nominal model and what is published. A file that is missing or another
+version is said in one line, and its row is left out.
+
+    python benchmarks/real_machines.py --data ../shared/data
+    python benchmarks/real_machines.py --data ../shared/data --only emps servo_1khz --rivals --out results/real
+
+`--rivals` fits two other tools to the same logs, on terms of filtered derivatives (4th-order Butterworth forth and back,
+central differences): inertia, viscous and Coulomb friction, Stribeck friction, constant torque, quadratic drag, viscous
+friction by direction, up to 40 periods a turn, and the twist of a shaft.
+
+- stepwise least squares: a term is added if it takes 3 % off the rms of a blocked cross-validation, and more than one
+  standard error of the blocks' gains;
+- pysindy (`pip install pysindy`): sequentially thresholded ridge regression, threshold and ridge by the same blocks.
+
+All torque errors of that comparison are those of the same filtered derivatives, behind the same low-pass: the equation of
+motion of the model that jaxbl returned is applied to them as the terms of the others are. Its own account (errors before,
+after, limit) is on its smoothed motion, behind a low-pass that it chose; that would favour it in a comparison.
+
+mujoco.sysid (MuJoCo 4) is not among them: it fits numbers that it is given (mass, damping, friction loss) and looks for none
+that are missing; a joint of MuJoCo has neither a ripple over the turn nor a constant torque without an actuator of its own,
+and its dry friction is a soft constraint. What is compared here is which effects are named.
+"""
+
+import argparse
+import sys
+import tempfile
+import time
+import traceback
+from pathlib import Path
+
+import numpy as np
+from real.derivatives import Part, parts_of, terms_of, torque_error
+from real.machines import CASES, Case, logs_of, unfit
+from real.rivals import sindy, stepwise
+from real.table import Row, markdown, row_of, write
+
+CACHE = Path(__file__).parents[1] / ".cache" / "jax"
+
+
+def diagnosed(case: Case, data: Path, rivals: bool) -> Row:
+    """The row of a case."""
+    from jaxbl.diagnosis.diagnose import run_diagnosis
+    from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
+    from jaxbl.errors import InputError
+
+    row, task, model = row_of(case), None, None
+    with tempfile.TemporaryDirectory() as folder:
+        logs, holdout = logs_of(case, data, Path(folder))
+        start = time.perf_counter()
+        try:
+            task = read_diagnosis_task(logs, case.study, holdout=holdout)
+            found = run_diagnosis(task)
+            row.summary, model = found.summary, found.model
+        except InputError as error:
+            row.error, row.expected = str(error).replace(f"{data}/", ""), not case.readable
+        except Exception as error:
+            traceback.print_exc()
+            row.error = f"{type(error).__name__}: {error}"
+        row.seconds = time.perf_counter() - start
+    if task is None or not case.readable:
+        return row
+    _compare(row, case, task, model, rivals)
+    return row
+
+
+def _compare(row: Row, case: Case, task, model, rivals: bool) -> None:
+    """Add the torque errors of all tools behind one low-pass."""
+    sides = ("motor", "load") if task.config.drive.kind == "two_inertia" else ("motor",)
+    fitted, held = (parts_of(one, sides, case.cutoff) for one in (task.record, task.holdout))
+    linear = task.record.findings.channels["theta_e"].unit == "m"
+    row.unit = "N" if linear else "N m"
+    row.driving = _driving(held, float(task.config.drive.motor_inertia))
+    errors = {"nominal": torque_error(task.config, task.holdout, held)}
+    if model is not None:
+        errors["jaxbl"] = torque_error(model, task.holdout, held)
+    row.torques = {name: float(np.sqrt(np.mean(one**2))) for name, one in errors.items()}
+    if not rivals:
+        return
+    speed = max(float(np.max(np.abs(one.kinematics.velocity["motor"]))) for one in fitted)
+    travel = max(float(np.ptp(one.kinematics.position["motor"])) for one in fitted)
+    terms, other = (terms_of(parts, task.config, linear, (speed, travel)) for parts in (fitted, held))
+    for name, tool in (("stepwise", stepwise), ("pysindy", sindy)):
+        found = tool(terms, other)
+        row.rivals[name], row.torques[name] = found.said(), found.rms
+
+
+def _driving(parts: list[Part], inertia: float) -> float:
+    """Rms of the input, or where there is none of the inertia's torque, N m."""
+    torque = np.concatenate([one.low_passed(np.asarray(one.kinematics.torque)) for one in parts])
+    if np.any(torque):
+        return float(np.sqrt(np.mean(torque**2)))
+    speeding = np.concatenate([one.low_passed(np.asarray(one.kinematics.acceleration["motor"])) for one in parts])
+    return float(inertia * np.sqrt(np.mean(speeding**2)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="folder with the recordings")
+    parser.add_argument("--only", nargs="+", metavar="NAME", choices=[one.name for one in CASES], help="these rows alone")
+    parser.add_argument("--rivals", action="store_true", help="fit the other tools as well")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="leave scores.md, JSON files and a figure there")
+    asked = parser.parse_args()
+
+    import jax
+
+    if jax.config.values["jax_compilation_cache_dir"] is None:
+        jax.config.update("jax_compilation_cache_dir", str(CACHE))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    rows = []
+    for case in CASES:
+        if asked.only and case.name not in asked.only:
+            continue
+        if why := unfit(case, asked.data):
+            print(f"{case.name} is left out: {why}", file=sys.stderr)
+            continue
+        rows.append(diagnosed(case, asked.data, asked.rivals))
+        print(f"{case.name}: {rows[-1].summary.get('verdict', 'no diagnosis')}, {rows[-1].seconds:.0f} s", file=sys.stderr)
+    text = markdown(rows, asked.rivals)
+    print(text)
+    if asked.out is not None:
+        for path in write(rows, text, asked.out):
+            print(path)
+
+
+if __name__ == "__main__":
+    main()
