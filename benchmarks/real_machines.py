@@ -16,8 +16,10 @@ friction by direction, up to 40 periods a turn, and the twist of a shaft.
 - pysindy (`pip install pysindy`): sequentially thresholded ridge regression, threshold and ridge by the same blocks.
 
 All torque errors of that comparison are those of the same filtered derivatives, behind the same low-pass: the equation of
-motion of the model that jaxbl returned is applied to them as the terms of the others are. Its own account (errors before,
-after, limit) is on its smoothed motion, behind a low-pass that it chose; that would favour it in a comparison.
+motion of the model that jaxbl returned is applied to them as the terms of the others are, and its error is referred to the
+input. Its own account (errors before, after, limit) is on its smoothed motion, behind a low-pass that it chose; that would
+favour it in a comparison. Dry friction takes the sign of the filtered velocity for all tools, which is wrong for a moment at
+each reversal.
 
 mujoco.sysid (MuJoCo 4) is not among them: it fits numbers that it is given (mass, damping, friction loss) and looks for none
 that are missing; a joint of MuJoCo has neither a ripple over the turn nor a constant torque without an actuator of its own,

@@ -1,10 +1,10 @@
 """A log as filtered derivatives, and the torques and terms of its equation of motion behind the same low-pass."""
 
+import dataclasses
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -64,17 +64,28 @@ def parts_of(record: Record, sides: Sequence[str], cutoff: float) -> list[Part]:
     return found
 
 
-def torque_error(model: Config | Mapping[str, Any], record: Record, parts: Sequence[Part]) -> np.ndarray:
-    """Torque on the motor side by which a model misses the equation of motion, behind the low-pass, N m."""
-    if not isinstance(model, Config):
-        from jaxbl.config import read_model
+_MORE = 0.01
+"""Share by which the input is raised to see what of it acts: small enough to be a derivative."""
 
-        model = read_model(model)[0]
+
+def torque_error(model: Config, record: Record, parts: Sequence[Part]) -> np.ndarray:
+    """Torque on the motor side by which a model misses the equation of motion, behind the low-pass, N m.
+
+    Referred to the input: a model that multiplies all its torques, and the input by a gain, by one factor misses the same.
+    """
+    missed, acting, given = [], [], []
     with jax.enable_x64(True):
         experiment = on_record(model, record)
-        return np.concatenate(
-            [one.low_passed(np.asarray(balance(experiment, one.kinematics)["motor"].residual)) for one in parts]
-        )
+        for one in parts:
+            k = one.kinematics
+            raised = dataclasses.replace(k, torque=(1.0 + _MORE) * k.torque)
+            left, more = (np.asarray(balance(experiment, motion)["motor"].residual) for motion in (k, raised))
+            missed.append(one.low_passed(left))
+            acting.append(one.low_passed((more - left) / _MORE))
+            given.append(one.low_passed(np.asarray(k.torque)))
+    torque = np.concatenate(given)
+    gain = np.concatenate(acting) @ torque / (torque @ torque) if np.any(torque) else 1.0
+    return np.concatenate(missed) / gain
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Two other ways to find what a model lacks, on terms of filtered derivatives: stepwise least squares, and SINDy."""
 
 import itertools
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -116,7 +117,10 @@ def sindy(fitted: Terms, held: Terms) -> Found:
 
     def kept(rows: np.ndarray, share: float, ridge: float) -> np.ndarray:
         optimizer = pysindy.STLSQ(threshold=share, alpha=ridge * len(rows), max_iter=50)
-        optimizer.fit(fitted.columns[rows] / size, (fitted.target[rows] / scale)[:, None])
+        with warnings.catch_warnings():
+            # a threshold that leaves no term, or one that does not settle in so many rounds, loses by its errors
+            warnings.simplefilter("ignore")
+            optimizer.fit(fitted.columns[rows] / size, (fitted.target[rows] / scale)[:, None])
         return np.ravel(optimizer.coef_) * scale / size
 
     whole, tried = np.arange(len(fitted.target)), []
