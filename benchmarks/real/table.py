@@ -110,6 +110,8 @@ def markdown(rows: Sequence[Row], rivals: bool) -> str:
             f"{'<br>'.join(findings(one.summary))} | {one.published} | {one.seconds:.0f} |"
         )
     done = [one for one in rows if not one.error]
+    if not done:
+        return "\n".join(lines if rows else ["no recordings"])
     lines += [
         "",
         "Held-out errors by jaxbl's own account, rms (before → after; a complete model stays below the limit):",
