@@ -118,9 +118,11 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         if withdrawn:
             found = search.without(found, withdrawn)
         done()
+        if not np.isfinite(fitted.covariance).all():
+            raise InputError(f"{task.record.path}: the model's numbers cannot be fitted to this log; is its input complete?")
         expected = expected_errors(setup.holdout, fitted, after, setup.input_noise, found.model.linear.drive)
         controls = proof.controls(search, fitted, after, found.wrong)
-        judgement = judged(found, fitted, after.errors, expected, controls, setup.prior)
+        judgement = judged(found, fitted, proof.before.errors, after.errors, expected, controls, setup.prior)
         found = judgement.found
         done()
         lacking_after = residual_torques(fitted.experiment, setup.fitted.segments)

@@ -116,6 +116,7 @@ def tested(judgement: Judgement, expected: Mapping[str, Expected], controls: Seq
             "far": judgement.far,
             "chance": judgement.chance,
             "remainder": judgement.remainder,
+            "powerless": judgement.powerless,
         },
         "controls": {
             one.kind: {"rmse": one.errors, "z": one.z} | ({"effect": one.effect} if one.effect else {}) for one in controls

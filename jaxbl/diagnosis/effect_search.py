@@ -329,8 +329,16 @@ class EffectSearch:
             # a free function that was needed beside the effect is needed without it, too
             rest = {name: max(rest[name], one) for name, one in self.remainder(current).items()}
             left = _most(rest)
-        findings = tuple(_finding(one, current, left) for one in found.values())
+        heat = self._heat(current) if left > CLEAR and found else 1.0
+        findings = tuple(_finding(one, current, heat) for one in found.values())
         return Explanation(_verdict(left, findings), findings, current, nominal, wrong, rest)
+
+    def _heat(self, model: Model) -> float:
+        """By how much evidence is overstated where errors are correlated: variance of the effects' numbers over what it were
+        without correlation, the largest (tempered likelihood; P. Gruenwald, T. van Ommen, Bayesian Analysis 12 (2017))."""
+        best, own = self.refitted(model.numbers, model.theta), len(self.free)
+        variance, white = (np.diag(one)[own:] for one in (best.covariance, best.white))
+        return max(float(np.max(variance / np.maximum(white, 1e-300), initial=1.0)), 1.0)
 
     def without(self, found: Explanation, names: Collection[str]) -> Explanation:
         """An explanation without some of its effects; free functions are fitted anew to what remains."""
@@ -556,9 +564,8 @@ def _key(values: Mapping[str, Numbers], theta: np.ndarray) -> tuple:
     return (*((name, *numbers.items()) for name, numbers in values.items()), theta.tobytes())
 
 
-def _finding(tried: Sequence[_Tried], model: Model, left: float) -> Finding:
-    """The first of those tried, with its confidence; where something unknown remains, differences of evidence count less."""
-    heat = left if left > CLEAR else 1.0
+def _finding(tried: Sequence[_Tried], model: Model, heat: float) -> Finding:
+    """The first of those tried, with its confidence; differences of evidence are divided by `heat`."""
     # or nothing is missing
     *chances, _ = softmax(np.array([*(one.gain for one in tried), 0.0]) / heat)
     others = tuple((one.name, float(chance)) for one, chance in zip(tried[1:], chances[1:], strict=True))

@@ -19,7 +19,7 @@ _FUNCTIONS = {
     "place": ("position", 24, True), "velocity": ("velocity", 12, False),
 }  # fmt: skip
 """Coordinate of each function, its knots there, and whether it is a friction, against the direction of motion."""
-_LENGTHS = 0.1, 0.3, 0.6, 1.2
+_LENGTHS = 1e-3, 1e-2, 0.1, 0.3, 0.6, 1.2
 """Pre-sliding distances of the friction with a memory, over the standard deviation of the position."""
 
 

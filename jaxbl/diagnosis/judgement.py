@@ -26,6 +26,7 @@ class Judgement(NamedTuple):
         far: the model's own numbers that had to leave what is known of them, and by how many of its standard deviations.
         chance: whether the added torque does as well shuffled in time.
         remainder: whether the search found that something else is missing.
+        powerless: whether the model as given would pass, too, so that held-out data say nothing for the effects.
     """
 
     found: Explanation
@@ -33,11 +34,13 @@ class Judgement(NamedTuple):
     far: dict[str, float]
     chance: bool
     remainder: bool
+    powerless: bool
 
 
 def judged(
     found: Explanation,
     fitted: FittedModel,
+    before: Mapping[str, float],
     errors: Mapping[str, float],
     expected: Mapping[str, Expected],
     controls: Sequence[Control],
@@ -48,7 +51,7 @@ def judged(
     Args:
         found: of the search.
         fitted: the model with it.
-        errors: its errors on held-out data, by channel.
+        before, errors: errors of the model as given, and its own, on held-out data, by channel.
         expected: those of a complete model.
         controls: of the model.
         prior: standard deviations of its own numbers, which are the first of `fitted`.
@@ -64,10 +67,11 @@ def judged(
             findings = tuple(
                 _shared(each, found.model, found.wrong, one.z) if each.effect == last else each for each in findings
             )
-    verdict = "unknown_effect" if left or far or chance else found.verdict
-    return Judgement(
-        dataclasses.replace(found, verdict=verdict, findings=findings), left, far, chance, found.verdict == "unknown_effect"
-    )
+    powerless = bool(fitted.names) and not failed(before, expected)
+    verdict = "unknown_effect" if left or far or chance or powerless else found.verdict
+    remainder = found.verdict == "unknown_effect"
+    said = dataclasses.replace(found, verdict=verdict, findings=findings)
+    return Judgement(said, left, far, chance, remainder, powerless)
 
 
 def _shared(finding: Finding, model: Model, wrong: Model, z: float) -> Finding:

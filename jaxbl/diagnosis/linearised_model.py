@@ -224,6 +224,8 @@ OFF = 0.5
 """Prior size of the error of an inertia or a viscous friction, relative: nominal ones are right within a factor of two."""
 _FREQUENCIES, _COARSE = 8, 16
 """Peaks of the spectrum that are tried; frequencies at which the response to a torque is computed, smooth in between."""
+_LEAST_PERIODS = 3.0
+"""Of a periodic torque in a log: with fewer it is a constant or a drift."""
 _HIGHEST = 50.0
 """Hz: a torque of a higher frequency hardly moves a drive."""
 _NO_INPUT = 1e-3
@@ -470,7 +472,7 @@ class Linear:
         left = errors[:, :, self._taken(forces)] @ predictor.coefficients[i]
         time, real = np.asarray(part.time), int(self.signals[i].real.sum())
         span, top = real * self.period, self._highest
-        few = np.geomspace(1.0 / span, top, _COARSE)
+        few = np.geomspace(min(1.0 / span, 0.5 * top), top, _COARSE)
         phase = 2.0 * np.pi * few[:, None] * time[None, :]
         waves = np.zeros((2 * _COARSE, len(time), len(self.sides) + 1))
         waves[:, :, side] = np.concatenate([np.sin(phase), np.cos(phase)])
@@ -479,7 +481,7 @@ class Linear:
         slope = np.asarray(_gradient(part, gain, jnp.asarray(left / deviation[None, :] ** 2)))[:real, side]
         size = 4 * 2 ** int(np.ceil(np.log2(real)))
         frequency = np.fft.rfftfreq(size, self.period)
-        inside = (frequency >= 0.5 / span) & (frequency <= top)
+        inside = (frequency >= _LEAST_PERIODS / span) & (frequency <= top)
         expected = np.exp(np.interp(np.log(np.maximum(frequency, 1e-9)), np.log(few), np.log(power)))
         score = np.where(inside, np.abs(np.fft.rfft(slope, size)) ** 2 / expected, 0.0)
         peaks = np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:])) + 1

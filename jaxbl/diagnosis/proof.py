@@ -98,22 +98,30 @@ class Proof:
         self.noise = self.other.noise_floor(self.before.torques)
 
     def accepted(self, search: EffectSearch, found: Explanation) -> tuple[FittedModel, Comparison, list[str]]:
-        """The model with what was found, how it compares, and the effects that are withdrawn: with them it is worse."""
+        """The model with what was found, how it compares, and the effects that are withdrawn: with them it is
+        worse than as given, or no better than without the last of them."""
         names, withdrawn = found.model.names, []
         while True:
             base = found.model if names else found.nominal
             fitted = fit_model(search, {name: base.numbers[name] for name in names}, base.theta)
             after = self.other.compare(fitted.experiment)
-            if not self._worse(after) and (names or is_better(after.errors, self.before.errors)):
+            kept = not self._worse(after) and (names or is_better(after.errors, self.before.errors))
+            if kept and (len(names) < 2 or self._beaten(self._without_last(search, found, names), after) > 0.0):
                 return fitted, after, withdrawn
             if not names:
                 break
             withdrawn.append(names[-1])
             names = names[:-1]
         own, known = self.setup.own, np.diag(self.setup.prior**2)
-        # nothing is missing of a complete model: the log says how well its numbers are known
-        given = FittedModel((), self.setup.nominal, own, np.zeros(len(own)), known, fitted.white)
-        return given, self.before, withdrawn
+        # if nothing is missing, its numbers are off by as much as the fit says
+        off = fitted.white + np.outer(fitted.theta, fitted.theta)
+        return FittedModel((), self.setup.nominal, own, np.zeros(len(own)), known, off), self.before, withdrawn
+
+    def _without_last(self, search: EffectSearch, found: Explanation, names: Sequence[str]) -> Comparison:
+        """How a model without the last of its effects compares."""
+        model = found.model
+        fewer = fit_model(search, {name: model.numbers[name] for name in names[:-1]}, model.theta)
+        return self.other.compare(fewer.experiment)
 
     def _worse(self, after: Comparison) -> bool:
         """Whether a model is worse than the one given on what was held out, by more than noise."""

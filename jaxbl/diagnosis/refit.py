@@ -137,6 +137,8 @@ class _Refiner:
     def covariance(self, point: _Point) -> tuple[np.ndarray, np.ndarray]:
         """Covariance of theta: of the errors, which may be correlated, and the prior together; and if they are not."""
         linear, own, sides = point.linear, len(self.free), len(self.experiment.sides)
+        if not own:
+            return np.zeros((0, 0)), np.zeros((0, 0))
         residual, jacobian = [], []
         for errors in linear.errors(point.predictor.smoothness):
             flat = (errors / np.sqrt(point.predictor.given / linear.count)[None, :, None]).reshape(-1, errors.shape[2])

@@ -95,6 +95,10 @@ def _reasons(summary: Mapping[str, Any]) -> list[str]:
             f"{path} had to change{change}, {abs(z):.0f} times its [uncertainty]: findings and it may compensate each "
             "other. Noise of the torque channel does it, or too small a relative."
         )
+    if test["powerless"]:
+        lines.append(
+            "The data not used for the fit cannot confirm it: the model as given leaves no more there than could be chance."
+        )
     if test["chance"]:
         lines.append("Shuffled in time, the torque that was added does as well.")
     return lines

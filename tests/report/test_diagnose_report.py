@@ -53,7 +53,7 @@ SUMMARY = {
             for name, value in ERRORS.items()
             if not name.startswith("velocity")
         },
-        "test": {"level": 0.01, "failed": [], "far": {}, "chance": False, "remainder": False},
+        "test": {"level": 0.01, "failed": [], "far": {}, "chance": False, "remainder": False, "powerless": False},
         "controls": {
             "wrong": {"effect": "load.stribeck_friction", "rmse": scaled(0.3), "z": 12.3},
             "permuted": {"rmse": scaled(1.4) | {"theta_e": None}, "z": float("inf")},
@@ -132,6 +132,7 @@ def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
     first, _, _, second, *_ = lines(far={"drive.motor_inertia": -25.0})
     assert first == partly.format("83 %") + "not used for the fit, but not in a way that can be right."
     assert second.startswith("drive.motor_inertia had to change by -50%, 25 times its [uncertainty]: findings and it may")
+    assert lines(powerless=True)[3].startswith("The data not used for the fit cannot confirm it: the model as given leaves")
     assert lines(chance=True)[3] == "Shuffled in time, the torque that was added does as well."
 
 
