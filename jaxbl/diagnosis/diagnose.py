@@ -27,11 +27,11 @@ from .diagnosis_summary import extended_study, observers_say, rival_tables, summ
 from .diagnosis_task import DiagnosisTask, read_diagnosis_task
 from .effect_search import EffectSearch, Explanation
 from .expected_errors import expected_errors
-from .judgement import explained_share, judged
+from .judgement import exchanged, explained_share, judged
 from .localise import SIGNIFICANT, Localised, localise
 from .observer_residual import Observed, observed_torques
-from .proof import Proof, free_values
-from .reference_log import at_period
+from .proof import Control, FittedModel, Proof, free_values
+from .reference_log import Comparison, at_period
 from .residuals import Residual, residual_torques
 from .setup import Setup, set_up
 
@@ -114,14 +114,11 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         done()
         search, found = _explained(setup)
         done()
-        fitted, after, withdrawn = proof.accepted(search, found)
-        if withdrawn:
-            found = search.without(found, withdrawn)
+        found, fitted, after, controls, withdrawn = _proved(proof, search, found)
         done()
         if not np.isfinite(fitted.covariance).all():
             raise InputError(f"{task.record.path}: the model's numbers cannot be fitted to this log; is its input complete?")
         expected = expected_errors(setup.holdout, fitted, after, setup.input_noise, found.model.linear.drive)
-        controls = proof.controls(search, fitted, after, found.wrong)
         judgement = judged(found, fitted, proof.before.errors, after.errors, expected, controls, setup.prior)
         found = judgement.found
         done()
@@ -187,6 +184,24 @@ def _explained(setup: Setup) -> tuple[EffectSearch, Explanation]:
     if found.verdict == "no_discrepancy":
         _check_shown(setup, search.linear({}, np.zeros(len(setup.own))).shown())
     return search, found
+
+
+def _proved(
+    proof: Proof, search: EffectSearch, found: Explanation
+) -> tuple[Explanation, FittedModel, Comparison, list[Control], list[str]]:
+    """An explanation as far as the held-out data bear it out: the model with it, how that compares, its controls, and the
+    effects that were withdrawn. An effect that another one beats there changes places with it, once."""
+    other: Explanation | None = found
+    for _ in range(2):
+        found = other or found
+        fitted, after, withdrawn = proof.accepted(search, found)
+        if withdrawn:
+            found = search.without(found, withdrawn)
+        controls = proof.controls(search, fitted, after, found.wrong)
+        other = exchanged(found, controls)
+        if other is None:
+            break
+    return found, fitted, after, controls, withdrawn
 
 
 def _check_shown(setup: Setup, shown: float) -> None:

@@ -74,18 +74,37 @@ def judged(
     return Judgement(said, left, far, chance, remainder, powerless)
 
 
+def _nats(model: Model, wrong: Model, z: float) -> float:
+    """Evidence for a model over one with another effect in place of its last, as far as held-out data agree (nats)."""
+    if model.names[-1].partition(".")[2] in EFFECTS[wrong.names[-1]].special_cases:
+        # a more general effect does as well by its nature
+        return np.inf
+    fit = max(model.log_likelihood - wrong.log_likelihood, 0.0)
+    nats = model.log_evidence - wrong.log_evidence - fit * (1.0 - float(np.clip(z / _BEATEN, 0.0, 1.0)))
+    return nats - 0.5 * min(z, 0.0) ** 2
+
+
+def exchanged(found: Explanation, controls: Sequence[Control]) -> Explanation | None:
+    """An explanation with the other effect in place of its last, where the held-out data prefer that; else None."""
+    z = next((one.z for one in controls if one.kind == "wrong"), np.inf)
+    if found.wrong is None or not found.findings or found.findings[-1].effect != found.model.names[-1]:
+        return None
+    if _nats(found.model, found.wrong, z) >= 0.0:
+        return None
+    *others, last = found.findings
+    rival = found.wrong.names[-1]
+    chance = dict(last.alternatives).get(rival, 0.0)
+    alternatives = ((last.effect, last.confidence), *(one for one in last.alternatives if one[0] != rival))
+    now = Finding(rival, chance, found.wrong.numbers[rival], alternatives)
+    return dataclasses.replace(found, model=found.wrong, wrong=found.model, findings=(*others, now))
+
+
 def _shared(finding: Finding, model: Model, wrong: Model, z: float) -> Finding:
     """A finding whose effect was preferred to another one (`wrong`) by the log, as far as held-out data agree.
 
     What the numbers' prior says for it stands; what the fit says counts in full only if it shows on the held-out data, too.
     """
-    rival = wrong.names[-1]
-    if finding.effect.partition(".")[2] in EFFECTS[rival].special_cases:
-        # a more general effect does as well by its nature
-        return finding
-    fit = max(model.log_likelihood - wrong.log_likelihood, 0.0)
-    nats = model.log_evidence - wrong.log_evidence - fit * (1.0 - float(np.clip(z / _BEATEN, 0.0, 1.0)))
-    nats -= 0.5 * min(z, 0.0) ** 2
+    rival, nats = wrong.names[-1], _nats(model, wrong, z)
     chances = dict(finding.alternatives)
     weight = float(finding.confidence * np.exp(np.clip(-nats, -700.0, 700.0)))
     if weight <= max(chances.get(rival, 0.0), LEAST_CHANCE):

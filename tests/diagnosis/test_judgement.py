@@ -7,7 +7,7 @@ import pytest
 
 from jaxbl.diagnosis.effect_search import Explanation, Finding
 from jaxbl.diagnosis.expected_errors import Expected
-from jaxbl.diagnosis.judgement import explained_share, judged
+from jaxbl.diagnosis.judgement import exchanged, explained_share, judged
 from jaxbl.diagnosis.proof import Control
 
 NAME = "motor.coulomb_friction"
@@ -17,7 +17,8 @@ BEFORE = {"theta_e": 0.1, "torque_motor": 0.01}
 
 
 def fit(log_likelihood, log_evidence, name=NAME):
-    return SimpleNamespace(names=(name,), log_likelihood=log_likelihood, log_evidence=log_evidence)
+    numbers = {name: {"torque": 0.2}}
+    return SimpleNamespace(names=(name,), numbers=numbers, log_likelihood=log_likelihood, log_evidence=log_evidence)
 
 
 def found(verdict="explained", fit_gain=50.0, prior_gain=0.0, rival="motor.viscous_friction"):
@@ -71,6 +72,18 @@ def test_what_the_fit_says_counts_only_if_held_out_data_agree():
     assert confidence == pytest.approx(others["motor.viscous_friction"]) == pytest.approx(0.5, abs=0.01)
     assert confidence + sum(others.values()) == pytest.approx(1.0)
     assert shared(-3.0)[0] == pytest.approx(1.0 / (1.0 + np.exp(4.5)), abs=2e-3)
+
+
+def test_an_effect_that_another_beats_on_held_out_data_changes_places_with_it():
+    control = [Control("wrong", NOISE, -3.0, "motor.viscous_friction")]
+    said = found()
+    assert exchanged(said, []) is None and exchanged(said, [control[0]._replace(z=3.0)]) is None
+    other = exchanged(said, control)
+    assert other is not None and (other.model, other.wrong) == (said.wrong, said.model)
+    (one,) = other.findings
+    assert one.effect == "motor.viscous_friction" and one.numbers == {"torque": 0.2}
+    assert one.alternatives == ((NAME, 0.98), ("motor.inertia", 0.02))
+    assert exchanged(found(rival="motor.stribeck_friction"), [control[0]._replace(effect="motor.stribeck_friction")]) is None
 
 
 def test_what_the_prior_says_stands():
