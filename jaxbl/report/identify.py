@@ -30,8 +30,21 @@ def identification_lines(summary: dict[str, Any]) -> list[str]:
     return [*_headline(summary), *_remarks(summary)]
 
 
+_FAR = 10.0
+"""Factor between an inertia or a stiffness and its nominal value from which on a unit is rather wrong: data sheets and CAD
+know them within a factor of two."""
+
+
 def _headline(summary: dict[str, Any]) -> list[str]:
-    lines = []
+    far = [
+        f"{path} is {one['value'] / one['nominal']:.3g} times its nominal value"
+        for path, one in summary["parameters"].items()
+        if path.endswith(("inertia", ".stiffness"))
+        and one["nominal"]
+        and one["value"] is not None
+        and not 1.0 / _FAR < one["value"] / one["nominal"] < _FAR
+    ]
+    lines = [f"Doubtful: {', '.join(far)}: a unit, a factor or a sign in [log] may be wrong."] if far else []
     for path, one in summary["parameters"].items():
         low, high = one["interval"]
         if None in (one["value"], one["standard_error"], low, high):

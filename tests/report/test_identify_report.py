@@ -16,7 +16,7 @@ from jaxbl.identification.logs import unit_on
 from jaxbl.identification.regression import Kinematics, model_torques
 from jaxbl.records import read_record
 from jaxbl.report.figures import save
-from jaxbl.report.identify import draw_identification, write_identification_report
+from jaxbl.report.identify import _headline, draw_identification, write_identification_report
 from jaxbl.sweeps.trial import run
 
 GEARED = ["intervals", "residuals", "velocities", "torque", "hysteresis", "limit_cycle", "recursive"]
@@ -213,3 +213,10 @@ def test_the_fitted_line_is_shown_wherever_the_recursive_numbers_end(factor, tmp
     margin = 0.1 * (high - low)
     assert low + margin < 0.08 < high - margin
     save(figure, tmp_path / "recursive.png")
+
+
+@pytest.mark.parametrize(("factor", "told"), [(1000.0, True), (1.5, False)])
+def test_an_inertia_far_from_what_is_known_of_it_comes_first(factor, told):
+    one = {"value": 2e-4 * factor, "nominal": 2e-4, "standard_error": 1e-6, "interval": [0.0, 1.0], "unit": "kg m²"}
+    first = _headline({"parameters": {"drive.motor_inertia": one}})[0]
+    assert first.startswith("Doubtful: drive.motor_inertia is 1e+03 times its nominal value: a unit,") is told
