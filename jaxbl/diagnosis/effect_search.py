@@ -367,7 +367,9 @@ class EffectSearch:
                 if model.log_evidence - plainer.log_evidence < left:
                     model = plainer
                     kept = {(one.name if a == name else a): b for a, b in kept.items()}
-                    kept[one.name] = [one, *(other for other in tried if other.name != one.name)]
+                    # beside something unknown the two are as likely
+                    equal = one._replace(gain=tried[0].gain)
+                    kept[one.name] = [equal, *(other for other in tried if other.name != one.name)]
         return model, kept
 
     def _pruned(self, model: Model, smoothness: Sequence[float]) -> tuple[Model, set[str]]:

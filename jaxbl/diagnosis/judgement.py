@@ -89,12 +89,14 @@ def exchanged(found: Explanation, controls: Sequence[Control]) -> Explanation | 
     z = next((one.z for one in controls if one.kind == "wrong"), np.inf)
     if found.wrong is None or not found.findings or found.findings[-1].effect != found.model.names[-1]:
         return None
-    if _nats(found.model, found.wrong, z) >= 0.0:
+    nats = _nats(found.model, found.wrong, z)
+    if nats >= 0.0:
         return None
     *others, last = found.findings
     rival = found.wrong.names[-1]
-    chance = dict(last.alternatives).get(rival, 0.0)
-    alternatives = ((last.effect, last.confidence), *(one for one in last.alternatives if one[0] != rival))
+    both = last.confidence + dict(last.alternatives).get(rival, 0.0)
+    chance = both / (1.0 + float(np.exp(nats)))
+    alternatives = ((last.effect, both - chance), *(one for one in last.alternatives if one[0] != rival))
     now = Finding(rival, chance, found.wrong.numbers[rival], alternatives)
     return dataclasses.replace(found, model=found.wrong, wrong=found.model, findings=(*others, now))
 
@@ -104,6 +106,9 @@ def _shared(finding: Finding, model: Model, wrong: Model, z: float) -> Finding:
 
     What the numbers' prior says for it stands; what the fit says counts in full only if it shows on the held-out data, too.
     """
+    if model.log_evidence < wrong.log_evidence:
+        # the two have changed places
+        return finding
     rival, nats = wrong.names[-1], _nats(model, wrong, z)
     chances = dict(finding.alternatives)
     weight = float(finding.confidence * np.exp(np.clip(-nats, -700.0, 700.0)))

@@ -82,7 +82,13 @@ def test_an_effect_that_another_beats_on_held_out_data_changes_places_with_it():
     assert other is not None and (other.model, other.wrong) == (said.wrong, said.model)
     (one,) = other.findings
     assert one.effect == "motor.viscous_friction" and one.numbers == {"torque": 0.2}
-    assert one.alternatives == ((NAME, 0.98), ("motor.inertia", 0.02))
+    assert one.confidence == pytest.approx(0.98 / (1.0 + np.exp(-4.5)), rel=1e-3)
+    assert one.alternatives == ((NAME, pytest.approx(0.98 - one.confidence)), ("motor.inertia", 0.02))
+    # what the log alone said for the other one is no argument any more
+    fitted = SimpleNamespace(names=("motor.viscous_friction",), theta=np.zeros(1), free=[])
+    back = [Control("wrong", NOISE, 1.8, NAME)]
+    after = judged(other, fitted, BEFORE, NOISE, LIMITS, back, np.array([0.02]))  # type: ignore[arg-type]
+    assert after.found.findings == (one,)
     assert exchanged(found(rival="motor.stribeck_friction"), [control[0]._replace(effect="motor.stribeck_friction")]) is None
 
 
