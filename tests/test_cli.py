@@ -615,6 +615,8 @@ DIAGNOSED = {
         "holdout_rmse_after": {"theta_e": 0.001, "torque_motor": 0.01},
         "noise_floor": {"theta_e": 0.001, "torque_motor": 0.01},
         "free_run": {},
+        "expected": {},
+        "test": {"level": 0.01, "failed": [], "far": {}, "chance": False, "remainder": False, "powerless": False},
         "controls": {},
     },
 }
@@ -637,6 +639,7 @@ def quick(monkeypatch):
     def report(found, folder):
         from jaxbl.report.diagnose import diagnosis_lines
 
+        (folder / "report.html").write_text("its page")
         (folder / "diagnosis.json").write_text(json.dumps(found.summary))
         return diagnosis_lines(found.summary)
 

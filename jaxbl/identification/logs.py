@@ -49,7 +49,7 @@ class LogTask:
     @property
     def identity(self) -> str:
         """Hash of everything that decides the result."""
-        text = json.dumps([self.config.resolved(), sorted(self.missing), version("jaxbl")], sort_keys=True)
+        text = json.dumps([self.config.resolved(), sorted(self.missing), version("jaxbl"), _SUMMARIES], sort_keys=True)
         total = hashlib.sha256(text.encode())
         for record in (self.record, self.holdout):
             if record is not None:
@@ -59,6 +59,8 @@ class LogTask:
         return total.hexdigest()[:16]
 
 
+_SUMMARIES = 2
+"""Version of what `identification.json` and `diagnosis.json` hold: results of another one are computed anew."""
 _MOST_STEPS = 1000
 """Plant steps between two samples of a log at most: a drive moves through many of its time constants then."""
 

@@ -12,7 +12,7 @@ from .gearing import UNRELATED, Gearing, twist_noise
 from .resampling import Grid
 from .rigid_body import RigidFit
 from .signal_quality import ChannelFigures, resolution
-from .table import LogTable, PositionTable
+from .table import POSITION_CHANNELS, LogTable, PositionTable
 
 
 def check_motion(file: LogFile, name: str, values: np.ndarray) -> None:
@@ -26,8 +26,10 @@ def check_motion(file: LogFile, name: str, values: np.ndarray) -> None:
 
 
 def check_distinct(file: LogFile, channels: Mapping[str, RawChannel]) -> None:
-    """Refuse two channels with the same readings."""
+    """Refuse a position that is another channel's readings over again."""
     for (name, one), (other, two) in itertools.combinations(channels.items(), 2):
+        if not {name, other} & set(POSITION_CHANNELS.values()):
+            continue
         if np.array_equal(one.values, two.values, equal_nan=True) and np.any(one.values):
             raise file.wrong(f"{name} and {other} are the same in every row; each needs a column of its own")
 
