@@ -36,8 +36,18 @@ def diagnosis_lines(summary: dict[str, Any]) -> list[str]:
     return [*_headline(summary), *_remarks(summary)]
 
 
+_FAR = 10.0
+"""Factor between the torque and what [log] u says from which a unit is rather wrong: torque constants are known better."""
+
+
 def _headline(summary: dict[str, Any]) -> list[str]:
-    lines = [verdict_sentence(summary)]
+    gains = [1.0 + one["parameters"]["relative"]["value"] for one in summary["findings"] if "relative" in one["parameters"]]
+    lines = [
+        f"Doubtful: the torque would be {gain:.3g} times what u says: a unit, a factor or a sign in [log] may be wrong."
+        for gain in gains
+        if not 1.0 / _FAR < gain < _FAR
+    ]
+    lines.append(verdict_sentence(summary))
     for one in summary["findings"]:
         numbers = ", ".join(_number(leaf, number) for leaf, number in one["parameters"].items())
         lines.append(f"{one['effect']} (confidence {probability(one['confidence'])}): {numbers}.")

@@ -136,6 +136,13 @@ def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
     assert lines(chance=True)[3] == "Shuffled in time, the torque that was added does as well."
 
 
+@pytest.mark.parametrize(("relative", "told"), [(-0.98, True), (0.14, False)])
+def test_a_torque_that_is_far_off_comes_first(relative, told):
+    one = SUMMARY["findings"][0] | {"parameters": {"relative": {"value": relative, "standard_error": 0.01, "unit": ""}}}
+    first = diagnosis_lines(changed(findings=[one]))[0]
+    assert first.startswith("Doubtful: the torque would be 0.02 times what u says: a unit,") is told
+
+
 @pytest.mark.parametrize("findings", [SUMMARY["findings"], []], ids=["some", "none"])
 def test_the_verdict_is_drawn(findings, tmp_path):
     drawn = _verdict(changed(findings=findings, verdict="explained" if findings else "no_discrepancy"))
