@@ -654,8 +654,9 @@ DIAGNOSE = ["diagnose", "an axis.csv", "--model", "axis.toml"]
 def test_a_log_is_diagnosed_once(axis, quick, call, tmp_path):
     code, lines, _ = call(*DIAGNOSE, "--next-experiment", "next.csv")
     assert code == 0
-    assert lines[0].startswith(
-        "Explained: the model lacks motor.coulomb_friction; with it, no more is left on data not used "
+    assert lines[0] == (
+        "Explained: the model lacks motor.coulomb_friction; with it, no more is left on data not used for the fit than "
+        "noise and the uncertainty of the model's numbers account for."
     )
     assert lines[1] == "motor.coulomb_friction (confidence 0.97): torque = 0.05 ± 0.001 N m."
     assert lines[2].startswith(

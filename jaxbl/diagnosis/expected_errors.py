@@ -92,8 +92,8 @@ def expected_errors(
 
 
 def failed(errors: Mapping[str, float], expected: Mapping[str, Expected]) -> list[str]:
-    """Channels in which a model leaves more than a complete one would."""
-    return [name for name, one in expected.items() if not errors[name] <= one.limit]
+    """Channels in which a model leaves more than a complete one would, or in which nobody can say: draws of it diverge."""
+    return [name for name, one in expected.items() if not errors[name] <= one.limit < np.inf]
 
 
 def _moved(fitted: FittedModel, change: np.ndarray) -> Experiment:
@@ -118,6 +118,6 @@ def _quantile(squares: Sequence[float] | np.ndarray) -> float:
     mean, variance = float(np.mean(squares)), float(np.var(squares, ddof=1))
     if not 0.0 < mean < np.inf or variance == 0.0:
         return mean
-    # never narrower than half a degree of freedom, the square of one normal number
+    # never wider than with one degree of freedom, the square of one normal number
     shape = max(mean**2 / variance, 0.5)
     return mean / shape * float(gammaincinv(shape, 1.0 - LEVEL))

@@ -46,6 +46,8 @@ def test_torques_too_small_to_be_named_do_not_fail_a_model(tmp_path):
     more = errors | {"torque_motor": 1.05 * expected["torque_motor"].limit}
     assert failed(more, expected) == ["torque_motor"]
     assert failed(errors | {"theta_e": np.inf}, expected) == ["theta_e"]
+    # a limit that is none excuses nothing
+    assert failed(errors, expected | {"theta_e": expected["theta_e"]._replace(limit=np.inf)}) == ["theta_e"]
 
 
 @pytest.mark.parametrize("freedom", [1, 4, 30])
