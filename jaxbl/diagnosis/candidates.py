@@ -216,6 +216,9 @@ class MotionTorques:
         for name in dict.fromkeys(effect.name for effect in effects):
             which = [i for i, effect in enumerate(effects) if effect.name == name]
             place = self.experiment.drive.place(effects[which[0]].place)
+            # of the model's own only those in the gear matter, and only for others there: one structure, and one program
+            gear = [one for one in self.experiment.effects if one.place == place == "transmission" and one.name != name]
+            bare = with_effects(self.experiment, tuple(gear))
             direction = jnp.asarray(self.direction.get(place, self.torque))
             for first in range(0, len(which), _AT_ONCE):
                 some = which[first : first + _AT_ONCE]
@@ -223,7 +226,7 @@ class MotionTorques:
                 spare = [effects[some[-1]]] * (_AT_ONCE - len(some))
                 members = (*(effects[i] for i in some), *spare)
                 stack = jax.tree.map(lambda *x: jnp.asarray(np.array([float(one) for one in x])), *members)
-                torques = np.asarray(_torques(self.experiment, stack, self.part.moving(), direction))
+                torques = np.asarray(_torques(bare, stack, self.part.moving(), direction))
                 for i, torque in zip(some, torques, strict=False):
                     found[i] = torque
         return found
@@ -241,7 +244,8 @@ def forces_of(candidates: Sequence[Candidate], signals: MotionTorques, spare: in
 
 @jit
 def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direction: jax.Array) -> jax.Array:
-    """Torques of effects of one name, leaves of shape (effects,); shape (effects, samples, sides + 1)."""
+    """Torques of effects of one name, leaves of shape (effects,), in a model that has those in the gear alone; shape
+    (effects, samples, sides + 1)."""
     drive, sides = experiment.drive, experiment.sides
     along = Path(part.time, part.torque, part.position, part.velocity)
 
@@ -249,8 +253,7 @@ def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direct
         found = jnp.zeros((len(part.time), len(sides) + 1))
         place = drive.place(effect.place)
         if place == "transmission":
-            gear = tuple(one for one in experiment.effects if one.place == place and one.name != effect.name)
-            both = (with_effects(experiment, some) for some in (gear, (*gear, effect)))
+            both = (experiment, with_effects(experiment, (*experiment.effects, effect)))
             before, after = (one.plant.transmitted(part.position, part.velocity, effect_path(one, along)[0]) for one in both)
             found = found.at[:, 0].set(before[0] - after[0])
             found = found.at[:, 1].set(after[1] * after[0] - before[1] * before[0])

@@ -78,7 +78,7 @@ class Model:
         theta: the nominal model's own numbers.
         log_evidence: nats; only differences count.
         log_likelihood: nats; as `log_evidence`.
-        linear: the model, which has all effects, those of other names at neutral numbers, along the record.
+        linear: the model along the record; effects of other names are in it at neutral numbers, or not at all.
     """
 
     numbers: dict[str, Numbers]
@@ -593,9 +593,9 @@ def _owner(one: Free) -> tuple[str, str]:
 
 
 def with_numbers(experiment: Experiment, values: Mapping[str, Numbers]) -> Experiment:
-    """A model with all effects, some of them with these numbers."""
+    """A model with all effects (:func:`.neutral_effects.complete`), some of them with these numbers."""
     return set_leaves(
-        experiment,
+        complete(experiment, values),
         {
             f"effects.{name}.{leaf}": jnp.asarray(value, float)
             for name, numbers in values.items()

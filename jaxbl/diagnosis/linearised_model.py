@@ -308,7 +308,7 @@ class Linear:
         """Linearise a model about the motion of a log.
 
         Args:
-            experiment: the model with all effects (:func:`.neutral_effects.complete`); its sample period is that of the log.
+            experiment: the model (:func:`.neutral_effects.complete`); its sample period is that of the log.
             free, theta: numbers that may change, and where they are.
             prior: standard deviation of each theta about 0.
             segments: of the log.

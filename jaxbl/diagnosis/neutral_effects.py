@@ -1,13 +1,17 @@
 """A model with every effect in it: those that it lacks are there at numbers with which they do nothing.
 
-All models that a diagnosis tries then have one structure, and one compiled program serves them all: which effects act is a
-matter of numbers.
+The models that a diagnosis tries then have one structure, and one compiled program serves them all: which effects act is a
+matter of numbers. An effect with a state of its own, though, would make every linearisation larger: it is in the model only
+where it acts.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
+from functools import cache
 from typing import TypeVar
 
-from jaxbl.drive.effects import EFFECTS, make_effect
+import jax
+
+from jaxbl.drive.effects import EFFECTS, AbstractEffect, make_effect
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.simulate import Experiment, with_effects
 
@@ -36,9 +40,24 @@ def corrected(name: str) -> str | None:
     return None if number is None else f"drive.{name.partition('.')[0]}_{number}"
 
 
-def complete(experiment: Experiment) -> Experiment:
-    """A model with all effects that it lacks at neutral numbers; array leaves."""
-    added = [as_arrays(make_effect(name, **EFFECTS[name].neutral()), float) for name in candidates(experiment)]
+def _neutral(name: str) -> AbstractEffect:
+    return as_arrays(make_effect(name, **EFFECTS[name].neutral()), float)
+
+
+@cache
+def has_state(name: str) -> bool:
+    """Whether an effect has a state of its own."""
+    return bool(jax.tree.leaves(_neutral(name).init()))
+
+
+def complete(experiment: Experiment, acting: Collection[str] = ()) -> Experiment:
+    """A model with all effects that it lacks at neutral numbers; array leaves.
+
+    Of those with a state of their own it has the ones that are `acting`.
+    """
+    added = [_neutral(name) for name in candidates(experiment) if name in acting or not has_state(name)]
+    if not added:
+        return experiment
     effects = with_added(experiment.effects, added, lambda one: one.name)
     kinds = list(EFFECTS)
     if len({one.name for one in effects}) == len(effects):

@@ -18,7 +18,7 @@ from .diagnosis_task import DiagnosisTask, input_rms
 from .input_noise import smoothed_input, unfelt
 from .linearised_model import Linear
 from .localise import Localised, localise
-from .neutral_effects import complete
+from .neutral_effects import candidates, complete
 from .reference_log import WINDOW, ReferenceLog
 from .residuals import Residual, residual_torques, white_noise
 
@@ -49,7 +49,7 @@ class Setup(NamedTuple):
         task: study and logs.
         sliding: sides whose positions are no angles.
         bare: the model as given.
-        nominal: the same with all effects at neutral numbers.
+        nominal: the same with all effects without a state at neutral numbers.
         own: its numbers that are not exactly known.
         prior: relative standard deviation of each.
         recorded: segments of the log that numbers are fitted to, with the input as it was recorded.
@@ -87,7 +87,7 @@ def set_up(task: DiagnosisTask) -> Setup:
     bare = on_record(config, record)
     # one structure for all models, so that they share their compiled programs
     nominal = complete(bare)
-    _check_order(bare, nominal)
+    _check_order(bare)
     own = free_parameters(bare, default_paths(config, bare), float(np.std(record.torque)))
     prior = np.full(len(own), config.uncertainty.relative)
     rest = config.log.initial_state == "rest"
@@ -130,11 +130,12 @@ def _input_noise(size: float, nominal: Experiment, own: Sequence[Free], segments
     return InputNoise(noise if shown > _SHOWN else 0.0, possible * noise)
 
 
-def _check_order(bare: Experiment, nominal: Experiment) -> None:
+def _check_order(bare: Experiment) -> None:
     """Refuse a model of which two effects share a name, and are called by positions that others would shift."""
     names = [effect.name for effect in bare.effects]
     twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None and [effect.name for effect in nominal.effects[: len(names)]] != names:
+    every = complete(bare, candidates(bare)).effects
+    if twice is not None and [effect.name for effect in every[: len(names)]] != names:
         raise InputError(f"effects: two are {twice}; list them before those of the actuator")
 
 

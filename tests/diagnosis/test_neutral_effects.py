@@ -7,7 +7,7 @@ import pytest
 from small_study import rigid, small
 
 from jaxbl.config import prepare, read_config
-from jaxbl.diagnosis.neutral_effects import bucket, candidates, complete
+from jaxbl.diagnosis.neutral_effects import bucket, candidates, complete, has_state
 from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.parameters import as_arrays, parameters
 from jaxbl.simulate import trajectory
@@ -23,7 +23,7 @@ def model(sides):
 @pytest.mark.parametrize("sides", [1, 2])
 def test_neutral_effects_do_nothing(sides):
     bare = model(sides)
-    every = complete(bare)
+    every = complete(bare, candidates(bare))
     torque = jnp.asarray(np.random.default_rng(1).normal(0.0, 2.0, 300))
     runs = []
     for one in (bare, every):
@@ -40,13 +40,18 @@ def test_neutral_effects_do_nothing(sides):
 def test_all_effects_are_there_once(sides):
     bare = model(sides)
     lacking = candidates(bare)
-    names = [one.name for one in complete(bare).effects]
+    stateful = [name for name in lacking if has_state(name)]
+    assert "actuator.lag" in stateful and not has_state("motor.cogging")
+    names = [one.name for one in complete(bare, lacking).effects]
     assert len(set(names)) == len(names)
     assert set(names) == {*lacking, "motor.coulomb_friction"}
     if sides == 2:
         assert set(names) == set(EFFECTS)
+    # those with a state of their own are there if they act, in the same place as if they had been there from the first
+    assert [one.name for one in complete(bare).effects] == [name for name in names if name not in stateful]
+    assert [one.name for one in complete(complete(bare), lacking).effects] == names
     # a second time there is nothing to add
-    assert candidates(complete(bare)) == []
+    assert candidates(complete(bare)) == stateful and candidates(complete(bare, lacking)) == []
 
 
 @pytest.mark.parametrize("name", EFFECTS)
@@ -67,9 +72,9 @@ def test_buckets_are_few_and_large_enough():
 def test_given_effects_keep_their_order():
     data = small()
     saturated = [{"kind": "actuator.saturation", "limit": 4.0}, {"kind": "actuator.gain_error", "relative": 0.1}]
-    every = complete(as_arrays(prepare(read_config({**data, "effects": saturated})), float))
+    every = complete(as_arrays(prepare(read_config({**data, "effects": saturated})), float), ["actuator.lag"])
     acting = [one.name for one in every.effects if one.place == "actuator"]
     assert acting == ["actuator.saturation", "actuator.gain_error", "actuator.lag"]
-    late = complete(as_arrays(prepare(read_config({**data, "effects": saturated[:1]})), float))
+    late = complete(complete(as_arrays(prepare(read_config({**data, "effects": saturated[:1]})), float)), ["actuator.lag"])
     acting = [one.name for one in late.effects if one.place == "actuator"]
     assert acting == ["actuator.gain_error", "actuator.saturation", "actuator.lag"]
