@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hidden.cases import KINDS, Case, Log, cases, save
+from hidden.cases import ALONE, KINDS, Case, Log, cases, save
 from hidden.scoring import Diagnose, Oracle, Outcome, markdown, outcome, prove, run, write
 from hidden.simulator import engine
 
@@ -89,7 +89,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, required=True, help="of the cases; take one that development has not seen")
     parser.add_argument("--count", type=int, default=66, help="number of cases")
-    parser.add_argument("--kind", choices=(*KINDS, "all"), default="single")
+    parser.add_argument("--kind", choices=(*KINDS, *ALONE, "all"), default="single")
     parser.add_argument(
         "--save", type=Path, metavar="FOLDER", help="write logs, models and truth there, and diagnose nothing"
     )

@@ -16,6 +16,7 @@ VALUES = {
     "load.gravity": {"torque": 0.5, "phase": 0.4},
     "load.periodic_disturbance": {"amplitude": 0.5, "frequency": 2.0, "phase": 0.5},
     "motor.cogging": {"amplitude": 0.1, "harmonic": 6.0, "phase": 0.3},
+    "motor.torque_ripple": {"amplitude": 0.3, "harmonic": 5.0, "phase": -0.6},
     "transmission.backlash": {"half_gap": 0.04},
     "transmission.hardening": {"cubic_stiffness": 20.0},
     "transmission.damping": {"damping": 0.1},

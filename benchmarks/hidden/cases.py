@@ -19,10 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from .effects import EFFECTS, LEVELS, UNKNOWN, Motion, draw, error_of, exclusive, on_rigid, rms
+from .effects import EFFECTS, LEVELS, NEW, UNKNOWN, Motion, draw, error_of, exclusive, on_rigid, rms
 from .simulator import Machine, Run, Trace, simulate
 
 KINDS = ("single", "pairs", "none", "unknown", "hard")
+ALONE = ("new",)
+"""Kinds that `all` leaves out: the effects of :data:`.effects.NEW`, as `single`."""
 EXCITATIONS = ("sine", "multisine", "chirp", "steps")
 
 _PLANTS: dict[str, dict[str, Any]] = {
@@ -161,11 +163,11 @@ def cases(seed: int, count: int, kind: str = "single", duration: float | None = 
     Args:
         seed: the same seed, count and kind give the same cases.
         count: number of cases; effects, sizes and plants come equally often.
-        kind: one of `KINDS`, or `all`: half of the cases single, the rest of all other kinds alike.
+        kind: one of `KINDS` or `ALONE`, or `all`: half of the cases single, the rest of all other kinds alike.
         duration: of all logs in place of what is drawn, s: for quick trials.
     """
-    if kind not in (*KINDS, "all"):
-        raise ValueError(f"unknown kind {kind!r}; one of {', '.join((*KINDS, 'all'))}")
+    if kind not in (*KINDS, *ALONE, "all"):
+        raise ValueError(f"unknown kind {kind!r}; one of {', '.join((*KINDS, *ALONE, 'all'))}")
     counts = {kind: count}
     if kind == "all":
         each = count // (2 * (len(KINDS) - 1))
@@ -188,7 +190,7 @@ def cases(seed: int, count: int, kind: str = "single", duration: float | None = 
 
 def _targets(seed: int, count: int, kind: str) -> list[tuple[str, tuple[tuple[str, float], ...]]]:
     """Plant and hidden effects of each case, in equal shares."""
-    rng = np.random.default_rng([seed, KINDS.index(kind), 1])
+    rng = np.random.default_rng([seed, (*KINDS, *ALONE).index(kind), 1])
 
     def plants(effects: Iterable[str]) -> list[str]:
         return [plant for plant in PLANTS if plant != "direct" or all(on_rigid(effect) for effect in effects)]
@@ -205,7 +207,8 @@ def _targets(seed: int, count: int, kind: str) -> list[tuple[str, tuple[tuple[st
                     levels = [(LEVELS[1], LEVELS[1]), (LEVELS[1], LEVELS[2]), (LEVELS[2], LEVELS[1])][rng.integers(3)]
                     hidden.append((((one, levels[0]), (other, levels[1])), plants((one, other))))
     else:
-        hidden = [(((effect, level),), plants([effect])) for effect in EFFECTS for level in LEVELS]
+        sought = NEW if kind == "new" else EFFECTS
+        hidden = [(((effect, level),), plants([effect])) for effect in sought for level in LEVELS]
     targets: list[tuple[str, tuple[tuple[str, float], ...]]] = []
     while len(targets) < count:
         for i in rng.permutation(len(hidden)):
@@ -224,7 +227,7 @@ def _plan(
     hidden: tuple[tuple[str, float], ...],
     duration: float | None,
 ) -> _Plan:
-    rng = np.random.default_rng([seed, KINDS.index(kind), 2, index, draw_number])
+    rng = np.random.default_rng([seed, (*KINDS, *ALONE).index(kind), 2, index, draw_number])
     names = [name for name, _ in hidden]
     given = _PLANTS[plant]
     conditions, uncertainty = _conditions(kind, plant, rng)
@@ -395,8 +398,9 @@ def _carry_out(seed: int, plans: list[_Plan]) -> list[Case | None]:
         effects, found = [], {}
         fine = bool(np.isfinite(trace.states).all()) and rms(trace.states[1]) > 0.0
         for name, level in plan.hidden if fine else ():
-            drawn, found[name] = draw(name, level, motion, plan.uncertainty, plan.rng)
+            drawn, size = draw(name, level, motion, plan.uncertainty, plan.rng)
             effects.extend(drawn)
+            found[str(drawn[0]["kind"])] = size
         full.append(replace(plan.machine, effects=(*plan.machine.effects, *_ordered(effects))))
         sizes.append(found)
     runs = [replace(run, machine=machine) for plan, machine in zip(plans, full, strict=True) for run in plan.runs]

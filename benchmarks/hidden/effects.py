@@ -30,6 +30,10 @@ GEAR_EFFECTS = ("transmission.backlash", "transmission.hardening", "transmission
 ACTUATOR_EFFECTS = ("actuator.gain_error", "actuator.saturation", "actuator.lag")
 EFFECTS = (*SIDE_EFFECTS, *LOAD_EFFECTS, "motor.cogging", *GEAR_EFFECTS, *ACTUATOR_EFFECTS)
 """What the package knows: design.md, section 6."""
+PINION = "transmission.pinion"
+"""Eccentricity of the motor's wheel: to the package a `transmission.eccentricity` of as many periods as the ratio says."""
+NEW = ("motor.torque_ripple", PINION)
+"""Effects of the kind `new`: other kinds keep their cases."""
 UNKNOWN = ("unknown.drifting_friction", "unknown.hysteresis", "unknown.dent", "unknown.random_torque")
 LEVELS = (0.03, 0.1, 0.3)
 """Sizes as shares of the driving torque's rms; the first is called weak."""
@@ -40,7 +44,7 @@ _LARGEST, _LEAST = 3.0, -0.6
 
 def on_rigid(effect: str) -> bool:
     """Whether an effect has a meaning on a rigid drive."""
-    return effect not in GEAR_EFFECTS and not (effect.startswith("load.") and effect not in LOAD_EFFECTS)
+    return not effect.startswith("transmission.") and not (effect.startswith("load.") and effect not in LOAD_EFFECTS)
 
 
 def error_of(effect: str) -> str | None:
@@ -194,6 +198,10 @@ def _shape(
         case "cogging":
             harmonic = float(rng.choice([6, 8, 12, 14, 18, 24] if not machine.rigid else [6, 8, 12, 18, 24, 36]))
             return linear("amplitude", np.sin(harmonic * x + phase), harmonic=harmonic, phase=phase)
+        case "torque_ripple":
+            # one or two periods a pole pair: offset of a current sensor, unequal gains
+            harmonic = float(rng.choice([1, 2]) * rng.choice([2, 3, 4, 5, 7]))
+            return linear("amplitude", u * np.sin(harmonic * x + phase), harmonic=harmonic, phase=phase)
         case "backlash":
             plain = motion.elastic()
             return lambda c: {"half_gap": c}, lambda c: motion.elastic(gap=c) - plain, 0.0, math.inf
@@ -203,11 +211,13 @@ def _shape(
             reduced = 1.0 / (1.0 / drive["motor_inertia"] + machine.ratio**2 / drive["load_inertia"])
             critical = 2.0 * math.sqrt((machine.transmission or {})["stiffness"] * reduced)
             return linear("damping", motion.rate, most=1.5 * critical)
-        case "eccentricity":
-            harmonic = float(rng.choice([1, 1, 2, 3]))
+        case "eccentricity" | "pinion":
+            harmonic = (
+                float(rng.choice([1, 1, 2, 3])) if name == "eccentricity" else machine.ratio * float(rng.choice([1, 2]))
+            )
             wave, plain = np.sin(harmonic * motion.position["load"] + phase), motion.elastic()
             return (
-                lambda c: {"amplitude": c, "harmonic": harmonic, "phase": phase},
+                lambda c: {"kind": "transmission.eccentricity", "amplitude": c, "harmonic": harmonic, "phase": phase},
                 lambda c: motion.elastic(c * wave) - plain, 0.0, math.inf,
             )  # fmt: skip
         case "gain_error":

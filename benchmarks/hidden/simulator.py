@@ -34,7 +34,8 @@ load_dry load_coulomb load_extra load_stribeck load_drag load_constant load_grav
 motor_drift load_drift drift_time motor_dent load_dent dent_position dent_width gravity_phase
 periodic_rate periodic_phase cog_amplitude cog_harmonic cog_phase hysteresis_length
 motor_random load_random gain limit lag_rate
-loop kp kd filter motor_noise motor_resolution torque_limit period steps origin"""
+loop kp kd filter motor_noise motor_resolution torque_limit period steps origin
+ripple_amplitude ripple_harmonic ripple_phase"""
 _ROWS = _NAMES.split()
 P = SimpleNamespace(**{name: i for i, name in enumerate(_ROWS)})
 """Row of each number in the parameters of a lane."""
@@ -182,6 +183,9 @@ def _add(values: dict[str, float], effect: Mapping[str, Any], rigid: bool) -> No
         case "cogging":
             values["cog_amplitude"] += get("amplitude")
             values["cog_harmonic"], values["cog_phase"] = get("harmonic"), get("phase", 0.0)
+        case "torque_ripple":
+            values["ripple_amplitude"] += get("amplitude")
+            values["ripple_harmonic"], values["ripple_phase"] = get("harmonic"), get("phase", 0.0)
         case "backlash":
             values["half_gap"] += get("half_gap")
             values["gap"] = 1.0
@@ -236,6 +240,7 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
     (E_R, S_R, GAIN, LIMIT, LAG, LOOP, KP, KD, FILTER, NOISE, RES, U_MAX, PERIOD, STEPS) = range(
         P_.motor_random, P_.steps + 1
     )
+    R_A, R_N, R_P = P_.ripple_amplitude, P_.ripple_harmonic, P_.ripple_phase
     angle, speed, share = ANGLE_TOLERANCE, SPEED_TOLERANCE, TORQUE_TOLERANCE
 
     @jit
@@ -259,6 +264,7 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
         on_motor = p[E_DENT] != 0.0
         bump = (pick(on_motor, theta_e, theta_s) - p[DENT_AT]) / p[DENT_W]
         bump = np.exp(-bump * bump)
+        u = u * (1.0 + p[R_A] * np.sin(p[R_N] * theta_e + p[R_P]))
         sum_e = u - through - p[F_E] * w_e - p[E_Q] * w_e * np.abs(w_e) - p[E_K] - p[E_T] * swing - p[E_H] * w
         sum_e = sum_e - p[E_G] * np.sin(theta_e - p[G_PHASE]) - p[CA] * np.sin(p[CN] * theta_e + p[CP]) - p[E_R] * noise
         sum_s = ratio * through - p[F_S] * w_s - p[S_Q] * w_s * np.abs(w_s) - p[S_K] - p[S_T] * swing - p[S_H] * w

@@ -365,6 +365,7 @@ class Linear:
             speed=rms(joined(lambda part: part.velocity[side])),
             spread=float(np.std(position)),
             travel=float(np.ptp(position)),
+            ratio=float(self.experiment.drive.ratio("load")),
         )
 
     def choices(self, name: str) -> float:

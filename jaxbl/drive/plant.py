@@ -234,10 +234,12 @@ class Plant(eqx.Module):
             through = transmitted
         found = {}
         for side in self.drive.sides:
-            total = gains[side] * through + (torque if side == "motor" else 0.0)
+            driving = torque if side == "motor" else 0.0
+            total = gains[side] * through + driving
             level: Scalar = 0.0
+            motion = Motion(time, position[side], velocity[side], driving)
             for effect, own in self._at(side, states):
-                total = total - effect.resist(own, Motion(time, position[side], velocity[side]))
+                total = total - effect.resist(own, motion)
                 level = level + effect.dry_friction(own, velocity[side])
             found[side] = total, level
         return found

@@ -114,14 +114,14 @@ def model_torques(
     if plant.transmission is not None:
         found["transmission"] = _transmitted(plant, k, states)
     none = jnp.zeros_like(k.torque)
-    acting = jax.vmap(plant.torques)(k.position, k.velocity, states, none, k.time, none)
+    acting = jax.vmap(plant.torques)(k.position, k.velocity, states, torque, k.time, none)
     places = {plant.drive.place(effect.place) for effect in plant.effects}
     for side, (total, level) in acting.items():
         if side in places or (side == "motor" and "actuator" in places):
             direction = jnp.clip(k.velocity[side] / jnp.maximum(3.0 * deviation[side], jnp.finfo(float).tiny), -1.0, 1.0)
             added = (plant.inertia(side) - plant.drive.inertia(side)) * k.acceleration[side]
-            lost = k.torque - torque if side == "motor" else 0.0
-            found[side] = level * direction - total + added + lost
+            commanded = k.torque if side == "motor" else 0.0
+            found[side] = level * direction + commanded - total + added
     return found
 
 

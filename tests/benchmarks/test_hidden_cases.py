@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hidden.cases import _PLANTS, KINDS, _known, _targets, cases, save
-from hidden.effects import APART, EFFECTS, LEVELS, UNKNOWN, error_of, on_rigid
+from hidden.effects import APART, EFFECTS, LEVELS, NEW, PINION, UNKNOWN, error_of, on_rigid
 from hidden.proof import foretold, proofs
 from hidden.scoring import calibration, calibration_error, confusion, markdown, outcome, run, scores, write
 from hidden.simulator import Machine
@@ -47,7 +47,9 @@ def oracle(found):
 
 
 def test_all_effects_of_the_package_are_hidden_at_all_sizes():
-    assert set(EFFECTS) == set(effects.EFFECTS)
+    assert {*EFFECTS, *NEW} - {PINION} == set(effects.EFFECTS)
+    new = _targets(0, len(NEW) * len(LEVELS), "new")
+    assert {(effect, level) for _, ((effect, level),) in new} == {(e, s) for e in NEW for s in LEVELS}
     targets = _targets(0, 66, "single")
     assert {(effect, level) for _, ((effect, level),) in targets} == {(e, s) for e in EFFECTS for s in LEVELS}
     assert all(on_rigid(effect) for plant, hidden in _targets(1, 200, "pairs") for effect, _ in hidden if plant == "direct")

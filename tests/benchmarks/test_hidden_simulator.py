@@ -50,10 +50,11 @@ GEARED_MACHINE = Machine(
 
 
 def rigid(t, y, u, flank):
-    """A dent, hysteresis, drifting friction; u has been through gain, limit and lag."""
+    """A dent, hysteresis, drifting friction, torque ripple; u has been through gain, limit and lag."""
     x, v, _, _, h = y
     rate = (v - 0.5 * (abs(v) * abs(h) * h + v * h * h)) / 0.2
     level = 0.05 * (1.0 + 0.8 * (1.0 - 2.0 * t)) + 0.2 * np.exp(-(((x - 0.4) / 0.05) ** 2))
+    u = u * (1.0 + 0.2 * np.sin(7.0 * x - 0.4))
     return u - 0.05 * v - 0.02 - 0.1 * h, 0.0, level, 0.0, 0.0, rate
 
 
@@ -67,6 +68,7 @@ RIGID_MACHINE = Machine(
         {"kind": "unknown.drifting_friction", "side": "load", "torque": 0.05, "share": 0.8, "time": 1.0},
         {"kind": "unknown.hysteresis", "side": "motor", "torque": 0.1, "length": 0.2},
         {"kind": "unknown.dent", "side": "load", "torque": 0.2, "position": 0.4, "width": 0.05},
+        {"kind": "motor.torque_ripple", "amplitude": 0.2, "harmonic": 7.0, "phase": -0.4},
         {"kind": "actuator.gain_error", "relative": 0.1},
         {"kind": "actuator.saturation", "limit": 0.25},
         {"kind": "actuator.lag", "time_constant": 0.02},

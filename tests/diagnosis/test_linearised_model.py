@@ -94,6 +94,7 @@ SMALL = {
     "load.gravity": {"torque": 1e-2, "phase": 0.3},
     "load.periodic_disturbance": {"amplitude": 1e-2, "frequency": 2.0, "phase": 0.4},
     "motor.cogging": {"amplitude": 1e-3, "harmonic": 8.0, "phase": 0.2},
+    "motor.torque_ripple": {"amplitude": 1e-3, "harmonic": 4.0, "phase": -0.5},
     "transmission.damping": {"damping": 1e-4},
     "transmission.hardening": {"cubic_stiffness": 1.0},
     "transmission.eccentricity": {"amplitude": 1e-5, "harmonic": 2.0, "phase": 0.1},
@@ -124,7 +125,13 @@ def test_numbers_of_waves_are_those_of_the_effect(tmp_path):
     base = linear(tmp_path, 2)
     log = Scales(5.0, 1e-3, 10.0, 0.1, 0.3, 1.0, 0.2, travel=2.0, frequencies=(2.0,))
     values = (0.3e-3, -0.4e-3)
-    waves = ("load.gravity", "load.periodic_disturbance", "motor.cogging", "transmission.eccentricity")
+    waves = (
+        "load.gravity",
+        "load.periodic_disturbance",
+        "motor.cogging",
+        "motor.torque_ripple",
+        "transmission.eccentricity",
+    )
     seen = set()
     for one in variants_of(base.experiment, waves, lambda name: log):
         if one.name in waves:
@@ -186,5 +193,6 @@ def test_eccentricity_is_tried_once_a_turn_however_small_the_motion(tmp_path):
     model = linear(tmp_path, 2)
     travel = float(np.ptp(np.asarray(model.parts[0].position["load"])))
     least = int(np.floor(0.5 / travel)) + 1
+    assert least < 10  # twice a motor turn, with a gear ratio of 5
     tried = EFFECTS["transmission.eccentricity"].roles()["harmonic"].trials(model.scales("transmission.eccentricity"))
-    assert tuple(tried) == (1.0, *(float(n) for n in range(max(least, 2), 9)))
+    assert tuple(tried) == (1.0, *(float(n) for n in range(max(least, 2), 9)), 10.0)

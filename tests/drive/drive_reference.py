@@ -70,6 +70,9 @@ def right_side(t, y, u, law, effects, drive):
     at_load += value("load.periodic_disturbance", "amplitude") * np.sin(
         2.0 * np.pi * value("load.periodic_disturbance", "frequency") * t + value("load.periodic_disturbance", "phase")
     )
+    if "motor.torque_ripple" in effects:
+        ripple = effects["motor.torque_ripple"]
+        u *= 1.0 + ripple["amplitude"] * np.sin(ripple["harmonic"] * theta_e + ripple["phase"])
     omega_e_dot = (u - torque - drive["motor_viscous"] * omega_e - at_motor) / (
         drive["motor_inertia"] + value("motor.inertia", "inertia")
     )

@@ -27,12 +27,14 @@ PLACES = ("motor", "load", "transmission", "actuator")
 class Motion(NamedTuple):
     """What the torque of an effect may depend on: time in s, position in rad, velocity in rad/s.
 
-    Of its side; for an effect in the gear, the elastic deflection and its rate.
+    Of its side; for an effect in the gear, the elastic deflection and its rate. `torque` is the input that acts, N m, in
+    :meth:`AbstractEffect.resist` of an effect on the motor; elsewhere 0.
     """
 
     time: Value
     position: Value
     velocity: Value
+    torque: Value = 0.0
 
 
 class Scales(NamedTuple):
@@ -47,6 +49,7 @@ class Scales(NamedTuple):
         speed: rms of the effect's side (the motor's for gear and actuator), rad/s.
         spread: standard deviation of that side's position, rad.
         travel: range of that side's position, rad; for an effect in the gear, the load's.
+        ratio: motor turns for one load turn; 1 on a rigid drive.
         frequencies: at which a torque on the side would explain most of what the model leaves, Hz.
     """
 
@@ -58,6 +61,7 @@ class Scales(NamedTuple):
     speed: float
     spread: float
     travel: float
+    ratio: float = 1.0
     frequencies: tuple[float, ...] = ()
 
 
@@ -65,8 +69,8 @@ class Role(NamedTuple):
     """The part that a number plays in its effect.
 
     Attributes:
-        kind: `size`: the torque is proportional to it. `angle`: a phase in rad. `harmonic`: a whole number of periods a
-            turn, which is chosen and not fitted. `frequency`: in Hz. `shape`: any other number, positive.
+        kind: `size`: the torque is proportional to it. `angle`: a phase in rad. `harmonic`: a number of periods a turn,
+            which is chosen and not fitted. `frequency`: in Hz. `shape`: any other number, positive.
         neutral: its value where the effect does nothing.
         trials: the values to try on a log of given scales. Of a size: one, small enough for its torque to be linear.
         width: prior standard deviation: of an angle in rad, of a shape in its logarithm.
@@ -302,7 +306,7 @@ def _check_neutral(effect: AbstractEffect) -> None:
     """Check that at neutral numbers nothing is added, at a few motions."""
     state: Any = effect.init()
     for time, position, velocity in ((0.0, 0.3, 2.0), (0.1, -1.7, -0.5), (0.2, 4.0, 0.0)):
-        motion = Motion(*map(np.float64, (time, position, velocity)))
+        motion = Motion(*map(np.float64, (time, position, velocity, 0.7)))
         state = effect.advance(state, motion, 1e-3)
         off = {
             "resist": effect.resist(state, motion),

@@ -12,8 +12,10 @@ _GAPS = 0.01, 0.02, 0.04, 0.08, 0.12, 0.18, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 
 
 
 def _eccentric(log: Scales) -> list[float]:
-    """Once a turn is what eccentricity means; of others half a radian of the wave must be seen."""
-    return [1.0, *(float(n) for n in range(2, 9) if n * log.travel > 0.5)]
+    """Once a turn is what eccentricity means, of the load's wheel or of the motor's, and twice what an angled coupling does;
+    of all but the first half a radian of the wave must be seen."""
+    others = {*map(float, range(2, 9)), log.ratio, 2.0 * log.ratio}
+    return [1.0, *(n for n in sorted(others - {1.0}) if n * log.travel > 0.5)]
 
 
 @EFFECTS.add
@@ -66,7 +68,8 @@ class Damping(TransmissionEffect):
 
 @EFFECTS.add
 class Eccentricity(TransmissionEffect):
-    """Eccentric gear: a transmission error A sin(n theta_s + phase); the torque ratio follows it (no power is lost)."""
+    """Eccentric gear: a transmission error A sin(n theta_s + phase); the torque ratio follows it (no power is lost). Of the
+    pinion, once a motor turn: n is the gear ratio."""
 
     kind: ClassVar[str] = "eccentricity"
     # small beside the twist: the torque is linear in it there

@@ -1,4 +1,4 @@
-"""Torques on a side that are no friction: constant, of position, of time; and the error of the inertia."""
+"""Torques on a side that are no friction: constant, of position, of time, of the input; and the error of the inertia."""
 
 from typing import ClassVar
 
@@ -12,6 +12,18 @@ _MOST_COGGING = 40
 """Periods a turn up to which cogging is tried: of slots and magnets, the common ones have at most 36 or so."""
 _ARC = 0.5 * np.pi
 """Of a wave of cogging, rad, that the motion must cover for it to be tried."""
+
+
+_POLE_PAIRS = 1, 2, 3, 4, 5, 7
+"""Of common servo motors. A current sensor's offset makes one period of ripple a pole pair, unequal gains of two make two,
+and commutation or windings that are not sinusoidal make six."""
+
+
+def _ripple(log: Scales) -> list[float]:
+    if log.torque == 0.0:
+        return []
+    waves = sorted({float(n * pairs) for n in (1, 2, 6) for pairs in _POLE_PAIRS})
+    return [n for n in waves if n * log.travel > _ARC]
 
 
 def _cogging(log: Scales) -> list[float]:
@@ -84,3 +96,17 @@ class Cogging(SideEffect):
 
     def resist(self, state, motion):
         return self.amplitude * jnp.sin(self.harmonic * motion.position + self.phase)
+
+
+@EFFECTS.add
+class TorqueRipple(SideEffect):
+    """Ripple of the motor's torque, in proportion to it: u (1 + a sin(n theta + phase))."""
+
+    kind: ClassVar[str] = "torque_ripple"
+    places: ClassVar[tuple[str, ...]] = ("motor",)
+    amplitude: Scalar = size("", "relative amplitude a")
+    harmonic: Scalar = harmonic("periods n a turn", _ripple)
+    phase: Scalar = angle("phase at theta = 0")
+
+    def resist(self, state, motion):
+        return -motion.torque * self.amplitude * jnp.sin(self.harmonic * motion.position + self.phase)
