@@ -6,7 +6,8 @@ and without gap where the gap is what is hidden. `servo`: a geared axis with a r
 one encoder. The machines of a kind scatter by 15 %.
 
 Conditions of `single`, `pairs`, `none`, `unknown`: 10-20 s, 1 kHz or 500 Hz, three in ten in closed loop, nominal numbers
-off by 1-3 %, a quarter with 1 % noise on the torque channel. `hard` are single effects with at least three of: closed loop,
+off by 1-3 %, a quarter with 1 % noise on the torque channel; `new` as `single`, with the effects that the package has learnt
+since (`all` is without them). `hard` are single effects with at least three of: closed loop,
 3 s, coarse encoders, numbers off by 4-6 %, 1-3 % noise on the torque channel. Three in ten machines have another effect that
 the nominal model knows.
 """
@@ -108,7 +109,7 @@ class Case:
 
     Attributes:
         name: kind, seed and number.
-        kind: one of `KINDS`.
+        kind: one of `KINDS` or `ALONE`.
         truth: `verdict` (as in diagnosis.json), `effects` (name -> parameters; empty, or the unknown effect), `sizes`
             (name -> share of the driving torque's rms), `level` asked for (the largest of a pair), `seen` (change of what
             the encoders read over their noise), `growth` (change of the motor position for one of 1 rad/s in the initial

@@ -32,7 +32,7 @@ EFFECTS = (*SIDE_EFFECTS, *LOAD_EFFECTS, "motor.cogging", *GEAR_EFFECTS, *ACTUAT
 """What the package knows: design.md, section 6."""
 PINION = "transmission.pinion"
 """Eccentricity of the motor's wheel: to the package a `transmission.eccentricity` of as many periods as the ratio says."""
-NEW = ("motor.torque_ripple", PINION)
+NEW = ("motor.torque_ripple", PINION, "motor.presliding_friction", "load.presliding_friction")
 """Effects of the kind `new`: other kinds keep their cases."""
 UNKNOWN = ("unknown.drifting_friction", "unknown.hysteresis", "unknown.dent", "unknown.random_torque")
 LEVELS = (0.03, 0.1, 0.3)
@@ -57,7 +57,7 @@ def exclusive(one: str, other: str) -> bool:
     """Whether two effects are too much alike to be hidden, or known, together."""
     place = one.split(".")[0]
     pair = {one, other}
-    dry = {f"{place}.coulomb_friction", f"{place}.stribeck_friction"}
+    dry = {f"{place}.{kind}_friction" for kind in ("coulomb", "stribeck", "presliding")}
     scaling = {"actuator.gain_error", "motor.inertia", "motor.viscous_friction"}
     return one == other or pair <= dry or (pair <= scaling and "actuator.gain_error" in pair)
 
@@ -231,6 +231,9 @@ def _shape(
             )  # fmt: skip
         case "lag":
             return lambda c: {"time_constant": c}, lambda c: u - _lagged(u, motion.period, c), 0.0, math.inf
+        case "presliding_friction":
+            length = float(np.exp(rng.uniform(*np.log([0.02, 0.3])))) * float(np.std(x))
+            return linear("torque", dahl(v, motion.period, length), length=length)
         case "drifting_friction":
             share = float(rng.uniform(0.7, 0.95)) * sign
             drift = 1.0 - 2.0 * np.arange(len(u)) / len(u)
@@ -247,6 +250,15 @@ def _shape(
         case "random_torque":
             return linear("torque", np.ones_like(v), side=side)
     raise ValueError(f"unknown effect {kind}")
+
+
+def dahl(v: np.ndarray, period: float, length: float) -> np.ndarray:
+    """Share of the sliding friction that bent contacts have along a motion."""
+    w = np.zeros_like(v)
+    for k in range(1, len(v)):
+        way, end = abs(v[k]) * period / length, math.copysign(1.0, v[k])
+        w[k] = end + (w[k - 1] - end) * math.exp(-way)
+    return w
 
 
 def _lagged(u: np.ndarray, period: float, time_constant: float) -> np.ndarray:

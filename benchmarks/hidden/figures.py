@@ -86,12 +86,12 @@ def _calibration(outcomes: Sequence[Outcome]) -> Figure | None:
 
 
 def _sizes(outcomes: Sequence[Outcome]) -> Figure | None:
-    groups = {kind: [one for one in outcomes if one.kind == kind] for kind in ("single", "hard", "pairs", "unknown")}
+    names = {"single": "single", "new": "new", "hard": "hard", "pairs": "pairs, both", "unknown": "unknown, abstains"}
+    groups = {kind: [one for one in outcomes if one.kind == kind] for kind in names}
     groups = {kind: ones for kind, ones in groups.items() if ones}
     if not groups:
         return None
-    names = {"single": "single", "hard": "hard", "pairs": "pairs, both", "unknown": "unknown, abstains"}
-    aims = {"single": "single", "hard": "hard", "pairs": "pairs", "unknown": "abstentions"}
+    aims = {kind: kind for kind in names} | {"unknown": "abstentions"}
     figure = Figure(figsize=(7.0, 3.6))
     axes = figure.subplots()
     width = 0.8 / len(LEVELS)
@@ -124,7 +124,7 @@ def _gap(outcomes: Sequence[Outcome]) -> Figure | None:
         return None
     figure = Figure(figsize=(6.4, 3.6))
     axes = figure.subplots()
-    for i, kind in enumerate(("single", "hard", "pairs")):
+    for i, kind in enumerate(("single", "hard", "pairs", "new")):
         left = np.sort([max(1.0 - one.reduction, 1e-4) for one in known if one.kind == kind and one.reduction is not None])
         if len(left):
             axes.step(

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from .cases import Case
-from .simulator import Machine, Run, pack, simulate
+from .effects import dahl
+from .simulator import Machine, Run, Trace, pack, simulate
 
 WINDOW = 0.5
 """Length of the windows, s."""
@@ -58,6 +59,7 @@ def _windows(case: Case, model: Mapping[str, Any]) -> list[Run]:
     run, truth = case.runs[1], case.traces[1]
     machine = Machine(model["drive"], model.get("transmission"), model.get("effects", ()))
     acting = _acting(machine, truth.command, run.period)
+    bent = _bent(machine, truth)
     length = min(round(WINDOW / run.period), len(truth.t))
     return [
         Run(
@@ -66,6 +68,7 @@ def _windows(case: Case, model: Mapping[str, Any]) -> list[Run]:
             truth.command[k : k + length],
             initial=tuple(truth.states[:, k]),
             acting=acting[k],
+            bent=bent[k],
             origin=float(truth.t[k]),
         )
         for k in range(0, len(truth.t) - length + 1, length)
@@ -92,6 +95,16 @@ def proofs(asked: Sequence[tuple[Case, Mapping[str, Any]]]) -> list[tuple[float 
                 reductions.append(1.0 - new / old if math.isfinite(new) else -math.inf)
         found.append((float(np.mean(reductions)) if reductions else None, worse))
     return found
+
+
+def _bent(machine: Machine, truth: Trace) -> np.ndarray:
+    """Deflection of the contacts of presliding friction at each sample of the true motion, from 0; rad."""
+    for effect in machine.effects:
+        place, _, kind = effect["kind"].partition(".")
+        if kind == "presliding_friction":
+            velocity = truth.states[1 if machine.rigid or place == "motor" else 3]
+            return effect["length"] * dahl(velocity, float(truth.t[1] - truth.t[0]), effect["length"])
+    return np.zeros(len(truth.t))
 
 
 def _acting(machine: Machine, command: np.ndarray, period: float) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 What counts as right:
 
-- single and hard: the verdict is `explained` and the first finding is the hidden effect;
+- single, new and hard: the verdict is `explained` and the first finding is the hidden effect;
 - pairs: both hidden effects are among the findings; any other finding is spurious;
 - none: the verdict is `no_discrepancy`; everything else is a false alarm;
 - unknown: the verdict is `unknown_effect`; `explained` with a first confidence of at least `CONFIDENT` is confidently wrong.
@@ -28,8 +28,8 @@ from typing import Any
 
 import numpy as np
 
-from .cases import Case, Log
-from .effects import EFFECTS, UNKNOWN
+from .cases import ALONE, KINDS, Case, Log
+from .effects import EFFECTS, NEW, UNKNOWN
 from .proof import proofs
 
 Diagnose = Callable[[list[Log], dict[str, Any], Log], Mapping[str, Any]]
@@ -42,6 +42,7 @@ BINS = 10
 TARGETS = {
     "single": (0.97, True),
     "weak": (0.93, True),
+    "new": (0.97, True),
     "hard": (0.88, True),
     "pairs": (0.93, True),
     "pairs_spurious": (0.05, False),
@@ -270,9 +271,10 @@ def confusion(outcomes: Sequence[Outcome]) -> tuple[list[str], list[str], np.nda
     """Rows: what is hidden in cases with one thing or nothing; columns: what was said; counts."""
     ones = [one for one in outcomes if one.kind != "pairs"]
     truths = [one.hidden[0] if one.hidden else one.unknown or "no_discrepancy" for one in ones]
-    rows = [name for name in (*EFFECTS, *UNKNOWN, "no_discrepancy") if name in truths]
+    every = *EFFECTS, *NEW
+    rows = [name for name in (*every, *UNKNOWN, "no_discrepancy") if name in truths]
     said = {one.said for one in ones}
-    columns = [name for name in (*EFFECTS, "unknown_effect", "no_discrepancy", "failed") if name in said | set(rows)]
+    columns = [name for name in (*every, "unknown_effect", "no_discrepancy", "failed") if name in said | set(rows)]
     columns += sorted(said - set(columns))
     counts = np.zeros((len(rows), len(columns)), int)
     for truth, one in zip(truths, ones, strict=True):
@@ -292,7 +294,7 @@ def scores(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     def number(values: list[float]) -> dict[str, Any] | None:
         return {"value": float(np.median(values)), "count": len(values)} if values else None
 
-    by = {kind: [one for one in outcomes if one.kind == kind] for kind in ("single", "pairs", "none", "unknown", "hard")}
+    by = {kind: [one for one in outcomes if one.kind == kind] for kind in (*KINDS, *ALONE)}
     weak = [one for one in by["single"] if one.weak]
     known = [one for one in outcomes if one.hidden]
     curve = calibration(outcomes)
@@ -303,6 +305,8 @@ def scores(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "weak": rate(weak, lambda one: one.right),
         "single_tied": rate(by["single"], lambda one: one.tied),
         "single_spurious": rate(by["single"], lambda one: bool(one.hidden and one.right and one.spurious)),
+        "new": rate(by["new"], lambda one: one.right),
+        "new_tied": rate(by["new"], lambda one: one.tied),
         "hard": rate(by["hard"], lambda one: one.right),
         "hard_weak": rate([one for one in by["hard"] if one.weak], lambda one: one.right),
         "hard_tied": rate(by["hard"], lambda one: one.tied),
@@ -331,6 +335,8 @@ _TITLES = {
     "weak": "- weak (3 %)",
     "single_tied": "- first finding or one tied with it",
     "single_spurious": "- named, with a spurious second",
+    "new": "single effects learnt since: first finding right",
+    "new_tied": "- first finding or one tied with it",
     "hard": "hard set: first finding right",
     "hard_weak": "- weak (3 %)",
     "hard_tied": "- first finding or one tied with it",

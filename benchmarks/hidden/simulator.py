@@ -35,7 +35,8 @@ motor_drift load_drift drift_time motor_dent load_dent dent_position dent_width 
 periodic_rate periodic_phase cog_amplitude cog_harmonic cog_phase hysteresis_length
 motor_random load_random gain limit lag_rate
 loop kp kd filter motor_noise motor_resolution torque_limit period steps origin
-ripple_amplitude ripple_harmonic ripple_phase"""
+ripple_amplitude ripple_harmonic ripple_phase
+motor_bristle load_bristle bristle_torque bristle_excess bristle_stribeck bristle_damping"""
 _ROWS = _NAMES.split()
 P = SimpleNamespace(**{name: i for i, name in enumerate(_ROWS)})
 """Row of each number in the parameters of a lane."""
@@ -88,6 +89,7 @@ class Run:
         kp, kd, filter: gains of the loop, N m/rad and N m s/rad, and the share 0..1 of a new difference in its velocity.
         torque_limit: of the loop, N m.
         initial: θ_e, ω_e, θ_s, ω_s.
+        bent: deflection of the bristles of `presliding_friction` when the run begins, rad.
         acting: torque that the actuator makes when the run begins, N m (for `actuator.lag`).
         origin: time at which the run begins, s.
         motor_noise, load_noise: rms of the encoders, rad; resolutions in rad, 0 for none.
@@ -106,6 +108,7 @@ class Run:
     torque_limit: float = math.inf
     initial: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     acting: float = 0.0
+    bent: float = 0.0
     origin: float = 0.0
     motor_noise: float = 0.0
     load_noise: float = 0.0
@@ -151,6 +154,9 @@ def pack(run: Run, step: float = STEP) -> np.ndarray:
     values["gap"] = float(law.get("law") == "dead_zone")
     for effect in machine.effects:
         _add(values, effect, machine.rigid)
+    with_memory = [values[name] != 0.0 for name in ("motor_hysteresis", "load_hysteresis", "motor_bristle", "load_bristle")]
+    if sum(with_memory) > 1:
+        raise ValueError("one effect of a machine may have a memory")
     return np.array([values[name] for name in _ROWS])
 
 
@@ -214,6 +220,13 @@ def _add(values: dict[str, float], effect: Mapping[str, Any], rigid: bool) -> No
             values["dent_position"], values["dent_width"] = get("position"), get("width")
         case "random_torque":
             values[f"{side}_random"] += get("torque")
+        case "presliding_friction":
+            # LuGre's own numbers: sigma_0, F_c, F_s - F_c, 1 / v_s, sigma_1
+            values[f"{side}_bristle"] = get("torque") / get("length")
+            values["bristle_torque"] = get("torque")
+            values["bristle_excess"] = (get("breakaway_ratio", 1.0) - 1.0) * get("torque")
+            values["bristle_stribeck"] = 1.0 / get("stribeck_velocity", 1.0)
+            values["bristle_damping"] = get("damping", 0.0)
         case _:
             raise ValueError(f"unknown effect {effect['kind']}")
     if kind in ("coulomb_friction", "stribeck_friction", "dent", "drifting_friction"):
@@ -221,7 +234,8 @@ def _add(values: dict[str, float], effect: Mapping[str, Any], rigid: bool) -> No
 
 
 def build(jit: Any, pick: Any) -> SimpleNamespace:
-    """The engine's functions, elementwise over lanes: `p` holds a row a number, `y` is (θ_e, ω_e, θ_s, ω_s, hysteresis).
+    """The engine's functions, elementwise over lanes: `p` holds a row a number, `y` is (θ_e, ω_e, θ_s, ω_s, m), m the
+    hysteresis or the deflection of bristles.
 
     Args:
         jit: what compiles a function, or leaves it as it is.
@@ -241,6 +255,7 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
         P_.motor_random, P_.steps + 1
     )
     R_A, R_N, R_P = P_.ripple_amplitude, P_.ripple_harmonic, P_.ripple_phase
+    E_B, S_B, B_C, B_X, B_V, B_D = range(P_.motor_bristle, P_.bristle_damping + 1)
     angle, speed, share = ANGLE_TOLERANCE, SPEED_TOLERANCE, TORQUE_TOLERANCE
 
     @jit
@@ -275,6 +290,16 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
         v = pick(p[E_H] != 0.0, w_e, w_s)
         # Bouc-Wen with n = 2 and beta = gamma = 1/2
         w_rate = (v - 0.5 * (np.abs(v) * held + v * w * w)) / p[H_LEN]
+        # or LuGre's bristles: the state is their deflection then
+        v = pick(p[E_B] != 0.0, w_e, w_s)
+        bristles = p[E_B] + p[S_B]
+        fall = v * p[B_V]
+        most = p[B_C] + p[B_X] * np.exp(-fall * fall)
+        bend = v - bristles * np.abs(v) * w / pick(bristles > 0.0, most, 1.0)
+        damped = p[B_D] * bend
+        sum_e = sum_e - p[E_B] * w - pick(p[E_B] > 0.0, damped, 0.0)
+        sum_s = sum_s - p[S_B] * w - pick(p[S_B] > 0.0, damped, 0.0)
+        w_rate = pick(bristles > 0.0, bend, w_rate)
         return sum_e, np.maximum(dry_e, 0.0), sum_s, np.maximum(dry_s, 0.0), w_rate
 
     @jit
@@ -424,7 +449,7 @@ def _compiled() -> Any:
     def run(parameters, lengths, initial, torque, reference, rate, unit, noise, command, readings, states):
         for lane in numba.prange(len(parameters)):
             p = parameters[lane]
-            y = (initial[lane, 0], initial[lane, 1], initial[lane, 2], initial[lane, 3], 0.0)
+            y = (initial[lane, 0], initial[lane, 1], initial[lane, 2], initial[lane, 3], initial[lane, 5])
             modes = first(p, y)
             previous, velocity, lagged = initial[lane, 0], initial[lane, 1], initial[lane, 4]
             for k in range(lengths[lane]):
@@ -454,7 +479,7 @@ def _vectorised() -> Any:
     def run(parameters, lengths, initial, torque, reference, rate, unit, noise, command, readings, states):
         order = np.argsort(-lengths, kind="stable")
         p = np.ascontiguousarray(parameters[order].T)
-        y = (*initial[order, :4].T, np.zeros(len(order)))
+        y = (*initial[order, :4].T, initial[order, 5])
         modes = engine.first(p, y)
         previous, velocity, lagged = y[0], y[1], initial[order, 4]
         for k in range(int(lengths.max())):
@@ -538,7 +563,7 @@ def _batch(runs: Sequence[Run], step: float) -> list[Trace]:
             reference[i, :n], rate[i, :n] = run.reference
         if run.disturbance is not None:
             noise[i, : n + 1] = run.disturbance[: n + 1]
-    initial = np.array([(*run.initial, run.acting) for run in runs], float)
+    initial = np.array([(*run.initial, run.acting, run.bent) for run in runs], float)
     with np.errstate(all="ignore"):
         engine()[0](parameters, lengths, initial, torque, reference, rate, unit, noise, command, readings, states)
     traces = []

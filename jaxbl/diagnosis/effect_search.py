@@ -553,6 +553,12 @@ def _same(name: str, others: Iterable[str]) -> bool:
     return word is not None and any(EFFECTS[one].exclusive == word and one.partition(".")[0] == place for one in others)
 
 
+def _contains(general: str, name: str) -> bool:
+    """Whether an effect has another one at the same place as its special case."""
+    place, _, kind = name.partition(".")
+    return general.partition(".")[0] == place and kind in EFFECTS[general].special_cases
+
+
 def _verdict(left: float, findings: Sequence[Finding]) -> VerdictName:
     return "unknown_effect" if left > CLEAR else "explained" if findings else "no_discrepancy"
 
@@ -568,17 +574,19 @@ def _key(values: Mapping[str, Numbers], theta: np.ndarray) -> tuple:
 
 def _finding(tried: Sequence[_Tried], model: Model, heat: float) -> Finding:
     """The first of those tried, with its confidence; differences of evidence are divided by `heat`."""
+    name = tried[0].name
+    # one that contains it is no other explanation
+    tried = [one for one in tried if not _contains(one.name, name)]
     # or nothing is missing
     *chances, _ = softmax(np.array([*(one.gain for one in tried), 0.0]) / heat)
     others = tuple((one.name, float(chance)) for one, chance in zip(tried[1:], chances[1:], strict=True))
-    name = tried[0].name
     others = tuple(one for one in others if one[1] > LEAST_CHANCE)
     return Finding(name, float(chances[0]), model.numbers[name], others)
 
 
 def _fitted_numbers(name: str) -> list[str]:
-    """The numbers of an effect that are fitted: a harmonic is a whole number."""
-    return [leaf for leaf, role in EFFECTS[name].roles().items() if role.kind != "harmonic"]
+    """The numbers of an effect that are fitted: a harmonic is a whole number, and some are held."""
+    return [leaf for leaf, role in EFFECTS[name].roles().items() if role.kind not in ("harmonic", "held")]
 
 
 def paths_of(names: Iterable[str]) -> list[str]:

@@ -132,6 +132,7 @@ def default_paths(config: Config, experiment: Experiment) -> list[str]:
         if path.split(".")[0] in PHYSICAL
         and path not in config.uncertainty.exact
         and not (is_positive(about) and float(get_leaf(experiment, path)) <= 0.0)
+        and not (about.role and about.role.kind == "held" and float(get_leaf(experiment, path)) == about.role.neutral)
     ]
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hidden.cases import _PLANTS, KINDS, _known, _targets, cases, save
+from hidden.cases import _PLANTS, ALONE, KINDS, _known, _targets, cases, save
 from hidden.effects import APART, EFFECTS, LEVELS, NEW, PINION, UNKNOWN, error_of, on_rigid
 from hidden.proof import foretold, proofs
 from hidden.scoring import calibration, calibration_error, confusion, markdown, outcome, run, scores, write
@@ -29,7 +29,7 @@ GAP = {
 
 @pytest.fixture(scope="module")
 def found():
-    return cases(4, 32, "all", DURATION)
+    return cases(4, 32, "all", DURATION) + cases(4, len(NEW), "new", DURATION)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_same_seed_same_cases():
 
 
 def test_kinds_come_in_their_shares_and_logs_are_whole(found):
-    assert [sum(case.kind == kind for case in found) for kind in KINDS] == [16, 4, 4, 4, 4]
+    assert [sum(case.kind == kind for case in found) for kind in (*KINDS, *ALONE)] == [16, 4, 4, 4, 4, len(NEW)]
     for case in found:
         for log in (case.log, case.holdout):
             columns = log.columns()
@@ -86,7 +86,7 @@ def test_kinds_come_in_their_shares_and_logs_are_whole(found):
 def test_sizes_are_as_asked_or_say_so(found):
     for case in found:
         for (name, size), level in zip(case.truth["sizes"].items(), [case.truth["level"]], strict=False):
-            if case.kind in ("single", "hard") and name.split(".")[1] not in (
+            if case.kind in ("single", "new", "hard") and name.split(".")[1] not in (
                 "inertia",
                 "viscous_friction",
                 "gain_error",
@@ -110,19 +110,19 @@ def test_nominal_numbers_are_off_as_the_model_says_and_nominal_effects_stand_apa
 
 
 def test_models_are_studies_of_the_package_and_the_true_one_makes_the_truth(found):
-    checked = 0
+    checked = {"single": 0, "new": 0}
     for case in found:
         read_model(case.model)
         config, _ = read_model(case.oracle)
-        if case.kind != "single" or case.truth["growth"] > 1.0 or checked == 4:
+        if checked.get(case.kind, 4) == 4 or case.truth["growth"] > 1.0:
             continue
         law = None if config.transmission is None else config.transmission.build()
         plant = Plant(config.drive.build(), law, tuple(effect.build() for effect in config.effects))
         own = _package(plant, case.runs[0].initial, case.traces[0].command, case.conditions["period"])
         truth = case.traces[0].states[0]
         assert np.abs(own - truth).max() < 2e-3 * np.ptp(truth), case.name
-        checked += 1
-    assert checked == 4
+        checked[case.kind] += 1
+    assert checked == {"single": 4, "new": min(len(NEW), 4)}
 
 
 def _package(plant, initial, torques, period, substeps=20):
@@ -148,7 +148,7 @@ def _package(plant, initial, torques, period, substeps=20):
 def test_an_oracle_gets_full_marks(found, oracle):
     outcomes = run(found, oracle, oracle=lambda case: {"theta_e": 0.1})
     figures = scores(outcomes)
-    for key in ("single", "hard", "pairs", "abstentions"):
+    for key in ("single", "new", "hard", "pairs", "abstentions"):
         assert figures[key]["value"] == 1.0
     for key in (
         "false_alarms",

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from hidden.cases import cases
-from hidden_log import logged, model
+from hidden_log import driven, logged, model
 
 from jaxbl.diagnosis.effect_search import CLEAR, EffectSearch
 from jaxbl.identification.identify import read_identification_task
@@ -16,13 +16,16 @@ _SIZES = {"torque", "drag", "inertia", "viscous", "relative", "amplitude", "damp
 
 
 def explained(case, tmp_path):
-    log = tmp_path / "log.csv"
-    case.log.write(log)
-    task = read_identification_task(log, case.model)
+    case.log.write(tmp_path / "log.csv")
+    return search(tmp_path / "log.csv", case.model).run()
+
+
+def search(log, study):
+    task = read_identification_task(log, study)
     nominal = on_record(task.config, task.record)
     free = free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
     prior = [task.config.uncertainty.relative] * len(free)
-    return EffectSearch(nominal, free, prior, segments_of(task.record, nominal.sides)).run()
+    return EffectSearch(nominal, free, prior, segments_of(task.record, nominal.sides))
 
 
 @pytest.mark.slow
@@ -65,11 +68,25 @@ def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
     keep = (log.t < 1.2) | (log.t > 2.0)
     table = np.column_stack([log.t, log.u, log.theta_e])[keep]
     np.savetxt(tmp_path / "log.csv", table, "%.10g", ",", header="t,u,theta_e", comments="")
-    task = read_identification_task(tmp_path / "log.csv", model())
-    assert len(task.record.segments) == 2
-    nominal = on_record(task.config, task.record)
-    free = free_parameters(nominal, default_paths(task.config, nominal), float(np.std(task.record.torque)))
-    prior = [task.config.uncertainty.relative] * len(free)
-    found = EffectSearch(nominal, free, prior, segments_of(task.record, nominal.sides)).run()
+    one = search(tmp_path / "log.csv", model())
+    assert len(one.segments) == 2
+    found = one.run()
     assert found.verdict == "explained"
     assert [one.effect for one in found.findings] == ["motor.coulomb_friction"]
+    # friction that contains it explains as much, and is no alternative
+    (finding,) = found.findings
+    assert finding.confidence > 0.99 and finding.alternatives == ()
+
+
+HIDDEN = {"motor.presliding_friction": {"torque": 0.06, "length": 0.02}}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HIDDEN)
+def test_friction_beyond_coulombs_is_named_with_its_numbers(name, tmp_path):
+    driven(logged().u, [{"kind": name} | HIDDEN[name]], 3e-5, 1).write(tmp_path / "log.csv")
+    found = search(tmp_path / "log.csv", model()).run()
+    assert found.verdict == "explained"
+    assert [one.effect for one in found.findings] == [name]
+    for key, value in HIDDEN[name].items():
+        assert found.findings[0].numbers[key] == pytest.approx(value, rel=0.02)

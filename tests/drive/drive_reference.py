@@ -24,7 +24,8 @@ def sigmoid(z):
 
 
 def right_side(t, y, u, law, effects, drive):
-    """d/dt of (theta_e, theta_s, omega_e, omega_s, lagged torque) under a commanded torque u, sliding forwards only."""
+    """d/dt of (theta_e, theta_s, omega_e, omega_s, lagged torque, bristles of motor and load) under a commanded torque u,
+    sliding forwards only."""
 
     def value(effect, key):
         return effects.get(effect, {}).get(key, 0.0)
@@ -42,7 +43,18 @@ def right_side(t, y, u, law, effects, drive):
             + value(f"{name}.constant_torque", "torque")
         )
 
-    theta_e, theta_s, omega_e, omega_s, lagged = y
+    def bristle(name, v, z):
+        """Torque of LuGre's model and dz/dt, in its own numbers sigma_0, sigma_1, g."""
+        own = effects.get(f"{name}.presliding_friction")
+        if own is None:
+            return 0.0, 0.0
+        stiffness = own["torque"] / own["length"]
+        fall = np.exp(-((v / own["stribeck_velocity"]) ** 2))
+        g = own["torque"] + (own["breakaway_ratio"] * own["torque"] - own["torque"]) * fall
+        z_dot = v - stiffness * abs(v) * z / g
+        return stiffness * z + own["damping"] * z_dot, z_dot
+
+    theta_e, theta_s, omega_e, omega_s, lagged, z_e, z_s = y
     u = u * (1.0 + value("actuator.gain_error", "relative"))
     if "actuator.saturation" in effects:
         u = min(max(u, -value("actuator.saturation", "limit")), value("actuator.saturation", "limit"))
@@ -73,18 +85,21 @@ def right_side(t, y, u, law, effects, drive):
     if "motor.torque_ripple" in effects:
         ripple = effects["motor.torque_ripple"]
         u *= 1.0 + ripple["amplitude"] * np.sin(ripple["harmonic"] * theta_e + ripple["phase"])
+    bent_e, z_e_dot = bristle("motor", omega_e, z_e)
+    bent_s, z_s_dot = bristle("load", omega_s, z_s)
+    at_motor, at_load = at_motor + bent_e, at_load + bent_s
     omega_e_dot = (u - torque - drive["motor_viscous"] * omega_e - at_motor) / (
         drive["motor_inertia"] + value("motor.inertia", "inertia")
     )
     omega_s_dot = (ratio * torque - drive["load_viscous"] * omega_s - at_load) / (
         drive["load_inertia"] + value("load.inertia", "inertia")
     )
-    return [omega_e, omega_s, omega_e_dot, omega_s_dot, u_dot]
+    return [omega_e, omega_s, omega_e_dot, omega_s_dot, u_dot, z_e_dot, z_s_dot]
 
 
 def reference(law=sigmoid, effects=None, drive=DRIVE, start=START, torques=TORQUES, hold=HOLD):
     """(theta_e, theta_s, omega_e, omega_s) at the end of each hold, shape (holds, 4)."""
-    y = [start["motor_position"], start["load_position"], start["motor_velocity"], start["load_velocity"], 0.0]
+    y = [start["motor_position"], start["load_position"], start["motor_velocity"], start["load_velocity"], 0.0, 0.0, 0.0]
     states = []
     for k, u in enumerate(torques):
         # max_step: an adaptive step must not leap over a gap

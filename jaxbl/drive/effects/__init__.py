@@ -6,7 +6,7 @@ effect's name, its object a subclass of :class:`SideEffect`, :class:`Transmissio
 
 # ruff: noqa: I001
 # families, and the effects of one, in the order in which a model with all effects has them
-from .friction import CoulombFriction, StribeckFriction, ViscousFriction, QuadraticDrag
+from .friction import CoulombFriction, StribeckFriction, PreslidingFriction, ViscousFriction, QuadraticDrag
 from .loads import ConstantTorque, Inertia, Gravity, PeriodicDisturbance, Cogging, TorqueRipple
 from .gear import Backlash, Hardening, Damping, Eccentricity
 from .actuator import GainError, Saturation, Lag
@@ -24,6 +24,7 @@ from .base import (
     correction_of,
     frequency,
     harmonic,
+    held,
     make_effect,
     shape,
     size,

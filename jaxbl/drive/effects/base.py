@@ -70,13 +70,14 @@ class Role(NamedTuple):
 
     Attributes:
         kind: `size`: the torque is proportional to it. `angle`: a phase in rad. `harmonic`: a number of periods a turn,
-            which is chosen and not fitted. `frequency`: in Hz. `shape`: any other number, positive.
+            which is chosen and not fitted. `frequency`: in Hz. `shape`: any other number, positive. `held`: one that is not
+            sought: it stays neutral.
         neutral: its value where the effect does nothing.
         trials: the values to try on a log of given scales. Of a size: one, small enough for its torque to be linear.
         width: prior standard deviation: of an angle in rad, of a shape in its logarithm.
     """
 
-    kind: Literal["size", "angle", "harmonic", "frequency", "shape"]
+    kind: Literal["size", "angle", "harmonic", "frequency", "shape", "held"]
     neutral: float
     trials: Callable[[Scales], Sequence[float]]
     width: float = 1.0
@@ -105,6 +106,12 @@ def frequency(doc: str) -> Any:
 def shape(unit: str, doc: str, trials: Callable[[Scales], Sequence[float]], *, neutral: float = 1.0, **limits: Any) -> Any:
     """Declare a positive number that the torque is not proportional to: a speed, a gap, a time constant."""
     return parameter(unit, doc, role=Role("shape", neutral, trials), **limits)
+
+
+def held(unit: str, doc: str, neutral: float, **limits: Any) -> Any:
+    """Declare a number for simulations, `neutral` unless given. A diagnosis leaves it there, an identification too unless it
+    is given or asked for."""
+    return parameter(unit, doc, default=neutral, role=Role("held", neutral, lambda log: (neutral,)), **limits)
 
 
 class AbstractEffect(eqx.Module):
@@ -295,7 +302,7 @@ def _check_numbers(cls: type[AbstractEffect]) -> None:
     roles = [about.role for _, about in parameters(cls)]
     kinds = [role.kind for role in roles if role is not None]
     if kinds and len(kinds) < len(roles):
-        raise TypeError("either all numbers or none should have a role (size, angle, harmonic, frequency, shape)")
+        raise TypeError("either all numbers or none should have a role (size, angle, harmonic, frequency, shape, held)")
     if kinds.count("angle") > 1 or ("angle" in kinds and kinds.count("size") != 1):
         raise TypeError("an angle should stand beside one size")
     if cls.corrects not in (None, "inertia", "viscous") or (cls.corrects and kinds != ["size"]):
