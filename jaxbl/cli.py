@@ -400,6 +400,7 @@ def _start_jax() -> None:
     """Use every core as a device, and keep compiled programs between runs."""
     import jax
 
+    from .fused.kept import PROGRAMS
     from .workers import collect_rarely, cores
 
     collect_rarely()
@@ -411,6 +412,8 @@ def _start_jax() -> None:
         jax.config.update("jax_compilation_cache_dir", str(cache))
         # also what takes less than a second: a study has many of them
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    # and what was compiled is found without tracing it; processes that this one starts do so, too
+    os.environ.setdefault(PROGRAMS, f"{jax.config.values['jax_compilation_cache_dir']}/programs")
 
 
 def _print(lines: list[str], folder: Path) -> None:

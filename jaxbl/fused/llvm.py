@@ -129,10 +129,22 @@ class Loop:
         options = binding.create_pipeline_tuning_options(speed_level=3)
         passes = binding.create_pass_builder(_machine(), options)
         passes.getModulePassManager().run(parsed, passes)
-        self._engine = binding.create_mcjit_compiler(parsed, _machine())
+        self._load(_machine().emit_object(parsed))
+
+    def _load(self, code: bytes) -> None:
+        self._code = code
+        self._engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _machine())
+        self._engine.add_object_file(binding.ObjectFileRef.from_data(code))
         self._engine.finalize_object()
         address = self._engine.get_function_address("loop")
         self._call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, *[ctypes.c_int64] * 5)(address)
+
+    def __getstate__(self) -> tuple[int, list[Argument], bytes]:
+        return self.lanes, self.signature, self._code
+
+    def __setstate__(self, state: tuple[int, list[Argument], bytes]) -> None:
+        self.lanes, self.signature, code = state
+        self._load(code)
 
     def __call__(
         self,

@@ -18,7 +18,7 @@ import numpy as np
 from jaxbl.drive.plant import PlantState
 from jaxbl.simulate import Experiment, corrected, move, trajectory
 
-from . import Unsupported, attempted, say_scanned
+from . import Unsupported, attempted, kept, say_scanned
 
 _FLOAT = np.dtype(float)
 _NUMBER = jax.ShapeDtypeStruct((), _FLOAT)
@@ -130,6 +130,12 @@ class _Plant(NamedTuple):
         kinds = tuple((np.shape(leaf), str(jnp.result_type(leaf))) for leaf in leaves)
         return cls(structure, kinds, jax.tree.structure(state))
 
+    @property
+    def described(self) -> tuple[Any, Any]:
+        """Experiment and state, of numbers and arrays their types alone."""
+        leaves = [jax.ShapeDtypeStruct(size, dtype) for size, dtype in self.kinds]
+        return self.structure.unflatten(leaves), self.shape.unflatten([_NUMBER] * self.shape.num_leaves)
+
     def numbers(self, experiment: Experiment) -> list[np.ndarray]:
         """Those that a step reads."""
         leaves = jax.tree.leaves(experiment)
@@ -151,6 +157,15 @@ class _Plant(NamedTuple):
 @lru_cache(maxsize=64)
 def _read(plant: _Plant) -> tuple[int, ...]:
     """Places of the experiment's leaves that a step reads. Raises `Unsupported` if one of them is no number."""
+    key = kept.key_of("numbers read", *plant.described)
+    found = kept.load(key)
+    if found is None:
+        found = _found_read(plant)
+        kept.save(key, found)
+    return found
+
+
+def _found_read(plant: _Plant) -> tuple[int, ...]:
     from .jaxprs import flat
 
     def step(leaves: list[Any], state: list[Any], torque: Any, time: Any) -> list[Any]:
@@ -171,14 +186,19 @@ def _or_none(written: Callable[..., tuple[Callable[..., Any], tuple[Any, ...], d
 
     @lru_cache(maxsize=64)
     @wraps(written)
-    def found(*given: Any) -> Any:
+    def found(plant: _Plant, *given: Any) -> Any:
+        key = kept.key_of(f"loop of {written.__qualname__}", *plant.described, given)
+        if (loop := kept.load(key)) is not None:
+            return loop
         try:
             with attempted():
                 from .jaxprs import flat
                 from .llvm import Loop
 
-                sample, examples, numbers = written(*given)
-                return Loop(flat(sample, *examples), _FLOAT, **numbers)
+                sample, examples, numbers = written(plant, *given)
+                loop = Loop(flat(sample, *examples), _FLOAT, **numbers)
+                kept.save(key, loop)
+                return loop
         except Unsupported as why:
             say_scanned(str(why))
             return None

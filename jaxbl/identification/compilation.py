@@ -1,22 +1,34 @@
 """Compilation of programs that run only a few times, as those of identification and diagnosis do.
 
-They compile for longer than they run: options under which XLA compiles fast are worth more here than its fastest code.
-The engine of sweeps does not use them.
+They compile for longer than they run: options under which XLA compiles fast are worth more here than its fastest code, and
+where programs are kept (:mod:`jaxbl.fused.kept`) they are not even traced again. The engine of sweeps does not use them.
 """
 
 import functools
+import math
+import os
+import time
+from collections import OrderedDict
 from collections.abc import Callable
-from typing import Any, TypeVar
+from contextlib import suppress
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jax.core import Tracer
+from jax.experimental.serialize_executable import deserialize_and_load, serialize
+
+from jaxbl.fused import kept
 
 Result = TypeVar("Result")
 
 
 _FAST = {"xla_cpu_use_fusion_emitters": False}
 """XLA's former emitters compile in half the time of today's (benchmarks/NOTES.md)."""
+_LEAST = "jax_persistent_cache_min_compile_time_secs"
+_MOST = 500
+"""Programs that a process holds: of some 18 mappings each, a sixth of what the system allows."""
 
 
 @functools.cache
@@ -40,7 +52,92 @@ def jit(function: Callable[..., Result]) -> Callable[..., Result]:
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Result:
-        inside = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs)))
-        return (function if inside else compiled())(*args, **kwargs)
+        leaves, structure = jax.tree.flatten((args, kwargs))
+        if any(isinstance(leaf, Tracer) for leaf in leaves):
+            return function(*args, **kwargs)
+        if kept.keeping() is None:
+            return compiled()(*args, **kwargs)
+        arrays = [jnp.asarray(leaf) for leaf in leaves if eqx.is_array(leaf)]
+        rest = tuple(_Array() if eqx.is_array(leaf) else leaf for leaf in leaves)
+        key = function, structure, rest, tuple((one.shape, one.dtype, one.aval.weak_type) for one in arrays)
+        program = _programs.get(key)
+        if program is None:
+            while len(_programs) >= _MOST:
+                _programs.popitem(last=False)
+            program = _programs[key] = _program(function, args, kwargs, arrays)
+        else:
+            _programs.move_to_end(key)
+        return program(arrays)
 
     return call
+
+
+class _Array(NamedTuple):
+    """In the place of an array."""
+
+
+class _Program(NamedTuple):
+    """A compiled program of arrays, and what its result is made of: a pytree with :class:`_Array` in their places."""
+
+    compiled: Callable[..., list[jax.Array]]
+    result: Any
+
+    def __call__(self, arrays: list[jax.Array]) -> Any:
+        found = iter(self.compiled(*arrays))
+
+        def filled(one: Any) -> Any:
+            return next(found) if isinstance(one, _Array) else one
+
+        return jax.tree.map(filled, self.result, is_leaf=lambda one: isinstance(one, _Array))
+
+
+@functools.cache
+def _initialise() -> None:
+    """JAX finds LAPACK's routines when it first lowers one; a program that calls them without crashes."""
+    jax.jit(jnp.linalg.cholesky).lower(jnp.eye(2))
+
+
+_programs: OrderedDict[Any, _Program] = OrderedDict()
+
+
+def _program(function: Callable[..., Any], args: tuple, kwargs: dict[str, Any], arrays: list[jax.Array]) -> _Program:
+    """A program from disk, or compiled and put there."""
+    key = kept.key_of("program", function, args, kwargs)
+    found = kept.load(key)
+    if found is not None:
+        _initialise()
+        code, count, devices, result = found
+        given = jax.tree.structure((tuple(arrays), {}))
+        try:
+            loaded = deserialize_and_load(
+                code, given, jax.tree.structure([0] * count), execution_devices=jax.local_devices()[:devices]
+            )
+            return _Program(loaded, result)
+        except Exception:  # whatever another version of JAX, or another machine, makes of it
+            pass
+    dynamic, static = eqx.partition((args, kwargs), eqx.is_array)
+    structure, results = jax.tree.structure(dynamic), []
+
+    def flat(*given: Any) -> list[Any]:
+        args, kwargs = eqx.combine(structure.unflatten(given), static)
+        out = function(*args, **kwargs)
+        results.append(jax.tree.map(lambda one: _Array() if eqx.is_array(one) else one, out))
+        return [one for one in jax.tree.leaves(out) if eqx.is_array(one)]
+
+    flat.__name__ = getattr(function, "__name__", "program")
+    if key is None:
+        compiled = jax.jit(flat, compiler_options=_options()).lower(*arrays).compile()
+        return _Program(compiled, results[-1])
+    # code that JAX took from its own cache cannot be written once more: a name of its own, and not put there
+    flat.__name__ += f"_{os.getpid()}_{time.time_ns()}"
+    least = jax.config.values[_LEAST]
+    jax.config.update(_LEAST, math.inf)
+    try:
+        compiled = jax.jit(flat, compiler_options=_options()).lower(*arrays).compile()
+    finally:
+        jax.config.update(_LEAST, least)
+    shardings = jax.tree.leaves(compiled.output_shardings)
+    if shardings:
+        with suppress(Exception):  # JAX cannot write it: it is compiled anew next time
+            kept.save(key, (serialize(compiled)[0], len(shardings), len(shardings[0].device_set), results[-1]))
+    return _Program(compiled, results[-1])

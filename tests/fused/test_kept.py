@@ -1,0 +1,91 @@
+"""Compiled programs on disk: another process finds them without tracing, and what may have changed is not found."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxbl.drive.effects import make_effect
+from jaxbl.fused import kept
+
+SCRIPT = """
+import sys
+import numpy as np
+import jax
+import jax.numpy as jnp
+jax.config.update("jax_enable_x64", True)
+from jaxbl.config import prepare, read_config
+from jaxbl.drive.parameters import as_arrays
+from jaxbl.fused.single_plant import path
+from jaxbl.identification.smoother import smooth
+from jaxbl.identification import smoother
+
+traced = []
+smoother._fit, fit = lambda *given: traced.append(1) or fit(*given), smoother._fit
+time = np.arange(200) * 1e-3
+found = smooth(jnp.asarray(np.sin(9.0 * time) + 1e-4 * np.cos(1e3 * time)), jnp.asarray(1e-3))
+study = {"title": "t", "drive": {"kind": "rigid", "motor_inertia": 0.05, "motor_viscous": 0.1},
+         "excitation": {"kind": "sine", "amplitude": 1.0, "frequency": 2.0}, 
+         "observer": {"motor": {"lambda": 9.0, "alpha": 90.0}},
+         "run": {"duration": 1.0}}
+model = as_arrays(prepare(read_config(study)), float)
+states = path(model, model.plant.init(model.initial), np.sin(5.0 * time))
+print(len(traced), repr(float(found.jerk)), repr(float(np.sum(states.position["motor"]))))
+"""
+
+
+def test_another_process_does_not_trace(tmp_path, monkeypatch):
+    monkeypatch.setenv(kept.PROGRAMS, str(tmp_path))
+    said = []
+    for _ in range(2):
+        done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)
+        said.append(done.stdout.split())
+    assert said[0][0] == "1" and said[1][0] == "0"
+    assert said[0][1:] == said[1][1:]
+
+
+def test_names_tell_structures_apart(tmp_path, monkeypatch):
+    monkeypatch.setenv(kept.PROGRAMS, str(tmp_path))
+    drag, lag = make_effect("motor.quadratic_drag", drag=1.0), make_effect("actuator.lag", time_constant=1.0)
+    given = [
+        drag,
+        lag,
+        make_effect("load.quadratic_drag", drag=1.0),
+        jnp.zeros(3),
+        jnp.zeros(4),
+        np.zeros(3, np.float32),
+        1,
+        1.0,
+    ]
+    keys = [kept.key_of("program", one) for one in given]
+    assert None not in keys and len(set(keys)) == len(keys)
+    # of arrays what they are, not what they hold
+    assert kept.key_of("program", jnp.ones(3)) == kept.key_of("program", jnp.zeros(3))
+    assert kept.key_of("program", make_effect("motor.quadratic_drag", drag=jnp.ones(()))) == kept.key_of(
+        "program", make_effect("motor.quadratic_drag", drag=jnp.zeros(()))
+    )
+    with jax.enable_x64(False):
+        assert kept.key_of("program", 1) != kept.key_of("program", 1.0) != keys[-1]
+
+
+def test_what_is_not_known_by_its_text_is_not_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv(kept.PROGRAMS, str(tmp_path))
+    assert kept.key_of("program", lambda x: x) is None
+    assert kept.key_of("program", np.random.default_rng(0)) is None
+    monkeypatch.setenv(kept.PROGRAMS, "")
+    assert kept.key_of("program", 1) is None
+
+
+@pytest.mark.parametrize("content", [b"", b"half a pickle"])
+def test_a_broken_file_is_no_program(tmp_path, monkeypatch, content):
+    monkeypatch.setenv(kept.PROGRAMS, str(tmp_path))
+    key = kept.key_of("program", 1)
+    kept.save(key, [1, 2])
+    assert kept.load(key) == [1, 2]
+    folder = kept.keeping()
+    assert folder is not None and key is not None
+    (folder / key).write_bytes(content)
+    assert kept.load(key) is None
