@@ -600,6 +600,8 @@ DIAGNOSED = {
         {
             "effect": "motor.coulomb_friction",
             "confidence": 0.97,
+            "share": 0.12,
+            "z": 21.0,
             "parameters": {"torque": {"value": 0.05, "standard_error": 0.001, "unit": "N m"}},
             "alternatives": [],
         }

@@ -139,7 +139,7 @@ def _check_sides(config: Config) -> None:
 
 
 def _check_effects(config: Config) -> None:
-    """Effects act on what the drive has, and leave each side some inertia."""
+    """Effects act on what the drive has, their numbers agree, and they leave each side some inertia."""
     rigid = config.drive.kind == "rigid"
     for i, effect in enumerate(config.effects):
         place = effect.kind.partition(".")[0]
@@ -147,6 +147,8 @@ def _check_effects(config: Config) -> None:
             raise wrong(
                 f"effects[{i}]: {effect.kind} has no meaning on a rigid drive; motor.* and actuator.* effects act on it"
             )
+        if fault := EFFECTS[effect.kind].fault(effect.model_dump()):
+            raise wrong(f"effects[{i}]: {effect.kind}: {fault}")
     for side in ("motor",) if rigid else ("motor", "load"):
         nominal = getattr(config.drive, f"{side}_inertia")
         heavier = [effect for effect in config.effects if effect.kind.partition(".")[0] == side]
@@ -189,7 +191,7 @@ def _paths(table: Table, prefix: str) -> Iterator[tuple[str, Parameter]]:
         path = f"{prefix}.{field.alias or name}"
         if isinstance(value, Table):
             yield from _paths(value, path)
-        elif name not in _FIXED:
+        elif name not in _FIXED and not isinstance(value, list):
             extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
             yield path, Parameter(str(extra.get("unit", "")), field.description or "")
 

@@ -27,7 +27,8 @@ class Table(StrictTable):
         """The module that a generated table stands for."""
         names = {name for name in type(self).model_fields if name not in ("kind", "law")}
         # of the class: an instance would bind a partial function from Python 3.14 on
-        return type(self).factory(**{name: getattr(self, name) for name in names})
+        values = {name: getattr(self, name) for name in names}
+        return type(self).factory(**{name: tuple(one) if isinstance(one, list) else one for name, one in values.items()})
 
 
 def table_for(module: type, factory: Callable[..., Any] | None = None, base: type[Table] = Table, **tag: str) -> type[Table]:
@@ -38,12 +39,13 @@ def table_for(module: type, factory: Callable[..., Any] | None = None, base: typ
     """
     fields: dict[str, Any] = {key: (Literal[value], ...) for key, value in tag.items()}
     for field, known in parameters(module):
-        kind: Any = field.type if field.metadata.get("static") else float
+        # lists of numbers are empty by default
+        kind: Any = field.type if field.metadata.get("static") else list[float] if field.default == () else float
         optional = field.default is None
         fields[field.name] = (
             kind | None if optional else kind,
             Field(
-                default=... if field.default is dataclasses.MISSING else field.default,
+                default=... if field.default is dataclasses.MISSING else [] if field.default == () else field.default,
                 alias=key_of(field.name) if key_of(field.name) != field.name else None,
                 description=known.doc,
                 json_schema_extra={"unit": known.unit} if known.unit else None,

@@ -5,9 +5,9 @@ the fit has seen.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -30,10 +30,11 @@ from .expected_errors import expected_errors
 from .judgement import exchanged, explained_share, judged
 from .localise import SIGNIFICANT, Localised, localise
 from .observer_residual import Observed, observed_torques
-from .proof import Control, FittedModel, Proof, free_values
-from .reference_log import Comparison, at_period
+from .proof import SURE, Accepted, Control, Proof, free_values
+from .reference_log import at_period
 from .residuals import Residual, residual_torques
 from .setup import Setup, set_up
+from .torque_tables import tabulated
 
 _BOUND = 4.0
 """Standard deviations that the model's own numbers may be off where they are held."""
@@ -114,7 +115,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         done()
         search, found = _explained(setup)
         done()
-        found, fitted, after, controls, withdrawn = _proved(proof, search, found)
+        search, found, (fitted, after, withdrawn, gains), controls = _proved(proof, search, found)
         done()
         if not np.isfinite(fitted.covariance).all():
             raise InputError(f"{task.record.path}: the model's numbers cannot be fitted to this log; is its input complete?")
@@ -129,7 +130,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         observed = _observed(setup, observing)
         trace = trace_of(setup, on_log, on_holdout, observed)
         done()
-        summary = summary_of(setup, fitted, found, withdrawn)
+        summary = summary_of(setup, fitted, found, withdrawn, gains)
         about, notes = observers_say(observing, observed[0], setup)
         for side, one in about.items():
             summary["where"][side]["observed"] = one
@@ -141,9 +142,15 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
             coordinates = all_coordinates(fitted.experiment, segments, lacking_after, setup.sliding)
             left = localise(fitted.experiment, lacking_after, segments, coordinates)
             summary["where_after"] = where_lacking(task.record, left)
+        tables = None
+        if judgement.failed and not judgement.far:
+            tables = tabulated(proof, fitted.experiment, after, lacking_after, setup.sliding)
+        if tables is not None:
+            summary["tabulated"] = tables.said()
         if found.wrong is not None:
             summary["rival"] = rival_tables(task.config, setup.own, found.wrong)
-        model = extended_study(task.config, fitted.numbers, free_values(setup.own, fitted.theta) | gain_values)
+        values = free_values(setup.own, fitted.theta) | gain_values
+        model = extended_study(task.config, fitted.numbers, values, tables.effects() if tables else ())
         done()
     pairs = {
         side: [*((*one, False) for one in on_log[side] if not task.separate), *((*one, True) for one in on_holdout[side])]
@@ -161,9 +168,10 @@ def _paired(
     return {side: list(zip(pieces, after[side], strict=True)) for side, pieces in before.items()}
 
 
-def new_search(setup: Setup, bound: float = np.inf) -> EffectSearch:
-    """The search for effects on the log; `bound`: standard deviations that the model's own numbers may be off."""
-    exact = setup.task.config.uncertainty.exact
+def new_search(setup: Setup, bound: float = np.inf, without: Collection[str] = ()) -> EffectSearch:
+    """The search for effects on the log; `bound`: standard deviations that the model's own numbers may be off; `without`:
+    effects that are not sought."""
+    exact = (*setup.task.config.uncertainty.exact, *without)
     return EffectSearch(setup.bare, setup.own, setup.prior.tolist(), setup.fitted.segments, bound, exact)
 
 
@@ -186,22 +194,45 @@ def _explained(setup: Setup) -> tuple[EffectSearch, Explanation]:
     return search, found
 
 
-def _proved(
-    proof: Proof, search: EffectSearch, found: Explanation
-) -> tuple[Explanation, FittedModel, Comparison, list[Control], list[str]]:
-    """An explanation as far as the held-out data bear it out: the model with it, how that compares, its controls, and the
-    effects that were withdrawn. An effect that another one beats there changes places with it, once."""
+class _Proved(NamedTuple):
+    """An explanation as far as the held-out data bear it out, the search that found it, and the controls of its model."""
+
+    search: EffectSearch
+    found: Explanation
+    accepted: Accepted
+    controls: list[Control]
+
+
+def _proved(proof: Proof, search: EffectSearch, found: Explanation) -> _Proved:
+    """What the held-out data leave of an explanation. Where they take effects away, others are sought in their place."""
+    first = _exchanged(proof, search, found)
+    withdrawn = first.accepted.withdrawn
+    if not withdrawn:
+        return first
+    other = new_search(proof.setup, search.bound, withdrawn)
+    again = other.run()
+    if again.model.names in ((), first.accepted.fitted.names) or not other.plausible(again):
+        return first
+    second = _exchanged(proof, other, again)
+    if not second.accepted.fitted.names or proof.beaten(first.accepted.after, second.accepted.after) < SURE:
+        return first
+    gone = [*withdrawn, *second.accepted.withdrawn]
+    return second._replace(accepted=second.accepted._replace(withdrawn=gone))
+
+
+def _exchanged(proof: Proof, search: EffectSearch, found: Explanation) -> _Proved:
+    """As :func:`_proved`; an effect that another one beats on the held-out data changes places with it, once."""
     other: Explanation | None = found
     for _ in range(2):
         found = other or found
-        fitted, after, withdrawn = proof.accepted(search, found)
-        if withdrawn:
-            found = search.without(found, withdrawn)
-        controls = proof.controls(search, fitted, after, found.wrong)
+        accepted = proof.accepted(search, found)
+        if accepted.withdrawn:
+            found = search.without(found, accepted.withdrawn)
+        controls = proof.controls(search, accepted.fitted, accepted.after, found.wrong)
         other = exchanged(found, controls)
         if other is None:
             break
-    return found, fitted, after, controls, withdrawn
+    return _Proved(search, found, accepted, controls)
 
 
 def _check_shown(setup: Setup, shown: float) -> None:

@@ -32,9 +32,14 @@ from .sentences import sentence_of
 from .setup import Setup
 
 
-def summary_of(setup: Setup, fitted: FittedModel, found: Explanation, withdrawn: Sequence[str]) -> dict[str, Any]:
-    """The summary but for the proof, and for what the observers say; `withdrawn`: effects that were found, and that the
-    explanation is without."""
+def summary_of(
+    setup: Setup, fitted: FittedModel, found: Explanation, withdrawn: Sequence[str], gains: Mapping[str, float]
+) -> dict[str, Any]:
+    """The summary but for the proof, and for what the observers say.
+
+    `withdrawn`: effects that were found, and that the explanation is without; `gains`: standard errors by which the model
+    beats one without an effect on the held-out data, by effect.
+    """
     task, record, located = setup.task, setup.task.record, setup.located
     where = where_lacking(record, located)
     values, errors = free_values(fitted.free, fitted.theta), fitted.errors()
@@ -65,7 +70,11 @@ def summary_of(setup: Setup, fitted: FittedModel, found: Explanation, withdrawn:
         "samples": len(record.time),
         "sample_period": record.sample_period,
         "verdict": found.verdict,
-        "findings": [_finding(record, one, values, errors, where) for one in found.findings],
+        # what has the larger torque matters more
+        "findings": [
+            _finding(record, one, values, errors, where) | {"z": gains.get(one.effect)}
+            for one in sorted(found.findings, key=lambda one: -one.share)
+        ],
         "parameters": {
             one.path: {
                 "value": values[one.path],
@@ -100,6 +109,7 @@ def _finding(
     return {
         "effect": one.effect,
         "confidence": one.confidence,
+        "share": one.share,
         "parameters": numbers,
         "alternatives": [{"effect": name, "confidence": chance} for name, chance in one.alternatives],
         "where": {"place": place, "sentences": {side: where[side]["sentence"] for side in sides}},
@@ -152,10 +162,15 @@ def observers_say(
     return found, notes
 
 
-def extended_study(config: Config, numbers: Mapping[str, Mapping[str, float]], values: Mapping[str, float]) -> Config:
-    """The study with effects more, and with these numbers."""
+def extended_study(
+    config: Config,
+    numbers: Mapping[str, Mapping[str, float]],
+    values: Mapping[str, float],
+    tables: Sequence[Mapping[str, Any]] = (),
+) -> Config:
+    """The study with effects more, some of them tables of torques, and with these numbers."""
     data = config.resolved()
-    added = [{"kind": name, **one} for name, one in numbers.items()]
+    added = [*({"kind": name, **one} for name, one in numbers.items()), *tables]
     data["effects"] = with_added(data.get("effects", []), added, lambda one: one["kind"])
     return with_values(read_config(data), values)
 

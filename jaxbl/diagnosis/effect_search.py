@@ -100,12 +100,14 @@ class Finding:
         effect: its name.
         confidence: probability that it is this one.
         numbers: of the effect.
+        share: rms of its torque along the record over that of the driving torque.
         alternatives: other effects that the record does not rule out in its place, and their probabilities.
     """
 
     effect: str
     confidence: float
     numbers: Numbers
+    share: float
     alternatives: tuple[tuple[str, float], ...]
 
 
@@ -581,7 +583,7 @@ def _finding(tried: Sequence[_Tried], model: Model, heat: float) -> Finding:
     *chances, _ = softmax(np.array([*(one.gain for one in tried), 0.0]) / heat)
     others = tuple((one.name, float(chance)) for one, chance in zip(tried[1:], chances[1:], strict=True))
     others = tuple(one for one in others if one[1] > LEAST_CHANCE)
-    return Finding(name, float(chances[0]), model.numbers[name], others)
+    return Finding(name, float(chances[0]), model.numbers[name], model.linear.share(name), others)
 
 
 def _fitted_numbers(name: str) -> list[str]:

@@ -11,10 +11,7 @@ from jaxbl.simulate import Experiment
 
 from .effect_search import FAR, LEAST_CHANCE, Explanation, Finding, Model
 from .expected_errors import Expected, failed
-from .proof import Control, FittedModel
-
-_BEATEN = 2.0
-"""Standard errors by which a control must be beaten: 2 % by chance."""
+from .proof import SURE, Control, FittedModel
 
 
 class Judgement(NamedTuple):
@@ -59,7 +56,7 @@ def judged(
     left = failed(errors, expected)
     away = fitted.theta[: len(prior)] / prior
     far = {one.path: float(z) for one, z in zip(fitted.free, away, strict=False) if abs(z) > FAR}
-    chance = any(one.kind == "permuted" and one.z < _BEATEN for one in controls)
+    chance = any(one.kind == "permuted" and one.z < SURE for one in controls)
     findings = found.findings
     for one in controls:
         if one.kind == "wrong" and found.wrong is not None:
@@ -80,7 +77,7 @@ def _nats(model: Model, wrong: Model, z: float) -> float:
         # a more general effect does as well by its nature
         return np.inf
     fit = max(model.log_likelihood - wrong.log_likelihood, 0.0)
-    nats = model.log_evidence - wrong.log_evidence - fit * (1.0 - float(np.clip(z / _BEATEN, 0.0, 1.0)))
+    nats = model.log_evidence - wrong.log_evidence - fit * (1.0 - float(np.clip(z / SURE, 0.0, 1.0)))
     return nats - 0.5 * min(z, 0.0) ** 2
 
 
@@ -97,7 +94,7 @@ def exchanged(found: Explanation, controls: Sequence[Control]) -> Explanation | 
     both = last.confidence + dict(last.alternatives).get(rival, 0.0)
     chance = both / (1.0 + float(np.exp(nats)))
     alternatives = ((last.effect, both - chance), *(one for one in last.alternatives if one[0] != rival))
-    now = Finding(rival, chance, found.wrong.numbers[rival], alternatives)
+    now = Finding(rival, chance, found.wrong.numbers[rival], found.wrong.linear.share(rival), alternatives)
     return dataclasses.replace(found, model=found.wrong, wrong=found.model, findings=(*others, now))
 
 

@@ -23,6 +23,8 @@ data cost; of speeds the noise is known less well."""
 _BLOCKS = 16
 """Of held-out data, over which errors are compared: many enough for a standard error, and longer than errors are correlated
 in most logs."""
+SURE = 2.0
+"""Standard errors that count as a difference between two models: 2 % by chance."""
 
 
 class FittedModel(NamedTuple):
@@ -84,6 +86,22 @@ class Control(NamedTuple):
     effect: str = ""
 
 
+class Accepted(NamedTuple):
+    """An explanation as far as the held-out data bear it out.
+
+    Attributes:
+        fitted: the model with it.
+        after: how it compares there.
+        withdrawn: effects that were found, and that it is without.
+        gains: standard errors by which the model beats the one without an effect, by effect.
+    """
+
+    fitted: FittedModel
+    after: Comparison
+    withdrawn: list[str]
+    gains: dict[str, float]
+
+
 class Proof:
     """Models fitted on the log, and compared on what was held out.
 
@@ -97,39 +115,48 @@ class Proof:
         self.before = self.other.compare(setup.nominal)
         self.noise = self.other.noise_floor(self.before.torques)
 
-    def accepted(self, search: EffectSearch, found: Explanation) -> tuple[FittedModel, Comparison, list[str]]:
-        """The model with what was found, how it compares, and the effects that are withdrawn: with them it is
-        worse than as given, or no better than without the last of them."""
-        names, withdrawn = found.model.names, []
-        while True:
-            base = found.model if names else found.nominal
-            fitted = fit_model(search, {name: base.numbers[name] for name in names}, base.theta)
+    def accepted(self, search: EffectSearch, found: Explanation) -> Accepted:
+        """The model with what was found, as far as the held-out data bear it out.
+
+        Withdrawn, one after the other, are effects without which a model does as well there, and while the model is worse
+        than the one given, the effect without which it does best.
+        """
+        names, withdrawn = list(found.model.names), []
+        while names:
+            fitted = fit_model(search, {name: found.model.numbers[name] for name in names}, found.model.theta)
             after = self.other.compare(fitted.experiment)
-            kept = not self._worse(after) and (names or is_better(after.errors, self.before.errors))
-            if kept and (len(names) < 2 or self._beaten(self._without_last(search, found, names), after) > 0.0):
-                return fitted, after, withdrawn
-            if not names:
-                break
-            withdrawn.append(names[-1])
-            names = names[:-1]
+            gains = {name: self.beaten(self._without(search, found.model, names, name), after) for name in names}
+            least = min(gains, key=lambda name: gains[name])
+            if gains[least] > 0.0 and not self.worse(after, self.before):
+                return Accepted(fitted, after, withdrawn, gains)
+            withdrawn.append(least)
+            names.remove(least)
+        fitted = fit_model(search, {}, found.nominal.theta)
+        after = self.other.compare(fitted.experiment)
+        if not self.worse(after, self.before) and is_better(after.errors, self.before.errors):
+            return Accepted(fitted, after, withdrawn, {})
         own, known = self.setup.own, np.diag(self.setup.prior**2)
         # if nothing is missing, its numbers are off by as much as the fit says
         off = fitted.white + np.outer(fitted.theta, fitted.theta)
-        return FittedModel((), self.setup.nominal, own, np.zeros(len(own)), known, off), self.before, withdrawn
+        given = FittedModel((), self.setup.nominal, own, np.zeros(len(own)), known, off)
+        return Accepted(given, self.before, withdrawn, {})
 
-    def _without_last(self, search: EffectSearch, found: Explanation, names: Sequence[str]) -> Comparison:
-        """How a model without the last of its effects compares."""
-        model = found.model
-        fewer = fit_model(search, {name: model.numbers[name] for name in names[:-1]}, model.theta)
+    def _without(self, search: EffectSearch, model: Model, names: Sequence[str], left_out: str) -> Comparison:
+        """How a model without one of its effects compares, all numbers fitted anew."""
+        fewer = fit_model(search, {name: model.numbers[name] for name in names if name != left_out}, model.theta)
         return self.other.compare(fewer.experiment)
 
-    def _worse(self, after: Comparison) -> bool:
-        """Whether a model is worse than the one given on what was held out, by more than noise."""
-        return any(
-            not value
-            <= (_WORSE_SPEED if name.startswith("velocity") else _WORSE) * max(self.before.errors[name], self.noise[name])
-            for name, value in after.errors.items()
-        )
+    def worse(self, after: Comparison, before: Comparison) -> bool:
+        """Whether a model is worse than another in a channel: by more than new numbers may cost, and by more than the blocks
+        of held-out data differ."""
+        for name, value in after.errors.items():
+            limit = _WORSE_SPEED if name.startswith("velocity") else _WORSE
+            if value <= limit * max(before.errors[name], self.noise[name]):
+                continue
+            other, own = (_blocks(one.samples[name], self.noise[name]) for one in (before, after))
+            if not _standard_errors(other, own) > -SURE:
+                return True
+        return False
 
     def controls(self, search: EffectSearch, fitted: FittedModel, after: Comparison, rival: Model | None) -> list[Control]:
         """Controls of a model with effects; `rival`: the best one with a wrong effect, whose numbers are fitted as well."""
@@ -138,34 +165,24 @@ class Proof:
         found = []
         if rival is not None:
             other = self.other.compare(fit_model(search, rival.numbers, rival.theta).experiment)
-            found.append(Control("wrong", other.errors, self._beaten(other, after), rival.names[-1]))
+            found.append(Control("wrong", other.errors, self.beaten(other, after), rival.names[-1]))
         added = {
             side: [one.torque - left.torque for one, left in zip(pieces, after.torques[side], strict=True)]
             for side, pieces in self.before.torques.items()
         }
         shuffled = self.other.permuted(self.setup.nominal, added)
         if shuffled is not None:
-            found.append(Control("permuted", shuffled.errors, self._beaten(shuffled, after)))
+            found.append(Control("permuted", shuffled.errors, self.beaten(shuffled, after)))
         return found
 
-    def _beaten(self, control: Comparison, after: Comparison) -> float:
-        """By how many standard errors a model beats a control, block by block, each channel over the model's own noise.
-
-        By logarithms, since a few blocks may have most of the errors; what structure in the noise may bring is no gain.
-        """
-        costs = np.zeros((2, _BLOCKS))
-        for cost, one in zip(costs, (control, after), strict=True):
+    def beaten(self, control: Comparison, after: Comparison) -> float:
+        """By how many standard errors a model beats a control, block by block, each channel over the model's own noise."""
+        costs = []
+        for one in (control, after):
             floor = self.other.noise_floor(one.torques)
-            for name in floor:
-                if not name.startswith("velocity"):
-                    with np.errstate(invalid="ignore", over="ignore"):
-                        blocks = np.array_split(np.square(one.samples[name] / floor[name]).ravel(), _BLOCKS)
-                    cost += [float(np.mean(block)) for block in blocks]
-        if not np.isfinite(costs[0]).all():
-            return np.inf
-        gains = np.log(np.maximum(costs, np.finfo(float).tiny))
-        gains = gains[0] - gains[1]
-        return float(np.mean(gains) / np.hypot(np.std(gains, ddof=1) / np.sqrt(_BLOCKS), 2.0 * FLOOR))
+            channels = [name for name in floor if not name.startswith("velocity")]
+            costs.append(np.sum([_blocks(one.samples[name], floor[name]) for name in channels], axis=0))
+        return _standard_errors(*costs)
 
     def gap(self, fitted: FittedModel, after: Comparison) -> dict[str, Any]:
         """Errors on held-out data before and after, and the noise."""
@@ -194,6 +211,24 @@ class Proof:
                 break
             found["free_run"][name] = errors
         return found
+
+
+def _blocks(errors: np.ndarray, noise: float) -> np.ndarray:
+    """Mean squared errors over their noise, by blocks of held-out data."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.array([np.mean(block) for block in np.array_split(np.square(errors / noise).ravel(), _BLOCKS)])
+
+
+def _standard_errors(control: np.ndarray, model: np.ndarray) -> float:
+    """By how many standard errors squared errors of a model, block by block, are below those of a control.
+
+    By logarithms, since a few blocks may have most of the errors; what structure in the noise may bring is no gain.
+    """
+    if not (np.isfinite(control).all() and np.isfinite(model).all()):
+        return -np.inf if np.isfinite(control).all() else np.inf
+    control, model = (np.log(np.maximum(one, np.finfo(float).tiny)) for one in (control, model))
+    gains = control - model
+    return float(np.mean(gains) / np.hypot(np.std(gains, ddof=1) / np.sqrt(_BLOCKS), 2.0 * FLOOR))
 
 
 def is_better(new: Mapping[str, float], old: Mapping[str, float]) -> bool:

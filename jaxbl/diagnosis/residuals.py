@@ -270,11 +270,7 @@ def narrowed(residual: Residual, cutoff: float) -> tuple[Residual, np.ndarray]:
     Noise of accelerations grows with the square of the frequency: what is slow shows better without what is fast. At
     `cutoff` (Hz) half of the power passes.
     """
-    width = np.sqrt(np.log(2.0)) / (2.0 * np.pi * cutoff * residual.period)
-    stride = max(int(width), 1)
-    # at the ends smoother and filter find but one side
-    cut = min(int(3.0 * width + 0.5 / (residual.bandwidth * residual.period)), len(residual.time) // 4)
-    at = np.arange(cut, len(residual.time) - cut, stride)
+    width, stride, at = _filter(residual, cutoff)
     reach = len(residual.correlation) + int(8.0 * width)
     size = 2 ** int(np.ceil(np.log2(2 * reach)))
     spectrum = noise_spectrum(residual.correlation, size)
@@ -291,6 +287,21 @@ def narrowed(residual: Residual, cutoff: float) -> tuple[Residual, np.ndarray]:
         bandwidth=min(cutoff, residual.bandwidth),
     )
     return low, at
+
+
+def _filter(residual: Residual, cutoff: float) -> tuple[float, int, np.ndarray]:
+    """Width of the Gaussian in samples, distance of those that are kept, and their indices."""
+    width = np.sqrt(np.log(2.0)) / (2.0 * np.pi * cutoff * residual.period)
+    # at the ends smoother and filter find but one side
+    cut = min(int(3.0 * width + 0.5 / (residual.bandwidth * residual.period)), len(residual.time) // 4)
+    stride = max(int(width), 1)
+    return width, stride, np.arange(cut, len(residual.time) - cut, stride)
+
+
+def low_passed(values: np.ndarray, residual: Residual, cutoff: float) -> np.ndarray:
+    """Signals along a residual behind the low-pass of :func:`narrowed`; shape (..., samples)."""
+    width, _, at = _filter(residual, cutoff)
+    return gaussian_filter1d(values, width, axis=-1)[..., at]
 
 
 def noise_spectrum(correlation: np.ndarray, size: int) -> np.ndarray:

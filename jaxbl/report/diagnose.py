@@ -50,11 +50,14 @@ def _headline(summary: dict[str, Any]) -> list[str]:
     lines.append(verdict_sentence(summary))
     for one in summary["findings"]:
         numbers = ", ".join(_number(leaf, number) for leaf, number in one["parameters"].items())
-        lines.append(f"{one['effect']} (confidence {probability(one['confidence'])}): {numbers}.")
+        lines.append(
+            f"{one['effect']} (confidence {probability(one['confidence'])}): {numbers}; {_percent(one['share'])} of the "
+            "driving torque."
+        )
         if one["alternatives"]:
             others = ", ".join(f"{other['effect']} ({probability(other['confidence'])})" for other in one["alternatives"])
             lines.append(f"  Not ruled out by this log: {others}.")
-    return [*lines, *_reasons(summary), *_gap_lines(summary["gap"])]
+    return [*lines, *_reasons(summary), *_gap_lines(summary["gap"]), *_table_lines(summary)]
 
 
 _NO_MORE = "no more is left on data not used for the fit than noise and the uncertainty of the model's numbers account for"
@@ -79,6 +82,30 @@ def verdict_sentence(summary: Mapping[str, Any]) -> str:
         f"Partly explained: the model lacks {names}; with {them}, {share} of the missing torque is explained on data not "
         f"used for the fit{rest}."
     )
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.2g} %" if share < 0.1 else f"{100.0 * share:.0f} %"
+
+
+_OVER = {"position": "position", "turn": "position within a turn", "speed": "speed"}
+
+
+def _table_lines(summary: Mapping[str, Any]) -> list[str]:
+    """What tables of torques without a name add."""
+    if "tabulated" not in summary:
+        return []
+    found, gap = summary["tabulated"], summary["gap"]
+    which = " and ".join(
+        f"{side} torque over {' and '.join(_OVER[one['over']] for one in tables)}"
+        for side, tables in found["tables"].items()
+    )
+    errors = "; ".join(
+        f"{name} {rms_text(gap['holdout_rmse_after'][name])} -> {rms_text(value)} {gap['units'][name]}"
+        for name, value in found["holdout_rmse"].items()
+        if not name.startswith("velocity")
+    )
+    return [f"Not named, but added to model.toml as a table: {which}. On held-out data it takes {errors}."]
 
 
 def _share(value: float | None) -> str:
@@ -248,7 +275,32 @@ def draw_diagnosis(found: Diagnosis) -> list[Drawn]:
     """All figures of a diagnosis."""
     unit = unit_on(found.record, "motor.torque", "N m")
     residuals = draw_residuals(found.residuals, found.coordinates, found.located, unit, found.observed)
-    return [_verdict(found.summary), _over_time(found), *residuals]
+    tables = [_tables(found)] if "tabulated" in found.summary else []
+    return [_verdict(found.summary), _over_time(found), *tables, *residuals]
+
+
+def _tables(found: Diagnosis) -> Drawn:
+    """Torques without a name, over position and speed, with their standard errors."""
+    sides = found.summary["tabulated"]["tables"]
+    each = [(side, one) for side, tables in sides.items() for one in tables]
+    figure, axes = subplots(11.0, 3.6, columns=len(each))
+    for ax, (side, one) in zip(axes, each, strict=True):
+        kind = "velocity" if one["over"] == "speed" else "position"
+        points, torques, errors = (np.array(one[key]) for key in ("points", "torques", "errors"))
+        ax.fill_between(points, torques - 2.0 * errors, torques + 2.0 * errors, color=FAINT, alpha=0.35, lw=0.0)
+        ax.plot(points, torques, "o-", color=_AFTER, ms=4, lw=1.4)
+        ax.axhline(0.0, color=FAINT, lw=0.8)
+        unit = unit_on(found.record, f"{side}.{kind}", "rad/s" if kind == "velocity" else "rad")
+        force = unit_on(found.record, f"{side}.torque", "N m")
+        ax.set(
+            xlabel=with_unit(f"{side} {_OVER[one['over']]}", unit),
+            ylabel=with_unit(f"{side}: resisting {missing_quantity(force)}", force),
+        )
+    caption = (
+        "What none of the known effects explains, as tables in model.toml: the torque that resists motion "
+        "beside the named effects. Band: two standard errors. Held-out data are predicted better with it."
+    )
+    return Drawn("tabulated", figure, caption)
 
 
 def _verdict(summary: Mapping[str, Any]) -> Drawn:

@@ -54,6 +54,14 @@ def right_side(t, y, u, law, effects, drive):
         z_dot = v - stiffness * abs(v) * z / g
         return stiffness * z + own["damping"] * z_dot, z_dot
 
+    def tabulated(name, theta, v):
+        table = effects.get(f"{name}.tabulated")
+        if table is None:
+            return 0.0
+        theta = np.mod(theta, 2.0 * np.pi) if table.get("turn") else theta
+        of_position = np.interp(theta, table["positions"], table["position_torques"]) if "positions" in table else 0.0
+        return of_position + (np.interp(v, table["speeds"], table["speed_torques"]) if "speeds" in table else 0.0)
+
     theta_e, theta_s, omega_e, omega_s, lagged, z_e, z_s = y
     u = u * (1.0 + value("actuator.gain_error", "relative"))
     if "actuator.saturation" in effects:
@@ -77,7 +85,8 @@ def right_side(t, y, u, law, effects, drive):
     at_motor = side("motor", omega_e) + value("motor.cogging", "amplitude") * np.sin(
         value("motor.cogging", "harmonic") * theta_e + value("motor.cogging", "phase")
     )
-    at_load = side("load", omega_s)
+    at_motor += tabulated("motor", theta_e, omega_e)
+    at_load = side("load", omega_s) + tabulated("load", theta_s, omega_s)
     at_load += value("load.gravity", "torque") * np.sin(theta_s - value("load.gravity", "phase"))
     at_load += value("load.periodic_disturbance", "amplitude") * np.sin(
         2.0 * np.pi * value("load.periodic_disturbance", "frequency") * t + value("load.periodic_disturbance", "phase")

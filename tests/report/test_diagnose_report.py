@@ -31,6 +31,8 @@ SUMMARY = {
         {
             "effect": "load.coulomb_friction",
             "confidence": 0.93,
+            "share": 0.12,
+            "z": 21.0,
             "parameters": {"torque": {"value": 0.274, "standard_error": 0.0021, "unit": "N m"}},
             "alternatives": [{"effect": "load.stribeck_friction", "confidence": 0.07}],
         }
@@ -72,7 +74,7 @@ def test_the_headline_has_verdict_numbers_and_gap():
         "Explained: the model lacks load.coulomb_friction; with it, no more is left on data not used for the fit than noise "
         "and the uncertainty of the model's numbers account for."
     )
-    assert lines[1] == "load.coulomb_friction (confidence 0.93): torque = 0.274 ± 0.0021 N m."
+    assert lines[1] == "load.coulomb_friction (confidence 0.93): torque = 0.274 ± 0.0021 N m; 12 % of the driving torque."
     assert lines[2] == "  Not ruled out by this log: load.stribeck_friction (0.07)."
     assert lines[3].startswith("On other.csv, over windows of 0.5 s, rms: theta_e 0.1 -> 0.0011 rad (noise 0.001); theta_s ")
     assert lines[4].startswith("In one free run: theta_e 0.1 -> 0.002 rad;")

@@ -8,6 +8,7 @@ effect's name, its object a subclass of :class:`SideEffect`, :class:`Transmissio
 # families, and the effects of one, in the order in which a model with all effects has them
 from .friction import CoulombFriction, StribeckFriction, PreslidingFriction, ViscousFriction, QuadraticDrag
 from .loads import ConstantTorque, Inertia, Gravity, PeriodicDisturbance, Cogging, TorqueRipple
+from .tables import Tabulated
 from .gear import Backlash, Hardening, Damping, Eccentricity
 from .actuator import GainError, Saturation, Lag
 from .base import (
@@ -28,4 +29,5 @@ from .base import (
     make_effect,
     shape,
     size,
+    table,
 )

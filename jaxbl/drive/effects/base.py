@@ -114,6 +114,11 @@ def held(unit: str, doc: str, neutral: float, **limits: Any) -> Any:
     return parameter(unit, doc, default=neutral, role=Role("held", neutral, lambda log: (neutral,)), **limits)
 
 
+def table(unit: str, doc: str) -> Any:
+    """Declare a list of numbers, empty unless given. No axis and no fit changes them."""
+    return parameter(unit, doc, default=(), fixed=True)
+
+
 class AbstractEffect(eqx.Module):
     """Base of all effects; every hook has a neutral default.
 
@@ -218,6 +223,11 @@ class AbstractEffect(eqx.Module):
         """Whether numbers that were fitted are those of such an effect: sizes above their least value."""
         limits = {field.name: about.minimum for field, about in parameters(cls) if field.name in cls.sizes()}
         return all(least is None or numbers[name] > least for name, least in limits.items())
+
+    @classmethod
+    def fault(cls, numbers: Mapping[str, Any]) -> str:
+        """What is wrong with the numbers of a study, beyond the range of each, and what would be right; "" if nothing is."""
+        return ""
 
     @classmethod
     def suits(cls, transmission: Any) -> bool:

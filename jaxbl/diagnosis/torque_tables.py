@@ -1,0 +1,241 @@
+"""What no known effect explains, as a table: torque over position, over speed, or both, from what a model still lacks.
+
+Piecewise linear functions are fitted to the missing torque by penalised least squares. Their smoothness, and over which of
+the coordinates they go, are chosen by cross-validation on blocks of the log. They have no name and explain nothing, but the
+model with them predicts better if they are kept: that is decided on held-out data.
+Reference: P. Eilers, B. Marx, Flexible smoothing with B-splines and penalties, Statistical Science 11 (1996).
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbl.drive.effects import Tabulated
+from jaxbl.drive.parameters import as_arrays
+from jaxbl.identification.compilation import jit
+from jaxbl.identification.segments import Segment
+from jaxbl.identification.smoother import Smoothed
+from jaxbl.simulate import Experiment, with_effects
+
+from .proof import SURE, Proof
+from .reference_log import Comparison, ReferenceLog
+from .residuals import Residual, as_smoothed, low_passed, narrowed
+
+_POINTS = {"position": 25, "turn": 37, "speed": 17}
+"""Points of a table: waves of 12 periods over the range, or 18 a turn, still show; speeds have them where samples are."""
+_BLOCKS = 10
+"""Of consecutive samples, each left out once."""
+_GAIN = 0.03
+"""Share of the rms that a table has to take away by cross-validation."""
+_STIFFNESS = 10.0 ** np.arange(-4.0, 5.0)
+"""Weights of the squared second differences that are tried, over the mean square of the columns."""
+_RIDGE = 1e-6
+"""Weight of the squares: where there are no data a table goes to zero."""
+_LEAST = 20
+"""Samples behind the low-pass that a point must have."""
+_TURN = 2.0 * np.pi
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """Torque over one coordinate.
+
+    Attributes:
+        over: position, turn (position within a turn) or speed.
+        points: of it, rad or rad/s.
+        torques: resisting torque at each, N m.
+        errors: their standard errors, from the scatter of blocks of the log.
+    """
+
+    over: str
+    points: np.ndarray
+    torques: np.ndarray
+    errors: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Tabulation:
+    """A model with tables, which predicts held-out data better than without.
+
+    Attributes:
+        tables: by side.
+        experiment: the model with them.
+        after: how it compares on held-out data.
+        z: standard errors by which it beats the model without them there.
+    """
+
+    tables: dict[str, list[Table]]
+    experiment: Experiment
+    after: Comparison
+    z: float
+
+    def effects(self) -> list[dict[str, Any]]:
+        """The tables as effects of a study."""
+        return [{"kind": f"{side}.{Tabulated.kind}"} | _numbers(tables) for side, tables in self.tables.items()]
+
+    def said(self) -> dict[str, Any]:
+        """As JSON."""
+        tables = {side: [dataclasses.asdict(one) for one in tables] for side, tables in self.tables.items()}
+        return {"tables": tables, "z": self.z, "holdout_rmse": self.after.errors}
+
+
+def tabulated(
+    proof: Proof,
+    experiment: Experiment,
+    after: Comparison,
+    lacking: Mapping[str, Sequence[Residual]],
+    sliding: Sequence[str],
+) -> Tabulation | None:
+    """Tables of what a model still lacks, if it predicts held-out data better with them; else None.
+
+    Args:
+        proof: compares models on held-out data.
+        experiment: the model.
+        after: how it compares there.
+        lacking: torques that it lacks on the log, by side, segment by segment.
+        sliding: sides whose positions are no angles.
+    """
+    best: Tabulation | None = None
+    for side in experiment.sides:
+        if any(effect.name == f"{side}.{Tabulated.kind}" for effect in experiment.effects):
+            continue
+        tables = _fitted(proof.setup.fitted, lacking[side], side, rotary=side not in sliding)
+        if not tables:
+            continue
+        known = best.tables if best else {}
+        tried = _with_tables(experiment, {**known, side: tables})
+        compared = proof.other.compare(tried)
+        before = best.after if best else after
+        z = proof.beaten(before, compared)
+        if z > SURE and not proof.worse(compared, before):
+            best = Tabulation({**known, side: tables}, tried, compared, proof.beaten(after, compared) if best else z)
+    return best
+
+
+def _fitted(log: ReferenceLog, lacking: Sequence[Residual], side: str, *, rotary: bool) -> list[Table]:
+    """Tables of the torque that a side lacks, by cross-validation; none where they take nothing away."""
+    cutoff = log.bandwidth[side]
+    target = -np.concatenate([narrowed(one, cutoff)[0].torque for one in lacking])
+    choices = _choices(log.segments, side, rotary)
+    widths = {over: len(points) for over, points in choices.items()}
+    if len(target) < _LEAST * sum(widths.values()):
+        return []
+    columns = {
+        over: np.concatenate(
+            [_columns(segment, one, side, over, points, cutoff) for segment, one in zip(log.segments, lacking, strict=True)]
+        )
+        for over, points in choices.items()
+    }
+    blocks = np.array_split(np.arange(len(target)), _BLOCKS)
+    nothing = np.array([np.mean(target[rows] ** 2) for rows in blocks])
+    found = []
+    for overs in _sets(list(choices)):
+        matrix = np.concatenate([columns[over] for over in overs], axis=1)
+        fits = [_Fit.of(matrix, target, blocks, [widths[over] for over in overs], stiffness) for stiffness in _STIFFNESS]
+        fit = min(fits, key=lambda one: float(np.mean(one.squares)))
+        gain = nothing - fit.squares
+        sure = np.mean(gain) > np.std(gain, ddof=1) / np.sqrt(_BLOCKS)
+        if sure and 1.0 - np.sqrt(np.mean(fit.squares) / np.mean(nothing)) > _GAIN:
+            found.append((overs, fit))
+    if not found:
+        return []
+    _, best = min(found, key=lambda one: float(np.mean(one[1].squares)))
+    # the fewest tables of those within one standard error of the best
+    limit = np.mean(best.squares) + np.std(best.squares - nothing, ddof=1) / np.sqrt(_BLOCKS)
+    overs, fit = next((overs, one) for overs, one in found if np.mean(one.squares) <= limit)
+    ends = np.cumsum([widths[over] for over in overs])[:-1]
+    values, errors = np.split(fit.values, ends), np.split(fit.errors, ends)
+    return [Table(*one) for one in zip(overs, [choices[over] for over in overs], values, errors, strict=True)]
+
+
+def _sets(overs: Sequence[str]) -> list[list[str]]:
+    """Coordinates alone, then a position with the speed."""
+    return [*([one] for one in overs), *([one, "speed"] for one in overs if one != "speed")]
+
+
+def _choices(segments: Sequence[Segment], side: str, rotary: bool) -> dict[str, np.ndarray]:
+    """Points over each coordinate that a log shows."""
+    position, speed = (np.concatenate([np.asarray(one.smoothed[side].state)[:, i] for one in segments]) for i in (0, 1))
+    found = {"position": np.linspace(position.min(), position.max(), _POINTS["position"])}
+    if rotary and np.ptp(position) > _TURN:
+        found["turn"] = np.linspace(0.0, _TURN, _POINTS["turn"])
+    # apart from one another by a share of the range, so that rows of equal samples make no point twice
+    spread = np.quantile(speed, np.linspace(0.0, 1.0, _POINTS["speed"]))
+    even = np.linspace(speed.min(), speed.max(), _POINTS["speed"])
+    found["speed"] = 0.9 * spread + 0.1 * even
+    return found
+
+
+def _columns(segment: Segment, lacking: Residual, side: str, over: str, points: np.ndarray, cutoff: float) -> np.ndarray:
+    """Torque of height 1 at each point of a table along a segment, as missing torques are seen; (samples, points)."""
+    smoothed = segment.smoothed[side]
+    values = np.asarray(smoothed.state)[:, 1 if over == "speed" else 0]
+    values = np.mod(values, _TURN) if over == "turn" else np.clip(values, points[0], points[-1])
+    hats = np.stack([np.interp(values, points, one) for one in np.eye(len(points))])
+    seen = np.asarray(_seen(jnp.asarray(hats), smoothed, jnp.asarray(segment.period)))
+    return low_passed(seen, lacking, cutoff).T
+
+
+@jit
+def _seen(columns: Float[Array, "columns samples"], smoothed: Smoothed, period: Float[Array, ""]) -> Array:
+    return jax.lax.map(lambda one: as_smoothed(one, smoothed, period), columns)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Fit:
+    """Penalised least squares: values, their standard errors, and mean squared errors of each block left out."""
+
+    values: np.ndarray
+    errors: np.ndarray
+    squares: np.ndarray
+
+    @classmethod
+    def of(
+        cls, matrix: np.ndarray, target: np.ndarray, blocks: Sequence[np.ndarray], widths: Sequence[int], stiffness: float
+    ) -> "_Fit":
+        penalty, at = _RIDGE * np.eye(matrix.shape[1]), 0
+        for width in widths:
+            second = np.diff(np.eye(width), n=2, axis=0)
+            penalty[at : at + width, at : at + width] += stiffness * second.T @ second
+            at += width
+        penalty *= np.mean(matrix**2) * len(target)
+        grams = [matrix[rows].T @ matrix[rows] for rows in blocks]
+        towards = [matrix[rows].T @ target[rows] for rows in blocks]
+        inner, right = np.sum(grams, axis=0), np.sum(towards, axis=0)
+        squares = []
+        for rows, gram, one in zip(blocks, grams, towards, strict=True):
+            share = 1.0 - len(rows) / len(target)
+            values = np.linalg.solve(inner - gram + share * penalty, right - one)
+            squares.append(np.mean((target[rows] - matrix[rows] @ values) ** 2))
+        inverse = np.linalg.inv(inner + penalty)
+        values = inverse @ right
+        # scatter of the blocks' gradients: errors within a block are correlated
+        scores = np.stack([one - gram @ values for gram, one in zip(grams, towards, strict=True)])
+        scores -= scores.mean(axis=0)
+        covariance = inverse @ (scores.T @ scores * _BLOCKS / (_BLOCKS - 1)) @ inverse
+        return cls(values, np.sqrt(np.diag(covariance)), np.array(squares))
+
+
+def _numbers(tables: Sequence[Table]) -> dict[str, Any]:
+    """Tables as numbers of the effect."""
+    found: dict[str, Any] = {}
+    for one in tables:
+        points, torques = ("speeds", "speed_torques") if one.over == "speed" else ("positions", "position_torques")
+        found |= {points: one.points.tolist(), torques: one.torques.tolist()} | (
+            {"turn": True} if one.over == "turn" else {}
+        )
+    return found
+
+
+def _with_tables(experiment: Experiment, tables: Mapping[str, Sequence[Table]]) -> Experiment:
+    """A model with tables on its sides."""
+    added = []
+    for side, some in tables.items():
+        numbers = {key: tuple(one) if isinstance(one, list) else one for key, one in _numbers(some).items()}
+        added.append(as_arrays(Tabulated(side=side, **numbers), float))
+    return with_effects(experiment, (*added, *experiment.effects))
