@@ -1,0 +1,78 @@
+"""Tables of a torque without a name: they show a torque that is there, and nothing where nothing is."""
+
+import jax
+import numpy as np
+import pytest
+from hidden_log import driven, model
+from small_study import rigid
+from trace_segment import segment_of
+
+from jaxbl.config import prepare, read_config
+from jaxbl.diagnosis.diagnosis_summary import extended_study
+from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
+from jaxbl.diagnosis.proof import Proof
+from jaxbl.diagnosis.reference_log import ReferenceLog
+from jaxbl.diagnosis.residuals import residual_torques
+from jaxbl.diagnosis.setup import set_up
+from jaxbl.diagnosis.torque_tables import _fitted, tabulated
+from jaxbl.sweeps.trial import run
+
+SETTINGS = {"run.duration": 8.0, "run.substeps": 5}
+OBSERVER = {"motor": {"lambda": 20.0, "alpha": 400.0}}
+WAVE = {"kind": "motor.cogging", "amplitude": 0.05, "harmonic": 3.0, "phase": 0.4}
+DRAG = {"kind": "motor.quadratic_drag", "drag": 0.004}
+
+
+def study(*effects):
+    excitation = {"kind": "multisine", "amplitude": 1.0, "frequency": 0.5}
+    return rigid(SETTINGS, excitation=excitation, observer=OBSERVER, effects=list(effects))
+
+
+def tables(*effects):
+    """Of what a model without these effects lacks on a run with them."""
+    segment = segment_of(run(study(*effects), seed=1).trace)
+    experiment = prepare(read_config(study()))
+    lacking = residual_torques(experiment, [segment])["motor"]
+    log = ReferenceLog([segment], {"motor": 20.0})
+    return {one.over: one for one in _fitted(log, lacking, "motor", rotary=True)}
+
+
+def test_a_torque_over_position_is_found_with_its_error():
+    found = tables(WAVE)
+    assert set(found) in ({"position"}, {"turn"})
+    (one,) = found.values()
+    truth = 0.05 * np.sin(3.0 * one.points + 0.4)
+    # points at the ends of the travel are hardly visited
+    inner = slice(2, -2)
+    np.testing.assert_allclose(one.torques[inner], truth[inner], atol=0.012)
+    assert np.median(one.errors[inner]) < 0.006
+
+
+def test_a_torque_over_speed_is_found():
+    found = tables(DRAG)
+    assert set(found) == {"speed"}
+    one = found["speed"]
+    np.testing.assert_allclose(one.torques[1:-1], (0.004 * one.points * np.abs(one.points))[1:-1], atol=0.01)
+
+
+def test_nothing_is_tabulated_where_nothing_is_missing():
+    assert tables() == {}
+
+
+def test_a_model_with_tables_predicts_better_and_runs_as_a_study(tmp_path):
+    """The torque is that of the bench's own simulator, which shares nothing with the package."""
+    t = 2e-3 * np.arange(4000)
+    torque = 0.3 * sum(np.sin(2.0 * np.pi * 0.5 * k * t + k**2) for k in range(1, 7))
+    driven(torque, [WAVE], 3e-5, 1).write(tmp_path / "axis.csv")
+    task = read_diagnosis_task(tmp_path / "axis.csv", model())
+    with jax.enable_x64(True):
+        setup = set_up(task)
+        proof = Proof(setup)
+        found = tabulated(proof, setup.nominal, proof.before, setup.lacking, setup.sliding)
+    assert found is not None and found.z > 2.0
+    for name in ("theta_e", "torque_motor"):
+        assert found.after.errors[name] < 0.6 * proof.before.errors[name]
+    longer = extended_study(task.config, {}, {}, found.effects())
+    (effect,) = longer.effects
+    assert effect.kind == "motor.tabulated" and len(effect.positions) == len(effect.position_torques)
+    assert read_config(longer.resolved()).build().effects[0].positions == pytest.approx(effect.positions)
