@@ -297,7 +297,12 @@ class EffectSearch:
         found: dict[str, list[_Tried]] = {}
         wrong: Model | None = None
         rest: dict[str, tuple[float, float]] | None = None
+        visited: set[frozenset[str]] = set()
         while len(found) < _MOST:
+            # two effects that make each other needless would come and go without end
+            if frozenset(current.names) in visited:
+                break
+            visited.add(frozenset(current.names))
             predictor, tried = self._round(current)
             if not tried or tried[0][0] <= 0.0:
                 predictor, tried = self._coloured_round(current)

@@ -36,8 +36,8 @@ _STIFFNESS = 10.0 ** np.arange(-4.0, 5.0)
 """Weights of the squared second differences that are tried, over the mean square of the columns."""
 _RIDGE = 1e-6
 """Weight of the squares: where there are no data a table goes to zero."""
-_LEAST = 20
-"""Samples behind the low-pass that a point must have."""
+_LEAST = 5
+"""Samples behind the low-pass for each point; smoothness leaves fewer free numbers than points."""
 _TURN = 2.0 * np.pi
 
 
@@ -123,8 +123,6 @@ def _fitted(log: ReferenceLog, lacking: Sequence[Residual], side: str, *, rotary
     target = -np.concatenate([narrowed(one, cutoff)[0].torque for one in lacking])
     choices = _choices(log.segments, side, rotary)
     widths = {over: len(points) for over, points in choices.items()}
-    if len(target) < _LEAST * sum(widths.values()):
-        return []
     columns = {
         over: np.concatenate(
             [_columns(segment, one, side, over, points, cutoff) for segment, one in zip(log.segments, lacking, strict=True)]
@@ -135,6 +133,8 @@ def _fitted(log: ReferenceLog, lacking: Sequence[Residual], side: str, *, rotary
     nothing = np.array([np.mean(target[rows] ** 2) for rows in blocks])
     found = []
     for overs in _sets(list(choices)):
+        if len(target) < _LEAST * sum(widths[over] for over in overs):
+            continue
         matrix = np.concatenate([columns[over] for over in overs], axis=1)
         fits = [_Fit.of(matrix, target, blocks, [widths[over] for over in overs], stiffness) for stiffness in _STIFFNESS]
         fit = min(fits, key=lambda one: float(np.mean(one.squares)))
