@@ -5,8 +5,10 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import norm
 
 from jaxbl.drive.effects import EFFECTS
+from jaxbl.drive.parameters import get_leaf
 from jaxbl.simulate import Experiment
 
 from .effect_search import FAR, LEAST_CHANCE, Explanation, Finding, Model
@@ -57,7 +59,7 @@ def judged(
     away = fitted.theta[: len(prior)] / prior
     far = {one.path: float(z) for one, z in zip(fitted.free, away, strict=False) if abs(z) > FAR}
     chance = any(one.kind == "permuted" and one.z < SURE for one in controls)
-    findings = found.findings
+    findings = tuple(_no_surer(one, fitted) for one in found.findings)
     for one in controls:
         if one.kind == "wrong" and found.wrong is not None:
             last = fitted.names[-1]
@@ -69,6 +71,14 @@ def judged(
     remainder = found.verdict == "unknown_effect"
     said = dataclasses.replace(found, verdict=verdict, findings=findings)
     return Judgement(said, left, far, chance, remainder, powerless)
+
+
+def _no_surer(finding: Finding, fitted: FittedModel) -> Finding:
+    """A finding no surer than that its torque is not zero."""
+    errors, paths = fitted.errors(), [f"effects.{finding.effect}.{leaf}" for leaf in EFFECTS[finding.effect].sizes()]
+    z = [abs(float(get_leaf(fitted.experiment, path))) / max(errors[path], 1e-300) for path in paths if path in errors]
+    chance = float(2.0 * norm.cdf(max(z)) - 1.0) if z else 1.0
+    return finding if finding.confidence <= chance else dataclasses.replace(finding, confidence=chance)
 
 
 def _nats(model: Model, wrong: Model, z: float) -> float:

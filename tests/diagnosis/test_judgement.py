@@ -9,6 +9,7 @@ from jaxbl.diagnosis.effect_search import Explanation, Finding
 from jaxbl.diagnosis.expected_errors import Expected
 from jaxbl.diagnosis.judgement import exchanged, explained_share, judged
 from jaxbl.diagnosis.proof import Control
+from jaxbl.drive import make_effect
 
 NAME = "motor.coulomb_friction"
 LIMITS = {"theta_e": Expected(1e-4, 0.0, 0.0, 1.2e-4), "torque_motor": Expected(0.01, 0.0, 0.0, 0.012)}
@@ -30,9 +31,13 @@ def found(verdict="explained", fit_gain=50.0, prior_gain=0.0, rival="motor.visco
     return Explanation(verdict, (finding,), model, model, wrong, {})  # type: ignore[arg-type]
 
 
-def judge(errors=NOISE, before=BEFORE, theta=0.0, controls=(), verdict="explained", **gains):
+def judge(errors=NOISE, before=BEFORE, theta=0.0, controls=(), verdict="explained", error=0.001, **gains):
     fitted = SimpleNamespace(
-        names=(NAME,), theta=np.array([theta, 1.0]), free=[SimpleNamespace(path="drive.motor_inertia")] * 2
+        names=(NAME,),
+        theta=np.array([theta, 1.0]),
+        free=[SimpleNamespace(path="drive.motor_inertia")] * 2,
+        experiment=SimpleNamespace(effects=(make_effect(NAME, torque=0.1),)),
+        errors=lambda: {f"effects.{NAME}.torque": error},
     )
     return judged(found(verdict, **gains), fitted, before, errors, LIMITS, controls, np.array([0.02]))  # type: ignore[arg-type]
 
@@ -88,7 +93,7 @@ def test_an_effect_that_another_beats_on_held_out_data_changes_places_with_it():
     assert one.confidence == pytest.approx(0.98 / (1.0 + np.exp(-4.5)), rel=1e-3)
     assert one.alternatives == ((NAME, pytest.approx(0.98 - one.confidence)), ("motor.inertia", 0.02))
     # what the log alone said for the other one is no argument any more
-    fitted = SimpleNamespace(names=("motor.viscous_friction",), theta=np.zeros(1), free=[])
+    fitted = SimpleNamespace(names=("motor.viscous_friction",), theta=np.zeros(1), free=[], errors=dict)
     back = [Control("wrong", NOISE, 1.8, NAME)]
     after = judged(other, fitted, BEFORE, NOISE, LIMITS, back, np.array([0.02]))  # type: ignore[arg-type]
     assert after.found.findings == (one,)
@@ -119,3 +124,9 @@ def test_the_explained_share_is_that_of_the_torques_power_beyond_what_a_complete
     assert share((np.sqrt(1.25), np.sqrt(25.25)), (np.sqrt(1.25), 0.5)) == pytest.approx(0.5)
     assert share((np.sqrt(1.25), 0.5), (np.sqrt(2.25), 0.5)) == pytest.approx(-1.0)
     assert share((0.5, 0.4), (0.6, 0.5)) is None
+
+
+def test_no_effect_is_surer_than_that_its_torque_is_not_zero():
+    (one,) = judge(error=0.1).found.findings
+    # one standard error
+    assert one.confidence == pytest.approx(0.683, abs=0.001)
