@@ -32,7 +32,10 @@ EFFECTS = (*SIDE_EFFECTS, *LOAD_EFFECTS, "motor.cogging", *GEAR_EFFECTS, *ACTUAT
 """What the package knows: design.md, section 6."""
 PINION = "transmission.pinion"
 """Eccentricity of the motor's wheel: to the package a `transmission.eccentricity` of as many periods as the ratio says."""
-NEW = ("motor.torque_ripple", PINION, "motor.presliding_friction", "load.presliding_friction")
+NEW = (
+    "motor.torque_ripple", PINION, "motor.presliding_friction", "load.presliding_friction",
+    "motor.cogging_harmonics", "transmission.hysteresis", "load.flexibility",
+)  # fmt: skip
 """Effects of the kind `new`: other kinds keep their cases."""
 UNKNOWN = ("unknown.drifting_friction", "unknown.hysteresis", "unknown.dent", "unknown.random_torque")
 LEVELS = (0.03, 0.1, 0.3)
@@ -198,6 +201,27 @@ def _shape(
         case "cogging":
             harmonic = float(rng.choice([6, 8, 12, 14, 18, 24] if not machine.rigid else [6, 8, 12, 18, 24, 36]))
             return linear("amplitude", np.sin(harmonic * x + phase), harmonic=harmonic, phase=phase)
+        case "cogging_harmonics":
+            base, phases = float(rng.choice([3, 4, 6, 7, 8, 9])), rng.uniform(-math.pi, math.pi, 3)
+            shares = [1.0, *rng.uniform(0.3, 0.8, 2)]
+            parts = {}
+            for k, (share, turn) in enumerate(zip(shares, phases, strict=True), 1):
+                end = f"_{k}" if k > 1 else ""
+                parts |= {f"sine{end}": share * math.cos(turn), f"cosine{end}": share * math.sin(turn)}
+            wave = np.sin(np.outer((1, 2, 3), base * x) + phases[:, None]).T @ shares
+            return (
+                lambda c: {"harmonic": base} | {key: c * value for key, value in parts.items()},
+                lambda c: c * wave, 0.0, math.inf,
+            )  # fmt: skip
+        case "flexibility":
+            # seen in the speeds that the drive has, and lightly damped
+            frequency, damping = float(np.exp(rng.uniform(*np.log([2.0, 15.0])))), float(rng.uniform(0.01, 0.1))
+            wave = _swinging(v, motion.period, 2.0 * math.pi * frequency, damping)
+            most = _LARGEST * drive[f"{side}_inertia"]
+            return linear("inertia", wave, most=most, frequency=frequency, damping_ratio=damping)
+        case "hysteresis" if place == "transmission":
+            length = float(rng.uniform(0.1, 0.5) * np.std(motion.deflection))
+            return linear("torque", _bouc_wen(motion.rate, motion.period, length), length=length)
         case "torque_ripple":
             # one or two periods a pole pair: offset of a current sensor, unequal gains
             harmonic = float(rng.choice([1, 2]) * rng.choice([2, 3, 4, 5, 7]))
@@ -278,3 +302,13 @@ def _bouc_wen(v: np.ndarray, period: float, length: float) -> np.ndarray:
         now = w[k]
         w[k + 1] = now + period / length * (v[k] - 0.5 * (abs(v[k]) * now * abs(now) + v[k] * now * now))
     return w
+
+
+def _swinging(v: np.ndarray, period: float, rate: float, damping: float) -> np.ndarray:
+    """Acceleration of what hangs on a moving side by a spring and a damper, rad/s^2."""
+    from scipy.signal import cont2discrete, dlsim
+
+    system = np.array([[0.0, 1.0], [-(rate**2), -2.0 * damping * rate]]), np.array([[-1.0], [2.0 * damping * rate]])
+    seen = np.array([[-(rate**2), -2.0 * damping * rate]]), np.array([[2.0 * damping * rate]])
+    found = cont2discrete((*system, *seen), period, "foh")
+    return dlsim(found, v)[1][:, 0]

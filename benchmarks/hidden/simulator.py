@@ -36,7 +36,9 @@ periodic_rate periodic_phase cog_amplitude cog_harmonic cog_phase hysteresis_len
 motor_random load_random gain limit lag_rate
 loop kp kd filter motor_noise motor_resolution torque_limit period steps origin
 ripple_amplitude ripple_harmonic ripple_phase
-motor_bristle load_bristle bristle_torque bristle_excess bristle_stribeck bristle_damping"""
+motor_bristle load_bristle bristle_torque bristle_excess bristle_stribeck bristle_damping
+base_harmonic base_sine base_cosine base_sine_2 base_cosine_2 base_sine_3 base_cosine_3
+shaft_torque shaft_length third_motor third_load third_rate third_damping"""
 _ROWS = _NAMES.split()
 P = SimpleNamespace(**{name: i for i, name in enumerate(_ROWS)})
 """Row of each number in the parameters of a lane."""
@@ -142,6 +144,7 @@ def pack(run: Run, step: float = STEP) -> np.ndarray:
     machine, values = run.machine, dict.fromkeys(_ROWS, 0.0)
     drive, law = machine.drive, machine.transmission or {}
     values |= {"load_inertia": 1.0, "ratio": machine.ratio, "limit": math.inf, "dent_width": 1.0, "hysteresis_length": 1.0}
+    values |= {"shaft_length": 1.0}
     values |= {"gain": 1.0, "drift_time": 1.0, "kp": run.kp, "kd": run.kd, "filter": run.filter, "period": run.period}
     values["steps"] = float(max(2, math.ceil(run.period / step - 1e-9)))
     values |= {"torque_limit": run.torque_limit, "motor_noise": run.motor_noise, "motor_resolution": run.motor_resolution}
@@ -189,6 +192,14 @@ def _add(values: dict[str, float], effect: Mapping[str, Any], rigid: bool) -> No
         case "cogging":
             values["cog_amplitude"] += get("amplitude")
             values["cog_harmonic"], values["cog_phase"] = get("harmonic"), get("phase", 0.0)
+        case "cogging_harmonics":
+            for key in ("harmonic", "sine", "cosine", "sine_2", "cosine_2", "sine_3", "cosine_3"):
+                values[f"base_{key}"] = get(key, 0.0)
+        case "flexibility":
+            values[f"third_{side}"], values["third_damping"] = get("inertia"), get("damping_ratio", 0.02)
+            values["third_rate"] = 2.0 * math.pi * get("frequency")
+        case "hysteresis" if place == "transmission":
+            values["shaft_torque"], values["shaft_length"] = get("torque"), get("length")
         case "torque_ripple":
             values["ripple_amplitude"] += get("amplitude")
             values["ripple_harmonic"], values["ripple_phase"] = get("harmonic"), get("phase", 0.0)
@@ -234,8 +245,8 @@ def _add(values: dict[str, float], effect: Mapping[str, Any], rigid: bool) -> No
 
 
 def build(jit: Any, pick: Any) -> SimpleNamespace:
-    """The engine's functions, elementwise over lanes: `p` holds a row a number, `y` is (θ_e, ω_e, θ_s, ω_s, m), m the
-    hysteresis or the deflection of bristles.
+    """The engine's functions, elementwise over lanes: `p` holds a row a number, `y` is (θ_e, ω_e, θ_s, ω_s, m, hysteresis of
+    the shaft, twist of the third inertia's spring, its velocity), m the hysteresis or the deflection of bristles.
 
     Args:
         jit: what compiles a function, or leaves it as it is.
@@ -256,6 +267,8 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
     )
     R_A, R_N, R_P = P_.ripple_amplitude, P_.ripple_harmonic, P_.ripple_phase
     E_B, S_B, B_C, B_X, B_V, B_D = range(P_.motor_bristle, P_.bristle_damping + 1)
+    BN, BS, BC, BS2, BC2, BS3, BC3 = range(P_.base_harmonic, P_.base_cosine_3 + 1)
+    SHAFT_T, SHAFT_L, E_T3, S_T3, T_W, T_D = range(P_.shaft_torque, P_.third_damping + 1)
     angle, speed, share = ANGLE_TOLERANCE, SPEED_TOLERANCE, TORQUE_TOLERANCE
 
     @jit
@@ -264,8 +277,8 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
 
     @jit
     def torques(p, y, contact, now, u, noise):
-        """Sum of torques without dry friction, level of dry friction, both sides; and the rate of the hysteresis."""
-        theta_e, w_e, theta_s, w_s, w = y
+        """Sum of torques without dry friction, level of dry friction, both sides; and the rates of what is behind."""
+        theta_e, w_e, theta_s, w_s, w, shaft, spring, w_t = y
         turn = p[EN] * theta_s + p[EP]
         ratio = p[N] - p[EA] * p[EN] * np.cos(turn)
         z = theta_e - p[N] * theta_s + p[EA] * np.sin(turn)
@@ -273,6 +286,12 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
         bent = closed * (z - contact * p[GAP] * p[HALF])
         through = p[K] * (bent - 4.0 * p[J0] * np.tanh(0.5 * p[SLOPE] * bent)) + p[CUBIC] * bent * bent * bent
         through = through + p[DAMP] * closed * (w_e - ratio * w_s)
+        # Bouc-Wen in the shaft
+        rate = closed * (w_e - ratio * w_s)
+        shaft_rate = (rate - 0.5 * (np.abs(rate) * shaft * np.abs(shaft) + rate * shaft * shaft)) / p[SHAFT_L]
+        through = through + p[SHAFT_T] * shaft
+        slip = w_t - pick(p[E_T3] != 0.0, w_e, w_s)
+        third = -p[T_W] * p[T_W] * spring - 2.0 * p[T_D] * p[T_W] * slip
         swing = np.sin(p[T_RATE] * now + p[T_PHASE])
         held = w * np.abs(w)
         drift = 1.0 - 2.0 * now / p[DRIFT_T]
@@ -281,9 +300,13 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
         bump = np.exp(-bump * bump)
         u = u * (1.0 + p[R_A] * np.sin(p[R_N] * theta_e + p[R_P]))
         sum_e = u - through - p[F_E] * w_e - p[E_Q] * w_e * np.abs(w_e) - p[E_K] - p[E_T] * swing - p[E_H] * w
+        turn = p[BN] * theta_e
+        sum_e = sum_e - p[E_T3] * third - p[BS] * np.sin(turn) - p[BC] * np.cos(turn)
+        sum_e = sum_e - p[BS2] * np.sin(2.0 * turn) - p[BC2] * np.cos(2.0 * turn)
+        sum_e = sum_e - p[BS3] * np.sin(3.0 * turn) - p[BC3] * np.cos(3.0 * turn)
         sum_e = sum_e - p[E_G] * np.sin(theta_e - p[G_PHASE]) - p[CA] * np.sin(p[CN] * theta_e + p[CP]) - p[E_R] * noise
         sum_s = ratio * through - p[F_S] * w_s - p[S_Q] * w_s * np.abs(w_s) - p[S_K] - p[S_T] * swing - p[S_H] * w
-        sum_s = sum_s - p[S_G] * np.sin(theta_s - p[G_PHASE]) - p[S_R] * noise
+        sum_s = sum_s - p[S_G] * np.sin(theta_s - p[G_PHASE]) - p[S_R] * noise - p[S_T3] * third
         fall_e, fall_s = w_e * p[E_V], w_s * p[S_V]
         dry_e = p[E_C] + p[E_X] * np.exp(-fall_e * fall_e) + p[E_DRIFT] * drift + p[E_DENT] * bump
         dry_s = p[S_C] + p[S_X] * np.exp(-fall_s * fall_s) + p[S_DRIFT] * drift + p[S_DENT] * bump
@@ -300,16 +323,16 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
         sum_e = sum_e - p[E_B] * w - pick(p[E_B] > 0.0, damped, 0.0)
         sum_s = sum_s - p[S_B] * w - pick(p[S_B] > 0.0, damped, 0.0)
         w_rate = pick(bristles > 0.0, bend, w_rate)
-        return sum_e, np.maximum(dry_e, 0.0), sum_s, np.maximum(dry_s, 0.0), w_rate
+        return sum_e, np.maximum(dry_e, 0.0), sum_s, np.maximum(dry_s, 0.0), w_rate, shaft_rate, slip, third
 
     @jit
     def rates(p, y, modes, now, u, noise):
         contact, d_e, d_s = modes
-        sum_e, dry_e, sum_s, dry_s, w_rate = torques(p, y, contact, now, u, noise)
+        sum_e, dry_e, sum_s, dry_s, w_rate, shaft, spring, third = torques(p, y, contact, now, u, noise)
         # a side that sticks has d = 0 and stays
         a_e = np.abs(d_e) * (sum_e - d_e * dry_e) / p[J_E]
         a_s = np.abs(d_s) * (sum_s - d_s * dry_s) / p[J_S]
-        return y[1], a_e, y[3], a_s, w_rate
+        return y[1], a_e, y[3], a_s, w_rate, shaft, spring, third
 
     @jit
     def held(p, s, u, lagged):
@@ -318,7 +341,10 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
 
     @jit
     def moved(y, k, h):
-        return y[0] + h * k[0], y[1] + h * k[1], y[2] + h * k[2], y[3] + h * k[3], y[4] + h * k[4]
+        return (
+            y[0] + h * k[0], y[1] + h * k[1], y[2] + h * k[2], y[3] + h * k[3],
+            y[4] + h * k[4], y[5] + h * k[5], y[6] + h * k[6], y[7] + h * k[7],
+        )  # fmt: skip
 
     @jit
     def advance(p, y, modes, s, h, start, u, lagged, n0, slope):
@@ -336,6 +362,9 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
             y[2] + c * (k1[2] + 2.0 * (k2[2] + k3[2]) + k4[2]),
             y[3] + c * (k1[3] + 2.0 * (k2[3] + k3[3]) + k4[3]),
             y[4] + c * (k1[4] + 2.0 * (k2[4] + k3[4]) + k4[4]),
+            y[5] + c * (k1[5] + 2.0 * (k2[5] + k3[5]) + k4[5]),
+            y[6] + c * (k1[6] + 2.0 * (k2[6] + k3[6]) + k4[6]),
+            y[7] + c * (k1[7] + 2.0 * (k2[7] + k3[7]) + k4[7]),
         )
 
     @jit
@@ -347,7 +376,7 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
     @jit
     def distances(p, y, modes, now, u, noise):
         contact, d_e, d_s = modes
-        sum_e, dry_e, sum_s, dry_s, _ = torques(p, y, contact, now, u, noise)
+        sum_e, dry_e, sum_s, dry_s, _, _, _, _ = torques(p, y, contact, now, u, noise)
         z = twist(p, y[0], y[2])
         gap = pick(contact != 0.0, contact * z - p[HALF], p[HALF] - np.abs(z)) / angle
         return (
@@ -389,6 +418,9 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
             pick(taken, new_y[2], y[2]),
             pick(taken, pick(event_s, 0.0, new_y[3]), y[3]),
             pick(taken, new_y[4], y[4]),
+            pick(taken, new_y[5], y[5]),
+            pick(taken, new_y[6], y[6]),
+            pick(taken, new_y[7], y[7]),
         )
         s = pick(taken, end, s)
         h = pick(taken, p[PERIOD] / p[STEPS], h * cut)
@@ -398,7 +430,7 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
     def begin(p, y, modes, start, u, lagged, n0):
         """Modes at a sample: the input has jumped, and what stuck may not do so any more."""
         contact, d_e, d_s = modes
-        sum_e, dry_e, sum_s, dry_s, _ = torques(p, y, contact, start, held(p, 0.0, u, lagged), n0)
+        sum_e, dry_e, sum_s, dry_s, _, _, _, _ = torques(p, y, contact, start, held(p, 0.0, u, lagged), n0)
         stuck_e, stuck_s = (d_e == 0.0) & (np.abs(sum_e) > dry_e), (d_s == 0.0) & (np.abs(sum_s) > dry_s)
         return contact, pick(stuck_e, np.sign(sum_e), d_e), pick(stuck_s, np.sign(sum_s), d_s)
 
@@ -449,7 +481,7 @@ def _compiled() -> Any:
     def run(parameters, lengths, initial, torque, reference, rate, unit, noise, command, readings, states):
         for lane in numba.prange(len(parameters)):
             p = parameters[lane]
-            y = (initial[lane, 0], initial[lane, 1], initial[lane, 2], initial[lane, 3], initial[lane, 5])
+            y = (initial[lane, 0], initial[lane, 1], initial[lane, 2], initial[lane, 3], initial[lane, 5], 0.0, 0.0, 0.0)
             modes = first(p, y)
             previous, velocity, lagged = initial[lane, 0], initial[lane, 1], initial[lane, 4]
             for k in range(lengths[lane]):
@@ -479,7 +511,7 @@ def _vectorised() -> Any:
     def run(parameters, lengths, initial, torque, reference, rate, unit, noise, command, readings, states):
         order = np.argsort(-lengths, kind="stable")
         p = np.ascontiguousarray(parameters[order].T)
-        y = (*initial[order, :4].T, initial[order, 5])
+        y = (*initial[order, :4].T, initial[order, 5], *np.zeros((3, len(order))))
         modes = engine.first(p, y)
         previous, velocity, lagged = y[0], y[1], initial[order, 4]
         for k in range(int(lengths.max())):

@@ -248,7 +248,6 @@ def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direct
     (effects, samples, sides + 1)."""
     drive, sides = experiment.drive, experiment.sides
     along = Path(part.time, part.torque, part.position, part.velocity)
-    torque = effect_path(experiment, along)[1]
 
     def one(effect: AbstractEffect) -> jax.Array:
         found = jnp.zeros((len(part.time), len(sides) + 1))
@@ -263,7 +262,7 @@ def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direct
         if place == "actuator":
             found = found.at[:, -1].set(acting - part.torque)
         else:
-            driving = torque if place == "motor" else 0.0
+            driving = part.torque if place == "motor" else 0.0
             motion = Motion(part.time, part.position[place], part.velocity[place], driving)
             resisting = effect.resist(state, motion) + effect.dry_friction(state, motion.velocity) * direction
             resisting = resisting + effect.added_inertia() * part.modelled[place]

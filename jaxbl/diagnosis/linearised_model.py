@@ -366,7 +366,18 @@ class Linear:
             spread=float(np.std(position)),
             travel=float(np.ptp(position)),
             ratio=float(self.experiment.drive.ratio("load")),
+            harmonics=self._harmonics(side),
         )
+
+    def _harmonics(self, side: str) -> tuple[float, ...]:
+        """Periods a turn of the waves that effects on a side have."""
+        found: list[float] = []
+        for effect in self.experiment.effects:
+            roles = type(effect).roles()
+            acts = any(float(getattr(effect, leaf)) != 0.0 for leaf, role in roles.items() if role.kind == "size")
+            if acts and self.experiment.drive.place(effect.place) == side:
+                found += [float(getattr(effect, leaf)) for leaf, role in roles.items() if role.kind == "harmonic"]
+        return tuple(found)
 
     def choices(self, name: str) -> float:
         """Logarithm of the number of values that an effect was sought with, where each could be told from the next."""
@@ -375,7 +386,8 @@ class Linear:
             if role.kind == "frequency":
                 count *= max(self.count * self.period * self._highest, 1.0)
             elif role.kind == "harmonic":
-                count *= max(len(role.trials(self.scales(name))), 1)
+                log = self.scales(name)
+                count *= max(len(role.trials(log)) if role.sought is None else role.sought(log), 1)
         return float(np.log(count))
 
     @property

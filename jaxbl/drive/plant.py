@@ -206,7 +206,9 @@ class Plant(eqx.Module):
         motions = {side: Motion(time, position[side], velocity[side]) for side in self.drive.sides}
         motions["actuator"] = motions["motor"]
         if self.transmission is not None:
-            motions["transmission"] = Motion(time, *self._strained(position, velocity, states)[:2])
+            # the rate changes with the position: its mean over the step is that at the middle
+            middle = {side: position[side] + 0.5 * step * velocity[side] for side in self.drive.sides}
+            motions["transmission"] = Motion(time, *self._strained(middle, velocity, states)[:2])
         return tuple(
             effect.advance(own, motions[self.drive.place(effect.place)], step)
             for effect, own in zip(self.effects, states, strict=True)

@@ -24,8 +24,8 @@ def sigmoid(z):
 
 
 def right_side(t, y, u, law, effects, drive):
-    """d/dt of (theta_e, theta_s, omega_e, omega_s, lagged torque, bristles of motor and load) under a commanded torque u,
-    sliding forwards only."""
+    """d/dt of (theta_e, theta_s, omega_e, omega_s, lagged torque, bristles of motor and load, hysteresis, twist and velocity
+    of a third inertia) under a commanded torque u, sliding forwards only."""
 
     def value(effect, key):
         return effects.get(effect, {}).get(key, 0.0)
@@ -62,7 +62,7 @@ def right_side(t, y, u, law, effects, drive):
         of_position = np.interp(theta, table["positions"], table["position_torques"]) if "positions" in table else 0.0
         return of_position + (np.interp(v, table["speeds"], table["speed_torques"]) if "speeds" in table else 0.0)
 
-    theta_e, theta_s, omega_e, omega_s, lagged, z_e, z_s = y
+    theta_e, theta_s, omega_e, omega_s, lagged, z_e, z_s, w, twist, third = y
     u = u * (1.0 + value("actuator.gain_error", "relative"))
     if "actuator.saturation" in effects:
         u = min(max(u, -value("actuator.saturation", "limit")), value("actuator.saturation", "limit"))
@@ -81,12 +81,22 @@ def right_side(t, y, u, law, effects, drive):
         z -= half_gap * np.sign(z)
     torque = law(z)
     torque += value("transmission.hardening", "cubic_stiffness") * z**3 + value("transmission.damping", "damping") * z_dot
+    torque += value("transmission.hysteresis", "torque") * w
+    w_dot = z_dot - 0.5 * (abs(z_dot) * abs(w) * w + z_dot * w * w)
+    w_dot /= effects.get("transmission.hysteresis", {"length": 1.0})["length"]
 
     at_motor = side("motor", omega_e) + value("motor.cogging", "amplitude") * np.sin(
         value("motor.cogging", "harmonic") * theta_e + value("motor.cogging", "phase")
     )
     at_motor += tabulated("motor", theta_e, omega_e)
     at_load = side("load", omega_s) + tabulated("load", theta_s, omega_s)
+    for k, name in ((1, ""), (2, "_2"), (3, "_3")):
+        turn = k * value("motor.cogging_harmonics", "harmonic") * theta_e
+        at_motor += value("motor.cogging_harmonics", f"sine{name}") * np.sin(turn)
+        at_motor += value("motor.cogging_harmonics", f"cosine{name}") * np.cos(turn)
+    rate = 2.0 * np.pi * value("load.flexibility", "frequency")
+    third_dot = -(rate**2) * twist - 2.0 * value("load.flexibility", "damping_ratio") * rate * (third - omega_s)
+    at_load += value("load.flexibility", "inertia") * third_dot
     at_load += value("load.gravity", "torque") * np.sin(theta_s - value("load.gravity", "phase"))
     at_load += value("load.periodic_disturbance", "amplitude") * np.sin(
         2.0 * np.pi * value("load.periodic_disturbance", "frequency") * t + value("load.periodic_disturbance", "phase")
@@ -103,12 +113,13 @@ def right_side(t, y, u, law, effects, drive):
     omega_s_dot = (ratio * torque - drive["load_viscous"] * omega_s - at_load) / (
         drive["load_inertia"] + value("load.inertia", "inertia")
     )
-    return [omega_e, omega_s, omega_e_dot, omega_s_dot, u_dot, z_e_dot, z_s_dot]
+    behind = third - omega_s
+    return [omega_e, omega_s, omega_e_dot, omega_s_dot, u_dot, z_e_dot, z_s_dot, w_dot, behind, third_dot]
 
 
 def reference(law=sigmoid, effects=None, drive=DRIVE, start=START, torques=TORQUES, hold=HOLD):
     """(theta_e, theta_s, omega_e, omega_s) at the end of each hold, shape (holds, 4)."""
-    y = [start["motor_position"], start["load_position"], start["motor_velocity"], start["load_velocity"], 0.0, 0.0, 0.0]
+    y = [start["motor_position"], start["load_position"], start["motor_velocity"], start["load_velocity"], *[0.0] * 6]
     states = []
     for k, u in enumerate(torques):
         # max_step: an adaptive step must not leap over a gap

@@ -293,7 +293,18 @@ def test_no_other_module_holds_the_name_of_an_effect():
                 assert not any(re.search(rf"\b{re.escape(one)}\b", node.value) for one in names), (file, node.value)
 
 
-ORDINARY = {"inertia", "damping", "gravity", "backlash", "lag", "hardening", "saturation", "eccentricity"}
+ORDINARY = {
+    "inertia",
+    "damping",
+    "gravity",
+    "backlash",
+    "lag",
+    "hardening",
+    "saturation",
+    "eccentricity",
+    "hysteresis",
+    "flexibility",
+}
 """Kinds that are plain words, too: of nominal numbers, and of what a sentence may speak of (eccentric encoders)."""
 
 

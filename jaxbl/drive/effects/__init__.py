@@ -7,9 +7,18 @@ effect's name, its object a subclass of :class:`SideEffect`, :class:`Transmissio
 # ruff: noqa: I001
 # families, and the effects of one, in the order in which a model with all effects has them
 from .friction import CoulombFriction, StribeckFriction, PreslidingFriction, ViscousFriction, QuadraticDrag
-from .loads import ConstantTorque, Inertia, Gravity, PeriodicDisturbance, Cogging, TorqueRipple
+from .loads import (
+    ConstantTorque,
+    Inertia,
+    Gravity,
+    PeriodicDisturbance,
+    Cogging,
+    CoggingHarmonics,
+    TorqueRipple,
+    Flexibility,
+)
 from .tables import Tabulated
-from .gear import Backlash, Hardening, Damping, Eccentricity
+from .gear import Backlash, Hardening, Damping, Hysteresis, Eccentricity
 from .actuator import GainError, Saturation, Lag
 from .base import (
     EFFECTS,

@@ -27,7 +27,8 @@ PLACES = ("motor", "load", "transmission", "actuator")
 class Motion(NamedTuple):
     """What the torque of an effect may depend on: time in s, position in rad, velocity in rad/s.
 
-    Of its side; for an effect in the gear, the elastic deflection and its rate. `torque` is the input that acts, N m, in
+    Of its side; for an effect in the gear, the elastic deflection and its rate (for its memory, in the middle of the step).
+    `torque` is the input that acts, N m, in
     :meth:`AbstractEffect.resist` of an effect on the motor; elsewhere 0.
     """
 
@@ -50,6 +51,7 @@ class Scales(NamedTuple):
         spread: standard deviation of that side's position, rad.
         travel: range of that side's position, rad; for an effect in the gear, the load's.
         ratio: motor turns for one load turn; 1 on a rigid drive.
+        harmonics: periods a turn of the waves over position that the model has on the side.
         frequencies: at which a torque on the side would explain most of what the model leaves, Hz.
     """
 
@@ -62,6 +64,7 @@ class Scales(NamedTuple):
     spread: float
     travel: float
     ratio: float = 1.0
+    harmonics: tuple[float, ...] = ()
     frequencies: tuple[float, ...] = ()
 
 
@@ -75,12 +78,14 @@ class Role(NamedTuple):
         neutral: its value where the effect does nothing.
         trials: the values to try on a log of given scales. Of a size: one, small enough for its torque to be linear.
         width: prior standard deviation: of an angle in rad, of a shape in its logarithm.
+        sought: number of values that a harmonic was sought among; left out: the number of trials.
     """
 
     kind: Literal["size", "angle", "harmonic", "frequency", "shape", "held"]
     neutral: float
     trials: Callable[[Scales], Sequence[float]]
     width: float = 1.0
+    sought: Callable[[Scales], int] | None = None
 
 
 def size(unit: str, doc: str, *, trial: Callable[[Scales], float] = lambda log: 1.0, **limits: Any) -> Any:
@@ -93,9 +98,15 @@ def angle(doc: str) -> Any:
     return parameter("rad", doc, default=0.0, role=Role("angle", 0.0, lambda log: (0.0,), 1.8))
 
 
-def harmonic(doc: str, trials: Callable[[Scales], Sequence[float]], **limits: Any) -> Any:
+def harmonic(
+    doc: str,
+    trials: Callable[[Scales], Sequence[float]],
+    *,
+    sought: Callable[[Scales], int] | None = None,
+    **limits: Any,
+) -> Any:
     """Declare a number of periods a turn."""
-    return parameter("1/turn", doc, above=0.0, role=Role("harmonic", 1.0, trials), **limits)
+    return parameter("1/turn", doc, above=0.0, role=Role("harmonic", 1.0, trials, sought=sought), **limits)
 
 
 def frequency(doc: str) -> Any:

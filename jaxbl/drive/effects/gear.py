@@ -1,4 +1,4 @@
-"""The gear beyond its law: free play, hardening, damping, kinematic error."""
+"""The gear beyond its law: free play, hardening, damping, hysteresis, kinematic error."""
 
 from typing import ClassVar
 
@@ -64,6 +64,36 @@ class Damping(TransmissionEffect):
 
     def transmit(self, state, deflection, rate):
         return self.damping * rate
+
+
+@EFFECTS.add
+class Hysteresis(TransmissionEffect):
+    """Friction within the shaft (Bouc-Wen, n = 2), beside the law: T w. With the deflection z, dw/dz = 1 / length where w
+    returns to 0, and (1 - w²) / length where it grows. Small swings see a stiffness of T / length more."""
+
+    kind: ClassVar[str] = "hysteresis"
+    torque: Scalar = size("N m", "largest hysteretic torque T", minimum=0.0)
+    length: Scalar = shape(
+        "rad",
+        "deflection over which it builds up",
+        lambda log: [share * log.largest_twist for share in (0.03, 0.08, 0.2, 0.4, 0.8)],
+        above=0.0,
+    )
+
+    def init(self):
+        return (jnp.zeros_like(self.length),)
+
+    def advance(self, state, motion, step):
+        # exact at a steady rate: linear up to w = 0, a hyperbolic tangent from there on
+        forward = jnp.where(motion.velocity < 0.0, -1.0, 1.0)
+        way = jnp.abs(motion.velocity) * step / self.length
+        w = forward * state[0]
+        rise = jnp.tanh(jnp.maximum(way + jnp.minimum(w, 0.0), 0.0))
+        base = jnp.maximum(w, 0.0)
+        return (forward * jnp.where(w + way < 0.0, w + way, (base + rise) / (1.0 + base * rise)),)
+
+    def transmit(self, state, deflection, rate):
+        return self.torque * state[0]
 
 
 @EFFECTS.add
