@@ -303,6 +303,7 @@ ORDINARY = {
     "saturation",
     "eccentricity",
     "hysteresis",
+    "tabulated",
     "flexibility",
 }
 """Kinds that are plain words, too: of nominal numbers, and of what a sentence may speak of (eccentric encoders)."""
