@@ -15,7 +15,7 @@ Automatica 24 (1988), for the local approach.
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,20 +23,20 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
-from jaxbl.drive.effects import EFFECTS, ConstantTorque, Scales
+from jaxbl.drive.effects import EFFECTS, Scales
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import Direction, slopes
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.prediction import kalman_gain
-from jaxbl.identification.regression import Path, effect_path
+from jaxbl.identification.regression import Path, effect_states
 from jaxbl.identification.segments import Segment
 from jaxbl.identification.trajectory import Free, with_fitted
-from jaxbl.simulate import Experiment, with_effects
+from jaxbl.simulate import Experiment
 
 from .candidates import SHARE, SPACING, Candidate, MotionTorques, Part, all_of_the_input, forces_of, rms
 from .evidence import Products
-from .neutral_effects import bucket, corrected
+from .neutral_effects import bucket, corrected, with_torques
 from .whittle import Spectrum, weighted_products
 
 _SAMPLES, _BLOCK, _NUMBERS = 1024, 128, 4
@@ -44,17 +44,10 @@ _SAMPLES, _BLOCK, _NUMBERS = 1024, 128, 4
 to which the number of free numbers is padded."""
 
 
-class _AddedTorque(ConstantTorque):
-    """By which the derivatives by a torque on a side are found; a name of its own, beside what the model has."""
-
-    kind: ClassVar[str] = "added_torque"
-
-
 def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segment: Segment) -> Part:
     """A model along a segment, where its free numbers are at theta."""
     sides, smoothed = experiment.sides, segment.smoothed
-    added = tuple(_AddedTorque(side=side, torque=jnp.zeros(())) for side in sides)  # type: ignore[arg-type]
-    experiment = with_effects(experiment, (*experiment.effects, *added))
+    experiment, added = with_torques(experiment)
     count = len(segment)
     size = bucket(count, _SAMPLES)
 
@@ -69,13 +62,16 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
     time, torque = padded(segment.time), padded(segment.torque)
     smooth: list[Any] = [{side: states[side][:, i] for side in sides} for i in range(3)]
     along = Path(*jax.tree.map(jnp.asarray, (time, torque, *smooth[:2])))
-    effects, _ = effect_path(experiment, along)
+    effects = effect_states(experiment, along)
     motion = PlantState(smooth[0], smooth[1], jax.tree.map(np.asarray, effects))
     # by side, not by name
     names, each = sorted(sides), len(sides)
     order = [names.index(side) + i * each for i in range(2) for side in sides]
     order += range(2 * each, len(jax.tree.leaves(motion)))
-    slope, value = slopes(experiment, motion, torque, time, _directions(experiment, free, theta, motion, order))
+    # as they may differ from sample to sample elsewhere, where the same loop serves
+    none = {path: np.zeros(size) for path in added.values()}
+    ways = _directions(experiment, free, theta, motion, order, list(added.values()))
+    slope, value = slopes(experiment, motion, torque, time, ways, none)
     slope, value = slope[:, order].transpose(2, 1, 0), value[order].T
     vectors = np.stack(jax.tree.leaves(motion), axis=1)[:, order]
     defect = np.zeros_like(value)
@@ -92,9 +88,14 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
 
 
 def _directions(
-    experiment: Experiment, free: Sequence[Free], theta: np.ndarray, motion: PlantState, order: Sequence[int]
+    experiment: Experiment,
+    free: Sequence[Free],
+    theta: np.ndarray,
+    motion: PlantState,
+    order: Sequence[int],
+    added: Sequence[str],
 ) -> list[Direction]:
-    """Each state, torque on each side, input, each free number."""
+    """Each state, torque on each side (`added`: their paths), input, each free number."""
     leaves, structure = jax.tree.flatten(experiment)
     places, shape = structure.unflatten(range(len(leaves))), jax.tree.structure(motion)
 
@@ -104,11 +105,10 @@ def _directions(
         states = [float(i == state) for i in range(shape.num_leaves)]
         return Direction(structure.unflatten(list(numbers)), shape.unflatten(states), torque)
 
-    added = places.effects[-len(experiment.sides) :]
     numbers = [(get_leaf(places, one.path), float(one.slope(at))) for one, at in zip(free, theta, strict=True)]
     return [
         *(direction(state=i) for i in order),
-        *(direction((one.torque, -1.0)) for one in added),
+        *(direction((get_leaf(places, path), -1.0)) for path in added),
         direction(torque=1.0),
         *(direction(one) for one in numbers),
     ]

@@ -7,11 +7,12 @@ where it acts.
 
 from collections.abc import Callable, Collection, Iterable
 from functools import cache
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import jax
+import jax.numpy as jnp
 
-from jaxbl.drive.effects import EFFECTS, AbstractEffect, make_effect
+from jaxbl.drive.effects import EFFECTS, AbstractEffect, ConstantTorque, make_effect
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.simulate import Experiment, with_effects
 
@@ -64,6 +65,19 @@ def complete(experiment: Experiment, acting: Collection[str] = ()) -> Experiment
         # one order whatever was given, so that models share their programs; that of the actuator's matters
         effects.sort(key=lambda one: len(kinds) if one.place == "actuator" else kinds.index(one.name))
     return with_effects(experiment, tuple(effects))
+
+
+class _AddedTorque(ConstantTorque):
+    """A torque on a side, beside what the model has there; a name of its own."""
+
+    kind: ClassVar[str] = "added_torque"
+
+
+def with_torques(experiment: Experiment) -> tuple[Experiment, dict[str, str]]:
+    """A model with a further resisting torque on each side, of zero, and its dotted path by side."""
+    added = [_AddedTorque(side=side, torque=jnp.zeros(())) for side in experiment.sides]  # type: ignore[arg-type]
+    paths = {one.side: f"effects.{one.name}.torque" for one in added}
+    return with_effects(experiment, (*experiment.effects, *added)), paths
 
 
 def with_added(given: Iterable[Effect], added: Iterable[Effect], name_of: Callable[[Effect], str]) -> list[Effect]:

@@ -7,25 +7,22 @@ error of the model. Torques by the equations of motion at the smoothed motion, b
 import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-from jaxbl.drive.effects import SideEffect
-from jaxbl.drive.parameters import Scalar
 from jaxbl.drive.plant import PlantState
-from jaxbl.fused.single_plant import path
-from jaxbl.identification.compilation import jit
+from jaxbl.fused.single_plant import paths
 from jaxbl.identification.segments import Segment, reading_noise, windows_of
-from jaxbl.identification.trajectory import Windows, projected_residual
+from jaxbl.identification.trajectory import Windows
 from jaxbl.records import POSITION_CHANNELS
-from jaxbl.simulate import Experiment, trajectory, with_effects
+from jaxbl.simulate import Experiment
 
-from .neutral_effects import bucket
+from .free_starts import best_runs
+from .neutral_effects import with_torques
 from .residuals import Residual, narrowed, residual_torques
 
 WINDOW = 0.5
@@ -105,17 +102,13 @@ class ReferenceLog:
             for side, pieces in torques.items()
         }
 
-    def windows(self, experiment: Experiment) -> tuple[Windows, np.ndarray]:
-        """The log in windows, some of them only to fill up, and the row that each of the others begins with."""
-        windows, firsts = windows_of(self.segments, experiment, self.samples, self.rest)
-        return windows.padded(bucket(len(firsts), 1)), firsts
-
     def largest_departures(self, experiment: Experiment) -> dict[str, float]:
         """How far a model departs from each side's motion on short windows from the smoothed states, over its range."""
-        windows, _ = self.windows(experiment)
-        simulated, found = _paths(experiment, windows, windows.start).position, {}
+        experiment, added = with_torques(experiment)
+        windows = jax.tree.map(np.asarray, windows_of(self.segments, experiment, self.samples, self.rest)[0])
+        simulated, found = _run(experiment, windows, windows.start, added).position, {}
         for side in experiment.sides:
-            apart = float(jnp.max(jnp.abs(simulated[side] - windows.measured[side])))
+            apart = float(np.max(np.abs(simulated[side] - windows.measured[side])))
             span = max(float(np.ptp(one.readings[side])) for one in self.segments)
             found[side] = apart / span if np.isfinite(apart) else np.inf
         return found
@@ -124,28 +117,16 @@ class ReferenceLog:
         """Errors of a model at this log's period on short windows, and the torques that it lacks; `added`: torques on its
         sides besides, N m, sample by sample from the first to the last."""
         experiment = at_period(experiment, self.period)
-        driven = self._driven(experiment, added or {})
         torques = residual_torques(experiment, self.segments)
         for side, table in (added or {}).items():
             pieces = zip(torques[side], self._rows(), strict=True)
             torques[side] = [dataclasses.replace(one, torque=one.torque - table[rows]) for one, rows in pieces]
-        samples = self._samples(driven, *self.windows(driven), _STATES) | self._narrowed(torques)
+        samples = self._samples(experiment, self.samples, _STATES, added or {}) | self._narrowed(torques)
         return Comparison(_all_rms(samples), torques, samples)
 
     def _rows(self) -> list[np.ndarray]:
         """Sampling periods from the log's first sample to each sample, segment by segment."""
         return [np.round((one.time - self.segments[0].time[0]) / self.period).astype(int) for one in self.segments]
-
-    def _driven(self, experiment: Experiment, added: Mapping[str, np.ndarray]) -> Experiment:
-        """A model with known torques on its sides, sample by sample; none where there is no table."""
-        begin, end = self.segments[0].time[0], self.segments[-1].time[-1]
-        period, first = (jnp.asarray(float(one)) for one in (self.period, begin))
-        count, known = bucket(round(float(end - begin) / self.period) + 1, 256), []
-        for side in experiment.sides:
-            table = added.get(side, np.zeros(0))
-            table = jnp.asarray(np.pad(table, (0, count - len(table))))
-            known.append(_KnownTorque(side=side, torque=table, first=first, period=period))  # type: ignore[arg-type]
-        return with_effects(experiment, (*known, *experiment.effects))
 
     def free_run(self, experiment: Experiment) -> tuple[dict[str, float], float]:
         """Errors of one run over the longest segment, and what a standard deviation of the initial speed would do to it.
@@ -155,28 +136,52 @@ class ReferenceLog:
         """
         experiment, longest = at_period(experiment, self.period), max(map(len, self.segments))
         spare = max(longest.bit_length() - 4, 0)
-        windows, firsts = windows_of(self.segments, experiment, longest >> spare << spare, self.rest)
-        windows, firsts = windows.only(np.arange(1)).padded(1), firsts[:1]
-        errors = _all_rms(self._samples(experiment, windows, firsts, _STATES_OF_ONE_RUN, alone=True))
-        first = next(one for one in self.segments if one.rows.start == firsts[0])
-        deviation = {side: float(np.median(np.asarray(one.deviation(1)))) for side, one in first.smoothed.items()}
-        return errors, _growth(experiment, windows, deviation)
+        length = longest >> spare << spare
+        one = dataclasses.replace(self, segments=[next(part for part in self.segments if len(part) >= length)])
+        errors = _all_rms(one._samples(experiment, length, _STATES_OF_ONE_RUN, {}))
+        smoothed = one.segments[0].smoothed
+        deviation = {side: float(np.median(np.asarray(part.deviation(1)))) for side, part in smoothed.items()}
+        return errors, one._growth(experiment, length, deviation)
 
     def _samples(
-        self, experiment: Experiment, windows: Windows, firsts: np.ndarray, passes: int, *, alone: bool = False
+        self, experiment: Experiment, length: int, passes: int, added: Mapping[str, np.ndarray]
     ) -> dict[str, np.ndarray]:
-        """Errors of positions and speeds, shape (windows, samples)."""
-        rows = firsts[:, None] + np.arange(windows.torque.shape[1])[None, :]
-        residual, start = _residuals(experiment, windows, passes, self.rest)
-        residual = np.asarray(residual)[: len(firsts)]
-        run = _run(experiment, windows, start) if alone else _paths(experiment, windows, start)
-        found = {POSITION_CHANNELS[side]: self.noise[side] * residual[:, :, i] for i, side in enumerate(experiment.sides)}
+        """Errors of positions and speeds on windows of a length, under torques added sample by sample; shape
+        (windows, samples)."""
+        experiment, paths = with_torques(experiment)
+        windows, firsts = windows_of(self.segments, experiment, length, self.rest)
+        rows = firsts[:, None] + np.arange(length)[None, :]
+        varying = {path: self._along(windows, added.get(side)) for side, path in paths.items()}
+        run = best_runs(experiment, windows, passes, self.rest, varying)
+        found = {
+            POSITION_CHANNELS[side]: self.noise[side] * run.residual[:, :, i] for i, side in enumerate(experiment.sides)
+        }
         for side in experiment.sides:
             smoothed = np.full(self.segments[-1].rows.stop, np.nan)
             for one in self.segments:
-                smoothed[one.rows] = np.asarray(one.smoothed[side].velocity)
-            found[f"velocity_{side}"] = np.asarray(run.velocity[side])[: len(firsts)] - smoothed[rows]
+                smoothed[one.rows] = one.smoothed[side].velocity
+            found[f"velocity_{side}"] = np.asarray(run.states.velocity[side]) - smoothed[rows]
         return found
+
+    def _along(self, windows: Windows, table: np.ndarray | None) -> np.ndarray:
+        """A torque that is added, as one that resists, on windows; N m, shape (windows, samples)."""
+        if table is None:
+            return np.zeros(windows.torque.shape)
+        first = np.round((np.asarray(windows.time) - self.segments[0].time[0]) / self.period).astype(int)
+        return -table[first[:, None] + np.arange(windows.torque.shape[1])]
+
+    def _growth(self, experiment: Experiment, length: int, deviation: Mapping[str, float]) -> float:
+        """Change of the positions by a standard deviation of the initial speeds, over the motion; the largest."""
+        experiment, added = with_torques(experiment)
+        windows = jax.tree.map(np.asarray, windows_of(self.segments, experiment, length, self.rest)[0])
+        start, step = windows.start, 1e-3
+        moved = {side: value + step * deviation[side] for side, value in start.velocity.items()}
+        begun = start, PlantState(start.position, moved, start.effects)
+        one, other = (_run(experiment, windows, state, added).position for state in begun)
+        # of what diverges, or of a side that never moved, nothing can be predicted
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            change = {side: _rms([np.asarray(other[side][0] - one[side][0])]) / step for side in experiment.sides}
+            return float(np.max([change[side] / np.std(windows.measured[side][0]) for side in experiment.sides]))
 
     def permuted(self, experiment: Experiment, added: Mapping[str, Sequence[np.ndarray]]) -> Comparison | None:
         """Errors of the nominal model with what the extended one adds on each side, N m, segment by segment, in the wrong
@@ -191,19 +196,6 @@ class ReferenceLog:
         return self.compare(experiment, tables) if changed else None
 
 
-class _KnownTorque(SideEffect):
-    """A torque along time that drives a side."""
-
-    kind: ClassVar[str] = "known_torque"
-    torque: Float[Array, " samples"]
-    first: Scalar
-    period: Scalar
-
-    def resist(self, state: Any, motion: Any) -> Any:
-        at = jnp.floor((motion.time - self.first) / self.period + 1e-6).astype(jnp.int32)
-        return -self.torque[jnp.clip(at, 0, len(self.torque) - 1)]
-
-
 def _order(count: int, size: int, random: np.random.Generator) -> np.ndarray:
     """Indices in which blocks have changed places: none stays."""
     blocks = np.array_split(np.arange(count), max(count // size, 2))
@@ -214,34 +206,11 @@ def _order(count: int, size: int, random: np.random.Generator) -> np.ndarray:
     return np.concatenate([blocks[i] for i in source])[:count]
 
 
-@jit
-def _residuals(experiment: Experiment, windows: Windows, passes: int, rest: bool) -> tuple[Array, PlantState]:
-    """Position residuals over the noise from the best initial states, and these."""
-    return projected_residual(experiment, windows, passes, rest)
-
-
-@jit
-def _paths(experiment: Experiment, windows: Windows, start: PlantState) -> PlantState:
-    """States along each window."""
-    return jax.vmap(lambda *given: trajectory(experiment, *given))(start, windows.torque, windows.time)
-
-
-def _run(experiment: Experiment, windows: Windows, start: PlantState) -> PlantState:
-    """States along the only window: one run of many samples takes less time than :func:`_paths`."""
-    start, torque, time = jax.tree.map(lambda x: np.asarray(x)[0], (start, windows.torque, windows.time))
-    return jax.tree.map(lambda x: x[None], path(experiment, start, torque, time))
-
-
-def _growth(experiment: Experiment, windows: Windows, deviation: dict[str, float]) -> float:
-    """Change of the positions by a standard deviation of the initial speeds, over the motion; the larger of the sides."""
-    start, step = windows.start, 1e-3
-    moved = {side: value + step * deviation[side] for side, value in start.velocity.items()}
-    begun = start, PlantState(start.position, moved, start.effects)
-    one, other = (_run(experiment, windows, state).position for state in begun)
-    # of what diverges, or of a side that never moved, nothing can be predicted
-    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        change = {side: _rms([np.asarray(other[side] - one[side])]) / step for side in experiment.sides}
-        return float(np.max([change[side] / np.std(windows.measured[side][0]) for side in experiment.sides]))
+def _run(experiment: Experiment, windows: Windows, start: PlantState, added: Mapping[str, str]) -> PlantState:
+    """States along each window, of a model with torques that may be added (`added`: their paths)."""
+    # none are: the same loop serves
+    none = {path: np.zeros(windows.torque.shape) for path in added.values()}
+    return paths(experiment, start, np.asarray(windows.torque), np.asarray(windows.time), varying=none)
 
 
 def _all_rms(samples: Mapping[str, np.ndarray]) -> dict[str, float]:

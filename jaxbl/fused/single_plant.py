@@ -5,7 +5,7 @@ starts some twenty kernels for a step of a single plant, and passes what they co
 do (effects that read tables) is left to XLA. In float64, under `jax.enable_x64`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, wraps
 from typing import Any, NamedTuple
@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.drive.plant import PlantState
-from jaxbl.simulate import Experiment, corrected, move, trajectory
+from jaxbl.simulate import Experiment, corrected, move
 
 from . import Unsupported, attempted, kept, say_scanned
 
@@ -41,24 +42,64 @@ def path(
     gain: dict[str, np.ndarray] | None = None,
 ) -> PlantState:
     """The plant's states at the samples, with a leading time axis; arguments as of :func:`jaxbl.simulate.trajectory`."""
-    plant = _Plant.of(experiment, start)
+    starts, torques, readings = jax.tree.map(lambda x: np.asarray(x)[None], (start, torque, measured or {}))
+    found = paths(experiment, starts, torques, np.array([time], float), readings, gain)
+    return jax.tree.map(lambda x: x[0], found)
+
+
+def paths(
+    experiment: Experiment,
+    starts: PlantState,
+    torque: np.ndarray,
+    time: np.ndarray,
+    measured: Mapping[str, np.ndarray] | None = None,
+    gain: Mapping[str, np.ndarray] | None = None,
+    varying: Mapping[str, np.ndarray] | None = None,
+) -> PlantState:
+    """As :func:`path`, for several runs: starts and times `(runs,)`, input and readings `(runs, samples)`.
+
+    Numbers of the experiment that differ from sample to sample are `varying`, by dotted paths, `(runs, samples)`.
+    """
+    plant, varying = _Plant.of(experiment, starts), varying or {}
     sides = () if gain is None else tuple(sorted(gain))
-    loop = _path_loop(plant, sides)
+    loop = _path_loop(plant, sides, plant.places(tuple(varying)))
+    runs, samples = torque.shape
     if loop is None:
-        states = _scanned(experiment, *jax.tree.map(jnp.asarray, (start, torque, time, measured, gain)))
-        return jax.tree.map(np.asarray, states)
-    carry = [np.array([leaf], float) for leaf in jax.tree.leaves(start)]
-    fixed = [*plant.numbers(experiment), np.asarray(time, float)]
-    fixed += [np.asarray(value, float) for side in sides for value in (gain or {})[side]]
-    given = torque, *((measured or {})[side] for side in sides)
-    inputs = np.arange(len(torque), dtype=np.int32), *(np.ascontiguousarray(column, float) for column in given)
-    kept = [np.empty(len(torque)) for _ in carry]
-    loop([*carry, *fixed, *inputs, *kept], len(torque), 0, 1)
+        given = starts, torque, time, dict(measured or {}), dict(varying)
+        rows = [jax.tree.map(lambda x, i=i: jnp.asarray(x[i]), given) for i in range(runs)]
+        each = [_scanned(experiment, gain, *one) for one in rows]  # pyright: ignore[reportCallIssue]
+        return jax.tree.map(lambda *x: np.stack(x), *each)
+    numbers = plant.numbers(experiment)
+    gains = [np.asarray(value, float) for side in sides for value in (gain or {})[side]]
+    columns = [
+        np.ascontiguousarray(column, float)
+        for column in (torque, *((measured or {})[side] for side in sides), *varying.values())
+    ]
+    leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(starts)]
+    kept, index = [np.empty((runs, samples)) for _ in leaves], np.arange(samples, dtype=np.int32)
+
+    def one(i: int) -> None:
+        carry = [np.array([leaf[i]]) for leaf in leaves]
+        fixed = [*numbers, np.asarray(time[i], float), *gains]
+        loop([*carry, *fixed, index, *(column[i] for column in columns), *(rows[i] for rows in kept)], samples, 0, 1)
+
+    _shared(one, range(runs))
     return plant.shape.unflatten(kept)
 
 
+def _shared(function: Callable[..., None], *jobs: Iterable[Any]) -> None:
+    """Call a function for each of the jobs, in threads: loops do not hold the interpreter."""
+    with ThreadPoolExecutor(len(jax.local_devices())) as pool:
+        list(pool.map(function, *jobs))
+
+
 def slopes(
-    experiment: Experiment, states: PlantState, torque: np.ndarray, time: np.ndarray, directions: Sequence[Direction]
+    experiment: Experiment,
+    states: PlantState,
+    torque: np.ndarray,
+    time: np.ndarray,
+    directions: Sequence[Direction],
+    varying: Mapping[str, np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives of the step that follows each sample, and where it leads.
 
@@ -66,23 +107,28 @@ def slopes(
         experiment: with array leaves.
         states: at the samples, leaves `(samples,)`; likewise torque (N m) and time (s).
         directions: of change.
+        varying: numbers of the experiment that differ from sample to sample, by dotted paths, `(samples,)`.
 
     Returns:
         Change of the state along each direction `(directions, states, samples)`, in the order of the state's leaves, and the
         state after the step `(states, samples)`.
     """
-    plant = _Plant.of(experiment, states)
+    plant, varying = _Plant.of(experiment, states), varying or {}
     leaves = jax.tree.leaves(states)
-    loop = _slopes_loop(plant)
+    loop = _slopes_loop(plant, plant.places(tuple(varying)))
     if loop is None:
         # numbers as arrays: one program for all directions
         changes = [jax.tree.map(lambda x: jnp.asarray(x, float), one) for one in directions]
-        found = [_pushed(experiment, states, jnp.asarray(torque), jnp.asarray(time), one) for one in changes]
+        given = jax.tree.map(jnp.asarray, (states, torque, time, dict(varying)))
+        found = [_pushed(experiment, *given, one) for one in changes]  # pyright: ignore[reportCallIssue]
         changes, new = [jax.tree.leaves(change) for change, _ in found], jax.tree.leaves(found[0][1])
         return np.array(changes, float), np.array(new, float)
     count = len(torque)
     whole = -(-count // loop.lanes) * loop.lanes
-    values = [np.pad(np.asarray(column, float), (0, whole - count), "edge") for column in (*leaves, torque, time)]
+    values = [
+        np.pad(np.asarray(column, float), (0, whole - count), "edge")
+        for column in (*leaves, torque, time, *varying.values())
+    ]
     numbers = plant.numbers(experiment)
     changes, new = np.empty((len(directions), len(leaves), whole)), np.empty((len(leaves), whole))
 
@@ -91,30 +137,50 @@ def slopes(
         # all find the same new state
         loop([*values, *numbers, *(np.asarray(number, float) for number in fixed), *change, *new], 1, 0, whole)
 
-    with ThreadPoolExecutor(len(jax.local_devices())) as pool:
-        list(pool.map(along, directions, changes))
+    _shared(along, directions, changes)
     return changes[:, :, :count], new[:, :count]
 
 
-_scanned = eqx.filter_jit(trajectory)
+@eqx.filter_jit
+def _scanned(
+    experiment: Experiment,
+    gain: Any,
+    start: PlantState,
+    torque: jax.Array,
+    time: jax.Array,
+    measured: dict[str, jax.Array],
+    varying: dict[str, jax.Array],
+) -> PlantState:
+    def sample(state: PlantState, given: Any) -> tuple[PlantState, PlantState]:
+        index, torque, readings, numbers = given
+        at, one = time + index * experiment.run.sample_period, set_leaves(experiment, numbers)
+        return move(one.plant, one.run, corrected(state, readings, gain or {}), torque, at), state
+
+    samples = jnp.arange(len(torque)).astype(float), torque, measured, varying
+    return jax.lax.scan(sample, jax.tree.map(lambda x: jnp.asarray(x, float), start), samples)[1]
 
 
 @eqx.filter_jit
 def _pushed(
-    experiment: Experiment, states: PlantState, torque: jax.Array, time: jax.Array, direction: Direction
+    experiment: Experiment,
+    states: PlantState,
+    torque: jax.Array,
+    time: jax.Array,
+    varying: dict[str, jax.Array],
+    direction: Direction,
 ) -> tuple[PlantState, PlantState]:
-    def step(state: PlantState, torque: jax.Array, time: jax.Array) -> tuple[PlantState, PlantState]:
+    def step(state: PlantState, torque: jax.Array, time: jax.Array, numbers: Any) -> tuple[PlantState, PlantState]:
         def moved(experiment: Experiment, state: PlantState, torque: jax.Array) -> PlantState:
             return move(experiment.plant, experiment.run, state, torque, time)
 
-        given = experiment, state, torque
+        given = set_leaves(experiment, numbers), state, torque
         changes = jax.tree.map(
             lambda one, change: jnp.broadcast_to(change, one.shape).astype(one.dtype), given, tuple(direction)
         )
         new, change = jax.jvp(moved, given, changes)
         return change, new
 
-    return jax.vmap(step)(states, torque, time)
+    return jax.vmap(step)(states, torque, time, varying)
 
 
 class _Plant(NamedTuple):
@@ -141,12 +207,17 @@ class _Plant(NamedTuple):
         leaves = jax.tree.leaves(experiment)
         return [np.asarray(leaves[i], float) for i in _read(self)]
 
-    def put(self, numbers: Sequence[Any]) -> Experiment:
-        """The experiment with these; what no step reads is zero."""
+    def places(self, paths: tuple[str, ...]) -> tuple[int, ...]:
+        """Places of numbers among the experiment's leaves, by their dotted paths."""
+        order = self.structure.unflatten(range(len(self.kinds)))
+        return tuple(get_leaf(order, path) for path in paths)
+
+    def put(self, numbers: Sequence[Any], others: Mapping[int, Any]) -> Experiment:
+        """The experiment with these, and with others in their places; what no step reads is zero."""
         # of NumPy, so that they leave no trace
         leaves: list[Any] = [np.zeros(size, dtype) for size, dtype in self.kinds]
         for i, number in zip(_read(self), numbers, strict=True):
-            leaves[i] = number
+            leaves[i] = others.get(i, number)
         return self.structure.unflatten(leaves)
 
     def step(self, experiment: Experiment, state: Sequence[Any], torque: Any, time: Any) -> list[Any]:
@@ -207,12 +278,12 @@ def _or_none(written: Callable[..., tuple[Callable[..., Any], tuple[Any, ...], d
 
 
 @_or_none
-def _path_loop(plant: _Plant, sides: tuple[str, ...]) -> Any:
-    """From state, numbers, first time and gains, and a sample's index, torque and readings."""
+def _path_loop(plant: _Plant, sides: tuple[str, ...] = (), varying: tuple[int, ...] = ()) -> Any:
+    """From state, numbers, first time and gains, and a sample's index, torque, readings and varying numbers."""
 
     def sample(state: list[Any], numbers: list[Any], first: Any, gains: list[Any], index: Any, inputs: list[Any]) -> Any:
-        experiment = plant.put(numbers)
-        torque, *readings = inputs
+        torque, *readings = inputs[: 1 + len(sides)]
+        experiment = plant.put(numbers, dict(zip(varying, inputs[1 + len(sides) :], strict=True)))
         gain = {side: gains[2 * i : 2 * i + 2] for i, side in enumerate(sides)}
         seen = corrected(plant.shape.unflatten(state), dict(zip(sides, readings, strict=True)), gain)
         time = first + index.astype(torque.dtype) * experiment.run.sample_period
@@ -220,23 +291,25 @@ def _path_loop(plant: _Plant, sides: tuple[str, ...]) -> Any:
 
     count = plant.shape.num_leaves
     fixed = [_NUMBER] * len(_read(plant)), _NUMBER, [_NUMBER] * (2 * len(sides))
-    index, inputs = jax.ShapeDtypeStruct((), np.int32), [_NUMBER] * (1 + len(sides))
+    index, inputs = jax.ShapeDtypeStruct((), np.int32), [_NUMBER] * (1 + len(sides) + len(varying))
     examples = [_NUMBER] * count, *fixed, index, inputs
     return sample, examples, {"carry": count, "lanes": 1, "fixed": len(jax.tree.leaves(fixed))}
 
 
 @_or_none
-def _slopes_loop(plant: _Plant) -> Any:
-    """From state, torque and time of a lane, numbers, and changes of numbers, state and torque."""
+def _slopes_loop(plant: _Plant, varying: tuple[int, ...] = ()) -> Any:
+    """From state, torque, time and varying numbers of a lane, numbers, and changes of numbers, state and torque."""
 
-    def slope(state: list[Any], torque: Any, time: Any, numbers: list[Any], changes: tuple[Any, ...]) -> Any:
+    def slope(state: list[Any], torque: Any, time: Any, own: list[Any], numbers: list[Any], changes: tuple[Any, ...]) -> Any:
         def step(numbers: list[Any], state: list[Any], torque: Any) -> list[Any]:
-            return plant.step(plant.put(numbers), state, torque, time)
+            return plant.step(plant.put(numbers, {}), state, torque, time)
 
+        at = dict(zip(varying, own, strict=True))
+        numbers = [at.get(i, number) for i, number in zip(_read(plant), numbers, strict=True)]
         new, change = jax.jvp(step, (numbers, state, torque), changes)
         return change, new
 
     count = plant.shape.num_leaves
-    state, numbers = [_NUMBER] * count, [_NUMBER] * len(_read(plant))
-    examples = state, _NUMBER, _NUMBER, numbers, (numbers, state, _NUMBER)
-    return slope, examples, {"values": count + 2, "fixed": 2 * len(numbers) + count + 1}
+    state, numbers, own = [_NUMBER] * count, [_NUMBER] * len(_read(plant)), [_NUMBER] * len(varying)
+    examples = state, _NUMBER, _NUMBER, own, numbers, (numbers, state, _NUMBER)
+    return slope, examples, {"values": count + 2 + len(varying), "fixed": 2 * len(numbers) + count + 1}

@@ -167,6 +167,12 @@ def effect_path(experiment: Experiment, path: Path, from_rest: bool = False) -> 
     return jax.lax.scan(sample, start, (path.torque, motion))[1]
 
 
+def effect_states(experiment: Experiment, path: Path) -> States:
+    """The effects' own states at each sample of a known motion, by :func:`effect_path` unless there are none."""
+    none = settled(experiment, path.torque[0])
+    return effect_path(experiment, path)[0] if jax.tree.leaves(none) else none
+
+
 def decimate(values: Float[Array, " samples"], factor: int) -> Float[Array, " less"]:
     """Zero-phase low-pass (Hamming window) and every `factor`-th sample, but for the ends, where the filter does not fit."""
     if factor == 1:

@@ -14,7 +14,7 @@ from jaxbl.drive.plant import PlantState
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
-from .regression import Kinematics, Path, effect_path, kinematics_from, shortest
+from .regression import Kinematics, Path, effect_states, kinematics_from, shortest
 from .smoother import Smoothed, smooth
 from .trajectory import Windows, cut
 
@@ -92,7 +92,7 @@ def windows_of(
             continue
         k = one.kinematics
         along = Path(k.time, jnp.asarray(one.torque), k.position, k.velocity)
-        start = PlantState(k.position, k.velocity, effect_path(experiment, along)[0])
+        start = PlantState(k.position, k.velocity, effect_states(experiment, along))
         pieces.append(cut(one.torque, one.readings, one.period, start, noise, samples, float(one.time[0]), rest))
         firsts.append(one.rows.start + samples * np.arange(len(one) // samples))
     return Windows.join(pieces), np.concatenate(firsts)

@@ -30,9 +30,9 @@ from .compilation import jit
 
 _INNER = 2
 """Initial states tried at each step of the fit."""
-_RIDGE = 1e-10
+RIDGE = 1e-10
 """Least damping of a search for initial states, over the columns' squares: above rounding, below what it changes."""
-_INFLUENCE = 1e-20
+INFLUENCE = 1e-20
 """Of a state, over that of the one with the most: what is below is none (an effect that does nothing)."""
 _ENOUGH = 2e-3
 """A fit has ended where a step takes less than this off the sum of squares, in units of the residuals' variance."""
@@ -144,7 +144,7 @@ class Windows(eqx.Module):
     def join(parts: Sequence["Windows"]) -> "Windows":
         """Windows of several parts of a record, with the noise and gain of the first."""
         per_window = [(one.torque, one.measured, one.time, one.start, one.rest) for one in parts]
-        torque, measured, time, start, rest = jax.tree.map(lambda *x: jnp.concatenate(x), *per_window)
+        torque, measured, time, start, rest = jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *per_window)
         return Windows(torque, measured, time, start, parts[0].noise, rest, parts[0].gain)
 
 
@@ -233,24 +233,24 @@ def _eliminate(experiment: Experiment, window: Windows, passes: int, rest: bool)
         start, value, slope, cost = jax.tree.map(
             partial(jnp.where, better), (best.tried, value, slope, cost), (best.start, best.value, best.slope, best.cost)
         )
-        damping = jnp.where(better, jnp.maximum(0.01 * best.damping, _RIDGE), jnp.maximum(30.0 * best.damping, 1e-2))
+        damping = jnp.where(better, jnp.maximum(0.01 * best.damping, RIDGE), jnp.maximum(30.0 * best.damping, 1e-2))
         size = jnp.sqrt(jnp.sum(slope**2, axis=0))
         # a state without influence stays where it is
-        size = jnp.where(size > _INFLUENCE * jnp.max(size), size, jnp.inf)
+        size = jnp.where(size > INFLUENCE * jnp.max(size), size, jnp.inf)
         unit = slope / size[None, :]
         change = jnp.linalg.solve(unit.T @ unit + damping * jnp.eye(len(start)), unit.T @ value)
         tried = start - change / size
         if rest:
             # from there nothing leads back: a side that friction holds does not feel a little velocity
             middle = passes // 2
-            tried, damping = jnp.where(i == middle, still, tried), jnp.where(i == middle, _RIDGE, damping)
+            tried, damping = jnp.where(i == middle, still, tried), jnp.where(i == middle, RIDGE, damping)
         return _Inner(start, value, slope, cost, damping, tried)
 
     none = jnp.zeros(window.torque.shape[0] * len(experiment.sides))
-    first = _Inner(guess, none, jnp.zeros((len(none), len(guess))), jnp.asarray(jnp.inf), jnp.asarray(_RIDGE), guess)
+    first = _Inner(guess, none, jnp.zeros((len(none), len(guess))), jnp.asarray(jnp.inf), jnp.asarray(RIDGE), guess)
     found = jax.lax.fori_loop(0, passes, attempt, first)
     size = jnp.sqrt(jnp.sum(found.slope**2, axis=0))
-    seen = size > _INFLUENCE * jnp.max(size)
+    seen = size > INFLUENCE * jnp.max(size)
     basis, _ = jnp.linalg.qr(found.slope / jnp.where(seen, size, jnp.inf)[None, :])
     # of a column of zeros the decomposition makes any direction
     basis = jnp.where(seen[None, :], basis, 0.0)
@@ -507,16 +507,17 @@ def cut(
     """
     count = len(torque) // samples
     standing = np.arange(count) == (0 if rest else -1)
-    start = jax.tree.map(lambda x: jnp.asarray(x)[: count * samples : samples], start)
-    still = jax.tree.map(lambda x: jnp.where(standing, 0.0, x), start.velocity)
+    # by numpy: no program is compiled for each length
+    start = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[: count * samples : samples]), start)
+    still = jax.tree.map(lambda x: jnp.asarray(np.where(standing, 0.0, x)), start.velocity)
 
     def split(values: Any) -> Array:
-        return jnp.asarray(values)[: count * samples].reshape(count, samples)
+        return jnp.asarray(np.asarray(values)[: count * samples].reshape(count, samples))
 
     return Windows(
         torque=split(torque),
         measured={side: split(values) for side, values in measured.items()},
-        time=first + period * samples * jnp.arange(count),
+        time=jnp.asarray(first + period * samples * np.arange(count)),
         start=PlantState(start.position, still, start.effects),
         noise={side: jnp.asarray(value, float) for side, value in noise.items()},
         rest=jnp.asarray(standing),

@@ -1,0 +1,149 @@
+"""Runs of a model over windows of a log, each from the initial state that suits its readings best.
+
+As :func:`jaxbl.identification.trajectory.projected_residual`, for a model without derivatives by its numbers: paths and the
+derivatives of their steps by loops for this machine's processor, and no more values tried for a window than it needs.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxbl.drive.plant import PlantState
+from jaxbl.fused.single_plant import Direction, paths, slopes
+from jaxbl.identification.trajectory import INFLUENCE, RIDGE, Windows
+from jaxbl.simulate import Experiment
+
+_SETTLED = 1e-9
+"""Share of its sum of squares that a further step of a window's search may promise where it ends: rounding is 1e-15, what
+decides is 1e-2."""
+
+
+class Run(NamedTuple):
+    """A model on windows of a log.
+
+    Attributes:
+        residual: measured less simulated positions over the noise, without what initial states can explain; shape
+            (windows, samples, sides).
+        states: simulated, leaves of shape (windows, samples).
+    """
+
+    residual: np.ndarray
+    states: PlantState
+
+
+class _Model(NamedTuple):
+    """A model on windows of a log; `varying` are numbers by path that differ from sample to sample."""
+
+    experiment: Experiment
+    windows: Windows
+    varying: Mapping[str, np.ndarray]
+
+    def states(self, starts: np.ndarray, which: np.ndarray) -> list[np.ndarray]:
+        """Along some windows, from starts of shape (windows, states)."""
+        start = jax.tree.structure(self.windows.start).unflatten(list(starts.T))
+        torque, time = self.windows.torque[which], self.windows.time[which]
+        varying = {path: values[which] for path, values in self.varying.items()}
+        return jax.tree.leaves(paths(self.experiment, start, torque, time, varying=varying))  # type: ignore[arg-type]
+
+    def residual(self, states: list[np.ndarray], which: np.ndarray) -> np.ndarray:
+        w = self.windows
+        found = jax.tree.structure(w.start).unflatten(states)
+        sides = [(w.measured[side][which] - found.position[side]) / w.noise[side] for side in self.experiment.sides]
+        return np.stack(sides, axis=-1)
+
+    def slope(self, states: list[np.ndarray], which: np.ndarray) -> np.ndarray:
+        """Derivative of the residual by the initial states, shape (windows, samples, sides, states)."""
+        w, shape = self.windows, jax.tree.structure(self.windows.start)
+        count, (runs, samples) = len(states), states[0].shape
+        zero = jax.tree.map(lambda _: 0.0, self.experiment)
+        ways = [Direction(zero, shape.unflatten(list(row)), 0.0) for row in np.eye(count)]
+        time = w.time[which][:, None] + float(self.experiment.run.sample_period) * np.arange(samples)
+        flat = shape.unflatten([one.ravel() for one in states])
+        varying = {path: values[which].ravel() for path, values in self.varying.items()}
+        changes, _ = slopes(self.experiment, flat, np.asarray(w.torque[which]).ravel(), time.ravel(), ways, varying)
+        steps = changes.reshape(count, count, runs, samples).transpose(3, 2, 1, 0)
+        places: Any = shape.unflatten(range(count))
+        rows = [places.position[side] for side in self.experiment.sides]
+        found = np.empty((samples, runs, len(rows), count))
+        reached = np.broadcast_to(np.eye(count), (runs, count, count))
+        for i in range(samples):
+            found[i] = reached[:, rows]
+            reached = steps[i] @ reached
+        noise = np.array([float(w.noise[side]) for side in self.experiment.sides])
+        return -found.transpose(1, 0, 2, 3) / noise[:, None]
+
+
+def best_runs(
+    experiment: Experiment, windows: Windows, passes: int, rest: bool, varying: Mapping[str, np.ndarray] | None = None
+) -> Run:
+    """Runs from the best initial states, found by damped Gauss-Newton.
+
+    Args:
+        experiment: the model, at the windows' period.
+        windows: without weights.
+        passes: initial states that are tried for a window at most.
+        rest: whether standstill is one of them.
+        varying: numbers of the model that differ from sample to sample, by dotted paths, shape (windows, samples).
+    """
+    windows = jax.tree.map(np.asarray, windows)
+    model = _Model(experiment, windows, varying or {})
+    with np.errstate(invalid="ignore", over="ignore"):
+        return _searched(model, passes, rest)
+
+
+def _searched(model: _Model, passes: int, rest: bool) -> Run:
+    windows, sides = model.windows, model.experiment.sides
+    leaves, shape = jax.tree.flatten(windows.start)
+    places: Any = shape.unflatten(range(len(leaves)))
+    best = np.stack([np.broadcast_to(leaf, len(windows.time)) for leaf in leaves], axis=1).astype(float)
+    runs, count = best.shape
+    samples = windows.torque.shape[1]
+    moving = [places.velocity[side] for side in sides]
+    still, known = best.copy(), np.ones_like(best)
+    still[:, moving] = 0.0
+    known[np.ix_(np.flatnonzero(windows.rest), moving)] = 0.0
+    residual, slope = np.zeros((runs, samples, len(sides))), np.zeros((runs, samples, len(sides), count))
+    states = [np.zeros((runs, samples)) for _ in leaves]
+    cost, damping, tried = np.full(runs, np.inf), np.full(runs, RIDGE), best.copy()
+    going = np.ones(runs, bool)
+    for i in range(passes):
+        if rest and i == passes // 2 + 1:
+            # from there nothing leads back: a side that friction holds does not feel a little velocity
+            tried, going = still.copy(), np.ones(runs, bool)
+            damping[:] = RIDGE
+        which = np.flatnonzero(going)
+        if not len(which):
+            if rest and i <= passes // 2:
+                continue
+            break
+        found = model.states(tried[which], which)
+        value = model.residual(found, which)
+        squares = np.sum(value**2, axis=(1, 2))
+        better = (squares < cost[which]) | ~np.isfinite(cost[which])
+        new = which[better]
+        damping[which] = np.where(better, np.maximum(0.01 * damping[which], RIDGE), np.maximum(30.0 * damping[which], 1e-2))
+        if len(new):
+            best[new], cost[new], residual[new] = tried[new], squares[better], value[better]
+            for kept, one in zip(states, found, strict=True):
+                kept[new] = one[better]
+            slope[new] = model.slope([one[better] for one in found], new) * known[new][:, None, None, :]
+        flat = slope[which].reshape(len(which), -1, count)
+        size = np.sqrt(np.sum(flat**2, axis=1))
+        # a state without influence stays where it is
+        size = np.where(size > INFLUENCE * np.max(size, axis=1, keepdims=True), size, np.inf)
+        unit = flat / size[:, None, :]
+        towards = np.einsum("wrn,wr->wn", unit, residual[which].reshape(len(which), -1))
+        matrix = unit.transpose(0, 2, 1) @ unit + damping[which][:, None, None] * np.eye(count)
+        change = np.linalg.solve(matrix, towards[:, :, None])[:, :, 0]
+        tried[which] = best[which] - change / size
+        going[which] = ~(np.einsum("wn,wn->w", change, towards) <= _SETTLED * cost[which])
+    flat = slope.reshape(runs, -1, count)
+    size = np.sqrt(np.sum(flat**2, axis=1))
+    seen = size > INFLUENCE * np.max(size, axis=1, keepdims=True)
+    # of a column of zeros the decomposition makes any direction
+    basis = np.linalg.qr(flat / np.where(seen, size, np.inf)[:, None, :])[0] * seen[:, None, :]
+    left = residual.reshape(runs, -1)
+    left = left - np.einsum("wrn,wn->wr", basis, np.einsum("wrn,wr->wn", basis, left))
+    return Run(left.reshape(residual.shape), shape.unflatten(states))

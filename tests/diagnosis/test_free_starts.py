@@ -1,0 +1,58 @@
+"""The best initial states of windows, and what they leave, are those of the fit's own search."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_study import small
+
+from jaxbl.config import prepare, read_config
+from jaxbl.diagnosis.free_starts import best_runs
+from jaxbl.diagnosis.neutral_effects import with_torques
+from jaxbl.drive.parameters import as_arrays, set_leaves
+from jaxbl.identification.compilation import jit
+from jaxbl.identification.segments import segments_of, windows_of
+from jaxbl.identification.trajectory import projected_residual
+from jaxbl.records import read_record
+from jaxbl.sweeps.trial import run
+
+STUDY = small(
+    {"run.duration": 2.0, "run.substeps": 5},
+    excitation={"kind": "multisine", "amplitude": 5.0, "frequency": 0.7},
+    transmission={"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.02},
+    effects=[{"kind": "load.coulomb_friction", "torque": 2.0}, {"kind": "actuator.lag", "time_constant": 2e-3}],
+    encoders={"noise": 1e-4},
+    observer={"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}},
+)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    file = tmp_path_factory.mktemp("log") / "log.csv"
+    run(STUDY, seed=1).trace[["t", "u", "theta_e", "theta_s"]].to_csv(file, index=False)
+    model = as_arrays(prepare(read_config(STUDY)), float)
+    return with_torques(set_leaves(model, {"drive.load_inertia": model.drive.load_inertia * 1.1})), read_record(file)
+
+
+@pytest.mark.parametrize("rest", [False, True])
+def test_runs_are_those_of_the_fit(log, rest):
+    (model, _), record = log
+    windows, _ = windows_of(segments_of(record, model.sides), model, 250, rest)
+    found = best_runs(model, windows, 8, rest)
+    expected, start = jit(projected_residual)(model, windows, 8, rest)
+    assert found.residual.shape == (8, 250, 2)
+    assert np.sqrt(np.mean(np.square(expected))) > 1.5
+    assert found.residual == pytest.approx(np.asarray(expected), rel=1e-5, abs=1e-5)
+    for have, want in zip(jax.tree.leaves(found.states), jax.tree.leaves(start), strict=True):
+        assert have[:, 0] == pytest.approx(np.asarray(want), rel=1e-4, abs=1e-6)
+
+
+def test_torques_may_be_added_sample_by_sample(log):
+    """Where all of the input goes over the motor's added torque, with the lag away, nothing changes."""
+    (model, paths), record = log
+    model = set_leaves(model, {"effects.actuator.lag.time_constant": jnp.asarray(1e-30)})
+    windows, _ = windows_of(segments_of(record, model.sides), model, 250)
+    expected = best_runs(model, windows, 4, False)
+    idle = type(windows)(0.0 * windows.torque, windows.measured, windows.time, windows.start, windows.noise, windows.rest)
+    found = best_runs(model, idle, 4, False, {paths["motor"]: -np.asarray(windows.torque)})
+    assert found.residual == pytest.approx(expected.residual, rel=1e-6, abs=1e-6)
