@@ -507,12 +507,14 @@ def cut(
     """
     count = len(torque) // samples
     standing = np.arange(count) == (0 if rest else -1)
-    # by numpy: no program is compiled for each length
-    start = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[: count * samples : samples]), start)
-    still = jax.tree.map(lambda x: jnp.asarray(np.where(standing, 0.0, x)), start.velocity)
+    # where nothing is traced by numpy: no program is compiled for each length
+    traced = any(isinstance(one, jax.core.Tracer) for one in jax.tree.leaves((torque, measured, start)))
+    numpy: Any = jnp if traced else np
+    start = jax.tree.map(lambda x: jnp.asarray(numpy.asarray(x)[: count * samples : samples]), start)
+    still = jax.tree.map(lambda x: jnp.asarray(numpy.where(standing, 0.0, x)), start.velocity)
 
     def split(values: Any) -> Array:
-        return jnp.asarray(np.asarray(values)[: count * samples].reshape(count, samples))
+        return jnp.asarray(numpy.asarray(values)[: count * samples].reshape(count, samples))
 
     return Windows(
         torque=split(torque),
