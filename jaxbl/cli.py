@@ -215,12 +215,12 @@ def inspect(
     from .records import inspect as inspect_log
     from .report.inspect import write_inspection_report
 
-    table = gear_ratio = None
+    table = gear_ratio = nominal = None
     if model is not None:
         from .config import read_log_config
 
-        table, gear_ratio = read_log_config(model)
-    found = inspect_log(log, table, gear_ratio=gear_ratio)
+        table, gear_ratio, nominal = read_log_config(model)
+    found = inspect_log(log, table, gear_ratio=gear_ratio, nominal=nominal)
     folder = _folder(log, out)
     claim_log_folder(folder, log, overwrite=overwrite)
     _print(write_inspection_report(found, folder), folder)

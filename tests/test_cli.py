@@ -609,6 +609,7 @@ DIAGNOSED = {
     "where": {"motor": {"sentence": "motor side, somewhere"}},
     "rest": {},
     "withdrawn": [],
+    "warnings": [],
     "notes": [],
     "gap": {
         "holdout": {"file": "axis.csv", "separate": False, "from": 0.4, "to": 0.6, "window": 0.1},

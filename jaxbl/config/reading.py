@@ -9,6 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from jaxbl.errors import InputError
+from jaxbl.records import NominalDrive
 from jaxbl.records.reader import read_log_table
 from jaxbl.records.table import LogTable
 from jaxbl.validation import Key, brief, first_error
@@ -61,17 +62,18 @@ def _read(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any], 
     return str(Path(source)), *_file(Path(source), [])
 
 
-def read_log_config(path: Path) -> tuple[LogTable, float | None]:
-    """The `[log]` table of a TOML file and the gear ratio, if it has one: a whole study, or nothing but `[log]`.
+def read_log_config(path: Path) -> tuple[LogTable, float | None, NominalDrive | None]:
+    """The `[log]` table of a TOML file, the gear ratio and the nominal drive: of a whole study, or nothing but `[log]`.
 
     Raises:
         InputError: unreadable file, bad TOML, unknown key, wrong type or range; one line that names file and key.
     """
     data, _ = _file(path, [])
     if set(data) <= {"title", "notes", "log"}:
-        return read_log_table(data.get("log"), str(path)), None
+        return read_log_table(data.get("log"), str(path)), None, None
     config, _ = read_model(path)
-    return config.log, None if config.drive.kind == "rigid" else config.drive.gear_ratio
+    ratio = None if config.drive.kind == "rigid" else config.drive.gear_ratio
+    return config.log, ratio, config.nominal_drive()
 
 
 def _file(path: Path, chain: list[Path]) -> tuple[dict[str, Any], dict[Key, str]]:

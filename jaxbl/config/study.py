@@ -18,6 +18,7 @@ from pydantic import Field, model_validator
 
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import Parameter, as_arrays
+from jaxbl.records import NominalDrive
 from jaxbl.records.table import LogTable
 from jaxbl.simulate import Experiment
 from jaxbl.validation import wrong
@@ -99,6 +100,15 @@ class Config(Table):
             identifier=None if rigid else self.identifier.build(),
             run=self.run.build(),
         )
+
+    def nominal_drive(self) -> NominalDrive | None:
+        """What a log of the drive is checked against; None on a rigid drive, and where the law has no stiffness."""
+        stiffness = getattr(self.transmission, "stiffness", None)
+        if self.drive.kind != "two_inertia" or self.transmission is None or not stiffness:
+            return None
+        half_gap = float(self.transmission.build().half_gap)
+        sides = {key: getattr(self.drive, key) for key in ("motor_inertia", "motor_viscous", "load_inertia", "load_viscous")}
+        return NominalDrive(gear_ratio=self.drive.gear_ratio, stiffness=stiffness, half_gap=half_gap, **sides)
 
     def resolved(self) -> dict[str, Any]:
         """The whole config as plain data, defaults filled in."""

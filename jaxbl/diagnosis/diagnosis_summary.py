@@ -87,6 +87,7 @@ def summary_of(
         "where": where,
         "rest": {name: {"evidence": gain, "share": share} for name, (gain, share) in found.rest.items()},
         "withdrawn": list(withdrawn),
+        "warnings": list(record.warnings),
         "notes": notes,
     }
 

@@ -48,7 +48,7 @@ def read_diagnosis_task(
     if holdout is None:
         record, other = split_off_last_quarter(record)
     else:
-        other = read_logs(config, holdout, GEAR_TOLERANCE)
+        other = read_logs(config, holdout, GEAR_TOLERANCE, like=record)
         _check_machine(record, other)
     return DiagnosisTask(config, missing, _long(record), _long(other), holdout is not None)
 

@@ -70,7 +70,8 @@ def read_identification_task(
     asked = {"parameters": None if parameters is None else list(parameters), "profile": profile}
     given = {key: value for key, value in asked.items() if value is not None}
     config = config.model_copy(update={"identify": config.identify.model_copy(update=given)})
-    return LogTask(config, missing, read_logs(config, log), None if holdout is None else read_logs(config, holdout))
+    record = read_logs(config, log)
+    return LogTask(config, missing, record, None if holdout is None else read_logs(config, holdout, like=record))
 
 
 def identify(

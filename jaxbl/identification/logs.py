@@ -19,7 +19,7 @@ import numpy as np
 from jaxbl.config import Config, prepare
 from jaxbl.drive.parameters import get_leaf, leaf_paths
 from jaxbl.errors import InputError
-from jaxbl.records import POSITION_CHANNELS, Record, join, read_record
+from jaxbl.records import POSITION_CHANNELS, PositionTable, Record, join, read_record
 from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress
 
@@ -59,7 +59,7 @@ class LogTask:
         return total.hexdigest()[:16]
 
 
-_SUMMARIES = 2
+_SUMMARIES = 3
 """Version of what `identification.json` and `diagnosis.json` hold: results of another one are computed anew."""
 _MOST_STEPS = 1000
 """Plant steps between two samples of a log at most: a drive moves through many of its time constants then."""
@@ -71,17 +71,43 @@ def stage_counter(stages: int, progress: Progress | None) -> Callable[[], None]:
     return lambda: progress(next(finished), stages) if progress is not None else None
 
 
-def read_logs(config: Config, logs: Logs, gear_tolerance: float = 0.0) -> Record:
-    """Read logs as a study says, with the channels that its drive needs; `gear_tolerance` as of `read_record`."""
+def read_logs(config: Config, logs: Logs, gear_tolerance: float = 0.0, like: Record | None = None) -> Record:
+    """Read logs as a study says, with the channels that its drive needs; `gear_tolerance` as of `read_record`.
+
+    A skew and an offset between the encoders that one log of a machine is sure of hold for those that are not: that of
+    the first such log, or of the record that they are to be `like`.
+    """
     several = [logs] if isinstance(logs, str | Path | Record) else list(logs)
     if not several:
         raise InputError("no log: at least one is needed")
-    return join([one if isinstance(one, Record) else _read_one(config, one, gear_tolerance) for one in several])
+    records = [one if isinstance(one, Record) else _read_one(config, one, gear_tolerance) for one in several]
+    known: dict[str, float] = {}
+    for one in [*reversed(records)] if like is None else [like]:
+        known |= one.corrections
+    for i, (log, record) in enumerate(zip(several, records, strict=True)):
+        # an offset changes when a counter is switched off and on, a skew does not
+        given = {key: known.get(key, 0.0) for key in {*known, *record.corrections}}
+        if "offset" in known:
+            given |= {key: value for key, value in record.corrections.items() if key == "offset"}
+        if not isinstance(log, Record) and given != record.corrections:
+            records[i] = _read_one(_corrected(config, given), log, gear_tolerance)
+    return join(records)
+
+
+def _corrected(config: Config, given: Mapping[str, float]) -> Config:
+    """The study with a skew of theta_s and an offset of theta_e in `[log]`, as they are given."""
+    table = config.log
+    for name, key in (("theta_s", "skew"), ("theta_e", "offset")):
+        if key in given:
+            position = getattr(table, name) or PositionTable()
+            table = table.model_copy(update={name: position.model_copy(update={key: given[key]})})
+    return config.model_copy(update={"log": table})
 
 
 def _read_one(config: Config, log: str | Path, gear_tolerance: float) -> Record:
     ratio = config.drive.gear_ratio if config.drive.kind == "two_inertia" else None
-    record = read_record(log, config.log, gear_ratio=ratio, gear_tolerance=gear_tolerance)
+    nominal = config.nominal_drive()
+    record = read_record(log, config.log, gear_ratio=ratio, gear_tolerance=gear_tolerance, nominal=nominal)
     sides = ("motor", "load") if config.drive.kind == "two_inertia" else ("motor",)
     for side in sides:
         if side not in record.positions:

@@ -1,5 +1,6 @@
 """Measured logs: reading them into SI units, and what they are good for."""
 
+from .alignment import NominalDrive as NominalDrive
 from .inspection import Inspection as Inspection
 from .inspection import Judgement as Judgement
 from .inspection import inspect as inspect
@@ -10,3 +11,4 @@ from .reader import read_log_table as read_log_table
 from .reader import read_record as read_record
 from .table import POSITION_CHANNELS as POSITION_CHANNELS
 from .table import LogTable as LogTable
+from .table import PositionTable as PositionTable

@@ -110,8 +110,8 @@ def _position(file: LogFile, name: str, table: PositionTable, stamps: TimeStamps
         "m": 1.0,
         "mm": 1e-3,
     }[table.unit]
-    values = table.sign * table.factor * one * values + table.offset
-    return RawChannel(values, table.si_unit, 0.0, table.skew, held=False)
+    values = table.sign * table.factor * one * values + (table.offset or 0.0)
+    return RawChannel(values, table.si_unit, 0.0, table.skew or 0.0, held=False)
 
 
 def _torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamps, *, linear: bool) -> RawChannel:

@@ -29,11 +29,15 @@ class LogFile:
         path: the file.
         columns: name -> values, one-dimensional; numbers in place of names where the file has none.
         notes: what was done to the log, and what is odd about it, in sentences.
+        warnings: those to be said first.
+        corrections: as of a record.
     """
 
     def __init__(self, path: Path, columns: dict[str | int, Any]):
         self.path, self.columns = path, columns
         self.notes: list[str] = []
+        self.warnings: list[str] = []
+        self.corrections: dict[str, float] = {}
 
     def wrong(self, text: str) -> InputError:
         """What to raise where something is wrong with the file."""

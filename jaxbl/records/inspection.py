@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from .alignment import NominalDrive
 from .gearing import Gearing, twist_noise
 from .least_squares import jackknifed
 from .reader import Record, read_log_table, read_record
@@ -75,16 +76,21 @@ class Inspection:
             "dynamics": None if dynamics is None else dynamics.to_dict(),
             "reversals": self.reversals,
             "identifiable": [asdict(judgement) for judgement in self.judgements],
+            "warnings": list(record.warnings),
             "notes": list(record.notes),
         }
 
 
 def inspect(
-    path: str | Path, log: LogTable | Mapping[str, Any] | None = None, *, gear_ratio: float | None = None
+    path: str | Path,
+    log: LogTable | Mapping[str, Any] | None = None,
+    *,
+    gear_ratio: float | None = None,
+    nominal: NominalDrive | None = None,
 ) -> Inspection:
     """Read a measured log and judge what it can identify; arguments and errors are those of :func:`read_record`."""
     table = read_log_table(log)
-    record = read_record(path, table, gear_ratio=gear_ratio)
+    record = read_record(path, table, gear_ratio=gear_ratio, nominal=nominal)
     gearing = record.findings.gearing
     ratio = gear_ratio if gear_ratio is not None else None if gearing is None else gearing.ratio
     if len(record.positions) < 2:

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from jaxbl.errors import InputError
 from jaxbl.validation import first_error
 
+from .alignment import NominalDrive, Skew, clock_skew, encoder_offset
 from .channels import RawChannel, read_channels
 from .files import LogFile, read_log_file
 from .gearing import Gearing, fit_gearing
@@ -27,7 +28,7 @@ from .plausibility import (
 from .resampling import Grid, resampled
 from .rigid_body import RigidFit, fit_rigid_drive
 from .signal_quality import ChannelFigures, channel_figures, longest
-from .table import POSITION_CHANNELS, LogTable
+from .table import POSITION_CHANNELS, LogTable, PositionTable
 from .time_stamps import Sampling, Segments, read_time_stamps, split_at_gaps
 
 
@@ -64,6 +65,8 @@ class Record:
         start: time of the first sample by the stamps of the log, s.
         segments: contiguous parts; between them the log has gaps.
         notes: what was done to the log, and what is odd about it, in sentences.
+        warnings: those that are to be said first: clock or zero point of an encoder corrected, units in doubt.
+        corrections: "skew" of theta_s, s, and "offset" of theta_e, rad (m), as far as the log's own were put in.
         findings: figures on its quality.
         intervals: between the raw stamps that were kept, s, shape (raw samples - 1,).
     """
@@ -78,6 +81,8 @@ class Record:
     start: float
     segments: tuple[slice, ...]
     notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+    corrections: dict[str, float]
     findings: Findings
     intervals: np.ndarray
 
@@ -104,6 +109,7 @@ def read_record(
     *,
     gear_ratio: float | None = None,
     gear_tolerance: float = 0.0,
+    nominal: NominalDrive | None = None,
 ) -> Record:
     """Read a measured log.
 
@@ -115,6 +121,8 @@ def read_record(
         log: the `[log]` table of a study, or its keys; left out: columns t, u, theta_e, theta_s in s, N m, rad, rad.
         gear_ratio: expected ratio of motor over load motion, which the log is checked against.
         gear_tolerance: relative deviation of the ratio up to which the log is read nevertheless, with a note.
+        nominal: what the log's drive is said to be; with it a skew and an offset between the encoders that nothing else can
+            make are corrected, where the `[log]` table does not give them.
 
     Raises:
         InputError: the file or a column is missing or unfit, or the log contradicts what is said of it; one line.
@@ -130,7 +138,9 @@ def read_record(
     for name in encoders:
         check_motion(file, name, channels[name].values)
     # from there to evenly spaced samples
-    grid, gearing, regular = _evenly_spaced(file, table, segments, channels, gear_ratio)
+    grid, gearing, regular = _evenly_spaced(file, table, segments, channels, gear_ratio, nominal)
+    if nominal is not None and len(encoders) == 2:
+        _correct_offset(file, table, grid, channels, nominal)
     # what these say of the drive
     if len(encoders) == 2:
         check_gear_ratio(file, table, grid, gearing, gear_ratio, gear_tolerance)
@@ -160,13 +170,20 @@ def read_record(
         start=stamps.start + float(grid.time[0]),
         segments=tuple(grid.segments),
         notes=tuple(file.notes),
+        warnings=tuple(file.warnings),
+        corrections=file.corrections,
         findings=Findings(segments.sampling, figures, gearing, dynamics),
         intervals=np.diff(segments.times),
     )
 
 
 def _evenly_spaced(
-    file: LogFile, table: LogTable, segments: Segments, channels: Mapping[str, RawChannel], gear_ratio: float | None
+    file: LogFile,
+    table: LogTable,
+    segments: Segments,
+    channels: Mapping[str, RawChannel],
+    gear_ratio: float | None,
+    nominal: NominalDrive | None,
 ) -> tuple[Grid, Gearing | None, bool]:
     """The channels at even spacing without skews; relation of both encoders; whether the stamps had that spacing already."""
     period = table.resample or segments.period
@@ -185,6 +202,12 @@ def _evenly_spaced(
     if any(raw.skew == "estimate" for raw in channels.values()):
         skews["theta_s"] = _estimated_skew(file, gearing, period)
         grid, gearing = attempt()
+    elif nominal is not None and gearing is not None and _is_open(table, "skew", ("theta_e", "theta_s")):
+        found = clock_skew(gearing, grid, nominal)
+        if found is not None and found.sure:
+            skews["theta_s"] = file.corrections["skew"] = found.value
+            grid, gearing = attempt()
+            file.warnings.append(_skew_sentence(found))
     if not regular:
         why = "to the period that [log] resample asks for" if table.resample else "from uneven stamps"
         file.notes.append(
@@ -207,6 +230,47 @@ def _estimated_skew(file: LogFile, gearing: Gearing | None, period: float) -> fl
         )
     file.notes.append(f"The skew of theta_s was estimated against theta_e: {found}.")
     return gearing.skew
+
+
+def _is_open(table: LogTable, key: str, names: Sequence[str]) -> bool:
+    """Whether `[log]` leaves a key of all these positions out."""
+    return all(getattr(getattr(table, name) or PositionTable(), key) is None for name in names)
+
+
+def _skew_sentence(found: Skew) -> str:
+    how = "later" if found.value > 0.0 else "earlier"
+    return (
+        f"theta_s is {1e3 * abs(found.value):.3g} ± {1e3 * found.error:.1g} ms {how} than theta_e, more than friction can "
+        f"make (at most {1e3 * found.windup:.2g} ms): corrected. [log] theta_s.skew = {found.value:.4g} says the same, 0 "
+        "leaves it as it is."
+    )
+
+
+def _correct_offset(
+    file: LogFile, table: LogTable, grid: Grid, channels: dict[str, RawChannel], nominal: NominalDrive
+) -> None:
+    """Take an offset between the encoders out of theta_e where it is sure, and say so; say that it may be one, if not."""
+    if not _is_open(table, "offset", ("theta_e", "theta_s")):
+        return
+    found = encoder_offset(grid, nominal)
+    if found is None:
+        return
+    size = f"{found.value:.4g} ± {found.error:.1g} {channels['theta_e'].unit}"
+    twist = f"theta_e - {nominal.gear_ratio:g} theta_s"
+    if found.sure:
+        grid.values["theta_e"] = grid.values["theta_e"] - found.value
+        file.corrections["offset"] = -found.value
+        channels["theta_e"] = channels["theta_e"]._replace(values=channels["theta_e"].values - found.value)
+        file.warnings.append(
+            f"{twist} is {size} without torque, an offset between the encoders: corrected. [log] theta_e.offset = "
+            f"{-found.value:.4g} says the same, 0 leaves it as it is."
+        )
+        return
+    cause = "a constant torque in the shaft" if found.both else "a constant torque that holds the load on one flank of a gap"
+    file.warnings.append(
+        f"{twist} is {size} in the mean: an offset between the encoders, or {cause}; this log cannot tell them apart. "
+        f"[log] theta_e.offset = {-found.value:.4g} takes it for an offset, 0 for none."
+    )
 
 
 def _figures(file: LogFile, name: str, raw: RawChannel, segments: Segments, source: Grid) -> ChannelFigures:
@@ -240,7 +304,7 @@ def join(records: Sequence[Record]) -> Record:
     first = records[0]
     if len(records) == 1:
         return first
-    period, times, segments, notes, rows, end = first.sample_period, [], [], [], 0, 0.0
+    period, times, segments, notes, warnings, rows, end = first.sample_period, [], [], [], [], 0, 0.0
     for record in records:
         if not np.isclose(record.sample_period, period, rtol=1e-6, atol=0.0):
             raise InputError(
@@ -256,6 +320,7 @@ def join(records: Sequence[Record]) -> Record:
         segments += [slice(part.start + rows, part.stop + rows) for part in record.segments]
         rows += len(record.time)
         notes += [f"{record.path.name}: {note}" for note in record.notes]
+        warnings += [f"{record.path.name}: {warning}" for warning in record.warnings]
     notes.insert(0, f"{len(records)} logs, one after the other: {', '.join(record.path.name for record in records)}.")
     return replace(
         first,
@@ -265,6 +330,7 @@ def join(records: Sequence[Record]) -> Record:
         transmitted=_together([record.transmitted for record in records]),
         segments=tuple(segments),
         notes=tuple(notes),
+        warnings=tuple(warnings),
         intervals=np.concatenate([record.intervals for record in records]),
     )
 

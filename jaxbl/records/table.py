@@ -77,7 +77,6 @@ class _ChannelTable(_ColumnTable):
     """What measured channels have in common."""
 
     sign: _Sign = Field(default=1, description="-1 if the column counts the other way; 1 or -1")
-    offset: float = Field(default=0.0, description="added last, in SI units")
     signed_bits: int | None = Field(
         default=None, ge=2, le=63, description="word length of two's complement numbers that were logged as unsigned"
     )
@@ -93,10 +92,13 @@ class PositionTable(_ChannelTable):
     wrap: float | None = Field(
         default=None, gt=0.0, description="period, in numbers of the column, after which it starts again; undone"
     )
-    skew: _Skew = Field(
-        default=0.0,
+    offset: float | None = Field(
+        default=None, description="added last, in SI units; left out: 0, of theta_e less an offset that is sure"
+    )
+    skew: _Skew | None = Field(
+        default=None,
         description="by how much the stamps are later than the readings, undone; 'estimate' (theta_s only): as found "
-        "against theta_e",
+        "against theta_e; left out: 0, of theta_s a skew that is sure",
         json_schema_extra=_SECONDS,
     )
 
@@ -125,6 +127,7 @@ class TorqueTable(_ChannelTable):
         gt=0.0,
         description="N m (N on a linear axis) in one number of the column; needed for V, A and counts; else 1",
     )
+    offset: float = Field(default=0.0, description="added last, in SI units")
     saturation: float | None = Field(
         default=None, gt=0.0, description="magnitude, in numbers of the column, at which it saturates"
     )

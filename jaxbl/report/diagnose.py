@@ -47,7 +47,7 @@ def _headline(summary: dict[str, Any]) -> list[str]:
         for gain in gains
         if not 1.0 / _FAR < gain < _FAR
     ]
-    lines.append(verdict_sentence(summary))
+    lines = [*summary["warnings"], *lines, verdict_sentence(summary)]
     for one in summary["findings"]:
         numbers = ", ".join(_number(leaf, number) for leaf, number in one["parameters"].items())
         lines.append(

@@ -45,6 +45,7 @@ def _headline(summary: dict[str, Any]) -> list[str]:
         and not 1.0 / _FAR < one["value"] / one["nominal"] < _FAR
     ]
     lines = [f"Doubtful: {', '.join(far)}: a unit, a factor or a sign in [log] may be wrong."] if far else []
+    lines = [*summary["warnings"], *lines]
     for path, one in summary["parameters"].items():
         low, high = one["interval"]
         if None in (one["value"], one["standard_error"], low, high):

@@ -38,7 +38,8 @@ def write_inspection_report(inspection: Inspection, folder: Path) -> list[str]:
         PageTable("Channels", _CHANNEL_COLUMNS, list(_channel_rows(record))),
     ]
     table = tomli_w.dumps({"log": inspection.log.model_dump(exclude_none=True)})
-    write_report(folder, record.path.name, [_headline(record)], draw_inspection(inspection), tables, table, record.notes)
+    lead = [*record.warnings, _headline(record)]
+    write_report(folder, record.path.name, lead, draw_inspection(inspection), tables, table, record.notes)
     return summary(inspection)
 
 
@@ -66,7 +67,7 @@ def _channel_rows(record: Record) -> Iterator[tuple[str, ...]]:
 def summary(inspection: Inspection) -> list[str]:
     """The log in at most 25 lines: channels, what can be identified, what was done."""
     record = inspection.record
-    lines = [f"{record.path.name}: {_headline(record)}", ""]
+    lines = [f"{record.path.name}: {_headline(record)}", *record.warnings, ""]
     lines += _aligned([_CHANNEL_COLUMNS, *_channel_rows(record)])
     lines += ["", *_aligned([("identifies", "", ""), *((j.quantity, j.answer, j.why) for j in inspection.judgements)])]
     room = _LINES - len(lines) - 1

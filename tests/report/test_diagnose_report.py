@@ -42,6 +42,7 @@ SUMMARY = {
     "explained_share": 0.83,
     "parameters": {"drive.motor_inertia": {"value": 0.01, "nominal": 0.02}},
     "withdrawn": [],
+    "warnings": [],
     "notes": ["A note."],
     "gap": {
         "holdout": {"file": "/logs/other.csv", "separate": True, "from": 0.0, "to": 5.0, "window": 0.5},
