@@ -101,14 +101,20 @@ class Config(Table):
             run=self.run.build(),
         )
 
-    def nominal_drive(self) -> NominalDrive | None:
-        """What a log of the drive is checked against; None on a rigid drive, and where the law has no stiffness."""
-        stiffness = getattr(self.transmission, "stiffness", None)
-        if self.drive.kind != "two_inertia" or self.transmission is None or not stiffness:
-            return None
-        half_gap = float(self.transmission.build().half_gap)
-        sides = {key: getattr(self.drive, key) for key in ("motor_inertia", "motor_viscous", "load_inertia", "load_viscous")}
-        return NominalDrive(gear_ratio=self.drive.gear_ratio, stiffness=stiffness, half_gap=half_gap, **sides)
+    def nominal_drive(self) -> NominalDrive:
+        """What a log of the drive is checked against."""
+        drive, law = self.drive, None if self.transmission is None else self.transmission.build()
+        if law is None or drive.kind != "two_inertia":
+            return NominalDrive(drive.motor_inertia, drive.motor_viscous)
+        return NominalDrive(
+            motor_inertia=drive.motor_inertia,
+            motor_viscous=drive.motor_viscous,
+            load_inertia=drive.load_inertia,
+            load_viscous=drive.load_viscous,
+            gear_ratio=drive.gear_ratio,
+            stiffness=float(getattr(law, "stiffness", None) or math.inf),
+            half_gap=float(law.half_gap),
+        )
 
     def resolved(self) -> dict[str, Any]:
         """The whole config as plain data, defaults filled in."""

@@ -1,5 +1,6 @@
 """Clock and zero of one encoder against the other's: what is sure to be neither friction, gap nor load torque."""
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,22 +23,28 @@ _FELT = 0.1
 
 @dataclass(frozen=True)
 class NominalDrive:
-    """What a study says of two inertias, in its units (rad or m, N m or N); the transmission's at the motor.
+    """What a study says of its drive, in its units (rad or m, N m or N); the transmission's at the motor.
 
     Attributes:
+        motor_inertia, motor_viscous: of the motor, or of a rigid drive.
+        load_inertia, load_viscous: of the load; 0 on a rigid drive.
         gear_ratio: motor over load motion.
-        stiffness: of the shaft.
+        stiffness: of the shaft; infinite on a rigid drive, and where its law has none.
         half_gap: half of the free play; 0 where there is none.
-        motor_inertia, motor_viscous, load_inertia, load_viscous: of the sides.
     """
 
-    gear_ratio: float
-    stiffness: float
-    half_gap: float
     motor_inertia: float
     motor_viscous: float
-    load_inertia: float
-    load_viscous: float
+    load_inertia: float = 0.0
+    load_viscous: float = 0.0
+    gear_ratio: float = 1.0
+    stiffness: float = math.inf
+    half_gap: float = 0.0
+
+    def inertia(self, channel: str) -> float:
+        """Of the whole drive, at the side of an encoder's channel."""
+        at_motor = self.motor_inertia + self.load_inertia / self.gear_ratio**2
+        return at_motor if channel == "theta_e" else at_motor * self.gear_ratio**2
 
 
 @dataclass(frozen=True)

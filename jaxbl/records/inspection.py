@@ -49,6 +49,20 @@ class Inspection:
     reversals: int
     judgements: tuple[Judgement, ...]
 
+    def as_read(self) -> str:
+        """Sizes that its user knows, in one sentence: a wrong unit shows in them."""
+        record, side = self.record, main_side(self.record)
+        channel = record.findings.channels[POSITION_CHANNELS[side]]
+        turning = channel.unit == "rad"
+        fastest = float(np.quantile(np.abs(velocity(record)), 0.999))
+        sizes = [f"{side} up to " + (f"{fastest * 30.0 / math.pi:.3g} rpm" if turning else f"{fastest:.3g} m/s")]
+        if record.torque is not None and np.ptp(record.torque):
+            sizes.append(f"u up to {np.abs(record.torque).max():.3g} {record.findings.channels['u'].unit}")
+            found = record.findings.dynamics
+            if found is not None and 0.0 < 4.0 * found.errors[0] < found.values[0] and found.inflation[0] < 10.0:
+                sizes.append(f"inertia about {found.values[0]:.2g} {'kg m²' if turning else 'kg'}")
+        return f"As read: {', '.join(sizes)}. If the machine is another, see the units in [log]."
+
     @property
     def twist(self) -> np.ndarray | None:
         """theta_e - gear_ratio theta_s about its median, rad (m), shape (samples,); None with one encoder."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from .alignment import NominalDrive
 from .channels import RawChannel
 from .files import LogFile
 from .gearing import UNRELATED, Gearing, twist_noise
@@ -148,11 +149,40 @@ def check_torque(file: LogFile, found: RigidFit, grid: Grid, position: np.ndarra
         )
     # a driven load returns work as well: no error
     if share < -0.1:
-        file.notes.append(
-            f"The drive returns {-100 * share:.0f} % of the work: the load drives it, or the sign of u is wrong."
-        )
+        text = f"the drive returns {-100 * share:.0f} % of the work: the load drives it, or the sign of u is wrong."
+        (file.warnings if share < -0.5 else file.notes).append(f"Doubtful: {text}" if share < -0.5 else f"T{text[1:]}")
     elif backwards and share < 0.1:
         file.notes.append("The drive seems to accelerate against u: see its sign, unit and column.")
+
+
+_FAR = 10.0
+"""Factor between an inertia and its nominal value from which on a unit is rather wrong: data sheets and CAD know it within a
+factor of two."""
+
+
+_FAR_TORQUE = 300.0
+"""Factor between the torque and what the nominal drive needs from which on a unit is rather wrong: a drive that creeps
+against dry friction needs a hundred times the torque of its inertia."""
+
+
+def warn_inertia(file: LogFile, found: RigidFit, channel: str, nominal: NominalDrive) -> None:
+    """Say first that inertia or torque are far from the nominal ones, as a wrong unit makes them."""
+    expected = nominal.inertia(channel)
+    value, error = float(found.values[0]), float(found.errors[0])
+    # a coefficient that noise, gravity or a spring hides says nothing
+    if value > 4.0 * error and found.shares[0] > 0.05 and found.inflation[0] < 10.0:
+        ratio, least, largest = value / expected, 1.0 / _FAR, _FAR
+        text = f"u moves {channel} as an inertia of {value:.3g} would, {ratio:.3g} times the nominal {expected:.3g}"
+    elif value:
+        needed = expected * found.acceleration
+        ratio, least, largest = found.torque / needed, 1.0 / _FAR, _FAR_TORQUE
+        text = (
+            f"u is {found.torque:.3g} rms, {ratio:.3g} times what the nominal inertia {expected:.3g} needs for this motion"
+        )
+    else:
+        return
+    if not least < ratio < largest:
+        file.warnings.append(f"Doubtful: {text}: check the units of t, u and {channel} in [log], and the model.")
 
 
 # remarks
@@ -169,7 +199,8 @@ def note_channel(file: LogFile, name: str, figures: ChannelFigures, fastest: flo
         file.notes.append(f"{name} is saturated in {100 * figures.saturated:.2g} % of the samples.")
     # 1e4 rad/s, about 100 000 rpm, is beyond drives
     if figures.unit == "rad" and fastest > 1e4:
-        file.notes.append(f"{name} reaches {fastest:.3g} rad/s, {fastest * 30.0 / math.pi:.3g} rpm: check its unit.")
+        rpm = fastest * 30.0 / math.pi
+        file.warnings.append(f"Doubtful: {name} reaches {fastest:.3g} rad/s, {rpm:.3g} rpm: check its unit, and that of t.")
 
 
 def note_skew(file: LogFile, found: Gearing, period: float) -> None:

@@ -24,6 +24,7 @@ from .plausibility import (
     note_channel,
     note_lost_motion,
     note_skew,
+    warn_inertia,
 )
 from .resampling import Grid, resampled
 from .rigid_body import RigidFit, fit_rigid_drive
@@ -138,9 +139,10 @@ def read_record(
     for name in encoders:
         check_motion(file, name, channels[name].values)
     # from there to evenly spaced samples
-    grid, gearing, regular = _evenly_spaced(file, table, segments, channels, gear_ratio, nominal)
-    if nominal is not None and len(encoders) == 2:
-        _correct_offset(file, table, grid, channels, nominal)
+    shaft = nominal if nominal is not None and math.isfinite(nominal.stiffness) and len(encoders) == 2 else None
+    grid, gearing, regular = _evenly_spaced(file, table, segments, channels, gear_ratio, shaft)
+    if shaft is not None:
+        _correct_offset(file, table, grid, channels, shaft)
     # what these say of the drive
     if len(encoders) == 2:
         check_gear_ratio(file, table, grid, gearing, gear_ratio, gear_tolerance)
@@ -148,6 +150,8 @@ def read_record(
     dynamics = fit_rigid_drive(grid.values["u"], position, grid.segments, grid.period) if "u" in channels else None
     if dynamics is not None:
         check_torque(file, dynamics, grid, position)
+        if nominal is not None:
+            warn_inertia(file, dynamics, encoders[0], nominal)
     # uneven stamps would pass for noise of what moves between them
     source = Grid(segments.times, {n: raw.values for n, raw in channels.items()}, segments.parts, grid.period)
     figures = {name: _figures(file, name, raw, segments, source if regular else grid) for name, raw in channels.items()}
@@ -183,7 +187,7 @@ def _evenly_spaced(
     segments: Segments,
     channels: Mapping[str, RawChannel],
     gear_ratio: float | None,
-    nominal: NominalDrive | None,
+    shaft: NominalDrive | None,
 ) -> tuple[Grid, Gearing | None, bool]:
     """The channels at even spacing without skews; relation of both encoders; whether the stamps had that spacing already."""
     period = table.resample or segments.period
@@ -202,8 +206,8 @@ def _evenly_spaced(
     if any(raw.skew == "estimate" for raw in channels.values()):
         skews["theta_s"] = _estimated_skew(file, gearing, period)
         grid, gearing = attempt()
-    elif nominal is not None and gearing is not None and _is_open(table, "skew", ("theta_e", "theta_s")):
-        found = clock_skew(gearing, grid, nominal)
+    elif shaft is not None and gearing is not None and _is_open(table, "skew", ("theta_e", "theta_s")):
+        found = clock_skew(gearing, grid, shaft)
         if found is not None and found.sure:
             skews["theta_s"] = file.corrections["skew"] = found.value
             grid, gearing = attempt()

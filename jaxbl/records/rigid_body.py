@@ -25,6 +25,8 @@ class RigidFit:
         skew: by how much the stamps of u are later than the torque, s.
         skew_error: standard error.
         residual: rms of the residual over the rms of the torque about its mean.
+        torque: rms, N m (N).
+        acceleration: rms of the low-passed motion, rad/s² (m/s²).
     """
 
     names: tuple[str, ...]
@@ -35,6 +37,8 @@ class RigidFit:
     skew: float
     skew_error: float
     residual: float
+    torque: float
+    acceleration: float
 
     def to_dict(self) -> dict[str, Any]:
         """As in `inspection.json`; an inflation without limit is null."""
@@ -103,4 +107,6 @@ def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence
         skew=float(found[5]) + 0.5 * period,
         skew_error=float(errors[5]),
         residual=float(np.std(left) / np.std(target)),
+        torque=float(np.sqrt(np.mean(target**2))),
+        acceleration=float(np.sqrt(np.mean(rows[:, 0] ** 2))),
     )

@@ -90,7 +90,7 @@ def read_time_stamps(file: LogFile, table: LogTable) -> TimeStamps:
     # stamps that were rounded to more than a period come in groups
     group = 0.0 if np.median(intervals) else float(np.median(intervals[intervals > 0.0]))
     if median >= _SLOW:
-        file.notes.append(f"The period is {median:g} s: if the stamps are not in s, set [log] t.unit.")
+        file.warnings.append(f"Doubtful: the period is {median:g} s; if the stamps are not in s, set [log] t.unit.")
     # 2.5: one group may be missing
     return TimeStamps(stamps[rows], start, rows, len(stamps), median, max(GAP * median, 2.5 * group))
 

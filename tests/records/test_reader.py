@@ -11,7 +11,7 @@ from measured import COULOMB, EMPS, GEAR_RATIO, INERTIA, SERVO, VISCOUS, XL330, 
 from small_study import small
 
 from jaxbl.errors import InputError
-from jaxbl.records import LogTable, join, read_log_table, read_record
+from jaxbl.records import LogTable, NominalDrive, join, read_log_table, read_record
 from jaxbl.sweeps.trial import run
 
 
@@ -479,12 +479,31 @@ def test_doubts_are_remarks(tmp_path):
     odd = frame.assign(theta_s=made(seed=5)["theta_s"])
     notes = read_record(wrote(tmp_path, odd), gear_ratio=GEAR_RATIO).notes
     assert any(note.startswith("theta_e and theta_s are hardly related") for note in notes)
-    notes = read_record(wrote(tmp_path, frame.assign(t=1000.0 * frame["t"])), gear_ratio=GEAR_RATIO).notes
-    assert any("if the stamps are not in s, set [log] t.unit" in note for note in notes)
-    notes = read_record(wrote(tmp_path, frame.assign(t=frame["t"] / 1000.0)), gear_ratio=GEAR_RATIO).notes
-    assert any("rpm: check its unit" in note for note in notes)
+    warnings = read_record(wrote(tmp_path, frame.assign(t=1000.0 * frame["t"])), gear_ratio=GEAR_RATIO).warnings
+    assert any("if the stamps are not in s, set [log] t.unit" in warning for warning in warnings)
+    warnings = read_record(wrote(tmp_path, frame.assign(t=frame["t"] / 1000.0)), gear_ratio=GEAR_RATIO).warnings
+    assert any("rpm: check its unit" in warning for warning in warnings)
     notes = read_record(wrote(tmp_path, frame.assign(u=0.0)), gear_ratio=GEAR_RATIO).notes
     assert notes == ("u is 0 in all rows: free motion, which does not show the inertia by itself.",)
+
+
+@pytest.mark.parametrize(
+    ("change", "times"),
+    [
+        (lambda frame: frame.assign(u=1000.0 * frame["u"]), "1e+03"),
+        (lambda frame: frame.assign(theta_e=np.degrees(frame["theta_e"])), "0.0175"),
+        (lambda frame: frame.assign(t=1000.0 * frame["t"]), "1e+06"),
+        (lambda frame: frame.assign(u=frame["u"] / 1000.0), "0.001"),
+        (lambda frame: frame.assign(u=3.0 * frame["u"]), None),
+    ],
+)
+def test_an_inertia_far_from_the_nominal_one_is_said_first(tmp_path, change, times):
+    """Torque in mN m or kN m, degrees for radians, ms for s; three times the nominal may well be."""
+    path = wrote(tmp_path, change(made().drop(columns="theta_s")))
+    warnings = read_record(path, nominal=NominalDrive(INERTIA, VISCOUS)).warnings
+    said = [warning for warning in warnings if warning.startswith("Doubtful: u moves theta_e as an inertia of")]
+    assert len(said) == (times is not None)
+    assert times is None or f", {times} times the nominal 0.01: check the units" in said[0]
 
 
 def test_a_falling_load_gives_its_energy_back(tmp_path):
