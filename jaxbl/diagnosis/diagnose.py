@@ -146,7 +146,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         if judgement.failed and not judgement.far:
             tables = tabulated(proof, fitted.experiment, after, lacking_after, setup.sliding)
         if tables is not None:
-            summary["tabulated"] = tables.said()
+            summary["torque_tables"] = tables.said()
         if found.wrong is not None:
             summary["rival"] = rival_tables(task.config, setup.own, found.wrong)
         values = free_values(setup.own, fitted.theta) | gain_values

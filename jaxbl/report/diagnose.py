@@ -93,9 +93,9 @@ _OVER = {"position": "position", "turn": "position within a turn", "speed": "spe
 
 def _table_lines(summary: Mapping[str, Any]) -> list[str]:
     """What tables of torques without a name add."""
-    if "tabulated" not in summary:
+    if "torque_tables" not in summary:
         return []
-    found, gap = summary["tabulated"], summary["gap"]
+    found, gap = summary["torque_tables"], summary["gap"]
     which = " and ".join(
         f"{side} torque over {' and '.join(_OVER[one['over']] for one in tables)}"
         for side, tables in found["tables"].items()
@@ -275,13 +275,13 @@ def draw_diagnosis(found: Diagnosis) -> list[Drawn]:
     """All figures of a diagnosis."""
     unit = unit_on(found.record, "motor.torque", "N m")
     residuals = draw_residuals(found.residuals, found.coordinates, found.located, unit, found.observed)
-    tables = [_tables(found)] if "tabulated" in found.summary else []
+    tables = [_tables(found)] if "torque_tables" in found.summary else []
     return [_verdict(found.summary), _over_time(found), *tables, *residuals]
 
 
 def _tables(found: Diagnosis) -> Drawn:
     """Torques without a name, over position and speed, with their standard errors."""
-    sides = found.summary["tabulated"]["tables"]
+    sides = found.summary["torque_tables"]["tables"]
     each = [(side, one) for side, tables in sides.items() for one in tables]
     figure, axes = subplots(11.0, 3.6, columns=len(each))
     for ax, (side, one) in zip(axes, each, strict=True):
@@ -300,7 +300,7 @@ def _tables(found: Diagnosis) -> Drawn:
         "What none of the known effects explains, as tables in model.toml: the torque that resists motion "
         "beside the named effects. Band: two standard errors. Held-out data are predicted better with it."
     )
-    return Drawn("tabulated", figure, caption)
+    return Drawn("torque_tables", figure, caption)
 
 
 def _verdict(summary: Mapping[str, Any]) -> Drawn:
