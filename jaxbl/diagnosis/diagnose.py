@@ -26,14 +26,15 @@ from .coordinates import CoordinateValues, all_coordinates
 from .diagnosis_summary import extended_study, observers_say, rival_tables, summary_of, tested, trace_of, where_lacking
 from .diagnosis_task import DiagnosisTask, read_diagnosis_task
 from .effect_search import EffectSearch, Explanation
-from .expected_errors import expected_errors
+from .expected_errors import Expected, expected_errors, failed
 from .judgement import exchanged, explained_share, judged
 from .localise import SIGNIFICANT, Localised, localise
 from .observer_residual import Observed, observed_torques
-from .proof import SURE, Accepted, Control, Proof, free_values
+from .proof import SURE, Accepted, Control, Proof, beaten, free_values
 from .reference_log import at_period
 from .residuals import Residual, residual_torques
 from .setup import Setup, set_up
+from .torque_regression import extended
 from .torque_tables import tabulated
 
 _BOUND = 4.0
@@ -115,11 +116,10 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         done()
         search, found = _explained(setup)
         done()
-        search, found, (fitted, after, withdrawn, gains), controls = _proved(proof, search, found)
+        (search, found, (fitted, after, withdrawn, gains), controls), expected = _proved(proof, search, found)
         done()
         if not np.isfinite(fitted.covariance).all():
             raise InputError(f"{task.record.path}: the model's numbers cannot be fitted to this log; is its input complete?")
-        expected = expected_errors(setup.holdout, fitted, after, setup.input_noise, found.model.linear.drive)
         judgement = judged(found, fitted, proof.before.errors, after.errors, expected, controls, setup.prior)
         found = judgement.found
         done()
@@ -202,22 +202,41 @@ class _Proved(NamedTuple):
     accepted: Accepted
     controls: list[Control]
 
+    def expected(self, setup: Setup) -> dict[str, Expected]:
+        """Errors of a complete model on the held-out data."""
+        drive = self.found.model.linear.drive
+        return expected_errors(setup.holdout, self.accepted.fitted, self.accepted.after, setup.input_noise, drive)
 
-def _proved(proof: Proof, search: EffectSearch, found: Explanation) -> _Proved:
-    """What the held-out data leave of an explanation. Where they take effects away, others are sought in their place."""
-    first = _exchanged(proof, search, found)
-    withdrawn = first.accepted.withdrawn
-    if not withdrawn:
-        return first
-    other = new_search(proof.setup, search.bound, withdrawn)
-    again = other.run()
-    if again.model.names in ((), first.accepted.fitted.names) or not other.plausible(again):
-        return first
-    second = _exchanged(proof, other, again)
-    if not second.accepted.fitted.names or proof.beaten(first.accepted.after, second.accepted.after) < SURE:
-        return first
-    gone = [*withdrawn, *second.accepted.withdrawn]
-    return second._replace(accepted=second.accepted._replace(withdrawn=gone))
+    def or_better(self, proof: Proof, other: "_Proved") -> "_Proved":
+        """Another one in its place, if the held-out data surely prefer that."""
+        if not other.accepted.fitted.names or beaten(proof.other, self.accepted.after, other.accepted.after) < SURE:
+            return self
+        gone = dict.fromkeys([*self.accepted.withdrawn, *other.accepted.withdrawn])
+        named = other.accepted.fitted.names
+        accepted = other.accepted._replace(withdrawn=[name for name in gone if name not in named])
+        return other._replace(accepted=accepted)
+
+
+def _proved(proof: Proof, search: EffectSearch, found: Explanation) -> tuple[_Proved, dict[str, Expected]]:
+    """What the held-out data leave of an explanation, and the errors of a complete model there.
+
+    Where they take effects away, others are sought in their place; where more is left than a complete model would leave,
+    those that the missing torque itself shows.
+    """
+    best = _exchanged(proof, search, found)
+    if best.accepted.withdrawn:
+        other = new_search(proof.setup, search.bound, best.accepted.withdrawn)
+        again = other.run()
+        if again.model.names not in ((), best.accepted.fitted.names) and other.plausible(again):
+            best = best.or_better(proof, _exchanged(proof, other, again))
+    expected = best.expected(proof.setup)
+    if failed(best.accepted.after.errors, expected):
+        more = extended(best.search, best.found, proof.setup.fitted)
+        if more is not best.found:
+            better = best.or_better(proof, _exchanged(proof, best.search, more))
+            if better is not best:
+                return better, better.expected(proof.setup)
+    return best, expected
 
 
 def _exchanged(proof: Proof, search: EffectSearch, found: Explanation) -> _Proved:

@@ -71,10 +71,14 @@ def summary_of(
         "sample_period": record.sample_period,
         "verdict": found.verdict,
         # what has the larger torque matters more
-        "findings": [
-            _finding(record, one, values, errors, where) | {"z": gains.get(one.effect)}
-            for one in sorted(found.findings, key=lambda one: -one.share)
-        ],
+        "findings": sorted(
+            (
+                _finding(record, one, values, errors, where)
+                | {"share": fitted.share(one.effect), "z": gains.get(one.effect)}
+                for one in found.findings
+            ),
+            key=lambda one: -one["share"],
+        ),
         "parameters": {
             one.path: {
                 "value": values[one.path],
@@ -110,7 +114,6 @@ def _finding(
     return {
         "effect": one.effect,
         "confidence": one.confidence,
-        "share": one.share,
         "parameters": numbers,
         "alternatives": [{"effect": name, "confidence": chance} for name, chance in one.alternatives],
         "where": {"place": place, "sentences": {side: where[side]["sentence"] for side in sides}},

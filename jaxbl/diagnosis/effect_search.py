@@ -100,14 +100,12 @@ class Finding:
         effect: its name.
         confidence: probability that it is this one.
         numbers: of the effect.
-        share: rms of its torque along the record over that of the driving torque.
         alternatives: other effects that the record does not rule out in its place, and their probabilities.
     """
 
     effect: str
     confidence: float
     numbers: Numbers
-    share: float
     alternatives: tuple[tuple[str, float], ...]
 
 
@@ -358,6 +356,15 @@ class EffectSearch:
         findings = tuple(one for one in found.findings if one.effect in kept)
         return Explanation(_verdict(_most(rest), findings), findings, model, found.nominal, None, rest)
 
+    def adopted(
+        self, found: Explanation, numbers: Mapping[str, Numbers], theta: np.ndarray, findings: Sequence[Finding]
+    ) -> Explanation:
+        """An explanation with other effects and numbers; free functions are fitted anew to what remains."""
+        values = {name: dict(one) for name, one in numbers.items()}
+        model = dataclasses.replace(found.model, numbers=values, theta=theta, linear=self.linear(values, theta))
+        rest = self.remainder(model)
+        return Explanation(_verdict(_most(rest), findings), tuple(findings), model, found.nominal, None, rest)
+
     def _fewest(self, model: Model, found: dict[str, list[_Tried]], left: float) -> tuple[Model, dict[str, list[_Tried]]]:
         """Where something unknown remains: only effects with a good part of its gain, and of those that differ by less than
         it the one with the fewest numbers, since spare numbers imitate the unknown."""
@@ -367,7 +374,7 @@ class EffectSearch:
         for name, tried in list(kept.items()):
             fewer = [one for one in tried[1:] if len(one.numbers) < len(tried[0].numbers)]
             others = [one for one in fewer if one.gain > tried[0].gain - left]
-            others = [one for one in others if one.name not in kept and not _same(one.name, set(kept) - {name})]
+            others = [one for one in others if one.name not in kept and not exclusive(one.name, set(kept) - {name})]
             for one in sorted(others, key=lambda one: (len(one.numbers), -one.gain))[:1]:
                 numbers = {a: model.numbers[a] for a in model.names if a != name} | {one.name: one.numbers}
                 plainer = self.refit(numbers, model.theta, predictor)
@@ -531,7 +538,7 @@ class EffectSearch:
 
     def _variants(self, model: Model) -> list[Candidate]:
         """Effects that a model lacks, at what was chosen last for it."""
-        lacking = [name for name in self.lacking if name not in model.names and not _same(name, model.names)]
+        lacking = [name for name in self.lacking if name not in model.names and not exclusive(name, model.names)]
         return variants_of(self.nominal, lacking, model.linear.scales)
 
     def _ranked(
@@ -554,13 +561,13 @@ class EffectSearch:
         return _Scored(none, linear.count, deviation), list(best.values())
 
 
-def _same(name: str, others: Iterable[str]) -> bool:
+def exclusive(name: str, others: Iterable[str]) -> bool:
     """Whether an effect cannot stand beside one that is there: of dry friction a side has one law."""
     word, place = EFFECTS[name].exclusive, name.partition(".")[0]
     return word is not None and any(EFFECTS[one].exclusive == word and one.partition(".")[0] == place for one in others)
 
 
-def _contains(general: str, name: str) -> bool:
+def contains(general: str, name: str) -> bool:
     """Whether an effect has another one at the same place as its special case."""
     place, _, kind = name.partition(".")
     return general.partition(".")[0] == place and kind in EFFECTS[general].special_cases
@@ -583,12 +590,12 @@ def _finding(tried: Sequence[_Tried], model: Model, heat: float) -> Finding:
     """The first of those tried, with its confidence; differences of evidence are divided by `heat`."""
     name = tried[0].name
     # one that contains it is no other explanation
-    tried = [one for one in tried if not _contains(one.name, name)]
+    tried = [one for one in tried if not contains(one.name, name)]
     # or nothing is missing
     *chances, _ = softmax(np.array([*(one.gain for one in tried), 0.0]) / heat)
     others = tuple((one.name, float(chance)) for one, chance in zip(tried[1:], chances[1:], strict=True))
     others = tuple(one for one in others if one[1] > LEAST_CHANCE)
-    return Finding(name, float(chances[0]), model.numbers[name], model.linear.share(name), others)
+    return Finding(name, float(chances[0]), model.numbers[name], others)
 
 
 def _fitted_numbers(name: str) -> list[str]:

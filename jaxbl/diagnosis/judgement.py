@@ -104,7 +104,7 @@ def exchanged(found: Explanation, controls: Sequence[Control]) -> Explanation | 
     both = last.confidence + dict(last.alternatives).get(rival, 0.0)
     chance = both / (1.0 + float(np.exp(nats)))
     alternatives = ((last.effect, both - chance), *(one for one in last.alternatives if one[0] != rival))
-    now = Finding(rival, chance, found.wrong.numbers[rival], found.wrong.linear.share(rival), alternatives)
+    now = Finding(rival, chance, found.wrong.numbers[rival], alternatives)
     return dataclasses.replace(found, model=found.wrong, wrong=found.model, findings=(*others, now))
 
 

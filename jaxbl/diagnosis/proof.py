@@ -13,7 +13,8 @@ from jaxbl.simulate import Experiment
 
 from .diagnosis_task import input_rms
 from .effect_search import FLOOR, EffectSearch, Explanation, Model
-from .reference_log import PREDICTABLE, Comparison
+from .linearised_model import Linear
+from .reference_log import PREDICTABLE, Comparison, ReferenceLog
 from .setup import Setup
 
 _WORSE, _WORSE_SPEED = 1.02, 1.05
@@ -37,6 +38,7 @@ class FittedModel(NamedTuple):
         theta: of these.
         covariance: of theta.
         white: the same if prediction errors are white, as those of a complete model.
+        linear: the model along the log; None of the model as given.
     """
 
     names: tuple[str, ...]
@@ -45,6 +47,12 @@ class FittedModel(NamedTuple):
     theta: np.ndarray
     covariance: np.ndarray
     white: np.ndarray
+    linear: Linear | None = None
+
+    def share(self, name: str) -> float:
+        """Torque of an effect along the log, rms over the driving torque's."""
+        assert self.linear is not None
+        return self.linear.share(name)
 
     @property
     def numbers(self) -> dict[str, dict[str, float]]:
@@ -66,7 +74,9 @@ def free_values(free: Sequence[Free], theta: np.ndarray) -> dict[str, float]:
 def fit_model(search: EffectSearch, numbers: Mapping[str, Mapping[str, float]], theta: np.ndarray) -> FittedModel:
     """A model with some effects, its own numbers and theirs fitted from given ones."""
     found = search.refitted({name: dict(one) for name, one in numbers.items()}, theta)
-    return FittedModel(tuple(numbers), found.experiment, found.linear.free, found.theta, found.covariance, found.white)
+    return FittedModel(
+        tuple(numbers), found.experiment, found.linear.free, found.theta, found.covariance, found.white, found.linear
+    )
 
 
 class Control(NamedTuple):
@@ -125,7 +135,7 @@ class Proof:
         while names:
             fitted = fit_model(search, {name: found.model.numbers[name] for name in names}, found.model.theta)
             after = self.other.compare(fitted.experiment)
-            gains = {name: self.beaten(self._without(search, found.model, names, name), after) for name in names}
+            gains = {name: beaten(self.other, self._without(search, found.model, names, name), after) for name in names}
             least = min(gains, key=lambda name: gains[name])
             if gains[least] > 0.0 and not self.worse(after, self.before):
                 return Accepted(fitted, after, withdrawn, gains)
@@ -165,24 +175,15 @@ class Proof:
         found = []
         if rival is not None:
             other = self.other.compare(fit_model(search, rival.numbers, rival.theta).experiment)
-            found.append(Control("wrong", other.errors, self.beaten(other, after), rival.names[-1]))
+            found.append(Control("wrong", other.errors, beaten(self.other, other, after), rival.names[-1]))
         added = {
             side: [one.torque - left.torque for one, left in zip(pieces, after.torques[side], strict=True)]
             for side, pieces in self.before.torques.items()
         }
         shuffled = self.other.permuted(self.setup.nominal, added)
         if shuffled is not None:
-            found.append(Control("permuted", shuffled.errors, self.beaten(shuffled, after)))
+            found.append(Control("permuted", shuffled.errors, beaten(self.other, shuffled, after)))
         return found
-
-    def beaten(self, control: Comparison, after: Comparison) -> float:
-        """By how many standard errors a model beats a control, block by block, each channel over the model's own noise."""
-        costs = []
-        for one in (control, after):
-            floor = self.other.noise_floor(one.torques)
-            channels = [name for name in floor if not name.startswith("velocity")]
-            costs.append(np.sum([_blocks(one.samples[name], floor[name]) for name in channels], axis=0))
-        return _standard_errors(*costs)
 
     def gap(self, fitted: FittedModel, after: Comparison) -> dict[str, Any]:
         """Errors on held-out data before and after, and the noise."""
@@ -211,6 +212,16 @@ class Proof:
                 break
             found["free_run"][name] = errors
         return found
+
+
+def beaten(log: ReferenceLog, control: Comparison, after: Comparison) -> float:
+    """By how many standard errors a model beats a control, block by block, each channel over the model's own noise."""
+    costs = []
+    for one in (control, after):
+        floor = log.noise_floor(one.torques)
+        channels = [name for name in floor if not name.startswith("velocity")]
+        costs.append(np.sum([_blocks(one.samples[name], floor[name]) for name in channels], axis=0))
+    return _standard_errors(*costs)
 
 
 def _blocks(errors: np.ndarray, noise: float) -> np.ndarray:

@@ -22,7 +22,7 @@ from jaxbl.identification.segments import Segment
 from jaxbl.identification.smoother import Smoothed
 from jaxbl.simulate import Experiment, with_effects
 
-from .proof import SURE, Proof
+from .proof import SURE, Proof, beaten
 from .reference_log import Comparison, ReferenceLog
 from .residuals import Residual, as_smoothed, low_passed, narrowed
 
@@ -111,9 +111,9 @@ def tabulated(
         tried = _with_tables(experiment, {**known, side: tables})
         compared = proof.other.compare(tried)
         before = best.after if best else after
-        z = proof.beaten(before, compared)
+        z = beaten(proof.other, before, compared)
         if z > SURE and not proof.worse(compared, before):
-            best = Tabulation({**known, side: tables}, tried, compared, proof.beaten(after, compared) if best else z)
+            best = Tabulation({**known, side: tables}, tried, compared, beaten(proof.other, after, compared) if best else z)
     return best
 
 
@@ -177,12 +177,13 @@ def _columns(segment: Segment, lacking: Residual, side: str, over: str, points: 
     values = np.asarray(smoothed.state)[:, 1 if over == "speed" else 0]
     values = np.mod(values, _TURN) if over == "turn" else np.clip(values, points[0], points[-1])
     hats = np.stack([np.interp(values, points, one) for one in np.eye(len(points))])
-    seen = np.asarray(_seen(jnp.asarray(hats), smoothed, jnp.asarray(segment.period)))
-    return low_passed(seen, lacking, cutoff).T
+    passed = np.asarray(seen(jnp.asarray(hats), smoothed, jnp.asarray(segment.period)))
+    return low_passed(passed, lacking, cutoff).T
 
 
 @jit
-def _seen(columns: Float[Array, "columns samples"], smoothed: Smoothed, period: Float[Array, ""]) -> Array:
+def seen(columns: Float[Array, "columns samples"], smoothed: Smoothed, period: Float[Array, ""]) -> Array:
+    """Torques as missing torques are seen; shape (columns, samples)."""
     return jax.lax.map(lambda one: as_smoothed(one, smoothed, period), columns)
 
 

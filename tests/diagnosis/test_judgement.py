@@ -19,14 +19,11 @@ BEFORE = {"theta_e": 0.1, "torque_motor": 0.01}
 
 def fit(log_likelihood, log_evidence, name=NAME):
     numbers = {name: {"torque": 0.2}}
-    linear = SimpleNamespace(share=lambda name: 0.3)
-    return SimpleNamespace(
-        names=(name,), numbers=numbers, log_likelihood=log_likelihood, log_evidence=log_evidence, linear=linear
-    )
+    return SimpleNamespace(names=(name,), numbers=numbers, log_likelihood=log_likelihood, log_evidence=log_evidence)
 
 
 def found(verdict="explained", fit_gain=50.0, prior_gain=0.0, rival="motor.viscous_friction"):
-    finding = Finding(NAME, 0.98, {"torque": 0.1}, 0.3, (("motor.inertia", 0.02),))
+    finding = Finding(NAME, 0.98, {"torque": 0.1}, (("motor.inertia", 0.02),))
     model, wrong = fit(0.0, 0.0), fit(-fit_gain, -fit_gain - prior_gain, rival)
     return Explanation(verdict, (finding,), model, model, wrong, {})  # type: ignore[arg-type]
 

@@ -1,0 +1,233 @@
+"""Effects that the missing torque itself shows, where prediction errors do not.
+
+A one-step predictor corrects itself at every reading, and what is left of a slow torque in its errors may be less than what
+is unknown beside it. Here candidates are columns of a regression on the torque that a model still lacks, low-passed as that
+is, and judged by cross-validation on blocks of the log, which takes errors for as correlated as they are. The best are put
+into the model, all numbers are fitted, and the models are compared on the log block by block.
+Reference: S. Arlot, A. Celisse, A survey of cross-validation procedures, Statistics Surveys 4 (2010), section 8.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import norm
+
+from jaxbl.drive.effects import EFFECTS
+from jaxbl.drive.parameters import get_leaf
+from jaxbl.identification.segments import Segment
+
+from .candidates import Candidate, Numbers, forces_of, variants_of
+from .effect_search import LEAST_CHANCE, EffectSearch, Explanation, Finding, Model, contains, exclusive
+from .proof import SURE, FittedModel, beaten, fit_model
+from .reference_log import Comparison, ReferenceLog
+from .residuals import Residual, low_passed, narrowed
+from .torque_tables import seen
+
+_BLOCKS = 10
+"""Of consecutive samples, each left out once: more than the eight of which a standard error is any use."""
+_GAIN = 0.03
+"""Share of the rms that a candidate has to take away by cross-validation, and by which models have to differ."""
+_TRIED = 3
+"""Candidates of a regression that are put into the model."""
+_ADDED = 3
+"""Effects that are added at most."""
+
+
+class _Proposal(NamedTuple):
+    """A candidate, its numbers, and the share of the missing torque's rms that it takes away by cross-validation."""
+
+    name: str
+    numbers: Numbers
+    gain: float
+
+
+class _Tried(NamedTuple):
+    """A model with an effect more (or one in place of its special case), and how it compares on the log."""
+
+    name: str
+    fitted: FittedModel
+    compared: Comparison
+    z: float
+
+
+def extended(search: EffectSearch, found: Explanation, log: ReferenceLog) -> Explanation:
+    """An explanation with what a regression on the missing torque adds; the same one if it adds nothing.
+
+    Args:
+        search: that found it.
+        found: the explanation.
+        log: the log that was searched, whose low-pass missing torques are looked at behind.
+    """
+    for _ in range(_ADDED):
+        more = _with_one_more(search, found, log)
+        if more is None:
+            break
+        found = more
+    return found
+
+
+def _with_one_more(search: EffectSearch, found: Explanation, log: ReferenceLog) -> Explanation | None:
+    model = found.model
+    now = fit_model(search, model.numbers, model.theta)
+    compared = log.compare(now.experiment)
+    tried: list[_Tried] = []
+    for one in _proposals(search, model, compared.torques, log)[:_TRIED]:
+        kept = {name: numbers for name, numbers in now.numbers.items() if not _replaced(name, one.name)}
+        fitted = fit_model(search, kept | {one.name: one.numbers}, now.theta[: len(search.free)])
+        if not EFFECTS[one.name].possible(fitted.numbers[one.name]):
+            continue
+        after = log.compare(fitted.experiment)
+        z = beaten(log, compared, after)
+        if z > SURE and _less(after, compared):
+            tried.append(_Tried(one.name, fitted, after, z))
+    if not tried:
+        return None
+    # the one that beats all others, or loses by least
+    best = max(tried, key=lambda one: min((beaten(log, other.compared, one.compared) for other in tried if other is not one),
+                                          default=one.z))  # fmt: skip
+    findings = [one for one in found.findings if not _replaced(one.effect, best.name)]
+    rivals = {one.name: beaten(log, one.compared, best.compared) for one in tried if one is not best}
+    for name in model.names:
+        if _replaced(name, best.name):
+            rivals[name] = best.z
+    chances = {name: float(norm.cdf(-z)) for name, z in rivals.items()}
+    alternatives = tuple((name, one) for name, one in chances.items() if one > LEAST_CHANCE)
+    confidence = max(1.0 - sum(chances.values()), 0.5)
+    findings.append(Finding(best.name, confidence, best.fitted.numbers[best.name], alternatives))
+    return search.adopted(found, best.fitted.numbers, best.fitted.theta[: len(search.free)], findings)
+
+
+def _less(after: Comparison, before: Comparison) -> bool:
+    """Whether some missing torque has become smaller by a share that matters."""
+    return any(after.errors[name] < (1.0 - _GAIN) * value for name, value in before.errors.items() if "torque" in name)
+
+
+def _replaced(name: str, by: str) -> bool:
+    """Whether an effect gives way to another one: its special case, or of the same word at one place."""
+    return contains(by, name) or exclusive(by, [name])
+
+
+def _proposals(
+    search: EffectSearch, model: Model, lacking: Mapping[str, Sequence[Residual]], log: ReferenceLog
+) -> list[_Proposal]:
+    """Candidates that take away a part of the missing torque by cross-validation, the best one of each name, best first."""
+    linear = model.linear
+    # errors of numbers that may change are no finding of this regression: they take part in it
+    own = [name for name in search.lacking if linear.same(name) is not None and linear.nominal(name) is not None]
+    sought = [name for name in search.lacking if not any(one == name or contains(one, name) for one in model.names)]
+    base = variants_of(search.nominal, [name for name in own if name not in model.names], linear.scales)
+    variants = variants_of(search.nominal, [name for name in sought if name not in own], linear.scales)
+    regression = _Regression(model, lacking, log, base, variants)
+    found: dict[str, _Proposal] = {}
+    for one in variants:
+        proposal = regression.tried(one)
+        if proposal is not None and proposal.gain > (found[one.name].gain if one.name in found else _GAIN):
+            found[one.name] = proposal
+    return sorted(found.values(), key=lambda one: -one.gain)
+
+
+class _Regression:
+    """Missing torques of all sides, and columns of effects, behind one low-pass; as products, block by block."""
+
+    def __init__(
+        self,
+        model: Model,
+        lacking: Mapping[str, Sequence[Residual]],
+        log: ReferenceLog,
+        base: Sequence[Candidate],
+        variants: Sequence[Candidate],
+    ):
+        self.names, self.sides = model.names, tuple(lacking)
+        forces = []
+        for signals in model.linear.signals:
+            there = signals.of([get_leaf(model.linear.experiment, f"effects.{name}") for name in model.names])
+            tried = forces_of([*base, *variants], signals)
+            both = np.concatenate([np.stack(there), tried]) if there else tried
+            forces.append(both[:, signals.real])
+        self.places: dict[Candidate, tuple[np.ndarray, int]] = {}
+        at = len(model.names)
+        for one in (*base, *variants):
+            self.places[one] = np.arange(at, at + one.width), (at + one.width if one.offset else -1)
+            at += one.width + one.offset
+        self.base = np.concatenate([np.arange(0), *(self.places[one][0] for one in base)]).astype(int)
+        self.grams = [
+            _products(
+                np.concatenate(
+                    [
+                        _behind(_on_side(force, i), segment, residual, side, log.bandwidth[side])
+                        for force, segment, residual in zip(forces, log.segments, lacking[side], strict=True)
+                    ],
+                    axis=1,
+                ),
+                np.concatenate([narrowed(one, log.bandwidth[side])[0].torque for one in lacking[side]]),
+            )
+            for i, side in enumerate(self.sides)
+        ]
+        self.without = self._crossed(np.array([*range(len(model.names)), *self.base]), -1)[0]
+
+    def tried(self, candidate: Candidate) -> _Proposal | None:
+        """A candidate beside the model's effects; None where it is not allowed or not surely better."""
+        columns, offset = self.places[candidate]
+        kept = [i for i, name in enumerate(self.names) if not _replaced(name, candidate.name)]
+        at = np.array([*columns, *kept, *self.base])
+        squares, values = self._crossed(at, offset)
+        gains = np.sum(
+            [one / np.mean(one) - new / np.mean(one) for one, new in zip(self.without, squares, strict=True)], axis=0
+        )
+        if not np.mean(gains) > np.std(gains, ddof=1) / np.sqrt(_BLOCKS):
+            return None
+        ratio = np.prod([np.mean(new) / np.mean(one) for one, new in zip(self.without, squares, strict=True)])
+        numbers = candidate.numbers(values[: len(columns)].tolist())
+        return None if numbers is None else _Proposal(candidate.name, numbers, 1.0 - float(np.sqrt(ratio)))
+
+    def _crossed(self, at: np.ndarray, offset: int) -> tuple[list[np.ndarray], np.ndarray]:
+        """Mean squared errors of each block left out, by side, and the coefficients by all blocks.
+
+        Columns act on all sides with one coefficient, each side over its own missing torque.
+        """
+        products = [one / np.sum(one[:, -1, -1]) for one in self.grams]
+        if offset >= 0:
+            products = [_less_column(one, offset) for one in products]
+        total = np.sum(products, axis=0)
+        whole = np.sum(total, axis=0)
+        values = _solved(whole, at)
+        squares: list[list[float]] = [[] for _ in self.sides]
+        for b in range(_BLOCKS):
+            fit = np.zeros(whole.shape[0])
+            fit[at], fit[-1] = -_solved(whole - total[b], at), 1.0
+            for side, one in zip(squares, products, strict=True):
+                side.append(float(fit @ one[b] @ fit))
+        return [np.array(one) for one in squares], values
+
+
+def _on_side(force: np.ndarray, i: int) -> np.ndarray:
+    """Torques on a side, shape (columns, samples); those on the input act on the motor, which is the first."""
+    return force[:, :, i] + (force[:, :, -1] if i == 0 else 0.0)
+
+
+def _behind(columns: np.ndarray, segment: Segment, residual: Residual, side: str, cutoff: float) -> np.ndarray:
+    """Torques as the missing torque of a side is seen; shape (columns, rows)."""
+    passed = np.asarray(seen(jnp.asarray(columns), segment.smoothed[side], jnp.asarray(segment.period)))
+    return low_passed(passed, residual, cutoff)
+
+
+def _products(columns: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Products of columns and target with one another, block by block; shape (blocks, columns + 1, columns + 1)."""
+    every = np.concatenate([columns, target[None]])
+    return np.stack([one @ one.T for one in np.array_split(every, _BLOCKS, axis=1)])
+
+
+def _less_column(products: np.ndarray, offset: int) -> np.ndarray:
+    """Products with a column taken off the target."""
+    change = np.eye(products.shape[1])
+    change[-1, offset] = -1.0
+    return change @ products @ change.T
+
+
+def _solved(products: np.ndarray, at: np.ndarray) -> np.ndarray:
+    inner, right = products[np.ix_(at, at)], products[at, -1]
+    size = np.sqrt(np.diag(inner))
+    size[size <= 0.0] = np.inf
+    return np.linalg.lstsq(inner / np.outer(size, size), right / size, rcond=1e-10)[0] / size
