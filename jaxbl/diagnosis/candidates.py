@@ -264,7 +264,10 @@ def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direct
         else:
             driving = part.torque if place == "motor" else 0.0
             motion = Motion(part.time, part.position[place], part.velocity[place], driving)
-            resisting = effect.resist(state, motion) + effect.dry_friction(state, motion.velocity) * direction
+            resisting = effect.resist(state, motion)
+            if type(effect).holds is not AbstractEffect.holds:
+                resisting = jnp.where(part.held[place] > 0.0, effect.holds() * direction, resisting)
+            resisting = resisting + effect.dry_friction(state, motion.velocity) * direction
             resisting = resisting + effect.added_inertia() * part.modelled[place]
             found = found.at[:, sides.index(place)].set(-resisting)
         return found * part.weight[:, None]

@@ -231,14 +231,14 @@ def _blocks(errors: np.ndarray, noise: float) -> np.ndarray:
 
 
 def _standard_errors(control: np.ndarray, model: np.ndarray) -> float:
-    """By how many standard errors squared errors of a model, block by block, are below those of a control.
+    """By how many standard errors squared errors of a model over their noise, block by block, are below those of a control.
 
-    By logarithms, since a few blocks may have most of the errors; what structure in the noise may bring is no gain.
+    By logarithms, since a few blocks may have most of the errors, of noise and errors together: what is less than the noise
+    counts for nothing, as on a drive that stands still. What structure in the noise may bring is no gain.
     """
     if not (np.isfinite(control).all() and np.isfinite(model).all()):
         return -np.inf if np.isfinite(control).all() else np.inf
-    control, model = (np.log(np.maximum(one, np.finfo(float).tiny)) for one in (control, model))
-    gains = control - model
+    gains = np.log1p(control) - np.log1p(model)
     return float(np.mean(gains) / np.hypot(np.std(gains, ddof=1) / np.sqrt(_BLOCKS), 2.0 * FLOOR))
 
 

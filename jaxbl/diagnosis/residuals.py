@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.ndimage import gaussian_filter1d
 
+from jaxbl.drive.effects import Motion
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.regression import Kinematics, effect_path
 from jaxbl.identification.segments import Segment
@@ -138,7 +139,10 @@ def _acting(
     direction = passage * (2.0 - jnp.abs(passage))
     # what is not shown to move for a while may be held: friction is then what is missing, as far as it goes
     held = smoothed.held(period)
-    friction = jnp.where(held, jnp.clip(total - inertia * acceleration, -level, level), level * direction)
+    motion = Motion(part.time, part.position[side], velocity, torque if side == "motor" else jnp.zeros_like(torque))
+    bent, most = experiment.plant.holding(side, motion, states)
+    needed = jnp.clip(total + bent - inertia * acceleration, -(level + most), level + most) - bent
+    friction = jnp.where(held, needed, level * direction)
     return total, friction, jnp.where(held, 0.0, 2.0 * level * (1.0 - jnp.abs(passage)) / step)
 
 

@@ -246,6 +246,16 @@ class Plant(eqx.Module):
             found[side] = total, level
         return found
 
+    def holding(self, side: str, motion: Motion, states: States) -> tuple[Scalar, Scalar]:
+        """Torque (N m) of a side's frictions with a memory that may hold it, and the level up to which they do so while it
+        is not seen to move."""
+        torque: Scalar = 0.0
+        level: Scalar = 0.0
+        for effect, own in self._at(side, states):
+            if type(effect).holds is not AbstractEffect.holds:
+                torque, level = torque + effect.resist(own, motion), level + effect.holds()
+        return torque, level
+
     def _kick(
         self, velocity: Sides, position: Sides, seen: Sides, states: States, torque: Scalar, time: Scalar, step: Scalar
     ) -> Sides:

@@ -202,6 +202,13 @@ class AbstractEffect(eqx.Module):
         """Level in N m of set-valued dry friction on the effect's side: it holds up to it, and opposes motion with it."""
         return 0.0
 
+    def holds(self) -> Value:
+        """Torque in N m up to which :meth:`resist` may hold a side that is not seen to move.
+
+        Of a friction with a memory whose contacts bend by less than readings show: its own state is then not known.
+        """
+        return 0.0
+
     def added_inertia(self) -> Value:
         """Inertia in kg m^2 added to the side's nominal one. It has no state: one that varies needs a torque as well."""
         return 0.0

@@ -98,6 +98,9 @@ class PreslidingFriction(SideEffect):
         v = motion.velocity
         return self.torque * state[0] + self.damping * (v - jnp.abs(v) * state[0] / self._most(v))
 
+    def holds(self):
+        return self.torque * jnp.maximum(self.breakaway_ratio, 1.0)
+
     def _most(self, velocity):
         """Steady friction over F_c."""
         return 1.0 + (self.breakaway_ratio - 1.0) * jnp.exp(-((velocity / self.stribeck_velocity) ** 2))
