@@ -398,6 +398,8 @@ def _folder(config: Path, out: Path | None) -> Path:
 
 def _start_jax() -> None:
     """Use every core as a device, and keep compiled programs between runs."""
+    # matrices are small here: threads of BLAS would wait for one another longer than they compute; before NumPy is loaded
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     import jax
 
     from .fused.kept import PROGRAMS

@@ -4,6 +4,7 @@
 without a trace, with any reducers: :func:`scan` for simulated and :func:`replay` for recorded positions.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -68,7 +69,7 @@ class Experiment(eqx.Module):
 
 def with_effects(experiment: Experiment, effects: tuple[AbstractEffect, ...]) -> Experiment:
     """The experiment with other effects."""
-    return eqx.tree_at(lambda e: e.effects, experiment, effects)
+    return dataclasses.replace(experiment, effects=effects)
 
 
 class State(eqx.Module):

@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Motion, Numbers, Scales, make_effect
-from jaxbl.drive.parameters import as_arrays
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.regression import Path, effect_path
 from jaxbl.simulate import Experiment, with_effects
@@ -55,10 +54,6 @@ class Part(eqx.Module):
     own: Float[Array, "samples states numbers"]
     defect: Float[Array, "samples states"]
     weight: Float[Array, " samples"]
-
-    def moving(self) -> "Part":
-        """Without the model's step: what torques along the motion need, of one shape whatever numbers are free."""
-        return eqx.tree_at(lambda part: (part.step, part.force, part.own, part.defect), self, (None,) * 4)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -164,7 +159,7 @@ def _trial(name: str, known: Numbers) -> Candidate:
 
 
 def _effect(name: str, numbers: Numbers) -> AbstractEffect:
-    return as_arrays(make_effect(name, **numbers), float)
+    return make_effect(name, **numbers)
 
 
 def all_of_the_input() -> Candidate:
@@ -181,7 +176,9 @@ class MotionTorques:
         self.count = len(part.time)
         self.real = np.asarray(part.weight) > 0.0
         self.torque = np.asarray(part.torque)
-        needed = _needed(experiment, part.moving())
+        # what torques along the motion need, of one shape whatever numbers are free
+        self.moving = dataclasses.replace(part, step=None, force=None, own=None, defect=None)
+        needed = _needed(experiment, self.moving)
         self.direction = {side: self._direction(side, np.asarray(needed[side])) for side in self.sides}
         self.known: dict[Candidate, np.ndarray] = {}
 
@@ -213,8 +210,9 @@ class MotionTorques:
     def of(self, effects: Sequence[AbstractEffect]) -> list[np.ndarray]:
         """Torque that each effect adds, shape (samples, sides + 1); on top of what a model without it has."""
         found: list[np.ndarray] = [np.zeros(0)] * len(effects)
-        for name in dict.fromkeys(effect.name for effect in effects):
-            which = [i for i, effect in enumerate(effects) if effect.name == name]
+        names = [effect.name for effect in effects]
+        for name in dict.fromkeys(names):
+            which = [i for i, one in enumerate(names) if one == name]
             place = self.experiment.drive.place(effects[which[0]].place)
             # of the model's own only those in the gear matter, and only for others there: one structure, and one program
             gear = [one for one in self.experiment.effects if one.place == place == "transmission" and one.name != name]
@@ -226,20 +224,20 @@ class MotionTorques:
                 spare = [effects[some[-1]]] * (_AT_ONCE - len(some))
                 members = (*(effects[i] for i in some), *spare)
                 stack = jax.tree.map(lambda *x: jnp.asarray(np.array([float(one) for one in x])), *members)
-                torques = np.asarray(_torques(bare, stack, self.part.moving(), direction))
+                torques = np.asarray(_torques(bare, stack, self.moving, direction))
                 for i, torque in zip(some, torques, strict=False):
                     found[i] = torque
         return found
 
 
-def forces_of(candidates: Sequence[Candidate], signals: MotionTorques, spare: int = 0) -> np.ndarray:
-    """Columns of candidates, one after the other, N m, and columns of zeros; shape (columns, samples, sides + 1)."""
+def forces_of(candidates: Sequence[Candidate], signals: MotionTorques) -> np.ndarray:
+    """Columns of candidates, one after the other, N m; shape (columns, samples, sides + 1)."""
     new = [one for one in candidates if one not in signals.known]
     torques = iter(signals.of([effect for one in new for effect in one.effects]))
     for one in new:
         signals.known[one] = one.columns(signals, [next(torques) for _ in one.effects])
-    zeros = np.zeros((spare, signals.count, len(signals.sides) + 1))
-    return np.concatenate([*(signals.known[one] for one in candidates), zeros])
+    none = np.zeros((0, signals.count, len(signals.sides) + 1))
+    return np.concatenate([none, *(signals.known[one] for one in candidates)])
 
 
 @jit

@@ -13,19 +13,18 @@ References: L. Ljung, System Identification (1999), 7.4; M. Basseville, Detectin
 Automatica 24 (1988), for the local approach.
 """
 
-import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
 from jaxbl.drive.effects import EFFECTS, Scales
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
+from jaxbl.fused.recursion import Recursion
 from jaxbl.fused.single_plant import Direction, slopes
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.prediction import kalman_gain
@@ -39,9 +38,8 @@ from .evidence import Products
 from .neutral_effects import bucket, corrected, with_torques
 from .whittle import Spectrum, weighted_products
 
-_SAMPLES, _BLOCK, _NUMBERS = 1024, 128, 4
-"""Least padded length of a part, so that records of about one length share their compiled programs; a block of it; multiple
-to which the number of free numbers is padded."""
+_SAMPLES = 1024
+"""Least padded length of a part, so that records of about one length share their compiled programs."""
 
 
 def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segment: Segment) -> Part:
@@ -81,7 +79,6 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
         # nothing happens from the last reading on
         defect[: count - 1] = value[: count - 1] - vectors[1:count]
     a, b, own = np.split(slope, (len(order), len(order) + each + 1), axis=2)
-    own = np.concatenate([own, np.zeros((*own.shape[:2], -len(free) % _NUMBERS))], axis=2)
     weight = (np.arange(size) < count).astype(float)
     given = time, torque, read, *smooth, modelled, deviation, held, a, b, own, defect, weight
     return Part(*jax.tree.map(jnp.asarray, given))
@@ -121,96 +118,78 @@ def gain_matrix(gain: Array, states: int) -> Array:
     return gains.at[sides + jnp.arange(sides), jnp.arange(sides)].set(gain[:, 1])
 
 
-def _known(part: Part, forces: Array) -> Array:
-    """What drives the state's change at each sample; columns: constant, own numbers, forces, initial states."""
-    samples, states = part.defect.shape
-    none = jnp.zeros((samples, states, states))
-    forced = jnp.einsum("tni,cti->tnc", part.force, forces)
-    return jnp.concatenate([part.defect[:, :, None], part.own, forced, none], axis=2)
+def _closed(part: Part, gains: Array) -> Array:
+    """Step of the predictor's errors under a gain, A (1 - K C); by sample."""
+    return part.step.at[:, :, : gains.shape[1]].add(-part.step @ gains)
 
 
-def _closed(part: Part, gains: Array) -> tuple[Array, Array]:
-    """Step of the predictor's errors under a gain, A (1 - K C), and A K; by sample."""
-    fed = part.step @ gains
-    return part.step.at[:, :, : gains.shape[1]].add(-fed), fed
+class _Columns:
+    """Everything that the prediction errors along a part are linear in; columns: constant, own numbers, forces, initial
+    states."""
+
+    def __init__(self, part: Part, forces: np.ndarray):
+        # behind the last sample there is nothing but filling
+        self.count, self.size = int(np.sum(np.asarray(part.weight) > 0.0)), len(part.time)
+        self.step, self.force, self.own, self.defect, self.readings = (
+            np.asarray(one)[: self.count] for one in (part.step, part.force, part.own, part.defect, part.readings)
+        )
+        self.forces = np.asarray(forces)
+        self.states = self.defect.shape[1]
+        self.width = 1 + self.own.shape[2] + len(self.forces) + self.states
+        self.recursion = Recursion.of(self.states, self.readings.shape[1], self.width)
+
+    def along(self, gains: Sequence[np.ndarray]) -> Iterator[tuple[slice, list[np.ndarray]]]:
+        """Rows of some samples after the others, and the prediction errors there under each gain, rad, shape
+        (sides, samples, columns)."""
+        begun = np.zeros((self.states, self.width))
+        begun[:, self.width - self.states :] = np.eye(self.states)
+        changes = [begun] * len(gains)
+        length = max(_VALUES // self.width, 64)
+        for first in range(0, self.count, length):
+            rows = slice(first, min(first + length, self.count))
+            known = np.zeros((self.states, rows.stop - first, self.width))
+            known[:, :, 0] = self.defect[rows].T
+            known[:, :, 1 : 1 + self.own.shape[2]] = self.own[rows].transpose(1, 0, 2)
+            if len(self.forces):
+                torques = np.ascontiguousarray(self.forces[:, rows].transpose(1, 2, 0))
+                forced = np.matmul(self.force[rows], torques).transpose(1, 0, 2)
+                known[:, :, 1 + self.own.shape[2] : self.width - self.states] = forced
+            changes, errors = self.recursion(changes, gains, self.step[rows], known, self.readings[rows])
+            yield rows, errors
 
 
-def _product(matrix: Array, columns: Array) -> Array:
-    """Of small matrices: written out, it takes less time than a call of what is made for large ones."""
-    if columns.shape[1] > _MANY:
-        return matrix @ columns
-    return sum((matrix[:, k, None] * columns[None, k] for k in range(len(columns))), jnp.zeros((1, 1)))
+def _errors(part: Part, gain: Array | np.ndarray, forces: Array | np.ndarray) -> np.ndarray:
+    """Prediction errors, rad, by side; columns as of :class:`_Columns`; shape (samples, sides, columns)."""
+    columns = _Columns(part, np.asarray(forces))
+    found = np.zeros((columns.size, columns.readings.shape[1], columns.width))
+    for rows, (errors,) in columns.along([np.asarray(gain)]):
+        found[rows] = errors.transpose(1, 0, 2)
+    return found
 
 
-def _recursion(part: Part, gains: Array, change: Array, known: Array) -> tuple[Array, Array]:
-    """Prediction errors along some samples, rad; shape (samples, sides, columns)."""
-    closed, fed = _closed(part, gains)
-
-    def first(values: Array) -> Array:
-        """Of the first column alone."""
-        return jnp.pad(values[..., None], [*[(0, 0)] * values.ndim, (0, known.shape[2] - 1)])
-
-    def sample(change: Array, given: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-        closed, known, read = given
-        return _product(closed, change) + known + first(read), change[: gains.shape[1]]
-
-    change, seen = jax.lax.scan(sample, change, (closed, known, jnp.einsum("tis,ts->ti", fed, part.readings)))
-    return change, (first(part.readings) - seen) * part.weight[:, None, None]
-
-
-def _start(states: int, width: int) -> Array:
-    return jnp.zeros((states, width)).at[:, width - states :].set(jnp.eye(states))
-
-
-@jit
-def _errors(part: Part, gain: Array, forces: Array) -> Array:
-    """Prediction errors, rad, by side; columns as of :func:`_known`; shape (samples, sides, columns)."""
-    known = _known(part, forces)
-    states, width = known.shape[1:]
-    return _recursion(part, gain_matrix(gain, states), _start(states, width), known)[1]
-
-
-@jit
-def _grams(part: Part, gains: Array, forces: Array) -> Array:
+def _grams(part: Part, gains: Sequence[np.ndarray], forces: np.ndarray) -> np.ndarray:
     """Products of the columns of the prediction errors with one another, rad^2, for several gains, by side;
     shape (gains, sides, columns, columns)."""
-    states, sides = part.defect.shape[1], part.readings.shape[1]
-    width = 1 + part.own.shape[2] + len(forces) + states
-    count = len(part.time) // _BLOCK
-    blocks = jax.tree.map(lambda x: x.reshape(count, _BLOCK, *x.shape[1:]), part)
-
-    def some(gains: Array, blocks: Part, forces: Array) -> Array:
-        matrices = jax.vmap(lambda gain: gain_matrix(gain, states))(gains)
-
-        def block(carry: tuple[Array, Array], given: tuple[Part, Array]) -> tuple[tuple[Array, Array], None]:
-            change, total = carry
-            one, i = given
-            known = _known(one, jax.lax.dynamic_slice_in_dim(forces, i * _BLOCK, _BLOCK, 1))
-            change, errors = jax.vmap(lambda gain, change: _recursion(one, gain, change, known))(matrices, change)
-            return (change, total + jnp.einsum("gtsc,gtsd->gscd", errors, errors)), None
-
-        start = jnp.broadcast_to(_start(states, width), (len(gains), states, width))
-        none = jnp.zeros((len(gains), sides, width, width))
-        return jax.lax.scan(block, (start, none), (blocks, jnp.arange(count)))[0][1]
-
-    # devices share the gains
-    devices = jax.local_devices()
-    mesh = Mesh(np.array(devices[: math.gcd(len(devices), len(gains))]), ("gains",))
-    own, every = PartitionSpec("gains"), PartitionSpec()
-    shared = jax.shard_map(some, mesh=mesh, in_specs=(own, every, every), out_specs=own, check_vma=False)
-    return shared(gains, blocks, forces)
+    columns = _Columns(part, forces)
+    total = np.zeros((len(gains), columns.readings.shape[1], columns.width, columns.width))
+    # of a gain under which errors diverge
+    with np.errstate(invalid="ignore", over="ignore"):
+        for _, found in columns.along(gains):
+            for sums, errors in zip(total, found, strict=True):
+                sums += np.matmul(errors.transpose(0, 2, 1), errors)
+    return total
 
 
 @jit
 def _gradient(part: Part, gain: Array, left: Array) -> Array:
     """Derivative of the sum of products of errors with `left` by the torque at each sample, shape (samples, sides + 1)."""
     states, sides = part.defect.shape[1], left.shape[1]
-    closed, _ = _closed(part, gain_matrix(gain, states))
+    closed = _closed(part, gain_matrix(gain, states))
     added = jnp.zeros((len(left), states)).at[:, :sides].set(-left * part.weight[:, None])
 
     def sample(adjoint: Array, given: tuple[Array, Array]) -> tuple[Array, Array]:
         closed, added = given
-        return _product(closed.T, adjoint[:, None])[:, 0] + added, adjoint
+        return closed.T @ adjoint + added, adjoint
 
     _, adjoints = jax.lax.scan(sample, jnp.zeros(states), (closed, added), reverse=True)
     return jnp.einsum("tij,ti->tj", part.force, adjoints)
@@ -237,8 +216,8 @@ _SILENT = 1e-20
 rounding is 1e-16."""
 _LOST = 0.01
 """Nats that rounding may take (benchmarks/NOTES.md): under too low a gain the influence of an initial state grows."""
-_COLUMNS, _MANY = 16, 80
-"""Least padded number of candidate columns, and the number from which on XLA's matrix product is the faster one."""
+_VALUES = 65536
+"""Samples times columns that the recursion takes at once: what it knows and finds of them stays in the cache."""
 
 
 class Predictor:
@@ -412,20 +391,7 @@ class Linear:
         """Prediction errors under a given gain, part by part, rad; shape (samples, sides, columns)."""
         gain = self.gain(smoothness)
         none = [self._forces((), one) for one in self.signals]
-        errors = [_errors(one.part, gain, forces) for one, forces in zip(self.signals, none, strict=True)]
-        some = self._taken(none)
-        return [np.asarray(one)[:, :, some] for one in errors]
-
-    def _taken(self, forces: Sequence[np.ndarray]) -> np.ndarray:
-        """As :meth:`_some`, with all forces of candidates, part by part; without candidates they are there to fill up."""
-        # a candidate may do nothing in one part
-        return self._some(len(forces[0]) if any(one.any() for one in forces) else 0, len(forces[0]))
-
-    def _some(self, forces: int, width: int) -> np.ndarray:
-        """Columns that are not there to fill up, some of the forces among them."""
-        own, padded = len(self.free), self.parts[0].own.shape[2]
-        last = 1 + padded + width + np.arange(self.states)
-        return np.concatenate([np.arange(1 + own), 1 + padded + np.arange(forces), last])
+        return [_errors(one.part, gain, forces) for one, forces in zip(self.signals, none, strict=True)]
 
     def choose(self, variants: Sequence[Candidate], near: Sequence[float] | None = None) -> Predictor:
         """The predictor with the least errors, some candidates taken in; the search begins at a smoothness of each side."""
@@ -457,19 +423,13 @@ class Linear:
         return chosen, forces
 
     def _predictors(self, options: list[list[float]], forces: list[np.ndarray]) -> list[Predictor]:
-        # one compiled program for a few and for all
-        count = len(_COARSE_SMOOTHNESS) if 1 < len(options) < len(_COARSE_SMOOTHNESS) else len(options)
-        gains = jnp.stack([self.gain(options[min(i, len(options) - 1)]) for i in range(count)])
-        grams, some = [], self._taken(forces)
-        for part, force in zip(self.parts, forces, strict=True):
-            grams.append(np.asarray(_grams(part, gains, force))[:, :, some[:, None], some])
+        gains = [np.asarray(self.gain(one)) for one in options]
+        grams = [_grams(part, gains, force) for part, force in zip(self.parts, forces, strict=True)]
         return [Predictor(self, one, [gram[i] for gram in grams]) for i, one in enumerate(options)]
 
     def _forces(self, variants: Sequence[Candidate], signals: MotionTorques) -> np.ndarray:
-        """Torques of candidates, padded with columns of zeros, so that few programs serve all; shape (columns, samples,
-        sides + 1)."""
-        width = sum(one.width + one.offset for one in variants)
-        return forces_of(variants, signals, bucket(width, _COLUMNS, 2) - width)
+        """Torques of candidates, shape (columns, samples, sides + 1)."""
+        return forces_of(variants, signals)
 
     def frequencies(self, place: str) -> list[float]:
         """Frequencies (Hz) at which a disturbance of a side explains most, by the gradient of the errors' squares.
@@ -481,15 +441,14 @@ class Linear:
         part, side = self.parts[i], self.sides.index(place)
         predictor, forces = self._last
         gain, deviation = self.gain(predictor.smoothness), predictor.deviation
-        errors = np.asarray(_errors(part, gain, forces[i]))
-        left = errors[:, :, self._taken(forces)] @ predictor.coefficients[i]
+        left = _errors(part, gain, forces[i]) @ predictor.coefficients[i]
         time, real = np.asarray(part.time), int(self.signals[i].real.sum())
         span, top = real * self.period, self._highest
         few = np.geomspace(min(1.0 / span, 0.5 * top), top, _COARSE)
         phase = 2.0 * np.pi * few[:, None] * time[None, :]
         waves = np.zeros((2 * _COARSE, len(time), len(self.sides) + 1))
         waves[:, :, side] = np.concatenate([np.sin(phase), np.cos(phase)])
-        responses = np.asarray(_errors(part, gain, waves))[:, :, 1 + part.own.shape[2] : -self.states]
+        responses = _errors(part, gain, waves)[:, :, 1 + part.own.shape[2] : -self.states]
         power = np.sum((responses / deviation[None, :, None]) ** 2, axis=(0, 1)).reshape(2, -1).mean(axis=0)
         slope = np.asarray(_gradient(part, gain, jnp.asarray(left / deviation[None, :] ** 2)))[:real, side]
         size = 4 * 2 ** int(np.ceil(np.log2(real)))
@@ -526,14 +485,11 @@ class Linear:
         total, power = np.zeros((at, at)), np.zeros(at - 1 - own)
         for signals in self.signals:
             part, forces = signals.part, self._forces(variants, signals)
-            power += self._power(forces[: at - 1 - own], signals)
-            some = self._some(at - 1 - own, len(forces))
+            power += self._power(forces, signals)
             if isinstance(noise, Spectrum):
-                errors = np.asarray(_errors(part, gain, forces))[signals.real][:, :, some]
-                gram = weighted_products(errors, noise)
+                gram = weighted_products(_errors(part, gain, forces)[signals.real], noise)
             else:
-                gram = np.asarray(_grams(part, gain[None], forces))[0][:, some[:, None], some]
-                gram = np.einsum("s,scd->cd", noise**-2.0, gram)
+                gram = np.einsum("s,scd->cd", noise**-2.0, _grams(part, [np.asarray(gain)], forces)[0])
             total += _eliminated(gram, self.states)
         with np.errstate(divide="ignore"):
             # what has no torque along this motion cannot be found

@@ -113,11 +113,33 @@ def get_leaf(tree: Any, path: str) -> Any:
 
 
 def set_leaves(tree: Tree, values: Mapping[str, Any]) -> Tree:
-    """A copy of `tree` in which the leaves named by dotted paths have new values."""
-    if not values:
+    """A copy of `tree` in which the leaves named by dotted paths have new values. Raises `KeyError` where there is none."""
+    by_member: dict[str, dict[str, Any]] = {}
+    members = _members(tree) if isinstance(tree, tuple) else None
+    for path, value in values.items():
+        if members is None:
+            key, _, rest = path.partition(".")
+            key = f"{key}_" if keyword.iskeyword(key) else key
+            if not hasattr(tree, key):
+                raise KeyError(path)
+        else:
+            # a member's own name may hold dots (`load.coulomb_friction`)
+            keys = path.split(".")
+            splits = ((".".join(keys[:count]), ".".join(keys[count:])) for count in range(1, len(keys) + 1))
+            key, rest = next((one for one in splits if one[0] in members), ("", ""))
+            if not key:
+                raise KeyError(path)
+        by_member.setdefault(key, {})[rest] = value
+    if not by_member:
         return tree
-    paths = list(values)
-    return eqx.tree_at(lambda t: [get_leaf(t, path) for path in paths], tree, [values[path] for path in paths])
+
+    def new(old: Any, inside: Mapping[str, Any]) -> Any:
+        return inside[""] if "" in inside else set_leaves(old, inside)
+
+    if members is None:
+        changed = {key: new(getattr(tree, key), inside) for key, inside in by_member.items()}
+        return dataclasses.replace(tree, **changed)  # type: ignore[type-var]
+    return tuple(new(old, by_member[key]) if key in by_member else old for key, old in members.items())  # type: ignore[return-value]
 
 
 def as_arrays(tree: Tree, dtype: Any) -> Tree:

@@ -79,14 +79,17 @@ class Argument(NamedTuple):
             raise ValueError(f"{self.name} of a loop needs {count} contiguous numbers of type {self.dtype}, {wrong}")
 
 
-def signature_of(body: ClosedJaxpr, around: Around | None, values: int, carry: int, fixed: int) -> list[Argument]:
+def signature_of(
+    body: ClosedJaxpr, around: Around | None, values: int, carry: int, fixed: int, beside: int = 0
+) -> list[Argument]:
     """The arrays of a loop in their order; arguments as of :class:`Loop`."""
     own, read = values + carry, body.jaxpr.invars
     groups: list[tuple[str, str, Sequence[Any]]] = [
         ("value", "lanes", read[:values]),
         ("carry", "lanes", read[values:own]),
         ("fixed number", "one", read[own : own + fixed]),
-        ("input", "samples", read[own + fixed :]),
+        ("input", "samples", read[own + fixed : len(read) - beside]),
+        ("lane's input", "both", read[len(read) - beside :]),
         ("input afterwards", "one", [v for part in (around or ())[1:] for v in part.jaxpr.invars[own:]]),
         ("kept number", "both", body.jaxpr.outvars[carry:]),
         ("result", "lanes", around.finish.jaxpr.outvars if around else []),
@@ -98,9 +101,11 @@ class Loop:
     """A compiled loop over samples, and what is done around it.
 
     Args:
-        body: jaxpr of one sample, scalars of one lane: values, carry, fixed, one sample's inputs -> carry, and what is kept.
+        body: jaxpr of one sample, scalars of one lane: values, carry, fixed, one sample's inputs, the last of them of this
+            lane alone -> carry, and what is kept.
         dtype: of the lanes' numbers.
-        values, carry, fixed: how many differ from lane to lane, a lane carries, and all lanes read unchanged in a call.
+        values, carry, fixed, beside: how many differ from lane to lane, a lane carries, all lanes read unchanged in a call,
+            and a lane alone reads at each sample.
         around: left out, nothing.
         lanes: that are computed together; left out, as many as suit the machine.
 
@@ -116,13 +121,14 @@ class Loop:
         values: int = 0,
         carry: int = 0,
         fixed: int = 0,
+        beside: int = 0,
         around: Around | None = None,
         lanes: int | None = None,
     ):
         self.lanes = lanes or vector_lanes(dtype)
         body = substituted(body, FUNCTIONS)
         around = None if around is None else Around(*(substituted(part, FUNCTIONS) for part in around))
-        self.signature = signature_of(body, around, values, carry, fixed)
+        self.signature = signature_of(body, around, values, carry, fixed, beside)
         module = ir.Module("loop")
         _Writer(module, self.lanes).loop(body, around, self.signature)
         parsed = binding.parse_assembly(str(module))
@@ -219,8 +225,8 @@ class _Writer:
         width = build.sub(last, first)
 
         def lanes(lane: Vector, _: list[Vector]) -> list[Vector]:
-            def read(name: str) -> list[Vector]:
-                places = {i: build.gep(arrays[i], [lane], source_etype=kinds[i]) for i in group[name]}
+            def read(name: str, place: Vector = lane) -> list[Vector]:
+                places = {i: build.gep(arrays[i], [place], source_etype=kinds[i]) for i in group[name]}
                 return [build.load(at, align=dtypes[i].itemsize, typ=self.vector(kinds[i])) for i, at in places.items()]
 
             def write(name: str, values: Sequence[Vector], at: Vector) -> list[Vector]:
@@ -233,8 +239,10 @@ class _Writer:
             self.constant = {*numbers, *steady}
 
             def sample(index: Vector, state: list[Vector]) -> list[Vector]:
-                found = self.run(body, [*numbers, *state, *steady, *(scalar(i, index) for i in group["input"])])
-                write("kept number", found[carry:], build.add(build.mul(index, width), build.sub(lane, first)))
+                place = build.add(build.mul(index, width), build.sub(lane, first))
+                own = read("lane's input", place)
+                found = self.run(body, [*numbers, *state, *steady, *(scalar(i, index) for i in group["input"]), *own])
+                write("kept number", found[carry:], place)
                 return found[:carry]
 
             if around is None:

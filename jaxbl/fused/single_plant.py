@@ -193,7 +193,7 @@ class _Plant(NamedTuple):
     @classmethod
     def of(cls, experiment: Experiment, state: PlantState) -> "_Plant":
         leaves, structure = jax.tree.flatten(experiment)
-        kinds = tuple((np.shape(leaf), str(jnp.result_type(leaf))) for leaf in leaves)
+        kinds = tuple((np.shape(leaf), str(getattr(leaf, "dtype", None) or jnp.result_type(leaf))) for leaf in leaves)
         return cls(structure, kinds, jax.tree.structure(state))
 
     @property

@@ -137,7 +137,8 @@ def _transmitted(plant: Plant, k: Kinematics, states: States) -> Float[Array, " 
 
 def settled(experiment: Experiment, torque: Float[Array, ""]) -> States:
     """The effects' own states after an input (N m) that has lasted."""
-    return tuple(effect.settled(torque) for effect in experiment.effects)
+    # as of their classes: of a method of a module equinox makes a module
+    return tuple(type(effect).settled(effect, torque) for effect in experiment.effects)
 
 
 @jit

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
@@ -508,7 +509,7 @@ def cut(
     count = len(torque) // samples
     standing = np.arange(count) == (0 if rest else -1)
     # where nothing is traced by numpy: no program is compiled for each length
-    traced = any(isinstance(one, jax.core.Tracer) for one in jax.tree.leaves((torque, measured, start)))
+    traced = any(isinstance(one, Tracer) for one in jax.tree.leaves((torque, measured, start)))
     numpy: Any = jnp if traced else np
     start = jax.tree.map(lambda x: jnp.asarray(numpy.asarray(x)[: count * samples : samples]), start)
     still = jax.tree.map(lambda x: jnp.asarray(numpy.where(standing, 0.0, x)), start.velocity)

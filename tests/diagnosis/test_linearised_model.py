@@ -60,7 +60,6 @@ def errors(model, forces=None):
     (signals,) = model.signals
     none = np.zeros((0, signals.count, len(model.sides) + 1)) if forces is None else forces
     found = np.asarray(module._errors(model.parts[0], model.gain([1e-6] * len(model.sides)), jnp.asarray(none)))
-    found = found[:, :, model._some(len(none), len(none))]
     flat = found.reshape(-1, found.shape[2])
     basis = np.linalg.qr(flat[:, -model.states :])[0]
     rest = flat[:, : -model.states]

@@ -168,7 +168,7 @@ class AbstractEffect(eqx.Module):
 
     def settled(self, torque: Value) -> Any:
         """The own state after a commanded torque (N m) that has lasted; at t = 0 unless the effect says otherwise."""
-        return self.init()
+        return type(self).init(self)
 
     def advance(self, state: Any, motion: Motion, step: Value) -> Any:
         """The own state after `step` seconds at a steady velocity. The plant calls it for both halves of a step."""

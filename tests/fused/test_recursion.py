@@ -1,0 +1,42 @@
+"""The recursion of a predictor's errors by machine code does what its definition says."""
+
+import numpy as np
+import pytest
+
+from jaxbl.fused import recursion as module
+from jaxbl.fused.recursion import Recursion
+
+
+@pytest.mark.parametrize("machine_code", [True, False])
+@pytest.mark.parametrize(("states", "sides", "width"), [(2, 1, 3), (5, 2, 40)])
+def test_errors_follow_the_definition(states, sides, width, machine_code, monkeypatch):
+    rng = np.random.default_rng(1)
+    step = 0.3 * rng.normal(size=(60, states, states))
+    known, readings = rng.normal(size=(states, 60, width)), rng.normal(size=(60, sides))
+    begun, gains = rng.normal(size=(states, width)), [rng.normal(0.3, 0.1, (sides, 2)) for _ in range(3)]
+    recursion = Recursion(states, sides, width)
+    assert recursion.loop is not None
+    if not machine_code:
+        monkeypatch.setattr(recursion, "loop", None)
+    # in two parts
+    ends, first = recursion([begun] * 3, gains, step[:25], known[:, :25], readings[:25])
+    ends, last = recursion(ends, gains, step[25:], known[:, 25:], readings[25:])
+    for gain, end, *parts in zip(gains, ends, first, last, strict=True):
+        errors, change = np.concatenate(parts, axis=1), begun
+        full = np.zeros((states, sides))
+        for i in range(sides):
+            full[i, i], full[sides + i, i] = gain[i]
+        for i in range(60):
+            read = np.zeros((sides, width))
+            read[:, 0] = readings[i]
+            left = read - change[:sides]
+            assert errors[:, i] == pytest.approx(left, rel=1e-9, abs=1e-12)
+            change = step[i] @ (change + full @ left) + known[:, i]
+        assert end == pytest.approx(change, rel=1e-9, abs=1e-12)
+
+
+def test_one_loop_serves_all_widths():
+    before = module._loop.cache_info().misses
+    for width in (3, 17, 90):
+        Recursion(3, 1, width)
+    assert module._loop.cache_info().misses <= before + 1
