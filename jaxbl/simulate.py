@@ -206,9 +206,11 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
 def move(plant: Plant, run: Run, state: PlantState, torque: Scalar, time: Number) -> PlantState:
     """The plant from one sample to the next, in `substeps` steps under a held input."""
     small = run.sample_period / run.substeps
+    effects, arriving = plant.receive(state.effects, torque, run.sample_period)
+    state = PlantState(state.position, state.velocity, effects)
 
     def substep(i: Int[Array, ""], state: PlantState) -> PlantState:
-        return plant.advance(state, torque, time + i * small, small)
+        return plant.advance(state, arriving(i * small, small), time + i * small, small)
 
     if run.substeps == 1:
         return substep(jnp.asarray(0), state)

@@ -54,8 +54,10 @@ VALUES = {
     "transmission.damping": {"damping": 0.1},
     "transmission.hysteresis": {"torque": 0.3, "length": 0.1},
     "transmission.eccentricity": {"amplitude": 0.05, "harmonic": 3.0, "phase": 0.7},
+    "actuator.delay": {"delay": 0.046875},
     "actuator.gain_error": {"relative": 0.1},
     "actuator.saturation": {"limit": 0.25},
     "actuator.lag": {"time_constant": 0.05},
+    "actuator.back_emf": {"resistance": 0.01, "torque_constant": 0.02},
 }
 """Both sides keep turning forwards under a steady torque, so that dry friction slides throughout."""

@@ -163,7 +163,7 @@ def _check_effects(config: Config) -> None:
             raise wrong(
                 f"effects[{i}]: {effect.kind} has no meaning on a rigid drive; motor.* and actuator.* effects act on it"
             )
-        if fault := EFFECTS[effect.kind].fault(effect.model_dump()):
+        if fault := EFFECTS[effect.kind].fault(effect.model_dump(), config.run.sample_period):
             raise wrong(f"effects[{i}]: {effect.kind}: {fault}")
     for side in ("motor",) if rigid else ("motor", "load"):
         nominal = getattr(config.drive, f"{side}_inertia")

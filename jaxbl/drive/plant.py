@@ -10,6 +10,8 @@ References: J. J. Moreau, Numerical aspects of the sweeping process, CMAME 177 (
 Methods for Nonsmooth Dynamical Systems, Springer (2008), ch. 10.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -188,6 +190,17 @@ class Plant(eqx.Module):
         position = {side: middle[side] + 0.5 * step * velocity[side] for side in self.drive.sides}
         return PlantState(position, velocity, self.remember(states, middle, velocity, middle_time, 0.5 * step))
 
+    def receive(self, states: States, torque: Any, period: Scalar) -> tuple[States, Callable[[Scalar, Scalar], Any]]:
+        """What the effects let arrive of a torque (N m) that is commanded for `period` seconds: their states, and
+        its mean as a function of the time since the sample began and the seconds that the mean is over."""
+        new, arriving = [], lambda since, step: torque
+        for effect, own in zip(self.effects, states, strict=True):
+            if type(effect).receive is not AbstractEffect.receive:
+                own, first, then, switch = effect.receive(own, arriving(0.0, period), period)
+                arriving = partial(_mean, first, then, switch)
+            new.append(own)
+        return tuple(new), arriving
+
     def actuate(self, states: States, torque: Any, step: Scalar) -> tuple[States, Any]:
         """What the effects make of a commanded torque (N m) held over `step` seconds: their states, and the torque."""
         new = []
@@ -239,6 +252,8 @@ class Plant(eqx.Module):
         found = {}
         for side in self.drive.sides:
             driving = torque if side == "motor" else 0.0
+            for effect, own in self._at("actuator", states) if side == "motor" else ():
+                driving = driving - effect.resist(own, Motion(time, position[side], velocity[side], torque))
             total = gains[side] * through + driving
             level: Scalar = 0.0
             motion = Motion(time, position[side], velocity[side], driving)
@@ -276,6 +291,11 @@ class Plant(eqx.Module):
         """Effects of a place, each with its own state."""
         pairs = zip(self.effects, states, strict=True)
         return [(effect, own) for effect, own in pairs if self.drive.place(effect.place) == place]
+
+
+def _mean(first: Scalar, then: Scalar, switch: Scalar, since: Scalar, step: Scalar) -> Scalar:
+    """Mean over `step` seconds, from `since`, of a torque that changes once, at `switch`."""
+    return then + (first - then) * jnp.clip((switch - since) / step, 0.0, 1.0)
 
 
 def _rubbed(before: Float[Array, ""], free: Scalar, stop: Scalar) -> Float[Array, ""]:

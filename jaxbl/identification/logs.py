@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.config import Config, prepare
+from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import get_leaf, leaf_paths
 from jaxbl.errors import InputError
 from jaxbl.records import POSITION_CHANNELS, PositionTable, Record, join, read_record
@@ -121,6 +122,9 @@ def _read_one(config: Config, log: str | Path, gear_tolerance: float) -> Record:
             f"{record.path}: its samples are {record.sample_period:.4g} s apart, more than {_MOST_STEPS} plant steps of "
             f"{step:.3g} s ([run]); where the stamps are not in s, [log] t.unit says so"
         )
+    for effect in config.effects:
+        if fault := EFFECTS[effect.kind].fault(effect.model_dump(), record.sample_period):
+            raise InputError(f"{record.path}: {effect.kind}: {fault}")
     if record.torque is None:
         notes = (*record.notes, "No input torque was recorded: the drive is taken to move freely, without one.")
         record = dataclasses.replace(record, torque=np.zeros(len(record.time)), notes=notes)

@@ -159,7 +159,8 @@ def effect_path(experiment: Experiment, path: Path, from_rest: bool = False) -> 
 
     def sample(states: States, given: tuple[Any, Any]) -> tuple[States, tuple[States, Array]]:
         torque, motion = given
-        new, acting = plant.actuate(states, torque, period)
+        new, arriving = plant.receive(states, torque, period)
+        new, acting = plant.actuate(new, arriving(0.0, period), period)
         if motion is not None:
             time, position, rate = motion
             new = plant.remember(new, position, rate, time, period)

@@ -69,6 +69,9 @@ def right_side(t, y, u, law, effects, drive):
     u_dot = 0.0
     if "actuator.lag" in effects:
         u, u_dot = lagged, (u - lagged) / value("actuator.lag", "time_constant")
+    if "actuator.back_emf" in effects:
+        winding = effects["actuator.back_emf"]
+        u = winding["torque_constant"] * (u - winding["torque_constant"] * omega_e) / winding["resistance"]
 
     amplitude, n, phase = (value("transmission.eccentricity", key) for key in ("amplitude", "harmonic", "phase"))
     ratio = drive["gear_ratio"] - amplitude * n * np.cos(n * theta_s + phase)
@@ -121,19 +124,25 @@ def reference(law=sigmoid, effects=None, drive=DRIVE, start=START, torques=TORQU
     """(theta_e, theta_s, omega_e, omega_s) at the end of each hold, shape (holds, 4)."""
     y = [start["motor_position"], start["load_position"], start["motor_velocity"], start["load_velocity"], *[0.0] * 6]
     states = []
-    for k, u in enumerate(torques):
-        # max_step: an adaptive step must not leap over a gap
-        solution = solve_ivp(
-            right_side,
-            (k * hold, (k + 1) * hold),
-            y,
-            method="DOP853",
-            rtol=1e-12,
-            atol=1e-13,
-            max_step=0.02,
-            args=(u, law, effects or {}, drive),
-        )
-        y = solution.y[:, -1]
+    late = (effects or {}).get("actuator.delay", {"delay": 0.0})["delay"] / hold
+    # a delayed input changes within a hold
+    whole, edge = int(late), (late - int(late)) * hold
+    arriving = [*[0.0] * (whole + 1), *torques]
+    for k in range(len(torques)):
+        spans = [(0.0, edge, arriving[k]), (edge, hold, arriving[k + 1])] if edge else [(0.0, hold, arriving[k + 1])]
+        for start_of, end, u in spans:
+            # max_step: an adaptive step must not leap over a gap
+            solution = solve_ivp(
+                right_side,
+                (k * hold + start_of, k * hold + end),
+                y,
+                method="DOP853",
+                rtol=1e-12,
+                atol=1e-13,
+                max_step=0.02,
+                args=(u, law, effects or {}, drive),
+            )
+            y = solution.y[:, -1]
         states.append(y[:4])
     return np.array(states)
 
@@ -155,9 +164,12 @@ def _trajectory(plant, initial, torques, substeps, hold):
 
     def over(carry, torque):
         state, start = carry
+        effects, arriving = plant.receive(state.effects, torque, hold)
+        state = eqx.tree_at(lambda s: s.effects, state, effects)
 
         def advance(i, state):
-            return plant.advance(state, torque, start + i.astype(hold.dtype) * step, step)
+            since = i.astype(hold.dtype) * step
+            return plant.advance(state, arriving(since, step), start + since, step)
 
         state = jax.lax.fori_loop(0, substeps, advance, state)
         sides = [(part, side) for part in (state.position, state.velocity) for side in plant.drive.sides]

@@ -179,6 +179,22 @@ def test_a_block_on_a_spring_loses_two_friction_deflections_a_swing_and_sticks(d
     assert motor[-1] == pytest.approx(turning[-1], abs=tolerance)
 
 
+@pytest.mark.parametrize("samples", [0.0, 0.3, 1.0, 2.7, 16.0])
+def test_a_delayed_input_is_the_input_shifted(samples):
+    period, inputs = 2e-3, np.random.default_rng(0).standard_normal(40)
+    late = samples * period
+    drive = block(make_effect("actuator.delay", delay=late))
+    states, quarters = (drive.effects[0].init(),), 0.25 * period * np.arange(4)
+    for k, torque in enumerate(inputs):
+        states, arriving = drive.receive(states, torque, period)
+        for since in quarters:
+            # the mean of what was commanded so much earlier, zero before the first command
+            at = k * period + since - late + 0.25 * period * (np.arange(1000) + 0.5) / 1000
+            index = np.floor(at / period + 1e-9).astype(int)
+            expected = np.mean(np.where(index < 0, 0.0, inputs[np.maximum(index, 0)]))
+            assert arriving(since, 0.25 * period) == pytest.approx(expected, abs=5e-3)
+
+
 # Effects of other packages.
 
 
@@ -303,6 +319,7 @@ ORDINARY = {
     "saturation",
     "eccentricity",
     "hysteresis",
+    "delay",
     "tabulated",
     "flexibility",
 }

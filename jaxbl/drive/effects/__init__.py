@@ -19,7 +19,7 @@ from .loads import (
 )
 from .tables import Tabulated
 from .gear import Backlash, Hardening, Damping, Hysteresis, Eccentricity
-from .actuator import GainError, Saturation, Lag
+from .actuator import Delay, GainError, Saturation, Lag, BackEmf
 from .base import (
     EFFECTS,
     AbstractEffect,

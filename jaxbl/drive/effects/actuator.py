@@ -4,13 +4,50 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from ..parameters import Scalar
+from ..parameters import Scalar, parameter
 from .base import EFFECTS, ActuatorEffect, shape, size
 
 _LIMITS = 0.98, 0.95, 0.92, 0.88, 0.84, 0.8, 0.75, 0.7, 0.65, 0.6, 0.55, 0.5, 0.45, 0.4, 0.35, 0.3
 """Limits tried, over the largest commanded torque."""
+_KEPT = 16
+"""Samples that a delay may last: each is a state. Of buses and controllers, few last longer than 4."""
+_DELAYS = 0.5, 1.0, 2.0, 4.0, 8.0
+"""Delays tried, in samples."""
 _LAGS = 0.3, 0.6, 1.2, 2.4, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0
 """Time constants tried, in samples: by factors of about 2."""
+
+
+@EFFECTS.add
+class Delay(ActuatorEffect):
+    """Dead time of the torque, exact for an input held from sample to sample: u(t - T); before t = 0 it was zero."""
+
+    kind: ClassVar[str] = "delay"
+    rank: ClassVar[int] = 0
+    delay: Scalar = shape(
+        "s", "dead time T", lambda log: [samples * log.period for samples in _DELAYS], neutral=1e-30, minimum=0.0
+    )
+
+    def init(self):
+        return (jnp.zeros_like(self.delay),) * _KEPT
+
+    def settled(self, torque):
+        return (jnp.zeros_like(self.delay) + torque,) * _KEPT
+
+    def receive(self, state, torque, period):
+        commanded = (torque, *state)
+        late = jnp.clip(self.delay / period, 0.0, _KEPT)
+        # of the commands kept, the last to have arrived when the sample begins, and the next one
+        whole = jnp.minimum(jnp.floor(late), _KEPT - 1.0)
+        first, then = (
+            sum(jnp.where(whole == k, one, 0.0) for k, one in enumerate(some)) for some in (commanded[1:], commanded[:-1])
+        )
+        return commanded[:-1], first, then, (late - whole) * period
+
+    @classmethod
+    def fault(cls, numbers, period):
+        longest = _KEPT * period
+        text = f"delay: {numbers['delay']:g} s is longer than {_KEPT} samples; it should be at most {longest:g} s"
+        return text if numbers["delay"] > longest * (1.0 + 1e-9) else ""
 
 
 @EFFECTS.add
@@ -61,3 +98,21 @@ class Lag(ActuatorEffect):
         new = torque + (lagged - torque) * jnp.exp(-steps)
         # the mean over the step keeps the impulse
         return (new,), torque + (lagged - torque) * -jnp.expm1(-steps) / steps
+
+
+@EFFECTS.add
+class BackEmf(ActuatorEffect):
+    """A motor fed by voltage, the input u in V: torque k_t / R (u - k_t omega), without inductance (`actuator.lag` has it).
+    A diagnosis does not try it: back-EMF acts as a viscous friction of the motor."""
+
+    kind: ClassVar[str] = "back_emf"
+    rank: ClassVar[int] = 4
+    velocity_dependent: ClassVar[bool] = True
+    resistance: Scalar = parameter("ohm", "resistance R of the winding", above=0.0)
+    torque_constant: Scalar = parameter("N m/A", "torque constant k_t, which is that of the back-EMF in V s/rad", above=0.0)
+
+    def actuate(self, state, torque, step):
+        return state, self.torque_constant / self.resistance * torque
+
+    def resist(self, state, motion):
+        return self.torque_constant**2 / self.resistance * motion.velocity

@@ -27,9 +27,9 @@ PLACES = ("motor", "load", "transmission", "actuator")
 class Motion(NamedTuple):
     """What the torque of an effect may depend on: time in s, position in rad, velocity in rad/s.
 
-    Of its side; for an effect in the gear, the elastic deflection and its rate (for its memory, in the middle of the step).
-    `torque` is the input that acts, N m, in
-    :meth:`AbstractEffect.resist` of an effect on the motor; elsewhere 0.
+    Of its side (of an effect of the actuator, the motor); for an effect in the gear, the elastic deflection and its rate (to
+    `advance`, in the middle of the step). `torque` is the input that acts, N m, in :meth:`AbstractEffect.resist` of an
+    effect on the motor; elsewhere 0.
     """
 
     time: Value
@@ -174,6 +174,11 @@ class AbstractEffect(eqx.Module):
         """The own state after `step` seconds at a steady velocity. The plant calls it for both halves of a step."""
         return state
 
+    def receive(self, state: Any, torque: Value, period: Value) -> tuple[Any, Value, Value, Value]:
+        """What arrives of an input (N m) that is commanded for a sample of `period` seconds, before :meth:`actuate`: the own
+        state, the torque that goes on at first, the one after it, and the time in s at which they change."""
+        return state, torque, torque, 0.0
+
     def actuate(self, state: Any, torque: Value, step: Value) -> tuple[Any, Value]:
         """Turn the commanded torque (N m) into the one that acts over the next `step` seconds."""
         return state, torque
@@ -243,8 +248,9 @@ class AbstractEffect(eqx.Module):
         return all(least is None or numbers[name] > least for name, least in limits.items())
 
     @classmethod
-    def fault(cls, numbers: Mapping[str, Any]) -> str:
-        """What is wrong with the numbers of a study, beyond the range of each, and what would be right; "" if nothing is."""
+    def fault(cls, numbers: Mapping[str, Any], period: float) -> str:
+        """What is wrong with the numbers of a study whose samples are `period` seconds apart, beyond the range of each, and
+        what would be right; "" if nothing is."""
         return ""
 
     @classmethod
@@ -271,7 +277,8 @@ class TransmissionEffect(AbstractEffect):
 
 
 class ActuatorEffect(AbstractEffect):
-    """An effect on the input torque. Several act one after the other, in the order of the config.
+    """An effect on the input torque. Several act one after the other, in the order of the config; what it resists is taken
+    off the motor's torque.
 
     Those that a config does not list are put in the order of `rank`.
     """
@@ -343,7 +350,9 @@ def _check_neutral(effect: AbstractEffect) -> None:
     for time, position, velocity in ((0.0, 0.3, 2.0), (0.1, -1.7, -0.5), (0.2, 4.0, 0.0)):
         motion = Motion(*map(np.float64, (time, position, velocity, 0.7)))
         state = effect.advance(state, motion, 1e-3)
+        state, first, then, switch = effect.receive(state, motion.position, 1e-3)
         off = {
+            "receive": then + (first - then) * switch / 1e-3 - motion.position,
             "resist": effect.resist(state, motion),
             "dry_friction": effect.dry_friction(state, motion.velocity),
             "added_inertia": effect.added_inertia(),

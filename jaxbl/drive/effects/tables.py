@@ -30,7 +30,7 @@ class Tabulated(SideEffect):
         return of_position + _interpolated(motion.velocity, self.speeds, self.speed_torques)
 
     @classmethod
-    def fault(cls, numbers: Mapping[str, Any]) -> str:
+    def fault(cls, numbers: Mapping[str, Any], period: float) -> str:
         for points, torques in (("positions", "position_torques"), ("speeds", "speed_torques")):
             given = numbers[points]
             if len(given) != len(numbers[torques]):
