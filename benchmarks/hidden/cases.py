@@ -421,7 +421,7 @@ def _carry_out(seed: int, plans: list[_Plan]) -> list[Case | None]:
     return result
 
 
-_ORDER = ("actuator.gain_error", "actuator.saturation", "actuator.lag")
+_ORDER = ("actuator.delay", "actuator.gain_error", "actuator.saturation", "actuator.lag")
 
 
 def _ordered(effects: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -34,7 +34,7 @@ PINION = "transmission.pinion"
 """Eccentricity of the motor's wheel: to the package a `transmission.eccentricity` of as many periods as the ratio says."""
 NEW = (
     "motor.torque_ripple", PINION, "motor.presliding_friction", "load.presliding_friction",
-    "motor.cogging_harmonics", "transmission.hysteresis", "load.flexibility",
+    "motor.cogging_harmonics", "transmission.hysteresis", "load.flexibility", "actuator.delay",
 )  # fmt: skip
 """Effects of the kind `new`: other kinds keep their cases."""
 UNKNOWN = ("unknown.drifting_friction", "unknown.hysteresis", "unknown.dent", "unknown.random_torque")
@@ -253,6 +253,13 @@ def _shape(
                 lambda c: {"limit": top / (1.0 + c)},
                 lambda c: u - np.clip(u, -top / (1.0 + c), top / (1.0 + c)), 0.0, math.inf,
             )  # fmt: skip
+        case "delay":
+            # of whole samples; controllers and buses have a few
+            def shifted(c: float) -> np.ndarray:
+                late = _samples_of(c, motion.period)
+                return u - np.concatenate([np.zeros(late), u[: len(u) - late]])
+
+            return lambda c: {"delay": _samples_of(c, motion.period) * motion.period}, shifted, 0.0, math.inf
         case "lag":
             return lambda c: {"time_constant": c}, lambda c: u - _lagged(u, motion.period, c), 0.0, math.inf
         case "presliding_friction":
@@ -283,6 +290,10 @@ def dahl(v: np.ndarray, period: float, length: float) -> np.ndarray:
         way, end = abs(v[k]) * period / length, math.copysign(1.0, v[k])
         w[k] = end + (w[k - 1] - end) * math.exp(-way)
     return w
+
+
+def _samples_of(delay: float, period: float) -> int:
+    return int(min(max(round(delay / period), 1), 12))
 
 
 def _lagged(u: np.ndarray, period: float, time_constant: float) -> np.ndarray:

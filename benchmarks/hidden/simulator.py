@@ -38,7 +38,7 @@ loop kp kd filter motor_noise motor_resolution torque_limit period steps origin
 ripple_amplitude ripple_harmonic ripple_phase
 motor_bristle load_bristle bristle_torque bristle_excess bristle_stribeck bristle_damping
 base_harmonic base_sine base_cosine base_sine_2 base_cosine_2 base_sine_3 base_cosine_3
-shaft_torque shaft_length third_motor third_load third_rate third_damping"""
+shaft_torque shaft_length third_motor third_load third_rate third_damping delayed"""
 _ROWS = _NAMES.split()
 P = SimpleNamespace(**{name: i for i, name in enumerate(_ROWS)})
 """Row of each number in the parameters of a lane."""
@@ -157,6 +157,8 @@ def pack(run: Run, step: float = STEP) -> np.ndarray:
     values["gap"] = float(law.get("law") == "dead_zone")
     for effect in machine.effects:
         _add(values, effect, machine.rigid)
+        if effect["kind"] == "actuator.delay":  # in whole samples
+            values["delayed"] = float(round(effect["delay"] / run.period))
     with_memory = [values[name] != 0.0 for name in ("motor_hysteresis", "load_hysteresis", "motor_bristle", "load_bristle")]
     if sum(with_memory) > 1:
         raise ValueError("one effect of a machine may have a memory")
@@ -217,6 +219,8 @@ def _add(values: dict[str, float], effect: Mapping[str, Any], rigid: bool) -> No
             values["gain"] *= 1.0 + get("relative")
         case "saturation":
             values["limit"] = get("limit")
+        case "delay":
+            pass
         case "lag":
             values["lag_rate"] = 1.0 / get("time_constant")
         case "drifting_friction":
@@ -475,7 +479,7 @@ def _compiled() -> Any:
     attempt, begin, first, control, acting, held = (
         engine.attempt, engine.begin, engine.first, engine.control, engine.acting, engine.held,
     )  # fmt: skip
-    period, steps, origin = P.period, P.steps, P.origin
+    period, steps, origin, delayed = P.period, P.steps, P.origin, P.delayed
 
     @numba.njit(parallel=True)
     def run(parameters, lengths, initial, torque, reference, rate, unit, noise, command, readings, states):
@@ -492,7 +496,8 @@ def _compiled() -> Any:
                 command[lane, k], readings[lane, k] = u, previous
                 for i in range(4):
                     states[lane, i, k] = y[i]
-                u = acting(p, u)
+                late = int(p[delayed])
+                u = acting(p, command[lane, k - late] if k >= late else initial[lane, 4])
                 slope = (noise[lane, k + 1] - noise[lane, k]) / p[period]
                 modes = begin(p, y, modes, start, u, lagged, noise[lane, k])
                 s, h, tries = 0.0, p[period] / p[steps], 0
@@ -527,7 +532,8 @@ def _vectorised() -> Any:
             command[order, k], readings[order, k] = u, previous
             for i in range(4):
                 states[order, i, k] = y[i]
-            u = engine.acting(p, u)
+            at = k - p[P.delayed].astype(int)
+            u = engine.acting(p, np.where(at >= 0, command[order, np.maximum(at, 0)], initial[order, 4]))
             n0 = noise[order, k]
             slope = (noise[order, k + 1] - n0) / p[P.period]
             modes = engine.begin(p, y, modes, start, u, lagged, n0)

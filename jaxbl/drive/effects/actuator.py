@@ -103,7 +103,8 @@ class Lag(ActuatorEffect):
 @EFFECTS.add
 class BackEmf(ActuatorEffect):
     """A motor fed by voltage, the input u in V: torque k_t / R (u - k_t omega), without inductance (`actuator.lag` has it).
-    A diagnosis does not try it: back-EMF acts as a viscous friction of the motor."""
+    Of a log in V, `[log] u` has the factor 1. A diagnosis does not try it: back-EMF acts as a viscous friction of the motor.
+    """
 
     kind: ClassVar[str] = "back_emf"
     rank: ClassVar[int] = 4
