@@ -9,7 +9,7 @@ from jaxbl.validation import nearest
 
 from .files import LogFile
 from .signal_quality import resolution
-from .table import POSITION_CHANNELS, LogTable, PositionTable, TorqueTable
+from .table import POSITION_CHANNELS, SPEED_CHANNELS, LogTable, PositionTable, SpeedTable, TorqueTable
 from .time_stamps import TimeStamps
 
 
@@ -39,13 +39,20 @@ def read_channels(file: LogFile, table: LogTable, stamps: TimeStamps) -> dict[st
     found: dict[str, RawChannel] = {}
     linear = False
     for name in POSITION_CHANNELS.values():
-        if _is_recorded(file, table, name):
+        speed = getattr(table, SPEED_CHANNELS[name])
+        if speed is not None:
+            linear |= speed.si_unit == "m" and not found
+            found[name] = _integral(file, name, speed, stamps)
+        elif _is_recorded(file, table, name):
             position = getattr(table, name) or PositionTable()
             linear |= position.si_unit == "m" and not found
             found[name] = _position(file, name, position, stamps)
     if not found:
         columns = ", ".join(map(str, file.columns))
-        raise file.wrong(f"no column 'theta_e' or 'theta_s'; columns: {columns}; [log] theta_e can name the motor position")
+        raise file.wrong(
+            f"no column 'theta_e' or 'theta_s'; columns: {columns}; [log] theta_e can name the motor position, "
+            "omega_e its speed"
+        )
     torques = {"u": table.u or TorqueTable()} if _is_recorded(file, table, "u") else {}
     if table.transmitted is not None:
         torques["transmitted"] = table.transmitted
@@ -64,7 +71,8 @@ def _is_recorded(file: LogFile, table: LogTable, name: str) -> bool:
         names = list(file.columns)
         hint = "the file has no header" if all(isinstance(n, int) for n in names) else nearest("u", map(str, names))
         raise file.wrong(f"no column 'u'; {hint}; [log] u can name it, absent = [\"u\"] says that there is none")
-    used = {t.column for t in (table.t, table.u, table.theta_e, table.theta_s) if t is not None}
+    given = (table.t, table.u, table.theta_e, table.theta_s, table.omega_e, table.omega_s)
+    used = {t.column for t in given if t is not None}
     for other in file.columns:
         near = isinstance(other, str) and other.lower().replace("_", "").replace(" ", "") == name.replace("_", "")
         if near and other not in used:
@@ -112,6 +120,30 @@ def _position(file: LogFile, name: str, table: PositionTable, stamps: TimeStamps
     }[table.unit]
     values = table.sign * table.factor * one * values + (table.offset or 0.0)
     return RawChannel(values, table.si_unit, 0.0, table.skew or 0.0, held=False)
+
+
+_SPEED = {
+    "rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0, "turn/s": 2.0 * math.pi, "m/s": 1.0, "mm/s": 1e-3,
+}  # fmt: skip
+"""Unit of a speed -> rad/s (m/s)."""
+
+
+def _integral(file: LogFile, name: str, table: SpeedTable, stamps: TimeStamps) -> RawChannel:
+    """A position from its speed by the trapezoidal rule, 0 at the first row."""
+    channel = SPEED_CHANNELS[name]
+    column = table.column_or(channel)
+    values = _numbers(file, channel, column, table.signed_bits, stamps)
+    if np.ptp(values) == 0.0:
+        raise file.wrong(f"column {column!r} ({channel}) is {values[0]:g} in all rows; it should change")
+    step = resolution(values)
+    speed = table.sign * table.factor * _SPEED[table.unit] * values + table.offset
+    position = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(stamps.times))])
+    coarse = f" in steps of {step * table.factor:.3g} {table.unit}" if step else ""
+    file.warnings.append(
+        f"{name} is the integral of the speed {channel}{coarse}: its errors add up over time. More than noise may be "
+        "left where the model is complete, and what depends on the place of the load is found only roughly."
+    )
+    return RawChannel(position, table.si_unit, 0.0, table.skew, held=False)
 
 
 def _torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamps, *, linear: bool) -> RawChannel:

@@ -22,12 +22,22 @@ from jaxbl.validation import nearest
 _KINDS = "text (CSV and the like), Parquet, MATLAB (.mat) and JSON can be read"
 
 
+class Columns(dict[str | int, Any]):
+    """Columns of a file by name, with the units that the file says, and remarks on how it was read."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.units: dict[str | int, str] = {}
+        self.notes: list[str] = []
+
+
 class LogFile:
     """A log file as it is being read.
 
     Attributes:
         path: the file.
         columns: name -> values, one-dimensional; numbers in place of names where the file has none.
+        units: those that the file itself says, by column.
         notes: what was done to the log, and what is odd about it, in sentences.
         warnings: those to be said first.
         corrections: as of a record.
@@ -35,7 +45,8 @@ class LogFile:
 
     def __init__(self, path: Path, columns: dict[str | int, Any]):
         self.path, self.columns = path, columns
-        self.notes: list[str] = []
+        self.units = columns.units if isinstance(columns, Columns) else {}
+        self.notes = [*columns.notes] if isinstance(columns, Columns) else []
         self.warnings: list[str] = []
         self.corrections: dict[str, float] = {}
 
@@ -144,6 +155,8 @@ _NO_ROWS = "has a header and no rows; a log needs rows of numbers"
 def _text(text: str) -> dict[str | int, Any]:
     """Comma, semicolon, tab or white space between columns; a header or none; # before remarks."""
     lines = text.splitlines()
+    if (block := _behind_remarks(lines)) is not None:
+        return block
     skipped = next((i for i, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), None)
     if skipped is None:
         raise InputError("holds only remarks; rows of numbers are needed")
@@ -178,6 +191,74 @@ def _text(text: str) -> dict[str | int, Any]:
     if not len(frame):
         raise InputError(_NO_ROWS)
     return {name if isinstance(name, str) else int(name): frame[name].to_numpy() for name in frame.columns}
+
+
+_REMARKS = 100
+"""Lines that a program may write before the rows: exports of drive software and of scopes have ten to thirty."""
+
+
+def _behind_remarks(lines: list[str]) -> Columns | None:
+    """Rows behind a block of remarks, as EPOS Studio and TwinCAT Scope write them; None where there is no such block.
+
+    The lines just before the rows hold names and, below, units; TwinCAT's the word Name over each column of times.
+    """
+    start = next((i for i in range(min(len(lines) - 2, _REMARKS)) if _is_row(lines[i]) and _is_row(lines[i + 1])), 0)
+    head = [line for line in lines[:start] if line.strip() and not line.lstrip().startswith("#")]
+    if len(head) < 2:
+        return None
+    separator = next((c for c in ";\t," if c in lines[start]), None)
+    if separator is None:
+        return None
+    count = len(_cells(lines[start], separator))
+    known = any(mark in line for line in head for mark in ("EPOS Studio", "Starttime of export"))
+    if not known and len(_cells(head[0], separator)) == count:
+        return None
+    rows = [line for line in lines[start:] if line.strip() and line.strip() != "EOF"]
+    sample = "\n".join(rows[:50])
+    decimal = "," if separator != "," and re.search(r"\d,\d", sample) and not re.search(r"\d\.\d", sample) else "."
+    with _reading("a table"):
+        frame = pd.read_csv(
+            io.StringIO("\n".join(rows)), sep=separator, header=None, decimal=decimal, skipinitialspace=True, index_col=False
+        )
+    titles = [_cells(line, separator) for line in head]
+    titles = [cells[:count] for cells in titles if len(cells) >= count]
+    scope = [cells for cells in titles if cells[0] == "Name"]
+    names = scope[-1] if scope else titles[-2] if len(titles) > 1 else titles[-1] if titles else []
+    units = titles[-1] if len(titles) > 1 and not scope else []
+    return _together([frame[i].to_numpy() for i in range(count)], names, units)
+
+
+def _is_row(line: str) -> bool:
+    """Whether a line holds two numbers or more, and nothing else."""
+    separator = next((c for c in ";\t," if c in line), None)
+    cells = [] if separator is None else _cells(line, separator)
+    cells = cells[:-1] if cells and not cells[-1] else cells
+    return len(cells) > 1 and all(_NUMBER.fullmatch(cell) for cell in cells)
+
+
+def _together(values: list[np.ndarray], names: list[str], units: list[str]) -> Columns:
+    """Columns with their names; those with times of their own at the times of the first."""
+    found, times = Columns(), values[0]
+    own = times
+    for i, column in enumerate(values):
+        name = names[i] if i < len(names) else ""
+        if i == 0 or name == "Name":
+            own = column
+            if i:
+                continue
+            name = "t"
+        elif not np.array_equal(own, times, equal_nan=True):
+            inside = np.isfinite(own) & np.isfinite(column)
+            column = np.interp(times, own[inside], column[inside])
+            found.notes.append(f"'{name}' has times of its own; its values are interpolated to the others' times.")
+        name = name or f"column {i}"
+        found[name] = column
+        if i < len(units) and units[i]:
+            found.units[name] = units[i]
+    if found.units:
+        said = ", ".join(f"{name} {unit}" for name, unit in found.units.items())
+        found.notes.append(f"Units by the file itself, which [log] has to repeat: {said}.")
+    return found
 
 
 def _cells(line: str, separator: str) -> list[str]:

@@ -160,9 +160,9 @@ _FAR = 10.0
 factor of two."""
 
 
-_FAR_TORQUE = 300.0
-"""Factor between the torque and what the nominal drive needs from which on a unit is rather wrong: a drive that creeps
-against dry friction needs a hundred times the torque of its inertia."""
+_FAR_TORQUE = 1000.0
+"""Factor between the torque and what the nominal inertia needs from which on a unit is rather wrong: mN m for N m. A screw
+that turns slowly against dry friction needs six hundred times the torque of its inertia."""
 
 
 def warn_inertia(file: LogFile, found: RigidFit, channel: str, nominal: NominalDrive) -> None:

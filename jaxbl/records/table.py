@@ -116,6 +116,24 @@ class PositionTable(_ChannelTable):
         return "m" if self.unit in ("m", "mm") else "rad"
 
 
+class SpeedTable(_ChannelTable):
+    """A speed that was recorded in place of a position; the position is its integral."""
+
+    unit: Literal["rad/s", "deg/s", "rpm", "turn/s", "m/s", "mm/s"] = Field(
+        default="rad/s", description="unit of the column"
+    )
+    factor: float = Field(default=1.0, gt=0.0, description="units in one number of the column")
+    offset: float = Field(default=0.0, description="added to the speed, in rad/s (m/s)", json_schema_extra={"unit": "rad/s"})
+    skew: float = Field(
+        default=0.0, description="by how much the stamps are later than the readings, undone", json_schema_extra=_SECONDS
+    )
+
+    @property
+    def si_unit(self) -> str:
+        """Of its integral: m on a linear axis, else rad."""
+        return "m" if self.unit in ("m/s", "mm/s") else "rad"
+
+
 class TorqueTable(_ChannelTable):
     """A torque's column (force on a linear axis), or that of a voltage, current or duty that stands for it."""
 
@@ -146,6 +164,9 @@ _ChannelName = Literal["u", "theta_e", "theta_s"]
 POSITION_CHANNELS = {"motor": "theta_e", "load": "theta_s"}
 """Side of the drive -> the channel of its encoder."""
 
+SPEED_CHANNELS = {"theta_e": "omega_e", "theta_s": "omega_s"}
+"""Channel of a position -> that of the speed which may stand in its place."""
+
 _Plain = Annotated[bool | int | float | str, BeforeValidator(_is_plain)]
 
 
@@ -161,6 +182,8 @@ class LogTable(StrictTable):
     u: TorqueTable | None = Field(default=None, description="input torque on the motor shaft; left out: column u, in N m")
     theta_e: PositionTable | None = Field(default=None, description="motor position; left out: column theta_e, in rad")
     theta_s: PositionTable | None = Field(default=None, description="load position; left out: column theta_s, in rad")
+    omega_e: SpeedTable | None = Field(default=None, description="motor speed, in place of theta_e; left out: none")
+    omega_s: SpeedTable | None = Field(default=None, description="load speed, in place of theta_s; left out: none")
     transmitted: TorqueTable | None = Field(default=None, description="measured transmitted torque; left out: none")
     absent: list[_ChannelName] | None = Field(
         default=None, description="channels that were not recorded, of u, theta_e, theta_s; left out: none"
@@ -192,6 +215,11 @@ class LogTable(StrictTable):
         for name in absent:
             if getattr(self, name) is not None:
                 raise wrong(f"{name} is described and said to be absent; remove one of them")
+        for theta, omega in SPEED_CHANNELS.items():
+            if getattr(self, omega) is not None and (getattr(self, theta) is not None or theta in absent):
+                raise wrong(
+                    f"{omega} stands in place of {theta}, which is described or said to be absent; remove one of them"
+                )
         if "theta_e" in absent and "theta_s" in absent:
             raise wrong("absent: a log without theta_e and theta_s has no position; one of them is needed")
         if self.theta_e is not None and self.theta_e.skew == "estimate":
@@ -203,4 +231,4 @@ class LogTable(StrictTable):
     @property
     def load_unit(self) -> str:
         """Of the load position and the twist: m on a linear axis, else rad."""
-        return (self.theta_s or PositionTable()).si_unit
+        return (self.omega_s or self.theta_s or PositionTable()).si_unit

@@ -163,3 +163,48 @@ def test_columns_that_are_not_there_or_not_numbers(case, tmp_path):
     (tmp_path / "log.csv").write_text(content)
     with pytest.raises(InputError, match=message):
         read_log_file(tmp_path / "log.csv").numbers(column)
+
+
+EPOS = """Date:;2020-07-09 22:31:10
+EPOS Studio Version:;3.6.1.0
+Sampling period:;40.000
+"Trigger:;1;0.000000;""Channel 1"";x"
+;Velocity actual value averaged;Torque actual value averaged
+ms;rpm;%
+0.000;0;0.5
+40.000;-3;1.5
+80.000;7;2.5
+"""
+SCOPE = """Name\tproject
+File\tlog.csv
+Starttime of export\t132959733843760000\tMontag, 2. Mai 2022\t15:56:24.376
+
+
+Name\tposition\tcurrent\tName\tfast
+Data-Type\tREAL64\tREAL64\tData-Type\tREAL32
+SampleTime[ms]\t2\t2\tSampleTime[ms]\t1
+
+0\t0,5\t1\t0\t0
+2\t1,5\t2\t1\t10
+4\t2,5\t3\t2\t20
+EOF
+"""
+
+
+def test_exports_with_remarks_before_their_rows(tmp_path):
+    (tmp_path / "epos.csv").write_bytes(EPOS.replace("\n", "\r\n").encode())
+    file = read_log_file(tmp_path / "epos.csv")
+    assert list(file.columns) == ["t", "Velocity actual value averaged", "Torque actual value averaged"]
+    np.testing.assert_array_equal(file.numbers(1), [0.0, -3.0, 7.0])
+    assert file.units["t"] == "ms" and file.units["Torque actual value averaged"] == "%"
+    assert file.notes == [
+        "Units by the file itself, which [log] has to repeat: t ms, Velocity actual value averaged rpm, Torque actual value "
+        "averaged %."
+    ]
+    (tmp_path / "scope.csv").write_text(SCOPE)
+    file = read_log_file(tmp_path / "scope.csv")
+    assert list(file.columns) == ["t", "position", "current", "fast"]
+    np.testing.assert_array_equal(file.numbers("position"), [0.5, 1.5, 2.5])
+    # sampled at times of its own: the last is before those of the others
+    np.testing.assert_array_equal(file.numbers("fast"), [0.0, 20.0, 20.0])
+    assert file.notes == ["'fast' has times of its own; its values are interpolated to the others' times."]

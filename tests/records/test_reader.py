@@ -653,3 +653,26 @@ def test_logs_that_are_not_alike(logs, tmp_path):
     free = read_record(tmp_path / "free.csv", {"absent": ["u"]})
     with pytest.raises(InputError, match=r"free\.csv: has no torque, which .*a\.csv has"):
         join([first, free])
+
+
+def test_a_speed_stands_for_a_position(tmp_path):
+    frame = made()
+    rpm = np.gradient(frame["theta_e"], frame["t"]) * 30.0 / math.pi
+    path = wrote(tmp_path, frame.assign(speed=-rpm).drop(columns="theta_e"))
+    record = read_record(path, {"omega_e": {"column": "speed", "unit": "rpm", "sign": -1}}, gear_ratio=GEAR_RATIO)
+    motion = frame["theta_e"] - frame["theta_e"][0]
+    np.testing.assert_allclose(record.positions["motor"], motion, atol=2e-3)
+    assert record.warnings[0].startswith("theta_e is the integral of the speed omega_e: its errors add up over time.")
+    with pytest.raises(InputError, match="omega_e stands in place of theta_e, which is described"):
+        read_record(path, {"omega_e": "speed", "theta_e": "theta_s"})
+    with pytest.raises(InputError, match=r"\[log\] theta_e can name the motor position, omega_e its speed"):
+        read_record(path, {"absent": ["theta_s"]})
+
+
+def test_an_export_of_drive_software_is_read_as_it_is():
+    """Screw drives (TRO 2021): remarks, names, units, speed in place of a position."""
+    log = {"t": {"unit": "ms"}, "omega_e": {"column": 1, "unit": "rpm"}, "u": {"column": 2, "factor": 9.84e-5}}
+    record = read_record(real("screw_drives/experiments/driveNo2/start_stop/50.csv"), log)
+    assert record.sample_period == pytest.approx(0.04, rel=1e-7) and len(record.time) == 500
+    speed = np.diff(record.positions["motor"]) / 0.04 * 30.0 / math.pi
+    assert np.abs(speed).max() == pytest.approx(53.0, abs=3.0)
