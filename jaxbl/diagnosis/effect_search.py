@@ -121,6 +121,7 @@ class Explanation:
         wrong: the best model with another effect in place of the last finding, or None.
         rest: gain in evidence (nats) of each free function of time, position or velocity, and its most likely size among
             those tried, as a share of the driving torque.
+        general: effects that were tried in place of a finding and contain it, and their numbers.
     """
 
     verdict: VerdictName
@@ -129,6 +130,7 @@ class Explanation:
     nominal: Model
     wrong: Model | None
     rest: dict[str, tuple[float, float]]
+    general: Mapping[str, Numbers] = dataclasses.field(default_factory=dict)
 
 
 class _Scored(NamedTuple):
@@ -336,7 +338,8 @@ class EffectSearch:
             left = _most(rest)
         heat = self._heat(current) if left > CLEAR and found else 1.0
         findings = tuple(_finding(one, current, heat) for one in found.values())
-        return Explanation(_verdict(left, findings), findings, current, nominal, wrong, rest)
+        general = {one.name: one.numbers for name, tried in found.items() for one in tried if contains(one.name, name)}
+        return Explanation(_verdict(left, findings), findings, current, nominal, wrong, rest, general)
 
     def _heat(self, model: Model) -> float:
         """By how much evidence is overstated where errors are correlated: variance of the effects' numbers over what it were
@@ -354,7 +357,7 @@ class EffectSearch:
         model = self.refit(kept, theta, model.linear.choose(()))
         rest = self.remainder(model)
         findings = tuple(one for one in found.findings if one.effect in kept)
-        return Explanation(_verdict(_most(rest), findings), findings, model, found.nominal, None, rest)
+        return Explanation(_verdict(_most(rest), findings), findings, model, found.nominal, None, rest, found.general)
 
     def adopted(
         self, found: Explanation, numbers: Mapping[str, Numbers], theta: np.ndarray, findings: Sequence[Finding]
@@ -363,7 +366,7 @@ class EffectSearch:
         values = {name: dict(one) for name, one in numbers.items()}
         model = dataclasses.replace(found.model, numbers=values, theta=theta, linear=self.linear(values, theta))
         rest = self.remainder(model)
-        return Explanation(_verdict(_most(rest), findings), tuple(findings), model, found.nominal, None, rest)
+        return Explanation(_verdict(_most(rest), findings), tuple(findings), model, found.nominal, None, rest, found.general)
 
     def _fewest(self, model: Model, found: dict[str, list[_Tried]], left: float) -> tuple[Model, dict[str, list[_Tried]]]:
         """Where something unknown remains: only effects with a good part of its gain, and of those that differ by less than

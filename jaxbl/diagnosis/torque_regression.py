@@ -75,7 +75,15 @@ def _with_one_more(search: EffectSearch, found: Explanation, log: ReferenceLog) 
     now = fit_model(search, model.numbers, model.theta)
     compared = log.compare(now.experiment)
     tried: list[_Tried] = []
-    for one in _proposals(search, model, compared.torques, log)[:_TRIED]:
+    proposed = _proposals(search, model, compared.torques, log)[:_TRIED]
+    # what the search preferred a simpler effect to
+    given = {one.name for one in proposed}
+    proposed += [
+        _Proposal(name, numbers, 0.0)
+        for name, numbers in found.general.items()
+        if name not in given and any(contains(name, one) for one in model.names)
+    ]
+    for one in proposed:
         kept = {name: numbers for name, numbers in now.numbers.items() if not _replaced(name, one.name)}
         fitted = fit_model(search, kept | {one.name: one.numbers}, now.theta[: len(search.free)])
         if not EFFECTS[one.name].possible(fitted.numbers[one.name]):
