@@ -33,6 +33,8 @@ _TRIED = 3
 """Candidates of a regression that are put into the model."""
 _SURE = 1.0
 """Standard errors by which a model has to be better on the log; held-out data decide later."""
+_NAMED = 0.9
+"""Confidence from which on an effect is named: below it the missing torque is not that of one effect."""
 _ADDED = 3
 """Effects that are added at most."""
 
@@ -104,7 +106,9 @@ def _with_one_more(search: EffectSearch, found: Explanation, log: ReferenceLog) 
             rivals[name] = best.z
     chances = {name: float(norm.cdf(-z)) for name, z in rivals.items()}
     alternatives = tuple((name, one) for name, one in chances.items() if one > LEAST_CHANCE)
-    confidence = max(1.0 - sum(chances.values()), 0.5)
+    confidence = 1.0 - sum(chances.values())
+    if confidence < _NAMED:
+        return None
     findings.append(Finding(best.name, confidence, best.fitted.numbers[best.name], alternatives))
     return search.adopted(found, best.fitted.numbers, best.fitted.theta[: len(search.free)], findings)
 
