@@ -77,14 +77,10 @@ def _with_one_more(search: EffectSearch, found: Explanation, log: ReferenceLog) 
     now = fit_model(search, model.numbers, model.theta)
     compared = log.compare(now.experiment)
     tried: list[_Tried] = []
-    proposed = _proposals(search, model, compared.torques, log)[:_TRIED]
-    # what the search preferred a simpler effect to
-    given = {one.name for one in proposed}
-    proposed += [
-        _Proposal(name, numbers, 0.0)
-        for name, numbers in found.general.items()
-        if name not in given and any(contains(name, one) for one in model.names)
-    ]
+    # what the search preferred a simpler effect to, with the numbers that it had there
+    general = {name: one for name, one in found.general.items() if any(contains(name, other) for other in model.names)}
+    proposed = [_Proposal(name, numbers, 0.0) for name, numbers in general.items()]
+    proposed += [one for one in _proposals(search, model, compared.torques, log) if one.name not in general][:_TRIED]
     for one in proposed:
         kept = {name: numbers for name, numbers in now.numbers.items() if not _replaced(name, one.name)}
         fitted = fit_model(search, kept | {one.name: one.numbers}, now.theta[: len(search.free)])
