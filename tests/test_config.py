@@ -88,7 +88,14 @@ overlays = ["davila_fridman", "seeber_horn", "exact"]
 """
 
 # a value in range for every parameter that has no default
-NUMBERS = {"amplitude": 0.1, "frequency": 0.3, "start_frequency": 0.1, "stop_frequency": 2.0, "relative": 0.05}
+NUMBERS = {
+    "amplitude": 0.1,
+    "frequency": 0.3,
+    "start_frequency": 0.1,
+    "stop_frequency": 2.0,
+    "relative": 0.05,
+    "delay": 0.01,
+}
 
 # effects by kind with every parameter given
 TABLES = {
@@ -383,8 +390,9 @@ def test_every_effect_is_built_with_its_numbers_and_its_name(name):
     for key, value in TABLES[name].items():
         if key != "kind":
             assert getattr(effect, key) == value
-            moved = with_values(config, {f"effects.{name}.{key}": 0.7})
-            assert getattr(moved.build().effects[0], key) == 0.7
+            new = 0.5 * value if key == "delay" else 0.7
+            moved = with_values(config, {f"effects.{name}.{key}": new})
+            assert getattr(moved.build().effects[0], key) == new
 
 
 @pytest.mark.parametrize("data", [small(effects=[TABLES["motor.cogging"], *[TABLES["load.gravity"]] * 2]), rigid()])
@@ -471,6 +479,12 @@ def test_any_mutation_is_valid_or_an_input_error_of_one_line(mutations):
 def test_inertia_effects_must_leave_some():
     with pytest.raises(InputError, match=r"motor.inertia leaves a total inertia of .* on the motor"):
         read_config(rigid(effects=[{"kind": "motor.inertia", "inertia": -1e3}]))
+
+
+def test_a_delay_lasts_no_longer_than_what_is_kept():
+    delay = [{"kind": "actuator.delay", "delay": 0.0161}]
+    with pytest.raises(InputError, match=r"effects\[0\]: actuator.delay: delay: 0.0161 s .* at most 0.016 s"):
+        read_config(rigid({"run.sample_period": 1e-3}, effects=delay))
 
 
 def files(folder, **texts):

@@ -301,6 +301,7 @@ class Linear:
         self.signals = [MotionTorques(self.experiment, part) for part in self.parts]
         self.count = sum(int(one.real.sum()) for one in self.signals)
         self.states = self.parts[0].defect.shape[1]
+        self.input_gain = self.experiment.plant.input_gain
         self.drive, self.driven = self._drive()
         self._scales: dict[str, Scales] = {}
         # what the last search chose, and what the one without candidates did, which is asked for again and again
@@ -309,7 +310,7 @@ class Linear:
 
     def _drive(self) -> tuple[float, bool]:
         """Size of the torques, N m rms at the motor: the input's; where there is none, what the motion takes. And which."""
-        driving = rms(np.concatenate([one.torque[one.real] for one in self.signals]))
+        driving = self.input_gain * rms(np.concatenate([one.torque[one.real] for one in self.signals]))
         taken = [
             float(self.experiment.plant.inertia(side)) / one.over(side) * np.asarray(one.part.acceleration[side])[one.real]
             for one in self.signals
@@ -519,7 +520,7 @@ class Linear:
 
     def _power(self, torques: np.ndarray, signals: MotionTorques) -> np.ndarray:
         """Sums of squares of torques, referred to the motor."""
-        over = np.array([*(signals.over(side) for side in self.sides), 1.0])
+        over = np.array([*(signals.over(side) for side in self.sides), 1.0 / self.input_gain])
         return np.einsum("cts,cts->cs", torques, torques) @ over**-2.0
 
     def shown(self) -> float:

@@ -210,6 +210,12 @@ class Plant(eqx.Module):
         return tuple(new), torque
 
     @property
+    def input_gain(self) -> float:
+        """Torque on the motor for one unit of the input, which may be a voltage: of a small one that has lasted."""
+        states = tuple(effect.settled(_SMALL) for effect in self.effects)
+        return float(self.actuate(states, _SMALL, _LONG)[1]) / _SMALL
+
+    @property
     def memory(self) -> bool:
         """Whether some effect's own state depends on how the drive moves."""
         return any(type(effect).advance is not AbstractEffect.advance for effect in self.effects)
@@ -291,6 +297,10 @@ class Plant(eqx.Module):
         """Effects of a place, each with its own state."""
         pairs = zip(self.effects, states, strict=True)
         return [(effect, own) for effect, own in pairs if self.drive.place(effect.place) == place]
+
+
+_SMALL, _LONG = 1e-6, 1e9
+"""Input below every limit, and a time in s after which nothing lags behind."""
 
 
 def _mean(first: Scalar, then: Scalar, switch: Scalar, since: Scalar, step: Scalar) -> Scalar:

@@ -179,6 +179,12 @@ def test_a_block_on_a_spring_loses_two_friction_deflections_a_swing_and_sticks(d
     assert motor[-1] == pytest.approx(turning[-1], abs=tolerance)
 
 
+def test_the_gain_of_the_input_is_that_of_small_ones():
+    chain = made({name: numbers for name, numbers in VALUES.items() if name.startswith("actuator.")})
+    assert block(*chain).input_gain == pytest.approx(1.1 * 0.02 / 0.01)
+    assert block().input_gain == 1.0
+
+
 @pytest.mark.parametrize("samples", [0.0, 0.3, 1.0, 2.7, 16.0])
 def test_a_delayed_input_is_the_input_shifted(samples):
     period, inputs = 2e-3, np.random.default_rng(0).standard_normal(40)
