@@ -57,7 +57,7 @@ def jit(function: Callable[..., Result]) -> Callable[..., Result]:
             return function(*args, **kwargs)
         if kept.keeping() is None:
             return compiled()(*args, **kwargs)
-        arrays = [jnp.asarray(leaf) for leaf in leaves if eqx.is_array(leaf)]
+        arrays = [leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in leaves if eqx.is_array(leaf)]
         rest = tuple(_Array() if eqx.is_array(leaf) else leaf for leaf in leaves)
         key = function, structure, rest, tuple((one.shape, one.dtype, one.aval.weak_type) for one in arrays)
         program = _programs.get(key)
