@@ -91,14 +91,23 @@ def progress_bar(unit: str) -> "Iterator[Progress | None]":
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from .workers import listening
+
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn(unit), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("compiling", total=None)
+        heard = False
 
         def update(done: int, total: int) -> None:
-            bar.update(task, description="running", completed=done, total=total)
+            bar.update(task, description=None if heard else "running", completed=done, total=total)
 
-        yield update
+        def hear(what: str) -> None:
+            nonlocal heard
+            heard = True
+            bar.update(task, description=what)
+
+        with listening(hear):
+            yield update
 
 
 def duration(seconds: float) -> str:

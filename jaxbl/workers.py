@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -20,10 +20,28 @@ Result = TypeVar("Result")
 Progress = Callable[[int, int], None]
 """Called with the number of finished and of all lanes."""
 
+_listeners: list[Callable[[str], None]] = []
+
 _MEMORY = 5 * 2**30
 """Bytes that a process is granted: after twenty logs of many lengths one held 4.7e9."""
 _MOST_MAPPINGS = 30_000
 """Half of what Linux allows a process by default."""
+
+
+@contextmanager
+def listening(listener: Callable[[str], None]) -> Iterator[None]:
+    """Hear what is being done (:func:`doing`)."""
+    _listeners.append(listener)
+    try:
+        yield
+    finally:
+        _listeners.remove(listener)
+
+
+def doing(what: str) -> None:
+    """Say what is being done now, in a few words: the progress line of a terminal shows it."""
+    for listener in _listeners:
+        listener(what)
 
 
 def cores() -> int:

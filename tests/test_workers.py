@@ -12,7 +12,7 @@ import jax
 import pytest
 
 from jaxbl.errors import NoResult
-from jaxbl.workers import each, forget_programs, worth
+from jaxbl.workers import doing, each, forget_programs, listening, worth
 
 
 def square(x):
@@ -106,3 +106,12 @@ def test_programs_are_forgotten_once_they_are_many(monkeypatch):
     monkeypatch.setattr("jaxbl.workers._MOST_MAPPINGS", 10)
     forget_programs()
     assert len(calls) == 1
+
+
+def test_what_is_being_done_is_heard_while_someone_listens():
+    heard = []
+    doing("before")
+    with listening(heard.append):
+        doing("trying load.gravity")
+    doing("afterwards")
+    assert heard == ["trying load.gravity"]

@@ -20,7 +20,7 @@ from jaxbl.files import plain
 from jaxbl.identification.logs import Logs, arrays, gains_for, stage_counter
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
-from jaxbl.workers import Progress
+from jaxbl.workers import Progress, doing
 
 from .coordinates import CoordinateValues, all_coordinates
 from .diagnosis_summary import extended_study, observers_say, rival_tables, summary_of, tested, trace_of, where_lacking
@@ -111,11 +111,14 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
     """
     done = stage_counter(_STAGES, progress)
     with jax.enable_x64(True):
+        doing("smoothing the log")
         setup = set_up(task)
         proof = Proof(setup)
         done()
+        doing("comparing effects")
         search, found = _explained(setup)
         done()
+        doing("testing on held-out data")
         (search, found, (fitted, after, withdrawn, gains), controls), expected = _proved(proof, search, found)
         done()
         if not np.isfinite(fitted.covariance).all():
@@ -123,6 +126,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         judgement = judged(found, fitted, proof.before.errors, after.errors, expected, controls, setup.prior)
         found = judgement.found
         done()
+        doing("running the observers")
         lacking_after = residual_torques(fitted.experiment, setup.fitted.segments)
         on_log, on_holdout = _paired(setup.lacking, lacking_after), _paired(proof.before.torques, after.torques)
         _, gain_values = gains_for(task.missing, fitted.experiment, setup.recorded)

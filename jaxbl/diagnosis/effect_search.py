@@ -20,6 +20,7 @@ from jaxbl.drive.parameters import set_leaves
 from jaxbl.identification.segments import Segment
 from jaxbl.identification.trajectory import WIDE, Free, free_parameters
 from jaxbl.simulate import Experiment
+from jaxbl.workers import doing
 
 from .candidates import SHARE, Candidate, Numbers, variants_of
 from .evidence import Evidence, evidence_of
@@ -483,6 +484,7 @@ class EffectSearch:
 
     def _with(self, current: Model, one: _Scored, predictor: Predictor) -> Model:
         """A model with one effect more, refitted from the numbers that the screening gave it."""
+        doing(f"trying {' + '.join([*current.names, one.name])}")
         numbers = current.numbers | {one.name: one.found.numbers}
         return self.refit(numbers, current.theta + one.found.own[: len(self.free)], predictor)
 
