@@ -29,7 +29,7 @@ from scipy.integrate import solve_ivp
 jax.config.update("jax_enable_x64", True)
 
 from jaxbl.drive import DeadZone, Initial, Plant, PlantState, Rigid, SigmoidBacklash, TwoInertia, as_arrays  # noqa: E402
-from jaxbl.drive.effects import CoulombFriction  # noqa: E402
+from jaxbl.drive.effects import CoulombFriction, Motion  # noqa: E402
 
 PERIOD = 1e-3
 DEFAULT_SUBSTEPS = 10
@@ -47,11 +47,12 @@ def accelerations(plant, position, velocity, torque, smoothing):
     transmitted, ratio = (0.0, 0.0) if plant.transmission is None else plant.transmitted(position, velocity, states)
     result = {}
     for side in plant.drive.sides:
+        motion = Motion(0.0, position[side], velocity[side])
         total = torque - transmitted if side == "motor" else ratio * transmitted
         total = total - plant.drive.viscous(side) * velocity[side]
         for effect, own in zip(plant.effects, states, strict=True):
             if effect.place == side:
-                total = total - effect.dry_friction(own, velocity[side]) * jnp.tanh(velocity[side] / smoothing)
+                total = total - effect.dry_friction(own, motion) * jnp.tanh(velocity[side] / smoothing)
         result[side] = total / plant.inertia(side)
     return result
 

@@ -11,8 +11,9 @@ The size that is asked for is not always to be had; what became of it stands in 
 - an inertia, a viscous friction or a torque gain that is off by less than the nominal numbers are uncertain cannot be told
   from them, so it is made at least `APART` times that uncertainty (the gain, which moves all numbers at once, three
   quarters of that); the nominal number is off by nothing but the effect then, which is its error;
-- an inertia or a viscous friction grows fourfold at most and loses 60 % at most, a dent is at most 80 % of the driving
-  torque's rms high, a shaft at most one and a half times critically damped, a drifting friction at most 40 %.
+- an inertia or a viscous friction grows fourfold at most and loses 60 % at most (in one direction, too), a dent is at most
+  80 % of the driving torque's rms high, a shaft at most one and a half times critically damped, an unknown drifting
+  friction at most 40 %, friction under load at most 80 % of the transmitted torque.
 """
 
 import math
@@ -32,9 +33,10 @@ EFFECTS = (*SIDE_EFFECTS, *LOAD_EFFECTS, "motor.cogging", *GEAR_EFFECTS, *ACTUAT
 """What the package knows: design.md, section 6."""
 PINION = "transmission.pinion"
 """Eccentricity of the motor's wheel: to the package a `transmission.eccentricity` of as many periods as the ratio says."""
+_FRICTIONS = (f"{side}.{kind}_friction" for kind in ("presliding", "drifting", "asymmetric") for side in ("motor", "load"))
 NEW = (
-    "motor.torque_ripple", PINION, "motor.presliding_friction", "load.presliding_friction",
-    "motor.cogging_harmonics", "transmission.hysteresis", "load.flexibility", "actuator.delay",
+    "motor.torque_ripple", PINION, *_FRICTIONS, "transmission.load_friction", "motor.cogging_harmonics",
+    "transmission.hysteresis", "load.flexibility", "actuator.delay",
 )  # fmt: skip
 """Effects of the kind `new`: other kinds keep their cases."""
 UNKNOWN = ("unknown.drifting_friction", "unknown.hysteresis", "unknown.dent", "unknown.random_torque")
@@ -60,7 +62,7 @@ def exclusive(one: str, other: str) -> bool:
     """Whether two effects are too much alike to be hidden, or known, together."""
     place = one.split(".")[0]
     pair = {one, other}
-    dry = {f"{place}.{kind}_friction" for kind in ("coulomb", "stribeck", "presliding")}
+    dry = {f"{place}.{kind}_friction" for kind in ("coulomb", "stribeck", "presliding", "drifting")}
     scaling = {"actuator.gain_error", "motor.inertia", "motor.viscous_friction"}
     return one == other or pair <= dry or (pair <= scaling and "actuator.gain_error" in pair)
 
@@ -265,6 +267,20 @@ def _shape(
         case "presliding_friction":
             length = float(np.exp(rng.uniform(*np.log([0.02, 0.3])))) * float(np.std(x))
             return linear("torque", dahl(v, motion.period, length), length=length)
+        case "asymmetric_friction":
+            # friction must not drive
+            return linear("viscous_difference", 0.5 * np.abs(v), most=1.2 * drive[f"{side}_viscous"], factor=sign)
+        case "load_friction":
+            # all but self-locking at most
+            return linear("coefficient", np.abs(motion.elastic()) * np.sign(v), most=0.8)
+        case "drifting_friction" if place != "unknown":
+            # falls to between a third and two thirds
+            warm, time = float(rng.uniform(0.3, 0.7)), float(rng.uniform(0.1, 0.5)) * len(u) * motion.period
+            wave = np.sign(v) * (warm + (1.0 - warm) * np.exp(-np.arange(len(u)) * motion.period / time))
+            return (
+                lambda c: {"torque": c * warm, "initial_torque": c, "time_constant": time},
+                lambda c: c * wave / over, 0.0, math.inf,
+            )  # fmt: skip
         case "drifting_friction":
             share = float(rng.uniform(0.7, 0.95)) * sign
             drift = 1.0 - 2.0 * np.arange(len(u)) / len(u)

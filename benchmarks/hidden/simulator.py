@@ -38,7 +38,8 @@ loop kp kd filter motor_noise motor_resolution torque_limit period steps origin
 ripple_amplitude ripple_harmonic ripple_phase
 motor_bristle load_bristle bristle_torque bristle_excess bristle_stribeck bristle_damping
 base_harmonic base_sine base_cosine base_sine_2 base_cosine_2 base_sine_3 base_cosine_3
-shaft_torque shaft_length third_motor third_load third_rate third_damping delayed"""
+shaft_torque shaft_length third_motor third_load third_rate third_damping delayed
+motor_sided load_sided motor_warming load_warming warming_rate mesh"""
 _ROWS = _NAMES.split()
 P = SimpleNamespace(**{name: i for i, name in enumerate(_ROWS)})
 """Row of each number in the parameters of a lane."""
@@ -223,6 +224,15 @@ def _add(values: dict[str, float], effect: Mapping[str, Any], rigid: bool) -> No
             pass
         case "lag":
             values["lag_rate"] = 1.0 / get("time_constant")
+        case "asymmetric_friction":
+            values[f"{side}_sided"] += 0.5 * get("viscous_difference")
+            values[f"{side}_constant"] += 0.5 * get("torque_difference", 0.0)
+        case "load_friction":
+            values["mesh"], values["motor_dry"] = get("coefficient"), 1.0
+        case "drifting_friction" if place != "unknown":
+            values[f"{side}_coulomb"] += get("torque")
+            values[f"{side}_warming"] += get("initial_torque") - get("torque")
+            values["warming_rate"] = 1.0 / get("time_constant")
         case "drifting_friction":
             values[f"{side}_coulomb"] += get("torque")
             values[f"{side}_drift"] += get("torque") * get("share")
@@ -273,6 +283,7 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
     E_B, S_B, B_C, B_X, B_V, B_D = range(P_.motor_bristle, P_.bristle_damping + 1)
     BN, BS, BC, BS2, BC2, BS3, BC3 = range(P_.base_harmonic, P_.base_cosine_3 + 1)
     SHAFT_T, SHAFT_L, E_T3, S_T3, T_W, T_D = range(P_.shaft_torque, P_.third_damping + 1)
+    E_A, S_A, E_W, S_W, W_RATE, MESH = range(P_.motor_sided, P_.mesh + 1)
     angle, speed, share = ANGLE_TOLERANCE, SPEED_TOLERANCE, TORQUE_TOLERANCE
 
     @jit
@@ -314,6 +325,11 @@ def build(jit: Any, pick: Any) -> SimpleNamespace:
         fall_e, fall_s = w_e * p[E_V], w_s * p[S_V]
         dry_e = p[E_C] + p[E_X] * np.exp(-fall_e * fall_e) + p[E_DRIFT] * drift + p[E_DENT] * bump
         dry_s = p[S_C] + p[S_X] * np.exp(-fall_s * fall_s) + p[S_DRIFT] * drift + p[S_DENT] * bump
+        warming = np.exp(-now * p[W_RATE])
+        dry_e = dry_e + p[E_W] * warming + p[MESH] * np.abs(through)
+        dry_s = dry_s + p[S_W] * warming
+        sum_e = sum_e - p[E_A] * np.abs(w_e)
+        sum_s = sum_s - p[S_A] * np.abs(w_s)
         v = pick(p[E_H] != 0.0, w_e, w_s)
         # Bouc-Wen with n = 2 and beta = gamma = 1/2
         w_rate = (v - 0.5 * (np.abs(v) * held + v * w * w)) / p[H_LEN]

@@ -217,7 +217,8 @@ class MotionTorques:
             # of the model's own only those in the gear matter, and only for others there: one structure, and one program
             gear = [one for one in self.experiment.effects if one.place == place == "transmission" and one.name != name]
             bare = with_effects(self.experiment, tuple(gear))
-            direction = jnp.asarray(self.direction.get(place, self.torque))
+            # friction of the gear is on the motor's side; an effect on the input needs none
+            direction = jnp.asarray(self.direction.get("motor" if place == "transmission" else place, self.torque))
             for first in range(0, len(which), _AT_ONCE):
                 some = which[first : first + _AT_ONCE]
                 # as many at once each time, so that one compiled program serves
@@ -252,8 +253,11 @@ def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direct
         place = drive.place(effect.place)
         if place == "transmission":
             both = (experiment, with_effects(experiment, (*experiment.effects, effect)))
-            before, after = (one.plant.transmitted(part.position, part.velocity, effect_path(one, along)[0]) for one in both)
-            found = found.at[:, 0].set(before[0] - after[0])
+            at = part.position, part.velocity
+            given = [(one.plant, effect_path(one, along)[0]) for one in both]
+            before, after = (plant.transmitted(*at, states) for plant, states in given)
+            rubbed = [plant.gear_friction(states, c) for (plant, states), (c, _) in zip(given, (before, after), strict=True)]
+            found = found.at[:, 0].set(before[0] - after[0] + (rubbed[0] - rubbed[1]) * direction)
             found = found.at[:, 1].set(after[1] * after[0] - before[1] * before[0])
             return found * part.weight[:, None]
         (state,), acting = effect_path(with_effects(experiment, (effect,)), along)
@@ -265,7 +269,7 @@ def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direct
             resisting = effect.resist(state, motion)
             if type(effect).holds is not AbstractEffect.holds:
                 resisting = jnp.where(part.held[place] > 0.0, effect.holds() * direction, resisting)
-            resisting = resisting + effect.dry_friction(state, motion.velocity) * direction
+            resisting = resisting + effect.dry_friction(state, motion) * direction
             resisting = resisting + effect.added_inertia() * part.modelled[place]
             found = found.at[:, sides.index(place)].set(-resisting)
         return found * part.weight[:, None]

@@ -48,8 +48,8 @@ def summary_of(
         notes += [f"{task.holdout.path.name}: {note}" for note in task.holdout.notes if note not in record.notes]
     notes += [f"{name} was found, and withdrawn: with it the held-out data are met no better." for name in withdrawn]
     for one in found.findings:
-        if task.separate and any(role.kind == "frequency" for role in EFFECTS[one.effect].roles().values()):
-            notes.append(f"The phase of {one.effect} is taken to be the same at the start of both logs.")
+        if task.separate and EFFECTS[one.effect].in_time:
+            notes.append(f"{one.effect} is taken to run from the start of each log in the same way.")
     if found.verdict == "no_discrepancy":
         for side, one in located.items():
             least, unit = (

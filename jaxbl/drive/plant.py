@@ -151,6 +151,10 @@ class Plant(eqx.Module):
             torque = torque + effect.transmit(own, deflection, rate)
         return torque, ratio
 
+    def gear_friction(self, states: States, transmitted: Scalar) -> Scalar:
+        """Level of the dry friction that the transmitted torque (N m) causes on the motor's side, N m."""
+        return sum((effect.gear_friction(own, transmitted) for effect, own in self._at("transmission", states)), 0.0)
+
     def _strained(self, position: Sides, velocity: Sides, states: States) -> tuple[Float[Array, ""], Scalar, Scalar]:
         """Elastic deflection of the gear (rad), its rate (rad/s), and the motor angle for one unit of load angle."""
         effects = self._at("transmission", states)
@@ -261,11 +265,11 @@ class Plant(eqx.Module):
             for effect, own in self._at("actuator", states) if side == "motor" else ():
                 driving = driving - effect.resist(own, Motion(time, position[side], velocity[side], torque))
             total = gains[side] * through + driving
-            level: Scalar = 0.0
+            level: Scalar = self.gear_friction(states, through) if side == "motor" else 0.0
             motion = Motion(time, position[side], velocity[side], driving)
             for effect, own in self._at(side, states):
                 total = total - effect.resist(own, motion)
-                level = level + effect.dry_friction(own, velocity[side])
+                level = level + effect.dry_friction(own, motion)
             found[side] = total, level
         return found
 

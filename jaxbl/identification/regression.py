@@ -111,16 +111,21 @@ def model_torques(
     """
     plant, k, found = experiment.plant, kinematics, {}
     states, torque = effect_path(experiment, k, from_rest=True)
+    loaded: Any = 0.0
     if plant.transmission is not None:
         found["transmission"] = _transmitted(plant, k, states)
+        loaded = plant.gear_friction(states, found["transmission"])
     none = jnp.zeros_like(k.torque)
     acting = jax.vmap(plant.torques)(k.position, k.velocity, states, torque, k.time, none)
     places = {plant.drive.place(effect.place) for effect in plant.effects}
+    if not isinstance(loaded, float):
+        places.add("motor")
     for side, (total, level) in acting.items():
         if side in places or (side == "motor" and "actuator" in places):
             direction = jnp.clip(k.velocity[side] / jnp.maximum(3.0 * deviation[side], jnp.finfo(float).tiny), -1.0, 1.0)
             added = (plant.inertia(side) - plant.drive.inertia(side)) * k.acceleration[side]
             commanded = k.torque if side == "motor" else 0.0
+            level = level + (loaded if side == "motor" else 0.0)
             found[side] = level * direction + commanded - total + added
     return found
 

@@ -93,6 +93,8 @@ def test_sizes_are_as_asked_or_say_so(found):
                 "gain_error",
                 "damping",
                 "delay",
+                "asymmetric_friction",
+                "load_friction",
             ):
                 assert size == pytest.approx(level, rel=0.01)
 

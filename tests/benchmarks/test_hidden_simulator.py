@@ -82,7 +82,9 @@ def bristles(t, y, u, flank):
     through = 60.0 * (x - 5.0 * q)
     g = 0.8 + 0.3 * np.exp(-((v / 0.5) ** 2))
     rate = v - 0.8 / 0.05 * abs(v) * z / g
-    return u - through - 0.15 * v - 0.8 / 0.05 * z - 0.02 * rate, 5.0 * through - 16.0 * w, 0.0, 0.0, 0.0, rate
+    motor = u - through - (0.17 if v > 0.0 else 0.13) * v - 0.8 / 0.05 * z - 0.02 * rate
+    load = 5.0 * through - 16.0 * w - (1.0 if w > 0.0 else -2.0) * w - 0.25
+    return motor, load, 0.1 * abs(through), 3.0 + 2.0 * np.exp(-t / 0.4), 0.0, rate
 
 
 BRISTLES_MACHINE = Machine(
@@ -93,6 +95,11 @@ BRISTLES_MACHINE = Machine(
             "kind": "motor.presliding_friction", "torque": 0.8, "length": 0.05,
             "breakaway_ratio": 1.1 / 0.8, "stribeck_velocity": 0.5, "damping": 0.02,
         },
+        {"kind": "motor.asymmetric_friction", "viscous_difference": 0.04},
+        {"kind": "load.asymmetric_friction", "viscous_difference": 3.0, "torque_difference": 0.5},
+        {"kind": "load.viscous_friction", "viscous": -0.5},
+        {"kind": "load.drifting_friction", "torque": 3.0, "initial_torque": 5.0, "time_constant": 0.4},
+        {"kind": "transmission.load_friction", "coefficient": 0.1},
     ),
 )  # fmt: skip
 
@@ -143,7 +150,7 @@ def reference(torques, inertias, half, start, commands, lag):
                 return (flank * z - half if flank else half - abs(z)) + 1e-14
 
             flanks.terminal, flanks.direction = True, -1
-            events = [leaves(0), leaves(1), flanks] if half else [leaves(0)]
+            events = [leaves(0), leaves(1), flanks] if half else [leaves(0), leaves(1)]
             found = solve_ivp(
                 right, (now, begin + PERIOD), state, "DOP853", events=events, rtol=1e-10, atol=1e-13, max_step=PERIOD / 4
             )

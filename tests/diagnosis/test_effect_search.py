@@ -78,7 +78,11 @@ def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
     assert finding.confidence > 0.99 and finding.alternatives == ()
 
 
-HIDDEN = {"motor.presliding_friction": {"torque": 0.06, "length": 0.02}}
+HIDDEN = {
+    "motor.presliding_friction": {"torque": 0.06, "length": 0.02},
+    "motor.drifting_friction": {"torque": 0.04, "initial_torque": 0.08, "time_constant": 1.0},
+    "motor.asymmetric_friction": {"viscous_difference": -0.01},
+}
 
 
 @pytest.mark.slow

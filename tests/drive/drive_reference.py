@@ -36,9 +36,15 @@ def right_side(t, y, u, law, effects, drive):
             -((v / effects[stribeck]["stribeck_velocity"]) ** 2) if stribeck in effects else 0.0
         )
         dry = value(f"{name}.coulomb_friction", "torque") + value(stribeck, "torque") + falling
+        if (drifting := effects.get(f"{name}.drifting_friction")) is not None:
+            cold, warm = drifting["initial_torque"], drifting["torque"]
+            dry += warm + (cold - warm) * np.exp(-t / drifting["time_constant"])
+        differs = f"{name}.asymmetric_friction"
+        more = 0.5 if v > 0.0 else -0.5
+        dry += more * value(differs, "torque_difference")
         return (
             dry * np.sign(v)
-            + value(f"{name}.viscous_friction", "viscous") * v
+            + (value(f"{name}.viscous_friction", "viscous") + more * value(differs, "viscous_difference")) * v
             + value(f"{name}.quadratic_drag", "drag") * abs(v) * v
             + value(f"{name}.constant_torque", "torque")
         )
@@ -107,6 +113,7 @@ def right_side(t, y, u, law, effects, drive):
     if "motor.torque_ripple" in effects:
         ripple = effects["motor.torque_ripple"]
         u *= 1.0 + ripple["amplitude"] * np.sin(ripple["harmonic"] * theta_e + ripple["phase"])
+    at_motor += value("transmission.load_friction", "coefficient") * abs(torque) * np.sign(omega_e)
     bent_e, z_e_dot = bristle("motor", omega_e, z_e)
     bent_s, z_s_dot = bristle("load", omega_s, z_s)
     at_motor, at_load = at_motor + bent_e, at_load + bent_s

@@ -50,8 +50,8 @@ def test_each_effect_is_what_its_equation_says_to_second_order(name):
 
 def test_effects_add_up_in_any_order():
     values = {name: numbers for name, numbers in VALUES.items() if name != "transmission.backlash"}
-    coarse, fine = errors(values, (256, 1024))
-    assert np.log2(coarse / fine) / 2.0 == pytest.approx(2.0, abs=0.02)
+    coarse, fine = errors(values, (256, 4096))
+    assert np.log2(coarse / fine) / 4.0 == pytest.approx(2.0, abs=0.02)
     # the actuator is a chain, and keeps its order
     shuffled = sorted(made(values), key=lambda effect: (effect.place == "actuator", effect.place))
     there, back = (trajectory(plant(*order), 64) for order in (made(values), shuffled))
@@ -263,6 +263,14 @@ class Forgetful(TorsionSpring):
         return 0.0
 
 
+class AsBefore(SideEffect):
+    kind = "as_before"
+    torque: float = size("N m", "torque")
+
+    def dry_friction(self, state, velocity):
+        return self.torque
+
+
 class NotNeutral(SideEffect):
     kind = "not_neutral"
     torque: float = size("N m", "torque")
@@ -285,6 +293,7 @@ class TwoAngles(SideEffect):
         ("motor.thing", 3, "derived from AbstractEffect"),
         ("motor.without", Without, "either all numbers or none should have a role"),
         ("motor.forgetful", Forgetful, r"resist should take \(self, state, motion\), not \(self, motion\)"),
+        ("motor.as_before", AsBefore, r"dry_friction should take \(self, state, motion\), not \(self, state, velocity\)"),
         ("motor.not_neutral", NotNeutral, "not neutral: resist adds 1"),
         ("motor.two_angles", TwoAngles, "an angle should stand beside one size"),
     ],

@@ -107,7 +107,7 @@ def test_slopes_are_those_of_differences(name):
     numbers, felt = jax.tree.leaves((one, states, torque)), 0
     for way, change in zip(ways, changes, strict=True):
         # of the number's own size
-        by = 1e-5 * (np.max(np.abs(numbers[jax.tree.leaves(way).index(1.0)])) + 1e-3)
+        by = 3e-5 * (np.max(np.abs(numbers[jax.tree.leaves(way).index(1.0)])) + 1e-3)
         expected = (moved(way, by) - moved(way, -by)) / (2.0 * by)
         error = np.abs(change - expected) / (np.max(np.abs(expected)) + 1e-9)
         assert np.median(error) < 1e-6

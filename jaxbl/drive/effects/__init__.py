@@ -6,7 +6,8 @@ effect's name, its object a subclass of :class:`SideEffect`, :class:`Transmissio
 
 # ruff: noqa: I001
 # families, and the effects of one, in the order in which a model with all effects has them
-from .friction import CoulombFriction, StribeckFriction, PreslidingFriction, ViscousFriction, QuadraticDrag
+from .friction import CoulombFriction, StribeckFriction, PreslidingFriction, DriftingFriction
+from .friction import ViscousFriction, AsymmetricFriction, QuadraticDrag
 from .loads import (
     ConstantTorque,
     Inertia,
@@ -18,7 +19,7 @@ from .loads import (
     Flexibility,
 )
 from .tables import Tabulated
-from .gear import Backlash, Hardening, Damping, Hysteresis, Eccentricity
+from .gear import Backlash, Hardening, Damping, Hysteresis, Eccentricity, LoadFriction
 from .actuator import Delay, GainError, Saturation, Lag, BackEmf
 from .base import (
     EFFECTS,

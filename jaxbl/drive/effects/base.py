@@ -28,8 +28,8 @@ class Motion(NamedTuple):
     """What the torque of an effect may depend on: time in s, position in rad, velocity in rad/s.
 
     Of its side (of an effect of the actuator, the motor); for an effect in the gear, the elastic deflection and its rate (to
-    `advance`, in the middle of the step). `torque` is the input that acts, N m, in :meth:`AbstractEffect.resist` of an
-    effect on the motor; elsewhere 0.
+    `advance`, in the middle of the step). `torque` is the input that acts, N m, in :meth:`AbstractEffect.resist` and
+    :meth:`AbstractEffect.dry_friction` of an effect on the motor; elsewhere 0.
     """
 
     time: Value
@@ -140,6 +140,7 @@ class AbstractEffect(eqx.Module):
         places: where it may act: motor, load, transmission, actuator.
         velocity_dependent: whether a hook looks at a velocity; it is then evaluated twice a step (predictor and
             corrector), which keeps the integrator's second order.
+        in_time: whether it depends on the time since a log began.
         corrects: the drive's number that it is the error of: `inertia` or `viscous`.
         exclusive: of effects with the same word here, a place has one.
         special_cases: simpler kinds at the same place that it contains, and their numbers from its own.
@@ -148,6 +149,7 @@ class AbstractEffect(eqx.Module):
     kind: ClassVar[str]
     places: ClassVar[tuple[str, ...]]
     velocity_dependent: ClassVar[bool] = False
+    in_time: ClassVar[bool] = False
     corrects: ClassVar[str | None] = None
     exclusive: ClassVar[str | None] = None
     special_cases: ClassVar[Mapping[str, Callable[[Numbers], Numbers]]] = {}
@@ -203,7 +205,7 @@ class AbstractEffect(eqx.Module):
         """Torque in N m subtracted on the effect's side."""
         return 0.0
 
-    def dry_friction(self, state: Any, velocity: Value) -> Value:
+    def dry_friction(self, state: Any, motion: Motion) -> Value:
         """Level in N m of set-valued dry friction on the effect's side: it holds up to it, and opposes motion with it."""
         return 0.0
 
@@ -212,6 +214,10 @@ class AbstractEffect(eqx.Module):
 
         Of a friction with a memory whose contacts bend by less than readings show: its own state is then not known.
         """
+        return 0.0
+
+    def gear_friction(self, state: Any, torque: Value) -> Value:
+        """Level in N m of set-valued dry friction that a transmitted torque (N m) causes on the motor's side of the gear."""
         return 0.0
 
     def added_inertia(self) -> Value:
@@ -322,7 +328,7 @@ def _check_entry(name: str, found: Any) -> None:
         raise TypeError("effects on motor or load, and no others, should be derived from SideEffect")
     for hook, of_base in inspect.getmembers(AbstractEffect, inspect.isfunction):
         expected, given = (list(inspect.signature(one).parameters) for one in (of_base, getattr(found, hook)))
-        if not hook.startswith("_") and len(given) != len(expected):
+        if not hook.startswith("_") and given != expected:
             raise TypeError(f"{hook} should take ({', '.join(expected)}), not ({', '.join(given)})")
     _check_numbers(found)
     if neutral := found.neutral():
@@ -354,7 +360,8 @@ def _check_neutral(effect: AbstractEffect) -> None:
         off = {
             "receive": then + (first - then) * switch / 1e-3 - motion.position,
             "resist": effect.resist(state, motion),
-            "dry_friction": effect.dry_friction(state, motion.velocity),
+            "dry_friction": effect.dry_friction(state, motion),
+            "gear_friction": effect.gear_friction(state, motion.torque),
             "added_inertia": effect.added_inertia(),
             "transmission_error": effect.transmission_error(state, motion.position),
             "deflect": effect.deflect(state, motion.position) - motion.position,

@@ -1,4 +1,5 @@
-"""Friction of a side: dry, falling with speed, with contacts that bend before they slide, viscous, and drag."""
+"""Friction of a side: dry, falling with speed, with contacts that bend before they slide, drifting, viscous, different by
+direction, and drag."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -17,7 +18,7 @@ class CoulombFriction(SideEffect):
     exclusive: ClassVar[str | None] = "dry friction"
     torque: Scalar = size("N m", "friction torque F_c", minimum=0.0)
 
-    def dry_friction(self, state, velocity):
+    def dry_friction(self, state, motion):
         return self.torque
 
 
@@ -39,8 +40,9 @@ class StribeckFriction(SideEffect):
         above=0.0,
     )
 
-    def dry_friction(self, state, velocity):
-        return self.torque + (self.breakaway_torque - self.torque) * jnp.exp(-((velocity / self.stribeck_velocity) ** 2))
+    def dry_friction(self, state, motion):
+        fall = jnp.exp(-((motion.velocity / self.stribeck_velocity) ** 2))
+        return self.torque + (self.breakaway_torque - self.torque) * fall
 
     @classmethod
     def directions(cls):
@@ -107,6 +109,37 @@ class PreslidingFriction(SideEffect):
 
 
 @EFFECTS.add
+class DriftingFriction(SideEffect):
+    """Dry friction that changes as the machine warms up: F + (F_0 - F) exp(-t / tau).
+
+    Reference: L. Simoni, M. Beschi, G. Legnani, A. Visioli, Friction modeling with temperature effects for industrial robot
+    manipulators, IROS (2015): one thermal time constant.
+    """
+
+    kind: ClassVar[str] = "drifting_friction"
+    in_time: ClassVar[bool] = True
+    exclusive: ClassVar[str | None] = "dry friction"
+    special_cases: ClassVar = {"coulomb_friction": lambda one: {"torque": 0.5 * (one["torque"] + one["initial_torque"])}}
+    torque: Scalar = size("N m", "friction torque F in the end, when warm", minimum=0.0)
+    initial_torque: Scalar = size("N m", "friction torque F_0 at t = 0", minimum=0.0)
+    time_constant: Scalar = shape(
+        "s",
+        "time constant tau of the change",
+        # from a change over the log's first part to one that is all but linear in time
+        lambda log: [share * log.duration for share in (0.1, 0.3, 1.0)],
+        above=0.0,
+    )
+
+    def dry_friction(self, state, motion):
+        return self.torque + (self.initial_torque - self.torque) * jnp.exp(-motion.time / self.time_constant)
+
+    @classmethod
+    def directions(cls):
+        # steady friction, and what there is more at the start
+        return [{"torque": 1.0, "initial_torque": 1.0}, {"initial_torque": 1.0}]
+
+
+@EFFECTS.add
 class ViscousFriction(SideEffect):
     """Error of the nominal viscous friction: an additional torque f v."""
 
@@ -117,6 +150,24 @@ class ViscousFriction(SideEffect):
 
     def resist(self, state, motion):
         return self.viscous * motion.velocity
+
+
+@EFFECTS.add
+class AsymmetricFriction(SideEffect):
+    """Friction that differs by direction: forwards half of each difference more than the drive and other effects say,
+    backwards half less, (d_F + d_f |v|) / 2.
+
+    For F+ + f+ v forwards and F- + f- |v| backwards: viscous friction (f+ + f-) / 2 of the drive, dry friction
+    (F+ + F-) / 2, and the differences f+ - f- and F+ - F- here. A difference of dry friction alone is a constant torque.
+    """
+
+    kind: ClassVar[str] = "asymmetric_friction"
+    velocity_dependent: ClassVar[bool] = True
+    viscous_difference: Scalar = size("N m s/rad", "viscous friction forwards less that backwards, d_f")
+    torque_difference: Scalar = held("N m", "dry friction forwards less that backwards, d_F", 0.0)
+
+    def resist(self, state, motion):
+        return 0.5 * (self.torque_difference + self.viscous_difference * jnp.abs(motion.velocity))
 
 
 @EFFECTS.add

@@ -1,4 +1,4 @@
-"""The gear beyond its law: free play, hardening, damping, hysteresis, kinematic error."""
+"""The gear beyond its law: free play, hardening, damping, hysteresis, kinematic error, friction under load."""
 
 from typing import ClassVar
 
@@ -109,3 +109,20 @@ class Eccentricity(TransmissionEffect):
 
     def transmission_error(self, state, load_position):
         return self.amplitude * jnp.sin(self.harmonic * load_position + self.phase)
+
+
+@EFFECTS.add
+class LoadFriction(TransmissionEffect):
+    """Friction of gear teeth or a screw under load: dry friction mu |C| on the motor's side, C the transmitted torque.
+    Efficiency 1 / (1 + mu) where the motor drives, 1 - mu where the load does; from mu = 1 on the gear locks itself.
+
+    A rigid drive has none: what its gear carries depends on how its inertia is shared, which it does not say.
+    Reference: M. Duclusaud, G. Passault, V. Padois, O. Ly, Extended friction models for the physics simulation of servo
+    actuators, arXiv:2410.08650 (2024): their load-dependent friction.
+    """
+
+    kind: ClassVar[str] = "load_friction"
+    coefficient: Scalar = size("", "friction torque over transmitted torque, mu", minimum=0.0)
+
+    def gear_friction(self, state, torque):
+        return self.coefficient * jnp.abs(torque)

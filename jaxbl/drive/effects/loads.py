@@ -78,6 +78,7 @@ class PeriodicDisturbance(SideEffect):
     """A torque periodic in time: A sin(2 pi f t + phase)."""
 
     kind: ClassVar[str] = "periodic_disturbance"
+    in_time: ClassVar[bool] = True
     places: ClassVar[tuple[str, ...]] = ("load",)
     # of vanishing frequency
     special_cases: ClassVar = {"constant_torque": lambda one: {"torque": one["amplitude"] * np.sin(one["phase"])}}
