@@ -49,7 +49,9 @@ def test_each_effect_is_what_its_equation_says_to_second_order(name):
 
 
 def test_effects_add_up_in_any_order():
-    values = {name: numbers for name, numbers in VALUES.items() if name != "transmission.backlash"}
+    # two have kinks where the transmitted torque turns: of second order in the mean
+    kinked = ("transmission.backlash", "transmission.load_friction")
+    values = {name: numbers for name, numbers in VALUES.items() if name not in kinked}
     coarse, fine = errors(values, (256, 4096))
     assert np.log2(coarse / fine) / 4.0 == pytest.approx(2.0, abs=0.02)
     # the actuator is a chain, and keeps its order
