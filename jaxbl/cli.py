@@ -207,10 +207,17 @@ def inspect(
     model: Annotated[
         Path | None, typer.Option(metavar="TOML", help="study, or a file with [log] alone: how to read the log")
     ] = None,
+    write: Annotated[
+        Path | None, typer.Option(metavar="NEW.toml", help="propose [log] and a nominal model for identify and diagnose")
+    ] = None,
     out: LogOutOption = None,
     overwrite: LogOverwriteOption = False,
 ) -> None:
     """Examine a measured log: channels, sampling, noise, and which parameters it can identify."""
+    if write is not None and write.exists():
+        raise InputError(f"{write}: is there already; --write needs a new name")
+    if write is not None and not write.parent.is_dir():
+        raise InputError(f"{write}: there is no folder {write.parent}")
     from .files import claim_log_folder
     from .records import inspect as inspect_log
     from .report.inspect import write_inspection_report
@@ -220,10 +227,28 @@ def inspect(
         from .config import read_log_config
 
         table, gear_ratio, nominal = read_log_config(model)
-    found = inspect_log(log, table, gear_ratio=gear_ratio, nominal=nominal)
+    guesses: list[str] = []
+    if write is None:
+        found = inspect_log(log, table, gear_ratio=gear_ratio, nominal=nominal)
+    else:
+        from .records.proposal import propose
+
+        study, guesses, found = propose(log, None if table is None else table.model_dump(exclude_unset=True))
     folder = _folder(log, out)
     claim_log_folder(folder, log, overwrite=overwrite)
-    _print(write_inspection_report(found, folder), folder)
+    lines = write_inspection_report(found, folder)
+    if write is not None:
+        import tomli_w
+
+        from .files import write_atomic
+
+        remarks = [
+            f"Proposed by jaxbl inspect --write from {log.name}. Look it through: names, units, and the drive.",
+            *guesses,
+        ]
+        write_atomic(write, "".join(f"# {remark}\n" for remark in remarks) + tomli_w.dumps(study))
+        lines += ["", f"{write}: a first model. Run: jaxbl identify {log} --model {write}", *guesses]
+    _print(lines, folder)
 
 
 @app.command()

@@ -1,0 +1,252 @@
+"""A first study for a log: columns guessed by name and unit, and a nominal drive from a rough fit."""
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxbl.errors import InputError
+
+from .alignment import NominalDrive
+from .files import LogFile, read_log_file
+from .inspection import Inspection, inspect
+from .least_squares import jackknifed
+from .rigid_body import direction_of
+from .signal_quality import SHORTEST, low_passed, without_ends
+
+_VAGUE = 0.5
+"""Relative uncertainty of numbers from a rough fit: inertias and stiffness may be split wrongly between the sides."""
+_NAMES = {
+    "t": r"t|time|timestamp|times|zeit|clock",
+    "u": r"u|torque|tau|moment|drehmoment|force|kraft|current|strom|iq|i_q|voltage|volt|vir|vm",
+    "theta_s": r"(theta_s|load|output|arm|joint|link|secondary|enc(oder)?_?2)",
+    "omega": r"(omega|speed|velocity|velo|drehzahl|geschwindigkeit|rpm|vel)",
+    "theta_e": r"(theta|position|pos|angle|winkel|lage|enc|q|qm|motor)",
+    "wanted": r"(goal|target|set|ref|command|cmd|desired|soll|demand)",
+}
+"""What columns are usually called."""
+_UNITS = {
+    "rad": "rad", "deg": "deg", "°": "deg", "degrees": "deg", "turn": "turn", "rev": "turn", "m": "m", "mm": "mm",
+    "counts": "counts", "inc": "counts", "s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns", "nm": "N m",
+    "n m": "N m", "n·m": "N m", "n": "N", "a": "A", "v": "V", "rpm": "rpm", "1/min": "rpm", "rad/s": "rad/s",
+    "deg/s": "deg/s", "°/s": "deg/s", "rev/s": "turn/s", "m/s": "m/s", "mm/s": "mm/s", "mnm": "mN m", "mn m": "mN m",
+    "%": "%", "ma": "mA",
+}  # fmt: skip
+"""How units are written -> what `[log]` calls them."""
+_SPEEDS = ("rpm", "rad/s", "deg/s", "turn/s", "m/s", "mm/s")
+
+
+def _split(file: LogFile, column: str | int) -> tuple[str, str]:
+    """Name of a column without its unit, in lower case, and the unit that it says; "" for none."""
+    name, unit = str(column).strip().lower(), str(file.units.get(column, "")).lower()
+    if found := re.search(r"[\[(]\s*(.+?)\s*[\])]\s*$", name):
+        name, unit = name[: found.start()].strip(" _"), unit or found[1]
+    elif "_" in name and name.rsplit("_", 1)[1] in _UNITS and name.rsplit("_", 1)[1] not in ("s", "m", "v", "a", "n"):
+        name, end = name.rsplit("_", 1)
+        unit = unit or end
+    return name, _UNITS.get(unit, "")
+
+
+def _is(kind: str, name: str) -> bool:
+    words = [word for word in re.split(r"[^a-z0-9äöü]+", name) if word]
+    one = _NAMES[kind]
+    return any(re.fullmatch(one, word) for word in (name.replace(" ", "_"), *words))
+
+
+def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
+    """A `[log]` table by names and units of columns, and what had to be guessed, in sentences.
+
+    Raises:
+        InputError: no column looks like a position or a speed.
+    """
+    file = read_log_file(Path(path))
+    if all(isinstance(column, int) for column in file.columns):
+        raise InputError(
+            f"{path}: --write goes by the names of columns, and the file has none; a file with [log] for --model can give "
+            "their numbers"
+        )
+    table: dict[str, Any] = {}
+    guesses: list[str] = []
+    speeds: dict[str, tuple[str | int, str, np.ndarray]] = {}
+    for column in file.columns:
+        name, unit = _split(file, column)
+        numbers = np.asarray(file.columns[column])
+        if numbers.dtype.kind not in "iuf" or _is("wanted", name):
+            continue
+        if "t" not in table and _is("t", name):
+            table["t"] = _time(column, unit, numbers, guesses)
+        elif "u" not in table and _is("u", name):
+            table["u"] = _torque(column, unit, guesses)
+        elif _is("omega", name) or unit in _SPEEDS:
+            speeds.setdefault("omega_s" if _is("theta_s", name) else "omega_e", (column, unit, numbers))
+        elif "theta_s" not in table and _is("theta_s", name):
+            table["theta_s"] = _position(column, unit, "rad", numbers, guesses)
+        elif "theta_e" not in table and _is("theta_e", name):
+            table["theta_e"] = _position(column, unit, "rad", numbers, guesses)
+    for omega, (column, unit, numbers) in speeds.items():
+        # a measured position is better than the integral of a speed
+        if omega.replace("omega", "theta") not in table:
+            table[omega] = _position(column, unit, "rad/s", numbers, guesses)
+    if not {"theta_e", "theta_s", "omega_e", "omega_s"} & set(table):
+        columns = ", ".join(map(str, file.columns))
+        raise InputError(f"{path}: no column is called like a position or a speed: {columns}; [log] theta_e can name one")
+    if "u" not in table:
+        table["absent"] = ["u"]
+        guesses.append("No column looks like a torque: u is taken as not recorded.")
+    if "t" not in table:
+        raise InputError(f"{path}: no column is called like a time; [log] t can name it, or give a period")
+    return table, guesses
+
+
+def _time(column: str | int, unit: str, values: np.ndarray, guesses: list[str]) -> dict[str, Any]:
+    if unit not in ("s", "ms", "us", "ns"):
+        median = float(np.median(np.diff(values.astype(float)))) if len(values) > 1 else 0.0
+        # drives are sampled every 10 us to 0.1 s
+        unit = next((u for u, one in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)) if median * one <= 0.1), "s")
+        if unit != "s":
+            guesses.append(f"t is taken to be in {unit}, by its period of {median:g}.")
+    return {"column": column, "unit": unit}
+
+
+def _torque(column: str | int, unit: str, guesses: list[str]) -> dict[str, Any]:
+    plain = {"mN m": ("N m", 1e-3), "%": ("N m", 0.01), "mA": ("A", 1e-3)}
+    if unit in ("A", "V", "%", "mA"):
+        guesses.append(f"u.factor: put in the torque of one {unit}; 1 is a placeholder for each A or V, and for 100 %.")
+    if unit in plain:
+        unit, factor = plain[unit]
+        return {"column": column, "unit": unit, "factor": factor}
+    if unit in ("A", "V"):
+        return {"column": column, "unit": unit, "factor": 1.0}
+    if not unit:
+        guesses.append("The unit of u is not said: N m is assumed.")
+    return {"column": column} | ({"unit": unit} if unit in ("N m", "N") else {})
+
+
+def _position(column: str | int, unit: str, default: str, values: np.ndarray, guesses: list[str]) -> dict[str, Any]:
+    whole = bool(np.isfinite(values).all() and (values == np.round(values)).all())
+    if unit == "counts" or (not unit and default == "rad" and whole):
+        guesses.append(f"'{column}' looks like counts: put in counts_per_turn; 4096 is a placeholder.")
+        return {"column": column, "unit": "counts", "counts_per_turn": 4096.0}
+    if not unit:
+        guesses.append(f"The unit of '{column}' is not said: {default} is assumed.")
+    return {"column": column, "unit": unit or default}
+
+
+def propose(path: str | Path, log: dict[str, Any] | None = None) -> tuple[dict[str, Any], list[str], Inspection]:
+    """A study of a log for `identify` and `diagnose`, what was guessed, and the log as it reads.
+
+    Args:
+        path: the log.
+        log: its `[log]` table; left out: guessed.
+
+    Raises:
+        InputError: as of :func:`jaxbl.records.read_record`, or no columns can be guessed.
+    """
+    table, guesses = guess_log_table(path) if log is None else (log, [])
+    try:
+        found = inspect(path, table)
+    except InputError as error:
+        if log is not None or "set sign = -1 in [log] u" not in str(error):
+            raise
+        table["u"]["sign"] = -1
+        guesses.append("u is reversed: with the sign of the file the drive would accelerate against it.")
+        found = inspect(path, table)
+    nominal = _nominal(found, guesses)
+    if math.isfinite(nominal.stiffness):
+        found = inspect(path, table, gear_ratio=nominal.gear_ratio, nominal=nominal)
+        for channel, key in (("theta_s", "skew"), ("theta_e", "offset")):
+            if key in found.record.corrections:
+                table[channel] = _as_table(table.get(channel, channel)) | {key: found.record.corrections[key]}
+    return _study(found, nominal, table), guesses, found
+
+
+def _as_table(given: Any) -> dict[str, Any]:
+    return given if isinstance(given, dict) else {"column": given}
+
+
+def _nominal(found: Inspection, guesses: list[str]) -> NominalDrive:
+    """Inertia and friction by the rough fit; of two sides half of it each, at the motor."""
+    dynamics, gearing = found.record.findings.dynamics, found.record.findings.gearing
+    inertia, viscous = 1.0, 0.0
+    if dynamics is None:
+        guesses.append("The log does not show an inertia: 1 is a placeholder.")
+    else:
+        inertia, viscous = (float(value) for value in dynamics.values[:2])
+        if inertia < 2.0 * float(dynamics.errors[0]) or inertia <= 0.0:
+            # inertia is then a small part of the torque
+            inertia = 0.1 * dynamics.torque / dynamics.acceleration
+            guesses.append(f"The log hardly shows the inertia: {inertia:.2g} would take a tenth of the torque.")
+        viscous = viscous if viscous > 0.0 else 0.01 * dynamics.torque / max(dynamics.acceleration, 1e-300)
+    period = found.record.sample_period
+    if gearing is None or found.gear_ratio is None or found.record.torque is None:
+        return NominalDrive(inertia, viscous)
+    both = found.record.positions
+    parts = [
+        _kinematics(both["motor"][s], both["load"][s], found.record.findings.channels["theta_e"].bandwidth, period)
+        for s in found.record.segments
+        if s.stop - s.start >= SHORTEST
+    ]
+    motor, rows = (np.concatenate(column) for column in zip(*parts, strict=True))
+    values, errors = jackknifed(motor, rows)
+    if not np.isfinite(values).all() or values[0] <= 0.0:
+        raise InputError(
+            f"{found.record.path}: theta_e moves {gearing.ratio:.4g} for each 1 of theta_s; it should be more than 0: set "
+            "sign = -1 in [log] theta_e or theta_s, or leave one of them out, and give the file as --model"
+        )
+    ratio, whole = float(values[0]), float(round(values[0]))
+    # most ratios of one stage are whole
+    if whole and abs(ratio - whole) < max(0.005 * ratio, 5.0 * float(errors[0])):
+        guesses.append(f"gear_ratio is {ratio:.4g} by the log, and taken to be {whole:g}.")
+        ratio = whole
+    half = 0.5 * inertia
+    drive = NominalDrive(half, 0.5 * viscous, half * ratio**2, 0.5 * viscous * ratio**2, ratio)
+    guesses.append("Inertia and friction are divided evenly between the sides, and the stiffness is a rough guess.")
+    # the load's inertia winds the shaft up by J_s / (N K) times its acceleration; where it is small, half of the torque does
+    wound = max(float(values[2]), 2.0 * float(errors[2]), 1e-300)
+    beside = np.std(motor - ratio * rows[:, 0]) - 0.5 * gearing.lost_motion
+    least = 0.5 * float(np.std(found.record.torque)) / max(float(beside), 0.1 * gearing.lost_motion, 1e-300)
+    stiffness = max(drive.load_inertia / ratio / wound, least if math.isfinite(least) and least < 1e12 else 0.0)
+    return replace(drive, stiffness=stiffness, half_gap=0.5 * max(gearing.lost_motion, 0.0))
+
+
+def _kinematics(motor: np.ndarray, load: np.ndarray, width: float, period: float) -> tuple[np.ndarray, np.ndarray]:
+    """Motor position, and load position, velocity, acceleration, direction, 1; low-passed."""
+    cutoff = 4.0 * width
+    smooth = low_passed(np.column_stack([motor, load]), cutoff, period) if width else np.column_stack([motor, load])
+    velocity = np.gradient(smooth[:, 1], period)
+    acceleration = np.gradient(velocity, period)
+    rows = np.column_stack([smooth[:, 1], velocity, acceleration, direction_of(velocity), np.ones(len(motor))])
+    cut = without_ends(len(motor), cutoff, period) if width else slice(None)
+    return smooth[cut, 0], rows[cut]
+
+
+def _study(found: Inspection, nominal: NominalDrive, table: dict[str, Any]) -> dict[str, Any]:
+    record = found.record
+    two = math.isfinite(nominal.stiffness)
+    names = ("motor_inertia", "motor_viscous", *(("load_inertia", "load_viscous", "gear_ratio") if two else ()))
+    study: dict[str, Any] = {
+        "title": record.path.stem,
+        "drive": {"kind": "two_inertia" if two else "rigid"} | {name: _rounded(getattr(nominal, name)) for name in names},
+    }
+    fastest = 0.0
+    if two:
+        law = {"law": "dead_zone", "stiffness": _rounded(nominal.stiffness), "half_gap": _rounded(nominal.half_gap)}
+        study["transmission"] = law if nominal.half_gap else {"law": "linear_shaft", "stiffness": law["stiffness"]}
+        fastest = math.sqrt(nominal.stiffness / nominal.motor_inertia)
+    # ten plant steps for each radian of the shaft's own motion
+    substeps = max(math.ceil(10.0 * fastest * record.sample_period / (2.0 * math.pi)), 1)
+    noise = record.findings.channels["theta_e" if "motor" in record.positions else "theta_s"].noise
+    return study | {
+        "encoders": {"noise": _rounded(noise)},
+        "run": {"sample_period": record.sample_period, "substeps": substeps},
+        "uncertainty": {"relative": _VAGUE, "exact": ["drive.gear_ratio"] if two else []},
+        "log": table,
+    }
+
+
+def _rounded(value: float) -> float:
+    """To three digits: no more of a rough fit is meant."""
+    return float(f"{value:.3g}")
