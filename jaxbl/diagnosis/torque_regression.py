@@ -124,6 +124,8 @@ def _proposals(
 ) -> list[_Proposal]:
     """Candidates that take away a part of the missing torque by cross-validation, the best one of each name, best first."""
     linear = model.linear
+    # frequencies are sought in what this leaves
+    linear.choose(())
     # errors of numbers that may change are no finding of this regression: they take part in it
     own = [name for name in search.lacking if linear.same(name) is not None and linear.nominal(name) is not None]
     sought = [name for name in search.lacking if not any(one == name or contains(one, name) for one in model.names)]
