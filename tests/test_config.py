@@ -1,5 +1,6 @@
 """The TOML study: what is valid, what the messages about the rest say, and what it builds."""
 
+import re
 import tomllib
 
 import hypothesis.strategies as st
@@ -99,7 +100,12 @@ NUMBERS = {
 
 # effects by kind with every parameter given
 TABLES = {
-    name: {"kind": name} | {key_of(f.name): NUMBERS.get(f.name, 0.2) for f, _ in parameters(EFFECTS[name])}
+    name: {"kind": name}
+    | {
+        key_of(f.name): NUMBERS.get(f.name, 0.2)
+        for f, _ in parameters(EFFECTS[name])
+        if f.default != () and f.name != "turn"
+    }
     for name in EFFECTS
 }
 
@@ -393,6 +399,29 @@ def test_every_effect_is_built_with_its_numbers_and_its_name(name):
             new = 0.5 * value if key == "delay" else 0.7
             moved = with_values(config, {f"effects.{name}.{key}": new})
             assert getattr(moved.build().effects[0], key) == new
+
+
+TABULATED = {"kind": "motor.tabulated", "positions": [0.0, 1.0], "position_torques": [0.1, 0.2], "turn": True}
+
+
+def test_a_table_of_torques_is_built_and_no_axis_goes_over_it():
+    config = read_config(small(effects=[TABULATED]))
+    (effect,) = config.build().effects
+    assert effect.positions == (0.0, 1.0) and effect.position_torques == (0.1, 0.2) and effect.turn and effect.speeds == ()
+    assert not any("tabulated" in path for path in (*numeric_paths(config), *leaf_paths(config.build())))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"positions": [0.0]}, "position_torques has 2 numbers; it should have one for each of 1 positions"),
+        ({"positions": [1.0, 1.0]}, "positions should increase"),
+        ({"speeds": [1.0]}, "speed_torques has 0 numbers; it should have one for each of 1 speeds"),
+    ],
+)
+def test_a_wrong_table_of_torques_is_refused(change, message):
+    with pytest.raises(InputError, match=re.escape(f"effects[0]: motor.tabulated: {message}")):
+        read_config(small(effects=[TABULATED | change]))
 
 
 @pytest.mark.parametrize("data", [small(effects=[TABLES["motor.cogging"], *[TABLES["load.gravity"]] * 2]), rigid()])

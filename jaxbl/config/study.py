@@ -207,7 +207,7 @@ def _paths(table: Table, prefix: str) -> Iterator[tuple[str, Parameter]]:
         path = f"{prefix}.{field.alias or name}"
         if isinstance(value, Table):
             yield from _paths(value, path)
-        elif name not in _FIXED and not isinstance(value, list):
+        elif name not in _FIXED and not isinstance(value, (list, bool)):
             extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
             yield path, Parameter(str(extra.get("unit", "")), field.description or "")
 
