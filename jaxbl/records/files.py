@@ -19,7 +19,9 @@ import pandas as pd
 from jaxbl.errors import InputError
 from jaxbl.validation import nearest
 
-_KINDS = "text (CSV and the like), Parquet, MATLAB (.mat) and JSON can be read"
+from .libraries import read_mdf, read_tdms
+
+_KINDS = "text (CSV and the like), Parquet, MATLAB (.mat), JSON, MDF4 and TDMS can be read"
 
 
 class Columns(dict[str | int, Any]):
@@ -75,7 +77,7 @@ class LogFile:
     def numbers(self, column: str | int, channel: str = "") -> np.ndarray:
         """A column of finite numbers, shape (rows,); InputError names the first row, counted from 1, that holds none."""
         name = self.name(column, channel)
-        given = self.columns[name]
+        given = np.asarray(self.columns[name])
         values = np.asarray(pd.to_numeric(pd.Series(given), errors="coerce"), dtype=float)
         finite = np.isfinite(values)
         if not finite.all():
@@ -115,7 +117,14 @@ def read_log_file(path: Path) -> LogFile:
 
 
 def _columns(path: Path) -> dict[str | int, Any]:
-    content, suffix = path.read_bytes(), path.suffix.lower()
+    suffix = path.suffix.lower()
+    with path.open("rb") as file:
+        first = file.read(8)
+    for mark, kind, read in ((b"TDSm", "TDMS", read_tdms), (b"MDF", "MDF", read_mdf)):
+        if first.startswith(mark):
+            with _reading(kind):
+                return read(path)
+    content = path.read_bytes()
     if not content.strip():
         raise InputError(f"is empty; {_KINDS}")
     if content.startswith(b"PAR1"):

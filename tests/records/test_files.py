@@ -1,6 +1,7 @@
 """Columns out of files of every kind."""
 
 import json
+import sys
 
 import h5py
 import numpy as np
@@ -208,3 +209,36 @@ def test_exports_with_remarks_before_their_rows(tmp_path):
     # sampled at times of its own: the last is before those of the others
     np.testing.assert_array_equal(file.numbers("fast"), [0.0, 20.0, 20.0])
     assert file.notes == ["'fast' has times of its own; its values are interpolated to the others' times."]
+
+
+def test_tdms_by_its_library(tmp_path):
+    library = pytest.importorskip("nptdms", reason="the extra logs is not installed")
+    channels = [library.ChannelObject("drive", name, x, {"wf_increment": 0.1}) for name, x in (("u", U), ("theta_e", T))]
+    with library.TdmsWriter(tmp_path / "log.tdms") as writer:
+        writer.write_segment(channels)
+    file = read_log_file(tmp_path / "log.tdms")
+    assert list(file.columns) == ["u", "theta_e", "t"]
+    np.testing.assert_array_equal(file.numbers("u"), U)
+    np.testing.assert_allclose(file.numbers("t"), T)
+
+
+@pytest.mark.filterwarnings("ignore")  # of the library
+def test_mdf_by_its_library(tmp_path):
+    library = pytest.importorskip("asammdf", reason="the extra logs is not installed")
+    with library.MDF() as mdf:
+        mdf.append([library.Signal(U, T, name="u"), library.Signal(2.0 * U, T, name="theta_e")])
+        mdf.append([library.Signal(np.array([0.0, 4.0]), T[[0, -1]], name="slow")])
+        mdf.save(tmp_path / "log.mf4")
+    file = read_log_file(tmp_path / "log.mf4")
+    assert set(file.columns) == {"t", "u", "theta_e", "slow"}
+    np.testing.assert_array_equal(file.numbers("theta_e"), 2.0 * U)
+    np.testing.assert_allclose(file.numbers("t"), T)
+    np.testing.assert_allclose(file.numbers("slow"), [0.0, 1.0, 2.0, 3.0, 4.0])
+
+
+@pytest.mark.parametrize(("mark", "package"), [(b"TDSm", "nptdms"), (b"MDF     4.10    ", "asammdf")])
+def test_a_missing_library_names_the_extra(tmp_path, monkeypatch, mark, package):
+    monkeypatch.setitem(sys.modules, package, None)
+    (tmp_path / "log").write_bytes(mark + bytes(64))
+    with pytest.raises(InputError, match=rf"needs the package {package}: pip install 'jaxbl\[logs\]'"):
+        read_log_file(tmp_path / "log")
