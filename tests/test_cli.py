@@ -433,13 +433,25 @@ def test_shipped_studies_run_without_a_word_on_stderr(name, command, tmp_path):
     assert (done.returncode, done.stderr) == (0, "")
 
 
+def test_inspect_writes_a_first_model(call, tmp_path):
+    made(count=6000, gap=0.1, noise=1e-4).to_csv("axis.csv", index=False)
+    code, lines, _ = call("inspect", "axis.csv", "--write", "axis.toml")
+    assert code == 0 and "axis.toml: a first model. Run: jaxbl identify axis.csv --model axis.toml" in lines
+    text = (tmp_path / "axis.toml").read_text()
+    assert text.startswith("# Proposed by jaxbl inspect --write from axis.csv.") and "gear_ratio = 20.0" in text
+    assert call("inspect", "axis.csv", "--model", "axis.toml", "--out", "again")[0] == 0
+    with pytest.raises(InputError, match="axis.toml: is there already; --write needs a new name"):
+        call("inspect", "axis.csv", "--write", "axis.toml")
+
+
 def test_inspect_says_what_a_log_holds_and_leaves_numbers_figures_and_report(call, tmp_path):
     made(count=6000, gap=0.1, noise=1e-4).to_csv("axis.csv", index=False)
     code, lines, _ = call("inspect", "axis.csv")
     folder = tmp_path / "results" / "axis"
     assert code == 0
     assert lines[0] == "axis.csv: 6000 samples, 6 s every 1 ms, even stamps, one segment"
-    assert [line.split()[0] for line in lines[3:6]] == ["theta_e", "theta_s", "u"]
+    assert lines[1].startswith("As read: motor up to ") and "u up to " in lines[1]
+    assert [line.split()[0] for line in lines[4:7]] == ["theta_e", "theta_s", "u"]
     assert lines[-1] == "results/axis/report.html" and len(lines) <= 26
     figures = {f"figures/{name}.png" for name in ("channels", "spectra", "torque_over_velocity", "twist")}
     assert {"inspection.json", "report.html"} | figures <= set(left(folder))
