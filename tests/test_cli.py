@@ -440,7 +440,7 @@ def test_inspect_writes_a_first_model(call, tmp_path):
     text = (tmp_path / "axis.toml").read_text()
     assert text.startswith("# Proposed by jaxbl inspect --write from axis.csv.") and "gear_ratio = 20.0" in text
     assert call("inspect", "axis.csv", "--model", "axis.toml", "--out", "again")[0] == 0
-    with pytest.raises(InputError, match="axis.toml: is there already; --write needs a new name"):
+    with pytest.raises(InputError, match=r"axis.toml: is there already; --write needs a new name"):
         call("inspect", "axis.csv", "--write", "axis.toml")
 
 
