@@ -12,7 +12,7 @@ from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
 from .diagnosis_task import input_rms
-from .effect_search import FLOOR, EffectSearch, Explanation, Model
+from .effect_search import FAR, FLOOR, EffectSearch, Explanation, Model
 from .linearised_model import Linear
 from .reference_log import PREDICTABLE, Comparison, ReferenceLog
 from .setup import Setup
@@ -135,7 +135,7 @@ class Proof:
         while names:
             fitted = fit_model(search, {name: found.model.numbers[name] for name in names}, found.model.theta)
             after = self.other.compare(fitted.experiment)
-            gains = {name: beaten(self.other, self._without(search, found.model, names, name), after) for name in names}
+            gains = {name: self._gain(search, fitted, after, name) for name in names}
             least = min(gains, key=lambda name: gains[name])
             if gains[least] > 0.0 and not self.worse(after, self.before):
                 return Accepted(fitted, after, withdrawn, gains)
@@ -151,10 +151,15 @@ class Proof:
         given = FittedModel((), self.setup.nominal, own, np.zeros(len(own)), known, off)
         return Accepted(given, self.before, withdrawn, {})
 
-    def _without(self, search: EffectSearch, model: Model, names: Sequence[str], left_out: str) -> Comparison:
-        """How a model without one of its effects compares, all numbers fitted anew."""
-        fewer = fit_model(search, {name: model.numbers[name] for name in names if name != left_out}, model.theta)
-        return self.other.compare(fewer.experiment)
+    def _gain(self, search: EffectSearch, fitted: FittedModel, after: Comparison, name: str) -> float:
+        """Standard errors by which a model beats the one without an effect, all numbers fitted anew; infinite where its own
+        numbers would then have to be what they cannot be, as the one that the effect is the error of."""
+        own, prior = len(self.setup.prior), self.setup.prior
+        numbers = {one: values for one, values in fitted.numbers.items() if one != name}
+        fewer = fit_model(search, numbers, fitted.theta[:own])
+        if np.any((np.abs(fewer.theta[:own]) > FAR * prior) & (np.abs(fitted.theta[:own]) <= FAR * prior)):
+            return np.inf
+        return beaten(self.other, self.other.compare(fewer.experiment), after)
 
     def worse(self, after: Comparison, before: Comparison) -> bool:
         """Whether a model is worse than another in a channel: by more than new numbers may cost, and by more than the blocks
