@@ -5,12 +5,14 @@
 
 import dataclasses
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.drive.plant import PlantState
+from jaxbl.drive.effects import AbstractEffect, Motion
+from jaxbl.drive.plant import PlantState, States
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
@@ -78,6 +80,27 @@ def long_enough(segments: Sequence[Segment], factor: int) -> list[Kinematics]:
     return [one.kinematics for one in segments if len(one) >= max(2 * shortest(factor), _FEWEST)]
 
 
+def _held(experiment: Experiment, segment: Segment, states: States) -> States:
+    """States of effects along a segment; where a side is not seen to move, those of frictions with a memory that hold it.
+
+    Their state follows from the way covered, and there that is less than readings show.
+    """
+    plant, k, found = experiment.plant, segment.kinematics, list(states)
+    holding = [i for i, one in enumerate(plant.effects) if type(one).holds is not AbstractEffect.holds]
+    if not holding:
+        return states
+    acting = jax.vmap(plant.torques)(k.position, k.velocity, states, k.torque, k.time)
+    for i in holding:
+        side = plant.drive.place(plant.effects[i].place)
+        motion = Motion(
+            k.time, k.position[side], k.velocity[side], k.torque if side == "motor" else jnp.zeros_like(k.torque)
+        )
+        rest = acting[side][0] + plant.holding(side, motion, states)[0] - plant.inertia(side) * k.acceleration[side]
+        still = segment.smoothed[side].held(segment.period)
+        found[i] = jax.tree.map(partial(jnp.where, still), plant.effects[i].bent(rest), states[i])
+    return tuple(found)
+
+
 def windows_of(
     segments: Sequence[Segment], experiment: Experiment, samples: int, rest: bool = False
 ) -> tuple[Windows, np.ndarray]:
@@ -92,7 +115,7 @@ def windows_of(
             continue
         k = one.kinematics
         along = Path(k.time, jnp.asarray(one.torque), k.position, k.velocity)
-        start = PlantState(k.position, k.velocity, effect_states(experiment, along))
+        start = PlantState(k.position, k.velocity, _held(experiment, one, effect_states(experiment, along)))
         pieces.append(cut(one.torque, one.readings, one.period, start, noise, samples, float(one.time[0]), rest))
         firsts.append(one.rows.start + samples * np.arange(len(one) // samples))
     return Windows.join(pieces), np.concatenate(firsts)

@@ -220,6 +220,10 @@ class AbstractEffect(eqx.Module):
         """Level in N m of set-valued dry friction that a transmitted torque (N m) causes on the motor's side of the gear."""
         return 0.0
 
+    def bent(self, torque: Value) -> Any:
+        """The own state in which :meth:`resist` is nearest to a torque (N m), of an effect that :meth:`holds`."""
+        return self.init()
+
     def added_inertia(self) -> Value:
         """Inertia in kg m^2 added to the side's nominal one. It has no state: one that varies needs a torque as well."""
         return 0.0

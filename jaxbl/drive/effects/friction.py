@@ -103,6 +103,11 @@ class PreslidingFriction(SideEffect):
     def holds(self):
         return self.torque * jnp.maximum(self.breakaway_ratio, 1.0)
 
+    def bent(self, torque):
+        most = jnp.maximum(self.breakaway_ratio, 1.0)
+        # at the neutral torque, zero, any state does
+        return (jnp.clip(torque / jnp.where(self.torque == 0.0, 1.0, self.torque), -most, most),)
+
     def _most(self, velocity):
         """Steady friction over F_c."""
         return 1.0 + (self.breakaway_ratio - 1.0) * jnp.exp(-((velocity / self.stribeck_velocity) ** 2))
