@@ -673,7 +673,7 @@ def test_a_log_is_diagnosed_once(axis, quick, call, tmp_path):
         "Explained: the model lacks motor.coulomb_friction; with it, no more is left on data not used for the fit than "
         "noise and the uncertainty of the model's numbers account for."
     )
-    assert lines[1] == "motor.coulomb_friction (confidence 0.97): torque = 0.05 ± 0.001 N m."
+    assert lines[1] == "motor.coulomb_friction (confidence 0.97): torque = 0.05 ± 0.001 N m; 12 % of the driving torque."
     assert lines[2].startswith(
         "On the last part of the log (0.4 to 0.6 s), held out, over windows of 0.1 s, rms: theta_e 0.1 ->"
     )

@@ -50,6 +50,8 @@ _REFIT_STEPS, _REFIT_SETTLED = 15, 2e-3
 exact (:mod:`.refit`); evidences are compared at this one."""
 _LEAST_GAIN = 1e-3
 """Nats; what gains less in a screening gains nothing but rounding."""
+_EARNED = 3.0
+"""Nats that an effect must gain over its special case to be named in its place: odds of twenty."""
 _SHARE_OF_UNKNOWN = 0.2
 """An effect is named beside something unknown if its gain is this share of what a free function gains: known effects that
 only imitate the unknown one gain less."""
@@ -463,12 +465,21 @@ class EffectSearch:
             model = self._with(current, one, predictor)
             gain = self._gain(base, model) if model.linear.share(one.name) > LEAST else -np.inf
             tried.append((gain, model))
+        gains = {model.names[-1]: gain for gain, model in tried}
+        # of an effect and its special case the simpler one, unless the other is clearly better
+        tried = [
+            (gain, model)
+            for gain, model in tried
+            if not any(contains(model.names[-1], name) and gain < other + _EARNED for name, other in gains.items())
+        ]
         return predictor, sorted(tried, key=lambda pair: -pair[0])
 
     def _coloured_round(self, current: Model) -> tuple[Predictor, list[tuple[float, Model]]]:
         """As :meth:`_round` by Whittle's likelihood, where errors are not white; without those that gain nothing."""
         linear = current.linear
         predictor = linear.choose(())
+        if not np.isfinite(predictor.deviation).all():
+            return predictor, []
         spectrum = spectrum_of(linear.left(predictor.smoothness))
         if not spectrum.coloured:
             return predictor, []
@@ -515,9 +526,11 @@ class EffectSearch:
 
     def _gain(self, base: Model | _Scored, model: Model | _Scored) -> float:
         """Gain in evidence of a model's effect (nats), less what structure in the noise may bring (:data:`FLOOR`)."""
+        if not np.isfinite([base.log_evidence, model.log_evidence]).all():
+            # one of them diverges
+            return -np.inf
         explained = model.log_likelihood - base.log_likelihood
-        gain = model.log_evidence - base.log_evidence
-        return gain - min(max(explained, 0.0), self.floor) if np.isfinite(gain) else -np.inf
+        return model.log_evidence - base.log_evidence - min(max(explained, 0.0), self.floor)
 
     def _screen(self, model: Model, predictor: Predictor) -> tuple[Predictor, list[tuple[float, _Scored]]]:
         """The best candidates on the linearised model with their gains, and the predictor chosen with the first of them."""

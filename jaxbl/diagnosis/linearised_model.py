@@ -442,6 +442,9 @@ class Linear:
         part, side = self.parts[i], self.sides.index(place)
         predictor, forces = self._last
         gain, deviation = self.gain(predictor.smoothness), predictor.deviation
+        if not np.isfinite(deviation).all():
+            # no predictor follows this model
+            return []
         left = _errors(part, gain, forces[i]) @ predictor.coefficients[i]
         time, real = np.asarray(part.time), int(self.signals[i].real.sum())
         span, top = real * self.period, self._highest

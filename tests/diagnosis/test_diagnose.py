@@ -191,10 +191,8 @@ def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
 
     def spoilt(experiment, free, *rest):
         found = real(experiment, free, *rest)
-        if not any(one.path.startswith("effects.") for one in free):
-            return found
-        path = "effects.motor.coulomb_friction.torque"
-        wrong = set_leaves(found.experiment, {path: 4.0 * get_leaf(found.experiment, path)})
+        sizes = [one.path for one in free if one.path.startswith("effects.") and one.role == "size"]
+        wrong = set_leaves(found.experiment, {path: 4.0 * get_leaf(found.experiment, path) for path in sizes})
         return found._replace(experiment=wrong)
 
     monkeypatch.setattr(explain, "refined", spoilt)
