@@ -631,7 +631,15 @@ DIAGNOSED = {
         "noise_floor": {"theta_e": 0.001, "torque_motor": 0.01},
         "free_run": {},
         "expected": {},
-        "test": {"level": 0.01, "failed": [], "far": {}, "chance": False, "remainder": False, "powerless": False},
+        "test": {
+            "level": 0.01,
+            "failed": [],
+            "far": {},
+            "chance": False,
+            "remainder": False,
+            "powerless": False,
+            "little": False,
+        },
         "controls": {},
     },
 }

@@ -123,7 +123,8 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         done()
         if not np.isfinite(fitted.covariance).all():
             raise InputError(f"{task.record.path}: the model's numbers cannot be fitted to this log; is its input complete?")
-        judgement = judged(found, fitted, proof.before.errors, after.errors, expected, controls, setup.prior)
+        share = explained_share(setup.nominal, proof.before.errors, after.errors, expected)
+        judgement = judged(found, fitted, proof.before.errors, after.errors, expected, controls, setup.prior, share)
         found = judgement.found
         done()
         doing("running the observers")
@@ -139,7 +140,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         for side, one in about.items():
             summary["where"][side]["observed"] = one
         summary["notes"] += notes
-        summary["explained_share"] = explained_share(setup.nominal, proof.before.errors, after.errors, expected)
+        summary["explained_share"] = share
         summary["gap"] = proof.gap(fitted, after) | tested(judgement, expected, controls)
         if found.verdict == "unknown_effect":
             segments = setup.fitted.segments

@@ -131,6 +131,7 @@ def tested(judgement: Judgement, expected: Mapping[str, Expected], controls: Seq
             "chance": judgement.chance,
             "remainder": judgement.remainder,
             "powerless": judgement.powerless,
+            "little": judgement.little,
         },
         "controls": {
             one.kind: {"rmse": one.errors, "z": one.z} | ({"effect": one.effect} if one.effect else {}) for one in controls

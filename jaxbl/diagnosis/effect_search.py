@@ -50,6 +50,8 @@ _REFIT_STEPS, _REFIT_SETTLED = 15, 2e-3
 exact (:mod:`.refit`); evidences are compared at this one."""
 _LEAST_GAIN = 1e-3
 """Nats; what gains less in a screening gains nothing but rounding."""
+_SAME = 3.0
+"""Factor up to which a number that gives an effect its shape leaves it what it is: the distance of the values tried."""
 _EARNED = 3.0
 """Nats that an effect must gain over its special case to be named in its place: odds of twenty."""
 _SHARE_OF_UNKNOWN = 0.2
@@ -321,7 +323,9 @@ class EffectSearch:
                 first, *rivals = found[plain]
                 rivals = [one for one in rivals if one.name != plain]
                 found[plain] = [_Tried(plain, first.gain, current.numbers[plain]), *rivals]
-            wrong = others[0][1] if others else None
+            # a rival stands beside the same effects
+            rivals = (model for _, model in others if set(model.names[:-1]) == set(current.names[:-1]))
+            wrong = next(rivals, None)
             rest = self.remainder(current)
             # small beside what no effect explains: more of them would only imitate that
             if record[0].gain < _SHARE_OF_UNKNOWN * _most(rest) and _most(rest) > CLEAR:
@@ -335,7 +339,11 @@ class EffectSearch:
             current = self._settled(current)
             found = {name: tried for name, tried in found.items() if name in current.names}
         if current.names != before:
-            wrong = wrong if current.names[-1:] == before[-1:] else None
+            # a rival stands beside the same effects
+            same = (
+                wrong is not None and current.names[-1:] == before[-1:] and set(wrong.names[:-1]) == set(current.names[:-1])
+            )
+            wrong = wrong if same else None
             # a free function that was needed beside the effect is needed without it, too
             rest = {name: max(rest[name], one) for name, one in self.remainder(current).items()}
             left = _most(rest)
@@ -402,10 +410,11 @@ class EffectSearch:
         return model, gone
 
     def _needless(self, name: str, numbers: Mapping[str, Numbers], theta: np.ndarray, predictor: Predictor) -> Model | None:
-        """The model without one of its effects, all numbers refitted, if the effect gains nothing beside the others."""
+        """The model without one of its effects, all numbers refitted, if the effect gains nothing beside the others, and these
+        do not become something else to stand for it: friction over a long way is a spring."""
         full = self.refit(numbers, theta, predictor)
         less = self.refit({one: values for one, values in numbers.items() if one != name}, theta, predictor)
-        return less if self._gain(less, full) <= 0.0 else None
+        return less if self._gain(less, full) <= 0.0 and not _changed(full, less) else None
 
     def _settled(self, model: Model) -> Model:
         """A model without effects that are needless once all numbers are those of least prediction errors: one may only have
@@ -589,6 +598,16 @@ def contains(general: str, name: str) -> bool:
     """Whether an effect has another one at the same place as its special case."""
     place, _, kind = name.partition(".")
     return general.partition(".")[0] == place and kind in EFFECTS[general].special_cases
+
+
+def _changed(before: Model, after: Model) -> bool:
+    """Whether an effect's speed, length or time has changed by more than a factor (:data:`_SAME`)."""
+    for name, numbers in after.numbers.items():
+        for leaf, role in EFFECTS[name].roles().items():
+            now, then = abs(numbers[leaf]), abs(before.numbers[name][leaf])
+            if role.kind == "shape" and not then <= _SAME * now <= _SAME**2 * then:
+                return True
+    return False
 
 
 def _verdict(left: float, findings: Sequence[Finding]) -> VerdictName:

@@ -15,6 +15,9 @@ from .effect_search import FAR, LEAST_CHANCE, Explanation, Finding, Model
 from .expected_errors import Expected, failed
 from .proof import SURE, Control, FittedModel
 
+_LEAST_SHARE = 0.5
+"""Of the missing torque, that an explanation takes away: with less it may pass only since its numbers are open."""
+
 
 class Judgement(NamedTuple):
     """What the held-out data leave of an explanation.
@@ -26,6 +29,7 @@ class Judgement(NamedTuple):
         chance: whether the added torque does as well shuffled in time.
         remainder: whether the search found that something else is missing.
         powerless: whether the model as given would pass, too, so that held-out data say nothing for the effects.
+        little: whether the effects take away less than half of the torque that is missing on held-out data.
     """
 
     found: Explanation
@@ -34,6 +38,7 @@ class Judgement(NamedTuple):
     chance: bool
     remainder: bool
     powerless: bool
+    little: bool
 
 
 def judged(
@@ -44,6 +49,7 @@ def judged(
     expected: Mapping[str, Expected],
     controls: Sequence[Control],
     prior: np.ndarray,
+    share: float | None,
 ) -> Judgement:
     """Judge an explanation.
 
@@ -54,6 +60,7 @@ def judged(
         expected: those of a complete model.
         controls: of the model.
         prior: standard deviations of its own numbers, which are the first of `fitted`.
+        share: of the missing torque that it explains (:func:`explained_share`).
     """
     left = failed(errors, expected)
     away = fitted.theta[: len(prior)] / prior
@@ -67,15 +74,18 @@ def judged(
                 _shared(each, found.model, found.wrong, one.z) if each.effect == last else each for each in findings
             )
     powerless = bool(fitted.names) and not failed(before, expected)
-    verdict = "unknown_effect" if left or far or chance or powerless else found.verdict
+    little = bool(fitted.names) and share is not None and share < _LEAST_SHARE
+    verdict = "unknown_effect" if left or far or chance or powerless or little else found.verdict
     remainder = found.verdict == "unknown_effect"
     said = dataclasses.replace(found, verdict=verdict, findings=findings)
-    return Judgement(said, left, far, chance, remainder, powerless)
+    return Judgement(said, left, far, chance, remainder, powerless, little)
 
 
 def _no_surer(finding: Finding, fitted: FittedModel) -> Finding:
     """A finding no surer than that its torque is not zero."""
-    errors, paths = fitted.errors(), [f"effects.{finding.effect}.{leaf}" for leaf in EFFECTS[finding.effect].sizes()]
+    cls, errors = EFFECTS[finding.effect], fitted.errors()
+    # of an effect without sizes its other numbers have to be known
+    paths = [f"effects.{finding.effect}.{leaf}" for leaf in cls.sizes() or cls.roles()]
     z = [abs(float(get_leaf(fitted.experiment, path))) / max(errors[path], 1e-300) for path in paths if path in errors]
     chance = float(2.0 * norm.cdf(max(z)) - 1.0) if z else 1.0
     return finding if finding.confidence <= chance else dataclasses.replace(finding, confidence=chance)

@@ -20,6 +20,8 @@ from .setup import Setup
 _WORSE, _WORSE_SPEED = 1.02, 1.05
 """Errors of a model over those of the one given, or over the noise, up to which it is no worse: what numbers fitted on other
 data cost; of speeds the noise is known less well."""
+_SURELY = 1.1
+"""The same from which on it is worse, whatever the blocks of held-out data say."""
 
 _BLOCKS = 16
 """Of held-out data, over which errors are compared: many enough for a standard error, and longer than errors are correlated
@@ -162,12 +164,15 @@ class Proof:
         return beaten(self.other, self.other.compare(fewer.experiment), after)
 
     def worse(self, after: Comparison, before: Comparison) -> bool:
-        """Whether a model is worse than another in a channel: by more than new numbers may cost, and by more than the blocks
-        of held-out data differ."""
+        """Whether a model is worse than another in a channel: by more than new numbers may cost, and surely so by the blocks
+        of held-out data, or by much."""
         for name, value in after.errors.items():
             limit = _WORSE_SPEED if name.startswith("velocity") else _WORSE
-            if value <= limit * max(before.errors[name], self.noise[name]):
+            most = max(before.errors[name], self.noise[name])
+            if value <= limit * most:
                 continue
+            if not value <= _SURELY * most:
+                return True
             other, own = (_blocks(one.samples[name], self.noise[name]) for one in (before, after))
             if not _standard_errors(other, own) > -SURE:
                 return True

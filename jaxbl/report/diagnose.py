@@ -136,6 +136,8 @@ def _reasons(summary: Mapping[str, Any]) -> list[str]:
         lines.append(
             "The data not used for the fit cannot confirm it: the model as given leaves no more there than could be chance."
         )
+    if test["little"] and not test["failed"]:
+        lines.append("It takes away less than half of the torque that is missing on the data not used for the fit.")
     if test["chance"]:
         lines.append("Shuffled in time, the torque that was added does as well.")
     return lines

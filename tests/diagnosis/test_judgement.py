@@ -28,7 +28,7 @@ def found(verdict="explained", fit_gain=50.0, prior_gain=0.0, rival="motor.visco
     return Explanation(verdict, (finding,), model, model, wrong, {})  # type: ignore[arg-type]
 
 
-def judge(errors=NOISE, before=BEFORE, theta=0.0, controls=(), verdict="explained", error=0.001, **gains):
+def judge(errors=NOISE, before=BEFORE, theta=0.0, controls=(), verdict="explained", error=0.001, share=1.0, **gains):
     fitted = SimpleNamespace(
         names=(NAME,),
         theta=np.array([theta, 1.0]),
@@ -36,7 +36,7 @@ def judge(errors=NOISE, before=BEFORE, theta=0.0, controls=(), verdict="explaine
         experiment=SimpleNamespace(effects=(make_effect(NAME, torque=0.1),)),
         errors=lambda: {f"effects.{NAME}.torque": error},
     )
-    return judged(found(verdict, **gains), fitted, before, errors, LIMITS, controls, np.array([0.02]))  # type: ignore[arg-type]
+    return judged(found(verdict, **gains), fitted, before, errors, LIMITS, controls, np.array([0.02]), share)  # type: ignore[arg-type]
 
 
 def test_a_verdict_that_held_out_data_support_stays():
@@ -54,13 +54,14 @@ def test_a_verdict_that_held_out_data_support_stays():
         ({"controls": [Control("permuted", NOISE, 1.9)]}, {"chance": True}),
         ({"verdict": "unknown_effect"}, {"remainder": True}),
         ({"before": NOISE}, {"powerless": True}),
+        ({"share": 0.2}, {"little": True}),
     ],
-    ids=["errors", "numbers", "shuffled", "search", "before"],
+    ids=["errors", "numbers", "shuffled", "search", "before", "share"],
 )
 def test_one_reason_is_enough_against_it(given, reason):
     said = judge(**given)
     assert said.found.verdict == "unknown_effect" and said.found.findings == found().findings
-    none = {"failed": [], "far": {}, "chance": False, "remainder": False, "powerless": False}
+    none = {"failed": [], "far": {}, "chance": False, "remainder": False, "powerless": False, "little": False}
     assert {key: getattr(said, key) for key in none} == none | reason
 
 
@@ -92,7 +93,7 @@ def test_an_effect_that_another_beats_on_held_out_data_changes_places_with_it():
     # what the log alone said for the other one is no argument any more
     fitted = SimpleNamespace(names=("motor.viscous_friction",), theta=np.zeros(1), free=[], errors=dict)
     back = [Control("wrong", NOISE, 1.8, NAME)]
-    after = judged(other, fitted, BEFORE, NOISE, LIMITS, back, np.array([0.02]))  # type: ignore[arg-type]
+    after = judged(other, fitted, BEFORE, NOISE, LIMITS, back, np.array([0.02]), 1.0)  # type: ignore[arg-type]
     assert after.found.findings == (one,)
     assert exchanged(found(rival="motor.stribeck_friction"), [control[0]._replace(effect="motor.stribeck_friction")]) is None
 

@@ -56,7 +56,15 @@ SUMMARY = {
             for name, value in ERRORS.items()
             if not name.startswith("velocity")
         },
-        "test": {"level": 0.01, "failed": [], "far": {}, "chance": False, "remainder": False, "powerless": False},
+        "test": {
+            "level": 0.01,
+            "failed": [],
+            "far": {},
+            "chance": False,
+            "remainder": False,
+            "powerless": False,
+            "little": False,
+        },
         "controls": {
             "wrong": {"effect": "load.stribeck_friction", "rmse": scaled(0.3), "z": 12.3},
             "permuted": {"rmse": scaled(1.4) | {"theta_e": None}, "z": float("inf")},

@@ -54,9 +54,9 @@ class StribeckFriction(SideEffect):
         return super().possible(numbers) and numbers["breakaway_torque"] > numbers["torque"]
 
 
-_LENGTHS = 0.001, 0.003, 0.01, 0.03, 0.1, 0.25, 0.6
-"""Pre-sliding lengths tried, over the position's standard deviation: a shorter one is dry friction on most logs, over a
-longer one nothing slides."""
+_LENGTHS = 0.001, 0.003, 0.01, 0.03, 0.1
+"""Pre-sliding lengths tried, over the position's standard deviation: a shorter one is dry friction on most logs, a longer
+one a spring."""
 
 
 @EFFECTS.add
