@@ -410,8 +410,8 @@ class EffectSearch:
         return model, gone
 
     def _needless(self, name: str, numbers: Mapping[str, Numbers], theta: np.ndarray, predictor: Predictor) -> Model | None:
-        """The model without one of its effects, all numbers refitted, if the effect gains nothing beside the others, and these
-        do not become something else to stand for it: friction over a long way is a spring."""
+        """The model without one of its effects, all numbers refitted, if the effect gains nothing beside the others, and
+        these do not become something else to stand for it: friction over a long way is a spring."""
         full = self.refit(numbers, theta, predictor)
         less = self.refit({one: values for one, values in numbers.items() if one != name}, theta, predictor)
         return less if self._gain(less, full) <= 0.0 and not _changed(full, less) else None
