@@ -191,7 +191,9 @@ class Flexibility(SideEffect):
         twist, velocity = state
         rate, decay = self._rates
         swing = jnp.sqrt(rate**2 - decay**2)
-        cosine, sine = jnp.cos(swing * step), step * jnp.sinc(swing * step / jnp.pi)
+        # sin(swing * step) / swing, and its limit; not by `jnp.sinc`, whose primitives not every loop knows
+        turns = jnp.where(swing == 0.0, 1.0, swing)
+        cosine, sine = jnp.cos(swing * step), jnp.where(swing == 0.0, step, jnp.sin(turns * step) / turns)
         slip = velocity - motion.velocity
         left = jnp.exp(-decay * step)
         twist, slip = (
