@@ -91,7 +91,7 @@ def summary_of(
         "where": where,
         "rest": {name: {"evidence": gain, "share": share} for name, (gain, share) in found.rest.items()},
         "withdrawn": list(withdrawn),
-        "warnings": list(record.warnings),
+        "warnings": setup.task.warnings,
         "notes": notes,
     }
 

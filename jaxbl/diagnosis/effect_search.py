@@ -64,8 +64,8 @@ CLEAR = 100.0
 since quantisation and time stepping leave structure, too (benchmarks/NOTES.md)."""
 _SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
 """Prior sizes of a free function that are tried, over :data:`.candidates.SHARE`: down to the least that counts."""
-_MOST = 4
-"""Effects that are sought: twice as many as the bench hides at once."""
+_MOST = 6
+"""Effects that are sought: a servo motor shows dry and viscous friction, a constant torque, waves of cogging, a delay."""
 _RECENT = 4
 """Models along the record that are kept: where a refit ended, the next one begins."""
 LEAST = 1e-3
@@ -315,8 +315,8 @@ class EffectSearch:
                 break
             (_, current), *others = tried
             record = [_Tried(model.names[-1], gain, model.numbers[model.names[-1]]) for gain, model in tried]
-            current, gone = self._pruned(current, predictor.smoothness)
-            found = {name: one for name, one in found.items() if name not in gone} | {record[0].name: record}
+            current = self._pruned(current, predictor.smoothness)
+            found = {name: one for name, one in found.items() if name in current.names} | {record[0].name: record}
             current, renamed = self._simplified(current, predictor.smoothness)
             found = {renamed.get(name, name): one for name, one in found.items()}
             for plain in renamed.values():
@@ -400,14 +400,11 @@ class EffectSearch:
                     kept[one.name] = [equal, *(other for other in tried if other.name != one.name)]
         return model, kept
 
-    def _pruned(self, model: Model, smoothness: Sequence[float]) -> tuple[Model, set[str]]:
-        """A model without the earlier effects that a later one has made needless, and their names."""
-        gone: set[str] = set()
+    def _pruned(self, model: Model, smoothness: Sequence[float]) -> Model:
+        """A model without the earlier effects that a later one has made needless."""
         for name in model.names[:-1]:
-            less = self._needless(name, model.numbers, model.theta, model.linear.predictor(smoothness))
-            if less is not None:
-                model, gone = less, gone | {name}
-        return model, gone
+            model = self._needless(name, model.numbers, model.theta, model.linear.predictor(smoothness)) or model
+        return model
 
     def _needless(self, name: str, numbers: Mapping[str, Numbers], theta: np.ndarray, predictor: Predictor) -> Model | None:
         """The model without one of its effects, all numbers refitted, if the effect gains nothing beside the others, and
@@ -503,9 +500,10 @@ class EffectSearch:
         return predictor, sorted(tried, key=lambda pair: -pair[0])
 
     def _with(self, current: Model, one: _Scored, predictor: Predictor) -> Model:
-        """A model with one effect more, refitted from the numbers that the screening gave it."""
-        doing(f"trying {' + '.join([*current.names, one.name])}")
-        numbers = current.numbers | {one.name: one.found.numbers}
+        """A model with one effect more, in place of its special cases, refitted from the numbers of the screening."""
+        numbers = {name: values for name, values in current.numbers.items() if not contains(one.name, name)}
+        numbers[one.name] = one.found.numbers
+        doing(f"trying {' + '.join(numbers)}")
         return self.refit(numbers, current.theta + one.found.own[: len(self.free)], predictor)
 
     def remainder(self, model: Model) -> dict[str, tuple[float, float]]:
@@ -603,9 +601,9 @@ def contains(general: str, name: str) -> bool:
 def _changed(before: Model, after: Model) -> bool:
     """Whether an effect's speed, length or time has changed by more than a factor (:data:`_SAME`)."""
     for name, numbers in after.numbers.items():
-        for leaf, role in EFFECTS[name].roles().items():
+        for leaf in [leaf for leaf, role in EFFECTS[name].roles().items() if role.kind == "shape"]:
             now, then = abs(numbers[leaf]), abs(before.numbers[name][leaf])
-            if role.kind == "shape" and not then <= _SAME * now <= _SAME**2 * then:
+            if not then <= _SAME * now <= _SAME**2 * then:
                 return True
     return False
 

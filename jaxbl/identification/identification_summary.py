@@ -167,7 +167,7 @@ def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mappin
         "held": found.held,
         "condition": found.condition,
         "residual": residual,
-        "warnings": list(record.warnings),
+        "warnings": task.warnings,
         "notes": list(record.notes),
     }
 

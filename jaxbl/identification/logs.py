@@ -20,7 +20,7 @@ from jaxbl.config import Config, prepare
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import get_leaf, leaf_paths
 from jaxbl.errors import InputError
-from jaxbl.records import POSITION_CHANNELS, PositionTable, Record, join, read_record
+from jaxbl.records import POSITION_CHANNELS, PositionTable, Record, TurningLog, join, read_record, turned
 from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress
 
@@ -46,6 +46,12 @@ class LogTask:
     missing: frozenset[str]
     record: Record
     holdout: Record | None
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is to be said first of the logs."""
+        other = None if self.holdout is None or self.holdout.path == self.record.path else self.holdout
+        return [*self.record.warnings, *(f"Held-out log: {one}" for one in (other.warnings if other else ()))]
 
     @property
     def identity(self) -> str:
@@ -92,7 +98,36 @@ def read_logs(config: Config, logs: Logs, gear_tolerance: float = 0.0, like: Rec
             given |= {key: value for key, value in record.corrections.items() if key == "offset"}
         if not isinstance(log, Record) and given != record.corrections:
             records[i] = _read_one(_corrected(config, given), log, gear_tolerance)
-    return join(records)
+    first, *others = records if like is None else (like, *records)
+    others = [_from_zero_of(first, one, config) for one in others]
+    return join([first, *others] if like is None else others)
+
+
+def _from_zero_of(first: Record, record: Record, config: Config) -> Record:
+    """A log whose positions count from the zero of another one, as far as torques that repeat with the turn show it."""
+    table, two = config.log, config.drive.kind == "two_inertia"
+    given = any(one is not None and one.offset is not None for one in (table.theta_e, table.theta_s))
+    if given or "motor" not in record.positions or record.findings.channels["theta_e"].unit != "rad":
+        return record
+    ratio = config.drive.gear_ratio if two else 1.0
+    motions = []
+    for one in (first, record):
+        assert one.torque is not None
+        load = ratio * one.positions["load"] if two else None
+        motions.append(TurningLog(one.torque, one.positions["motor"], load, one.segments, one.sample_period))
+    found = turned(*motions)
+    if found is None:
+        return record
+    waves = ", ".join(map(str, found.waves))
+    other = f" (to theta_s 1/{ratio:g} of it)" if two else ""
+    warning = (
+        f"theta_e counts from another zero than in {first.path.name}, by the torque that repeats {waves} times a turn: "
+        f"{found.value:.4g} ± {found.error:.1g} rad were added{other}. [log] theta_e.offset = 0 leaves it as it is."
+    )
+    positions = {
+        side: values + found.value / (ratio if side == "load" else 1.0) for side, values in record.positions.items()
+    }
+    return dataclasses.replace(record, positions=positions, warnings=(*record.warnings, warning))
 
 
 def _corrected(config: Config, given: Mapping[str, float]) -> Config:

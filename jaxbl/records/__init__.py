@@ -4,6 +4,8 @@ from .alignment import NominalDrive as NominalDrive
 from .inspection import Inspection as Inspection
 from .inspection import Judgement as Judgement
 from .inspection import inspect as inspect
+from .position_zero import TurningLog as TurningLog
+from .position_zero import turned as turned
 from .reader import Findings as Findings
 from .reader import Record as Record
 from .reader import join as join

@@ -1,0 +1,54 @@
+"""Several logs of one machine as one record."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from jaxbl.config import read_model
+from jaxbl.identification.logs import read_logs
+from jaxbl.records import Record
+
+MODEL = {"drive": {"kind": "rigid", "motor_inertia": 4e-5, "motor_viscous": 1e-4}}
+
+
+def written(path: Path, seed: int, zero: float) -> Path:
+    """A log of a motor with cogging of 5 a turn, whose encoder has a zero of its own."""
+    time = 1e-3 * np.arange(6000)
+    place = 20.0 * np.sin(1.5 * time + seed)
+    speed, change = 30.0 * np.cos(1.5 * time + seed), -45.0 * np.sin(1.5 * time + seed)
+    torque = 4e-5 * change + 1e-4 * speed + 2e-3 * np.sin(5.0 * place)
+    noise = np.random.default_rng(seed).standard_normal((2, len(time)))
+    pd.DataFrame({"t": time, "u": torque + 3e-4 * noise[0], "theta_e": place - zero + 1e-4 * noise[1]}).to_csv(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def paths(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("logs")
+    return [written(folder / f"{seed}.csv", seed, zero) for seed, zero in ((0, 0.0), (1, 0.3), (2, -0.2))]
+
+
+def ahead(record: Record, paths: list[Path]) -> list[float]:
+    """By how much the positions of each log of a record were turned, rad."""
+    read = np.concatenate([pd.read_csv(one)["theta_e"] for one in paths])
+    return [float(np.mean(one)) for one in np.split(record.positions["motor"] - read, len(paths))]
+
+
+def test_logs_with_other_zeros_are_turned_to_that_of_the_first(paths: list[Path]):
+    config, _ = read_model(MODEL)
+    record = read_logs(config, paths[:2])
+    np.testing.assert_allclose(ahead(record, paths[:2]), [0.0, 0.3], atol=0.02)
+    (warning,) = record.warnings
+    assert warning.startswith(
+        "1.csv: theta_e counts from another zero than in 0.csv, by the torque that repeats 5 times a turn"
+    )
+    held = read_logs(config, paths[2], like=record)
+    np.testing.assert_allclose(ahead(held, paths[2:]), [-0.2], atol=0.02)
+
+
+def test_an_offset_that_is_given_stands(paths: list[Path]):
+    config, _ = read_model(MODEL | {"log": {"theta_e": {"column": "theta_e", "offset": 0.0}}})
+    record = read_logs(config, paths[:2])
+    assert ahead(record, paths[:2]) == [0.0, 0.0] and not record.warnings

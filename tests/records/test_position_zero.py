@@ -1,0 +1,50 @@
+"""Positions of two logs that count from different zeros, found by the torque that repeats with the turn."""
+
+import numpy as np
+import pytest
+
+from jaxbl.records import TurningLog, turned
+
+
+def log(seed: int, zero: float, cogging: float = 2e-3, gear: bool = False, turns: float = 3.0) -> TurningLog:
+    """A motor that turns to and fro; cogging of 5 and 10 a turn, read from a zero of its own."""
+    random, period = np.random.default_rng(seed), 1e-3
+    time = np.arange(8000) * period
+    swing = 2.0 * np.pi * turns
+    place = swing * np.sin(2.0 * np.pi * 0.25 * time + seed)
+    speed = np.gradient(place, period)
+    torque = 4e-5 * np.gradient(speed, period) + 1e-4 * speed + 0.015 * np.sign(speed) + 5e-4
+    read = place - zero + 1e-4 * random.standard_normal(len(time))
+    # the shaft winds up by what is transmitted, and cogging is not
+    load = read - 1e-2 * torque if gear else None
+    torque += cogging * np.sin(10.0 * place + 0.4) + 0.5 * cogging * np.sin(5.0 * place)
+    torque += 1e-3 * random.standard_normal(len(time))
+    return TurningLog(torque, read, load, [slice(0, 4000), slice(4000, 8000)], period)
+
+
+@pytest.mark.parametrize("gear", [False, True])
+def test_the_difference_of_the_zeros_is_found(gear: bool):
+    found = turned(log(1, 0.0, gear=gear), log(2, 0.4, gear=gear))
+    assert found is not None and found.waves == (5, 10)
+    assert abs(found.value - 0.4) < 4.0 * found.error < 0.04
+
+
+def test_the_smallest_of_equal_places_is_taken():
+    # 5 and 10 a turn repeat every 72 degrees
+    found = turned(log(1, 0.0), log(2, 3.0))
+    assert found is not None
+    assert abs(found.value - (3.0 - 2.0 * 2.0 * np.pi / 5.0)) < 4.0 * found.error
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (log(1, 0.3), log(2, 0.3)),
+        (log(1, 0.0, cogging=0.0), log(2, 0.4, cogging=0.0)),
+        (log(1, 0.0), log(2, 0.4, cogging=0.0)),
+        (log(1, 0.0, turns=0.3), log(2, 0.4, turns=0.3)),
+    ],
+    ids=["one zero", "no cogging", "cogging in one alone", "less than a turn"],
+)
+def test_nothing_is_turned_without_need(first: TurningLog, second: TurningLog):
+    assert turned(first, second) is None
