@@ -22,6 +22,9 @@ _ENDS = 1.5
 """Left out at either end of a part, in periods of the cutoff: there the filter has readings on one side only."""
 _RATE = 4.0
 """Samples that are kept, per period of the cutoff: twice what the low-pass leaves."""
+_SEEN = 5.0
+"""Standard deviations of its noise that a speed has to exceed, or the drive may be at rest: dry friction then takes what it
+has to, and no equation of motion says how much."""
 _HARMONICS = 40
 """Most periods a turn that are tried: more than the poles, teeth and balls of small drives make."""
 _SLOW = (0.01, 0.03, 0.1, 0.3)
@@ -36,18 +39,22 @@ class Part:
         kinematics: by Butterworth low-pass forth and back and central differences.
         period: sampling period, s.
         cutoff: of the low-pass, Hz.
+        moving: whether the motor moves, shape (samples,).
     """
 
     kinematics: Kinematics
     period: float
     cutoff: float
+    moving: np.ndarray
 
     def low_passed(self, values: np.ndarray) -> np.ndarray:
-        """Values behind the low-pass of the positions, without ends, and no more of them than needed; rows are samples."""
+        """Values in motion behind the low-pass of the positions, without ends, and no more of them than needed; rows are
+        samples."""
         sections = signal.butter(4, min(2.0 * self.cutoff * self.period, 0.99), output="sos")
         cut = round(_ENDS / (self.cutoff * self.period))
         stride = max(int(1.0 / (_RATE * self.cutoff * self.period)), 1)
-        return signal.sosfiltfilt(sections, values, axis=0)[cut : len(values) - cut : stride]
+        rows = slice(cut, len(values) - cut, stride)
+        return signal.sosfiltfilt(sections, values, axis=0)[rows][self.moving[rows]]
 
 
 def parts_of(record: Record, sides: Sequence[str], cutoff: float) -> list[Part]:
@@ -60,8 +67,17 @@ def parts_of(record: Record, sides: Sequence[str], cutoff: float) -> list[Part]:
         positions = {side: record.positions[side][rows] for side in sides}
         with jax.enable_x64(True):
             motion = differentiated(record.time[rows], record.torque[rows], positions, cutoff)
-        found.append(Part(motion, record.sample_period, cutoff))
+        least = _SEEN * _speed_noise(record, cutoff)
+        moving = np.abs(np.asarray(motion.velocity["motor"])) > least
+        found.append(Part(motion, record.sample_period, cutoff, moving))
     return found
+
+
+def _speed_noise(record: Record, cutoff: float) -> float:
+    """Standard deviation of the motor's speed behind an ideal low-pass, by the noise of the readings and their steps."""
+    about, h = record.findings.channels["theta_e"], record.sample_period
+    noise = np.hypot(about.noise, about.resolution / np.sqrt(12.0))
+    return float(2.0 * np.pi * noise * np.sqrt(2.0 * h * min(cutoff, 0.5 / h) ** 3 / 3.0))
 
 
 _MORE = 0.01
