@@ -18,8 +18,8 @@ friction by direction, up to 40 periods a turn, and the twist of a shaft.
 All torque errors of that comparison are those of the same filtered derivatives, behind the same low-pass: the equation of
 motion of the model that jaxbl returned is applied to them as the terms of the others are, and its error is referred to the
 input. Its own account (errors before, after, limit) is on its smoothed motion, behind a low-pass that it chose; that would
-favour it in a comparison. Where the drive is at rest (a speed within its noise) nothing is compared, and nothing fitted by the
-others: dry friction takes there what it has to. All tools have the positions as jaxbl turned them to one zero.
+favour it in a comparison. Where the drive is at rest (a speed within its noise) nothing is compared, and nothing fitted by
+the others: dry friction takes there what it has to. All tools have the positions as jaxbl turned them to one zero.
 
 mujoco.sysid (MuJoCo 4) is not among them: it fits numbers that it is given (mass, damping, friction loss) and looks for none
 that are missing; a joint of MuJoCo has neither a ripple over the turn nor a constant torque without an actuator of its own,

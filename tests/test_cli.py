@@ -621,6 +621,7 @@ DIAGNOSED = {
     "where": {"motor": {"sentence": "motor side, somewhere"}},
     "rest": {},
     "withdrawn": [],
+    "contradictions": [],
     "warnings": [],
     "notes": [],
     "gap": {
@@ -638,6 +639,7 @@ DIAGNOSED = {
             "chance": False,
             "remainder": False,
             "powerless": False,
+            "contradicting": False,
             "little": False,
         },
         "controls": {},

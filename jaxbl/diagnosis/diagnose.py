@@ -23,12 +23,22 @@ from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress, doing
 
 from .coordinates import CoordinateValues, all_coordinates
-from .diagnosis_summary import extended_study, observers_say, rival_tables, summary_of, tested, trace_of, where_lacking
+from .diagnosis_summary import (
+    contradictions_of,
+    extended_study,
+    observers_say,
+    rival_tables,
+    summary_of,
+    tested,
+    trace_of,
+    where_lacking,
+)
 from .diagnosis_task import DiagnosisTask, read_diagnosis_task
 from .effect_search import EffectSearch, Explanation
 from .expected_errors import Expected, expected_errors, failed
 from .judgement import exchanged, explained_share, judged
 from .localise import SIGNIFICANT, Localised, localise
+from .numbers_by_log import contradictions
 from .observer_residual import Observed, observed_torques
 from .proof import SURE, Accepted, Control, Proof, beaten, free_values
 from .reference_log import at_period
@@ -124,7 +134,10 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         if not np.isfinite(fitted.covariance).all():
             raise InputError(f"{task.record.path}: the model's numbers cannot be fitted to this log; is its input complete?")
         share = explained_share(setup.nominal, proof.before.errors, after.errors, expected)
-        judgement = judged(found, fitted, proof.before.errors, after.errors, expected, controls, setup.prior, share)
+        apart = contradictions(task, fitted, setup.fitted, setup.holdout, found.model.linear.drive)
+        judgement = judged(
+            found, fitted, proof.before.errors, after.errors, expected, controls, setup.prior, share, bool(apart)
+        )
         found = judgement.found
         done()
         doing("running the observers")
@@ -141,6 +154,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
             summary["where"][side]["observed"] = one
         summary["notes"] += notes
         summary["explained_share"] = share
+        summary["contradictions"] = contradictions_of(task.record, fitted, apart)
         summary["gap"] = proof.gap(fitted, after) | tested(judgement, expected, controls)
         if found.verdict == "unknown_effect":
             segments = setup.fitted.segments

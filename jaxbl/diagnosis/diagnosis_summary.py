@@ -25,6 +25,7 @@ from .expected_errors import LEVEL, Expected
 from .judgement import Judgement
 from .localise import SIGNIFICANT, Localised
 from .neutral_effects import with_added
+from .numbers_by_log import Contradiction
 from .observer_residual import Observed, compared
 from .proof import Control, FittedModel, free_values
 from .residuals import Residual
@@ -132,11 +133,25 @@ def tested(judgement: Judgement, expected: Mapping[str, Expected], controls: Seq
             "remainder": judgement.remainder,
             "powerless": judgement.powerless,
             "little": judgement.little,
+            "contradicting": judgement.contradicting,
         },
         "controls": {
             one.kind: {"rmse": one.errors, "z": one.z} | ({"effect": one.effect} if one.effect else {}) for one in controls
         },
     }
+
+
+def contradictions_of(record: Record, fitted: FittedModel, found: Sequence[Contradiction]) -> list[dict[str, Any]]:
+    """Numbers that two logs show to be different, in the log's units."""
+    units = {one.path: unit_on(record, one.path, one.unit) for one in fitted.free}
+    return [
+        {
+            "parameter": one.path,
+            "unit": units[one.path],
+            "logs": [{"log": by.log, "value": by.value, "standard_error": by.error} for by in (one.least, one.most)],
+        }
+        for one in found
+    ]
 
 
 def where_lacking(record: Record, located: Mapping[str, Localised]) -> dict[str, Any]:

@@ -30,6 +30,7 @@ class Judgement(NamedTuple):
         remainder: whether the search found that something else is missing.
         powerless: whether the model as given would pass, too, so that held-out data say nothing for the effects.
         little: whether the effects take away less than half of the torque that is missing on held-out data.
+        contradicting: whether the logs do not agree on the model's numbers.
     """
 
     found: Explanation
@@ -39,6 +40,7 @@ class Judgement(NamedTuple):
     remainder: bool
     powerless: bool
     little: bool
+    contradicting: bool
 
 
 def judged(
@@ -50,6 +52,7 @@ def judged(
     controls: Sequence[Control],
     prior: np.ndarray,
     share: float | None,
+    contradicting: bool = False,
 ) -> Judgement:
     """Judge an explanation.
 
@@ -61,6 +64,7 @@ def judged(
         controls: of the model.
         prior: standard deviations of its own numbers, which are the first of `fitted`.
         share: of the missing torque that it explains (:func:`explained_share`).
+        contradicting: whether the logs do not agree on its numbers (:mod:`.numbers_by_log`).
     """
     left = failed(errors, expected)
     away = fitted.theta[: len(prior)] / prior
@@ -75,10 +79,10 @@ def judged(
             )
     powerless = bool(fitted.names) and not failed(before, expected)
     little = bool(fitted.names) and share is not None and share < _LEAST_SHARE
-    verdict = "unknown_effect" if left or far or chance or powerless or little else found.verdict
+    verdict = "unknown_effect" if left or far or chance or powerless or little or contradicting else found.verdict
     remainder = found.verdict == "unknown_effect"
     said = dataclasses.replace(found, verdict=verdict, findings=findings)
-    return Judgement(said, left, far, chance, remainder, powerless, little)
+    return Judgement(said, left, far, chance, remainder, powerless, little, contradicting)
 
 
 def _no_surer(finding: Finding, fitted: FittedModel) -> Finding:

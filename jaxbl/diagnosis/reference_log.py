@@ -124,6 +124,11 @@ class ReferenceLog:
         samples = self._samples(experiment, self.samples, _STATES, added or {}) | self._narrowed(torques)
         return Comparison(_all_rms(samples), torques, samples)
 
+    def missing(self, experiment: Experiment) -> dict[str, np.ndarray]:
+        """Torques that a model lacks behind the low-pass, N m, by side."""
+        torques = residual_torques(at_period(experiment, self.period), self.segments)
+        return {side: self._narrowed({side: pieces})[f"torque_{side}"] for side, pieces in torques.items()}
+
     def _rows(self) -> list[np.ndarray]:
         """Sampling periods from the log's first sample to each sample, segment by segment."""
         return [np.round((one.time - self.segments[0].time[0]) / self.period).astype(int) for one in self.segments]

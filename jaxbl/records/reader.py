@@ -70,6 +70,7 @@ class Record:
         corrections: "skew" of theta_s, s, and "offset" of theta_e, rad (m), as far as the log's own were put in.
         findings: figures on its quality.
         intervals: between the raw stamps that were kept, s, shape (raw samples - 1,).
+        logs: name and rows of each log that it was joined from.
     """
 
     path: Path
@@ -86,6 +87,7 @@ class Record:
     corrections: dict[str, float]
     findings: Findings
     intervals: np.ndarray
+    logs: tuple[tuple[str, slice], ...]
 
 
 def read_log_table(log: LogTable | Mapping[str, Any] | None, name: str = "") -> LogTable:
@@ -178,6 +180,7 @@ def read_record(
         corrections=file.corrections,
         findings=Findings(segments.sampling, figures, gearing, dynamics),
         intervals=np.diff(segments.times),
+        logs=((file.path.name, slice(0, len(grid.time))),),
     )
 
 
@@ -308,7 +311,7 @@ def join(records: Sequence[Record]) -> Record:
     first = records[0]
     if len(records) == 1:
         return first
-    period, times, segments, notes, warnings, rows, end = first.sample_period, [], [], [], [], 0, 0.0
+    period, times, segments, logs, notes, warnings, rows, end = first.sample_period, [], [], [], [], [], 0, 0.0
     for record in records:
         if not np.isclose(record.sample_period, period, rtol=1e-6, atol=0.0):
             raise InputError(
@@ -322,6 +325,7 @@ def join(records: Sequence[Record]) -> Record:
         times.append(record.time - record.time[0] + end)
         end = float(times[-1][-1]) + _PAUSE * period
         segments += [slice(part.start + rows, part.stop + rows) for part in record.segments]
+        logs += [(name, slice(part.start + rows, part.stop + rows)) for name, part in record.logs]
         rows += len(record.time)
         notes += [f"{record.path.name}: {note}" for note in record.notes]
         warnings += [f"{record.path.name}: {warning}" for warning in record.warnings]
@@ -336,6 +340,7 @@ def join(records: Sequence[Record]) -> Record:
         notes=tuple(notes),
         warnings=tuple(warnings),
         intervals=np.concatenate([record.intervals for record in records]),
+        logs=tuple(logs),
     )
 
 

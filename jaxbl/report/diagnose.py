@@ -47,7 +47,7 @@ def _headline(summary: dict[str, Any]) -> list[str]:
         for gain in gains
         if not 1.0 / _FAR < gain < _FAR
     ]
-    lines = [*summary["warnings"], *lines, verdict_sentence(summary)]
+    lines = [*_contradiction_lines(summary), *summary["warnings"], *lines, verdict_sentence(summary)]
     for one in summary["findings"]:
         numbers = ", ".join(_number(leaf, number) for leaf, number in one["parameters"].items())
         lines.append(
@@ -58,6 +58,21 @@ def _headline(summary: dict[str, Any]) -> list[str]:
             others = ", ".join(f"{other['effect']} ({probability(other['confidence'])})" for other in one["alternatives"])
             lines.append(f"  Not ruled out by this log: {others}.")
     return [*lines, *_reasons(summary), *_gap_lines(summary["gap"]), *_table_lines(summary)]
+
+
+def _contradiction_lines(summary: Mapping[str, Any]) -> list[str]:
+    """Numbers that the logs do not agree on."""
+    found = []
+    for one in summary["contradictions"]:
+        unit = f" {one['unit']}" if one["unit"] else ""
+        said = [f"{by['value']:.3g} ± {by['standard_error']:.1g}{unit} by {by['log']}" for by in one["logs"]]
+        found.append(f"{one['parameter']} is {' and '.join(said)}")
+    if not found:
+        return []
+    return [
+        f"The logs contradict each other: {'; '.join(found)}. One model cannot hold for both: was the load, the controller "
+        "(a feedforward that u does not contain) or a unit another one?"
+    ]
 
 
 _NO_MORE = "no more is left on data not used for the fit than noise and the uncertainty of the model's numbers account for"

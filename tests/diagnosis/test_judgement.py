@@ -28,7 +28,17 @@ def found(verdict="explained", fit_gain=50.0, prior_gain=0.0, rival="motor.visco
     return Explanation(verdict, (finding,), model, model, wrong, {})  # type: ignore[arg-type]
 
 
-def judge(errors=NOISE, before=BEFORE, theta=0.0, controls=(), verdict="explained", error=0.001, share=1.0, **gains):
+def judge(
+    errors=NOISE,
+    before=BEFORE,
+    theta=0.0,
+    controls=(),
+    verdict="explained",
+    error=0.001,
+    share=1.0,
+    contradicting=False,
+    **gains,
+):
     fitted = SimpleNamespace(
         names=(NAME,),
         theta=np.array([theta, 1.0]),
@@ -36,7 +46,7 @@ def judge(errors=NOISE, before=BEFORE, theta=0.0, controls=(), verdict="explaine
         experiment=SimpleNamespace(effects=(make_effect(NAME, torque=0.1),)),
         errors=lambda: {f"effects.{NAME}.torque": error},
     )
-    return judged(found(verdict, **gains), fitted, before, errors, LIMITS, controls, np.array([0.02]), share)  # type: ignore[arg-type]
+    return judged(found(verdict, **gains), fitted, before, errors, LIMITS, controls, np.array([0.02]), share, contradicting)  # type: ignore[arg-type]
 
 
 def test_a_verdict_that_held_out_data_support_stays():
@@ -55,13 +65,15 @@ def test_a_verdict_that_held_out_data_support_stays():
         ({"verdict": "unknown_effect"}, {"remainder": True}),
         ({"before": NOISE}, {"powerless": True}),
         ({"share": 0.2}, {"little": True}),
+        ({"contradicting": True}, {"contradicting": True}),
     ],
-    ids=["errors", "numbers", "shuffled", "search", "before", "share"],
+    ids=["errors", "numbers", "shuffled", "search", "before", "share", "logs"],
 )
 def test_one_reason_is_enough_against_it(given, reason):
     said = judge(**given)
     assert said.found.verdict == "unknown_effect" and said.found.findings == found().findings
     none = {"failed": [], "far": {}, "chance": False, "remainder": False, "powerless": False, "little": False}
+    none["contradicting"] = False
     assert {key: getattr(said, key) for key in none} == none | reason
 
 

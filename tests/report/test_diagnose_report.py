@@ -40,6 +40,7 @@ SUMMARY = {
     "where": {"motor": {"sentence": "motor side: nothing beyond noise"}, "load": {"sentence": "load side, here"}},
     "rest": {"load.drift": {"evidence": -3.0, "share": 0.001}, "load.time": {"evidence": None, "share": 0.0}},
     "explained_share": 0.83,
+    "contradictions": [],
     "parameters": {"drive.motor_inertia": {"value": 0.01, "nominal": 0.02}},
     "withdrawn": [],
     "warnings": [],
@@ -63,6 +64,7 @@ SUMMARY = {
             "chance": False,
             "remainder": False,
             "powerless": False,
+            "contradicting": False,
             "little": False,
         },
         "controls": {
@@ -71,6 +73,24 @@ SUMMARY = {
         },
     },
 }
+
+
+def test_logs_that_contradict_each_other_are_named_first():
+    logs = [
+        {"log": "slow.csv", "value": 2.3e-5, "standard_error": 5e-6},
+        {"log": "fast.csv", "value": 1.68e-4, "standard_error": 5e-6},
+    ]
+    lines = diagnosis_lines(
+        changed(
+            contradictions=[{"parameter": "drive.motor_inertia", "unit": "kg m²", "logs": logs}], warnings=["A warning."]
+        )
+    )
+    assert lines[0] == (
+        "The logs contradict each other: drive.motor_inertia is 2.3e-05 ± 5e-06 kg m² by slow.csv and 0.000168 ± 5e-06 "
+        "kg m² by fast.csv. One model cannot hold for both: was the load, the controller (a feedforward that u does not "
+        "contain) or a unit another one?"
+    )
+    assert lines[1] == "A warning."
 
 
 def changed(**keys):

@@ -1,0 +1,139 @@
+"""Whether logs of one machine agree on its numbers.
+
+One model for several logs takes a mean of what they show. Here each log says by itself what the numbers should be: by
+regression of the torque that the model still lacks there on that torque's slopes, with standard errors by blocks.
+"""
+
+import dataclasses
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxbl.drive.parameters import set_leaves
+from jaxbl.identification.logs import arrays
+from jaxbl.records.least_squares import BLOCKS
+
+from .diagnosis_task import DiagnosisTask
+from .proof import FittedModel
+from .reference_log import ReferenceLog
+
+_STEP = 1e-3
+"""Change of theta by which a slope is found."""
+_APART = 6.0
+"""Standard errors by which two logs contradict each other: of some tens of pairs, with errors by twelve blocks, one in a
+hundred is so by chance."""
+_LEAST = 0.05
+"""Share of the driving torque that the difference has to make."""
+_INFLATED = 100.0
+"""Variance of a number over what it were if all others were known, from which on it depends on them."""
+
+
+class OfLog(NamedTuple):
+    """A number as one log shows it, and its standard error; both in the number's unit."""
+
+    log: str
+    value: float
+    error: float
+
+
+class Contradiction(NamedTuple):
+    """A number that two logs show to be different.
+
+    Attributes:
+        path: of the number.
+        least, most: what the two logs say that are furthest apart for their errors.
+    """
+
+    path: str
+    least: OfLog
+    most: OfLog
+
+
+def contradictions(
+    task: DiagnosisTask, fitted: FittedModel, log: ReferenceLog, holdout: ReferenceLog, driving: float
+) -> list[Contradiction]:
+    """Numbers of a model that its logs surely do not agree on; none of a single log.
+
+    Args:
+        task: names the logs.
+        fitted: the model, its numbers fitted to all of `log` at once.
+        log, holdout: what was fitted, and what was held out.
+        driving: torque that drives the machine, rms, N m.
+    """
+    parts = [(name, _rows_of(log, rows)) for name, rows in task.record.logs]
+    if task.separate:
+        parts += [(name, _rows_of(holdout, rows)) for name, rows in task.holdout.logs]
+    named = {name: one for name, one in parts if one.segments}
+    if len(named) < 2 or not fitted.free:
+        return []
+    shown = {name: _shown(fitted, one) for name, one in named.items()}
+    found = []
+    for k, number in enumerate(fitted.free):
+        apart = {
+            (one, other): z
+            for one, other in itertools.combinations(shown, 2)
+            if (z := _apart(shown[one], shown[other], k, _LEAST * driving)) > _APART
+        }
+        if not apart:
+            continue
+        value, slope = (float(of(fitted.theta[k])) for of in (number.value, number.slope))
+        both = [
+            OfLog(name, value + slope * float(shown[name].change[k]), abs(slope) * float(shown[name].error[k]))
+            for name in max(apart, key=lambda pair: apart[pair])
+        ]
+        found.append(Contradiction(number.path, *sorted(both, key=lambda of: of.value)))
+    return found
+
+
+class _Shown(NamedTuple):
+    """What a log says of a model's theta: by how much each number should be changed, the standard error, and the torque of a
+    change of 1 at the motor, rms, N m."""
+
+    change: np.ndarray
+    error: np.ndarray
+    torque: np.ndarray
+
+
+def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
+    now = log.missing(fitted.experiment)
+    moved = [
+        log.missing(set_leaves(fitted.experiment, arrays({one.path: one.value(at + _STEP)})))
+        for one, at in zip(fitted.free, fitted.theta, strict=True)
+    ]
+    # of equal weight on both sides, whatever the gear
+    products, torque = [], np.zeros(len(moved))
+    for side, missing in now.items():
+        slopes = np.stack([(one[side] - missing) / _STEP for one in moved])
+        torque = np.hypot(torque, np.sqrt(np.mean(slopes**2, axis=1)) / float(fitted.experiment.drive.ratio(side)))
+        both = np.concatenate([slopes, -missing[None]]) / max(float(np.sqrt(np.mean(missing**2))), 1e-300)
+        products.append([block @ block.T for block in np.array_split(both, BLOCKS, axis=1)])
+    blocks = np.sum(products, axis=0)
+    total = np.sum(blocks, axis=0)
+    size = np.sqrt(np.diag(total)[:-1])
+    there = size > 0.0
+    size = np.where(there, size, np.inf)
+
+    def solved(gram: np.ndarray) -> np.ndarray:
+        return np.linalg.lstsq(gram[:-1, :-1] / np.outer(size, size), gram[:-1, -1] / size, rcond=1e-10)[0] / size
+
+    change, without = solved(total), np.array([solved(total - one) for one in blocks])
+    error = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((without - without.mean(axis=0)) ** 2, axis=0))
+    # what depends on other numbers, or does nothing in this log, is not shown by it
+    inverse = np.linalg.pinv(total[:-1, :-1] / np.outer(size, size), rcond=1e-10, hermitian=True)
+    alone = there & (np.diag(inverse) < _INFLATED) & (np.diag(inverse) > 0.0)
+    return _Shown(change, np.where(alone, error, np.inf), torque)
+
+
+def _apart(one: _Shown, other: _Shown, k: int, least: float) -> float:
+    """Standard errors between two logs in a number; 0 where the difference makes less than a torque of `least`."""
+    apart = abs(one.change[k] - other.change[k])
+    if not apart * max(one.torque[k], other.torque[k]) > least:
+        return 0.0
+    return float(apart / max(np.hypot(one.error[k], other.error[k]), 1e-300))
+
+
+def _rows_of(log: ReferenceLog, rows: slice) -> ReferenceLog:
+    """The segments of a log that lie in some rows."""
+    within = [one for one in log.segments if rows.start <= one.rows.start and one.rows.stop <= rows.stop]
+    return dataclasses.replace(log, segments=within)

@@ -1,0 +1,73 @@
+"""Logs of one machine that do not agree on its numbers, on torques that are known in closed form."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+from jaxbl.config import prepare, read_model
+from jaxbl.diagnosis.numbers_by_log import contradictions
+from jaxbl.identification.trajectory import free_parameters
+
+INERTIA, VISCOUS, SAMPLES = 4e-5, 1e-4, 4000
+
+
+@dataclasses.dataclass(frozen=True)
+class Torques:
+    """A log that knows the torque of its machine; `truth`: inertia of each part."""
+
+    segments: tuple
+    truth: tuple
+    turned: float = 1.0
+
+    def missing(self, experiment):
+        found = []
+        for one in self.segments:
+            i = one.rows.start // SAMPLES
+            time = 1e-3 * np.arange(SAMPLES)
+            speed, change = self.turned * 30.0 * np.sin(5.0 * time + i), self.turned * 150.0 * np.cos(5.0 * time + i)
+            noise = 1e-4 * np.random.default_rng(i).standard_normal(SAMPLES)
+            drive = experiment.drive
+            found.append(
+                (self.truth[i] - float(drive.motor_inertia)) * change
+                + (VISCOUS - float(drive.motor_viscous)) * speed
+                + noise
+            )
+        return {"motor": np.concatenate(found)}
+
+
+def found(first: float, second: float, turned: float = 1.0, separate: bool = False):
+    rows = [slice(0, SAMPLES), slice(SAMPLES, 2 * SAMPLES)]
+    names = [("a.csv", rows[0]), ("b.csv", rows[1])]
+    segments = tuple(SimpleNamespace(rows=one) for one in rows)
+    task = SimpleNamespace(
+        record=SimpleNamespace(logs=names[: 1 if separate else 2]),
+        separate=separate,
+        holdout=SimpleNamespace(logs=names[1:]),
+    )
+    config, _ = read_model({"drive": {"kind": "rigid", "motor_inertia": INERTIA, "motor_viscous": VISCOUS}})
+    with jax.enable_x64(True):
+        experiment = prepare(config.model_copy(update={"run": config.run.model_copy(update={"precision": "float64"})}))
+        free = free_parameters(experiment, ["drive.motor_inertia", "drive.motor_viscous"], 1.0)
+        fitted = SimpleNamespace(experiment=experiment, free=free, theta=np.zeros(2))
+        log = Torques(segments[: 1 if separate else 2], (first, second), turned)
+        held = Torques(segments[1:], (first, second), turned)
+        return contradictions(task, fitted, log, held, 5e-3)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("separate", [False, True])
+def test_an_inertia_that_two_logs_show_to_differ(separate):
+    (one,) = found(INERTIA, 1.5 * INERTIA, separate=separate)
+    assert one.path == "drive.motor_inertia" and (one.least.log, one.most.log) == ("a.csv", "b.csv")
+    assert one.least.value == pytest.approx(INERTIA, abs=4.0 * one.least.error)
+    assert one.most.value == pytest.approx(1.5 * INERTIA, rel=0.01)
+
+
+def test_logs_of_one_machine_agree():
+    assert found(INERTIA, INERTIA) == []
+
+
+def test_a_difference_without_torque_is_no_contradiction():
+    assert found(INERTIA, 1.5 * INERTIA, turned=0.05) == []
