@@ -1,6 +1,6 @@
 """What `jaxbl diagnose` leaves to be read: missing effects, their probability, and model errors before and after."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +80,7 @@ _NO_MORE = "no more is left on data not used for the fit than noise and the unce
 
 def verdict_sentence(summary: Mapping[str, Any]) -> str:
     """The verdict in one sentence."""
-    names = " and ".join(one["effect"] for one in summary["findings"])
+    names = _listed([one["effect"] for one in summary["findings"]])
     them = "it" if len(summary["findings"]) == 1 else "them"
     if summary["verdict"] == "explained":
         return f"Explained: the model lacks {names}; with {them}, {_NO_MORE}."
@@ -111,9 +111,8 @@ def _table_lines(summary: Mapping[str, Any]) -> list[str]:
     if "torque_tables" not in summary:
         return []
     found, gap = summary["torque_tables"], summary["gap"]
-    which = " and ".join(
-        f"{side} torque over {' and '.join(_OVER[one['over']] for one in tables)}"
-        for side, tables in found["tables"].items()
+    which = _listed(
+        [f"{side} torque over {_listed([_OVER[one['over']] for one in tables])}" for side, tables in found["tables"].items()]
     )
     errors = "; ".join(
         f"{name} {rms_text(gap['holdout_rmse_after'][name])} -> {rms_text(value)} {gap['units'][name]}"
@@ -124,7 +123,14 @@ def _table_lines(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _share(value: float | None) -> str:
-    return "none" if value is None or value < 0.005 else f"{100.0 * value:.{0 if value < 0.99 else 1}f} %"
+    if value is None or value < 0.005:
+        return "none"
+    return "more than 99.9 %" if value > 0.999 else f"{100.0 * value:.{0 if value < 0.99 else 1}f} %"
+
+
+def _listed(words: Sequence[str]) -> str:
+    """As in a sentence: a, b and c."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 def _reasons(summary: Mapping[str, Any]) -> list[str]:
