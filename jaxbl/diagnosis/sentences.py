@@ -58,7 +58,7 @@ def sentence_of(found: Localised, unit: str = "N m") -> str:
         hint = ""
         if telling is not None and best > 0.1:
             hint = f" (most: {_percent(best)}, {_PLACE.get(telling.name, telling.name)})"
-        clauses.append(f"nowhere in particular: neither speed nor position, load or time explains half of it{hint}")
+        clauses.append(f"spread over the log: no function of speed, position, load or time alone explains half of it{hint}")
     return f"{side}, {'; '.join(clauses)} ({size})"
 
 
