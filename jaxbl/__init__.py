@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from .gains.tune import tune as tune
     from .gains.verify import Verdict as Verdict
     from .gains.verify import verify as verify
+    from .identification.element import ElementIdentification as ElementIdentification
+    from .identification.element import identify_element as identify_element
     from .identification.identify import Identification as Identification
     from .identification.identify import identify as identify
     from .records import Inspection as Inspection
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from .records import inspect as inspect
     from .records import read_record as read_record
     from .report.diagnose import write_diagnosis_report as write_diagnosis_report
+    from .report.element import write_element_report as write_element_report
     from .report.identify import write_identification_report as write_identification_report
     from .report.inspect import write_inspection_report as write_inspection_report
     from .report.simulate import write_trial_report as write_trial_report
@@ -49,9 +52,11 @@ _NAMES = {
     "gains.accuracy_laws": ("Law", "accuracy_laws"),
     "gains.tune": ("Tuning", "tune"),
     "gains.verify": ("Verdict", "verify"),
+    "identification.element": ("ElementIdentification", "identify_element"),
     "identification.identify": ("Identification", "identify"),
     "records": ("Inspection", "LogTable", "Record", "inspect", "read_record"),
     "report.diagnose": ("write_diagnosis_report",),
+    "report.element": ("write_element_report",),
     "report.identify": ("write_identification_report",),
     "report.inspect": ("write_inspection_report",),
     "report.simulate": ("write_trial_report",),

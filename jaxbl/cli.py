@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from jaxbl.sweeps.programs import Backend
 
     from .config import Config
+    from .records import LogTable
 
 app = typer.Typer(
     add_completion=False,
@@ -267,6 +268,18 @@ def identify(
 ) -> None:
     """Fit a machine's parameters to its logs, with intervals: stiffness, gap, inertias, frictions."""
     _start_jax()
+    from .config import read_log_config
+
+    table, gear_ratio, _ = read_log_config(model)
+    if table.kind == "element":
+        if len(log) > 1:
+            raise InputError("identify: several logs; of a transmission on a test rig one log is fitted at a time")
+        if profile:
+            raise InputError(
+                "identify: --profile is for drives; intervals of a transmission on a test rig are by a jackknife"
+            )
+        _identify_element(log[0], table, gear_ratio, holdout, _folder(log[0], out), overwrite)
+        return
     from jaxbl.identification.identify import read_identification_task, run_identification
 
     from .files import results_of
@@ -280,6 +293,19 @@ def identify(
             task, file, lambda task: run_identification(task, progress), write_identification_report, overwrite=overwrite
         )
     _print(identification_lines(summary), folder)
+
+
+def _identify_element(
+    log: Path, table: "LogTable", gear_ratio: float | None, holdout: Path | None, folder: Path, overwrite: bool
+) -> None:
+    from jaxbl.identification.element import read_element_task, run_element
+
+    from .files import results_of
+    from .report.element import element_lines, write_element_report
+
+    task = read_element_task(log, table, gear_ratio, holdout=holdout)
+    file = folder / "identification.json"
+    _print(element_lines(results_of(task, file, run_element, write_element_report, overwrite=overwrite)), folder)
 
 
 @app.command()

@@ -487,6 +487,31 @@ def test_inspect_reads_as_the_model_says_and_leaves_other_results_alone(call, tm
     assert not (tmp_path / "results" / "none").exists()
 
 
+def test_a_transmission_on_a_test_rig_is_identified_and_no_drive(call, tmp_path):
+    t = 0.01 * np.arange(1200)
+    x = 0.02 * np.sin(2.0 * np.pi * 0.5 * t)
+    u = 500.0 * (x - np.clip(x, -0.005, 0.005)) + 0.01 * np.random.default_rng(0).standard_normal(1200)
+    for name in ("rig.csv", "again.csv"):
+        pd.DataFrame({"t": t, "x": 1e3 * x, "force": u}).to_csv(tmp_path / name, index=False)
+    model = write(tmp_path, {"log": {"kind": "element", "theta_e": {"column": "x", "unit": "mm"}, "u": "force"}})
+    code, out, _ = call("inspect", "rig.csv", "--model", model, "--out", "seen")
+    assert code == 0 and any(line.startswith("gap") and " yes " in line for line in out)
+    code, out, err = call("identify", "rig.csv", "--model", model, "--out", "found", "--holdout", "again.csv")
+    assert (code, err) == (0, []) and out[0].startswith("transmission.stiffness = ") and " N/m, 95 %: " in out[0]
+    found = json.loads(Path("found/identification.json").read_text())["parameters"]
+    assert found["transmission.half_gap"]["value"] == pytest.approx(0.005, rel=0.01)
+    assert tomllib.loads(Path("found/model.toml").read_text())["transmission"]["law"] == "dead_zone"
+    assert {"figures/loop.png", "figures/residual.png", "report.html", "trace.parquet"} <= set(left(Path("found")))
+    with pytest.raises(InputError, match=r"study.toml: log.kind: 'element' is a transmission alone, without the drive"):
+        call("diagnose", "rig.csv", "--model", model)
+    for extra, message in ((["rig.csv"], "one log is fitted at a time"), (["--profile"], "--profile is for drives")):
+        with pytest.raises(InputError, match=message):
+            call("identify", "rig.csv", *extra, "--model", model)
+    pd.DataFrame({"t": t, "x": t, "force": u}).to_csv("rig.csv", index=False)
+    with pytest.raises(InputError, match=r"rig.csv: the displacement never turns back"):
+        call("identify", "rig.csv", "--model", model, "--out", "other")
+
+
 def test_inspect_runs_without_a_word_on_stderr(tmp_path):
     (tmp_path / "log.toml").write_text(tomli_w.dumps({"log": EMPS}))
     done = jaxbl("inspect", str(real("emps/DATA_EMPS.mat")), "--model", "log.toml", "--out", "out", cwd=tmp_path)

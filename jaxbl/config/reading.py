@@ -39,9 +39,26 @@ def read_model(source: str | Path | Mapping[str, Any] | Config) -> tuple[Config,
     Raises:
         InputError: as :func:`read_config`.
     """
+    config, missing = _model(source)
+    if config.log.kind == "element":
+        raise InputError(_ELEMENT.format(source if isinstance(source, str | Path) else "config"))
+    return config, missing
+
+
+_ELEMENT = (
+    "{}: log.kind: 'element' is a transmission alone, without the drive whose motion diagnose explains; jaxbl identify "
+    "finds its stiffness, gap and friction (from Python: identify_element)"
+)
+
+
+def _model(source: str | Path | Mapping[str, Any] | Config) -> tuple[Config, frozenset[str]]:
+    """As :func:`read_model`, of any kind of log."""
     if isinstance(source, Config):
         return source, frozenset()
     name, data, origins = _read(source)
+    log = data.get("log")
+    if isinstance(log, dict) and log.get("kind") == "element" and "drive" not in data:
+        raise InputError(_ELEMENT.format(name))
     missing = set()
     if "excitation" not in data:
         missing.add("excitation")
@@ -71,7 +88,7 @@ def read_log_config(path: Path) -> tuple[LogTable, float | None, NominalDrive | 
     data, _ = _file(path, [])
     if set(data) <= {"title", "notes", "log"}:
         return read_log_table(data.get("log"), str(path)), None, None
-    config, _ = read_model(path)
+    config, _ = _model(path)
     ratio = None if config.drive.kind == "rigid" else config.drive.gear_ratio
     return config.log, ratio, config.nominal_drive()
 

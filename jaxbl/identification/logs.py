@@ -144,6 +144,8 @@ def _read_one(config: Config, log: str | Path, gear_tolerance: float) -> Record:
     ratio = config.drive.gear_ratio if config.drive.kind == "two_inertia" else None
     nominal = config.nominal_drive()
     record = read_record(log, config.log, gear_ratio=ratio, gear_tolerance=gear_tolerance, nominal=nominal)
+    if record.contradiction:
+        raise InputError(f"{record.path}: {record.contradiction}")
     sides = ("motor", "load") if config.drive.kind == "two_inertia" else ("motor",)
     for side in sides:
         if side not in record.positions:

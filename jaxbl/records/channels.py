@@ -77,7 +77,8 @@ def _is_recorded(file: LogFile, table: LogTable, name: str) -> bool:
         near = isinstance(other, str) and other.lower().replace("_", "").replace(" ", "") == name.replace("_", "")
         if near and other not in used:
             raise file.wrong(f"no column '{name}', but '{other}'; [log] {name} = \"{other}\" would read it")
-    file.notes.append(f"There is no {name} ({'motor' if name == 'theta_e' else 'load'} position) in this log.")
+    if table.kind == "drive":
+        file.notes.append(f"There is no {name} ({'motor' if name == 'theta_e' else 'load'} position) in this log.")
     return False
 
 

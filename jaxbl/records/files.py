@@ -1,4 +1,7 @@
-"""Reading a log file into named columns: text, Parquet, MATLAB (up to 7.2, and 7.3), JSON."""
+"""Reading a log file into named columns: text, Parquet, MATLAB (up to 7.2, and 7.3), JSON.
+
+Only columns that are wanted stay in memory; others are loaded if they are asked for after all.
+"""
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
@@ -8,7 +11,7 @@ import io
 import json
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,18 +22,20 @@ import pandas as pd
 from jaxbl.errors import InputError
 from jaxbl.validation import nearest
 
-from .libraries import read_mdf, read_tdms
+from .libraries import Column, Columns, read_bag, read_mcap, read_mdf, read_tdms
 
-_KINDS = "text (CSV and the like), Parquet, MATLAB (.mat), JSON, MDF4 and TDMS can be read"
-
-
-class Columns(dict[str | int, Any]):
-    """Columns of a file by name, with the units that the file says, and remarks on how it was read."""
-
-    def __init__(self, *args: Any, **kwargs: Any):
-        super().__init__(*args, **kwargs)
-        self.units: dict[str | int, str] = {}
-        self.notes: list[str] = []
+_KINDS = "text (CSV and the like), Parquet, MATLAB (.mat), JSON, MDF4, TDMS, MCAP and ROS bags can be read"
+_MARKS: tuple[tuple[bytes, str, Callable[..., dict[str | int, Any]]], ...] = (
+    (b"TDSm", "TDMS", lambda path, wanted: read_tdms(path)),
+    (b"MDF", "MDF", lambda path, wanted: read_mdf(path)),
+    (b"\x89MCAP", "MCAP", read_mcap),
+    (b"#ROSBAG", "a ROS bag", read_bag),
+)
+"""First bytes, name and reader of kinds that need a library."""
+_HEAD = 1 << 18
+"""Bytes from which the kind of a file and the form of its rows are seen: hundreds of rows."""
+_ROWS = 100_000
+"""Rows of text that are in memory with all their columns."""
 
 
 class LogFile:
@@ -42,7 +47,7 @@ class LogFile:
         units: those that the file itself says, by column.
         notes: what was done to the log, and what is odd about it, in sentences.
         warnings: those to be said first.
-        corrections: as of a record.
+        corrections, contradiction: as of a record.
     """
 
     def __init__(self, path: Path, columns: dict[str | int, Any]):
@@ -51,6 +56,7 @@ class LogFile:
         self.notes = [*columns.notes] if isinstance(columns, Columns) else []
         self.warnings: list[str] = []
         self.corrections: dict[str, float] = {}
+        self.contradiction = ""
 
     def wrong(self, text: str) -> InputError:
         """What to raise where something is wrong with the file."""
@@ -97,14 +103,18 @@ class LogFile:
         return values
 
 
-def read_log_file(path: Path) -> LogFile:
-    """Read all columns of a log file; the suffix and the first bytes say which kind it is.
+def read_log_file(path: Path, wanted: Collection[str | int] = ()) -> LogFile:
+    """Read columns of a log file; the suffix and the first bytes say which kind it is.
+
+    Args:
+        path: the file; of a ROS 2 bag its folder.
+        wanted: names, or numbers counted from 0, of columns that will be used; left out: all. Others are listed as well.
 
     Raises:
         InputError: the file is missing, empty, or of no known kind.
     """
     try:
-        return LogFile(path, _columns(path))
+        return LogFile(path, _columns(path, wanted))
     except FileNotFoundError:
         why = "no such file"
     except IsADirectoryError:
@@ -116,33 +126,60 @@ def read_log_file(path: Path) -> LogFile:
     raise InputError(f"{path}: {why}")
 
 
-def _columns(path: Path) -> dict[str | int, Any]:
+def _columns(path: Path, wanted: Collection[str | int]) -> dict[str | int, Any]:
     suffix = path.suffix.lower()
+    if (path / "metadata.yaml").is_file():
+        with _reading("a ROS bag"):
+            return read_bag(path, wanted)
     with path.open("rb") as file:
-        first = file.read(8)
-    for mark, kind, read in ((b"TDSm", "TDMS", read_tdms), (b"MDF", "MDF", read_mdf)):
-        if first.startswith(mark):
+        head = file.read(_HEAD)
+        whole = not file.read(1)
+    for mark, kind, read in _MARKS:
+        if head.startswith(mark):
             with _reading(kind):
-                return read(path)
-    content = path.read_bytes()
-    if not content.strip():
+                return read(path, wanted)
+    if not head.strip():
         raise InputError(f"is empty; {_KINDS}")
-    if content.startswith(b"PAR1"):
+    if head.startswith(b"PAR1"):
         with _reading("Parquet"):
-            frame = pd.read_parquet(path)
-        return {str(name): frame[name].to_numpy() for name in frame.columns}
+            return _parquet(path)
     # an HDF5 file begins so; MATLAB 7.3 puts half a kilobyte of text before that
-    if b"\x89HDF" in (content[:4], content[512:516]):
+    if b"\x89HDF" in (head[:4], head[512:516]):
         return _hdf5(path)
     if suffix == ".mat":
-        return _matlab(path)
-    if b"\0" in content:
+        return _matlab(path, wanted)
+    if head.startswith(b"SQLite format 3"):
+        raise InputError("is a database, perhaps of a ROS 2 bag; give the bag's folder, the one with metadata.yaml")
+    if b"\0" in head:
         raise InputError(f"is not a log of a known kind; {_KINDS}")
+    # whole lines, so that no letter is cut
+    head = head if whole else head[: head.rfind(b"\n") + 1] or head
     try:
-        text = content.decode("utf-8-sig")
+        return _of_text(path, head.decode("utf-8-sig"), "utf-8-sig", whole, wanted)
     except UnicodeDecodeError:
-        text = content.decode("latin-1")  # a degree sign in a header of an old program
-    return _json(text) if suffix == ".json" or text.lstrip()[0] in "[{" else _text(text)
+        # a degree sign in a header of an old program
+        return _of_text(path, head.decode("latin-1"), "latin-1", whole, wanted)
+
+
+def _of_text(path: Path, head: str, encoding: str, whole: bool, wanted: Collection[str | int]) -> dict[str | int, Any]:
+    def text() -> str:
+        return head if whole else path.read_text(encoding=encoding)
+
+    if path.suffix.lower() == ".json" or head.lstrip()[0] in "[{":
+        return _json(text())
+    return _text(path, head, encoding, text, wanted)
+
+
+def _parquet(path: Path) -> dict[str | int, Any]:
+    from pyarrow.parquet import ParquetFile
+
+    with ParquetFile(path) as file:
+        names, rows = [str(name) for name in file.schema_arrow.names], file.metadata.num_rows
+
+    def loaded(name: str) -> np.ndarray:
+        return pd.read_parquet(path, columns=[name])[name].to_numpy()
+
+    return {name: Column(lambda name=name: loaded(name), rows) for name in names}
 
 
 @contextmanager
@@ -161,10 +198,12 @@ _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eEdD][+-]?\d+)?|[+-]?(nan|i
 _NO_ROWS = "has a header and no rows; a log needs rows of numbers"
 
 
-def _text(text: str) -> dict[str | int, Any]:
+def _text(
+    path: Path, head: str, encoding: str, text: Callable[[], str], wanted: Collection[str | int]
+) -> dict[str | int, Any]:
     """Comma, semicolon, tab or white space between columns; a header or none; # before remarks."""
-    lines = text.splitlines()
-    if (block := _behind_remarks(lines)) is not None:
+    lines = head.splitlines()
+    if (block := _behind_remarks(lines, text)) is not None:
         return block
     skipped = next((i for i, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), None)
     if skipped is None:
@@ -179,35 +218,60 @@ def _text(text: str) -> dict[str | int, Any]:
         cells = [*cells, ""]  # a separator at the end of the rows
     sample = "\n".join(lines[skipped + header : skipped + header + 50])
     decimal = "," if separator != "," and re.search(r"\d,\d", sample) and not re.search(r"\d\.\d", sample) else "."
+    names = _names(cells) if header else None
+
+    def rows(wanted: Collection[str | int]) -> tuple[list[str | int], dict[str | int, np.ndarray], int]:
+        """Names of all columns, values of those that are wanted (all, if none is), and the number of rows."""
+        chunks = pd.read_csv(
+            path,
+            sep=separator,
+            header=None,
+            names=names,
+            skiprows=skipped + header,
+            comment="#",
+            skipinitialspace=True,
+            decimal=decimal,
+            index_col=False,
+            low_memory=False,
+            encoding=encoding,
+            compression=None,
+            chunksize=_ROWS,
+        )
+        parts: dict[str | int, list[np.ndarray]] = {}
+        every: list[str | int] = []
+        count = 0
+        with chunks:
+            for frame in chunks:
+                count += len(frame)
+                every = [name if isinstance(name, str) else int(name) for name in frame.columns]
+                for i, name in enumerate(every):
+                    if not wanted or name in wanted or i in wanted:
+                        # a copy: a view would keep the whole chunk
+                        parts.setdefault(name, []).append(np.array(frame[name].to_numpy()))
+        return every, {name: np.concatenate(values) for name, values in parts.items()}, count
+
     with _reading("a table"), warnings.catch_warnings(action="error", category=pd.errors.ParserWarning):
         try:
-            frame = pd.read_csv(
-                io.StringIO(text),
-                sep=separator,
-                header=None,
-                names=_names(cells) if header else None,
-                skiprows=skipped + header,
-                comment="#",
-                skipinitialspace=True,
-                decimal=decimal,
-                index_col=False,
-                low_memory=False,
-            )
+            every, values, count = rows(wanted)
         except pd.errors.EmptyDataError:
             raise InputError(_NO_ROWS) from None
         except pd.errors.ParserWarning:
             raise InputError(f"rows have more columns than the header; they should have {len(cells)}") from None
-    if not len(frame):
+    if not count:
         raise InputError(_NO_ROWS)
-    return {name if isinstance(name, str) else int(name): frame[name].to_numpy() for name in frame.columns}
+    return {
+        name: values[name] if name in values else Column(lambda name=name: rows([name])[1][name], count) for name in every
+    }
 
 
 _REMARKS = 100
 """Lines that a program may write before the rows: exports of drive software and of scopes have ten to thirty."""
 
 
-def _behind_remarks(lines: list[str]) -> Columns | None:
+def _behind_remarks(lines: list[str], text: Callable[[], str]) -> Columns | None:
     """Rows behind a block of remarks, as EPOS Studio and TwinCAT Scope write them; None where there is no such block.
+
+    `lines` are the first of the `text`.
 
     The lines just before the rows hold names and, below, units; TwinCAT's the word Name over each column of times.
     """
@@ -222,7 +286,7 @@ def _behind_remarks(lines: list[str]) -> Columns | None:
     known = any(mark in line for line in head for mark in ("EPOS Studio", "Starttime of export"))
     if not known and len(_cells(head[0], separator)) == count:
         return None
-    rows = [line for line in lines[start:] if line.strip() and line.strip() != "EOF"]
+    rows = [line for line in text().splitlines()[start:] if line.strip() and line.strip() != "EOF"]
     sample = "\n".join(rows[:50])
     decimal = "," if separator != "," and re.search(r"\d,\d", sample) and not re.search(r"\d\.\d", sample) else "."
     with _reading("a table"):
@@ -285,39 +349,72 @@ def _names(cells: list[str]) -> list[str]:
 
 
 def _json(text: str) -> dict[str | int, Any]:
-    """An array of objects, an object that holds one, or an object of arrays."""
+    """An array of objects or of rows of numbers, an object that holds one array of objects, or arrays by name."""
     try:
         data = json.loads(text)
     except ValueError as error:
         raise InputError(f"is not valid JSON: {error}") from None
+    columns: dict[str | int, Any] = {}
     if isinstance(data, dict):
         rows = [value for value in data.values() if isinstance(value, list) and value and isinstance(value[0], dict)]
         if len(rows) != 1:
-            columns: dict[str | int, Any] = {name: _plain(value) for name, value in data.items() if isinstance(value, list)}
+            for name, value in data.items():
+                _add_json(columns, name, value)
             if not columns:
                 raise InputError("holds no array of rows or of numbers; a log needs one")
             return columns
         data = rows[0]
+    if _is_matrix(data):
+        return dict(enumerate(np.asarray(data, dtype=float).T))
     if not data or not all(isinstance(row, dict) for row in data):
-        raise InputError("should hold an array of objects, one a row")
+        raise InputError("should hold an array of objects, one a row, or of rows of equally many numbers")
     names = dict.fromkeys(name for row in data for name in row)
     return {name: _plain([row.get(name) for row in data]) for name in names}
+
+
+def _add_json(columns: dict[str | int, Any], name: str, value: Any) -> None:
+    """Arrays, columns of matrices as `name[0]`, and what objects hold as `name.key`."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _add_json(columns, f"{name}.{key}", inner)
+    elif _is_matrix(value):
+        for i, column in enumerate(np.asarray(value, dtype=float).T):
+            columns[f"{name}[{i}]"] = column
+    elif isinstance(value, list):
+        columns[name] = _plain(value)
+
+
+def _is_matrix(value: Any) -> bool:
+    """Whether a value is rows of equally many numbers."""
+    if not isinstance(value, list) or not value or not all(isinstance(row, list) and row for row in value):
+        return False
+    plain = all(isinstance(cell, int | float) or cell is None for row in value for cell in row)
+    return plain and len({len(row) for row in value}) == 1
 
 
 def _plain(values: list[Any]) -> np.ndarray:
     return np.asarray(pd.Series(values, dtype=object).infer_objects())
 
 
-def _matlab(path: Path) -> dict[str | int, Any]:
-    """Vectors, columns of matrices, and fields of structures (`name.field`)."""
-    from scipy.io import loadmat
+def _matlab(path: Path, wanted: Collection[str | int]) -> dict[str | int, Any]:
+    """Vectors, columns of matrices (`name[0]`), fields of structures (`name.field`), and cells (`name[0]`)."""
+    from scipy.io import loadmat, whosmat
+
+    def loaded(name: str) -> Any:
+        with _reading("a MATLAB file"):
+            return loadmat(path, variable_names=[name], squeeze_me=True, struct_as_record=True)[name]
 
     with _reading("a MATLAB file"):
-        data = loadmat(path, squeeze_me=True, struct_as_record=True)
+        known = whosmat(path)
+    tops = {re.split(r"[.\[]", str(column))[0] for column in wanted}
     columns: dict[str | int, Any] = {}
-    for name, value in data.items():
-        if not name.startswith("__"):
-            _add(columns, name, value)
+    for name, shape, kind in known:
+        if kind in ("cell", "struct"):
+            # what is in them shows only once they are loaded
+            if not wanted or name in tops:
+                _add(columns, name, loaded(name))
+        elif re.fullmatch(r"double|single|logical|u?int\d+", kind):
+            _add_lazily(columns, name, shape, lambda name=name: loaded(name))
     return _some(columns)
 
 
@@ -327,15 +424,26 @@ def _add(columns: dict[str | int, Any], name: str, value: Any) -> None:
         if value.ndim == 0:
             for field in value.dtype.names:
                 _add(columns, f"{name}.{field}", value[field].item() if value[field].dtype == object else value[field])
-        return
-    if value.dtype.kind not in "biuf":
-        return
-    if value.ndim == 1:
-        columns[name] = value
-    elif value.ndim == 2:
+        elif value.ndim == 1:
+            for i, one in enumerate(value):
+                _add(columns, f"{name}[{i}]", one)
+    elif value.dtype == object:
+        for i, one in enumerate(value.ravel() if value.ndim else []):
+            _add(columns, f"{name}[{i}]", one)
+    elif value.dtype.kind in "biuf":
+        _add_lazily(columns, name, value.shape, lambda: value)
+
+
+def _add_lazily(columns: dict[str | int, Any], name: str, shape: tuple[int, ...], load: Callable[[], Any]) -> None:
+    """A vector, or the columns of a matrix, of which `load` gives the values; `shape` may have ones that are squeezed."""
+    shape = tuple(one for one in shape if one != 1)
+    if len(shape) == 1:
+        columns[name] = Column(lambda: np.squeeze(load()), shape[0])
+    elif len(shape) == 2:
         # samples run along the longer side
-        for i, column in enumerate(value.T if value.shape[0] >= value.shape[1] else value):
-            columns[f"{name}[{i}]"] = column
+        along = 1 if shape[0] >= shape[1] else 0
+        for i in range(shape[along]):
+            columns[f"{name}[{i}]"] = Column(lambda i=i: np.take(np.squeeze(load()), i, axis=along), shape[1 - along])
 
 
 def _hdf5(path: Path) -> dict[str | int, Any]:
@@ -344,13 +452,28 @@ def _hdf5(path: Path) -> dict[str | int, Any]:
 
     columns: dict[str | int, Any] = {}
 
-    def visit(name: str, item: Any) -> None:
-        named = isinstance(item, h5py.Dataset) and not name.startswith("#")
-        if named and item.attrs.get("MATLAB_class") != b"char" and item.dtype.kind in "biuf":
-            _add(columns, name.replace("/", "."), np.squeeze(item[()]))
+    def loaded(place: str) -> np.ndarray:
+        with _reading("a MATLAB file"), h5py.File(path) as file:
+            return np.asarray(file[place])
+
+    def add(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Group):
+            for key, inner in item.items():
+                add(f"{name}.{key}", inner)
+        elif item.attrs.get("MATLAB_class") == b"char":
+            return
+        elif item.dtype.kind in "biuf":
+            _add_lazily(columns, name, item.shape, lambda place=item.name: loaded(place))
+        elif h5py.check_ref_dtype(item.dtype) is not None:
+            # cells, and structures of several entries
+            for i, reference in enumerate(np.ravel(item[()])):
+                if reference:
+                    add(f"{name}[{i}]", item.file[reference])
 
     with _reading("a MATLAB file"), h5py.File(path) as file:
-        file.visititems(visit)
+        for name, item in file.items():
+            if not name.startswith("#"):
+                add(name, item)
     return _some(columns)
 
 

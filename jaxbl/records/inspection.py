@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from .alignment import NominalDrive
+from .element import Element, fit_element
 from .gearing import Gearing, twist_noise
 from .least_squares import jackknifed
 from .reader import Record, read_log_table, read_record
@@ -41,6 +42,7 @@ class Inspection:
         gear_ratio: motor over load motion: the expected one, else that of the log; None with one encoder.
         reversals: how often the direction of motion changes.
         judgements: what the log can identify.
+        element: what a transmission on a test rig is; None of a drive, or where the log shows nothing.
     """
 
     record: Record
@@ -48,12 +50,20 @@ class Inspection:
     gear_ratio: float | None
     reversals: int
     judgements: tuple[Judgement, ...]
+    element: Element | None = None
 
     def as_read(self) -> str:
         """Sizes that its user knows, in one sentence: a wrong unit shows in them."""
         record, side = self.record, main_side(self.record)
         channel = record.findings.channels[POSITION_CHANNELS[side]]
         turning = channel.unit == "rad"
+        if self.log.kind == "element":
+            moved, torque = np.ptp(displacement(record, self.gear_ratio)), record.torque
+            assert torque is not None
+            return (
+                f"As read: displacement over {moved:.3g} {channel.unit}, u over {np.ptp(torque):.3g} "
+                f"{record.findings.channels['u'].unit}. If the rig is another, see the units in [log]."
+            )
         fastest = float(np.quantile(np.abs(velocity(record)), 0.999))
         sizes = [f"{side} up to " + (f"{fastest * 30.0 / math.pi:.3g} rpm" if turning else f"{fastest:.3g} m/s")]
         if record.torque is not None and np.ptp(record.torque):
@@ -89,6 +99,7 @@ class Inspection:
             "gearing": None if found.gearing is None else asdict(found.gearing),
             "dynamics": None if dynamics is None else dynamics.to_dict(),
             "reversals": self.reversals,
+            "element": None if self.element is None else self.element.to_dict(),
             "identifiable": [asdict(judgement) for judgement in self.judgements],
             "warnings": list(record.warnings),
             "notes": list(record.notes),
@@ -105,6 +116,10 @@ def inspect(
     """Read a measured log and judge what it can identify; arguments and errors are those of :func:`read_record`."""
     table = read_log_table(log)
     record = read_record(path, table, gear_ratio=gear_ratio, nominal=nominal)
+    if table.kind == "element":
+        ratio = None if len(record.positions) < 2 else gear_ratio or 1.0
+        element = element_of(record, ratio)
+        return Inspection(record, table, ratio, 0 if element is None else element.reversals, _of_element(element), element)
     gearing = record.findings.gearing
     ratio = gear_ratio if gear_ratio is not None else None if gearing is None else gearing.ratio
     if len(record.positions) < 2:
@@ -116,6 +131,52 @@ def inspect(
         rigid = [_beside_a_gap(judgement) for judgement in rigid]
     found = [*rigid, *_of_transmission(record, speed, reversals, ratio)]
     return Inspection(record, table, ratio, reversals, tuple(found))
+
+
+def displacement(record: Record, gear_ratio: float | None) -> np.ndarray:
+    """Of an element: of one side, against `gear_ratio` times the other's if it was recorded; rad (m), shape (samples,)."""
+    motor, load = record.positions["motor"], record.positions.get("load")
+    return motor if load is None else motor - (gear_ratio or 1.0) * load
+
+
+def element_of(record: Record, gear_ratio: float | None) -> Element | None:
+    """What a log says of a transmission on a test rig; None where it shows nothing."""
+    assert record.torque is not None
+    channel = record.findings.channels["theta_e"]
+    moved, noise = displacement(record, gear_ratio), element_noise(record, gear_ratio)
+    return fit_element(moved, record.torque, record.segments, record.sample_period, noise=noise, linear=channel.unit == "m")
+
+
+def element_noise(record: Record, gear_ratio: float | None) -> float:
+    """Of an element's displacement, with that of the resolution, rad (m) rms."""
+    found = record.findings.channels
+    ratio = {"theta_e": 1.0, "theta_s": gear_ratio or 1.0}
+    parts = [(ratio[n] * found[n].noise, ratio[n] * found[n].resolution / 12.0**0.5) for n in ratio if n in found]
+    return float(np.hypot.reduce([one for part in parts for one in part]))
+
+
+_WORDS = {
+    "stiffness": "stiffness", "gap": "half_gap", "damping": "damping", "dry friction": "dry_friction",
+    "hysteresis": "hysteresis", "friction under load": "load_friction",
+}  # fmt: skip
+"""Quantity of an element -> its number."""
+
+
+def _of_element(found: Element | None) -> tuple[Judgement, ...]:
+    if found is None:
+        why = "the displacement never turns back, or hardly moves: load it to and fro, through the gap"
+        return tuple(Judgement(quantity, "no", why) for quantity in _WORDS)
+    judgements = []
+    for quantity, key in _WORDS.items():
+        number = found.numbers.get(key)
+        if number is None:
+            judgements.append(Judgement(quantity, "no", "does not make the torque any better on parts of the log left out"))
+            continue
+        low, high = number.interval
+        unit = f" {number.unit}" if number.unit else ""
+        text = f"{key} = {number.value:.4g} ± {number.error:.2g}{unit}, 95 %: {low:.4g} to {high:.4g}"
+        judgements.append(Judgement(quantity, "weak" if key in found.open else "yes", text))
+    return tuple(judgements)
 
 
 def main_side(record: Record) -> str:

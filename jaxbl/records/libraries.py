@@ -1,16 +1,27 @@
-"""Logs that need a library of the extra `logs`: MDF4 and TDMS. Only columns that are asked for are loaded."""
+"""Logs that need a library of the extra `logs`: MDF4, TDMS, MCAP, ROS bags. Only columns that are asked for are loaded."""
 
 # the libraries are optional, and have no annotations
 # pyright: reportMissingImports=false
 
-from collections.abc import Callable
+import json
+from array import array
+from collections.abc import Callable, Collection, Iterator
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxbl.errors import InputError
+
+
+class Columns(dict[str | int, Any]):
+    """Columns of a file by name, with the units that the file says, and remarks on how it was read."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.units: dict[str | int, str] = {}
+        self.notes: list[str] = []
 
 
 class Column:
@@ -31,11 +42,11 @@ class Column:
         return np.asarray(self.load(), dtype=dtype)
 
 
-def _library(name: str, kind: str) -> Any:
+def _library(name: str, kind: str, package: str = "") -> Any:
     try:
         return import_module(name)
     except ImportError:
-        raise InputError(f"is {kind}, which needs the package {name}: pip install 'jaxbl[logs]'") from None
+        raise InputError(f"is {kind}, which needs the package {package or name}: pip install 'jaxbl[logs]'") from None
 
 
 def read_tdms(path: Path) -> dict[str | int, Any]:
@@ -80,3 +91,166 @@ def read_mdf(path: Path) -> dict[str | int, Any]:
         if index != file.masters_db.get(group) and name != "t":
             found[name] = Column(lambda name=name, group=group, index=index: loaded(name, group, index), len(times))
     return found
+
+
+_LONGEST = 64
+"""Entries of a list in a message that become columns: robots have fewer joints, and pictures more bytes."""
+
+
+class _Source(NamedTuple):
+    """Messages of a recording.
+
+    Attributes:
+        counts: topic -> how many.
+        messages: of some topics, in the order of time: topic, time of recording in ns, the message decoded.
+    """
+
+    counts: dict[str, int]
+    messages: Callable[[Collection[str]], Iterator[tuple[str, int, Any]]]
+
+
+def read_mcap(path: Path, wanted: Collection[str | int] = ()) -> Columns:
+    """As :func:`read_bag`, of an MCAP file whose messages are JSON or ROS 2's."""
+    library = _library("mcap.reader", "MCAP", "mcap")
+    with path.open("rb") as file:
+        summary = library.make_reader(file).get_summary()
+    if summary is None or summary.statistics is None:
+        raise InputError("has no summary at its end: it was not closed; 'mcap recover' mends it")
+    types: dict[int, Any] = {}
+    counts, other = {}, set()
+    for number, channel in summary.channels.items():
+        schema = summary.schemas.get(channel.schema_id)
+        if channel.message_encoding == "json" or (channel.message_encoding == "cdr" and schema is not None):
+            counts[channel.topic] = counts.get(channel.topic, 0) + summary.statistics.channel_message_counts.get(number, 0)
+        else:
+            other.add(f"{channel.topic} ({channel.message_encoding})")
+
+    def messages(topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+        with path.open("rb") as file:
+            for schema, channel, message in library.make_reader(file).iter_messages(topics=list(topics)):
+                if channel.message_encoding == "json":
+                    yield channel.topic, message.log_time, json.loads(message.data)
+                else:
+                    if schema.id not in types:
+                        types[schema.id] = _ros_types(schema)
+                    yield channel.topic, message.log_time, types[schema.id].deserialize_cdr(message.data, schema.name)
+
+    found = _columns_of(_Source(counts, messages), wanted)
+    if other:
+        found.notes.append(f"Messages that are neither JSON nor ROS 2's are not read: {', '.join(sorted(other))}.")
+    return found
+
+
+def _ros_types(schema: Any) -> Any:
+    """What decodes messages of a schema that a file holds."""
+    library = _library("rosbags.typesys", "MCAP with messages of ROS 2", "rosbags")
+    store = library.get_typestore(library.Stores.EMPTY)
+    text = schema.data.decode()
+    store.register(
+        library.get_types_from_msg(text, schema.name) if schema.encoding == "ros2msg" else library.get_types_from_idl(text)
+    )
+    return store
+
+
+def read_bag(path: Path, wanted: Collection[str | int] = ()) -> Columns:
+    """Numbers in the messages of a ROS bag by topic and field, as `/joint_states.position[0]`; `t` are their times, s.
+
+    These are the stamps of the messages' headers where they have them, else the times of recording. Of topics that hold
+    `wanted` columns the one with the most messages gives the times; others are interpolated to them.
+    """
+    library = _library("rosbags.highlevel", "a ROS bag", "rosbags")
+    with library.AnyReader([path]) as reader:
+        counts: dict[str, int] = {}
+        for one in reader.connections:
+            counts[one.topic] = counts.get(one.topic, 0) + one.msgcount
+
+    def messages(topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+        with library.AnyReader([path]) as reader:
+            asked = [one for one in reader.connections if one.topic in topics]
+            for connection, time, data in reader.messages(connections=asked):
+                yield connection.topic, time, reader.deserialize(data, connection.msgtype)
+
+    return _columns_of(_Source(counts, messages), wanted)
+
+
+def _columns_of(source: _Source, wanted: Collection[str | int]) -> Columns:
+    """Columns of a recording, loaded as they are asked for: all that are wanted of a topic at once."""
+    fields: dict[str, dict[str, list[str | int]]] = {}
+    for topic, count in source.counts.items():
+        first = next(source.messages([topic]), None) if count else None
+        if first is not None:
+            fields[topic] = dict(_numbers_in(first[2], []))
+    places = {f"{topic}.{name}": (topic, name) for topic, names in fields.items() for name in names}
+    if not places:
+        raise InputError("holds no messages with numbers; a log needs them")
+    asked = {places[name][0] for name in wanted if name in places} or set(fields)
+    main = max((topic for topic in asked if fields[topic]), key=lambda topic: source.counts[topic])
+    loaded: dict[str, np.ndarray] = {}
+    times: dict[str, np.ndarray] = {}
+    found = Columns()
+
+    def load(topic: str, name: str) -> np.ndarray:
+        if name not in loaded:
+            names = [one for one, place in places.items() if place[0] == topic and (one in wanted or one == name)]
+            paths = [fields[topic][places[one][1]] for one in names]
+            stamps, recorded, rows = array("q"), array("q"), array("d")
+            for _, time, message in source.messages([topic]):
+                stamps.append(_stamp(message))
+                recorded.append(time)
+                rows.extend(float(_at(message, path)) for path in paths)
+            # a clock may begin at 0; headers that are not filled in are all 0
+            filled = len(stamps) > 1 and all(stamps[1:])
+            times[topic] = np.frombuffer(stamps if filled else recorded, dtype=np.int64)
+            values = np.frombuffer(rows, dtype=float).reshape(-1, len(names)) if names else np.empty((len(stamps), 0))
+            loaded.update(dict(zip(names, values.T, strict=True)))
+        return loaded.get(name, np.empty(0))
+
+    def seconds(topic: str) -> np.ndarray:
+        for one in (main, topic):
+            if one not in times:
+                load(one, "")
+        return 1e-9 * (times[topic] - times[main][0])
+
+    def column(topic: str, name: str) -> np.ndarray:
+        values = load(topic, name)
+        return values if topic == main else np.interp(seconds(main), seconds(topic), values)
+
+    count = source.counts[main]
+    found["t"] = Column(lambda: seconds(main), count)
+    for name, (topic, _) in places.items():
+        found[name] = Column(lambda topic=topic, name=name: column(topic, name), count)
+    apart = sorted({places[name][0] for name in wanted if name in places} - {main})
+    if apart:
+        found.notes.append(f"{', '.join(apart)} is interpolated to the times of {main}, of which there are most.")
+    return found
+
+
+def _numbers_in(message: Any, path: list[str | int]) -> Iterator[tuple[str, list[str | int]]]:
+    """Names of all numbers in a message, as `pose.position.x` or `position[0]`, and the way to each."""
+    if isinstance(message, bool | int | float | np.number):
+        yield "".join(f"[{one}]" if isinstance(one, int) else f".{one}" for one in path).lstrip("."), path
+    elif isinstance(message, list | tuple | np.ndarray):
+        for i in range(len(message) if len(message) <= _LONGEST else 0):
+            yield from _numbers_in(message[i], [*path, i])
+    elif not isinstance(message, str | bytes) and message is not None:
+        fields = message if isinstance(message, dict) else vars(message)
+        for name in fields:
+            if not name.startswith("__"):
+                yield from _numbers_in(fields[name], [*path, name])
+
+
+def _at(message: Any, path: list[str | int]) -> Any:
+    """A number in a message; nan where it has none."""
+    try:
+        for one in path:
+            message = message[one] if isinstance(one, int) or isinstance(message, dict) else getattr(message, one)
+    except (IndexError, KeyError, AttributeError):
+        return np.nan
+    return message
+
+
+def _stamp(message: Any) -> int:
+    """Time in the header of a message, ns; 0 where it has none."""
+    seconds = _at(message, ["header", "stamp", "sec"])
+    rest = _at(message, ["header", "stamp", "nanosec"])
+    return 0 if np.isnan(seconds) else int(seconds) * 1_000_000_000 + (0 if np.isnan(rest) else int(rest))

@@ -149,8 +149,9 @@ def check_torque(file: LogFile, found: RigidFit, grid: Grid, position: np.ndarra
         )
     # a driven load returns work as well: no error
     if share < -0.1:
-        text = f"the drive returns {-100 * share:.0f} % of the work: the load drives it, or the sign of u is wrong."
-        (file.warnings if share < -0.5 else file.notes).append(f"Doubtful: {text}" if share < -0.5 else f"T{text[1:]}")
+        file.warnings.append(
+            f"Doubtful: the drive returns {-100 * share:.0f} % of the work: the load drives it, or the sign of u is wrong."
+        )
     elif backwards and share < 0.1:
         file.notes.append("The drive seems to accelerate against u: see its sign, unit and column.")
 
@@ -159,23 +160,27 @@ _FAR = 10.0
 """Factor between an inertia and its nominal value from which on a unit is rather wrong: data sheets and CAD know it within a
 factor of two."""
 
-
+_SURE = 30.0
+"""Factor from which on it is no longer a rough number: units in place of others make 57 (degrees), 60 or 1000 of it."""
 _FAR_TORQUE = 1000.0
 """Factor between the torque and what the nominal inertia needs from which on a unit is rather wrong: mN m for N m. A screw
 that turns slowly against dry friction needs six hundred times the torque of its inertia."""
 
 
 def warn_inertia(file: LogFile, found: RigidFit, channel: str, nominal: NominalDrive) -> None:
-    """Say first that inertia or torque are far from the nominal ones, as a wrong unit makes them."""
+    """Say first that inertia or torque are far from the nominal ones, as a wrong unit makes them.
+
+    Where they are so far that no fit is worth its time, `file.contradiction` says so.
+    """
     expected = nominal.inertia(channel)
     value, error = float(found.values[0]), float(found.errors[0])
     # a coefficient that noise, gravity or a spring hides says nothing
     if value > 4.0 * error and found.shares[0] > 0.05 and found.inflation[0] < 10.0:
-        ratio, least, largest = value / expected, 1.0 / _FAR, _FAR
+        ratio, least, largest, sure = value / expected, 1.0 / _FAR, _FAR, _SURE
         text = f"u moves {channel} as an inertia of {value:.3g} would, {ratio:.3g} times the nominal {expected:.3g}"
     elif value:
         needed = expected * found.acceleration
-        ratio, least, largest = found.torque / needed, 1.0 / _FAR, _FAR_TORQUE
+        ratio, least, largest, sure = found.torque / needed, 1.0 / _FAR, _FAR_TORQUE, _SURE * _FAR_TORQUE
         text = (
             f"u is {found.torque:.3g} rms, {ratio:.3g} times what the nominal inertia {expected:.3g} needs for this motion"
         )
@@ -183,6 +188,8 @@ def warn_inertia(file: LogFile, found: RigidFit, channel: str, nominal: NominalD
         return
     if not least < ratio < largest:
         file.warnings.append(f"Doubtful: {text}: check the units of t, u and {channel} in [log], and the model.")
+    if not 1.0 / _SURE < ratio < sure:
+        file.contradiction = f"{text}: a unit of t, u or {channel} in [log] is wrong, or the model's inertia is"
 
 
 # remarks

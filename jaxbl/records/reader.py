@@ -68,6 +68,7 @@ class Record:
         notes: what was done to the log, and what is odd about it, in sentences.
         warnings: those that are to be said first: clock or zero point of an encoder corrected, units in doubt.
         corrections: "skew" of theta_s, s, and "offset" of theta_e, rad (m), as far as the log's own were put in.
+        contradiction: why nothing can be fitted to the nominal drive, as units are surely wrong; "" where they are not.
         findings: figures on its quality.
         intervals: between the raw stamps that were kept, s, shape (raw samples - 1,).
         logs: name and rows of each log that it was joined from.
@@ -85,6 +86,7 @@ class Record:
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
     corrections: dict[str, float]
+    contradiction: str
     findings: Findings
     intervals: np.ndarray
     logs: tuple[tuple[str, slice], ...]
@@ -130,7 +132,8 @@ def read_record(
     Raises:
         InputError: the file or a column is missing or unfit, or the log contradicts what is said of it; one line.
     """
-    table, file = read_log_table(log), read_log_file(Path(path))
+    table = read_log_table(log)
+    file = read_log_file(Path(path), table.columns())
     # from columns to SI channels at the time stamps of the log
     stamps = read_time_stamps(file, table)
     channels = read_channels(file, table, stamps)
@@ -138,18 +141,21 @@ def read_record(
     segments = split_at_gaps(file, stamps)
     channels = {name: raw._replace(values=raw.values[segments.distinct]) for name, raw in channels.items()}
     encoders = [name for name in POSITION_CHANNELS.values() if name in channels]
-    for name in encoders:
+    # the sides of an element move on their own, if they move
+    drive = table.kind == "drive"
+    for name in encoders if drive else encoders[:1]:
         check_motion(file, name, channels[name].values)
     # from there to evenly spaced samples
-    shaft = nominal if nominal is not None and math.isfinite(nominal.stiffness) and len(encoders) == 2 else None
+    two = drive and len(encoders) == 2
+    shaft = nominal if nominal is not None and math.isfinite(nominal.stiffness) and two else None
     grid, gearing, regular = _evenly_spaced(file, table, segments, channels, gear_ratio, shaft)
     if shaft is not None:
         _correct_offset(file, table, grid, channels, shaft)
     # what these say of the drive
-    if len(encoders) == 2:
+    if two:
         check_gear_ratio(file, table, grid, gearing, gear_ratio, gear_tolerance)
-    position = grid.values[encoders[0]]
-    dynamics = fit_rigid_drive(grid.values["u"], position, grid.segments, grid.period) if "u" in channels else None
+    position, driven = grid.values[encoders[0]], drive and "u" in channels
+    dynamics = fit_rigid_drive(grid.values["u"], position, grid.segments, grid.period) if driven else None
     if dynamics is not None:
         check_torque(file, dynamics, grid, position)
         if nominal is not None:
@@ -176,8 +182,10 @@ def read_record(
         start=stamps.start + float(grid.time[0]),
         segments=tuple(grid.segments),
         notes=tuple(file.notes),
-        warnings=tuple(file.warnings),
+        # doubts before what was corrected
+        warnings=tuple(sorted(file.warnings, key=lambda warning: not warning.startswith("Doubtful"))),
         corrections=file.corrections,
+        contradiction=file.contradiction,
         findings=Findings(segments.sampling, figures, gearing, dynamics),
         intervals=np.diff(segments.times),
         logs=((file.path.name, slice(0, len(grid.time))),),
@@ -199,7 +207,7 @@ def _evenly_spaced(
 
     def attempt() -> tuple[Grid, Gearing | None]:
         grid = resampled(file, segments, channels, period, skews, interpolate=not regular)
-        if "theta_e" not in channels or "theta_s" not in channels:
+        if table.kind == "element" or "theta_e" not in channels or "theta_s" not in channels:
             return grid, None
         turn = None if table.load_unit == "m" else 2.0 * math.pi
         motor, load = grid.values["theta_e"], grid.values["theta_s"]

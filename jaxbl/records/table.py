@@ -176,6 +176,11 @@ class LogTable(StrictTable):
     Accepted in every study; simulate and sweep do not use it.
     """
 
+    kind: Literal["drive", "element"] = Field(
+        default="drive",
+        description="drive: a machine in motion; element: a transmission alone on a test rig, theta_e the displacement of "
+        "one side (against theta_s, the other's, if there is one), u the torque through it",
+    )
     hold: Literal["zoh"] = Field(default="zoh", description="input between samples")
     initial_state: Literal["unknown", "rest"] = Field(default="unknown", description="state at the first sample")
     t: TimeTable | None = Field(default=None, description="time stamps; left out: column t, in s")
@@ -220,6 +225,11 @@ class LogTable(StrictTable):
                 raise wrong(
                     f"{omega} stands in place of {theta}, which is described or said to be absent; remove one of them"
                 )
+        if self.kind == "element":
+            if "u" in absent or "theta_e" in absent:
+                raise wrong("absent: an element is found from its displacement theta_e and the torque u; both are needed")
+            if self.omega_e is not None or self.omega_s is not None or self.transmitted is not None:
+                raise wrong("an element has a displacement (theta_e, theta_s) and a torque u, no speed and no transmitted")
         if "theta_e" in absent and "theta_s" in absent:
             raise wrong("absent: a log without theta_e and theta_s has no position; one of them is needed")
         if self.theta_e is not None and self.theta_e.skew == "estimate":
@@ -227,6 +237,16 @@ class LogTable(StrictTable):
         if self.theta_s is not None and self.theta_s.skew == "estimate" and "theta_e" in absent:
             raise wrong("theta_s.skew: 'estimate' needs theta_e, which is said to be absent")
         return self
+
+    def columns(self) -> set[str | int]:
+        """Names and numbers of all columns that may be read."""
+        found: set[str | int] = {*(self.where or {})}
+        for name in ("t", "u", "theta_e", "theta_s", "omega_e", "omega_s", "transmitted"):
+            channel = getattr(self, name)
+            found.add(name if channel is None else channel.column_or(name))
+            if isinstance(channel, PositionTable) and channel.minus is not None:
+                found.add(channel.minus)
+        return found
 
     @property
     def load_unit(self) -> str:

@@ -38,14 +38,9 @@ def write_inspection_report(inspection: Inspection, folder: Path) -> list[str]:
         PageTable("Channels", _CHANNEL_COLUMNS, list(_channel_rows(record))),
     ]
     table = tomli_w.dumps({"log": inspection.log.model_dump(exclude_none=True)})
-    lead = [_headline(record), *_first(inspection)]
+    lead = [*record.warnings, _headline(record), inspection.as_read()]
     write_report(folder, record.path.name, lead, draw_inspection(inspection), tables, table, record.notes)
     return summary(inspection)
-
-
-def _first(inspection: Inspection) -> list[str]:
-    """What is said before the tables."""
-    return [*inspection.record.warnings, inspection.as_read()]
 
 
 def _headline(record: Record) -> str:
@@ -72,7 +67,7 @@ def _channel_rows(record: Record) -> Iterator[tuple[str, ...]]:
 def summary(inspection: Inspection) -> list[str]:
     """The log in at most 25 lines: channels, what can be identified, what was done."""
     record = inspection.record
-    lines = [f"{record.path.name}: {_headline(record)}", *_first(inspection), ""]
+    lines = [*record.warnings, f"{record.path.name}: {_headline(record)}", inspection.as_read(), ""]
     lines += _aligned([_CHANNEL_COLUMNS, *_channel_rows(record)])
     lines += ["", *_aligned([("identifies", "", ""), *((j.quantity, j.answer, j.why) for j in inspection.judgements)])]
     room = _LINES - len(lines) - 1

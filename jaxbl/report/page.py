@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import tomli_w
 
@@ -15,6 +15,8 @@ from jaxbl.files import write_atomic
 from .figures import Drawn, save
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from jaxbl.diagnosis.diagnose import Diagnosis
     from jaxbl.identification.identify import Identification
 
@@ -79,13 +81,28 @@ def write_log_results(
     for the terminal.
     """
     title = found.config.title or f"{_TITLES[name]} {found.record.path.name}"
+    return write_results(folder, name, title, found.summary, found.trace, _model_text(found), lead, drawn, tables, remarks)
+
+
+def write_results(
+    folder: Path,
+    name: str,
+    title: str,
+    summary: dict[str, Any],
+    trace: "pd.DataFrame",
+    model: str,
+    lead: Sequence[str],
+    drawn: Sequence[Drawn],
+    tables: Sequence[PageTable],
+    remarks: Sequence[str],
+) -> list[str]:
+    """As :func:`write_log_results`, of anything that has a summary, a trace and a model in TOML."""
     with TemporaryDirectory(dir=folder, prefix=".draft.") as place:
         draft = Path(place)
-        found.trace.to_parquet(draft / "trace.parquet", index=False)
-        model = _model_text(found)
+        trace.to_parquet(draft / "trace.parquet", index=False)
         (draft / "model.toml").write_text(model, encoding="utf-8")
         lines = write_report(draft, title, lead, drawn, tables, model, remarks)
-        (draft / f"{name}.json").write_text(json.dumps(found.summary, indent=1, ensure_ascii=False), encoding="utf-8")
+        (draft / f"{name}.json").write_text(json.dumps(summary, indent=1, ensure_ascii=False), encoding="utf-8")
         for file in sorted(draft.rglob("*"), key=lambda one: one.name == f"{name}.json"):
             if file.is_file():
                 target = folder / file.relative_to(draft)

@@ -99,4 +99,4 @@ def test_friction_that_winds_up_a_soft_shaft_is_no_clock(read):
 def test_inspect_says_it_first(tmp_path):
     axis(3.04e-3, 0.379).to_parquet(tmp_path / "log.parquet")
     lines = summary(inspect(tmp_path / "log.parquet", gear_ratio=20.0, nominal=NOMINAL))
-    assert lines[1].startswith("theta_s is 3.0") and lines[2].startswith("theta_e - 20 theta_s is 0.37")
+    assert lines[0].startswith("theta_s is 3.0") and lines[1].startswith("theta_e - 20 theta_s is 0.37")

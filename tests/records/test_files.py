@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from jaxbl.errors import InputError
+from jaxbl.records import files
 from jaxbl.records.files import read_log_file
+from jaxbl.records.libraries import Column
 
 T, U = np.arange(5) * 0.1, np.array([1.5, -2.0, 3e-7, 4e12, 0.0])
 
@@ -106,6 +108,36 @@ def test_structures_and_matrices_of_matlab_have_columns_of_their_own(tmp_path):
             np.testing.assert_array_equal(columns.numbers(column), values)
 
 
+def test_cells_of_matlab_and_matrices_of_json(tmp_path):
+    cells = np.empty(2, dtype=object)
+    cells[0], cells[1] = T, np.stack([T, U], axis=1)
+    savemat(tmp_path / "a.mat", {"runs": cells, "gain": 2.0})
+    with h5py.File(tmp_path / "b.mat", "w") as file:
+        file["#refs#/a"], file["#refs#/b"] = T[None], np.stack([T, U])
+        file.create_dataset("runs", data=[[file["#refs#/a"].ref], [file["#refs#/b"].ref]], dtype=h5py.ref_dtype)
+    rows = np.stack([T, U], axis=1).tolist()
+    (tmp_path / "c.json").write_text(json.dumps({"runs": {"first": T.tolist()}, "x": rows}))
+    (tmp_path / "d.json").write_text(json.dumps(rows))
+    names = {"a.mat": ("runs[0]", "runs[1][1]"), "b.mat": ("runs[0]", "runs[1][1]"), "c.json": ("runs.first", "x[1]")}
+    for name, columns in (names | {"d.json": (0, 1)}).items():
+        file = read_log_file(tmp_path / name, {"runs[0]"})
+        for column, values in zip(columns, (T, U), strict=True):
+            np.testing.assert_array_equal(file.numbers(column), values)
+
+
+def test_columns_that_are_not_wanted_are_read_only_if_asked_for(tmp_path, monkeypatch):
+    frame = pd.DataFrame({"t": T, "u": U, "other": 2.0 * U})
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    frame.to_parquet(tmp_path / "log.parquet")
+    monkeypatch.setattr(files, "_ROWS", 2)  # in three chunks
+    for name in ("log.csv", "log.parquet"):
+        file = read_log_file(tmp_path / name, {"t", 1})
+        assert list(file.columns) == ["t", "u", "other"] and isinstance(file.columns["other"], Column)
+        assert len(file.columns["other"]) == 5
+        np.testing.assert_array_equal(file.numbers("u"), U)
+        np.testing.assert_array_equal(file.numbers("other"), 2.0 * U)
+
+
 BAD = {
     "missing": (None, "no such file"),
     "empty.csv": (b"", "is empty; text .* can be read"),
@@ -118,7 +150,9 @@ BAD = {
     "photo.png": (b"\x89PNG\0\0\0", "is not a log of a known kind"),
     "broken.json": (b'{"t": [1, 2', "is not valid JSON"),
     "scalars.json": (b'{"t": 1}', "holds no array of rows or of numbers"),
-    "list.json": (b"[1, 2]", "should hold an array of objects, one a row"),
+    "list.json": (b"[1, 2]", "should hold an array of objects, one a row, or of rows of equally many numbers"),
+    "ragged.json": (b"[[1, 2], [3]]", "should hold an array of objects"),
+    "bag.db3": (b"SQLite format 3\0", "perhaps of a ROS 2 bag; give the bag's folder"),
     "broken.parquet": (b"PAR1 no", "cannot be read as Parquet"),
     "broken.mat": (b"no matlab at all" * 20, "cannot be read as a MATLAB file"),
     "broken73.mat": (b"\x89HDF\r\n\x1a\n no", "cannot be read as a MATLAB file"),
@@ -236,9 +270,61 @@ def test_mdf_by_its_library(tmp_path):
     np.testing.assert_allclose(file.numbers("slow"), [0.0, 1.0, 2.0, 3.0, 4.0])
 
 
-@pytest.mark.parametrize(("mark", "package"), [(b"TDSm", "nptdms"), (b"MDF     4.10    ", "asammdf")])
+def wrote_mcap(path):
+    """A topic in JSON at times of recording, another, slower one."""
+    library = pytest.importorskip("mcap.writer", reason="the extra logs is not installed")
+    with path.open("wb") as file:
+        writer = library.Writer(file)
+        writer.start()
+        schema = writer.register_schema("state", "jsonschema", b"{}")
+        channels = {name: writer.register_channel(f"/{name}", "json", schema) for name in ("axis", "slow")}
+        for i, (t, u) in enumerate(zip(T.tolist(), U.tolist(), strict=True)):
+            time = int(1e9 * t) + 1_700_000_000_000_000_000
+            data = {"axis": {"u": u, "angles": [t, u], "name": "x"}} | ({"slow": {"v": 10.0 * t}} if i in (0, 4) else {})
+            for name, message in data.items():
+                writer.add_message(channels[name], time, json.dumps(message).encode(), time)
+        writer.finish()
+
+
+def wrote_bag(path):
+    """Joint states, stamped in their headers, recorded 5 ms late."""
+    library = pytest.importorskip("rosbags.rosbag2", reason="the extra logs is not installed")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    state, header, stamp = (
+        store.types[f"{n}/msg/{m}"]
+        for n, m in (("sensor_msgs", "JointState"), ("std_msgs", "Header"), ("builtin_interfaces", "Time"))
+    )
+    with library.Writer(path, version=9) as writer:
+        topic = writer.add_connection("/joint_states", state.__msgtype__, typestore=store)
+        for t, u in zip(T, U, strict=True):
+            time = round(1e9 * t)
+            head = header(stamp(*divmod(time, 10**9)), "")
+            message = state(head, ["a"], np.array([t]), np.array([]), np.array([u]))
+            writer.write(topic, time + 5_000_000, store.serialize_cdr(message, state.__msgtype__))
+
+
+def test_mcap_and_ros_bags_by_their_libraries(tmp_path):
+    wrote_mcap(tmp_path / "log.mcap")
+    file = read_log_file(tmp_path / "log.mcap", {"t", "/axis.u", "/slow.v"})
+    assert list(file.columns) == ["t", "/axis.u", "/axis.angles[0]", "/axis.angles[1]", "/slow.v"]
+    for column, values in {"t": T, "/axis.u": U, "/axis.angles[0]": T, "/slow.v": 10.0 * T}.items():
+        np.testing.assert_allclose(file.numbers(column), values, atol=1e-7)
+    assert file.notes == ["/slow is interpolated to the times of /axis, of which there are most."]
+    wrote_bag(tmp_path / "bag")
+    file = read_log_file(tmp_path / "bag", {"t", "/joint_states.position[0]"})
+    for column, values in {"t": T, "/joint_states.position[0]": T, "/joint_states.effort[0]": U}.items():
+        np.testing.assert_allclose(file.numbers(column), values, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("mark", "package"),
+    [(b"TDSm", "nptdms"), (b"MDF     4.10    ", "asammdf"), (b"\x89MCAP0\r\n", "mcap"), (b"#ROSBAG V2.0", "rosbags")],
+)
 def test_a_missing_library_names_the_extra(tmp_path, monkeypatch, mark, package):
-    monkeypatch.setitem(sys.modules, package, None)
+    for module in (package, "mcap.reader", "rosbags.highlevel"):
+        monkeypatch.setitem(sys.modules, module, None)
     (tmp_path / "log").write_bytes(mark + bytes(64))
     with pytest.raises(InputError, match=rf"needs the package {package}: pip install 'jaxbl\[logs\]'"):
         read_log_file(tmp_path / "log")

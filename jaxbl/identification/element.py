@@ -1,0 +1,201 @@
+"""A transmission alone on a test rig, from its log: what `jaxbl identify` does where `[log] kind` is `element`."""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from jaxbl.drive.effects import CoulombFriction, Damping, Hysteresis, LoadFriction
+from jaxbl.drive.transmission import DeadZone, LinearShaft
+from jaxbl.errors import InputError
+from jaxbl.files import plain
+from jaxbl.records import LogTable, Record, read_record
+from jaxbl.records.element import Element, Number, error_on
+from jaxbl.records.inspection import displacement, element_noise, element_of
+
+# number -> where a study has it: an effect and its key
+_EFFECTS = {
+    "damping": (f"transmission.{Damping.kind}", "damping"),
+    "dry_friction": (f"motor.{CoulombFriction.kind}", "torque"),
+    "hysteresis": (f"transmission.{Hysteresis.kind}", "torque"),
+    "length": (f"transmission.{Hysteresis.kind}", "length"),
+    "load_friction": (f"transmission.{LoadFriction.kind}", "coefficient"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class ElementTask:
+    """A log of a transmission on a test rig, and how it was read: everything that decides the result.
+
+    Attributes:
+        title: headline of the report; "" for the file's name.
+        table: how the logs are read.
+        gear_ratio: of the displacements of both sides; None where there is one.
+        record: the log.
+        holdout: another log, on which what was found is tried out, or None.
+    """
+
+    title: str
+    table: LogTable
+    gear_ratio: float | None
+    record: Record
+    holdout: Record | None
+
+    @property
+    def identity(self) -> str:
+        """Hash of everything that decides the result."""
+        text = [self.title, self.table.model_dump(), self.gear_ratio, version("jaxbl")]
+        total = hashlib.sha256(json.dumps(text, sort_keys=True).encode())
+        for record in (self.record, self.holdout):
+            if record is not None:
+                for values in (record.time, record.torque, *record.positions.values()):
+                    total.update(np.ascontiguousarray(values).tobytes())
+        return total.hexdigest()[:16]
+
+
+@dataclasses.dataclass(frozen=True)
+class ElementIdentification:
+    """What a log says of a transmission on a test rig.
+
+    Attributes:
+        task: the log.
+        found: its numbers.
+        summary: as in `identification.json`.
+        trace: one row a sample: `t`, `u`, `displacement`, `torque` of what was found (empty before the first reversal).
+        tables: `[transmission]` and `[[effects]]` of a study with these numbers, to be included in one that has `[drive]`.
+    """
+
+    task: ElementTask
+    found: Element
+    summary: dict[str, Any]
+    trace: pd.DataFrame
+    tables: dict[str, Any]
+
+
+def read_element_task(
+    log: str | Path, table: LogTable, gear_ratio: float | None = None, *, title: str = "", holdout: str | Path | None = None
+) -> ElementTask:
+    """Read the logs; `gear_ratio` is that of the displacements of both sides, 1 if left out.
+
+    Raises:
+        InputError: an unfit log.
+    """
+    records = [None if path is None else read_record(path, table) for path in (log, holdout)]
+    assert records[0] is not None
+    ratio = None if len(records[0].positions) < 2 else gear_ratio or 1.0
+    return ElementTask(title, table, ratio, records[0], records[1])
+
+
+def identify_element(
+    log: str | Path,
+    table: LogTable | Mapping[str, Any],
+    *,
+    gear_ratio: float | None = None,
+    holdout: str | Path | None = None,
+) -> ElementIdentification:
+    """Find stiffness, gap, friction and hysteresis of a transmission alone on a test rig.
+
+    Args:
+        log: the file.
+        table: the `[log]` table, or its keys; `kind = "element"`.
+        gear_ratio: displacement of theta_e for 1 of theta_s, where both are recorded; left out: 1.
+        holdout: another log of the rig, on which what was found is tried out.
+
+    Raises:
+        InputError: an unfit log, or one that shows no stiffness.
+    """
+    read = table if isinstance(table, LogTable) else LogTable.model_validate({"kind": "element"} | dict(table))
+    return run_element(read_element_task(log, read, gear_ratio, holdout=holdout))
+
+
+def run_element(task: ElementTask) -> ElementIdentification:
+    """Do what :func:`read_element_task` read.
+
+    Raises:
+        InputError: a log that shows no stiffness.
+    """
+    record = task.record
+    found = element_of(record, task.gear_ratio)
+    if found is None:
+        raise InputError(
+            f"{record.path}: the displacement never turns back, or hardly moves; a log of a transmission should load it to "
+            "and fro"
+        )
+    stiffness = found.numbers["stiffness"]
+    if "stiffness" in found.open or stiffness.value <= 0.0:
+        raise InputError(
+            f"{record.path}: the torque does not follow the displacement (stiffness {stiffness.value:.3g} ± "
+            f"{stiffness.error:.2g} {stiffness.unit}); see columns and signs in [log]"
+        )
+    moved = displacement(record, task.gear_ratio)
+    trace = pd.DataFrame({"t": record.time, "u": record.torque, "displacement": moved, "torque": found.torque})
+    return ElementIdentification(task, found, plain(_summary(task, found)), trace, _tables(found))
+
+
+def _path(name: str) -> str:
+    """Where a study has a number, or the name itself."""
+    if name in ("stiffness", "half_gap"):
+        return f"transmission.{name}"
+    effect, key = _EFFECTS.get(name, ("", ""))
+    return f"effects.{effect}.{key}" if effect else name
+
+
+def _entry(one: Number) -> dict[str, Any]:
+    return {
+        "value": one.value,
+        "standard_error": one.error,
+        "interval": list(one.interval),
+        "unit": one.unit,
+        "nominal": None,
+    }
+
+
+def _summary(task: ElementTask, found: Element) -> dict[str, Any]:
+    record = task.record
+    kept = {name: one for name, one in found.numbers.items() if name not in found.open}
+    summary = {
+        "title": task.title,
+        "kind": "element",
+        "identity": task.identity,
+        "file": str(record.path.resolve()),
+        "samples": len(record.time),
+        "sample_period": record.sample_period,
+        "parameters": {_path(name): _entry(one) for name, one in kept.items()},
+        "refused": [
+            {"direction": {_path(name): 1.0}, "why": "this log leaves it open by more than half of its value"}
+            for name in found.open
+        ],
+        "method": {"element": {"terms": list(found.terms), "gains": found.gains, "reversals": found.reversals}},
+        "torque": {"element": {"rms": found.residual, "relative": found.share, "unit": found.numbers["offset"].unit}},
+        "warnings": list(record.warnings),
+        "notes": list(record.notes),
+    }
+    if task.holdout is not None:
+        other = task.holdout
+        assert other.torque is not None
+        moved, noise = displacement(other, task.gear_ratio), element_noise(other, task.gear_ratio)
+        error = error_on(found, moved, other.torque, other.segments, other.sample_period, noise)
+        rms, relative = (None, None) if error is None else error
+        summary["holdout"] = {"file": str(other.path.resolve()), "torque": {"rms": rms, "relative": relative}}
+    return summary
+
+
+def _tables(found: Element) -> dict[str, Any]:
+    value = {name: one.value for name, one in found.numbers.items() if name not in found.open}
+    law = DeadZone if "half_gap" in value else LinearShaft
+    transmission = {"law": law.name, "stiffness": value["stiffness"]}
+    if "half_gap" in value:
+        transmission["half_gap"] = value["half_gap"]
+    effects: dict[str, dict[str, Any]] = {}
+    for name, (kind, key) in _EFFECTS.items():
+        if name in value:
+            effects.setdefault(kind, {"kind": kind})[key] = value[name]
+    # a hysteresis whose length is open has no torque that a study could simulate
+    whole = [one for one in effects.values() if one["kind"] != _EFFECTS["length"][0] or len(one) == 3]
+    return {"transmission": transmission} | ({"effects": whole} if whole else {})

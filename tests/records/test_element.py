@@ -1,0 +1,52 @@
+"""A transmission alone on a test rig: what its torque over displacement says, and where it says nothing."""
+
+import numpy as np
+import pytest
+
+from jaxbl.records.element import fit_element
+
+PERIOD, STIFFNESS, GAP, CENTRE, FRICTION, TORQUE, LENGTH = 0.01, 500.0, 0.02, 0.005, 0.8, 2.0, 0.01
+
+
+def loaded(count=2400, seed=1, gap=GAP):
+    """Displacement (rad) and torque (N m) of a shaft with a gap, hysteresis and dry friction; noise on both."""
+    random, fine = np.random.default_rng(seed), 20
+    t = PERIOD / fine * np.arange(count * fine)
+    x = 0.06 * np.sin(2.0 * np.pi * 0.4 * t) * (0.5 + 0.5 * t / t[-1])
+    deflection = x - CENTRE
+    deflection = deflection - np.clip(deflection, -gap, gap)
+    h = np.zeros(len(t))
+    for i, step in enumerate(np.diff(deflection) / LENGTH):
+        h[i + 1] = h[i] + step * (1.0 - h[i] ** 2 if h[i] * step > 0.0 else 1.0)
+    u = STIFFNESS * deflection + TORQUE * h + FRICTION * np.sign(np.gradient(x, t)) + 0.3
+    x, u = x[::fine], u[::fine]
+    return x + 1e-5 * random.standard_normal(count), u + 0.1 * random.standard_normal(count)
+
+
+def test_a_gap_hysteresis_and_friction_are_told_apart():
+    x, u = loaded()
+    found = fit_element(x, u, [slice(0, 1300), slice(1300, 2400)], PERIOD, noise=1e-5, linear=False)
+    assert set(found.terms) == {"gap", "dry friction", "hysteresis"}
+    truth = {
+        "stiffness": STIFFNESS, "half_gap": GAP, "centre": CENTRE, "dry_friction": FRICTION, "hysteresis": TORQUE,
+        "length": LENGTH, "offset": 0.3,
+    }  # fmt: skip
+    assert set(found.numbers) == set(truth)
+    for name, value in truth.items():
+        one = found.numbers[name]
+        # 3.5 standard errors of eleven degrees of freedom: one in two hundred
+        assert abs(one.value - value) < 3.5 * one.error, (name, one)
+        assert name == "offset" or abs(one.value / value - 1.0) < 0.05, (name, one)
+    assert found.residual == pytest.approx(0.1, rel=0.1)
+    assert found.numbers["stiffness"].unit == "N m/rad"
+    assert np.isnan(found.torque[:20]).all() and np.nanstd(found.torque - u) < 0.11
+
+
+def test_a_shaft_is_a_shaft_and_one_way_says_nothing():
+    random = np.random.default_rng(2)
+    x = 0.01 * np.sin(2.0 * np.pi * 0.3 * PERIOD * np.arange(2000))
+    found = fit_element(x, 3.0e4 * x + random.standard_normal(2000), [slice(0, 2000)], PERIOD, noise=0.0, linear=True)
+    assert found.terms == () and found.numbers["stiffness"].unit == "N/m"
+    low, high = found.numbers["stiffness"].interval
+    assert low < 3.0e4 < high < 1.01 * 3.0e4
+    assert fit_element(0.001 * np.arange(500.0), np.arange(500.0), [slice(0, 500)], PERIOD, noise=0.0, linear=False) is None
