@@ -138,7 +138,7 @@ BAD = {
         small({"observer.motor.lambda_": 1.0}),
         "observer.motor: unknown key 'lambda_'; did you mean 'lambda'?",
     ),
-    "unknown key, none near": (small({"log.zzz": 1}), "log: unknown key 'zzz'; valid: hold, initial_state"),
+    "unknown key, none near": (small({"log.zzz": 1}), "log: unknown key 'zzz'; valid: kind, hold, initial_state"),
     "line break in a key": (small({"drive.a\nb": 1}), r"drive: unknown key 'a\nb'"),
     "line break in a tag": (small({"drive.kind": "a\nb"}), r"drive.kind: unknown kind 'a\nb'; valid: two_inertia, rigid"),
     "key of another law": (small({"transmission.half_gap": 0.1}), "transmission: unknown key 'half_gap'"),
