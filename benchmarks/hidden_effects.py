@@ -6,6 +6,7 @@ extra `bench`) 100 cases take a quarter of a CPU minute to draw; without it, in 
 
     python benchmarks/hidden_effects.py --seed 1 --count 66 --kind single          # all effects at 3, 10 and 30 %
     python benchmarks/hidden_effects.py --seed 1 --count 200 --kind all --out results/hidden
+    python benchmarks/hidden_effects.py --seed 1 --count 100 --kind clutter --out results/clutter
     python benchmarks/hidden_effects.py --seed 1 --count 200 --kind all --save results/cases    # logs and models as files
     python benchmarks/hidden_effects.py --seed 1 --count 200 --kind all --results results/diagnosed   # what a batch left
 """

@@ -7,9 +7,9 @@ one encoder. The machines of a kind scatter by 15 %.
 
 Conditions of `single`, `pairs`, `none`, `unknown`: 10-20 s, 1 kHz or 500 Hz, three in ten in closed loop, nominal numbers
 off by 1-3 %, a quarter with 1 % noise on the torque channel; `new` as `single`, with the effects that the package has learnt
-since (`all` is without them). `hard` are single effects with at least three of: closed loop,
-3 s, coarse encoders, numbers off by 4-6 %, 1-3 % noise on the torque channel. Three in ten machines have another effect that
-the nominal model knows.
+since (`all` is without them); `clutter` as `single`, with a little cogging and a random torque besides. `hard` are single
+effects with at least three of: closed loop, 3 s, coarse encoders, numbers off by 4-6 %, 1-3 % noise on the torque channel.
+Three in ten machines have another effect that the nominal model knows.
 """
 
 import math
@@ -24,8 +24,10 @@ from .effects import EFFECTS, LEVELS, NEW, UNKNOWN, Motion, draw, error_of, excl
 from .simulator import Machine, Run, Trace, simulate
 
 KINDS = ("single", "pairs", "none", "unknown", "hard")
-ALONE = ("new",)
-"""Kinds that `all` leaves out: the effects of :data:`.effects.NEW`, as `single`."""
+ALONE = ("new", "clutter")
+"""Kinds that `all` leaves out: the effects of :data:`.effects.NEW`, as `single`; and `single` with clutter beside it."""
+_CLUTTER = 0.002, 0.006
+"""Least and largest size of clutter, as a share of the driving torque's rms: above what may be named, below what matters."""
 EXCITATIONS = ("sine", "multisine", "chirp", "steps")
 
 _PLANTS: dict[str, dict[str, Any]] = {
@@ -111,9 +113,9 @@ class Case:
         name: kind, seed and number.
         kind: one of `KINDS` or `ALONE`.
         truth: `verdict` (as in diagnosis.json), `effects` (name -> parameters; empty, or the unknown effect), `sizes`
-            (name -> share of the driving torque's rms), `level` asked for (the largest of a pair), `seen` (change of what
-            the encoders read over their noise), `growth` (change of the motor position for one of 1 rad/s in the initial
-            speed, s; thousands mean that a free run cannot be foretold).
+            (name -> share of the driving torque's rms), `clutter` (names of small effects besides), `level` asked for (the
+            largest of a pair), `seen` (change of what the encoders read over their noise), `growth` (change of the motor
+            position for one of 1 rad/s in the initial speed, s; thousands mean that a free run cannot be foretold).
         conditions: plant, excitation, holdout (its excitation), loop, period, duration, initial_state, uncertainty, ...
         log, holdout: of the same machine, under two excitations.
         model: nominal study for the package, as plain data (no excitation, no observer).
@@ -393,7 +395,7 @@ def _band_limited(n: int, period: float, frequency: float, rng: np.random.Genera
 def _carry_out(seed: int, plans: list[_Plan]) -> list[Case | None]:
     """Size the effects along runs without them, run the machines, and leave out what is not fit for a case."""
     plain = simulate([plan.runs[0] for plan in plans])
-    full, sizes = [], []
+    full, sizes, clutter = [], [], []
     for plan, trace in zip(plans, plain, strict=True):
         motion = Motion.of(plan.machine, trace)
         effects, found = [], {}
@@ -402,8 +404,10 @@ def _carry_out(seed: int, plans: list[_Plan]) -> list[Case | None]:
             drawn, size = draw(name, level, motion, plan.uncertainty, plan.rng)
             effects.extend(drawn)
             found[str(drawn[0]["kind"])] = size
-        full.append(replace(plan.machine, effects=(*plan.machine.effects, *_ordered(effects))))
+        small = _clutter(plan, list(found), motion) if fine and plan.kind == "clutter" else []
+        full.append(replace(plan.machine, effects=(*plan.machine.effects, *_ordered(effects), *small)))
         sizes.append(found)
+        clutter.append(small)
     runs = [replace(run, machine=machine) for plan, machine in zip(plans, full, strict=True) for run in plan.runs]
     nudges = [_NUDGE * rms(trace.states[1]) for trace in plain]
     traces = simulate(runs)
@@ -417,8 +421,14 @@ def _carry_out(seed: int, plans: list[_Plan]) -> list[Case | None]:
             result.append(None)
             continue
         growth = rms(nudged[i].states[0] - made[0].states[0]) / nudges[i]
-        result.append(_case(seed, plan, sizes[i], {"seen": seen, "growth": growth}, pair, made))
+        result.append(_case(seed, plan, sizes[i], clutter[i], {"seen": seen, "growth": growth}, pair, made))
     return result
+
+
+def _clutter(plan: _Plan, hidden: Sequence[str], motion: Motion) -> list[dict[str, Any]]:
+    """Cogging and a random torque that are small, as every machine has something of."""
+    names = [name for name in ("motor.cogging", "unknown.random_torque") if name not in hidden]
+    return [draw(name, float(plan.rng.uniform(*_CLUTTER)), motion, plan.uncertainty, plan.rng)[0][0] for name in names]
 
 
 _ORDER = ("actuator.delay", "actuator.gain_error", "actuator.saturation", "actuator.lag")
@@ -461,13 +471,14 @@ def _case(
     seed: int,
     plan: _Plan,
     sizes: dict[str, float],
+    clutter: list[dict[str, Any]],
     more: dict[str, float],
     runs: tuple[Run, Run],
     traces: tuple[Trace, Trace],
 ) -> Case:
     machine = runs[0].machine
     hidden = {str(effect["kind"]): {k: v for k, v in effect.items() if k != "kind"} for effect in
-              machine.effects[len(plan.machine.effects) :]}  # fmt: skip
+              machine.effects[len(plan.machine.effects) : len(machine.effects) - len(clutter)]}  # fmt: skip
     known = list(plan.machine.effects)
     drift = hidden.get("unknown.drifting_friction")
     if drift is not None:  # its mean is known
@@ -484,6 +495,7 @@ def _case(
         "verdict": verdict,
         "effects": hidden,
         "sizes": sizes,
+        "clutter": [str(effect["kind"]) for effect in clutter],
         "level": max((level for _, level in plan.hidden), default=0.0),
         **more,
     }

@@ -3,6 +3,7 @@
 What counts as right:
 
 - single, new and hard: the verdict is `explained` and the first finding is the hidden effect;
+- clutter: the first finding is the hidden effect, whatever the verdict; clutter that is named is not spurious;
 - pairs: both hidden effects are among the findings; any other finding is spurious;
 - none: the verdict is `no_discrepancy`; everything else is a false alarm;
 - unknown: the verdict is `unknown_effect`; `explained` with a first confidence of at least `CONFIDENT` is confidently wrong.
@@ -11,7 +12,8 @@ Gap of a case: the mean over channels of 1 - e(after) / e(before), where e² = r
 that is negative; only channels with e(before) of at least the floor. Worse: some channel's rmse after is more than 5 % above
 the larger of before and floor. Ratio to the oracle: the median over channels of rmse after over the oracle's. That is by
 the tool's own account; by the bench's, where the extended model is given, see benchmarks/hidden/proof.py. Calibration:
-every finding of an `explained` verdict is a bet that pays where the effect was really hidden.
+every finding of an `explained` verdict, and every one of a case with clutter, is a bet that pays where the effect was really
+there.
 """
 
 import json
@@ -64,6 +66,7 @@ class Outcome:
     """What a diagnosis said about a case, beside the truth.
 
     Attributes:
+        clutter: small effects that are there besides.
         findings: effect, confidence and alternatives of each, as they were ordered.
         reduction, worse, ratio: of the held-out gap by its own account; None where it was not given.
         reachable: reduction by the oracle, by the same account.
@@ -79,6 +82,7 @@ class Outcome:
     unknown: str
     conditions: dict[str, Any]
     verdict: str
+    clutter: list[str] = field(default_factory=list)
     findings: list[tuple[str, float, list[str]]] = field(default_factory=list)
     reduction: float | None = None
     worse: bool | None = None
@@ -92,7 +96,7 @@ class Outcome:
     @property
     def named(self) -> list[str]:
         """Effects that are said to be there."""
-        return [effect for effect, _, _ in self.findings] if self.verdict == "explained" else []
+        return [effect for effect, _, _ in self.findings] if self.verdict == "explained" or self.kind == "clutter" else []
 
     @property
     def said(self) -> str:
@@ -117,7 +121,7 @@ class Outcome:
 
     @property
     def spurious(self) -> list[str]:
-        return [effect for effect in self.named if effect not in self.hidden]
+        return [effect for effect in self.named if effect not in (*self.hidden, *self.clutter)]
 
 
 Oracle = Callable[[Case], Mapping[str, float]]
@@ -197,6 +201,7 @@ def outcome(
         unknown=next(iter(case.truth["effects"])) if case.kind == "unknown" else "",
         conditions=case.conditions,
         verdict=verdict,
+        clutter=list(case.truth.get("clutter", ())),
         findings=[
             (one["effect"], float(one["confidence"]), [other["effect"] for other in one.get("alternatives", [])])
             for one in diagnosis.get("findings", [])
@@ -251,7 +256,12 @@ def wilson(hits: int, count: int) -> tuple[float, float]:
 
 def calibration(outcomes: Iterable[Outcome]) -> list[dict[str, float]]:
     """Findings by confidence, in `BINS` bins of equal width: `confidence` and `right` are means, `count` how many."""
-    bets = [(confidence, effect in one.hidden) for one in outcomes for effect, confidence, _ in one.findings if one.named]
+    bets = [
+        (confidence, effect in (*one.hidden, *one.clutter))
+        for one in outcomes
+        for effect, confidence, _ in one.findings
+        if one.named
+    ]
     rows = []
     for i in range(BINS):
         inside = [(c, r) for c, r in bets if min(int(c * BINS), BINS - 1) == i]
@@ -307,6 +317,9 @@ def scores(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "single_spurious": rate(by["single"], lambda one: bool(one.hidden and one.right and one.spurious)),
         "new": rate(by["new"], lambda one: one.right),
         "new_tied": rate(by["new"], lambda one: one.tied),
+        "clutter": rate(by["clutter"], lambda one: one.right),
+        "clutter_spurious": rate(by["clutter"], lambda one: bool(one.spurious)),
+        "clutter_overstated": rate(by["clutter"], lambda one: bool(one.spurious) and one.verdict == "explained"),
         "hard": rate(by["hard"], lambda one: one.right),
         "hard_weak": rate([one for one in by["hard"] if one.weak], lambda one: one.right),
         "hard_tied": rate(by["hard"], lambda one: one.tied),
@@ -337,6 +350,9 @@ _TITLES = {
     "single_spurious": "- named, with a spurious second",
     "new": "single effects learnt since: first finding right",
     "new_tied": "- first finding or one tied with it",
+    "clutter": "single effects with clutter: first finding right",
+    "clutter_spurious": "- spurious finding beside them",
+    "clutter_overstated": "- and the verdict is `explained`",
     "hard": "hard set: first finding right",
     "hard_weak": "- weak (3 %)",
     "hard_tied": "- first finding or one tied with it",

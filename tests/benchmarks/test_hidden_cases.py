@@ -30,7 +30,7 @@ GAP = {
 
 @pytest.fixture(scope="module")
 def found():
-    return cases(4, 32, "all", DURATION) + cases(4, len(NEW), "new", DURATION)
+    return cases(4, 32, "all", DURATION) + cases(4, len(NEW), "new", DURATION) + cases(4, 2, "clutter", DURATION)
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +57,17 @@ def test_all_effects_of_the_package_are_hidden_at_all_sizes():
     assert {effect for _, ((effect, _),) in _targets(0, 8, "unknown")} == set(UNKNOWN)
 
 
+def test_clutter_is_there_and_small_and_its_name_is_not_spurious(found):
+    for case in found:
+        assert bool(case.truth["clutter"]) == (case.kind == "clutter")
+        assert not set(case.truth["clutter"]) & set(case.truth["effects"])
+    case = found[-1]
+    said = [{"effect": name, "confidence": 0.9} for name in (*case.truth["effects"], "motor.cogging", "motor.inertia")]
+    one = outcome(case, {"verdict": "unknown_effect", "findings": said})
+    assert one.right and one.spurious == ["motor.inertia"]
+    assert sum(row["right"] * row["count"] for row in calibration([one])) == 2
+
+
 def test_a_machine_may_have_no_place_for_an_effect_that_the_model_knows():
     given = _PLANTS["direct"]
     machine = Machine(given["drive"], None)
@@ -75,7 +86,7 @@ def test_same_seed_same_cases():
 
 
 def test_kinds_come_in_their_shares_and_logs_are_whole(found):
-    assert [sum(case.kind == kind for case in found) for kind in (*KINDS, *ALONE)] == [16, 4, 4, 4, 4, len(NEW)]
+    assert [sum(case.kind == kind for case in found) for kind in (*KINDS, *ALONE)] == [16, 4, 4, 4, 4, len(NEW), 2]
     for case in found:
         for log in (case.log, case.holdout):
             columns = log.columns()
@@ -148,11 +159,12 @@ def _package(plant, initial, torques, period, substeps=20):
 def test_an_oracle_gets_full_marks(found, oracle):
     outcomes = run(found, oracle, oracle=lambda case: {"theta_e": 0.1})
     figures = scores(outcomes)
-    for key in ("single", "new", "hard", "pairs", "abstentions"):
+    for key in ("single", "new", "clutter", "hard", "pairs", "abstentions"):
         assert figures[key]["value"] == 1.0
     for key in (
         "false_alarms",
         "pairs_spurious",
+        "clutter_spurious",
         "confidently_wrong",
         "worse",
         "proved_worse",
