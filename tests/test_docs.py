@@ -170,7 +170,11 @@ def environment(folder):
     site.mkdir()
     (site / "sitecustomize.py").write_text(f"import sys\nsys.modules.update(dict.fromkeys({hidden!r}))\n")
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    return os.environ | {"PATH": path, "PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])}
+    # as on the command line, compiled programs are kept; here nothing changes the package while it runs
+    programs = str(ROOT / ".cache" / "programs")
+    return os.environ | {
+        "PATH": path, "PYTHONPATH": os.pathsep.join([str(site), str(ROOT)]), "JAXBL_PROGRAMS": programs
+    }  # fmt: skip
 
 
 def test_demo_is_this_command():

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import get_leaf
@@ -91,7 +91,7 @@ def _no_surer(finding: Finding, fitted: FittedModel) -> Finding:
     # of an effect without sizes its other numbers have to be known
     paths = [f"effects.{finding.effect}.{leaf}" for leaf in cls.sizes() or cls.roles()]
     z = [abs(float(get_leaf(fitted.experiment, path))) / max(errors[path], 1e-300) for path in paths if path in errors]
-    chance = float(2.0 * norm.cdf(max(z)) - 1.0) if z else 1.0
+    chance = float(2.0 * ndtr(max(z)) - 1.0) if z else 1.0
     return finding if finding.confidence <= chance else dataclasses.replace(finding, confidence=chance)
 
 

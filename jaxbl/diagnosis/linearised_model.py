@@ -295,7 +295,7 @@ class Linear:
         """
         self.bound = np.full(len(free), np.inf) if bound is None else bound
         self.free, self.theta, self.prior = tuple(free), np.asarray(theta), prior
-        self.experiment = with_fitted(experiment, free, jnp.asarray(self.theta))
+        self.experiment = with_fitted(experiment, free, self.theta)
         self.period, self.sides = segments[0].period, experiment.sides
         self.parts = [_part(self.experiment, free, self.theta, one) for one in segments]
         self.signals = [MotionTorques(self.experiment, part) for part in self.parts]
@@ -376,11 +376,11 @@ class Linear:
         return min(0.25 / self.period, _HIGHEST)
 
     @staticmethod
-    def gain_of(smoothness: Sequence[float], period: float) -> Array:
+    def gain_of(smoothness: Sequence[float], period: float) -> np.ndarray:
         """Steady-state gains of both sides, shape (sides, 2)."""
-        return jnp.asarray(np.stack([kalman_gain(q, period) for q in smoothness]))
+        return np.stack([kalman_gain(q, period) for q in smoothness])
 
-    def gain(self, smoothness: Sequence[float]) -> Array:
+    def gain(self, smoothness: Sequence[float]) -> np.ndarray:
         return self.gain_of(smoothness, self.period)
 
     def predictor(self, smoothness: Sequence[float]) -> Predictor:
@@ -424,7 +424,7 @@ class Linear:
         return chosen, forces
 
     def _predictors(self, options: list[list[float]], forces: list[np.ndarray]) -> list[Predictor]:
-        gains = [np.asarray(self.gain(one)) for one in options]
+        gains = [self.gain(one) for one in options]
         grams = [_grams(part, gains, force) for part, force in zip(self.parts, forces, strict=True)]
         return [Predictor(self, one, [gram[i] for gram in grams]) for i, one in enumerate(options)]
 
@@ -493,7 +493,7 @@ class Linear:
             if isinstance(noise, Spectrum):
                 gram = weighted_products(_errors(part, gain, forces)[signals.real], noise)
             else:
-                gram = np.einsum("s,scd->cd", noise**-2.0, _grams(part, [np.asarray(gain)], forces)[0])
+                gram = np.einsum("s,scd->cd", noise**-2.0, _grams(part, [gain], forces)[0])
             total += _eliminated(gram, self.states)
         with np.errstate(divide="ignore"):
             # what has no torque along this motion cannot be found

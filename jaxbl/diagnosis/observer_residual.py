@@ -15,16 +15,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from scipy.ndimage import uniform_filter1d
-from scipy.signal import lfilter
-from scipy.signal.windows import parzen
 
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.regression import Kinematics
 from jaxbl.identification.segments import Segment
-from jaxbl.identification.smoother import Smoothed
 from jaxbl.observer.super_twisting import ObserverState
+from jaxbl.records.linear_filters import filtered, parzen
 from jaxbl.simulate import Experiment, Signals, State, initial_state, replay
 
 from .residuals import Residual, beyond_nominal, narrowed
@@ -79,7 +77,7 @@ def observed_torques(experiment: Experiment, segments: Sequence[Segment]) -> dic
         known, readings = {}, {}
         for side in experiment.sides:
             smoothed = segment.smoothed[side]
-            known[side] = _known_acceleration(experiment, side, part, smoothed)
+            known[side] = _known_acceleration(experiment, side, part, smoothed.held(segment.period))
             drawn = float(smoothed.noise) * random.standard_normal((_DRAWS, len(segment)))
             runs = np.concatenate([segment.readings[side][None], np.asarray(part.position[side]) + drawn])
             readings[side] = jnp.asarray(runs)
@@ -90,9 +88,11 @@ def observed_torques(experiment: Experiment, segments: Sequence[Segment]) -> dic
 
 
 @jit
-def _known_acceleration(experiment: Experiment, side: str, part: Kinematics, smoothed: Smoothed) -> Float[Array, " samples"]:
+def _known_acceleration(
+    experiment: Experiment, side: str, part: Kinematics, held: Bool[Array, " samples"]
+) -> Float[Array, " samples"]:
     """Acceleration beyond the nominal one that a side's observer is given, rad/s^2."""
-    return _held(*beyond_nominal(experiment, side, part, smoothed)) / experiment.drive.inertia(side)
+    return _held(*beyond_nominal(experiment, side, part, held)) / experiment.drive.inertia(side)
 
 
 def _held(smooth: Float[Array, " samples"], friction: Float[Array, " samples"]) -> Float[Array, " samples"]:
@@ -147,7 +147,7 @@ def _observed(experiment: Experiment, side: str, part: Kinematics, controls: np.
     least = np.finfo(float).tiny
     deviation = float(np.sqrt(np.maximum(np.mean(noise**2), least)))
     # a window that keeps the spectrum positive, and what is fast out of what is slow
-    correlation = products / np.maximum(products[0], least) * parzen(2 * lags - 1)[lags - 1 :]
+    correlation = products / np.maximum(products[0], least) * parzen(lags)
     residual = Residual(
         side, np.asarray(part.time)[skipped:], torque[0], np.full(count, deviation), correlation,
         min(1.0 / (2.0 * np.pi * constant), 0.5 / period) if constant > 0.0 else 0.5 / period,
@@ -174,7 +174,7 @@ def compared(
     share = _share(experiment)
     own, other, noise, bandwidth = [], [], [], cutoff
     for one, smooth in zip(observed, residuals, strict=True):
-        late = lfilter([share], [1.0, share - 1.0], smooth.torque, zi=[(1.0 - share) * smooth.torque[0]])[0]
+        late = filtered(smooth.torque, [share], [share - 1.0])
         low, _ = narrowed(one.residual, cutoff)
         beside = dataclasses.replace(one.residual, torque=late[one.skipped :])
         own.append(low.torque)

@@ -91,8 +91,8 @@ class _Refiner:
     def _path(self, theta: np.ndarray, start: list[np.ndarray], smoothness: Sequence[float]) -> list[Segment]:
         """The segments with the filtered motion of a model in place of the smoothed one."""
         sides = self.experiment.sides
-        experiment = with_fitted(self.experiment, self.free, jnp.asarray(theta))
-        gain = np.asarray(Linear.gain_of(smoothness, self.segments[0].period))
+        experiment = with_fitted(self.experiment, self.free, theta)
+        gain = Linear.gain_of(smoothness, self.segments[0].period)
         gains = {side: gain[j] for j, side in enumerate(sides)}
         found = []
         for segment, first in zip(self.segments, start, strict=True):
@@ -168,5 +168,5 @@ def refined(
     """Refine the numbers of a model from theta; arguments as of :class:`.linearised_model.Linear` (`width`: its `prior`)."""
     refiner = _Refiner(experiment, free, width, segments)
     best = refiner.run(np.asarray(theta))
-    model = with_fitted(experiment, free, jnp.asarray(best.theta))
+    model = with_fitted(experiment, free, best.theta)
     return Refined(model, best.theta, *refiner.covariance(best), best.predictor.smoothness, best.start, best.linear)

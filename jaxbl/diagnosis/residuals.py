@@ -10,19 +10,20 @@ Sign: the torque that is missing from the model, J a less all modelled torques; 
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from scipy.ndimage import gaussian_filter1d
 
 from jaxbl.drive.effects import Motion
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.regression import Kinematics, effect_path
 from jaxbl.identification.segments import Segment
-from jaxbl.identification.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, running_sum, smooth
+from jaxbl.identification.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, smooth
 from jaxbl.simulate import Experiment
 
 _REACH = 60.0
@@ -72,6 +73,7 @@ class _Response:
     corner: float
 
 
+@lru_cache(maxsize=32)
 def _response(smoothness: float, size: int) -> _Response:
     """By the spectrum of the sampled white-jerk model, x' = F x + w with F = I + N."""
     frequency = np.linspace(0.0, np.pi, size // 2 + 1)
@@ -99,16 +101,16 @@ def _mean(spectrum: np.ndarray) -> float:
     return float(np.trapezoid(spectrum) / (len(spectrum) - 1))
 
 
-def as_smoothed(
-    values: Float[Array, " samples"], smoothed: Smoothed, period: float | Float[Array, ""]
-) -> Float[Array, " samples"]:
+def as_smoothed(values: np.ndarray, smoothed: Smoothed, period: float) -> np.ndarray:
     """Values as if they were accelerations seen through a smoother, its ends included."""
     # a steady acceleration passes unchanged
-    steady = jnp.mean(values)
-    rate = running_sum(values - steady) * period
-    position = jnp.concatenate([jnp.zeros(1), running_sum(rate)[:-1] * period])
-    # second differences of the position are the values
-    return steady + smooth(position, period, known=(smoothed.noise, smoothed.jerk)).acceleration
+    steady = np.mean(values)
+    # of what a diverging model says nothing is finite
+    with np.errstate(invalid="ignore", over="ignore"):
+        rate = np.cumsum(values - steady) * period
+        position = np.concatenate([np.zeros(1), np.cumsum(rate)[:-1] * period])
+        # second differences of the position are the values
+        return steady + np.asarray(smooth(position, period, known=(smoothed.noise, smoothed.jerk)).acceleration)
 
 
 def _mean_around(values: Float[Array, " samples"]) -> Float[Array, " samples"]:
@@ -124,7 +126,7 @@ def _torque(experiment: Experiment, side: str, position: dict, velocity: dict, *
 
 
 def _acting(
-    experiment: Experiment, side: str, part: Kinematics, smoothed: Smoothed
+    experiment: Experiment, side: str, part: Kinematics, held: Bool[Array, " samples"]
 ) -> tuple[Float[Array, " samples"], Float[Array, " samples"], Float[Array, " samples"]]:
     """Modelled torques on a side along a part, N m: all but dry friction, and dry friction; the derivative of the latter by
     the velocity at a reversal, whose time the velocity's noise leaves open."""
@@ -138,7 +140,6 @@ def _acting(
     passage = jnp.clip(velocity / step, -1.0, 1.0)
     direction = passage * (2.0 - jnp.abs(passage))
     # what is not shown to move for a while may be held: friction is then what is missing, as far as it goes
-    held = smoothed.held(period)
     motion = Motion(part.time, part.position[side], velocity, torque if side == "motor" else jnp.zeros_like(torque))
     bent, most = experiment.plant.holding(side, motion, states)
     needed = jnp.clip(total + bent - inertia * acceleration, -(level + most), level + most) - bent
@@ -148,15 +149,15 @@ def _acting(
 
 @jit
 def beyond_nominal(
-    experiment: Experiment, side: str, part: Kinematics, smoothed: Smoothed
+    experiment: Experiment, side: str, part: Kinematics, held: Bool[Array, " samples"]
 ) -> tuple[Float[Array, " samples"], Float[Array, " samples"]]:
     """Modelled torque on a side less that of its nominal equation, in which the inertia is the nominal one, N m.
 
     What transmission and effects add to J dv/dt = (input) - B v, the right-hand side that an observer (7)-(8) knows; and,
-    on its own, the dry friction that is to be subtracted.
+    on its own, the dry friction that is to be subtracted. `held`: where the side is not shown to move for a while.
     """
     drive, velocity = experiment.drive, part.velocity[side]
-    total, friction, _ = _acting(experiment, side, part, smoothed)
+    total, friction, _ = _acting(experiment, side, part, held)
     added = (experiment.plant.inertia(side) - drive.inertia(side)) * part.acceleration[side]
     nominal = drive.inertia(side) * drive.acceleration(side, velocity, part.torque)
     return total - added - nominal, friction
@@ -164,17 +165,17 @@ def beyond_nominal(
 
 @jit
 def _side(
-    experiment: Experiment, side: str, part: Kinematics, smoothed: Smoothed
-) -> tuple[Array, dict[str, Array], dict[str, Array]]:
-    """Missing torque, and the derivatives of the modelled torque by the positions and velocities, along a part."""
+    experiment: Experiment, side: str, part: Kinematics, held: Bool[Array, " samples"]
+) -> tuple[Array, Array, dict[str, Array], dict[str, Array]]:
+    """Torque that the inertia takes along a part, and the modelled one that the smoother sees; derivatives of the modelled
+    torque by the positions and velocities."""
     states, torque = effect_path(experiment, part, from_rest=True)
     given = part.position, part.velocity, states, torque, part.time, part.transmitted
-    total, friction, turning = _acting(experiment, side, part, smoothed)
-    period = (part.time[-1] - part.time[0]) / (len(part.time) - 1)
+    total, friction, turning = _acting(experiment, side, part, held)
     # the input is a mean around the sample already; of the rest, the mean that the position's second differences see
     driving = torque if side == "motor" else jnp.zeros_like(torque)
     modelled = driving + _mean_around(total - driving) - friction
-    missing = experiment.plant.inertia(side) * part.acceleration[side] - as_smoothed(modelled, smoothed, period)
+    taken = experiment.plant.inertia(side) * part.acceleration[side]
 
     def of(position: dict, velocity: dict, *rest: Any) -> Array:
         total, level = _torque(experiment, side, position, velocity, *rest)
@@ -182,7 +183,7 @@ def _side(
 
     by_position, by_velocity = jax.vmap(jax.jacfwd(of, argnums=(0, 1)))(*given)
     by_velocity[side] = by_velocity[side] - turning
-    return missing, by_position, by_velocity
+    return taken, modelled, by_position, by_velocity
 
 
 def white_noise(parts: Sequence[np.ndarray]) -> float:
@@ -205,14 +206,16 @@ def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> dic
         part, responses = segment.kinematics, _responses(segment)
         sensor = 0.0 if part.transmitted is None else white_noise([np.asarray(part.transmitted)])
         for side, pieces in found.items():
-            missing, *slopes = _side(experiment, side, part, segment.smoothed[side])
+            smoothed = segment.smoothed[side]
+            taken, modelled, *slopes = _side(experiment, side, part, smoothed.held(segment.period))
+            missing = np.asarray(taken) - as_smoothed(np.asarray(modelled), smoothed, segment.period)
             inertia, level = float(experiment.plant.inertia(side)), abs(float(experiment.drive.torque_gain(side))) * sensor
             variance, spectrum = _noise(segment, side, slopes, inertia, level, responses)
             lags = min(int(_REACH / min(one.corner for one in responses.values())) + 2, len(segment))
             correlation, tiny = np.fft.irfft(spectrum)[:lags], np.finfo(float).tiny
             pieces.append(
                 Residual(
-                    side, segment.time, np.asarray(missing), np.sqrt(np.maximum(variance, tiny)),
+                    side, segment.time, missing, np.sqrt(np.maximum(variance, tiny)),
                     correlation / max(correlation[0], tiny), responses[side].corner / (2.0 * np.pi * _period(segment)),
                 )
             )  # fmt: skip

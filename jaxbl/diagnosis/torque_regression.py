@@ -10,9 +10,8 @@ Reference: S. Arlot, A. Celisse, A survey of cross-validation procedures, Statis
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import get_leaf
@@ -100,7 +99,7 @@ def _with_one_more(search: EffectSearch, found: Explanation, log: ReferenceLog) 
     for name in model.names:
         if _replaced(name, best.name):
             rivals[name] = best.z
-    chances = {name: float(norm.cdf(-z)) for name, z in rivals.items()}
+    chances = {name: float(ndtr(-z)) for name, z in rivals.items()}
     alternatives = tuple((name, one) for name, one in chances.items() if one > LEAST_CHANCE)
     confidence = 1.0 - sum(chances.values())
     if confidence < _NAMED:
@@ -221,8 +220,7 @@ def _on_side(force: np.ndarray, i: int) -> np.ndarray:
 
 def _behind(columns: np.ndarray, segment: Segment, residual: Residual, side: str, cutoff: float) -> np.ndarray:
     """Torques as the missing torque of a side is seen; shape (columns, rows)."""
-    passed = np.asarray(seen(jnp.asarray(columns), segment.smoothed[side], jnp.asarray(segment.period)))
-    return low_passed(passed, residual, cutoff)
+    return low_passed(seen(columns, segment.smoothed[side], segment.period), residual, cutoff)
 
 
 def _products(columns: np.ndarray, target: np.ndarray) -> np.ndarray:

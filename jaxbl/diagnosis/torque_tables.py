@@ -10,14 +10,10 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from jaxbl.drive.effects import Tabulated
 from jaxbl.drive.parameters import as_arrays
-from jaxbl.identification.compilation import jit
 from jaxbl.identification.segments import Segment
 from jaxbl.identification.smoother import Smoothed
 from jaxbl.simulate import Experiment, with_effects
@@ -177,14 +173,12 @@ def _columns(segment: Segment, lacking: Residual, side: str, over: str, points: 
     values = np.asarray(smoothed.state)[:, 1 if over == "speed" else 0]
     values = np.mod(values, _TURN) if over == "turn" else np.clip(values, points[0], points[-1])
     hats = np.stack([np.interp(values, points, one) for one in np.eye(len(points))])
-    passed = np.asarray(seen(jnp.asarray(hats), smoothed, jnp.asarray(segment.period)))
-    return low_passed(passed, lacking, cutoff).T
+    return low_passed(seen(hats, smoothed, segment.period), lacking, cutoff).T
 
 
-@jit
-def seen(columns: Float[Array, "columns samples"], smoothed: Smoothed, period: Float[Array, ""]) -> Array:
+def seen(columns: np.ndarray, smoothed: Smoothed, period: float) -> np.ndarray:
     """Torques as missing torques are seen; shape (columns, samples)."""
-    return jax.lax.map(lambda one: as_smoothed(one, smoothed, period), columns)
+    return np.stack([as_smoothed(one, smoothed, period) for one in columns])
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,11 +13,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
-from scipy import signal
 
 from jaxbl.drive.plant import Plant, PlantState, States
+from jaxbl.records.linear_filters import low_pass_taps
 from jaxbl.simulate import Experiment, with_effects
 
 from .compilation import jit
@@ -62,7 +61,9 @@ def kinematics_from(time: np.ndarray, torque: np.ndarray, states: Mapping[str, A
     """
     held = np.asarray(torque, float)
     before = np.concatenate([held[:1], held[:-1]])
-    position, velocity, acceleration = ({side: state[:, i] for side, state in states.items()} for i in range(3))
+    position, velocity, acceleration = (
+        {side: jnp.asarray(np.asarray(state)[:, i]) for side, state in states.items()} for i in range(3)
+    )
     mean = jnp.asarray(0.5 * (before + held))
     measured = None if transmitted is None else jnp.asarray(transmitted)
     return Kinematics(jnp.asarray(time), mean, position, velocity, acceleration, measured)
@@ -184,7 +185,7 @@ def decimate(values: Float[Array, " samples"], factor: int) -> Float[Array, " le
     """Zero-phase low-pass (Hamming window) and every `factor`-th sample, but for the ends, where the filter does not fit."""
     if factor == 1:
         return values
-    taps = jnp.asarray(signal.firwin(20 * factor + 1, 1.0 / factor), values.dtype)
+    taps = jnp.asarray(low_pass_taps(20 * factor + 1, 1.0 / factor), values.dtype)
     return jnp.convolve(values, taps, "valid")[::factor]
 
 
@@ -213,6 +214,8 @@ def regress(experiment: Experiment, free: Sequence[Free], parts: Sequence[Kinema
     Parts shorter than :func:`shortest` for this decimation must be left out. Residuals and derivatives of the fit have shape
     (1, samples, equations, ...), for :func:`jaxbl.identification.intervals.spread`.
     """
+    import optimistix as optx
+
     names = list(eqx.filter_eval_shape(balance, experiment, parts[0]))
 
     def left(theta: Array, _: None = None) -> Array:

@@ -62,8 +62,7 @@ def segments_of(record: Record, sides: Sequence[str]) -> list[Segment]:
     found = []
     for rows in record.segments:
         readings = {side: record.positions[side][rows] for side in sides}
-        # as an array: a number would be compiled in, and no two logs have the same to the last digit
-        smoothed = {side: smooth(jnp.asarray(one), jnp.asarray(record.sample_period)) for side, one in readings.items()}
+        smoothed = {side: smooth(one, record.sample_period) for side, one in readings.items()}
         time, torque = record.time[rows] - record.time[0], record.torque[rows]
         transmitted = None if record.transmitted is None else record.transmitted[rows]
         found.append(Segment(rows, time, record.sample_period, torque, readings, smoothed, transmitted))

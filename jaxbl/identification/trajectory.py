@@ -16,9 +16,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
-import optimistix as optx
 from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
@@ -64,11 +62,16 @@ class Free(NamedTuple):
     role: str = ""
 
     def value(self, theta: Any) -> Any:
-        return self.scale * jnp.exp(theta) if self.positive else self.nominal + self.scale * theta
+        return self.scale * _exp(theta) if self.positive else self.nominal + self.scale * theta
 
     def slope(self, theta: Any) -> Any:
         """Derivative of the value."""
-        return self.scale * jnp.exp(theta) if self.positive else self.scale * jnp.ones_like(theta)
+        return self.scale * (_exp(theta) if self.positive else 0.0 * theta + 1.0)
+
+
+def _exp(values: Any) -> Any:
+    """Of JAX only where it has to be: a number by itself would be a program."""
+    return jnp.exp(values) if isinstance(values, jax.Array) else np.exp(values)
 
 
 def free_parameters(experiment: Experiment, paths: Sequence[str], torque: float) -> tuple[Free, ...]:
@@ -318,9 +321,12 @@ class _Point(NamedTuple):
         return jnp.sum(self.residual**2)
 
     @property
-    def info(self) -> optx.FunctionInfo:
+    def info(self) -> Any:
         """As the solver's parts take it."""
-        return optx.FunctionInfo.ResidualJac(self.residual, lx.MatrixLinearOperator(self.jacobian))
+        import lineax
+        import optimistix
+
+        return optimistix.FunctionInfo.ResidualJac(self.residual, lineax.MatrixLinearOperator(self.jacobian))
 
 
 def _reduced(
@@ -367,7 +373,11 @@ def _solve(
     residuals' variance. `point` is the least squares at a theta, from a guess of the initial states; the sum of squares is
     that of `count` residuals.
     """
-    descent, region = optx.DampedNewtonDescent(linear_solver=lx.QR()), optx.ClassicalTrustRegion()
+    # a quarter of a second that a diagnosis does not need
+    import lineax
+    import optimistix as optx
+
+    descent, region = optx.DampedNewtonDescent(linear_solver=lineax.QR()), optx.ClassicalTrustRegion()
     shapes = jax.eval_shape(point, theta, guess)
     none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 

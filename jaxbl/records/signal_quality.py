@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .linear_filters import both_ways, butterworth, welch
+
 SHORTEST = 64
 """Samples that a log needs, and a segment to be filtered and regressed: ten samples for each of six terms of a regression.
 
@@ -96,12 +98,10 @@ def spectrum(values: np.ndarray, period: float, *, slope: bool = False) -> tuple
 
     Frequencies in Hz without 0, and densities in unit²/Hz; (unit/s)²/Hz of the slope.
     """
-    from scipy.signal import welch
-
     # differences first: a slow motion of large range would leak over the whole band
     differences = np.diff(values)
     length = min(max(len(differences) // 4, 16), 4096, len(differences))
-    frequency, density = welch(differences, fs=1.0, nperseg=length, detrend="constant")
+    frequency, density = welch(differences, length)
     frequency, density = frequency[1:], density[1:]
     density = density * period / (4.0 * np.sin(np.pi * frequency) ** 2)
     frequency = frequency / period
@@ -166,12 +166,9 @@ def low_passed(values: np.ndarray, cutoff: float, period: float) -> np.ndarray:
 
     Samples run along the first axis. Where the cutoff is near the end of the band, values stay as they are.
     """
-    from scipy.signal import butter, sosfiltfilt
-
     if 2.0 * cutoff * period > 0.8:
         return values
-    sections = butter(2, 2.0 * cutoff * period, output="sos")
-    return sosfiltfilt(sections, values, axis=0, padlen=min(len(values) - 1, round(2.0 / (cutoff * period))))
+    return both_ways(values, *butterworth(2.0 * cutoff * period), min(len(values) - 1, round(2.0 / (cutoff * period))))
 
 
 def without_ends(samples: int, cutoff: float, period: float) -> slice:

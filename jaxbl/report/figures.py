@@ -10,6 +10,7 @@ import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import TightLayoutEngine
 from matplotlib.lines import Line2D
 
 SIDES = ("motor", "load")
@@ -68,13 +69,25 @@ def with_unit(label: str, unit: str) -> str:
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG, making its folder. Returns the path."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    if figure.get_layout_engine() is None:
+        # once: with an engine of its own a figure is laid out twice and drawn twice
+        width, height = figure.get_size_inches()
+        figure.subplots_adjust(_MARGIN / width, _MARGIN / height, 1.0 - 0.2 * _MARGIN / width, 1.0 - 0.5 * _MARGIN / height)
+        TightLayoutEngine(pad=_PAD).execute(figure)
     figure.savefig(path)
     return path
 
 
-def subplots(width: float, height: float, rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, list[Axes]]:
-    """A figure of so many inches, and its axes row by row; `how` is matplotlib's."""
-    figure = Figure(figsize=(width, height), layout="constrained")
+_MARGIN, _PAD = 0.7, 0.5
+"""Margins from which a layout begins, inches, as ticks depend on the size; and room between texts, over the font's size."""
+
+
+def subplots(
+    width: float, height: float, rows: int = 1, columns: int = 1, *, beside: bool = False, **how: Any
+) -> tuple[Figure, list[Axes]]:
+    """A figure of so many inches, and its axes row by row; `beside`: with colour bars or legends beside the axes; `how` is
+    matplotlib's."""
+    figure = Figure(figsize=(width, height), layout="constrained" if beside else "none")
     axes = figure.subplots(rows, columns, squeeze=False, **how).ravel().tolist()
     if columns == 1:
         figure.align_ylabels(axes)

@@ -234,7 +234,7 @@ def _hysteresis(log: LogSignals) -> Drawn:
     if log.measured is not None:
         panels.append(("measured", log.measured, _MEASURED))
     across, up = limits(log.twist[log.settled]), limits(*(one[log.settled] for _, one, _ in panels))
-    figure, axes = subplots(9.0, 4.4, columns=len(panels), sharex=True, sharey=True)
+    figure, axes = subplots(9.0, 4.4, columns=len(panels), beside=True, sharex=True, sharey=True)
     rate = log.low_passed(log.rate)
     for ax, (name, torque, colour) in zip(axes, panels, strict=True):
         _shade_gap(ax, log)

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxbl.identification.identify import Identification
 from jaxbl.records import POSITION_CHANNELS
+from jaxbl.records.linear_filters import filtered
 
 from .figures import SIDES
 
@@ -84,15 +85,13 @@ class LogSignals:
 
     def low_passed(self, values: Array) -> Array:
         """Values behind the low-pass of the equivalent control, for the same lag; NaN outside the observed part."""
-        from scipy.signal import lfilter
-
         constant = float(self.experiment.equivalent_control.time_constant)
-        filtered, part = np.full(len(values), np.nan), values[self.observed]
+        found, part = np.full(len(values), np.nan), values[self.observed]
         if constant > 0.0 and np.isfinite(part).all():
             share = -np.expm1(-self.record.sample_period / constant)
-            part, _ = lfilter([share], [1.0, share - 1.0], part, zi=[(1.0 - share) * part[0]])
-        filtered[self.observed] = part
-        return filtered
+            part = filtered(part, [share], [share - 1.0])
+        found[self.observed] = part
+        return found
 
     @cached_property
     def twist(self) -> Array:

@@ -215,7 +215,7 @@ def _grid_of_axes(
     columns = 2 if count == 4 else min(count, 3)
     rows = -(-count // columns)
     size = (panel[0] * columns + beside, panel[1] * rows + 0.7) if single is None or count > 1 else single
-    figure, axes = subplots(*size, rows, columns, sharex=True, sharey=True)
+    figure, axes = subplots(*size, rows, columns, beside=True, sharex=True, sharey=True)
     for i, ax in enumerate(axes):
         ax.set_visible(i < count)
         ax.tick_params(labelbottom=i + columns >= count)

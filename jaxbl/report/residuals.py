@@ -123,7 +123,7 @@ def _over_coordinates(
     axes[0].set_ylabel(with_unit(f"{found.name}: missing {missing_quantity(unit)}", unit))
     limit = 1.15 * max(float(np.quantile(np.abs(torque), 0.998)), 2.5 * noise)
     axes[0].set_ylim(-limit, limit)
-    figure.legend(*axes[0].get_legend_handles_labels(), ncols=2, loc="outside lower right")
+    legend(axes[-1], 2)
     sentence = sentence_of(found, unit)
     caption = (
         f"{sentence[:1].upper()}{sentence[1:]}. Dots are samples, black marks the means of bins "

@@ -53,7 +53,7 @@ def _map(tuning: Tuning, side: str) -> Drawn:
     xs, ys = tables["error"].columns.to_numpy(float), tables.index.to_numpy(float)
     norm = color_norm(grid, "log")
     edges = cell_edges(xs, True), cell_edges(ys, True)
-    figure, (ax,) = subplots(6.6, 5.4)
+    figure, (ax,) = subplots(6.6, 5.4, beside=True)
     ax.grid(False)
     ax.set_facecolor(MISSING)
     ax.set(xscale="log", yscale="log", xlabel="α / f⁺", ylabel="λ / √f⁺ (λ in √rad/s)")
@@ -87,7 +87,7 @@ def _front(tuning: Tuning, side: str) -> Drawn:
     summary = tuning.summary
     feasible = tuning.candidates[side].query("feasible")
     front = pd.DataFrame(summary["pareto"][side])
-    figure, (ax,) = subplots(6.6, 4.4)
+    figure, (ax,) = subplots(6.6, 4.4, beside=True)
     ax.plot(
         feasible["convergence_time"], feasible["error"], ".", ms=3.5, color=MISSING, label="gains that meet all constraints"
     )

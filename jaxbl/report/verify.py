@@ -57,7 +57,7 @@ def _axes_of_plane(ax: Axes, xs: np.ndarray, ys: np.ndarray) -> None:
 
 def _atlas(verdict: Verdict) -> Drawn:
     found = verdict.normalised
-    figure, (ax,) = subplots(7.6, 6.6)
+    figure, (ax,) = subplots(7.6, 6.6, beside=True)
     ax.grid(False)
     norm = LogNorm(0.05, 20.0)
     shown = np.clip(found.ratio, 1e-6, 1e6)
@@ -82,7 +82,7 @@ def _atlas(verdict: Verdict) -> Drawn:
 
 def _damping(verdict: Verdict) -> Drawn:
     found = verdict.normalised
-    figure, (ax,) = subplots(7.0, 4.8)
+    figure, (ax,) = subplots(7.0, 4.8, beside=True)
     for i, (damping, boundary) in enumerate(sorted({0.0: found.boundary, **found.damped}.items())):
         label = "no friction (exact condition)" if damping == 0.0 else f"friction number {damping:g}"
         least = np.where(boundary > 0.0, boundary, np.nan)
@@ -106,7 +106,7 @@ def _normalised(frame: pd.DataFrame, side: str) -> tuple[pd.Series, pd.Series]:
 
 def _levels(verdict: Verdict, side: str) -> Drawn:
     """Share of converged runs over the gains in units of each run's own true f_plus."""
-    figure, axes = subplots(9.4, 5.2, columns=len(verdict.levels), sharex=True, sharey=True)
+    figure, axes = subplots(9.4, 5.2, columns=len(verdict.levels), beside=True, sharex=True, sharey=True)
     planes = {}
     for level, frame in verdict.levels.items():
         alpha, lambda_ = _normalised(frame, side)
@@ -152,7 +152,7 @@ def _name(level: dict[str, Any]) -> str:
 
 def _conservatism(verdict: Verdict) -> Drawn:
     levels = verdict.summary["levels"]
-    figure, (ax,) = subplots(7.0, 0.9 + 0.62 * len(CONDITIONS))
+    figure, (ax,) = subplots(7.0, 0.9 + 0.62 * len(CONDITIONS), beside=True)
     for i, level in enumerate(levels):
         colour, shift = COLOURS[i % len(COLOURS)], 0.16 * (i - 0.5 * (len(levels) - 1))
         for k, entry in enumerate(level["conditions"]):

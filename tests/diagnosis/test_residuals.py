@@ -3,7 +3,6 @@
 import functools
 import json
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_study import rigid, small
@@ -69,7 +68,7 @@ def test_the_missing_torque_is_found_within_its_noise_and_with_its_sign():
     experiment = prepare(read_config(study(1)))
     (one,) = residual_torques(experiment, [segment])["motor"]
     missing = -0.1 * np.sign(trace["motor.velocity"].to_numpy())
-    seen = np.asarray(as_smoothed(jnp.asarray(missing), segment.smoothed["motor"], 1e-3))
+    seen = np.asarray(as_smoothed(missing, segment.smoothed["motor"], 1e-3))
     assert rms((one.torque - seen) / one.deviation) == pytest.approx(1.0, abs=0.1)
     assert scores(one) > 3.0
     # the other way round as the balance

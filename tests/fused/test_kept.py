@@ -20,13 +20,12 @@ jax.config.update("jax_enable_x64", True)
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.fused.single_plant import path
-from jaxbl.identification.smoother import smooth
 from jaxbl.identification import smoother
 
 traced = []
 smoother._fit, fit = lambda *given: traced.append(1) or fit(*given), smoother._fit
 time = np.arange(200) * 1e-3
-found = smooth(jnp.asarray(np.sin(9.0 * time) + 1e-4 * np.cos(1e3 * time)), jnp.asarray(1e-3))
+found = smoother._scanned(jnp.asarray(np.sin(9.0 * time) + 1e-4 * np.cos(1e3 * time)), jnp.asarray(1e-3), None)
 study = {"title": "t", "drive": {"kind": "rigid", "motor_inertia": 0.05, "motor_viscous": 0.1},
          "excitation": {"kind": "sine", "amplitude": 1.0, "frequency": 2.0}, 
          "observer": {"motor": {"lambda": 9.0, "alpha": 90.0}},

@@ -106,3 +106,12 @@ def test_quantised_readings_and_many_channels_at_once():
     found = jax.vmap(lambda x: smooth(x, PERIOD))(jnp.asarray(readings))
     np.testing.assert_allclose(found.noise, step / np.sqrt(12.0), rtol=0.2)
     assert np.sqrt(np.mean((found.state[0, :, 1] - 4.0 * np.cos(4.0 * t)) ** 2)) < 0.02
+
+
+@pytest.mark.parametrize("known", [None, (jnp.asarray(NOISE), jnp.asarray(JERK))], ids=["sought", "known"])
+def test_loops_and_xla_agree(known):
+    _, readings = motion(5, 700)
+    loops, scanned = smooth(readings, PERIOD, known=known), jax.jit(smooth)(jnp.asarray(readings), PERIOD, known=known)
+    for one, other in zip(loops, scanned, strict=True):
+        assert isinstance(one, np.ndarray | np.float64)
+        np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-9 * np.abs(other).max())

@@ -1,0 +1,57 @@
+"""Functions of a sample's scalars, taken along a signal by a loop for this machine's processor: one loop for all lengths."""
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any
+
+import jax
+import numpy as np
+
+from . import Unsupported, attempted, kept, say_scanned
+
+Sample = Callable[[list[Any], list[Any], list[Any]], tuple[list[Any], list[Any]]]
+"""From numbers that stay the same, what is carried and a sample's inputs, to what is carried on and what is kept."""
+_NUMBER = jax.ShapeDtypeStruct((), np.dtype(float))
+
+
+def stepped(
+    sample: Sample, values: Sequence[np.ndarray], carry: Sequence[np.ndarray], inputs: Sequence[np.ndarray]
+) -> list[np.ndarray] | None:
+    """What a function of a module keeps along a signal, each of shape (samples, lanes); None where it cannot be compiled.
+
+    Args:
+        sample: the function.
+        values, carry: of each lane, shape (lanes,); the same number of all, or one.
+        inputs: of each sample, shape (samples,).
+    """
+    lanes, samples = len(carry[0]), len(inputs[0])
+    loop = _loop(sample, len(values), len(carry), len(inputs), lanes == 1)
+    if loop is None:
+        return None
+    whole = -(-lanes // loop.lanes) * loop.lanes
+    given = [np.pad(np.asarray(one, float), (0, whole - lanes), "edge") for one in (*values, *carry)]
+    along = [np.ascontiguousarray(one, float) for one in inputs]
+    found = [np.empty((samples, whole)) for one in loop.signature if one.name.startswith("kept")]
+    loop([*given, *along, *found], samples, 0, whole)
+    return [one[:, :lanes] for one in found]
+
+
+@lru_cache(maxsize=64)
+def _loop(sample: Sample, values: int, carry: int, inputs: int, alone: bool) -> Any:
+    sizes, lanes = (values, carry, inputs), 1 if alone else None
+    key = kept.key_of("steps", sample, *sizes, lanes)
+    if (found := kept.load(key)) is not None:
+        return found
+    try:
+        with attempted():
+            from .jaxprs import flat
+            from .llvm import Loop
+
+            with jax.enable_x64(True):
+                body = flat(sample, *([_NUMBER] * size for size in sizes))
+            loop = Loop(body, np.dtype(float), values=values, carry=carry, lanes=lanes)
+            kept.save(key, loop)
+            return loop
+    except Unsupported as why:
+        say_scanned(str(why))
+        return None
