@@ -218,16 +218,18 @@ class MotionTorques:
             gear = [one for one in self.experiment.effects if one.place == place == "transmission" and one.name != name]
             bare = with_effects(self.experiment, tuple(gear))
             # friction of the gear is on the motor's side; an effect on the input needs none
-            direction = jnp.asarray(self.direction.get("motor" if place == "transmission" else place, self.torque))
+            direction = np.asarray(self.direction.get("motor" if place == "transmission" else place, self.torque))
             for first in range(0, len(which), _AT_ONCE):
                 some = which[first : first + _AT_ONCE]
                 # as many at once each time, so that one compiled program serves
                 spare = [effects[some[-1]]] * (_AT_ONCE - len(some))
                 members = (*(effects[i] for i in some), *spare)
-                stack = jax.tree.map(lambda *x: jnp.asarray(np.array([float(one) for one in x])), *members)
-                torques = np.asarray(_torques(bare, stack, self.moving, direction))
-                for i, torque in zip(some, torques, strict=False):
-                    found[i] = torque
+                stack = jax.tree.map(lambda *x: np.array([float(one) for one in x]), *members)
+                torques = {at: np.asarray(one) for at, one in _torques(bare, stack, self.moving, direction).items()}
+                for row, i in enumerate(some):
+                    found[i] = np.zeros((self.count, len(self.sides) + 1))
+                    for at, one in torques.items():
+                        found[i][self.real, at] = one[row][self.real]
         return found
 
 
@@ -242,14 +244,13 @@ def forces_of(candidates: Sequence[Candidate], signals: MotionTorques) -> np.nda
 
 
 @jit
-def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direction: jax.Array) -> jax.Array:
+def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direction: jax.Array) -> dict[int, jax.Array]:
     """Torques of effects of one name, leaves of shape (effects,), in a model that has those in the gear alone; shape
-    (effects, samples, sides + 1)."""
+    (effects, samples) by side, -1 being the input."""
     drive, sides = experiment.drive, experiment.sides
     along = Path(part.time, part.torque, part.position, part.velocity)
 
-    def one(effect: AbstractEffect) -> jax.Array:
-        found = jnp.zeros((len(part.time), len(sides) + 1))
+    def one(effect: AbstractEffect) -> dict[int, jax.Array]:
         place = drive.place(effect.place)
         if place == "transmission":
             both = (experiment, with_effects(experiment, (*experiment.effects, effect)))
@@ -257,24 +258,26 @@ def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direct
             given = [(one.plant, effect_path(one, along)[0]) for one in both]
             before, after = (plant.transmitted(*at, states) for plant, states in given)
             rubbed = [plant.gear_friction(states, c) for (plant, states), (c, _) in zip(given, (before, after), strict=True)]
-            found = found.at[:, 0].set(before[0] - after[0] + (rubbed[0] - rubbed[1]) * direction)
-            found = found.at[:, 1].set(after[1] * after[0] - before[1] * before[0])
-            return found * part.weight[:, None]
+            return {
+                0: before[0] - after[0] + (rubbed[0] - rubbed[1]) * direction,
+                1: after[1] * after[0] - before[1] * before[0],
+            }
         (state,), acting = effect_path(with_effects(experiment, (effect,)), along)
         if place == "actuator":
-            found = found.at[:, -1].set(acting - part.torque)
-        else:
-            driving = part.torque if place == "motor" else 0.0
-            motion = Motion(part.time, part.position[place], part.velocity[place], driving)
-            resisting = effect.resist(state, motion)
-            if type(effect).holds is not AbstractEffect.holds:
-                resisting = jnp.where(part.held[place] > 0.0, effect.holds() * direction, resisting)
-            resisting = resisting + effect.dry_friction(state, motion) * direction
-            resisting = resisting + effect.added_inertia() * part.modelled[place]
-            found = found.at[:, sides.index(place)].set(-resisting)
-        return found * part.weight[:, None]
+            return {-1: acting - part.torque}
+        driving = part.torque if place == "motor" else 0.0
+        motion = Motion(part.time, part.position[place], part.velocity[place], driving)
+        resisting = effect.resist(state, motion)
+        if type(effect).holds is not AbstractEffect.holds:
+            resisting = jnp.where(part.held[place] > 0.0, effect.holds() * direction, resisting)
+        resisting = resisting + effect.dry_friction(state, motion) * direction
+        resisting = resisting + effect.added_inertia() * part.modelled[place]
+        return {sides.index(place): -resisting}
 
-    return jax.vmap(one)(effects)
+    def whole(torque: jax.Array) -> jax.Array:
+        return jnp.broadcast_to(torque, part.time.shape)
+
+    return jax.vmap(lambda effect: {at: whole(torque) for at, torque in one(effect).items()})(effects)
 
 
 @jit

@@ -1,7 +1,7 @@
 """Coordinates of a log that a missing torque may depend on: speed, position, reversals, gap, load, time and others."""
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -79,7 +79,7 @@ def coordinates_of(
         found["load position"] = position_of("load")
     unit, force = ("m", "N") if "motor" in sliding else ("rad", "N m")
     if geared:
-        twist, rate = (np.asarray(experiment.plant.twist(one)) for one in (part.position, part.velocity))  # type: ignore[arg-type]
+        twist, rate = (_twist(experiment, one) for one in (part.position, part.velocity))
         found["twist"] = CoordinateValues(twist, unit, symbol="z")
         found["twist rate"] = CoordinateValues(rate, f"{unit}/s", symbol="ż")
     if side == "motor":
@@ -105,12 +105,17 @@ def all_coordinates(
     }
 
 
+def _twist(experiment: Experiment, values: Mapping[str, Any]) -> np.ndarray:
+    """Of positions, rad, or its rate, of velocities."""
+    return np.asarray(values["motor"]) - float(experiment.drive.ratio("load")) * np.asarray(values["load"])
+
+
 def _gear_classes(experiment: Experiment, part: Kinematics) -> dict[str, CoordinateValues]:
     """On which side of the gap the transmission is, and which way it is loaded."""
     found, plant = {}, experiment.plant
     torque = np.asarray(transmitted(experiment, part) if part.transmitted is None else part.transmitted)
     if plant.half_gap > 0.0:
-        twist = np.asarray(plant.twist(part.position))  # type: ignore[arg-type]
+        twist = _twist(experiment, part.position)
         inside = np.where(np.abs(twist) < plant.half_gap, 1, np.where(twist > 0.0, 2, 0))
         found["gap"] = CoordinateValues(inside, classes=("outside, z < 0", "inside of the gap", "outside, z > 0"))
     idle = np.abs(torque) < 0.02 * np.sqrt(np.mean(torque**2))

@@ -11,7 +11,6 @@ import dataclasses
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.special import softmax
 
@@ -654,7 +653,7 @@ def with_numbers(experiment: Experiment, values: Mapping[str, Numbers]) -> Exper
     return set_leaves(
         complete(experiment, values),
         {
-            f"effects.{name}.{leaf}": jnp.asarray(value, float)
+            f"effects.{name}.{leaf}": np.asarray(value, float)
             for name, numbers in values.items()
             for leaf, value in numbers.items()
         },

@@ -5,12 +5,12 @@ them is an effect with a name; if one pays after all effects with names have had
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.identification.compilation import jit
+from jaxbl.fused.steps import stepped
 
 from .candidates import Candidate, MotionTorques
 
@@ -68,14 +68,13 @@ def _hats(values: np.ndarray, span: tuple[float, float], count: int) -> np.ndarr
 
 def _stops(position: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Elastoplastic elements of several lengths, between -1 and 1, shape (samples, lengths)."""
-    steps = np.diff(position, prepend=position[0])[:, None] / np.maximum(lengths, 1e-300)[None, :]
-    return np.asarray(_stopped(jnp.asarray(steps)))
+    way, longest = np.diff(position, prepend=position[0]), np.maximum(lengths, 1e-300)
+    (found,) = stepped(_stopped, [longest], [np.zeros(len(lengths))], [way])
+    return found
 
 
-@jit
-def _stopped(steps: jax.Array) -> jax.Array:
-    def sample(now: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
-        now = jnp.clip(now + step, -1.0, 1.0)
-        return now, now
-
-    return jax.lax.scan(sample, jnp.zeros(steps.shape[1]), steps)[1]
+def _stopped(values: list[Any], carry: list[Any], inputs: list[Any]) -> tuple[list[Any], list[Any]]:
+    """A sample of an element: it bends by the way over its length, and slides beyond 1."""
+    (length,), (now,), (way,) = values, carry, inputs
+    now = jnp.clip(now + way / length, -1.0, 1.0)
+    return [now], [now]

@@ -26,6 +26,7 @@ from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.recursion import Recursion
 from jaxbl.fused.single_plant import Direction, slopes
+from jaxbl.fused.steps import stepped
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.prediction import kalman_gain
 from jaxbl.identification.regression import Path, effect_states
@@ -59,7 +60,7 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
     read = np.stack([padded(segment.readings[side]) - states[side][:, 0] for side in sides], axis=1)
     time, torque = padded(segment.time), padded(segment.torque)
     smooth: list[Any] = [{side: states[side][:, i] for side in sides} for i in range(3)]
-    along = Path(*jax.tree.map(jnp.asarray, (time, torque, *smooth[:2])))
+    along = Path(time, torque, *smooth[:2])
     effects = effect_states(experiment, along)
     motion = PlantState(smooth[0], smooth[1], jax.tree.map(np.asarray, effects))
     # by side, not by name
@@ -80,8 +81,7 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
         defect[: count - 1] = value[: count - 1] - vectors[1:count]
     a, b, own = np.split(slope, (len(order), len(order) + each + 1), axis=2)
     weight = (np.arange(size) < count).astype(float)
-    given = time, torque, read, *smooth, modelled, deviation, held, a, b, own, defect, weight
-    return Part(*jax.tree.map(jnp.asarray, given))
+    return Part(time, torque, read, *smooth, modelled, deviation, held, a, b, own, defect, weight)
 
 
 def _directions(
@@ -111,16 +111,19 @@ def _directions(
     ]
 
 
-def gain_matrix(gain: Array, states: int) -> Array:
+def gain_matrix(gain: np.ndarray, states: int) -> np.ndarray:
     """Gain of the whole state, shape (states, sides): positions, velocities, and nothing on the effects' own states."""
     sides = len(gain)
-    gains = jnp.zeros((states, sides)).at[jnp.arange(sides), jnp.arange(sides)].set(gain[:, 0])
-    return gains.at[sides + jnp.arange(sides), jnp.arange(sides)].set(gain[:, 1])
+    found = np.zeros((states, sides))
+    found[np.arange(sides), np.arange(sides)], found[sides + np.arange(sides), np.arange(sides)] = gain.T
+    return found
 
 
-def _closed(part: Part, gains: Array) -> Array:
+def _closed(part: Part, gains: np.ndarray) -> np.ndarray:
     """Step of the predictor's errors under a gain, A (1 - K C); by sample."""
-    return part.step.at[:, :, : gains.shape[1]].add(-part.step @ gains)
+    found = np.array(part.step)
+    found[:, :, : gains.shape[1]] -= part.step @ gains
+    return found
 
 
 class _Columns:
@@ -180,19 +183,25 @@ def _grams(part: Part, gains: Sequence[np.ndarray], forces: np.ndarray) -> np.nd
     return total
 
 
-@jit
-def _gradient(part: Part, gain: Array, left: Array) -> Array:
+def _backwards(_: list[Any], adjoint: list[Any], inputs: list[Any]) -> tuple[list[Any], list[Any]]:
+    """A sample of an adjoint recursion: a matrix, row by row, and what is added."""
+    count = len(adjoint)
+    new = [inputs[count * count + i] for i in range(count)]
+    for i in range(count):
+        for k in range(count):
+            new[i] = new[i] + inputs[k * count + i] * adjoint[k]
+    return new, adjoint
+
+
+def _gradient(part: Part, gain: np.ndarray, left: np.ndarray) -> np.ndarray:
     """Derivative of the sum of products of errors with `left` by the torque at each sample, shape (samples, sides + 1)."""
     states, sides = part.defect.shape[1], left.shape[1]
-    closed = _closed(part, gain_matrix(gain, states))
-    added = jnp.zeros((len(left), states)).at[:, :sides].set(-left * part.weight[:, None])
-
-    def sample(adjoint: Array, given: tuple[Array, Array]) -> tuple[Array, Array]:
-        closed, added = given
-        return closed.T @ adjoint + added, adjoint
-
-    _, adjoints = jax.lax.scan(sample, jnp.zeros(states), (closed, added), reverse=True)
-    return jnp.einsum("tij,ti->tj", part.force, adjoints)
+    closed, added = _closed(part, gain_matrix(gain, states)), np.zeros((len(left), states))
+    added[:, :sides] = -left * np.asarray(part.weight)[:, None]
+    inputs = [*closed.reshape(len(left), -1).T, *added.T]
+    found = stepped(_backwards, [], [np.zeros(1)] * states, [one[::-1] for one in inputs])
+    adjoints = np.stack([one[::-1, 0] for one in found], axis=1)
+    return np.einsum("tij,ti->tj", part.force, adjoints)
 
 
 _COARSE_SMOOTHNESS = 10.0 ** np.arange(-11.0, 1.0)
@@ -272,6 +281,13 @@ class Predictor:
         return float(self.count * np.sum(np.log(self.squares)) + np.sum((moved / width) ** 2))
 
 
+@jit
+def _figures(experiment: Experiment) -> tuple[Any, dict[str, Any]]:
+    """Gain of the input, and inertia of each side, kg m^2: as one program."""
+    plant = experiment.plant
+    return plant.input_gain, {side: jnp.asarray(plant.inertia(side)) for side in experiment.sides}
+
+
 class Linear:
     """A model along a record, linear in everything that may change."""
 
@@ -301,7 +317,8 @@ class Linear:
         self.signals = [MotionTorques(self.experiment, part) for part in self.parts]
         self.count = sum(int(one.real.sum()) for one in self.signals)
         self.states = self.parts[0].defect.shape[1]
-        self.input_gain = self.experiment.plant.input_gain
+        gain, self._inertia = _figures(self.experiment)
+        self.input_gain = float(gain)
         self.drive, self.driven = self._drive()
         self._scales: dict[str, Scales] = {}
         # what the last search chose, and what the one without candidates did, which is asked for again and again
@@ -312,7 +329,7 @@ class Linear:
         """Size of the torques, N m rms at the motor: the input's; where there is none, what the motion takes. And which."""
         driving = self.input_gain * rms(np.concatenate([one.torque[one.real] for one in self.signals]))
         taken = [
-            float(self.experiment.plant.inertia(side)) / one.over(side) * np.asarray(one.part.acceleration[side])[one.real]
+            float(self._inertia[side]) / one.over(side) * np.asarray(one.part.acceleration[side])[one.real]
             for one in self.signals
             for side in self.sides
         ]
@@ -335,7 +352,9 @@ class Linear:
 
         side = place if place in self.sides else "motor"
         position = joined(lambda part: part.position["load" if place == "transmission" else side])
-        twist = joined(lambda part: self.experiment.plant.twist(part.position)) if len(self.sides) == 2 else np.zeros(1)
+        ratio, twist = float(self.experiment.drive.ratio("load")), np.zeros(1)
+        if len(self.sides) == 2:
+            twist = joined(lambda part: part.position["motor"] - ratio * part.position["load"])
         return Scales(
             torque=float(np.max(np.abs(joined(lambda part: part.torque)))),
             period=self.period,
@@ -345,7 +364,7 @@ class Linear:
             speed=rms(joined(lambda part: part.velocity[side])),
             spread=float(np.std(position)),
             travel=float(np.ptp(position)),
-            ratio=float(self.experiment.drive.ratio("load")),
+            ratio=ratio,
             harmonics=self._harmonics(side),
         )
 
@@ -454,7 +473,7 @@ class Linear:
         waves[:, :, side] = np.concatenate([np.sin(phase), np.cos(phase)])
         responses = _errors(part, gain, waves)[:, :, 1 + part.own.shape[2] : -self.states]
         power = np.sum((responses / deviation[None, :, None]) ** 2, axis=(0, 1)).reshape(2, -1).mean(axis=0)
-        slope = np.asarray(_gradient(part, gain, jnp.asarray(left / deviation[None, :] ** 2)))[:real, side]
+        slope = _gradient(part, gain, left / deviation[None, :] ** 2)[:real, side]
         size = 4 * 2 ** int(np.ceil(np.log2(real)))
         frequency = np.fft.rfftfreq(size, self.period)
         inside = (frequency >= _LEAST_PERIODS / span) & (frequency <= top)

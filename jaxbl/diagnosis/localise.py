@@ -11,10 +11,11 @@ import itertools
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 
+import jax
 import numpy as np
 
-from jaxbl.identification import regression
 from jaxbl.identification.compilation import jit
+from jaxbl.identification.regression import Kinematics, balance
 from jaxbl.identification.segments import Segment
 from jaxbl.simulate import Experiment
 
@@ -430,9 +431,14 @@ def localise(
 ) -> dict[str, Localised]:
     """Where each side lacks torque, by its residuals (:func:`.residuals.residual_torques`), segment by segment, and the
     coordinates along them (:func:`.coordinates.all_coordinates`)."""
-    found = {}
-    balance = jit(regression.balance)
+    found, drives = {}, [_drives(experiment, one.kinematics) for one in segments]
     for side, pieces in residuals.items():
-        driving = np.concatenate([np.asarray(balance(experiment, one.kinematics)[side].drive) for one in segments])
+        driving = np.concatenate([np.asarray(one[side]) for one in drives])
         found[side] = locate(pieces, coordinates[side], floor=RESOLUTION * float(np.sqrt(np.mean(driving**2))))
     return found
+
+
+@jit
+def _drives(experiment: Experiment, kinematics: Kinematics) -> dict[str, jax.Array]:
+    """Torque that drives each equation, N m."""
+    return {name: one.drive for name, one in balance(experiment, kinematics).items()}

@@ -6,11 +6,11 @@ where it acts.
 """
 
 from collections.abc import Callable, Collection, Iterable
-from functools import cache
-from typing import ClassVar, TypeVar
+from functools import cache, lru_cache
+from typing import Any, ClassVar, TypeVar
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, ConstantTorque, make_effect
 from jaxbl.drive.parameters import as_arrays
@@ -42,13 +42,18 @@ def corrected(name: str) -> str | None:
 
 
 def _neutral(name: str) -> AbstractEffect:
-    return as_arrays(make_effect(name, **EFFECTS[name].neutral()), float)
+    return _neutral_of(name, EFFECTS[name], jax.dtypes.canonicalize_dtype(float))
+
+
+@lru_cache(maxsize=256)
+def _neutral_of(name: str, cls: type[AbstractEffect], dtype: Any) -> AbstractEffect:
+    return as_arrays(make_effect(name, **cls.neutral()), dtype)
 
 
 @cache
 def has_state(name: str) -> bool:
     """Whether an effect has a state of its own."""
-    return bool(jax.tree.leaves(_neutral(name).init()))
+    return bool(jax.tree.leaves(jax.eval_shape(_neutral(name).init)))
 
 
 def complete(experiment: Experiment, acting: Collection[str] = ()) -> Experiment:
@@ -75,7 +80,7 @@ class _AddedTorque(ConstantTorque):
 
 def with_torques(experiment: Experiment) -> tuple[Experiment, dict[str, str]]:
     """A model with a further resisting torque on each side, of zero, and its dotted path by side."""
-    added = [_AddedTorque(side=side, torque=jnp.zeros(())) for side in experiment.sides]  # type: ignore[arg-type]
+    added = [_AddedTorque(side=side, torque=np.zeros(())) for side in experiment.sides]  # type: ignore[arg-type]
     paths = {one.side: f"effects.{one.name}.torque" for one in added}
     return with_effects(experiment, (*experiment.effects, *added)), paths
 

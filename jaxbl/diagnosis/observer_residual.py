@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 from scipy.ndimage import uniform_filter1d
 
 from jaxbl.identification.compilation import jit
@@ -25,6 +24,7 @@ from jaxbl.observer.super_twisting import ObserverState
 from jaxbl.records.linear_filters import filtered, parzen
 from jaxbl.simulate import Experiment, Signals, State, initial_state, replay
 
+from .neutral_effects import complete
 from .residuals import Residual, beyond_nominal, narrowed
 
 _DRAWS = 6
@@ -74,28 +74,22 @@ def observed_torques(experiment: Experiment, segments: Sequence[Segment]) -> dic
     bare = eqx.tree_at(lambda e: e.identifier, experiment, None, is_leaf=lambda x: x is None)
     for i, segment in enumerate(segments):
         random, part = np.random.default_rng(i), segment.kinematics
+        # a structure for which there is a program
+        beyond = beyond_nominal(complete(experiment), segment)
         known, readings = {}, {}
         for side in experiment.sides:
             smoothed = segment.smoothed[side]
-            known[side] = _known_acceleration(experiment, side, part, smoothed.held(segment.period))
+            known[side] = _held(*beyond[side]) / float(experiment.drive.inertia(side))
             drawn = float(smoothed.noise) * random.standard_normal((_DRAWS, len(segment)))
             runs = np.concatenate([segment.readings[side][None], np.asarray(part.position[side]) + drawn])
-            readings[side] = jnp.asarray(runs)
-        controls = _controls(bare, jnp.asarray(segment.torque), readings, known, part)
+            readings[side] = runs
+        controls = _controls(bare, segment.torque, readings, known, part)
         for side in experiment.sides:
             found[side].append(_observed(experiment, side, part, np.asarray(controls[side])))
     return found
 
 
-@jit
-def _known_acceleration(
-    experiment: Experiment, side: str, part: Kinematics, held: Bool[Array, " samples"]
-) -> Float[Array, " samples"]:
-    """Acceleration beyond the nominal one that a side's observer is given, rad/s^2."""
-    return _held(*beyond_nominal(experiment, side, part, held)) / experiment.drive.inertia(side)
-
-
-def _held(smooth: Float[Array, " samples"], friction: Float[Array, " samples"]) -> Float[Array, " samples"]:
+def _held(smooth: np.ndarray, friction: np.ndarray) -> np.ndarray:
     """Torque to be held from each sample to the next, so that the implicit observer's position moves as under the true one.
 
     Held from sample k on, p_k moves the observer's positions by second differences of h^2 (p_{k-1} + p_k) / (2 J), where
@@ -103,8 +97,9 @@ def _held(smooth: Float[Array, " samples"], friction: Float[Array, " samples"]) 
     mean of two samples for p_k the former is tau + h^2 tau'' / 4, hence the sixth that is subtracted; not of friction,
     which jumps. The explicit observer's own lag of half a period remains.
     """
-    torque = smooth.at[1:-1].add(-jnp.diff(smooth, n=2) / 6.0) - friction
-    return jnp.append(0.5 * (torque[:-1] + torque[1:]), torque[-1])
+    torque = smooth - friction
+    torque[1:-1] -= np.diff(smooth, n=2) / 6.0
+    return np.append(0.5 * (torque[:-1] + torque[1:]), torque[-1])
 
 
 @jit

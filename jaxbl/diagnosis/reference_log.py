@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.drive.plant import PlantState
@@ -41,7 +40,7 @@ _STATES, _STATES_OF_ONE_RUN = 8, 3
 
 def at_period(experiment: Experiment, period: float) -> Experiment:
     """A model at the sampling period of another log, s."""
-    return eqx.tree_at(lambda e: e.run.sample_period, experiment, jnp.asarray(period))
+    return eqx.tree_at(lambda e: e.run.sample_period, experiment, np.asarray(period, float))
 
 
 class Comparison(NamedTuple):

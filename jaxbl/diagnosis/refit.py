@@ -11,7 +11,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.drive.plant import PlantState
@@ -149,9 +148,8 @@ class _Refiner:
             residual.append(rest[:, 0].reshape(-1, sides))
             jacobian.append(rest[:, 1:].reshape(-1, sides, own))
         fit = Fit(
-            jnp.asarray(point.theta), PlantState(dict.fromkeys(self.experiment.sides, jnp.zeros(1)), {}, ()),
-            jnp.asarray(np.concatenate(residual)[None]), jnp.asarray(np.concatenate(jacobian)[None]),
-            jnp.asarray(0.0), jnp.asarray(True),
+            point.theta, PlantState(dict.fromkeys(self.experiment.sides, np.zeros(1)), {}, ()),
+            np.concatenate(residual)[None], np.concatenate(jacobian)[None], np.zeros(()), np.ones((), bool),
         )  # fmt: skip
         found = spread(fit)
         # samples that only fill up

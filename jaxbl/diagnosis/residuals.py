@@ -11,7 +11,7 @@ Sign: the torque that is missing from the model, J a less all modelled torques; 
 import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -147,43 +147,66 @@ def _acting(
     return total, friction, jnp.where(held, 0.0, 2.0 * level * (1.0 - jnp.abs(passage)) / step)
 
 
-@jit
-def beyond_nominal(
-    experiment: Experiment, side: str, part: Kinematics, held: Bool[Array, " samples"]
-) -> tuple[Float[Array, " samples"], Float[Array, " samples"]]:
-    """Modelled torque on a side less that of its nominal equation, in which the inertia is the nominal one, N m.
+class _Equation(NamedTuple):
+    """Equation of motion of a side along a part, torques in N m.
 
-    What transmission and effects add to J dv/dt = (input) - B v, the right-hand side that an observer (7)-(8) knows; and,
-    on its own, the dry friction that is to be subtracted. `held`: where the side is not shown to move for a while.
+    Attributes:
+        inertia: of the side, kg m^2.
+        taken: by it.
+        modelled: that the smoother sees.
+        beyond: modelled less that of the nominal equation, in which the inertia is the nominal one; without dry friction.
+        friction: dry friction.
+        by_position, by_velocity: derivatives of the modelled torque by the positions and velocities.
     """
-    drive, velocity = experiment.drive, part.velocity[side]
-    total, friction, _ = _acting(experiment, side, part, held)
-    added = (experiment.plant.inertia(side) - drive.inertia(side)) * part.acceleration[side]
-    nominal = drive.inertia(side) * drive.acceleration(side, velocity, part.torque)
-    return total - added - nominal, friction
+
+    inertia: Float[Array, ""]
+    taken: Float[Array, " samples"]
+    modelled: Float[Array, " samples"]
+    beyond: Float[Array, " samples"]
+    friction: Float[Array, " samples"]
+    by_position: dict[str, Float[Array, " samples"]]
+    by_velocity: dict[str, Float[Array, " samples"]]
 
 
 @jit
-def _side(
-    experiment: Experiment, side: str, part: Kinematics, held: Bool[Array, " samples"]
-) -> tuple[Array, Array, dict[str, Array], dict[str, Array]]:
-    """Torque that the inertia takes along a part, and the modelled one that the smoother sees; derivatives of the modelled
-    torque by the positions and velocities."""
+def _equations(experiment: Experiment, part: Kinematics, held: dict[str, Bool[Array, " samples"]]) -> dict[str, _Equation]:
+    """Equations of all sides along a part; `held`: where a side is not shown to move for a while."""
     states, torque = effect_path(experiment, part, from_rest=True)
     given = part.position, part.velocity, states, torque, part.time, part.transmitted
-    total, friction, turning = _acting(experiment, side, part, held)
-    # the input is a mean around the sample already; of the rest, the mean that the position's second differences see
-    driving = torque if side == "motor" else jnp.zeros_like(torque)
-    modelled = driving + _mean_around(total - driving) - friction
-    taken = experiment.plant.inertia(side) * part.acceleration[side]
+    drive, found = experiment.drive, {}
+    for side in experiment.sides:
+        total, friction, turning = _acting(experiment, side, part, held[side])
+        # the input is a mean around the sample already; of the rest, the mean that the position's second differences see
+        driving = torque if side == "motor" else jnp.zeros_like(torque)
+        modelled = driving + _mean_around(total - driving) - friction
+        inertia, acceleration, velocity = experiment.plant.inertia(side), part.acceleration[side], part.velocity[side]
+        added = (inertia - drive.inertia(side)) * acceleration
+        nominal = drive.inertia(side) * drive.acceleration(side, velocity, part.torque)
 
-    def of(position: dict, velocity: dict, *rest: Any) -> Array:
-        total, level = _torque(experiment, side, position, velocity, *rest)
-        return total - level * jnp.sign(velocity[side])
+        def of(position: dict, velocity: dict, *rest: Any, side=side) -> Array:
+            total, level = _torque(experiment, side, position, velocity, *rest)
+            return total - level * jnp.sign(velocity[side])
 
-    by_position, by_velocity = jax.vmap(jax.jacfwd(of, argnums=(0, 1)))(*given)
-    by_velocity[side] = by_velocity[side] - turning
-    return taken, modelled, by_position, by_velocity
+        by_position, by_velocity = jax.vmap(jax.jacfwd(of, argnums=(0, 1)))(*given)
+        by_velocity[side] = by_velocity[side] - turning
+        found[side] = _Equation(
+            inertia, inertia * acceleration, modelled, total - added - nominal, friction, by_position, by_velocity
+        )
+    return found
+
+
+def _along(experiment: Experiment, segment: Segment) -> dict[str, _Equation]:
+    held = {side: np.asarray(one.held(segment.period)) for side, one in segment.smoothed.items()}
+    return jax.tree.map(np.asarray, _equations(experiment, segment.kinematics, held))
+
+
+def beyond_nominal(experiment: Experiment, segment: Segment) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Modelled torque on each side less that of its nominal equation, in which the inertia is the nominal one, N m.
+
+    What transmission and effects add to J dv/dt = (input) - B v, the right-hand side that an observer (7)-(8) knows; and,
+    on its own, the dry friction that is to be subtracted.
+    """
+    return {side: (one.beyond, one.friction) for side, one in _along(experiment, segment).items()}
 
 
 def white_noise(parts: Sequence[np.ndarray]) -> float:
@@ -205,12 +228,12 @@ def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> dic
     for segment in segments:
         part, responses = segment.kinematics, _responses(segment)
         sensor = 0.0 if part.transmitted is None else white_noise([np.asarray(part.transmitted)])
+        equations = _along(experiment, segment)
         for side, pieces in found.items():
-            smoothed = segment.smoothed[side]
-            taken, modelled, *slopes = _side(experiment, side, part, smoothed.held(segment.period))
-            missing = np.asarray(taken) - as_smoothed(np.asarray(modelled), smoothed, segment.period)
-            inertia, level = float(experiment.plant.inertia(side)), abs(float(experiment.drive.torque_gain(side))) * sensor
-            variance, spectrum = _noise(segment, side, slopes, inertia, level, responses)
+            one, slopes = equations[side], (equations[side].by_position, equations[side].by_velocity)
+            missing = one.taken - as_smoothed(one.modelled, segment.smoothed[side], segment.period)
+            level = abs(float(experiment.drive.torque_gain(side))) * sensor
+            variance, spectrum = _noise(segment, side, slopes, float(one.inertia), level, responses)
             lags = min(int(_REACH / min(one.corner for one in responses.values())) + 2, len(segment))
             correlation, tiny = np.fft.irfft(spectrum)[:lags], np.finfo(float).tiny
             pieces.append(

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 Scalar = float | Float[Array, ""]
@@ -147,7 +148,9 @@ def as_arrays(tree: Tree, dtype: Any) -> Tree:
 
     def cast(leaf: Any) -> Any:
         if isinstance(leaf, float) or (eqx.is_array(leaf) and jnp.issubdtype(leaf.dtype, jnp.inexact)):
-            return jnp.asarray(leaf, dtype)
+            # of a number known here `jnp.asarray` makes a program
+            known = isinstance(leaf, float | np.ndarray | np.generic)
+            return jax.device_put(np.asarray(leaf, dtype)) if known else jnp.asarray(leaf, dtype)
         return leaf
 
     return jax.tree.map(cast, tree)

@@ -214,10 +214,10 @@ class Plant(eqx.Module):
         return tuple(new), torque
 
     @property
-    def input_gain(self) -> float:
+    def input_gain(self) -> Scalar:
         """Torque on the motor for one unit of the input, which may be a voltage: of a small one that has lasted."""
         states = tuple(effect.settled(_SMALL) for effect in self.effects)
-        return float(self.actuate(states, _SMALL, _LONG)[1]) / _SMALL
+        return self.actuate(states, _SMALL, _LONG)[1] / _SMALL
 
     @property
     def memory(self) -> bool:

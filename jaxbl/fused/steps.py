@@ -1,10 +1,11 @@
 """Functions of a sample's scalars, taken along a signal by a loop for this machine's processor: one loop for all lengths."""
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from . import Unsupported, attempted, kept, say_scanned
@@ -16,8 +17,9 @@ _NUMBER = jax.ShapeDtypeStruct((), np.dtype(float))
 
 def stepped(
     sample: Sample, values: Sequence[np.ndarray], carry: Sequence[np.ndarray], inputs: Sequence[np.ndarray]
-) -> list[np.ndarray] | None:
-    """What a function of a module keeps along a signal, each of shape (samples, lanes); None where it cannot be compiled.
+) -> list[np.ndarray]:
+    """What a function of a module keeps along a signal, each of shape (samples, lanes); by XLA where it
+    cannot be compiled otherwise.
 
     Args:
         sample: the function.
@@ -27,7 +29,9 @@ def stepped(
     lanes, samples = len(carry[0]), len(inputs[0])
     loop = _loop(sample, len(values), len(carry), len(inputs), lanes == 1)
     if loop is None:
-        return None
+        with jax.enable_x64(True):
+            given = [[jnp.asarray(one, float) for one in some] for some in (values, carry, inputs)]
+            return [np.asarray(one) for one in _scanned(sample, *given)]
     whole = -(-lanes // loop.lanes) * loop.lanes
     given = [np.pad(np.asarray(one, float), (0, whole - lanes), "edge") for one in (*values, *carry)]
     along = [np.ascontiguousarray(one, float) for one in inputs]
@@ -55,3 +59,8 @@ def _loop(sample: Sample, values: int, carry: int, inputs: int, alone: bool) -> 
     except Unsupported as why:
         say_scanned(str(why))
         return None
+
+
+@partial(jax.jit, static_argnums=0)
+def _scanned(sample: Sample, values: list[jax.Array], carry: list[jax.Array], inputs: list[jax.Array]) -> list[jax.Array]:
+    return jax.lax.scan(lambda carry, inputs: sample(values, carry, inputs), carry, inputs)[1]

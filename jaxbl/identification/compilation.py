@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
@@ -57,9 +58,11 @@ def jit(function: Callable[..., Result]) -> Callable[..., Result]:
             return function(*args, **kwargs)
         if kept.keeping() is None:
             return compiled()(*args, **kwargs)
-        arrays = [leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in leaves if eqx.is_array(leaf)]
+        arrays = [_plain(leaf) for leaf in leaves if eqx.is_array(leaf)]
         rest = tuple(_Array() if eqx.is_array(leaf) else leaf for leaf in leaves)
-        key = function, structure, rest, tuple((one.shape, one.dtype, one.aval.weak_type) for one in arrays)
+        # of NumPy's none is weak
+        weak = [isinstance(one, jax.Array) and one.aval.weak_type for one in arrays]
+        key = function, structure, rest, tuple((one.shape, one.dtype, by) for one, by in zip(arrays, weak, strict=True))
         program = _programs.get(key)
         if program is None:
             while len(_programs) >= _MOST:
@@ -70,6 +73,14 @@ def jit(function: Callable[..., Result]) -> Callable[..., Result]:
         return program(arrays)
 
     return call
+
+
+def _plain(leaf: Any) -> Any:
+    """An array as a program takes it: of NumPy's as it is, if JAX has such numbers now, as to hand it over is a program."""
+    if isinstance(leaf, jax.Array):
+        return leaf
+    leaf = np.asarray(leaf)
+    return leaf if jax.dtypes.canonicalize_dtype(leaf.dtype) == leaf.dtype else jnp.asarray(leaf)
 
 
 class _Array(NamedTuple):
@@ -94,7 +105,12 @@ class _Program(NamedTuple):
 @functools.cache
 def _initialise() -> None:
     """JAX finds LAPACK's routines when it first lowers one; a program that calls them without crashes."""
-    jax.jit(jnp.linalg.cholesky).lower(jnp.eye(2))
+    try:
+        from jaxlib import lapack
+
+        lapack._lapack.initialize()
+    except (ImportError, AttributeError):  # of another version: by lowering one
+        jax.jit(jnp.linalg.cholesky).lower(jnp.eye(2))
 
 
 _programs: OrderedDict[Any, _Program] = OrderedDict()

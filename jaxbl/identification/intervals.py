@@ -9,15 +9,12 @@ D. Watts, Nonlinear Regression Analysis (1988), 6.1; D. Venzon, S. Moolgavkar, A
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import chdtri, ndtri
 
 from jaxbl.simulate import Experiment
 
-from .compilation import jit
-from .smoother import running_sum
 from .trajectory import Fit, Free, Windows, fits
 
 NORMAL = float(ndtri(0.975))
@@ -48,56 +45,54 @@ class Spread(NamedTuple):
     inflation: Float[Array, " parameters"]
 
 
-@jit
 def spread(fit: Fit) -> Spread:
-    """Covariance of theta by the sandwich J+ E[r r^T] J+^T, the middle by Newey and West with Andrews' bandwidth.
-
-    Works under `vmap` over fits.
-    """
-    windows, samples, _, parameters = fit.jacobian.shape
+    """Covariance of theta by the sandwich J+ E[r r^T] J+^T, the middle by Newey and West with Andrews' bandwidth."""
+    jacobian, residual = np.asarray(fit.jacobian, float), np.asarray(fit.residual, float)
+    windows, samples, _, parameters = jacobian.shape
     states = sum(1 for _ in fit.start.position) * 2
-    freedom = fit.residual.size - parameters - windows * states
-    normal = jnp.einsum("wtsp,wtsq->pq", fit.jacobian, fit.jacobian)
-    size = jnp.sqrt(jnp.diag(normal))
-    size = jnp.where(size > 0.0, size, 1.0)
-    scores = jnp.einsum("wtsp,wts->wtp", fit.jacobian / size[None, None, None, :], fit.residual).reshape(
-        windows * samples, parameters
-    )
-    variance = jnp.sum(fit.residual**2) / freedom
-    middle = _long_run(scores) * fit.residual.size / freedom
-    inverse = _pseudo_inverse(normal / jnp.outer(size, size))
-    plain = variance * inverse / jnp.outer(size, size)
-    sandwich = inverse @ middle @ inverse / jnp.outer(size, size)
-    inflation = jnp.sqrt(jnp.diag(sandwich) / jnp.diag(plain))
-    # elimination of the initial states leaves a little negative correlation behind: nothing to gain confidence from
-    more = jnp.maximum(1.0 / inflation, 1.0)
-    covariance = sandwich * jnp.outer(more, more)
-    return Spread(covariance, normal / variance, variance, inflation * more)
+    freedom = residual.size - parameters - windows * states
+    flat = jacobian.reshape(-1, parameters)
+    normal = flat.T @ flat
+    size = np.sqrt(np.diag(normal))
+    size = np.where(size > 0.0, size, 1.0)
+    scores = np.einsum("wtsp,wts->wtp", jacobian / size, residual).reshape(windows * samples, parameters)
+    # of what diverges nothing is finite
+    with np.errstate(all="ignore"):
+        variance = np.sum(residual**2) / freedom
+        middle = _long_run(scores) * residual.size / freedom
+        inverse = _pseudo_inverse(normal / np.outer(size, size))
+        plain = variance * inverse / np.outer(size, size)
+        sandwich = inverse @ middle @ inverse / np.outer(size, size)
+        inflation = np.sqrt(np.diag(sandwich) / np.diag(plain))
+        # elimination of the initial states leaves a little negative correlation behind: nothing to gain confidence from
+        more = np.maximum(1.0 / inflation, 1.0)
+        covariance = sandwich * np.outer(more, more)
+        return Spread(covariance, normal / variance, variance, inflation * more)
 
 
-def _pseudo_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Of a symmetric matrix, as `jnp.linalg.pinv`, which takes four times as long to compile."""
-    values, vectors = jnp.linalg.eigh(matrix)
-    size = jnp.abs(values)
-    kept = size > 10.0 * len(values) * jnp.finfo(values.dtype).eps * jnp.max(size, initial=0.0)
-    return (vectors * jnp.where(kept, 1.0 / jnp.where(kept, values, 1.0), 0.0)[None, :]) @ vectors.T
+def _pseudo_inverse(matrix: np.ndarray) -> np.ndarray:
+    """Of a symmetric matrix."""
+    if not np.isfinite(matrix).all():
+        return np.full_like(matrix, np.nan)
+    return np.linalg.pinv(matrix, 10.0 * len(matrix) * np.finfo(float).eps, hermitian=True)
 
 
-def _long_run(scores: Float[Array, "samples parameters"]) -> Float[Array, "parameters parameters"]:
+def _long_run(scores: np.ndarray) -> np.ndarray:
     """Sum of the autocovariances of a series under Bartlett's weights, times its length."""
     count = len(scores)
-    square = jnp.sum(scores**2, axis=0)
-    rho = jnp.sum(scores[1:] * scores[:-1], axis=0) / jnp.where(square > 0.0, square, 1.0)
-    rho = jnp.clip(rho, -0.99, 0.999)
+    square = np.sum(scores**2, axis=0)
+    rho = np.sum(scores[1:] * scores[:-1], axis=0) / np.where(square > 0.0, square, 1.0)
+    rho = np.clip(rho, -0.99, 0.999)
     weight = square**2
-    top = jnp.sum(weight * 4.0 * rho**2 / ((1.0 - rho) ** 6 * (1.0 + rho) ** 2))
-    bottom = jnp.sum(weight / (1.0 - rho) ** 4)
-    wide = 1.1447 * (top / jnp.where(bottom > 0.0, bottom, 1.0) * count) ** (1.0 / 3.0)
-    length = jnp.clip(jnp.ceil(wide), 1, count // 10).astype(int)
+    top = np.sum(weight * 4.0 * rho**2 / ((1.0 - rho) ** 6 * (1.0 + rho) ** 2))
+    bottom = np.sum(weight / (1.0 - rho) ** 4)
+    wide = 1.1447 * (top / np.where(bottom > 0.0, bottom, 1.0) * count) ** (1.0 / 3.0)
+    # nothing is known where the fit diverged
+    length = int(np.clip(np.ceil(wide), 1, count // 10)) if np.isfinite(wide) else 1
     # Bartlett's weights are those of all sums over `length` neighbours
-    total = jnp.concatenate([jnp.zeros((1, scores.shape[1])), running_sum(scores)])
-    last = jnp.arange(2 * count)
-    sums = total[jnp.clip(last, 0, count)] - total[jnp.clip(last - length, 0, count)]
+    total = np.concatenate([np.zeros((1, scores.shape[1])), np.cumsum(scores, axis=0)])
+    last = np.arange(2 * count)
+    sums = total[np.clip(last, 0, count)] - total[np.clip(last - length, 0, count)]
     return sums.T @ sums / length
 
 

@@ -12,8 +12,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.config import Config, prepare
@@ -168,9 +166,9 @@ def _read_one(config: Config, log: str | Path, gear_tolerance: float) -> Record:
     return record
 
 
-def arrays(values: Mapping[str, float]) -> dict[str, jax.Array]:
+def arrays(values: Mapping[str, float]) -> dict[str, np.ndarray]:
     """Numbers by path as arrays."""
-    return {path: jnp.asarray(value) for path, value in values.items()}
+    return {path: np.asarray(value, float) for path, value in values.items()}
 
 
 def on_record(config: Config, record: Record) -> Experiment:
@@ -183,7 +181,7 @@ def on_record(config: Config, record: Record) -> Experiment:
         experiment,
         dataclasses.replace(
             experiment.run,
-            sample_period=jnp.asarray(record.sample_period),
+            sample_period=np.asarray(record.sample_period, float),
             # along a log nothing asks for it; programs are compiled for one
             steps=1,
             substeps=substeps,

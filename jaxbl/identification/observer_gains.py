@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbl.drive.parameters import set_leaves
-from jaxbl.observer.conditions import least_lambda_exact
 from jaxbl.simulate import Experiment, Signals, State, replay
 
 from .compilation import jit
@@ -21,6 +20,14 @@ from .regression import Kinematics
 
 _ALPHA = np.geomspace(1.1, 6.0, 10)
 """Tried, over the largest disturbance: alpha must exceed it."""
+_LEAST_LAMBDA = np.array(
+    [
+        *(0.99121979323499, 0.846816465249442, 0.747579903703347, 0.668441411663471, 0.601665665672052),
+        *(0.543670341246327, 0.492453446343278, 0.446755440769939, 0.405712627502788, 0.368691656240434),
+    ]
+)
+"""Least lambda that converges with each of them, over the root of the largest disturbance: of
+:func:`jaxbl.observer.conditions.least_lambda_exact`, which takes longer to compile than all that follows (a test)."""
 _LAMBDA = np.geomspace(1.1, 12.0, 12)
 """Tried, over the least lambda that converges with that alpha."""
 _MOST = 20_000
@@ -70,17 +77,19 @@ def choose_gains(
     count = min(len(kinematics.time), _MOST)
     k = jax.tree.map(lambda x: x[:count], kinematics)
     ends = slice(min(20, count // 10), count - min(20, count // 10))
-    alpha, factor = (jnp.asarray(x.ravel()) for x in np.meshgrid(_ALPHA, _LAMBDA))
+    (alpha, factor), least = (x.ravel() for x in np.meshgrid(_ALPHA, _LAMBDA)), np.tile(_LEAST_LAMBDA, len(_LAMBDA))
+    # of NumPy: arithmetic alone is no program then
+    drive = jax.tree.map(np.asarray, experiment.drive)
     f_plus, tried = {}, {}
     for side in experiment.sides:
         # acceleration that the observer's nominal model does not explain
-        disturbance = k.acceleration[side] - experiment.drive.acceleration(side, k.velocity[side], k.torque)
-        f_plus[side] = float(jnp.max(jnp.abs(disturbance[ends])))
+        disturbance = k.acceleration[side] - drive.acceleration(side, k.velocity[side], k.torque)
+        f_plus[side] = float(np.max(np.abs(disturbance[ends])))
         bound = max(f_plus[side], np.finfo(float).tiny)
         tried[f"observer.{side}.alpha"] = alpha * bound
-        tried[f"observer.{side}.lambda"] = factor * least_lambda_exact(alpha * bound, jnp.full_like(alpha, bound))
+        tried[f"observer.{side}.lambda"] = factor * least * np.sqrt(bound)
 
-    readings = {side: jnp.asarray(measured[side])[:count] for side in experiment.sides}
+    readings = {side: np.asarray(measured[side])[:count] for side in experiment.sides}
     missed = _misses(experiment, k, tried, readings)
     chosen = {}
     for side in experiment.sides:

@@ -62,11 +62,10 @@ def kinematics_from(time: np.ndarray, torque: np.ndarray, states: Mapping[str, A
     held = np.asarray(torque, float)
     before = np.concatenate([held[:1], held[:-1]])
     position, velocity, acceleration = (
-        {side: jnp.asarray(np.asarray(state)[:, i]) for side, state in states.items()} for i in range(3)
+        {side: np.ascontiguousarray(np.asarray(state)[:, i]) for side, state in states.items()} for i in range(3)
     )
-    mean = jnp.asarray(0.5 * (before + held))
-    measured = None if transmitted is None else jnp.asarray(transmitted)
-    return Kinematics(jnp.asarray(time), mean, position, velocity, acceleration, measured)
+    measured = None if transmitted is None else np.asarray(transmitted)
+    return Kinematics(np.asarray(time), 0.5 * (before + held), position, velocity, acceleration, measured)  # type: ignore[arg-type]
 
 
 class Balance(NamedTuple):
@@ -131,6 +130,7 @@ def model_torques(
     return found
 
 
+@jit
 def transmitted(experiment: Experiment, k: Kinematics) -> Float[Array, " samples"]:
     """Transmitted torque by a model at known kinematics, N m."""
     gear = with_effects(experiment, tuple(one for one in experiment.effects if one.place == "transmission"))

@@ -113,7 +113,7 @@ def windows_of(
         if len(one) < samples:
             continue
         k = one.kinematics
-        along = Path(k.time, jnp.asarray(one.torque), k.position, k.velocity)
+        along = Path(k.time, one.torque, k.position, k.velocity)
         start = PlantState(k.position, k.velocity, _held(experiment, one, effect_states(experiment, along)))
         pieces.append(cut(one.torque, one.readings, one.period, start, noise, samples, float(one.time[0]), rest))
         firsts.append(one.rows.start + samples * np.arange(len(one) // samples))

@@ -9,16 +9,11 @@ References: Y. Bar-Shalom, X.-R. Li, T. Kirubarajan, Estimation with Application
 
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from jaxbl.drive.parameters import Scalar
 from jaxbl.fused.steps import stepped
-
-from .compilation import jit
 
 _SMOOTHNESS = 1e-14, 1e4
 """Range of q h^5 / sigma^2 that is searched: time constants of the smoother from 200 periods to a fraction of one."""
@@ -73,11 +68,6 @@ class Smoothed(NamedTuple):
         corner = (self.jerk / self.noise**2 / period) ** (1.0 / 6.0)
         still = _SHOWN * self.deviation(1)
         return (abs(self.velocity) < still) & (abs(self.acceleration) < corner * still)
-
-
-def running_sum(values: Float[Array, "samples ..."]) -> Float[Array, "samples ..."]:
-    """Cumulative sum over samples; on a processor faster than `jnp.cumsum`, to run and to compile."""
-    return jax.lax.scan(lambda total, one: (total + one, total + one), jnp.zeros_like(values[0]), values)[1]
 
 
 TRANSITION = ((1.0, 1.0, 0.5), (0.0, 1.0, 1.0), (0.0, 0.0, 1.0))
@@ -146,113 +136,89 @@ def _corrected(values: list[Any], carry: list[Any], inputs: list[Any]) -> tuple[
     return [a, a + b, 0.5 * a + b + c, *(moved[i][j] for i, j in _UPPER)], [*state, *covariance]
 
 
-def _along(sample: Any, values: list[Any], carry: list[Any], inputs: list[Any]) -> list[Any]:
-    """What a function of a sample keeps along a signal: by XLA, inside of compiled programs and where no loop is."""
-    return jax.lax.scan(lambda carry, inputs: sample(values, carry, inputs), carry, inputs)[1]
-
-
-def _looped(sample: Any, values: list[Any], carry: list[Any], inputs: list[Any]) -> list[Any]:
-    """The same by a loop, of arrays."""
+def _along(sample: Any, values: list[Any], carry: list[Any], inputs: list[Any]) -> list[np.ndarray]:
+    """What a function of a sample keeps along a signal; numbers are one lane."""
     found = stepped(sample, [np.ravel(one) for one in values], [np.ravel(one) for one in carry], inputs)
-    if found is None:
-        raise _NoLoop
     return [one if np.ndim(carry[0]) else one[:, 0] for one in found]
 
 
-class _NoLoop(Exception):
-    """This machine has none."""
+def _start(position: Any) -> list[Any]:
+    """Nothing is known at first but the size of things."""
+    largest = np.max(np.abs(np.diff(position)))
+    spread = [_SPREAD**2 * size**2 + 1.0 for size in (1.0, largest, largest)]
+    zero = 0.0 * position[0]
+    return [position[0], zero, zero, spread[0] + zero, zero, zero, spread[1], zero, spread[2]]
 
 
-class _Smoother(NamedTuple):
-    """Both passes, by XLA (`np` is `jax.numpy` then) or by loops."""
+def _first(position: Any, smoothness: Any) -> list[Any]:
+    """State and covariance at the first sample by a filter that runs backwards, as good as unknown: the spread tenfold.
 
-    np: Any
-    along: Any
-
-    def start(self, position: Any) -> list[Any]:
-        """Nothing is known at first but the size of things."""
-        largest = self.np.max(self.np.abs(self.np.diff(position)))
-        spread = [_SPREAD**2 * size**2 + 1.0 for size in (1.0, largest, largest)]
-        zero = 0.0 * position[0]
-        return [position[0], zero, zero, spread[0] + zero, zero, zero, spread[1], zero, spread[2]]
-
-    def first(self, position: Any, smoothness: Any) -> list[Any]:
-        """State and covariance at the first sample by a filter that runs backwards, as good as unknown: the spread tenfold.
-
-        From an altogether unknown one the backward pass would lose all digits in the covariance of the first samples.
-        """
-        *last, e, s = (one[-1] for one in self.along(_predicted, [smoothness], self.start(position), [position[::-1]]))
-        x, p = last[:3], last[3:]
-        gain = [p[i] / s for i in _FULL[0]]
-        turned = 1.0, -1.0, 1.0
-        covariance = [p[_FULL[i][j]] - gain[i] * gain[j] * s for i, j in _UPPER]
-        return [
-            *(sign * (one + by * e) for sign, one, by in zip(turned, x, gain, strict=True)),
-            *(_SPREAD**2 * turned[i] * turned[j] * one for (i, j), one in zip(_UPPER, covariance, strict=True)),
-        ]
-
-    def likelihood(self, scaled: Any, logs: Any) -> tuple[Any, Any]:
-        """Log-likelihood of several smoothnesses at their best noise, and that noise; positions in any unit, as the filter's
-        gains do not depend on it."""
-        values, start = [self.np.exp(logs)], [one + 0.0 * logs for one in self.start(scaled)]
-        # the first samples find the state
-        e, s = (one[3:] for one in self.along(_innovation, values, start, [scaled]))
-        variance = self.np.sum(e**2 / s, axis=0) / len(e)
-        return -0.5 * (len(e) * self.np.log(variance) + self.np.sum(self.np.log(s), axis=0)), self.np.sqrt(variance)
-
-    def zoomed(self, scaled: Any, low: Any, high: Any) -> tuple[Any, Any, Any]:
-        """Ends of a ninth of a range about the logarithm of the smoothness of largest likelihood, and the noise there."""
-        points = low + (high - low) * self.np.linspace(0.0, 1.0, _GRID)
-        likelihood, noise = self.likelihood(scaled, points)
-        best = self.np.argmax(likelihood)
-        step = (high - low) / (_GRID - 1)
-        return points[best] - step, points[best] + step, noise[best]
-
-    def unit(self, position: Any) -> Any:
-        """A guess of the noise."""
-        # third differences of white noise have variance 20 sigma^2; smooth motion adds little to their median
-        third = self.np.diff(position, n=3)
-        median = self.np.median(self.np.abs(third)) / 0.6745
-        # more than half of a counter's readings may stand still
-        guess = self.np.where(median > 0.0, median, self.np.sqrt(self.np.mean(third**2))) / 20.0**0.5
-        return self.np.maximum(guess, 1e-9 * self.np.ptp(position) + self.np.finfo(position.dtype).tiny)
-
-    def smoothed(self, position: Any, smoothness: Any, noise: Any, period: Any) -> Smoothed:
-        scaled = (position - position[0]) / noise
-        forward = self.along(_predicted, [smoothness], self.first(scaled, smoothness), [scaled])
-        zero = [0.0 * scaled[0]] * 9
-        found = [one[::-1] for one in self.along(_corrected, [], zero, [one[::-1] for one in forward])]
-        unit = self.np.stack([noise, noise / period, noise / period**2])
-        state = self.np.stack(found[:3], axis=1) * unit[None, :]
-        # the position counts from the first one
-        state = self.np.concatenate([state[:, :1] + position[0], state[:, 1:]], axis=1)
-        covariance = self.np.stack([self.np.stack([found[3 + i] for i in row], axis=1) for row in _FULL], axis=1)
-        innovations = forward[9] / self.np.sqrt(forward[10])
-        jerk = smoothness * noise**2 / period**5
-        return Smoothed(state, covariance * self.np.outer(unit, unit)[None], noise, jerk, innovations)
+    From an altogether unknown one the backward pass would lose all digits in the covariance of the first samples.
+    """
+    *last, e, s = (one[-1] for one in _along(_predicted, [smoothness], _start(position), [position[::-1]]))
+    x, p = last[:3], last[3:]
+    gain = [p[i] / s for i in _FULL[0]]
+    turned = 1.0, -1.0, 1.0
+    covariance = [p[_FULL[i][j]] - gain[i] * gain[j] * s for i, j in _UPPER]
+    return [
+        *(sign * (one + by * e) for sign, one, by in zip(turned, x, gain, strict=True)),
+        *(_SPREAD**2 * turned[i] * turned[j] * one for (i, j), one in zip(_UPPER, covariance, strict=True)),
+    ]
 
 
-def _fit(position: Array) -> tuple[Array, Array]:
+def _likelihood(scaled: Any, logs: Any) -> tuple[Any, Any]:
+    """Log-likelihood of several smoothnesses at their best noise, and that noise; positions in any unit, as the filter's
+    gains do not depend on it."""
+    values, start = [np.exp(logs)], [one + 0.0 * logs for one in _start(scaled)]
+    # the first samples find the state
+    e, s = (one[3:] for one in _along(_innovation, values, start, [scaled]))
+    variance = np.sum(e**2 / s, axis=0) / len(e)
+    return -0.5 * (len(e) * np.log(variance) + np.sum(np.log(s), axis=0)), np.sqrt(variance)
+
+
+def _zoomed(scaled: Any, low: Any, high: Any) -> tuple[Any, Any, Any]:
+    """Ends of a ninth of a range about the logarithm of the smoothness of largest likelihood, and the noise there."""
+    points = low + (high - low) * np.linspace(0.0, 1.0, _GRID)
+    likelihood, noise = _likelihood(scaled, points)
+    best = np.argmax(likelihood)
+    step = (high - low) / (_GRID - 1)
+    return points[best] - step, points[best] + step, noise[best]
+
+
+def _unit(position: Any) -> Any:
+    """A guess of the noise."""
+    # third differences of white noise have variance 20 sigma^2; smooth motion adds little to their median
+    third = np.diff(position, n=3)
+    median = np.median(np.abs(third)) / 0.6745
+    # more than half of a counter's readings may stand still
+    guess = np.where(median > 0.0, median, np.sqrt(np.mean(third**2))) / 20.0**0.5
+    return np.maximum(guess, 1e-9 * np.ptp(position) + np.finfo(position.dtype).tiny)
+
+
+def _smoothed(position: Any, smoothness: Any, noise: Any, period: Any) -> Smoothed:
+    scaled = (position - position[0]) / noise
+    forward = _along(_predicted, [smoothness], _first(scaled, smoothness), [scaled])
+    zero = [0.0 * scaled[0]] * 9
+    found = [one[::-1] for one in _along(_corrected, [], zero, [one[::-1] for one in forward])]
+    unit = np.stack([noise, noise / period, noise / period**2])
+    state = np.stack(found[:3], axis=1) * unit[None, :]
+    # the position counts from the first one
+    state = np.concatenate([state[:, :1] + position[0], state[:, 1:]], axis=1)
+    covariance = np.stack([np.stack([found[3 + i] for i in row], axis=1) for row in _FULL], axis=1)
+    innovations = forward[9] / np.sqrt(forward[10])
+    jerk = smoothness * noise**2 / period**5
+    return Smoothed(state, covariance * np.outer(unit, unit)[None], noise, jerk, innovations)
+
+
+def _fit(position: np.ndarray) -> tuple[np.float64, np.float64]:
     """Smoothness q h^5 / sigma^2 and sigma of largest likelihood."""
-    by = _Smoother(jnp, _along)
-    unit = by.unit(position)
+    unit = _unit(position)
     scaled = (position - position[0]) / unit
-    low, high = (jnp.log(jnp.asarray(x, position.dtype)) for x in _SMOOTHNESS)
-    first = low, high, jnp.ones((), position.dtype)
-    low, high, noise = jax.lax.fori_loop(0, _ZOOMS, lambda _, at: by.zoomed(scaled, *at[:2]), first)
-    return jnp.exp(0.5 * (low + high)), noise * unit
-
-
-@jit
-def _scanned(position: Array, period: Any, known: tuple[Any, Any] | None) -> Smoothed:
-    """As :func:`smooth`, by XLA."""
-    position, period = jnp.asarray(position, float), jnp.asarray(period, float)
-    if known is None:
-        smoothness, sigma = _fit(position)
-    else:
-        sigma, jerk = (jnp.asarray(one, float) for one in known)
-        smoothness = jerk * period**5 / sigma**2
-    return _Smoother(jnp, _along).smoothed(position, smoothness, sigma, period)
+    low, high = np.log(_SMOOTHNESS)
+    noise = np.float64(1.0)
+    for _ in range(_ZOOMS):
+        low, high, noise = _zoomed(scaled, low, high)
+    return np.exp(0.5 * (low + high)), noise * unit
 
 
 def smooth(
@@ -266,22 +232,12 @@ def smooth(
         known: standard deviation of the readings' noise, quantisation included, in rad, and spectral density of the jerk in
             rad^2/s^5; left out, both are found by maximum likelihood.
     """
-    if any(isinstance(one, Tracer) for one in jax.tree.leaves((position, period, known))):
-        return _scanned(position, period, known)
-    by, values, h = _Smoother(np, _looped), np.asarray(position, float), np.float64(period)
-    try:
-        with np.errstate(all="ignore"):
-            if known is None:
-                unit = by.unit(values)
-                scaled = (values - values[0]) / unit
-                low, high = np.log(_SMOOTHNESS)
-                noise = np.float64(1.0)
-                for _ in range(_ZOOMS):
-                    low, high, noise = by.zoomed(scaled, low, high)
-                smoothness, sigma = np.exp(0.5 * (low + high)), noise * unit
-            else:
-                sigma, jerk = (np.float64(one) for one in known)
-                smoothness = jerk * h**5 / sigma**2
-            return by.smoothed(values, smoothness, sigma, h)
-    except _NoLoop:
-        return _scanned(jnp.asarray(position), jnp.asarray(period), known)
+    values, h = np.asarray(position, float), np.float64(period)
+    # of what is not finite nothing is
+    with np.errstate(all="ignore"):
+        if known is None:
+            smoothness, sigma = _fit(values)
+        else:
+            sigma, jerk = (np.float64(one) for one in known)
+            smoothness = jerk * h**5 / sigma**2
+        return _smoothed(values, smoothness, sigma, h)

@@ -17,7 +17,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
@@ -133,8 +132,8 @@ class Windows(eqx.Module):
     def only(self, which: np.ndarray) -> "Windows":
         """Some of the windows."""
         per_window = self.torque, self.measured, self.time, self.start, self.rest
-        # without a compiled program for each length
-        torque, measured, time, start, rest = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[which]), per_window)
+        # by NumPy: without a compiled program for each length
+        torque, measured, time, start, rest = jax.tree.map(lambda x: np.asarray(x)[which], per_window)
         weight = None if self.weight is None else self.weight[which]
         return Windows(torque, measured, time, start, self.noise, rest, self.gain, weight)
 
@@ -142,13 +141,13 @@ class Windows(eqx.Module):
         """With windows of no weight at the end, so that compiled programs serve records of several lengths."""
         own = len(self.time)
         which = np.minimum(np.arange(count), own - 1)
-        return dataclasses.replace(self.only(which), weight=jnp.asarray((np.arange(count) < own).astype(float)))
+        return dataclasses.replace(self.only(which), weight=(np.arange(count) < own).astype(float))
 
     @staticmethod
     def join(parts: Sequence["Windows"]) -> "Windows":
         """Windows of several parts of a record, with the noise and gain of the first."""
         per_window = [(one.torque, one.measured, one.time, one.start, one.rest) for one in parts]
-        torque, measured, time, start, rest = jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *per_window)
+        torque, measured, time, start, rest = jax.tree.map(lambda *x: np.concatenate(x), *per_window)
         return Windows(torque, measured, time, start, parts[0].noise, rest, parts[0].gain)
 
 
@@ -518,20 +517,17 @@ def cut(
     """
     count = len(torque) // samples
     standing = np.arange(count) == (0 if rest else -1)
-    # where nothing is traced by numpy: no program is compiled for each length
-    traced = any(isinstance(one, Tracer) for one in jax.tree.leaves((torque, measured, start)))
-    numpy: Any = jnp if traced else np
-    start = jax.tree.map(lambda x: jnp.asarray(numpy.asarray(x)[: count * samples : samples]), start)
-    still = jax.tree.map(lambda x: jnp.asarray(numpy.where(standing, 0.0, x)), start.velocity)
+    start = jax.tree.map(lambda x: np.asarray(x)[: count * samples : samples], start)
+    still = jax.tree.map(lambda x: np.where(standing, 0.0, x), start.velocity)
 
-    def split(values: Any) -> Array:
-        return jnp.asarray(numpy.asarray(values)[: count * samples].reshape(count, samples))
+    def split(values: Any) -> Any:
+        return np.asarray(values)[: count * samples].reshape(count, samples)
 
     return Windows(
         torque=split(torque),
         measured={side: split(values) for side, values in measured.items()},
-        time=jnp.asarray(first + period * samples * np.arange(count)),
+        time=first + period * samples * np.arange(count),
         start=PlantState(start.position, still, start.effects),
-        noise={side: jnp.asarray(value, float) for side, value in noise.items()},
-        rest=jnp.asarray(standing),
+        noise={side: np.asarray(value, float) for side, value in noise.items()},
+        rest=standing,
     )

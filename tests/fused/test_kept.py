@@ -20,19 +20,21 @@ jax.config.update("jax_enable_x64", True)
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.fused.single_plant import path
-from jaxbl.identification import smoother
+from jaxbl.diagnosis import candidates
 
 traced = []
-smoother._fit, fit = lambda *given: traced.append(1) or fit(*given), smoother._fit
+candidates.effect_path, found = lambda *given: traced.append(1) or found(*given), candidates.effect_path
 time = np.arange(200) * 1e-3
-found = smoother._scanned(jnp.asarray(np.sin(9.0 * time) + 1e-4 * np.cos(1e3 * time)), jnp.asarray(1e-3), None)
 study = {"title": "t", "drive": {"kind": "rigid", "motor_inertia": 0.05, "motor_viscous": 0.1},
          "excitation": {"kind": "sine", "amplitude": 1.0, "frequency": 2.0}, 
          "observer": {"motor": {"lambda": 9.0, "alpha": 90.0}},
          "run": {"duration": 1.0}}
 model = as_arrays(prepare(read_config(study)), float)
 states = path(model, model.plant.init(model.initial), np.sin(5.0 * time))
-print(len(traced), repr(float(found.jerk)), repr(float(np.sum(states.position["motor"]))))
+motion = [{"motor": np.sin(9.0 * time)}] * 3
+part = candidates.Part(time, time, None, *motion, None, None, None, None, None, None, None, None)
+needed = candidates._needed(model, part)["motor"]
+print(len(traced), repr(float(np.sum(needed))), repr(float(np.sum(states.position["motor"]))))
 """
 
 

@@ -1,5 +1,6 @@
 """From a log to numbers with intervals: made logs whose truth is known, and a real machine."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from measured import EMPS, XL330, real
@@ -7,7 +8,9 @@ from small_study import rigid, small
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
+from jaxbl.identification import observer_gains
 from jaxbl.identification.identify import identify
+from jaxbl.observer.conditions import least_lambda_exact
 from jaxbl.report.identify import write_identification_report
 from jaxbl.sweeps.trial import run
 
@@ -304,3 +307,9 @@ def test_xl330_pendulum_swings_freely():
     assert any("taken to move freely" in note for note in found.summary["notes"])
     # of the inertia m l² = 0.0049 kg m², a mass point: gravity pulls less, as the servo's own inertia adds to it
     assert 0.3 < parameters["effects.load.gravity.torque"]["value"] < 0.49 * 0.1 * 9.81
+
+
+def test_the_least_lambda_of_the_gains_that_are_tried_is_that_of_the_condition():
+    alpha, bound = 7.3 * observer_gains._ALPHA, 7.3
+    least = least_lambda_exact(jnp.asarray(alpha), jnp.full(len(alpha), bound))
+    np.testing.assert_allclose(np.sqrt(bound) * observer_gains._LEAST_LAMBDA, least, rtol=1e-13)

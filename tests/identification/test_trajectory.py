@@ -107,17 +107,16 @@ def test_agrees_with_one_least_squares_problem_over_parameters_and_states():
     np.testing.assert_allclose(np.sqrt(np.diag(plain)), deviation, rtol=0.02)
 
 
+def realisations(torque, states, noise, keys, samples, period=PERIOD):
+    """Windows of one motion under several realisations of the noise, with a leading axis."""
+    seen = jax.vmap(lambda key: noisy(states, noise, key))(keys)
+    each = [windows_of(torque, {s: x[i] for s, x in seen.items()}, noise, samples, period) for i in range(len(keys))]
+    return jax.tree.map(lambda *x: np.stack(x), *each)
+
+
 @jit
-def _many(experiment, free, torque, states, keys):
-    """Numbers found from one motion under several realisations of the noise, and their covariances."""
-    noise = {"motor": 3e-4, "load": 6e-5}
-
-    def one(key):
-        windows = windows_of(torque, noisy(states, noise, key), noise, 300)
-        found = fit(experiment, free, windows, 0.03 * jax.random.normal(jax.random.fold_in(key, 1), (len(free),)), 25)
-        return found.theta, spread(found).covariance
-
-    return jax.vmap(one)(keys)
+def _fits(experiment, free, windows, starts, steps):
+    return jax.vmap(lambda one, start: fit(experiment, free, one, start, steps))(windows, starts)
 
 
 @pytest.mark.slow
@@ -127,7 +126,14 @@ def test_intervals_cover_the_truth_as_often_as_they_say(kind):
     experiment = drive(6)
     torque, states = map(jnp.asarray, recorded(kind, 600))
     free = free_parameters(experiment, list(TRUE), 1.0)
-    theta, covariance = _many(experiment, free, torque, states, jax.random.split(jax.random.key(7), 200))
+    keys = jax.random.split(jax.random.key(7), 200)
+    windows = realisations(torque, states, {"motor": 3e-4, "load": 6e-5}, keys, 300)
+    starts = 0.03 * jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, 1), (len(free),)))(keys)
+    found = _fits(experiment, free, windows, starts, 25)
+    theta, covariance = (
+        found.theta,
+        np.stack([spread(jax.tree.map(lambda x, i=i: x[i], found)).covariance for i in range(200)]),
+    )
     deviation = np.sqrt(np.einsum("rii->ri", covariance))
     covered = np.mean(np.abs(theta / deviation) < 1.96, axis=0)
     assert np.all((covered >= 0.92) & (covered <= 0.98)), covered
@@ -145,11 +151,6 @@ def test_the_gap_at_1_khz_by_the_fit_and_by_the_chain_of_the_paper():
     experiment = drive(3, period, **tables)
     free = free_parameters(experiment, list(TRUE), 1.0)
 
-    def by_fit(key):
-        return fit(
-            experiment, free, windows_of(torque, noisy(states, noise, key), noise, 500, period), jnp.zeros(6), 20
-        ).theta
-
     def by_chain(key):
         def last(state, signals):
             return experiment.identifier.estimate(state.identifier, experiment.transmission)
@@ -157,7 +158,8 @@ def test_the_gap_at_1_khz_by_the_fit_and_by_the_chain_of_the_paper():
         return replay(experiment, jnp.asarray(torque), noisy(states, noise, key), record=last, every=len(torque) - 1)[1]
 
     keys = jax.random.split(jax.random.key(11), 40)
-    fitted = jnp.exp(jit(jax.vmap(by_fit))(keys)) - 1.0
+    windows = realisations(torque, states, noise, keys, 500, period)
+    fitted = jnp.exp(_fits(experiment, free, windows, jnp.zeros((40, 6)), 20).theta) - 1.0
     assert np.abs(fitted[:, 5]).max() < 0.005, fitted[:, 5]
     chain = jax.tree.map(lambda x: x[:, -1], jit(jax.vmap(by_chain))(keys))
     size = {
