@@ -60,7 +60,8 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
     read = np.stack([padded(segment.readings[side]) - states[side][:, 0] for side in sides], axis=1)
     time, torque = padded(segment.time), padded(segment.torque)
     smooth: list[Any] = [{side: states[side][:, i] for side in sides} for i in range(3)]
-    along = Path(time, torque, *smooth[:2])
+    driven: list[Any] = [time, torque, *smooth[:2]]
+    along = Path(*driven)
     effects = effect_states(experiment, along)
     motion = PlantState(smooth[0], smooth[1], jax.tree.map(np.asarray, effects))
     # by side, not by name
@@ -81,7 +82,8 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
         defect[: count - 1] = value[: count - 1] - vectors[1:count]
     a, b, own = np.split(slope, (len(order), len(order) + each + 1), axis=2)
     weight = (np.arange(size) < count).astype(float)
-    return Part(time, torque, read, *smooth, modelled, deviation, held, a, b, own, defect, weight)
+    given: list[Any] = [time, torque, read, *smooth, modelled, deviation, held, a, b, own, defect, weight]
+    return Part(*given)
 
 
 def _directions(

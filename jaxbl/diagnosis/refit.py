@@ -15,10 +15,10 @@ import numpy as np
 
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import path
-from jaxbl.identification.intervals import spread
+from jaxbl.identification.intervals import spread_of
 from jaxbl.identification.regression import settled
 from jaxbl.identification.segments import Segment
-from jaxbl.identification.trajectory import Fit, Free, with_fitted
+from jaxbl.identification.trajectory import Free, with_fitted
 from jaxbl.simulate import Experiment
 
 from .linearised_model import Linear, Predictor
@@ -147,14 +147,10 @@ class _Refiner:
             rest = flat[:, : 1 + own] - basis @ (basis.T @ flat[:, : 1 + own])
             residual.append(rest[:, 0].reshape(-1, sides))
             jacobian.append(rest[:, 1:].reshape(-1, sides, own))
-        fit = Fit(
-            point.theta, PlantState(dict.fromkeys(self.experiment.sides, np.zeros(1)), {}, ()),
-            np.concatenate(residual)[None], np.concatenate(jacobian)[None], np.zeros(()), np.ones((), bool),
-        )  # fmt: skip
-        found = spread(fit)
+        found = spread_of(np.concatenate(residual)[None], np.concatenate(jacobian)[None], 2 * sides)
         # samples that only fill up
-        real = linear.count / fit.residual[0, :, 0].size
-        information, sandwich = real * np.asarray(found.information), np.asarray(found.covariance)
+        real = linear.count / sum(map(len, residual))
+        information, sandwich = real * found.information, found.covariance
         prior = np.diag(self.width**-2.0)
         inverse = np.linalg.inv(information + prior)
         return inverse @ (information @ sandwich @ information + prior) @ inverse, inverse

@@ -159,11 +159,11 @@ class _Equation(NamedTuple):
         by_position, by_velocity: derivatives of the modelled torque by the positions and velocities.
     """
 
-    inertia: Float[Array, ""]
-    taken: Float[Array, " samples"]
-    modelled: Float[Array, " samples"]
-    beyond: Float[Array, " samples"]
-    friction: Float[Array, " samples"]
+    inertia: Any
+    taken: Any
+    modelled: Any
+    beyond: Any
+    friction: Any
     by_position: dict[str, Float[Array, " samples"]]
     by_velocity: dict[str, Float[Array, " samples"]]
 

@@ -108,7 +108,7 @@ def _initialise() -> None:
     try:
         from jaxlib import lapack
 
-        lapack._lapack.initialize()
+        lapack._lapack.initialize()  # pyright: ignore[reportPrivateImportUsage]
     except (ImportError, AttributeError):  # of another version: by lowering one
         jax.jit(jnp.linalg.cholesky).lower(jnp.eye(2))
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.special import chdtri, ndtri
 
 from jaxbl.simulate import Experiment
@@ -39,17 +39,20 @@ class Spread(NamedTuple):
         inflation: factor on the standard errors by the correlation of the residuals, shape (parameters,).
     """
 
-    covariance: Float[Array, "parameters parameters"]
-    information: Float[Array, "parameters parameters"]
-    variance: Float[Array, ""]
-    inflation: Float[Array, " parameters"]
+    covariance: Float[np.ndarray, "parameters parameters"]
+    information: Float[np.ndarray, "parameters parameters"]
+    variance: float | np.floating
+    inflation: Float[np.ndarray, " parameters"]
 
 
 def spread(fit: Fit) -> Spread:
     """Covariance of theta by the sandwich J+ E[r r^T] J+^T, the middle by Newey and West with Andrews' bandwidth."""
-    jacobian, residual = np.asarray(fit.jacobian, float), np.asarray(fit.residual, float)
+    return spread_of(np.asarray(fit.residual, float), np.asarray(fit.jacobian, float), 2 * len(fit.start.position))
+
+
+def spread_of(residual: np.ndarray, jacobian: np.ndarray, states: int) -> Spread:
+    """The same of residuals, their derivatives (shapes as of a fit), and the number of a window's initial states."""
     windows, samples, _, parameters = jacobian.shape
-    states = sum(1 for _ in fit.start.position) * 2
     freedom = residual.size - parameters - windows * states
     flat = jacobian.reshape(-1, parameters)
     normal = flat.T @ flat

@@ -10,9 +10,8 @@ References: Y. Bar-Shalom, X.-R. Li, T. Kirubarajan, Estimation with Application
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
-from jaxbl.drive.parameters import Scalar
 from jaxbl.fused.steps import stepped
 
 _SMOOTHNESS = 1e-14, 1e4
@@ -38,29 +37,29 @@ class Smoothed(NamedTuple):
         innovations: one-step prediction errors over their standard deviations; white where the model holds.
     """
 
-    state: Float[Array, "samples 3"]
-    covariance: Float[Array, "samples 3 3"]
-    noise: Float[Array, ""]
-    jerk: Float[Array, ""]
-    innovations: Float[Array, " samples"]
+    state: Float[np.ndarray, "samples 3"]
+    covariance: Float[np.ndarray, "samples 3 3"]
+    noise: float | np.floating
+    jerk: float | np.floating
+    innovations: Float[np.ndarray, " samples"]
 
     @property
-    def position(self) -> Float[Array, " samples"]:
+    def position(self) -> Float[np.ndarray, " samples"]:
         return self.state[:, 0]
 
     @property
-    def velocity(self) -> Float[Array, " samples"]:
+    def velocity(self) -> Float[np.ndarray, " samples"]:
         return self.state[:, 1]
 
     @property
-    def acceleration(self) -> Float[Array, " samples"]:
+    def acceleration(self) -> Float[np.ndarray, " samples"]:
         return self.state[:, 2]
 
-    def deviation(self, order: int) -> Float[Array, " samples"]:
+    def deviation(self, order: int) -> Float[np.ndarray, " samples"]:
         """Standard deviation of the position (0), velocity (1) or acceleration (2)."""
         return self.covariance[:, order, order] ** 0.5
 
-    def held(self, period: float | Float[Array, ""]) -> Bool[Array, " samples"]:
+    def held(self, period: float) -> Bool[np.ndarray, " samples"]:
         """Where the position is not shown to move for a while: dry friction may hold it there.
 
         Neither velocity nor acceleration stands out of the velocity's noise, the latter over the smoother's time constant.
@@ -210,7 +209,7 @@ def _smoothed(position: Any, smoothness: Any, noise: Any, period: Any) -> Smooth
     return Smoothed(state, covariance * np.outer(unit, unit)[None], noise, jerk, innovations)
 
 
-def _fit(position: np.ndarray) -> tuple[np.float64, np.float64]:
+def _fit(position: np.ndarray) -> tuple[Any, Any]:
     """Smoothness q h^5 / sigma^2 and sigma of largest likelihood."""
     unit = _unit(position)
     scaled = (position - position[0]) / unit
@@ -221,9 +220,7 @@ def _fit(position: np.ndarray) -> tuple[np.float64, np.float64]:
     return np.exp(0.5 * (low + high)), noise * unit
 
 
-def smooth(
-    position: Float[Array, " samples"], period: float | Scalar, *, known: tuple[Scalar, Scalar] | None = None
-) -> Smoothed:
+def smooth(position: Float[np.ndarray, " samples"], period: float, *, known: tuple[Any, Any] | None = None) -> Smoothed:
     """Smooth one evenly sampled position channel.
 
     Args:

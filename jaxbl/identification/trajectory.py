@@ -180,7 +180,7 @@ class Fit(eqx.Module):
         return dataclasses.replace(self, theta=theta, jacobian=jacobian)
 
 
-def with_fitted(experiment: Experiment, free: Sequence[Free], theta: Float[Array, " parameters"]) -> Experiment:
+def with_fitted(experiment: Experiment, free: Sequence[Free], theta: Array | np.ndarray) -> Experiment:
     """The experiment with fitted numbers."""
     return set_leaves(experiment, {one.path: one.value(theta[i]) for i, one in enumerate(free)})
 
@@ -526,8 +526,8 @@ def cut(
     return Windows(
         torque=split(torque),
         measured={side: split(values) for side, values in measured.items()},
-        time=first + period * samples * np.arange(count),
+        time=first + period * samples * np.arange(count),  # pyright: ignore[reportArgumentType]
         start=PlantState(start.position, still, start.effects),
-        noise={side: np.asarray(value, float) for side, value in noise.items()},
+        noise={side: np.asarray(value, float) for side, value in noise.items()},  # pyright: ignore[reportArgumentType]
         rest=standing,
     )

@@ -6,9 +6,10 @@ P. D. Welch, The use of fast Fourier transform for the estimation of power spect
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-from scipy.linalg.blas import dtbsv
+from scipy.linalg import blas
 
 
 def filtered(values: np.ndarray, numerator: Sequence[float], denominator: Sequence[float]) -> np.ndarray:
@@ -29,7 +30,8 @@ def filtered(values: np.ndarray, numerator: Sequence[float], denominator: Sequen
     bands = np.ones((len(denominator) + 1, count), order="F")
     bands[1:] = np.asarray(denominator)[:, None]
     columns = driven.reshape(count, -1).T
-    solved = [dtbsv(len(denominator), bands, np.ascontiguousarray(one), lower=1, diag=1) for one in columns]
+    solve: Any = blas.dtbsv  # pyright: ignore[reportAttributeAccessIssue]
+    solved = [solve(len(denominator), bands, np.ascontiguousarray(one), lower=1, diag=1) for one in columns]
     return np.stack(solved, axis=1).reshape(driven.shape) + steady
 
 

@@ -87,7 +87,8 @@ def subplots(
 ) -> tuple[Figure, list[Axes]]:
     """A figure of so many inches, and its axes row by row; `beside`: with colour bars or legends beside the axes; `how` is
     matplotlib's."""
-    figure = Figure(figsize=(width, height), layout="constrained" if beside else "none")
+    layout: Any = "constrained" if beside else "none"
+    figure = Figure(figsize=(width, height), layout=layout)
     axes = figure.subplots(rows, columns, squeeze=False, **how).ravel().tolist()
     if columns == 1:
         figure.align_ylabels(axes)
