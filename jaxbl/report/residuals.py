@@ -117,7 +117,7 @@ def _over_coordinates(
         ax.locator_params(axis="x", nbins=5)
         ax.set_xlabel(with_unit(f"{one.name} {one.symbol}".rstrip(), one.unit))
         ax.set_title(
-            f"explains {100.0 * one.explained:.0f} %", loc="left", fontsize=10,
+            f"explains {100.0 * one.explained:.0f} %\n", loc="left", fontsize=10,
             fontweight="bold" if one is best and one.explained > 0.0 else "normal",
         )  # fmt: skip
     axes[0].set_ylabel(with_unit(f"{found.name}: missing {missing_quantity(unit)}", unit))
