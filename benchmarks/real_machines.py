@@ -84,9 +84,23 @@ def _compare(row: Row, case: Case, task, model, rivals: bool) -> None:
     speed = max(float(np.max(np.abs(one.kinematics.velocity["motor"]))) for one in fitted)
     travel = max(float(np.ptp(one.kinematics.position["motor"])) for one in fitted)
     terms, other = (terms_of(parts, task.config, linear, (speed, travel)) for parts in (fitted, held))
+    others = []
     for name, tool in (("stepwise", stepwise), ("pysindy", sindy)):
         found = tool(terms, other)
         row.rivals[name], row.torques[name] = found.said(), found.rms
+        others += [found.left] if found.rms is not None else []
+    if "jaxbl" in errors and others:
+        row.margin = _margin(errors["jaxbl"], min(others, key=lambda one: float(np.mean(one**2))))
+
+
+_BLOCKS = 16
+"""Of held-out data: many enough for a standard error."""
+
+
+def _margin(own: np.ndarray, other: np.ndarray) -> float:
+    """Standard errors by which the squares of errors are less than those of another tool."""
+    gains = np.array([np.mean(block) for block in np.array_split(other**2 - own**2, _BLOCKS)])
+    return float(np.mean(gains) / max(np.std(gains, ddof=1) / np.sqrt(_BLOCKS), 1e-300))
 
 
 def _driving(parts: list[Part], inertia: float) -> float:

@@ -28,6 +28,7 @@ class Row:
         torques: held-out torque errors of all tools behind one low-pass, rms, N m (N).
         driving: what they are compared with: rms of the input on the held-out part, or of inertia times acceleration.
         rivals: what they say.
+        margin: standard errors (16 blocks of held-out data) by which the squared error of jaxbl is below the best other's.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Row:
     torques: dict[str, float | None] = field(default_factory=dict)
     driving: float = 0.0
     rivals: dict[str, Any] = field(default_factory=dict)
+    margin: float | None = None
 
 
 def row_of(case: Case) -> Row:
@@ -94,6 +96,13 @@ def _errors(row: Row, kind: str) -> str:
     return "<br>".join(lines)
 
 
+_REASONS = {
+    "chance": "control: shuffled torque", "remainder": "search: a rest", "powerless": "the model as given passes",
+    "little": "less than half of the missing torque", "contradicting": "logs contradict each other",
+}  # fmt: skip
+"""Reasons against a verdict, beside errors."""
+
+
 def markdown(rows: Sequence[Row], rivals: bool) -> str:
     """All rows as tables."""
     lines = ["| recordings | verdict | explained | named by jaxbl, and its numbers | published | s |"]
@@ -121,7 +130,7 @@ def markdown(rows: Sequence[Row], rivals: bool) -> str:
     for one in done:
         test = one.summary["gap"]["test"]
         why = [*test["failed"], *test["far"]]
-        why += [text for key, text in (("chance", "control: shuffled torque"), ("remainder", "search: a rest")) if test[key]]
+        why += [text for key, text in _REASONS.items() if test[key]]
         lines.append(f"| {one.name} | {_errors(one, 'theta')} | {_errors(one, 'torque')} | {', '.join(why) or 'none'} |")
     lines += ["", *_compared(rows, rivals)]
     return "\n".join(lines)
@@ -131,12 +140,15 @@ def _compared(rows: Sequence[Row], rivals: bool) -> list[str]:
     some = [one for one in rows if one.torques]
     tools = TOOLS if rivals else TOOLS[:2]
     lines = ["Held-out torque error of the motor side behind one low-pass, rms, and its share of the driving torque:", ""]
-    lines += [f"| recordings | low-pass | {' | '.join(tools)} |", f"|---|---:|{'---:|' * len(tools)}"]
+    margin = [" against the best other |", "---:|"] if rivals else ["", ""]
+    lines += [f"| recordings | low-pass | {' | '.join(tools)} |{margin[0]}", f"|---|---:|{'---:|' * len(tools)}{margin[1]}"]
     for one in some:
         cells = []
         for tool in tools:
             value = one.torques.get(tool)
             cells.append("–" if value is None else f"{value:.4g} {one.unit} ({value / one.driving:.1%})")
+        if rivals:
+            cells.append("–" if one.margin is None else f"{one.margin:+.1f} standard errors")
         lines.append(f"| {one.name} | {one.cutoff:g} Hz | {' | '.join(cells)} |")
     if rivals:
         lines += ["", "| recordings | stepwise least squares | pysindy |", "|---|---|---|"]
