@@ -409,6 +409,9 @@ class EffectSearch:
         """The model without one of its effects, all numbers refitted, if the effect gains nothing beside the others, and
         these do not become something else to stand for it: friction over a long way is a spring."""
         full = self.refit(numbers, theta, predictor)
+        # no refit where the loss would be far too large even if others could take half of it over
+        if 0.5 * _linear_loss(full.linear, name, predictor) > self.floor + CLEAR:
+            return None
         less = self.refit({one: values for one, values in numbers.items() if one != name}, theta, predictor)
         return less if self._gain(less, full) <= 0.0 and not _changed(full, less) else None
 
@@ -605,6 +608,33 @@ def _changed(before: Model, after: Model) -> bool:
             if not then <= _SAME * now <= _SAME**2 * then:
                 return True
     return False
+
+
+def _linear_loss(linear: Linear, name: str, predictor: Predictor) -> float:
+    """Log-likelihood that a linearised model would lose without the torque of one of its effects, all other numbers at their
+    best (nats); 0 where it has no number that its torque is proportional to."""
+    gone = np.array([one.role == "size" and _owner(one)[0] == name for one in linear.free])
+    columns = linear.columns((), predictor.smoothness, predictor.deviation)
+    scale = columns.scale[1:]
+    if not gone.any() or not np.isfinite(scale[gone]).all() or not np.max(np.abs(columns.products)) < DIVERGED:
+        return 0.0
+    precision = np.where(gone, 0.0, scale**-2.0)
+    matrix = columns.products[1:, 1:] + np.diag(precision)
+    towards = columns.products[1:, 0] - precision * columns.centre[1:]
+    change = np.array(
+        [-float(one.value(at)) / float(one.slope(at)) for one, at in zip(linear.free, linear.theta, strict=True)]
+    )
+
+    def least(free: np.ndarray) -> float:
+        fixed = np.where(free, 0.0, change)
+        at = (towards + matrix @ fixed)[free]
+        gained = at @ np.linalg.lstsq(matrix[np.ix_(free, free)], at, rcond=1e-12)[0]
+        return float(columns.products[0, 0] + 2.0 * towards @ fixed + fixed @ matrix @ fixed - gained)
+
+    alive = np.isfinite(scale)
+    errors = linear.count * len(linear.sides)
+    with_it, without = least(alive), least(alive & ~gone)
+    return 0.5 * errors * float(np.log(without / with_it)) if 0.0 < with_it < without else 0.0
 
 
 def _verdict(left: float, findings: Sequence[Finding]) -> VerdictName:
