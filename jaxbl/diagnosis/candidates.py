@@ -175,6 +175,8 @@ class MotionTorques:
         self.sides = experiment.sides
         self.count = len(part.time)
         self.real = np.asarray(part.weight) > 0.0
+        # what is behind them only fills up
+        self.samples = int(np.sum(self.real))
         self.torque = np.asarray(part.torque)
         # what torques along the motion need, of one shape whatever numbers are free
         self.moving = dataclasses.replace(part, step=None, force=None, own=None, defect=None)
@@ -229,7 +231,7 @@ class MotionTorques:
                 for row, i in enumerate(some):
                     found[i] = np.zeros((self.count, len(self.sides) + 1))
                     for at, one in torques.items():
-                        found[i][self.real, at] = one[row][self.real]
+                        found[i][: self.samples, at] = one[row, : self.samples]
         return found
 
 

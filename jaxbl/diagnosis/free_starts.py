@@ -57,8 +57,7 @@ class _Model(NamedTuple):
         """Derivative of the residual by the initial states, shape (windows, samples, sides, states)."""
         w, shape = self.windows, jax.tree.structure(self.windows.start)
         count, (runs, samples) = len(states), states[0].shape
-        zero = jax.tree.map(lambda _: 0.0, self.experiment)
-        ways = [Direction(zero, shape.unflatten(list(row)), 0.0) for row in np.eye(count)]
+        ways = [Direction(state=row) for row in np.eye(count).tolist()]
         time = w.time[which][:, None] + float(self.experiment.run.sample_period) * np.arange(samples)
         flat = shape.unflatten([one.ravel() for one in states])
         varying = {path: values[which].ravel() for path, values in self.varying.items()}

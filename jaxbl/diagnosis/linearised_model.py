@@ -70,7 +70,7 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
     order += range(2 * each, len(jax.tree.leaves(motion)))
     # as they may differ from sample to sample elsewhere, where the same loop serves
     none = {path: np.zeros(size) for path in added.values()}
-    ways = _directions(experiment, free, theta, motion, order, list(added.values()))
+    ways = _directions(free, theta, len(order), order, list(added.values()))
     slope, value = slopes(experiment, motion, torque, time, ways, none)
     slope, value = slope[:, order].transpose(2, 1, 0), value[order].T
     vectors = np.stack(jax.tree.leaves(motion), axis=1)[:, order]
@@ -87,29 +87,14 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
 
 
 def _directions(
-    experiment: Experiment,
-    free: Sequence[Free],
-    theta: np.ndarray,
-    motion: PlantState,
-    order: Sequence[int],
-    added: Sequence[str],
+    free: Sequence[Free], theta: np.ndarray, states: int, order: Sequence[int], added: Sequence[str]
 ) -> list[Direction]:
     """Each state, torque on each side (`added`: their paths), input, each free number."""
-    leaves, structure = jax.tree.flatten(experiment)
-    places, shape = structure.unflatten(range(len(leaves))), jax.tree.structure(motion)
-
-    def direction(number: tuple[int, float] = (0, 0.0), state: int = -1, torque: float = 0.0) -> Direction:
-        numbers = np.zeros(len(leaves))
-        numbers[number[0]] = number[1]
-        states = [float(i == state) for i in range(shape.num_leaves)]
-        return Direction(structure.unflatten(list(numbers)), shape.unflatten(states), torque)
-
-    numbers = [(get_leaf(places, one.path), float(one.slope(at))) for one, at in zip(free, theta, strict=True)]
     return [
-        *(direction(state=i) for i in order),
-        *(direction((get_leaf(places, path), -1.0)) for path in added),
-        direction(torque=1.0),
-        *(direction(one) for one in numbers),
+        *(Direction(state=row) for row in np.eye(states)[list(order)].tolist()),
+        *(Direction({path: -1.0}) for path in added),
+        Direction(torque=1.0),
+        *(Direction({one.path: float(one.slope(at))}) for one, at in zip(free, theta, strict=True)),
     ]
 
 
@@ -259,13 +244,14 @@ class Predictor:
         bound = np.concatenate([linear.bound, np.full(width - own, np.inf)])
         for turn in range(2):
             weighted = [np.einsum("s,scd->cd", weight, one) for one in grams]
-            total = np.sum([_eliminated(one, states) for one in weighted], axis=0)
+            each = [_response_and_loss(one, states) for one in weighted]
+            total = np.sum([_without(one, states, by) for one, (by, _) in zip(weighted, each, strict=True)], axis=0)
             variance = 1.0 if turn else max(total[0, 0] / (count * sides), 1e-300)
-            lost = sum(_lost(one, states) for one in weighted) / variance
+            lost = sum(one for _, one in each) / variance
             if lost > _LOST or total[0, 0] < 0.0 or np.min(np.diag(total)[1:], initial=0.0) < 0.0:
                 return
             free = np.concatenate([[1.0], _least_squares(total, variance / prior**2, centre, bound * prior)])
-            coefficients = [np.concatenate([free, -_response(one, states) @ free]) for one in weighted]
+            coefficients = [np.concatenate([free, -by @ free]) for by, _ in each]
             left = [np.einsum("c,scd,d->s", at, one, at) for at, one in zip(coefficients, grams, strict=True)]
             squares = np.sum(left, axis=0)
             if not (squares > 0.0).all():
@@ -620,25 +606,31 @@ def _as_it_stands(grams: np.ndarray, states: int) -> np.ndarray:
     return np.einsum("c,scd,d->s", at, grams, at)
 
 
-def _lost(gram: np.ndarray, states: int) -> float:
-    """What rounding may take off the square of the first column when the initial states are eliminated."""
-    unit, size = _influence(gram, states)
-    real = np.isfinite(size)
-    if not real.any():
-        return 0.0
-    spread = np.abs(np.linalg.eigvalsh(unit[np.ix_(real, real)]))
-    return float(np.finfo(float).eps * gram[0, 0] * spread[-1] / max(spread[0], 1e-300))
-
-
 def _response(gram: np.ndarray, states: int) -> np.ndarray:
     """What the initial states, which may be all but alike, take off the other columns."""
+    return _response_and_loss(gram, states)[0]
+
+
+def _response_and_loss(gram: np.ndarray, states: int) -> tuple[np.ndarray, float]:
+    """What the initial states, which may be all but alike, take off the other columns; and what rounding may take off the
+    square of the first column with it."""
     if not np.isfinite(gram[-states:, -states:]).all():  # of a model that diverges
-        return np.zeros_like(gram[-states:, :-states])
+        return np.zeros_like(gram[-states:, :-states]), 0.0
     unit, size = _influence(gram, states)
-    inverse = np.linalg.pinv(unit, rcond=1e-12, hermitian=True)
-    return (inverse @ (gram[-states:, :-states] / size[:, None])) / size[:, None]
+    values, vectors = np.linalg.eigh(unit)
+    largest = np.max(np.abs(values))
+    kept = np.abs(values) > 1e-12 * largest
+    inverse = (vectors * np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)) @ vectors.T
+    response = (inverse @ (gram[-states:, :-states] / size[:, None])) / size[:, None]
+    # a state without influence has a zero of its own among these
+    least = np.sort(np.abs(values))[np.sum(~np.isfinite(size))] if np.isfinite(size).any() else largest
+    return response, float(np.finfo(float).eps * gram[0, 0] * largest / max(least, 1e-300)) if largest > 0.0 else 0.0
+
+
+def _without(gram: np.ndarray, states: int, response: np.ndarray) -> np.ndarray:
+    return gram[:-states, :-states] - gram[:-states, -states:] @ response
 
 
 def _eliminated(gram: np.ndarray, states: int) -> np.ndarray:
     """Products of columns without what the last of them, the initial states, explain."""
-    return gram[:-states, :-states] - gram[:-states, -states:] @ _response(gram, states)
+    return _without(gram, states, _response(gram, states))

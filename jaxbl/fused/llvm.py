@@ -154,7 +154,7 @@ class Loop:
 
     def __call__(
         self,
-        arrays: "Arrays | Sequence[np.ndarray]",
+        arrays: "Arrays | Sequence[np.ndarray | Numbers]",
         steps: int,
         first: int,
         last: int,
@@ -173,16 +173,38 @@ class Loop:
         self._call(ctypes.addressof(given.addresses), steps, first, last, begins, ends)
 
 
+class Numbers(NamedTuple):
+    """In the place of as many arrays of one number each: a vector of float64."""
+
+    vector: np.ndarray
+
+
 class Arrays:
     """Arrays for a loop, which reads where they lie: checked against its signature for so many samples and lanes."""
 
-    def __init__(self, signature: Sequence[Argument], arrays: Sequence[np.ndarray], steps: int, lanes: int):
-        if len(arrays) != len(signature):
-            raise ValueError(f"a loop needs {len(signature)} arrays, not {len(arrays)}")
-        for one, array in zip(signature, arrays, strict=True):
-            one.check(array, steps, lanes)
+    def __init__(self, signature: Sequence[Argument], arrays: "Sequence[np.ndarray | Numbers]", steps: int, lanes: int):
+        count = sum(len(one.vector) if isinstance(one, Numbers) else 1 for one in arrays)
+        if count != len(signature):
+            raise ValueError(f"a loop needs {len(signature)} arrays, not {count}")
+        addresses: list[int] = []
+        for array in arrays:
+            at = len(addresses)
+            if isinstance(array, Numbers):
+                begin = _address(array.vector)
+                addresses += range(begin, begin + array.vector.nbytes, array.vector.itemsize)
+                dtype = array.vector.dtype
+                wrong = [one for one in signature[at : len(addresses)] if one.holds != "one" or one.dtype != dtype]
+                if wrong or not array.vector.flags.c_contiguous:
+                    raise ValueError(f"{wrong[0].name if wrong else 'numbers'} of a loop is none of contiguous numbers")
+            else:
+                signature[at].check(array, steps, lanes)
+                addresses.append(_address(array))
         self.steps, self.lanes, self._kept = steps, lanes, list(arrays)
-        self.addresses = (ctypes.c_void_p * len(arrays))(*[x.__array_interface__["data"][0] for x in arrays])
+        self.addresses = (ctypes.c_void_p * count)(*addresses)
+
+
+def _address(array: np.ndarray) -> int:
+    return array.__array_interface__["data"][0]
 
 
 class _Writer:

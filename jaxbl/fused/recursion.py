@@ -7,14 +7,13 @@ what drives each column.
 """
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any
 
 import jax
 import numpy as np
 
-from . import Unsupported, attempted, kept, say_scanned
+from . import Unsupported, attempted, in_threads, kept, say_scanned
 
 _NUMBER = jax.ShapeDtypeStruct((), np.dtype(float))
 
@@ -69,11 +68,7 @@ class Recursion:
                 self.loop([*carry, *gains, *steps, *driven, *read, *errors], count, 0, self.whole)
             return carry[:, : self.width], errors[:, :, : self.width]
 
-        if len(gains) == 1:
-            found = [one(changes[0], gains[0])]
-        else:
-            with ThreadPoolExecutor(len(jax.local_devices())) as pool:
-                found = list(pool.map(one, changes, gains))
+        found = [one(changes[0], gains[0])] if len(gains) == 1 else in_threads(one, changes, gains)
         return [change for change, _ in found], [errors for _, errors in found]
 
 

@@ -5,8 +5,7 @@ starts some twenty kernels for a step of a single plant, and passes what they co
 do (effects that read tables) is left to XLA. In float64, under `jax.enable_x64`.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, wraps
 from typing import Any, NamedTuple
 
@@ -19,18 +18,19 @@ from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.drive.plant import PlantState
 from jaxbl.simulate import Experiment, corrected, move
 
-from . import Unsupported, attempted, kept, say_scanned
+from . import Unsupported, attempted, in_threads, kept, say_scanned
 
 _FLOAT = np.dtype(float)
 _NUMBER = jax.ShapeDtypeStruct((), _FLOAT)
 
 
 class Direction(NamedTuple):
-    """In which a step's derivative is sought: changes of the experiment's leaves, of the state's, and of the input (N m)."""
+    """In which a step's derivative is sought: changes of the experiment's numbers, by dotted paths, of the state's leaves
+    (left out: none), and of the input (N m)."""
 
-    experiment: Experiment
-    state: PlantState
-    torque: float
+    numbers: Mapping[str, float] = {}
+    state: Sequence[float] = ()
+    torque: float = 0.0
 
 
 def path(
@@ -69,28 +69,26 @@ def paths(
         rows = [jax.tree.map(lambda x, i=i: jnp.asarray(x[i]), given) for i in range(runs)]
         each = [_scanned(experiment, gain, *one) for one in rows]  # pyright: ignore[reportCallIssue]
         return jax.tree.map(lambda *x: np.stack(x), *each)
-    numbers = plant.numbers(experiment)
-    gains = [np.asarray(value, float) for side in sides for value in (gain or {})[side]]
+    from .llvm import Numbers
+
+    gains = [float(value) for side in sides for value in (gain or {})[side]]
     columns = [
         np.ascontiguousarray(column, float)
         for column in (torque, *((measured or {})[side] for side in sides), *varying.values())
     ]
+    fixed = np.concatenate([plant.numbers(experiment), [0.0], gains])
+    at = len(fixed) - len(gains) - 1
     leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(starts)]
     kept, index = [np.empty((runs, samples)) for _ in leaves], np.arange(samples, dtype=np.int32)
 
     def one(i: int) -> None:
-        carry = [np.array([leaf[i]]) for leaf in leaves]
-        fixed = [*numbers, np.asarray(time[i], float), *gains]
-        loop([*carry, *fixed, index, *(column[i] for column in columns), *(rows[i] for rows in kept)], samples, 0, 1)
+        carry, own = [np.array([leaf[i]]) for leaf in leaves], fixed.copy()
+        own[at] = time[i]
+        given = Numbers(own), index, *(column[i] for column in columns), *(rows[i] for rows in kept)
+        loop([*carry, *given], samples, 0, 1)
 
-    _shared(one, range(runs))
+    in_threads(one, range(runs))
     return plant.shape.unflatten(kept)
-
-
-def _shared(function: Callable[..., None], *jobs: Iterable[Any]) -> None:
-    """Call a function for each of the jobs, in threads: loops do not hold the interpreter."""
-    with ThreadPoolExecutor(len(jax.local_devices())) as pool:
-        list(pool.map(function, *jobs))
 
 
 def slopes(
@@ -118,27 +116,35 @@ def slopes(
     loop = _slopes_loop(plant, plant.places(tuple(varying)))
     if loop is None:
         # numbers as arrays: one program for all directions
-        changes = [jax.tree.map(lambda x: jnp.asarray(x, float), one) for one in directions]
-        given = jax.tree.map(jnp.asarray, (states, torque, time, dict(varying)))
-        found = [_pushed(experiment, *given, one) for one in changes]  # pyright: ignore[reportCallIssue]
+        zeros, given = jax.tree.map(np.zeros_like, experiment), (states, torque, time, dict(varying))
+        found = []
+        for one in directions:
+            state = jax.tree.structure(states).unflatten(np.array(one.state, float) if one.state else np.zeros(len(leaves)))
+            ways = set_leaves(zeros, _arrays(one.numbers)), state, np.asarray(one.torque, float)
+            found.append(_pushed(experiment, *jax.tree.map(jnp.asarray, (*given, ways))))  # pyright: ignore[reportCallIssue]
         changes, new = [jax.tree.leaves(change) for change, _ in found], jax.tree.leaves(found[0][1])
         return np.array(changes, float), np.array(new, float)
+    from .llvm import Numbers
+
     count = len(torque)
     whole = -(-count // loop.lanes) * loop.lanes
     values = [
         np.pad(np.asarray(column, float), (0, whole - count), "edge")
         for column in (*leaves, torque, time, *varying.values())
     ]
-    numbers = plant.numbers(experiment)
+    numbers, ways = plant.numbers(experiment), plant.ways(directions)
     changes, new = np.empty((len(directions), len(leaves), whole)), np.empty((len(leaves), whole))
 
-    def along(one: Direction, change: np.ndarray) -> None:
-        fixed = [*plant.numbers(one.experiment), *jax.tree.leaves(one.state), one.torque]
+    def along(way: np.ndarray, change: np.ndarray) -> None:
         # all find the same new state
-        loop([*values, *numbers, *(np.asarray(number, float) for number in fixed), *change, *new], 1, 0, whole)
+        loop([*values, Numbers(numbers), Numbers(way), *change, *new], 1, 0, whole)
 
-    _shared(along, directions, changes)
+    in_threads(along, ways, changes)
     return changes[:, :, :count], new[:, :count]
+
+
+def _arrays(numbers: Mapping[str, float]) -> dict[str, np.ndarray]:
+    return {path: np.asarray(value, float) for path, value in numbers.items()}
 
 
 @eqx.filter_jit
@@ -167,16 +173,14 @@ def _pushed(
     torque: jax.Array,
     time: jax.Array,
     varying: dict[str, jax.Array],
-    direction: Direction,
+    direction: tuple[Experiment, PlantState, jax.Array],
 ) -> tuple[PlantState, PlantState]:
     def step(state: PlantState, torque: jax.Array, time: jax.Array, numbers: Any) -> tuple[PlantState, PlantState]:
         def moved(experiment: Experiment, state: PlantState, torque: jax.Array) -> PlantState:
             return move(experiment.plant, experiment.run, state, torque, time)
 
         given = set_leaves(experiment, numbers), state, torque
-        changes = jax.tree.map(
-            lambda one, change: jnp.broadcast_to(change, one.shape).astype(one.dtype), given, tuple(direction)
-        )
+        changes = jax.tree.map(lambda one, change: jnp.broadcast_to(change, one.shape).astype(one.dtype), given, direction)
         new, change = jax.jvp(moved, given, changes)
         return change, new
 
@@ -187,13 +191,13 @@ class _Plant(NamedTuple):
     """What loops are compiled for: experiments of one structure, shapes and types of their leaves, structure of a state."""
 
     structure: Any
-    kinds: tuple[tuple[tuple[int, ...], str], ...]
+    kinds: tuple[tuple[tuple[int, ...], np.dtype], ...]
     shape: Any
 
     @classmethod
     def of(cls, experiment: Experiment, state: PlantState) -> "_Plant":
         leaves, structure = jax.tree.flatten(experiment)
-        kinds = tuple((np.shape(leaf), str(getattr(leaf, "dtype", None) or jnp.result_type(leaf))) for leaf in leaves)
+        kinds = tuple((np.shape(leaf), getattr(leaf, "dtype", None) or np.dtype(jnp.result_type(leaf))) for leaf in leaves)
         return cls(structure, kinds, jax.tree.structure(state))
 
     @property
@@ -202,15 +206,28 @@ class _Plant(NamedTuple):
         leaves = [jax.ShapeDtypeStruct(size, dtype) for size, dtype in self.kinds]
         return self.structure.unflatten(leaves), self.shape.unflatten([_NUMBER] * self.shape.num_leaves)
 
-    def numbers(self, experiment: Experiment) -> list[np.ndarray]:
+    def numbers(self, experiment: Experiment) -> np.ndarray:
         """Those that a step reads."""
         leaves = jax.tree.leaves(experiment)
-        return [np.asarray(leaves[i], float) for i in _read(self)]
+        return np.array([float(leaves[i]) for i in _read(self)])
+
+    def ways(self, directions: Sequence[Direction]) -> np.ndarray:
+        """Changes along each direction: of the numbers that a step reads, the state's leaves, the input."""
+        paths = tuple(dict.fromkeys(path for one in directions for path in one.numbers))
+        places, read = dict(zip(paths, self.places(paths), strict=True)), {at: i for i, at in enumerate(_read(self))}
+        found = np.zeros((len(directions), len(read) + self.shape.num_leaves + 1))
+        for row, one in zip(found, directions, strict=True):
+            for path, change in one.numbers.items():
+                if places[path] in read:
+                    row[read[places[path]]] = change
+            if len(one.state):
+                row[len(read) : -1] = one.state
+            row[-1] = one.torque
+        return found
 
     def places(self, paths: tuple[str, ...]) -> tuple[int, ...]:
         """Places of numbers among the experiment's leaves, by their dotted paths."""
-        order = self.structure.unflatten(range(len(self.kinds)))
-        return tuple(get_leaf(order, path) for path in paths)
+        return _places(self, paths)
 
     def put(self, numbers: Sequence[Any], others: Mapping[int, Any]) -> Experiment:
         """The experiment with these, and with others in their places; what no step reads is zero."""
@@ -223,6 +240,12 @@ class _Plant(NamedTuple):
     def step(self, experiment: Experiment, state: Sequence[Any], torque: Any, time: Any) -> list[Any]:
         new = move(experiment.plant, experiment.run, self.shape.unflatten(state), torque, time)
         return jax.tree.leaves(new)
+
+
+@lru_cache(maxsize=256)
+def _places(plant: _Plant, paths: tuple[str, ...]) -> tuple[int, ...]:
+    order = plant.structure.unflatten(range(len(plant.kinds)))
+    return tuple(get_leaf(order, path) for path in paths)
 
 
 @lru_cache(maxsize=64)
@@ -247,7 +270,7 @@ def _found_read(plant: _Plant) -> tuple[int, ...]:
     used = {id(v) for eqn in closed.jaxpr.eqns for v in eqn.invars} | {id(v) for v in closed.jaxpr.outvars}
     read = tuple(i for i, v in enumerate(closed.jaxpr.invars[: len(leaves)]) if id(v) in used)
     for i in read:
-        if plant.kinds[i] != ((), _FLOAT.name):
+        if plant.kinds[i] != ((), _FLOAT):
             raise Unsupported(f"steps that read {plant.kinds[i]}")
     return read
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.identification.logs import unit_on
 
-from .figures import COLOURS, FAINT, MISSING, Drawn, legend, stacked, style, subplots, with_unit
+from .figures import COLOURS, FAINT, MISSING, Drawn, decades, legend, stacked, style, subplots, with_unit
 from .page import PageTable, write_log_results
 from .residuals import draw_residuals, missing_quantity, plot_torque
 
@@ -378,6 +378,7 @@ def _gap_panel(ax: Axes, gap: Mapping[str, Any], names: list[str]) -> None:
         ylim=(len(names) - 0.4, -0.6),
         xlabel="rms error on held-out data over noise",
     )
+    decades(ax, "x")
     labels = [
         f"{_CHANNELS[name]}\n{rms_text(start)} → {rms_text(gap['holdout_rmse_after'][name])} {gap['units'][name]}"
         for name, start in gap["holdout_rmse_before"].items()

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import TightLayoutEngine
 from matplotlib.lines import Line2D
+from matplotlib.ticker import NullLocator
 
 SIDES = ("motor", "load")
 
@@ -70,12 +71,23 @@ def save(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG, making its folder. Returns the path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if figure.get_layout_engine() is None:
-        # once: with an engine of its own a figure is laid out twice and drawn twice
-        width, height = figure.get_size_inches()
-        figure.subplots_adjust(_MARGIN / width, _MARGIN / height, 1.0 - 0.2 * _MARGIN / width, 1.0 - 0.5 * _MARGIN / height)
-        TightLayoutEngine(pad=_PAD).execute(figure)
+        _lay_out(figure)
     figure.savefig(path)
     return path
+
+
+def _lay_out(figure: Figure) -> None:
+    """Find room for texts once: an engine of matplotlib's own does so twice, and before each drawing."""
+    width, height = figure.get_size_inches()
+    figure.subplots_adjust(_MARGIN / width, _MARGIN / height, 1.0 - 0.2 * _MARGIN / width, 1.0 - 0.5 * _MARGIN / height)
+    begins: dict[Axes, float] = {ax: ax.bbox.x0 for ax in figure.axes}
+    engine: Any = TightLayoutEngine(pad=_PAD, rect=None)  # type: ignore[arg-type]
+    engine.execute(figure)
+    # labels of y one above the other; those that stay where they are need no search for room when they are drawn
+    places = {ax: ax.yaxis.label.get_position()[0] - begin for ax, begin in begins.items() if ax.get_ylabel()}
+    columns = max((ax.get_subplotspec().get_gridspec().ncols for ax in begins if ax.get_subplotspec()), default=2)  # type: ignore[union-attr]
+    for ax in places if columns == 1 else ():
+        ax.yaxis.set_label_coords(min(places.values()) / ax.bbox.width, 0.5)
 
 
 _MARGIN, _PAD = 0.7, 0.5
@@ -90,7 +102,7 @@ def subplots(
     layout: Any = "constrained" if beside else "none"
     figure = Figure(figsize=(width, height), layout=layout)
     axes = figure.subplots(rows, columns, squeeze=False, **how).ravel().tolist()
-    if columns == 1:
+    if beside and columns == 1:
         figure.align_ylabels(axes)
     return figure, axes
 
@@ -102,6 +114,15 @@ def stacked(
     figure, axes = subplots(width, height * count + 0.6, count, sharex=sharex)
     axes[-1].set_xlabel(xlabel)
     return figure, axes
+
+
+def decades(ax: Axes, which: str = "both") -> None:
+    """Plain numbers at the decades of logarithmic axes, and nothing between: powers in mathematical type, and the many small
+    ticks, take longer than all else in a figure."""
+    for name, axis in (("x", ax.xaxis), ("y", ax.yaxis)):
+        if which in (name, "both"):
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_locator(NullLocator())
 
 
 def legend(ax: Axes, columns: int = 1, of: Sequence[Axes] = (), **how: Any) -> None:

@@ -13,6 +13,7 @@ from jaxbl.diagnosis.observer_residual import Observed
 from jaxbl.diagnosis.residuals import Residual, narrowed
 from jaxbl.diagnosis.sentences import sentence_of
 
+from . import figures
 from .figures import COLOURS, FAINT, MISSING, SIDE_COLOURS, Drawn, legend, outline, stacked, style, subplots, with_unit
 
 _CLOUD = 4000
@@ -156,6 +157,7 @@ def _spectra(residuals: Mapping[str, Sequence[Residual]], found: Mapping[str, Lo
         ax.loglog(frequency, size * np.sqrt(power), color=SIDE_COLOURS[name], lw=0.9, label="missing")
         ax.loglog(frequency, size * np.sqrt(floor), color=_MEAN, lw=1.2, ls="--", label="noise")
         ax.set_ylim(0.2 * size * np.sqrt(np.min(floor)), 3.0 * size * np.sqrt(np.max([np.max(power), np.max(floor)])))
+        figures.decades(ax)
         ax.axvline(found[name].bandwidth, color=FAINT, lw=0.9, ls=":", label="end of the band analysed")
         narrow = [one for one in found[name].peaks if not one.in_motion and one.excess_z > SIGNIFICANT]
         for peak in [one for one in narrow[:3] if one.power_share >= _LABELLED]:

@@ -174,7 +174,7 @@ def test_what_rounding_takes_is_known(growth):
     basis = np.linalg.qr(mixed / np.linalg.norm(mixed, axis=0))[0]
     left = columns[:, :3] - basis @ (basis.T @ columns[:, :3])
     true = float(left[:, 0] @ left[:, 0])
-    error, told = abs(module._eliminated(gram, states)[0, 0] - true), module._lost(gram, states)
+    error, told = abs(module._eliminated(gram, states)[0, 0] - true), module._response_and_loss(gram, states)[1]
     assert error < max(30.0 * told, 1e-9 * true)
     assert told < module._LOST or growth > 5.0
     assert told > module._LOST or growth < 20.0

@@ -74,12 +74,10 @@ def test_the_path_is_that_of_the_scan(name, observed):
 
 def directions(one, start):
     """Each state, the input, each number of the plant."""
-    zero, state = jax.tree.map(lambda _: 0.0, one), jax.tree.map(lambda _: 0.0, start)
-    leaves, shape = jax.tree.flatten(state)
-    found = [Direction(zero, shape.unflatten([float(i == j) for j in range(len(leaves))]), 0.0) for i in range(len(leaves))]
-    found.append(Direction(zero, state, 1.0))
+    found = [Direction(state=row) for row in np.eye(len(jax.tree.leaves(start))).tolist()]
+    found.append(Direction(torque=1.0))
     numbers = [path for path in leaf_paths(one) if path.split(".")[0] in ("drive", "transmission", "effects")]
-    return found + [Direction(set_leaves(zero, {path: 1.0}), state, 0.0) for path in numbers]
+    return found + [Direction({path: 1.0}) for path in numbers]
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -100,14 +98,19 @@ def test_slopes_are_those_of_differences(name):
         own = jax.tree.unflatten(jax.tree.structure(one), leaves)
         return jnp.stack(jax.tree.leaves(move(own.plant, own.run, state, torque, time)))
 
+    def whole(way):
+        """A direction as changes of all numbers."""
+        zeros, shape = jax.tree.map(lambda _: 0.0, one), jax.tree.structure(start)
+        return set_leaves(zeros, way.numbers), shape.unflatten(way.state or [0.0] * shape.num_leaves), way.torque
+
     def moved(way, by):
-        change = jax.tree.map(lambda x, c: np.broadcast_to(np.asarray(x) + by * c, STEPS), (one, states, torque), tuple(way))
+        change = jax.tree.map(lambda x, c: np.broadcast_to(np.asarray(x) + by * c, STEPS), (one, states, torque), whole(way))
         return np.asarray(step(jax.tree.leaves(change[0]), change[1], change[2], time)).T
 
     numbers, felt = jax.tree.leaves((one, states, torque)), 0
     for way, change in zip(ways, changes, strict=True):
         # of the number's own size
-        by = 3e-5 * (np.max(np.abs(numbers[jax.tree.leaves(way).index(1.0)])) + 1e-3)
+        by = 3e-5 * (np.max(np.abs(numbers[jax.tree.leaves(whole(way)).index(1.0)])) + 1e-3)
         expected = (moved(way, by) - moved(way, -by)) / (2.0 * by)
         error = np.abs(change - expected) / (np.max(np.abs(expected)) + 1e-9)
         assert np.median(error) < 1e-6
@@ -136,8 +139,7 @@ def test_what_a_loop_cannot_do_is_left_to_the_scan():
     found = path(one, start, torque)
     for side in one.sides:
         assert found.position[side] == pytest.approx(np.asarray(expected.position[side]), rel=1e-12)
-    way = Direction(jax.tree.map(lambda _: 0.0, one), jax.tree.map(lambda _: 0.0, start), 1.0)
-    changes, new = slopes(one, found, torque, 1e-3 * np.arange(STEPS), [way])
+    changes, new = slopes(one, found, torque, 1e-3 * np.arange(STEPS), [Direction(torque=1.0)])
     assert changes.shape == (1, 4, STEPS)
     inertia = float(one.drive.motor_inertia)
     motor = sorted(one.sides).index("motor") + 2
