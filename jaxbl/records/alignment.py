@@ -42,9 +42,16 @@ class NominalDrive:
     half_gap: float = 0.0
 
     def inertia(self, channel: str) -> float:
-        """Of the whole drive, at the side of an encoder's channel."""
-        at_motor = self.motor_inertia + self.load_inertia / self.gear_ratio**2
-        return at_motor if channel == "theta_e" else at_motor * self.gear_ratio**2
+        """Torque on the motor for the acceleration of an encoder's channel, of the whole drive."""
+        return self._at(channel, self.motor_inertia + self.load_inertia / self.gear_ratio**2)
+
+    def viscous(self, channel: str) -> float:
+        """Torque on the motor for the speed of an encoder's channel, of the whole drive."""
+        return self._at(channel, self.motor_viscous + self.load_viscous / self.gear_ratio**2)
+
+    def _at(self, channel: str, at_motor: float) -> float:
+        # the torque acts at the motor
+        return at_motor if channel == "theta_e" else at_motor * self.gear_ratio
 
 
 @dataclass(frozen=True)

@@ -167,29 +167,44 @@ _FAR_TORQUE = 1000.0
 that turns slowly against dry friction needs six hundred times the torque of its inertia."""
 
 
-def warn_inertia(file: LogFile, found: RigidFit, channel: str, nominal: NominalDrive) -> None:
-    """Say first that inertia or torque are far from the nominal ones, as a wrong unit makes them.
+_FAR_WORK = 100.0
+"""Factor between the work that friction takes and that of the nominal viscous friction from which on a unit is rather wrong.
+Dry friction that a model lacks takes ten times as much; that a drive takes a tenth is seen only in wrong units."""
 
-    Where they are so far that no fit is worth its time, `file.contradiction` says so.
+
+def warn_units(file: LogFile, found: RigidFit, channel: str, nominal: NominalDrive) -> None:
+    """Say first that inertia, torque or friction are far from the nominal ones, as a wrong unit makes them.
+
+    Where they are so far that no fit is worth its time, `file.contradiction` says so. Friction takes the work
+    <u ω> + J <ω² lost a second> / 2, against f <ω²> of the model: neither noise nor a gap nor a shaft changes that. A model
+    without friction says nothing of it.
     """
     expected = nominal.inertia(channel)
     value, error = float(found.values[0]), float(found.errors[0])
-    # a coefficient that noise, gravity or a spring hides says nothing
-    if value > 4.0 * error and found.shares[0] > 0.05 and found.inflation[0] < 10.0:
-        ratio, least, largest, sure = value / expected, 1.0 / _FAR, _FAR, _SURE
+    normal = nominal.viscous(channel) * found.square
+    taken = found.power + 0.5 * expected * found.slowing
+    work = taken / normal if normal > 0.0 and taken > 0.0 else None
+    usual = work is not None and 1.0 / _FAR < work < _FAR_WORK
+    text, doubtful, surely = "", False, False
+    # a coefficient that noise, gravity, a gap or a spring hides says nothing
+    if value > 4.0 * error and found.shares[0] > 0.05 and found.inflation[0] < 10.0 and found.residual < 0.5:
+        ratio = value / expected
         text = f"u moves {channel} as an inertia of {value:.3g} would, {ratio:.3g} times the nominal {expected:.3g}"
+        doubtful, surely = not 1.0 / _FAR < ratio < _FAR, not (usual or 1.0 / _SURE < ratio < _SURE)
     elif value:
-        needed = expected * found.acceleration
-        ratio, least, largest, sure = found.torque / needed, 1.0 / _FAR, _FAR_TORQUE, _SURE * _FAR_TORQUE
+        ratio = found.torque / (expected * found.acceleration)
         text = (
             f"u is {found.torque:.3g} rms, {ratio:.3g} times what the nominal inertia {expected:.3g} needs for this motion"
         )
-    else:
-        return
-    if not least < ratio < largest:
+        doubtful = not 1.0 / _FAR < ratio < _FAR_TORQUE
+        surely = not (usual or 1.0 / _SURE < ratio < _SURE * _FAR_TORQUE)
+    if work is not None and not usual and not doubtful:
+        text = f"friction takes {taken:.3g} W, {work:.3g} times what the nominal viscous friction would"
+        doubtful, surely = True, work < 1.0 / _SURE
+    if doubtful:
         file.warnings.append(f"Doubtful: {text}: check the units of t, u and {channel} in [log], and the model.")
-    if not 1.0 / _SURE < ratio < sure:
-        file.contradiction = f"{text}: a unit of t, u or {channel} in [log] is wrong, or the model's inertia is"
+    if doubtful and surely:
+        file.contradiction = f"{text}: a unit of t, u or {channel} in [log] is wrong, or the model's number is"
 
 
 # remarks

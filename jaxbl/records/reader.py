@@ -24,7 +24,7 @@ from .plausibility import (
     note_channel,
     note_lost_motion,
     note_skew,
-    warn_inertia,
+    warn_units,
 )
 from .resampling import Grid, resampled
 from .rigid_body import RigidFit, fit_rigid_drive
@@ -159,7 +159,7 @@ def read_record(
     if dynamics is not None:
         check_torque(file, dynamics, grid, position)
         if nominal is not None:
-            warn_inertia(file, dynamics, encoders[0], nominal)
+            warn_units(file, dynamics, encoders[0], nominal)
     # uneven stamps would pass for noise of what moves between them
     source = Grid(segments.times, {n: raw.values for n, raw in channels.items()}, segments.parts, grid.period)
     figures = {name: _figures(file, name, raw, segments, source if regular else grid) for name, raw in channels.items()}

@@ -27,6 +27,9 @@ class RigidFit:
         residual: rms of the residual over the rms of the torque about its mean.
         torque: rms, N m (N).
         acceleration: rms of the low-passed motion, rad/s² (m/s²).
+        power: mean that the torque puts in, W.
+        square: mean of the squared low-passed speed, rad²/s² (m²/s²).
+        slowing: by how much the squared speed falls from begin to end of the segments, over their length, rad²/s³ (m²/s³).
     """
 
     names: tuple[str, ...]
@@ -39,6 +42,9 @@ class RigidFit:
     residual: float
     torque: float
     acceleration: float
+    power: float
+    square: float
+    slowing: float
 
     def to_dict(self) -> dict[str, Any]:
         """As in `inspection.json`; an inflation without limit is null."""
@@ -68,7 +74,7 @@ def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence
         return None
     # three times the bandwidth: the corners of the motion stay, noise of the second derivative goes
     cutoff = 3.0 * width
-    targets, all_rows = [], []
+    targets, all_rows, slowing = [], [], 0.0
     for s in segments:
         if s.stop - s.start < SHORTEST:
             continue
@@ -80,6 +86,7 @@ def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence
         cut = without_ends(len(smooth), cutoff, period)
         columns = [acceleration, velocity, direction, smooth, np.ones_like(smooth), -np.gradient(held, period)]
         all_rows.append(np.stack(columns, axis=1)[cut])
+        slowing += float(velocity[cut][0] ** 2 - velocity[cut][-1] ** 2)
         targets.append(held[cut])
     if not targets:
         return None
@@ -109,4 +116,7 @@ def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence
         residual=float(np.std(left) / np.std(target)),
         torque=float(np.sqrt(np.mean(target**2))),
         acceleration=float(np.sqrt(np.mean(rows[:, 0] ** 2))),
+        power=float(np.mean(target * rows[:, 1])),
+        square=float(np.mean(rows[:, 1] ** 2)),
+        slowing=slowing / (len(rows) * period),
     )

@@ -500,10 +500,28 @@ def test_doubts_are_remarks(tmp_path):
 def test_an_inertia_far_from_the_nominal_one_is_said_first(tmp_path, change, times):
     """Torque in mN m or kN m, degrees for radians, ms for s; three times the nominal may well be."""
     path = wrote(tmp_path, change(made().drop(columns="theta_s")))
-    warnings = read_record(path, nominal=NominalDrive(INERTIA, VISCOUS)).warnings
+    record = read_record(path, nominal=NominalDrive(INERTIA, VISCOUS))
+    warnings = record.warnings
+    assert bool(record.contradiction) == (times is not None)
     said = [warning for warning in warnings if warning.startswith("Doubtful: u moves theta_e as an inertia of")]
     assert len(said) == (times is not None)
     assert times is None or f", {times} times the nominal 0.01: check the units" in said[0]
+
+
+def test_work_far_from_that_of_the_nominal_friction_is_said_first(tmp_path):
+    """A drive whose inertia does not show, as friction takes nearly all of the torque."""
+    t = 2e-3 * np.arange(4000)
+    position = np.sin(2.0 * np.pi * 0.2 * t) + 0.3 * np.sin(2.0 * np.pi * 0.5 * t)
+    frame = pd.DataFrame({"t": t, "u": 2.0 * np.gradient(position, t), "theta_e": position})
+    for factor, begin, surely in (
+        (1.0, "", False),
+        (1000.0, "Doubtful: friction takes", False),
+        (0.01, "Doubtful: u is", True),
+    ):
+        record = read_record(wrote(tmp_path, frame.assign(u=factor * frame["u"])), nominal=NominalDrive(1.0, 2.0))
+        said = [one for one in record.warnings if one.startswith("Doubtful")]
+        assert (len(said), bool(record.contradiction)) == (bool(begin), surely), record.warnings
+        assert not begin or said[0].startswith(begin)
 
 
 def test_a_falling_load_gives_its_energy_back(tmp_path):
