@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxbl.config import Config, read_model
 from jaxbl.errors import InputError
-from jaxbl.identification.logs import Logs, LogTask, read_logs
+from jaxbl.identification.logs import Logs, LogTask, read_with_holdout
 from jaxbl.records import Record
 
 HELD_OUT = 0.25
@@ -44,11 +44,10 @@ def read_diagnosis_task(
         InputError: unfit log or study, or a hold-out log of another machine.
     """
     config, missing = read_model(model)
-    record = read_logs(config, log, GEAR_TOLERANCE)
-    if holdout is None:
+    record, other = read_with_holdout(config, log, holdout, GEAR_TOLERANCE)
+    if other is None:
         record, other = split_off_last_quarter(record)
     else:
-        other = read_logs(config, holdout, GEAR_TOLERANCE, like=record)
         _check_machine(record, other)
     return DiagnosisTask(config, missing, _long(record), _long(other), holdout is not None)
 

@@ -23,7 +23,7 @@ from jaxbl.workers import Progress
 from .identification_summary import by_regression, by_trajectories, on_holdout, summary_of, torque_errors
 from .intervals import profile
 from .log_columns import columns_of, observer_chain
-from .logs import Logs, LogTask, arrays, decimation, default_paths, gains_for, on_record, read_logs, stage_counter
+from .logs import Logs, LogTask, arrays, decimation, default_paths, gains_for, on_record, read_with_holdout, stage_counter
 from .search import ParameterSearch
 from .segments import long_enough, segments_of
 from .trajectory import free_parameters
@@ -70,8 +70,7 @@ def read_identification_task(
     asked = {"parameters": None if parameters is None else list(parameters), "profile": profile}
     given = {key: value for key, value in asked.items() if value is not None}
     config = config.model_copy(update={"identify": config.identify.model_copy(update=given)})
-    record = read_logs(config, log)
-    return LogTask(config, missing, record, None if holdout is None else read_logs(config, holdout, like=record))
+    return LogTask(config, missing, *read_with_holdout(config, log, holdout))
 
 
 def identify(

@@ -70,6 +70,10 @@ _MOST_STEPS = 1000
 """Plant steps between two samples of a log at most: a drive moves through many of its time constants then."""
 
 
+_NEAR = 1e-2
+"""Relative difference of the sampling periods of a log and what is held out that changes no result."""
+
+
 def stage_counter(stages: int, progress: Progress | None) -> Callable[[], None]:
     """A function to be called after each stage, which tells `progress` how many of them are finished."""
     finished = itertools.count(1)
@@ -80,12 +84,17 @@ def read_logs(config: Config, logs: Logs, gear_tolerance: float = 0.0, like: Rec
     """Read logs as a study says, with the channels that its drive needs; `gear_tolerance` as of `read_record`.
 
     A skew and an offset between the encoders that one log of a machine is sure of hold for those that are not: that of
-    the first such log, or of the record that they are to be `like`.
+    the first such log, or of the record that they are to be `like`. Logs are read at the longest of their sampling periods,
+    the finest that all of them have; a finer log than the record they are to be `like` at the record's.
     """
     several = [logs] if isinstance(logs, str | Path | Record) else list(logs)
     if not several:
         raise InputError("no log: at least one is needed")
     records = [one if isinstance(one, Record) else _read_one(config, one, gear_tolerance) for one in several]
+    config = _at_one_period(config, records, like)
+    for i, (log, record) in enumerate(zip(several, records, strict=True)):
+        if not isinstance(log, Record) and not _alike(record.sample_period, config.log.resample or record.sample_period):
+            records[i] = _read_one(config, log, gear_tolerance)
     known: dict[str, float] = {}
     for one in [*reversed(records)] if like is None else [like]:
         known |= one.corrections
@@ -99,6 +108,37 @@ def read_logs(config: Config, logs: Logs, gear_tolerance: float = 0.0, like: Rec
     first, *others = records if like is None else (like, *records)
     others = [_from_zero_of(first, one, config) for one in others]
     return join([first, *others] if like is None else others)
+
+
+def _alike(one: float, other: float) -> bool:
+    """Whether two sampling periods (s) are the same but for rounding."""
+    return bool(np.isclose(one, other, rtol=1e-6, atol=0.0))
+
+
+def _at_one_period(config: Config, records: Sequence[Record], like: Record | None) -> Config:
+    """The study with `[log] resample` where logs are not sampled alike."""
+    periods = [record.sample_period for record in records]
+    longest = max(periods)
+    if like is not None and longest < like.sample_period and not np.isclose(longest, like.sample_period, rtol=_NEAR):
+        longest = like.sample_period
+    if all(_alike(one, longest) for one in periods):
+        return config
+    return config.model_copy(update={"log": config.log.model_copy(update={"resample": longest})})
+
+
+def read_with_holdout(
+    config: Config, logs: Logs, holdout: Logs | None, gear_tolerance: float = 0.0
+) -> tuple[Record, Record | None]:
+    """Logs and what is held out, both at the longest of their sampling periods; as :func:`read_logs`."""
+    record = read_logs(config, logs, gear_tolerance)
+    if holdout is None:
+        return record, None
+    other = read_logs(config, holdout, gear_tolerance, like=record)
+    if other.sample_period > record.sample_period and not np.isclose(other.sample_period, record.sample_period, rtol=_NEAR):
+        config = config.model_copy(update={"log": config.log.model_copy(update={"resample": other.sample_period})})
+        record = read_logs(config, logs, gear_tolerance)
+        other = read_logs(config, holdout, gear_tolerance, like=record)
+    return record, other
 
 
 def _from_zero_of(first: Record, record: Record, config: Config) -> Record:

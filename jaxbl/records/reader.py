@@ -224,9 +224,10 @@ def _evenly_spaced(
             grid, gearing = attempt()
             file.warnings.append(_skew_sentence(found))
     if not regular:
-        why = "to the period that [log] resample asks for" if table.resample else "from uneven stamps"
+        why = "to the period of [log] resample, or of the other logs" if table.resample else "from uneven stamps"
         file.notes.append(
-            f"Resampled {why}: every {1e3 * period:.6g} ms; positions by cubic splines, torques with their integral kept."
+            f"Resampled {why}: every {1e3 * period:.6g} ms, sampled every {1e3 * segments.period:.6g} ms; positions by "
+            "cubic splines, torques with their integral kept."
         )
     for name, skew in skews.items():
         if skew:

@@ -265,13 +265,26 @@ def refused(logs, *arguments, **keywords):
     return message
 
 
+def test_logs_of_unequal_periods_are_read_at_the_longest(logs, tmp_path):
+    log, axis = logged(seed=2), logs / "axis.csv"
+    coarse, again = tmp_path / "coarse.csv", tmp_path / "again.csv"
+    means = log.u.reshape(-1, 2).mean(axis=1)
+    dataclasses.replace(log, t=log.t[::2], u=means, theta_e=log.theta_e[::2]).write(coarse)
+    log.write(again)
+    for given, holdout in ((axis, coarse), (coarse, axis), ([coarse, axis], again)):
+        task = read_diagnosis_task(given, model(), holdout=holdout)
+        for record in (task.record, task.holdout):
+            assert record.sample_period == pytest.approx(0.004)
+        said = [
+            note for record in (task.record, task.holdout) for note in record.notes if "every 4 ms, sampled every 2" in note
+        ]
+        assert said
+
+
 def test_a_holdout_of_another_machine_is_refused(logs, tmp_path):
     axis = logs / "axis.csv"
     assert "is the log itself" in refused(logs, axis, model(), holdout=axis)
     log = logged(seed=2)
-    coarse = tmp_path / "coarse.csv"
-    dataclasses.replace(log, t=log.t * 2.0).write(coarse)
-    assert "is sampled every 0.004 s" in refused(logs, axis, model(), holdout=coarse)
     logged(seed=2, inertia=0.1).write(tmp_path / "heavy.csv")
     assert "shows an inertia of 0.1" in refused(logs, axis, model(), holdout=tmp_path / "heavy.csv")
     dataclasses.replace(log, theta_e=-log.theta_e).write(tmp_path / "sign.csv")
