@@ -99,10 +99,14 @@ def read_logs(config: Config, logs: Logs, gear_tolerance: float = 0.0, like: Rec
     for one in [*reversed(records)] if like is None else [like]:
         known |= one.corrections
     for i, (log, record) in enumerate(zip(several, records, strict=True)):
-        # an offset changes when a counter is switched off and on, a skew does not
+        # an offset changes when a counter is switched off and on, the skew of a clock that drifts with each log
         given = {key: known.get(key, 0.0) for key in {*known, *record.corrections}}
-        if "offset" in known:
-            given |= {key: value for key, value in record.corrections.items() if key == "offset"}
+        own = ("offset", *(("skew", "drift") if "drift" in known or "drift" in record.corrections else ()))
+        given |= {
+            key: record.corrections.get(key, 0.0)
+            for key in own
+            if key in given and (key in record.corrections or key != "offset")
+        }
         if not isinstance(log, Record) and given != record.corrections:
             records[i] = _read_one(_corrected(config, given), log, gear_tolerance)
     first, *others = records if like is None else (like, *records)
@@ -171,7 +175,7 @@ def _from_zero_of(first: Record, record: Record, config: Config) -> Record:
 def _corrected(config: Config, given: Mapping[str, float]) -> Config:
     """The study with a skew of theta_s and an offset of theta_e in `[log]`, as they are given."""
     table = config.log
-    for name, key in (("theta_s", "skew"), ("theta_e", "offset")):
+    for name, key in (("theta_s", "skew"), ("theta_s", "drift"), ("theta_e", "offset")):
         if key in given:
             position = getattr(table, name) or PositionTable()
             table = table.model_copy(update={name: position.model_copy(update={key: given[key]})})

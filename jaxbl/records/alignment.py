@@ -97,22 +97,27 @@ def clock_skew(gearing: Gearing, grid: Grid, nominal: NominalDrive) -> Skew | No
     """
     if gearing.skew is None or gearing.skew_error is None or "u" not in grid.values:
         return None
-    work = square = 0.0
-    for s in grid.segments:
-        velocity = np.gradient(grid.values["theta_e"][s], grid.period)
-        work += float(grid.values["u"][s] @ velocity)
-        square += float(velocity @ velocity)
-    if square == 0.0:
+    most = windup(grid, nominal)
+    if not math.isfinite(most):
         return None
-    windup = abs(work) / square / nominal.stiffness
     size = abs(gearing.skew)
     # a load that lags is what friction makes, one that leads it cannot make
-    friction = _VAGUE * windup if gearing.skew > 0.0 else 0.0
+    friction = _VAGUE * most if gearing.skew > 0.0 else 0.0
     sure = size > friction + _SURELY * gearing.skew_error and size > 0.05 * grid.period
     value = _skew_beside_torque(grid, nominal, gearing.skew) if sure else gearing.skew
     # friction takes something between nothing and all of it
-    value = float(np.clip(value, gearing.skew - windup, gearing.skew))
-    return Skew(value, float(np.hypot(gearing.skew_error, 0.5 * windup)), windup, sure)
+    value = float(np.clip(value, gearing.skew - most, gearing.skew))
+    return Skew(value, float(np.hypot(gearing.skew_error, 0.5 * most)), most, sure)
+
+
+def windup(grid: Grid, nominal: NominalDrive) -> float:
+    """The delay that friction can make at most, s: all of the motor's work done against the load's; inf: none shows."""
+    work = square = 0.0
+    for s in grid.segments if "u" in grid.values else ():
+        velocity = np.gradient(grid.values["theta_e"][s], grid.period)
+        work += float(grid.values["u"][s] @ velocity)
+        square += float(velocity @ velocity)
+    return abs(work) / square / nominal.stiffness if square else math.inf
 
 
 def _skew_beside_torque(grid: Grid, nominal: NominalDrive, known: float) -> float:

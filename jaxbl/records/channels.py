@@ -22,6 +22,7 @@ class RawChannel(NamedTuple):
         saturated: share of rows at the saturation level that `[log]` gives.
         skew: by how much the stamps are later than the values, s; "estimate": to be found.
         held: whether each value holds until the next stamp.
+        drift: by how much the skew grows in each second.
     """
 
     values: np.ndarray
@@ -29,6 +30,7 @@ class RawChannel(NamedTuple):
     saturated: float
     skew: float | str
     held: bool
+    drift: float = 0.0
 
 
 def read_channels(file: LogFile, table: LogTable, stamps: TimeStamps) -> dict[str, RawChannel]:
@@ -120,7 +122,7 @@ def _position(file: LogFile, name: str, table: PositionTable, stamps: TimeStamps
         "mm": 1e-3,
     }[table.unit]
     values = table.sign * table.factor * one * values + (table.offset or 0.0)
-    return RawChannel(values, table.si_unit, 0.0, table.skew or 0.0, held=False)
+    return RawChannel(values, table.si_unit, 0.0, table.skew or 0.0, held=False, drift=table.drift or 0.0)
 
 
 _SPEED = {

@@ -164,6 +164,72 @@ def _fit_with_skew(
     return *fit, skew, known
 
 
+@dataclass(frozen=True)
+class Drift:
+    """How the skew of theta_s against theta_e grows over a log.
+
+    Attributes:
+        value: s/s.
+        error: standard error.
+        skew: in the middle of the log, s.
+        reach: by how much the skew changes over half of the log, s.
+    """
+
+    value: float
+    error: float
+    skew: float
+    reach: float
+
+
+_FOLDS = 10
+"""Blocks of the log, each left out in turn, on which a drift has to prove itself."""
+
+
+def fit_drift(
+    times: np.ndarray, motor: np.ndarray, load: np.ndarray, segments: Sequence[slice], period: float, skew: float
+) -> Drift | None:
+    """A drift of the load's stamps that explains parts of the log left out better than the constant `skew` does; else None.
+
+    Arguments as of :func:`fit_gearing`.
+    """
+    width = _width(load[longest(segments)], period)
+    usable = [s for s in segments if s.stop - s.start >= SHORTEST]
+    if not width or not usable:
+        return None
+    constant = _gear_fit(times, motor, load, usable, period, 4.0 * width, skew)
+    drift, fit, error = 0.0, None, np.inf
+    half = 0.5 * float(times[-1] - times[0])
+    # converges quadratically, as the skew does
+    for _ in range(6):
+        fit = _gear_fit(times, motor, load, usable, period, 4.0 * width, skew, drift)
+        if fit is None or constant is None:
+            return None
+        values, errors = fit[2], fit[3]
+        steps = float(values[1] / values[0]), float(values[-1] / values[0])
+        skew, drift, error = skew + steps[0], drift + steps[1], float(errors[-1] / abs(values[0]))
+        if not np.isfinite(drift) or abs(drift) * half > 0.5 / width:
+            return None
+        if abs(steps[0]) + abs(steps[1]) * half < 1e-3 * period:
+            break
+    assert fit is not None and constant is not None
+    gains = np.log(_held_out(*constant[:2]) / _held_out(fit[0], fit[1]))
+    better = float(np.mean(gains)) > 2.0 * float(np.std(gains, ddof=1)) / _FOLDS**0.5
+    if not better or abs(drift) < 6.0 * error or abs(drift) * half < 0.05 * period:
+        return None
+    return Drift(drift, error, skew, abs(drift) * half)
+
+
+def _held_out(target: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Mean square error on each block of a regression on the others, shape (blocks,)."""
+    scaled, found = rows / (np.abs(rows).max(axis=0) + 1e-300), []
+    blocks = np.array_split(np.arange(len(target)), _FOLDS)
+    grams, moments = [scaled[b].T @ scaled[b] for b in blocks], [scaled[b].T @ target[b] for b in blocks]
+    for block, gram, moment in zip(blocks, grams, moments, strict=True):
+        values = np.linalg.lstsq(sum(grams) - gram, sum(moments) - moment, rcond=1e-12)[0]
+        found.append(float(np.mean((target[block] - scaled[block] @ values) ** 2)))
+    return np.array(found)
+
+
 def _width(positions: np.ndarray, period: float) -> float:
     """Bandwidth of the velocity, Hz; of motion that is slower than a spectrum shows, a few times one over its duration."""
     width = bandwidth(positions, period, slope=True)
@@ -284,15 +350,18 @@ def _gear_fit(
     period: float,
     cutoff: float,
     skew: float,
+    drift: float | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-    """One regression of :func:`fit_gearing` at a given skew.
+    """One regression of :func:`fit_gearing` at a given skew, and a drift (s/s) about the middle of the log, if it is sought.
 
-    Motor positions, shape (rows,); terms (position, velocity, flank, 1, acceleration, series), shape (rows, 5 + HARMONICS);
-    coefficients and standard errors, shape (5 + HARMONICS,).
+    Motor positions, shape (rows,); terms (position, velocity, flank, 1, acceleration, series; velocity times time where a
+    drift is sought), shape (rows, 5 + HARMONICS or one more); coefficients and standard errors, shape (terms,).
     """
+    middle = 0.5 * float(times[0] + times[-1])
     parts, smooth_motor = [], []
     for s in segments:
-        smooth = low_passed(interpolated(times[s], load[s], times[s] + skew), cutoff, period)
+        late = skew + (drift or 0.0) * (times[s] - middle)
+        smooth = low_passed(interpolated(times[s], load[s], times[s] + late), cutoff, period)
         velocity = np.gradient(smooth, times[s])
         parts.append(np.stack([smooth, velocity, np.gradient(velocity, times[s])]))
         smooth_motor.append(low_passed(motor[s], cutoff, period))
@@ -327,6 +396,9 @@ def _gear_fit(
     if best is None:
         return None
     rows[:, 2] = best[1]
+    if drift is not None:
+        about = np.concatenate([times[s][cut] for s, cut in zip(segments, inner, strict=True)]) - middle
+        rows = np.column_stack([rows, velocity * about])
     rows, target = rows[best[2]], target[best[2]]
     found, errors = _fitted(target, rows)
     if not np.isfinite(found).all() or found[0] == 0.0:

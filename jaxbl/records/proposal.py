@@ -157,7 +157,7 @@ def propose(path: str | Path, log: dict[str, Any] | None = None) -> tuple[dict[s
     nominal = _nominal(found, guesses)
     if math.isfinite(nominal.stiffness):
         found = inspect(path, table, gear_ratio=nominal.gear_ratio, nominal=nominal)
-        for channel, key in (("theta_s", "skew"), ("theta_e", "offset")):
+        for channel, key in (("theta_s", "skew"), ("theta_s", "drift"), ("theta_e", "offset")):
             if key in found.record.corrections:
                 table[channel] = _as_table(table.get(channel, channel)) | {key: found.record.corrections[key]}
     return _study(found, nominal, table), guesses, found

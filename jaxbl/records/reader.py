@@ -12,10 +12,10 @@ from pydantic import ValidationError
 from jaxbl.errors import InputError
 from jaxbl.validation import first_error
 
-from .alignment import NominalDrive, Skew, clock_skew, encoder_offset
+from .alignment import NominalDrive, Skew, clock_skew, encoder_offset, windup
 from .channels import RawChannel, read_channels
 from .files import LogFile, read_log_file
-from .gearing import Gearing, fit_gearing
+from .gearing import Drift, Gearing, fit_drift, fit_gearing
 from .plausibility import (
     check_distinct,
     check_gear_ratio,
@@ -26,7 +26,7 @@ from .plausibility import (
     note_skew,
     warn_units,
 )
-from .resampling import Grid, resampled
+from .resampling import Delay, Grid, resampled
 from .rigid_body import RigidFit, fit_rigid_drive
 from .signal_quality import ChannelFigures, channel_figures, longest
 from .table import POSITION_CHANNELS, LogTable, PositionTable
@@ -67,7 +67,7 @@ class Record:
         segments: contiguous parts; between them the log has gaps.
         notes: what was done to the log, and what is odd about it, in sentences.
         warnings: those that are to be said first: clock or zero point of an encoder corrected, units in doubt.
-        corrections: "skew" of theta_s, s, and "offset" of theta_e, rad (m), as far as the log's own were put in.
+        corrections: "skew" of theta_s, s, its "drift", s/s, and "offset" of theta_e, rad (m), as far as they were put in.
         contradiction: why nothing can be fitted to the nominal drive, as units are surely wrong; "" where they are not.
         findings: figures on its quality.
         intervals: between the raw stamps that were kept, s, shape (raw samples - 1,).
@@ -203,10 +203,10 @@ def _evenly_spaced(
     """The channels at even spacing without skews; relation of both encoders; whether the stamps had that spacing already."""
     period = table.resample or segments.period
     regular = segments.sampling.even and math.isclose(period, segments.period, rel_tol=1e-9)
-    skews = {name: raw.skew if isinstance(raw.skew, float) else 0.0 for name, raw in channels.items()}
+    delays = {name: Delay(raw.skew if isinstance(raw.skew, float) else 0.0, raw.drift) for name, raw in channels.items()}
 
     def attempt() -> tuple[Grid, Gearing | None]:
-        grid = resampled(file, segments, channels, period, skews, interpolate=not regular)
+        grid = resampled(file, segments, channels, period, delays, interpolate=not regular)
         if table.kind == "element" or "theta_e" not in channels or "theta_s" not in channels:
             return grid, None
         turn = None if table.load_unit == "m" else 2.0 * math.pi
@@ -214,25 +214,56 @@ def _evenly_spaced(
         return grid, fit_gearing(grid.time, motor, load, grid.segments, period, expected=gear_ratio, turn=turn)
 
     grid, gearing = attempt()
-    if any(raw.skew == "estimate" for raw in channels.values()):
-        skews["theta_s"] = _estimated_skew(file, gearing, period)
+    asked = any(raw.skew == "estimate" for raw in channels.values())
+    both = "theta_e", "theta_s"
+    open_ = shaft is not None and _is_open(table, "skew", both)
+    if gearing is not None and (asked or open_) and _is_open(table, "drift", both):
+        drift = _drift(file, gearing, grid, shaft if open_ else None)
+        if drift is not None:
+            middle = 0.5 * float(grid.time[0] + grid.time[-1])
+            delays["theta_s"] = Delay(-drift.value * middle, drift.value)
+            grid, gearing = attempt()
+    first = delays.get("theta_s", Delay())
+    if asked:
+        delays["theta_s"] = Delay(first.skew + _estimated_skew(file, gearing, period), first.drift)
         grid, gearing = attempt()
-    elif shaft is not None and gearing is not None and _is_open(table, "skew", ("theta_e", "theta_s")):
+    elif open_ and shaft is not None and gearing is not None:
         found = clock_skew(gearing, grid, shaft)
         if found is not None and found.sure:
-            skews["theta_s"] = file.corrections["skew"] = found.value
+            delays["theta_s"] = Delay(first.skew + found.value, first.drift)
             grid, gearing = attempt()
             file.warnings.append(_skew_sentence(found))
+    if open_ and any(delays["theta_s"]):
+        file.corrections |= {key: one for key, one in delays["theta_s"]._asdict().items() if one}
     if not regular:
         why = "to the period of [log] resample, or of the other logs" if table.resample else "from uneven stamps"
         file.notes.append(
             f"Resampled {why}: every {1e3 * period:.6g} ms, sampled every {1e3 * segments.period:.6g} ms; positions by "
             "cubic splines, torques with their integral kept."
         )
-    for name, skew in skews.items():
-        if skew:
-            file.notes.append(f"{name}: moved by its skew of {1e3 * skew:.4g} ms.")
+    for name, delay in delays.items():
+        if any(delay):
+            more = f", growing by {1e6 * delay.drift:.4g} us each second" if delay.drift else ""
+            file.notes.append(f"{name}: moved by its skew of {1e3 * delay.skew:.4g} ms{more}.")
     return grid, gearing, regular
+
+
+def _drift(file: LogFile, gearing: Gearing, grid: Grid, shaft: NominalDrive | None) -> Drift | None:
+    """A drift between the clocks of both encoders, as far as friction of the nominal drive, if one is given, is no cause."""
+    motor, load = grid.values["theta_e"], grid.values["theta_s"]
+    if gearing.wide:
+        return None
+    found = fit_drift(grid.time, motor, load, grid.segments, grid.period, gearing.skew or 0.0)
+    # friction that changes as the machine warms up changes the wind-up, by less than all of it
+    if found is None or (
+        shaft is not None and found.reach < windup(grid, shaft) + 6.0 * found.reach * found.error / abs(found.value)
+    ):
+        return None
+    file.warnings.append(
+        f"theta_s becomes later than theta_e by {1e6 * found.value:.4g} ± {1e6 * found.error:.1g} us each second, clocks "
+        f"that run apart: corrected. [log] theta_s.drift = {found.value:.4g} says the same, 0 leaves it as it is."
+    )
+    return found
 
 
 def _estimated_skew(file: LogFile, gearing: Gearing | None, period: float) -> float:

@@ -1,7 +1,7 @@
 """Channels at their own time stamps become samples at even spacing, moved by their skews."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,31 +28,42 @@ class Grid(NamedTuple):
     period: float
 
 
+class Delay(NamedTuple):
+    """By how much the stamps of a channel are later than its readings: `skew` (s) at time 0, and more by `drift` each s."""
+
+    skew: float = 0.0
+    drift: float = 0.0
+
+    def at(self, times: np.ndarray) -> np.ndarray:
+        """At times, s; shape (times,)."""
+        return self.skew + self.drift * times
+
+
 def resampled(
     file: LogFile,
     segments: Segments,
     channels: Mapping[str, RawChannel],
     period: float,
-    skews: Mapping[str, float],
+    delays: Mapping[str, Delay],
     *,
     interpolate: bool,
 ) -> Grid:
     """All channels on one grid within each segment: positions by cubic splines, a held torque by its means.
 
-    Without `interpolate` the stamps lie on the grid already, so that only skews (s) move values. InputError where a segment
+    Without `interpolate` the stamps lie on the grid already, so that only delays move values. InputError where a segment
     is too short for period and skews.
     """
     times, values, parts, begin = [], {name: [] for name in channels}, [], 0
     for part in segments.parts:
         stamps = segments.times[part]
         first = float(stamps[0])
-        if not interpolate and not any(skews.values()):
+        if not interpolate and not any(map(any, delays.values())):
             grid = first + period * np.arange(len(stamps), dtype=float)
         else:
-            grid = _common_grid(file, stamps, period, skews.values(), None if interpolate else first)
+            grid = _common_grid(file, stamps, period, delays.values(), None if interpolate else first)
         for name, raw in channels.items():
-            own = stamps - skews[name]
-            if not interpolate and not skews[name] and len(grid) == len(stamps):
+            own = stamps - delays[name].at(stamps)
+            if not interpolate and not any(delays[name]) and len(grid) == len(stamps):
                 values[name].append(raw.values[part])
             elif raw.held:
                 values[name].append(_held_means(own, raw.values[part], grid, period))
@@ -64,13 +75,15 @@ def resampled(
     return Grid(np.concatenate(times), {name: np.concatenate(v) for name, v in values.items()}, tuple(parts), period)
 
 
-def _common_grid(file: LogFile, stamps: np.ndarray, period: float, skews, first: float | None) -> np.ndarray:
+def _common_grid(
+    file: LogFile, stamps: np.ndarray, period: float, delays: Iterable[Delay], first: float | None
+) -> np.ndarray:
     """Times at which all channels have values, s; on the grid that begins at `first`, if it is given."""
-    low = max(float(stamps[0]) - skew for skew in skews)
+    ends = [stamps[[0, -1]] - delay.at(stamps[[0, -1]]) for delay in delays]
+    low, high = max(float(one[0]) for one in ends), min(float(one[1]) for one in ends)
     if first is not None:
         # where the channels without skew have their samples
         low = first + period * math.ceil((low - first) / period - 1e-6)
-    high = min(float(stamps[-1]) - skew for skew in skews)
     count = math.floor((high - low) / period + 1e-6) + 1
     if count < SHORTEST // 2:
         raise file.wrong(

@@ -101,6 +101,12 @@ class PositionTable(_ChannelTable):
         "against theta_e; left out: 0, of theta_s a skew that is sure",
         json_schema_extra=_SECONDS,
     )
+    drift: float | None = Field(
+        default=None,
+        description="by how much the skew grows in each second, undone; `skew` is then that at the first stamp; left out: "
+        "0, of theta_s a drift that is sure",
+        json_schema_extra={"unit": "s/s"},
+    )
 
     @model_validator(mode="after")
     def _counts(self) -> "PositionTable":

@@ -12,9 +12,9 @@ NOMINAL = NominalDrive(
 )
 
 
-def axis(skew=0.0, offset=0.0, gap=0.0, load_torque=0.0, motor_torque=0.0, stiffness=50.0, count=8000):
+def axis(skew=0.0, offset=0.0, gap=0.0, load_torque=0.0, motor_torque=0.0, stiffness=50.0, count=8000, drift=0.0, seed=0):
     """A geared axis with dry friction at the load in multisine motion: its equations of motion, both encoders with noise."""
-    random, t = np.random.default_rng(0), 1e-3 * np.arange(count)
+    random, t = np.random.default_rng(seed), 1e-3 * np.arange(count)
     frequency, size, phase = np.array([0.5, 0.83, 1.27, 2.1]), np.array([1.0, 0.5, 0.4, 0.2]), random.uniform(0.0, 6.3, 4)
 
     def motion(times, derivative):
@@ -29,7 +29,7 @@ def axis(skew=0.0, offset=0.0, gap=0.0, load_torque=0.0, motor_torque=0.0, stiff
     twist = shaft(t) / stiffness + 0.5 * gap * np.tanh(shaft(t) / 0.02)
     u = 20.0 * (1e-3 * motion(middle, 2) + 2e-3 * motion(middle, 1)) + shaft(middle) - motor_torque
     motor = 20.0 * motion(t, 0) + twist + offset + 1e-4 * random.standard_normal(count)
-    load = motion(t - skew, 0) + 5e-6 * random.standard_normal(count)
+    load = motion(t - skew - drift * t, 0) + 5e-6 * random.standard_normal(count)
     return pd.DataFrame({"t": t, "u": u, "theta_e": motor, "theta_s": load})
 
 
@@ -94,6 +94,22 @@ def test_friction_that_winds_up_a_soft_shaft_is_no_clock(read):
     record = read(axis(stiffness=2.0), nominal=soft)
     assert record.findings.gearing.skew > 1e-3
     assert record.corrections == {} and record.warnings == ()
+
+
+@pytest.mark.parametrize(("skew", "drift", "gap"), [(3e-3, 5e-5, 0.1), (0.0, -6e-4, 0.0)])
+def test_clocks_that_run_apart_are_found_to_a_tenth_of_a_sample(read, skew, drift, gap):
+    frame = axis(skew, gap=gap, drift=drift, seed=3)
+    record = read(frame)
+    ends, found = np.array([0.0, 8.0]), record.corrections
+    late = found["skew"] + found["drift"] * ends - skew - drift * ends
+    assert np.abs(late).max() < 0.1e-3
+    assert any("clocks that run apart: corrected" in warning for warning in record.warnings)
+    given = read(frame, {"theta_s": {"skew": found["skew"], "drift": found["drift"]}})
+    np.testing.assert_allclose(given.positions["load"], record.positions["load"], atol=1e-12)
+    # without a model, on request: with the wind-up by friction, here 0.05 ms
+    asked = read(frame, {"theta_s": {"skew": "estimate"}}, None)
+    (said,) = [note for note in asked.notes if "growing by" in note]
+    assert float(said.split("growing by ")[1].split(" us")[0]) == pytest.approx(1e6 * drift, rel=0.03)
 
 
 def test_inspect_says_it_first(tmp_path):
