@@ -139,7 +139,10 @@ def initial_state(experiment: Experiment, measured: dict[str, Number] | None = N
     zero = jnp.zeros_like(jnp.asarray(experiment.run.sample_period))
     rest = dict.fromkeys(experiment.sides, zero)
     plant = experiment.plant.init(experiment.initial) if measured is None else None
-    position, velocity = (measured or {}, rest) if plant is None else (plant.position, plant.velocity)
+    position, velocity = measured or {}, rest
+    if plant is not None:
+        velocity = plant.velocity
+        position = {side: experiment.plant.read(side, plant.position[side], velocity[side]) for side in experiment.sides}
     observer = {side: getattr(experiment.observer, side).init(position[side], velocity[side]) for side in experiment.sides}
     identifier = None
     if experiment.identifier is not None and experiment.transmission is not None:
@@ -157,7 +160,9 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
     else:
         noise = {side: value.astype(jnp.result_type(period)) for side, value in sample.noise.items()}
         measured = {
-            side: experiment.encoders.measure(side, before.position[side], noise[side], drive.ratio(side))
+            side: experiment.encoders.measure(
+                side, plant.read(side, before.position[side], before.velocity[side]), noise[side], drive.ratio(side)
+            )
             for side in drive.sides
         }
         moved = move(plant, experiment.run, before, torque_in, sample.time)

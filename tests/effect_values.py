@@ -66,3 +66,10 @@ VALUES = {
     "actuator.back_emf": {"resistance": 0.01, "torque_constant": 0.02},
 }
 """Both sides keep turning forwards under a steady torque, so that dry friction slides throughout."""
+
+ENCODERS = {
+    "encoder.offset": {"offset": 0.1},
+    "encoder.skew": {"skew": 2e-3},
+    "encoder.eccentricity": {"amplitude": 0.01, "harmonic": 2.0, "phase": 0.4},
+}
+"""Effects that move nothing."""

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .effects import AbstractEffect, Motion
+from .effects import AbstractEffect, EncoderEffect, Motion
 from .parameters import Scalar, parameter
 from .transmission import AbstractTransmission
 
@@ -229,7 +229,7 @@ class Plant(eqx.Module):
         if not self.memory:
             return states
         motions = {side: Motion(time, position[side], velocity[side]) for side in self.drive.sides}
-        motions["actuator"] = motions["motor"]
+        motions["actuator"] = motions["encoder"] = motions["motor"]
         if self.transmission is not None:
             # the rate changes with the position: its mean over the step is that at the middle
             middle = {side: position[side] + 0.5 * step * velocity[side] for side in self.drive.sides}
@@ -272,6 +272,13 @@ class Plant(eqx.Module):
                 level = level + effect.dry_friction(own, motion)
             found[side] = total, level
         return found
+
+    def read(self, side: str, position: Any, velocity: Any) -> Any:
+        """What the encoder of a side reads at a position (rad) and velocity (rad/s), before noise and counts; rad."""
+        for effect in self.effects:
+            if isinstance(effect, EncoderEffect) and self.drive.place(effect.encoder) == side:
+                position = effect.read(position, velocity)
+        return position
 
     def holding(self, side: str, motion: Motion, states: States) -> tuple[Scalar, Scalar]:
         """Torque (N m) of a side's frictions with a memory that may hold it, and the level up to which they do so while it

@@ -15,7 +15,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxbl.config import Config, prepare
-from jaxbl.drive.effects import EFFECTS
+from jaxbl.drive.effects import EFFECTS, EncoderEffect
 from jaxbl.drive.parameters import get_leaf, leaf_paths
 from jaxbl.errors import InputError
 from jaxbl.records import POSITION_CHANNELS, PositionTable, Record, TurningLog, join, read_record, turned
@@ -202,6 +202,8 @@ def _read_one(config: Config, log: str | Path, gear_tolerance: float) -> Record:
             f"{step:.3g} s ([run]); where the stamps are not in s, [log] t.unit says so"
         )
     for effect in config.effects:
+        if issubclass(cls := EFFECTS[effect.kind], EncoderEffect):
+            raise InputError(f"{record.path}: {effect.kind} has no place in a model of a log: {cls.in_log}")
         if fault := EFFECTS[effect.kind].fault(effect.model_dump(), record.sample_period):
             raise InputError(f"{record.path}: {effect.kind}: {fault}")
     if record.torque is None:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from drive_reference import START, block, plant, reference, trajectory
-from effect_values import VALUES
+from effect_values import ENCODERS, VALUES
 from scipy.integrate import solve_ivp
 
 from jaxbl.drive import EFFECTS, LinearShaft, Plant, TwoInertia, as_arrays, make_effect, parameters, registry
@@ -31,8 +31,9 @@ def errors(values, substeps):
 
 
 def test_the_names_are_the_contract():
-    assert set(EFFECTS) == set(VALUES)
-    for name, effect in zip(VALUES, made(VALUES), strict=True):
+    every = VALUES | ENCODERS
+    assert set(EFFECTS) == set(every)
+    for name, effect in zip(every, made(every), strict=True):
         assert effect.name == name
         assert inspect.getdoc(EFFECTS[name]) and list(parameters(effect))
 
@@ -46,6 +47,18 @@ def test_each_effect_is_what_its_equation_says_to_second_order(name):
     tolerance = 0.2 if name == "transmission.backlash" else 0.01
     assert np.log2(coarse / fine) / 3.0 == pytest.approx(2.0, abs=tolerance)
     assert fine < 3e-5
+
+
+def test_effects_on_an_encoder_change_its_reading_alone():
+    every = made(ENCODERS)
+    np.testing.assert_array_equal(trajectory(plant(*every), 8), trajectory(plant(), 8))
+    both, one = plant(*every), block(*every)
+    assert float(both.read("motor", 0.3, 2.0)) == pytest.approx(0.4)
+    late = 0.3 - 2e-3 * 2.0
+    assert float(both.read("load", 0.3, 2.0)) == pytest.approx(late + 0.01 * np.sin(2.0 * late + 0.4))
+    # a rigid drive has one encoder
+    assert float(one.read("motor", 0.3, 2.0)) == pytest.approx(0.1 + late + 0.01 * np.sin(2.0 * (late + 0.1) + 0.4))
+    assert float(plant().read("load", 0.3, 2.0)) == pytest.approx(0.3)
 
 
 def test_effects_add_up_in_any_order():
@@ -339,6 +352,8 @@ ORDINARY = {
     "delay",
     "tabulated",
     "flexibility",
+    "offset",
+    "skew",
 }
 """Kinds that are plain words, too: of nominal numbers, and of what a sentence may speak of (eccentric encoders)."""
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from effect_values import VALUES
+from effect_values import ENCODERS, VALUES
 from jax.extend.core import jaxpr_as_fun
 from jax.sharding import AbstractDevice, AbstractMesh, use_abstract_mesh
 
@@ -25,7 +25,7 @@ from jaxbl.throughput.workload import FIGURES, RANGES, SEED, Workload
 
 HALF = ["motor.coulomb_friction", "load.stribeck_friction", "load.gravity", "motor.cogging", "load.periodic_disturbance",
         "transmission.damping", "actuator.lag", "actuator.saturation"]  # fmt: skip
-OTHERS = [name for name in VALUES if name not in HALF]
+OTHERS = [*(name for name in VALUES if name not in HALF), *ENCODERS]
 
 
 def experiment(names, law=None, observer="implicit", rigid=False, substeps=2, steps=700, precision="float64"):
@@ -35,7 +35,7 @@ def experiment(names, law=None, observer="implicit", rigid=False, substeps=2, st
         Experiment(
             drive=Rigid(0.02, 0.03) if rigid else TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0),
             transmission=law,
-            effects=tuple(make_effect(name, **VALUES[name]) for name in names),
+            effects=tuple(make_effect(name, **(VALUES | ENCODERS)[name]) for name in names),
             initial=Initial(),
             excitation=Chirp(5.0, 0.5, 3.0, 0.5) if rigid else Sine(5.0, 0.8),
             encoders=Encoders(1e-4, motor_resolution=1e-5),

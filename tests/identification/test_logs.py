@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from jaxbl.config import read_model
+from jaxbl.errors import InputError
 from jaxbl.identification.logs import read_logs
 from jaxbl.records import Record
 
@@ -52,3 +53,9 @@ def test_an_offset_that_is_given_stands(paths: list[Path]):
     config, _ = read_model(MODEL | {"log": {"theta_e": {"column": "theta_e", "offset": 0.0}}})
     record = read_logs(config, paths[:2])
     assert ahead(record, paths[:2]) == [0.0, 0.0] and not record.warnings
+
+
+def test_a_model_of_a_log_has_no_effects_of_encoders(paths: list[Path]):
+    config, _ = read_model(MODEL | {"effects": [{"kind": "encoder.offset", "offset": 0.1}]})
+    with pytest.raises(InputError, match=r"0\.csv: encoder\.offset has no place in a model of a log: .* theta_e\.offset"):
+        read_logs(config, paths[0])

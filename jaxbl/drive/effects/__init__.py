@@ -1,7 +1,8 @@
 """Physical effects beyond the nominal drive, each written once and known by its full name (`load.coulomb_friction`).
 
 One file a family. Further packages add effects through the entry-point group `jaxbl.effects`: the entry's name is the
-effect's name, its object a subclass of :class:`SideEffect`, :class:`TransmissionEffect` or :class:`ActuatorEffect`.
+effect's name, its object a subclass of :class:`SideEffect`, :class:`TransmissionEffect`, :class:`ActuatorEffect` or
+:class:`EncoderEffect`.
 """
 
 # ruff: noqa: I001
@@ -21,10 +22,12 @@ from .loads import (
 from .tables import Tabulated
 from .gear import Backlash, Hardening, Damping, Hysteresis, Eccentricity, LoadFriction
 from .actuator import Delay, GainError, Saturation, Lag, BackEmf
+from .encoders import Offset, Skew, EncoderEccentricity
 from .base import (
     EFFECTS,
     AbstractEffect,
     ActuatorEffect,
+    EncoderEffect,
     Motion,
     Numbers,
     Role,

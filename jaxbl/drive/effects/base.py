@@ -21,7 +21,7 @@ from ..registry import Registry
 Value = Any  # a number or an array of one: hooks are duck-typed, neutral ones answer the Python number 0.0
 Numbers = dict[str, float]
 """Numbers of one effect, by name."""
-PLACES = ("motor", "load", "transmission", "actuator")
+PLACES = ("motor", "load", "transmission", "actuator", "encoder")
 
 
 class Motion(NamedTuple):
@@ -137,7 +137,7 @@ class AbstractEffect(eqx.Module):
 
     Attributes:
         kind: its name without the place.
-        places: where it may act: motor, load, transmission, actuator.
+        places: where it may act: motor, load, transmission, actuator, encoder.
         velocity_dependent: whether a hook looks at a velocity; it is then evaluated twice a step (predictor and
             corrector), which keeps the integrator's second order.
         in_time: whether it depends on the time since a log began.
@@ -224,6 +224,10 @@ class AbstractEffect(eqx.Module):
         """The own state in which :meth:`resist` is nearest to a torque (N m), of an effect that :meth:`holds`."""
         return self.init()
 
+    def read(self, position: Value, velocity: Value) -> Value:
+        """What an encoder reads (rad) at a position (rad) and velocity (rad/s) of its side, before noise and counts."""
+        return position
+
     def added_inertia(self) -> Value:
         """Inertia in kg m^2 added to the side's nominal one. It has no state: one that varies needs a torque as well."""
         return 0.0
@@ -297,6 +301,19 @@ class ActuatorEffect(AbstractEffect):
     rank: ClassVar[int] = 0
 
 
+class EncoderEffect(AbstractEffect):
+    """An effect on what an encoder reads: the load's, or the motor's on a rigid drive, unless the class says otherwise.
+
+    Attributes:
+        encoder: whose.
+        in_log: how a log without it is had, in words: models of logs have none.
+    """
+
+    places: ClassVar[tuple[str, ...]] = ("encoder",)
+    encoder: ClassVar[str] = "load"
+    in_log: ClassVar[str] = "its readings have it already"
+
+
 class _Effects(Registry):
     """Effects by full name: a class stands there once for each place where it may act."""
 
@@ -367,6 +384,7 @@ def _check_neutral(effect: AbstractEffect) -> None:
             "dry_friction": effect.dry_friction(state, motion),
             "gear_friction": effect.gear_friction(state, motion.torque),
             "added_inertia": effect.added_inertia(),
+            "read": effect.read(motion.position, motion.velocity) - motion.position,
             "transmission_error": effect.transmission_error(state, motion.position),
             "deflect": effect.deflect(state, motion.position) - motion.position,
             "transmit": effect.transmit(state, motion.position, motion.velocity),

@@ -1,0 +1,49 @@
+"""What encoders read beside the position: zero point, clock, eccentricity.
+
+They change no motion. On a log they are corrected when it is read (`[log]`), so that no model of a log has them.
+"""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from ..parameters import Scalar, parameter
+from .base import EFFECTS, EncoderEffect
+
+
+@EFFECTS.add
+class Offset(EncoderEffect):
+    """Zero point of the motor's encoder against the load's: theta_e reads more by the offset."""
+
+    kind: ClassVar[str] = "offset"
+    encoder: ClassVar[str] = "motor"
+    in_log: ClassVar[str] = "[log] theta_e.offset takes it off"
+    offset: Scalar = parameter("rad", "reading at position 0")
+
+    def read(self, position, velocity):
+        return position + self.offset
+
+
+@EFFECTS.add
+class Skew(EncoderEffect):
+    """Clock of the load's encoder: its readings are older than their stamps by the skew, theta - skew dtheta/dt."""
+
+    kind: ClassVar[str] = "skew"
+    in_log: ClassVar[str] = "[log] theta_s.skew takes it off"
+    skew: Scalar = parameter("s", "age of a reading at its stamp; short beside the changes of the velocity")
+
+    def read(self, position, velocity):
+        return position - self.skew * velocity
+
+
+@EFFECTS.add
+class EncoderEccentricity(EncoderEffect):
+    """Eccentric disk of the load's encoder: theta + A sin(n theta + phase)."""
+
+    kind: ClassVar[str] = "eccentricity"
+    amplitude: Scalar = parameter("rad", "amplitude A")
+    harmonic: Scalar = parameter("1/turn", "periods n a turn; 2 of a tilted disk", default=1.0, above=0.0)
+    phase: Scalar = parameter("rad", "phase at theta = 0", default=0.0)
+
+    def read(self, position, velocity):
+        return position + self.amplitude * jnp.sin(self.harmonic * position + self.phase)
