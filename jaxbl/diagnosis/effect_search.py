@@ -63,8 +63,8 @@ CLEAR = 100.0
 since quantisation and time stepping leave structure, too (benchmarks/NOTES.md)."""
 _SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
 """Prior sizes of a free function that are tried, over :data:`.candidates.SHARE`: down to the least that counts."""
-_MOST = 6
-"""Effects that are sought: a servo motor shows dry and viscous friction, a constant torque, waves of cogging, a delay."""
+_MOST = 5
+"""Effects that are sought: a servo motor shows dry and viscous friction, a constant torque, two waves of cogging."""
 _RECENT = 4
 """Models along the record that are kept: where a refit ended, the next one begins."""
 LEAST = 1e-3
