@@ -125,7 +125,7 @@ def main() -> None:
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(CACHE))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-    rows = []
+    rows, made = [], []
     for case in CASES:
         if asked.only and case.name not in asked.only:
             continue
@@ -134,11 +134,11 @@ def main() -> None:
             continue
         rows.append(diagnosed(case, asked.data, asked.rivals))
         print(f"{case.name}: {rows[-1].summary.get('verdict', 'no diagnosis')}, {rows[-1].seconds:.0f} s", file=sys.stderr)
-    text = markdown(rows, asked.rivals)
-    print(text)
-    if asked.out is not None:
-        for path in write(rows, text, asked.out):
-            print(path)
+        # after each: some take minutes
+        made = [] if asked.out is None else write(rows, markdown(rows, asked.rivals), asked.out)
+    print(markdown(rows, asked.rivals))
+    for path in made:
+        print(path)
 
 
 if __name__ == "__main__":
