@@ -118,22 +118,20 @@ def _mean_around(values: Float[Array, " samples"]) -> Float[Array, " samples"]:
     return values.at[1:-1].add(jnp.diff(values, n=2) / 12.0)
 
 
-def _torque(experiment: Experiment, side: str, position: dict, velocity: dict, *rest: Any) -> tuple[Array, Array]:
-    """All modelled torques on a side but for set-valued friction, and the level of that, N m; arguments as of
+def _torques(experiment: Experiment, position: dict, velocity: dict, *rest: Any) -> tuple[dict[str, Array], ...]:
+    """All modelled torques on each side but for set-valued friction, and the level of that, N m; arguments as of
     :meth:`jaxbl.drive.plant.Plant.torques`."""
-    total, level = experiment.plant.torques(position, velocity, *rest)[side]
-    return total - experiment.drive.viscous(side) * velocity[side], jnp.asarray(level, velocity[side].dtype)
+    acting, drive = experiment.plant.torques(position, velocity, *rest), experiment.drive
+    total = {side: one - drive.viscous(side) * velocity[side] for side, (one, _) in acting.items()}
+    return total, {side: jnp.asarray(level, velocity[side].dtype) for side, (_, level) in acting.items()}
 
 
-def _acting(
-    experiment: Experiment, side: str, part: Kinematics, held: Bool[Array, " samples"]
-) -> tuple[Float[Array, " samples"], Float[Array, " samples"], Float[Array, " samples"]]:
-    """Modelled torques on a side along a part, N m: all but dry friction, and dry friction; the derivative of the latter by
-    the velocity at a reversal, whose time the velocity's noise leaves open."""
-    states, torque = effect_path(experiment, part, from_rest=True)
-    given = part.position, part.velocity, states, torque, part.time, part.transmitted
-    total, level = jax.vmap(lambda *at: _torque(experiment, side, *at))(*given)
-    inertia, velocity, acceleration = experiment.plant.inertia(side), part.velocity[side], part.acceleration[side]
+def _dry(
+    experiment: Experiment, side: str, part: Kinematics, states: Any, torque: Array, acting: tuple[Array, Array], held: Array
+) -> tuple[Array, Array]:
+    """Dry friction along a part, N m, by what else is `acting` on the side and its level; its derivative by the velocity at
+    a reversal, whose time the velocity's noise leaves open."""
+    (total, level), velocity, acceleration = acting, part.velocity[side], part.acceleration[side]
     period = (part.time[-1] - part.time[0]) / (len(part.time) - 1)
     # the share of the time around a sample in forward motion less that in backward motion, seen as the rest is
     step = jnp.maximum(jnp.abs(acceleration) * period, jnp.finfo(float).tiny)
@@ -142,9 +140,10 @@ def _acting(
     # what is not shown to move for a while may be held: friction is then what is missing, as far as it goes
     motion = Motion(part.time, part.position[side], velocity, torque if side == "motor" else jnp.zeros_like(torque))
     bent, most = experiment.plant.holding(side, motion, states)
+    inertia = experiment.plant.inertia(side)
     needed = jnp.clip(total + bent - inertia * acceleration, -(level + most), level + most) - bent
     friction = jnp.where(held, needed, level * direction)
-    return total, friction, jnp.where(held, 0.0, 2.0 * level * (1.0 - jnp.abs(passage)) / step)
+    return friction, jnp.where(held, 0.0, 2.0 * level * (1.0 - jnp.abs(passage)) / step)
 
 
 class _Equation(NamedTuple):
@@ -174,21 +173,22 @@ def _equations(experiment: Experiment, part: Kinematics, held: dict[str, Bool[Ar
     states, torque = effect_path(experiment, part, from_rest=True)
     given = part.position, part.velocity, states, torque, part.time, part.transmitted
     drive, found = experiment.drive, {}
+
+    def of(position: dict, velocity: dict, *rest: Any) -> tuple[Any, Any]:
+        total, level = both = _torques(experiment, position, velocity, *rest)
+        return {side: total[side] - level[side] * jnp.sign(velocity[side]) for side in total}, both
+
+    slopes, (totals, levels) = jax.vmap(jax.jacfwd(of, argnums=(0, 1), has_aux=True))(*given)
     for side in experiment.sides:
-        total, friction, turning = _acting(experiment, side, part, held[side])
+        total, (by_position, by_velocity) = totals[side], slopes[side]
+        friction, turning = _dry(experiment, side, part, states, torque, (total, levels[side]), held[side])
         # the input is a mean around the sample already; of the rest, the mean that the position's second differences see
         driving = torque if side == "motor" else jnp.zeros_like(torque)
         modelled = driving + _mean_around(total - driving) - friction
         inertia, acceleration, velocity = experiment.plant.inertia(side), part.acceleration[side], part.velocity[side]
         added = (inertia - drive.inertia(side)) * acceleration
         nominal = drive.inertia(side) * drive.acceleration(side, velocity, part.torque)
-
-        def of(position: dict, velocity: dict, *rest: Any, side=side) -> Array:
-            total, level = _torque(experiment, side, position, velocity, *rest)
-            return total - level * jnp.sign(velocity[side])
-
-        by_position, by_velocity = jax.vmap(jax.jacfwd(of, argnums=(0, 1)))(*given)
-        by_velocity[side] = by_velocity[side] - turning
+        by_velocity = by_velocity | {side: by_velocity[side] - turning}
         found[side] = _Equation(
             inertia, inertia * acceleration, modelled, total - added - nominal, friction, by_position, by_velocity
         )
