@@ -307,12 +307,14 @@ class _Point(NamedTuple):
         jacobian: its derivative by theta, shape (residuals, parameters).
         start: the windows' initial states there.
         squares: sum of squared residuals of each window, shape (windows,).
+        whole: of :func:`_sloped`.
     """
 
     residual: Array
     jacobian: Array
     start: PlantState
     squares: Array
+    whole: tuple[Array, PlantState, Array]
 
     @property
     def cost(self) -> Array:
@@ -346,7 +348,7 @@ def _reduced(
     seen = jax.scipy.linalg.solve_triangular(root, towards / size, lower=True)
     rest = jnp.sqrt(jnp.maximum(total - jnp.sum(seen**2), 0.0))
     derivative = jnp.concatenate([root.T * (size * moving)[None, :], jnp.zeros((1, len(theta)))])
-    return _Point(jnp.concatenate([seen, rest[None]]), derivative, start, each)
+    return _Point(jnp.concatenate([seen, rest[None]]), derivative, start, each, (value, start, slope))
 
 
 class _Solved(NamedTuple):
@@ -355,6 +357,7 @@ class _Solved(NamedTuple):
     squares: Array
     steps: Array
     converged: Array
+    whole: tuple[Array, PlantState, Array]
 
 
 def _converged(new: tuple[Array, Array], old: tuple[Array, Array]) -> Array:
@@ -404,7 +407,7 @@ def _solve(
     theta, best, _, _, steps, _, ended = jax.lax.while_loop(going, step, start)
     # where no step was asked for
     states = jax.tree.map(partial(jnp.where, steps == 0), guess, best.start)
-    return _Solved(theta, states, best.squares, steps, ended & jnp.isfinite(best.cost))
+    return _Solved(theta, states, best.squares, steps, ended & jnp.isfinite(best.cost), best.whole)
 
 
 def fit(
@@ -445,23 +448,25 @@ def fit(
         return jnp.sum(value**2, axis=(1, 2)), start
 
     def again(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        theta, guess, left, round, converged, _ = carry
+        theta, guess, left, round, converged, _, last, _ = carry
         # a window's initial state may be the best of its neighbourhood only
-        other, start = anew(theta)
+        other, start = jax.lax.cond(last, lambda: (left, guess), lambda: anew(theta))
         gained = (round == 0) | jnp.any(left - other > _GAINED * jnp.sum(left) / count)
         better = (round == 0) | (other < left)
         guess = jax.tree.map(lambda new, old: jnp.where(better, new, old), start, guess)
-        # the last time looks for initial states alone
-        on = gained & (round < rounds)
-        found = _solve(reduced, theta, guess, jnp.where(on, most_steps, 0), count)
+        # the last time looks for initial states alone, and for what is left over with them: one step, which is not taken
+        on = ~last & gained & (round < rounds)
+        found = _solve(reduced, theta, guess, jnp.where(on, most_steps, 1), count)
         theta = jnp.where((moving > 0.0) & on, found.theta, theta)
         left, converged = jnp.where(on, found.squares, left), jnp.where(on, found.converged, converged)
-        return theta, found.start, left, round + 1, converged, on & (rounds > 1)
+        return theta, found.start, left, round + 1, converged, found.whole, on & (rounds <= 1), on
 
-    first = theta, windows.start, jnp.zeros(len(windows.time)), jnp.zeros((), int), jnp.asarray(False), jnp.asarray(True)
-    # the solver and the search of initial states stand in the program once: it takes long to compile
-    best, guess, _, _, converged, _ = jax.lax.while_loop(lambda carry: carry[-1], again, first)
-    value, start, jacobian = _sloped(experiment, free, dataclasses.replace(windows, start=guess), best)
+    none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(reduced, theta, windows.start).whole)
+    no, yes = jnp.asarray(False), jnp.asarray(True)
+    first = theta, windows.start, jnp.zeros(len(windows.time)), jnp.zeros((), int), no, none, no, yes
+    # all that simulates stands in the program once: it takes long to compile
+    best, *_, converged, whole, _, _ = jax.lax.while_loop(lambda carry: carry[-1], again, first)
+    value, start, jacobian = whole
     return Fit(best, start, value, jacobian, 0.5 * jnp.sum(value**2), converged)
 
 
