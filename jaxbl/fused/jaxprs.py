@@ -6,7 +6,7 @@ of equations, from here.
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -34,7 +34,7 @@ def substituted(closed: ClosedJaxpr, functions: Mapping[str, Callable[..., Any]]
     leaves = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in closed.in_avals]
     found = jax.make_jaxpr(partial(_inlined, closed, functions))(*leaves)
     # a function may itself call others
-    return found if not any(_callee(eqn) for eqn in found.jaxpr.eqns) else substituted(found, functions)
+    return found if not any(callee(eqn) for eqn in found.jaxpr.eqns) else substituted(found, functions)
 
 
 def contracted(closed: ClosedJaxpr, multiply_add: Callable[..., Any]) -> ClosedJaxpr:
@@ -75,7 +75,18 @@ def contracted(closed: ClosedJaxpr, multiply_add: Callable[..., Any]) -> ClosedJ
     return jax.make_jaxpr(evaluated)(*(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in closed.in_avals))
 
 
-def _callee(eqn: JaxprEqn) -> ClosedJaxpr | None:
+def traced(function: Callable[..., Any], *examples: Any) -> ClosedJaxpr:
+    """Trace a function of pytrees; calls inside stay calls, which takes half the time of opening them."""
+    return jax.make_jaxpr(function)(*examples)
+
+
+@lru_cache(maxsize=64)
+def traced_of_one(function: Callable[[Any], Any], dtype: Any) -> ClosedJaxpr:
+    """The same of a function of one number, once."""
+    return traced(function, jax.ShapeDtypeStruct((), dtype))
+
+
+def callee(eqn: JaxprEqn) -> ClosedJaxpr | None:
     """What an equation calls, if it does nothing else."""
     return parameter_of(eqn, "jaxpr", "call_jaxpr") if eqn.primitive.name in _CALLS else None
 
@@ -105,7 +116,7 @@ def _inlined(closed: ClosedJaxpr, functions: Mapping[str, Callable[..., Any]], *
     env = _given(closed, arguments)
     for eqn in jaxpr.eqns:
         given = [value_of(env, v) for v in eqn.invars]
-        called, name = _callee(eqn), eqn.primitive.name
+        called, name = callee(eqn), eqn.primitive.name
         if called is not None:
             env |= dict(zip(eqn.outvars, _inlined(called, functions, *given), strict=True))
         elif name in functions and jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):

@@ -16,7 +16,7 @@ from llvmlite import binding, ir
 
 from . import Unsupported
 from .elementary import FUNCTIONS
-from .jaxprs import ClosedJaxpr, JaxprEqn, Literal, Var, parameter_of, repetition, substituted
+from .jaxprs import ClosedJaxpr, JaxprEqn, Literal, Var, callee, parameter_of, repetition, traced_of_one
 from .split import Around
 
 _INT, _BIT, _POINTER = ir.IntType(64), ir.IntType(1), ir.PointerType()
@@ -126,8 +126,6 @@ class Loop:
         lanes: int | None = None,
     ):
         self.lanes = lanes or vector_lanes(dtype)
-        body = substituted(body, FUNCTIONS)
-        around = None if around is None else Around(*(substituted(part, FUNCTIONS) for part in around))
         self.signature = signature_of(body, around, values, carry, fixed, beside)
         module = ir.Module("loop")
         _Writer(module, self.lanes).loop(body, around, self.signature)
@@ -358,7 +356,11 @@ class _Writer:
             length, inner, fixed = repetition(eqn)
             still, state = given[:fixed], given[fixed:]
             return self.count(_INT(0), _INT(length), state, lambda _, state: self.run(inner, [*still, *state]))
+        if (called := callee(eqn)) is not None:
+            return self.run(called, given)
         dtype = _dtype(eqn.invars[0])
+        if name in FUNCTIONS and jnp.issubdtype(dtype, jnp.floating):
+            return self.run(traced_of_one(FUNCTIONS[name], dtype), given)
         rule = (_OF_FLOATS if jnp.issubdtype(dtype, jnp.floating) else _OF_INTEGERS).get(name) or _OF_ALL.get(name)
         if rule is None:
             raise Unsupported(f"{name} of {dtype}")

@@ -95,12 +95,12 @@ def _loop(states: int, sides: int) -> Any:
         return found
     try:
         with attempted():
-            from .jaxprs import flat
+            from .jaxprs import traced
             from .llvm import Loop
 
             sizes = states, 2 * sides, states * states, states, sides
             with jax.enable_x64(True):
-                body = flat(_sample(states, sides), *([_NUMBER] * size for size in sizes))
+                body = traced(_sample(states, sides), *([_NUMBER] * size for size in sizes))
             loop = Loop(body, np.dtype(float), carry=states, fixed=2 * sides, beside=states + sides)
             kept.save(key, loop)
             return loop

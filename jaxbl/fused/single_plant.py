@@ -286,11 +286,11 @@ def _or_none(written: Callable[..., tuple[Callable[..., Any], tuple[Any, ...], d
             return loop
         try:
             with attempted():
-                from .jaxprs import flat
+                from .jaxprs import traced
                 from .llvm import Loop
 
                 sample, examples, numbers = written(plant, *given)
-                loop = Loop(flat(sample, *examples), _FLOAT, **numbers)
+                loop = Loop(traced(sample, *examples), _FLOAT, **numbers)
                 kept.save(key, loop)
                 return loop
         except Unsupported as why:

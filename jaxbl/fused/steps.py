@@ -48,11 +48,11 @@ def _loop(sample: Sample, values: int, carry: int, inputs: int, alone: bool) -> 
         return found
     try:
         with attempted():
-            from .jaxprs import flat
+            from .jaxprs import traced
             from .llvm import Loop
 
             with jax.enable_x64(True):
-                body = flat(sample, *([_NUMBER] * size for size in sizes))
+                body = traced(sample, *([_NUMBER] * size for size in sizes))
             loop = Loop(body, np.dtype(float), values=values, carry=carry, lanes=lanes)
             kept.save(key, loop)
             return loop

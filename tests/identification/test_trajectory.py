@@ -240,7 +240,7 @@ def test_the_solver_takes_the_steps_of_levenberg_and_marquardt():
         return jnp.array([10.0 * (theta[1] - theta[0] ** 2), 1.0 - theta[0]])
 
     def point(theta, guess):
-        return _Point(residual(theta), jax.jacfwd(residual)(theta), guess, jnp.sum(residual(theta) ** 2)[None])
+        return _Point(residual(theta), jax.jacfwd(residual)(theta), guess, jnp.sum(residual(theta) ** 2)[None], ())
 
     start, nothing = jnp.array([-1.2, 1.0]), PlantState({}, {}, ())
     for steps in (2, 5, 9):
