@@ -58,6 +58,8 @@ def diagnosed(case: Case, data: Path, rivals: bool) -> Row:
             row.summary, model = found.summary, found.model
         except InputError as error:
             row.error, row.expected = str(error).replace(f"{data}/", ""), not case.readable
+            if row.expected:
+                row.error += _lost_motion(case, logs[0])
         except Exception as error:
             traceback.print_exc()
             row.error = f"{type(error).__name__}: {error}"
@@ -66,6 +68,14 @@ def diagnosed(case: Case, data: Path, rivals: bool) -> Row:
         return row
     _compare(row, case, task, model, rivals)
     return row
+
+
+def _lost_motion(case: Case, log: Path) -> str:
+    """What `jaxbl inspect` says of the gap of a recording that cannot be diagnosed."""
+    from jaxbl.records import inspect
+
+    gearing = inspect(log, case.study["log"]).record.findings.gearing
+    return "" if gearing is None else f"; lost motion by inspect: {gearing.lost_motion_text('rad')}"
 
 
 def _compare(row: Row, case: Case, task, model, rivals: bool) -> None:

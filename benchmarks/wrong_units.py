@@ -13,6 +13,7 @@ real/machines.py, left out without `--data`. A linear axis has no degrees: there
 
 import argparse
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -49,11 +50,12 @@ class MeasuredLog(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """How a command ended: its first line, exit code, and how long it took, s."""
+    """How a command ended: its first line, exit code, how long it took, s, and how long processors computed, s."""
 
     line: str
     code: int
     seconds: float
+    computed: float
 
 
 def simulated_axis() -> MeasuredLog:
@@ -103,14 +105,20 @@ RIGHT: dict[str, Callable[[MeasuredLog], pd.DataFrame]] = {"nothing": lambda log
 def ended(command: str, log: Path, model: Path, out: Path, limit: float) -> Ended:
     """Run a command in a process of its own, ended after `limit` seconds."""
     call = [sys.executable, "-m", "jaxbl", command, str(log), "--model", str(model), "--out", str(out), "--overwrite"]
-    start = time.perf_counter()
+    start, before = time.perf_counter(), _computed()
     try:
         done = subprocess.run(call, capture_output=True, text=True, timeout=limit, check=False, env=os.environ)
     except subprocess.TimeoutExpired:
-        return Ended("(not ended)", -1, time.perf_counter() - start)
+        return Ended("(not ended)", -1, time.perf_counter() - start, _computed() - before)
     said = done.stderr if done.returncode else done.stdout
     line = next(iter(said.splitlines()), "")
-    return Ended(line.replace(f"{log}: ", ""), done.returncode, time.perf_counter() - start)
+    return Ended(line.replace(f"{log}: ", ""), done.returncode, time.perf_counter() - start, _computed() - before)
+
+
+def _computed() -> float:
+    """Processor time of all processes that have ended, s."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def fault(what: str, one: Ended) -> str:
@@ -154,13 +162,17 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=180.0, metavar="S", help="end a command after so long")
     asked = parser.parse_args()
     faults, count = 0, 0
-    print("| log | wrong | command | first line | exit | s | fault |\n|---|---|---|---|---:|---:|---|")
+    print("| log | wrong | command | first line | exit | s | processor s | fault |")
+    print("|---|---|---|---|---:|---:|---:|---|")
     with tempfile.TemporaryDirectory() as folder:
         for name, what, command, one, wrong in rows(asked, Path(folder)):
             count, faults = count + 1, faults + bool(wrong)
             line = one.line.replace("|", "/")
             line = f"{line[:150]}..." if len(line) > 150 else line
-            print(f"| {name} | {what} | {command} | {line} | {one.code} | {one.seconds:.1f} | {wrong} |", flush=True)
+            print(
+                f"| {name} | {what} | {command} | {line} | {one.code} | {one.seconds:.1f} | {one.computed:.1f} | {wrong} |",
+                flush=True,
+            )
     print(f"\n{faults} of {count} with a fault")
     sys.exit(1 if faults else 0)
 

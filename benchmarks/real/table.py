@@ -110,7 +110,7 @@ def markdown(rows: Sequence[Row], rivals: bool) -> str:
     for one in rows:
         where = f"{one.name}<br>{one.split}"
         if one.error:
-            said = "cannot be read yet" if one.expected else "no diagnosis"
+            said = "has no torque" if one.expected else "no diagnosis"
             lines.append(f"| {where} | {said} | – | {one.error} | {one.published} | {one.seconds:.0f} |")
             continue
         share = one.summary["explained_share"]

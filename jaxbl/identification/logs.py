@@ -207,6 +207,11 @@ def _read_one(config: Config, log: str | Path, gear_tolerance: float) -> Record:
         if fault := EFFECTS[effect.kind].fault(effect.model_dump(), record.sample_period):
             raise InputError(f"{record.path}: {effect.kind}: {fault}")
     if record.torque is None:
+        if not any(path.endswith("inertia") for path in config.uncertainty.exact):
+            raise InputError(
+                f"{record.path}: without u a motion shows torques only as multiples of an inertia: put a known one into "
+                "[uncertainty] exact ('drive.motor_inertia'), or record u; jaxbl inspect says what the encoders show"
+            )
         notes = (*record.notes, "No input torque was recorded: the drive is taken to move freely, without one.")
         record = dataclasses.replace(record, torque=np.zeros(len(record.time)), notes=notes)
     return record

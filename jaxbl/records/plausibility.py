@@ -123,6 +123,10 @@ def _check_twist(file: LogFile, table: LogTable, found: Gearing, expected: float
     )
 
 
+_RETURNED = -0.5
+"""Work put in, over that which torque and motion exchange, below which no model of a drive can follow."""
+
+
 def check_torque(file: LogFile, found: RigidFit, grid: Grid, position: np.ndarray) -> None:
     """Refuse a torque of the wrong sign, or remark on it: a passive drive takes energy from its input; inertia is positive.
 
@@ -149,9 +153,13 @@ def check_torque(file: LogFile, found: RigidFit, grid: Grid, position: np.ndarra
         )
     # a driven load returns work as well: no error
     if share < -0.1:
-        file.warnings.append(
-            f"Doubtful: the drive returns {-100 * share:.0f} % of the work: the load drives it, or the sign of u is wrong."
-        )
+        text = f"the drive returns {-100 * share:.0f} % of the work"
+        file.warnings.append(f"Doubtful: {text}: the load drives it, or the sign of u is wrong.")
+        if share < _RETURNED:
+            file.contradiction = (
+                f"{text}, which only a drive does that its load drives: set sign = -1 in [log] u, or take a log in which "
+                "the motor drives"
+            )
     elif backwards and share < 0.1:
         file.notes.append("The drive seems to accelerate against u: see its sign, unit and column.")
 
@@ -185,7 +193,7 @@ def warn_units(file: LogFile, found: RigidFit, channel: str, nominal: NominalDri
     taken = found.power + 0.5 * expected * found.slowing
     work = taken / normal if normal > 0.0 and taken > 0.0 else None
     usual = work is not None and 1.0 / _FAR < work < _FAR_WORK
-    text, doubtful, surely = "", False, False
+    text, doubtful, surely, ratio = "", False, False, 1.0
     # a coefficient that noise, gravity, a gap or a spring hides says nothing
     if value > 4.0 * error and found.shares[0] > 0.05 and found.inflation[0] < 10.0 and found.residual < 0.5:
         ratio = value / expected
@@ -200,10 +208,18 @@ def warn_units(file: LogFile, found: RigidFit, channel: str, nominal: NominalDri
         surely = not (usual or 1.0 / _SURE < ratio < _SURE * _FAR_TORQUE)
     if work is not None and not usual and not doubtful:
         text = f"friction takes {taken:.3g} W, {work:.3g} times what the nominal viscous friction would"
-        doubtful, surely = True, work < 1.0 / _SURE
+        doubtful, surely, ratio = True, work < 1.0 / _SURE, 1.0 / work
     if doubtful:
         file.warnings.append(f"Doubtful: {text}: check the units of t, u and {channel} in [log], and the model.")
-    if doubtful and surely:
+    # two of them that are off in the same direction are no chance
+    alike = work is not None and not usual and (work > 1.0) == (ratio > 1.0)
+    against, about = float(found.values[1]), nominal.viscous(channel)
+    if against < -8.0 * float(found.errors[1]) and found.inflation[1] < 10.0 and -3.0 * about < against < -about / 3.0:
+        file.contradiction = (
+            f"u falls with the speed as a viscous friction of {against:.3g} would make it, the model's is {about:.3g}: set "
+            "sign = -1 in [log] u"
+        )
+    if doubtful and (surely or alike):
         file.contradiction = f"{text}: a unit of t, u or {channel} in [log] is wrong, or the model's number is"
 
 

@@ -231,6 +231,10 @@ def test_several_logs_are_one_record(measured):
 
 
 BAD = {
+    "no torque, no inertia": (
+        geared(log={"absent": ["u"]}),
+        r"without u a motion shows torques only as multiples of an inertia: put a known one into \[uncertainty\] exact",
+    ),
     "no load encoder": (geared(log={"absent": ["theta_s"]}), "no load position .theta_s., which a two_inertia drive needs"),
     "unknown number": (
         geared(identify={"parameters": ["drive.mass"]}),

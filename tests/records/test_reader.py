@@ -522,6 +522,8 @@ def test_work_far_from_that_of_the_nominal_friction_is_said_first(tmp_path):
         said = [one for one in record.warnings if one.startswith("Doubtful")]
         assert (len(said), bool(record.contradiction)) == (bool(begin), surely), record.warnings
         assert not begin or said[0].startswith(begin)
+    record = read_record(wrote(tmp_path, frame.assign(u=-frame["u"])), nominal=NominalDrive(1.0, 2.0))
+    assert record.contradiction.startswith("u falls with the speed as a viscous friction of -2"), record.contradiction
 
 
 def test_a_falling_load_gives_its_energy_back(tmp_path):
