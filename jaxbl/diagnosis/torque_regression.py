@@ -176,6 +176,8 @@ class _Regression:
             )
             for i, side in enumerate(self.sides)
         ]
+        # each side over its own missing torque
+        self.grams = [one / np.sum(one[:, -1, -1]) for one in self.grams]
         self.without = self._crossed(np.array([*range(len(model.names)), *self.base]), -1)[0]
 
     def tried(self, candidate: Candidate) -> _Proposal | None:
@@ -198,19 +200,18 @@ class _Regression:
 
         Columns act on all sides with one coefficient, each side over its own missing torque.
         """
-        products = [one / np.sum(one[:, -1, -1]) for one in self.grams]
+        index = [*at, *([offset] if offset >= 0 else []), -1]
+        products = [one[:, index][:, :, index] for one in self.grams]
         if offset >= 0:
-            products = [_less_column(one, offset) for one in products]
+            products = [_less_column(one) for one in products]
         total = np.sum(products, axis=0)
         whole = np.sum(total, axis=0)
-        values = _solved(whole, at)
         squares: list[list[float]] = [[] for _ in self.sides]
         for b in range(_BLOCKS):
-            fit = np.zeros(whole.shape[0])
-            fit[at], fit[-1] = -_solved(whole - total[b], at), 1.0
+            fit = np.append(-_solved(whole - total[b]), 1.0)
             for side, one in zip(squares, products, strict=True):
                 side.append(float(fit @ one[b] @ fit))
-        return [np.array(one) for one in squares], values
+        return [np.array(one) for one in squares], _solved(whole)
 
 
 def _on_side(force: np.ndarray, i: int) -> np.ndarray:
@@ -229,15 +230,18 @@ def _products(columns: np.ndarray, target: np.ndarray) -> np.ndarray:
     return np.stack([one @ one.T for one in np.array_split(every, _BLOCKS, axis=1)])
 
 
-def _less_column(products: np.ndarray, offset: int) -> np.ndarray:
-    """Products with a column taken off the target."""
-    change = np.eye(products.shape[1])
-    change[-1, offset] = -1.0
-    return change @ products @ change.T
+def _less_column(products: np.ndarray) -> np.ndarray:
+    """Products with the last column but one taken off the last, the target, and left out."""
+    less = products.copy()
+    less[:, -1] -= less[:, -2]
+    less[:, :, -1] -= less[:, :, -2]
+    kept = [*range(less.shape[1] - 2), -1]
+    return less[:, kept][:, :, kept]
 
 
-def _solved(products: np.ndarray, at: np.ndarray) -> np.ndarray:
-    inner, right = products[np.ix_(at, at)], products[at, -1]
+def _solved(products: np.ndarray) -> np.ndarray:
+    """Coefficients of all columns but the last, the target."""
+    inner, right = products[:-1, :-1], products[:-1, -1]
     size = np.sqrt(np.diag(inner))
     size[size <= 0.0] = np.inf
     return np.linalg.lstsq(inner / np.outer(size, size), right / size, rcond=1e-10)[0] / size
