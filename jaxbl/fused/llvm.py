@@ -152,7 +152,7 @@ class Loop:
 
     def __call__(
         self,
-        arrays: "Arrays | Sequence[np.ndarray | Numbers]",
+        arrays: "Arrays | Sequence[np.ndarray | Rows]",
         steps: int,
         first: int,
         last: int,
@@ -171,32 +171,32 @@ class Loop:
         self._call(ctypes.addressof(given.addresses), steps, first, last, begins, ends)
 
 
-class Numbers(NamedTuple):
-    """In the place of as many arrays of one number each: a vector of float64."""
+class Rows(NamedTuple):
+    """In the place of several arrays for a loop: the rows of one, which lie one behind the other."""
 
-    vector: np.ndarray
+    array: np.ndarray
 
 
 class Arrays:
     """Arrays for a loop, which reads where they lie: checked against its signature for so many samples and lanes."""
 
-    def __init__(self, signature: Sequence[Argument], arrays: "Sequence[np.ndarray | Numbers]", steps: int, lanes: int):
-        count = sum(len(one.vector) if isinstance(one, Numbers) else 1 for one in arrays)
+    def __init__(self, signature: Sequence[Argument], arrays: "Sequence[np.ndarray | Rows]", steps: int, lanes: int):
+        count = sum(len(one.array) if isinstance(one, Rows) else 1 for one in arrays)
         if count != len(signature):
             raise ValueError(f"a loop needs {len(signature)} arrays, not {count}")
         addresses: list[int] = []
-        for array in arrays:
-            at = len(addresses)
-            if isinstance(array, Numbers):
-                begin = _address(array.vector)
-                addresses += range(begin, begin + array.vector.nbytes, array.vector.itemsize)
-                dtype = array.vector.dtype
-                wrong = [one for one in signature[at : len(addresses)] if one.holds != "one" or one.dtype != dtype]
-                if wrong or not array.vector.flags.c_contiguous:
-                    raise ValueError(f"{wrong[0].name if wrong else 'numbers'} of a loop is none of contiguous numbers")
-            else:
-                signature[at].check(array, steps, lanes)
-                addresses.append(_address(array))
+        for one in arrays:
+            each = signature[len(addresses) : len(addresses) + (len(one.array) if isinstance(one, Rows) else 1)]
+            if not isinstance(one, Rows):
+                each[0].check(one, steps, lanes)
+                addresses.append(_address(one))
+            elif each:
+                each[0].check(one.array[:1], steps, lanes)
+                other = next((two for two in each if two[1:] != each[0][1:]), None)
+                if other is not None or not one.array.flags.c_contiguous:
+                    raise ValueError(f"{(other or each[0]).name} of a loop is no row of one array")
+                begin, stride = _address(one.array), one.array.strides[0]
+                addresses += range(begin, begin + len(each) * stride, stride)
         self.steps, self.lanes, self._kept = steps, lanes, list(arrays)
         self.addresses = (ctypes.c_void_p * count)(*addresses)
 

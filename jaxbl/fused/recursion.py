@@ -65,7 +65,10 @@ class Recursion:
             if self.loop is None:
                 _slowly(carry, gains, step, driven, read, errors)
             else:
-                self.loop([*carry, *gains, *steps, *driven, *read, *errors], count, 0, self.whole)
+                from .llvm import Rows
+
+                given = carry, np.array(gains), steps, driven, read, errors
+                self.loop([Rows(one) for one in given], count, 0, self.whole)
             return carry[:, : self.width], errors[:, :, : self.width]
 
         found = [one(changes[0], gains[0])] if len(gains) == 1 else in_threads(one, changes, gains)

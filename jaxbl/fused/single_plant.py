@@ -69,7 +69,7 @@ def paths(
         rows = [jax.tree.map(lambda x, i=i: jnp.asarray(x[i]), given) for i in range(runs)]
         each = [_scanned(experiment, gain, *one) for one in rows]  # pyright: ignore[reportCallIssue]
         return jax.tree.map(lambda *x: np.stack(x), *each)
-    from .llvm import Numbers
+    from .llvm import Rows
 
     gains = [float(value) for side in sides for value in (gain or {})[side]]
     columns = [
@@ -84,7 +84,7 @@ def paths(
     def one(i: int) -> None:
         carry, own = [np.array([leaf[i]]) for leaf in leaves], fixed.copy()
         own[at] = time[i]
-        given = Numbers(own), index, *(column[i] for column in columns), *(rows[i] for rows in kept)
+        given = Rows(own), index, *(column[i] for column in columns), *(rows[i] for rows in kept)
         loop([*carry, *given], samples, 0, 1)
 
     in_threads(one, range(runs))
@@ -124,7 +124,7 @@ def slopes(
             found.append(_pushed(experiment, *jax.tree.map(jnp.asarray, (*given, ways))))  # pyright: ignore[reportCallIssue]
         changes, new = [jax.tree.leaves(change) for change, _ in found], jax.tree.leaves(found[0][1])
         return np.array(changes, float), np.array(new, float)
-    from .llvm import Numbers
+    from .llvm import Rows
 
     count = len(torque)
     whole = -(-count // loop.lanes) * loop.lanes
@@ -137,7 +137,7 @@ def slopes(
 
     def along(way: np.ndarray, change: np.ndarray) -> None:
         # all find the same new state
-        loop([*values, Numbers(numbers), Numbers(way), *change, *new], 1, 0, whole)
+        loop([*values, Rows(numbers), Rows(way), Rows(change), Rows(new)], 1, 0, whole)
 
     in_threads(along, ways, changes)
     return changes[:, :, :count], new[:, :count]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxbl.fused.jaxprs import flat
-from jaxbl.fused.llvm import Arrays, Loop
+from jaxbl.fused.llvm import Arrays, Loop, Rows
 
 NUMBER, INDEX = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((), np.int32)
 
@@ -67,3 +67,19 @@ def test_arrays_serve_no_more_samples_and_lanes_than_they_were_made_for(loop):
         loop(made, 5, 0, 4)
     with pytest.raises(ValueError, match="needs 6 arrays, not 5"):
         loop(list(arrays().values())[:-1], 5, 0, 2)
+
+
+def test_rows_of_one_array_stand_for_several(loop):
+    given = arrays()
+    both = np.array([given["value 0"], given["carry 0"]])
+    rest = list(given.values())[2:]
+    loop([Rows(both), *rest], 5, 0, 2)
+    np.testing.assert_array_equal(both, [[1.0, 2.0], [110.0, 120.0]])
+    with pytest.raises(ValueError, match="input 0 of a loop needs 5 contiguous numbers of type int32"):
+        loop([Rows(both), rest[0], Rows(np.zeros((2, 5))), rest[3]], 5, 0, 2)
+    with pytest.raises(ValueError, match="fixed number 0 of a loop is no row of one array"):
+        loop([Rows(np.zeros((3, 2))), *rest[1:]], 5, 0, 2)
+    with pytest.raises(ValueError, match="value 0 of a loop is no row of one array"):
+        loop([Rows(np.zeros((4, 2))[::2]), *rest], 5, 0, 2)
+    with pytest.raises(ValueError, match="needs 6 arrays, not 7"):
+        loop([Rows(np.zeros((3, 2))), *rest], 5, 0, 2)
