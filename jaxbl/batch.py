@@ -11,7 +11,7 @@ from .files import make_folder, results_of
 from .report.diagnose import probability, rms_text
 from .workers import Progress, each, forget_programs, worth
 
-_LOGS = (".csv", ".parquet", ".mat")
+_LOGS = (".csv", ".parquet", ".mat", ".mf4", ".tdms", ".mcap")
 
 
 class LogJob(NamedTuple):
