@@ -41,6 +41,12 @@ LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help=_FORMATS, show_
 LogOutOption = Annotated[
     Path | None, typer.Option(metavar="DIR", help="folder for the results [default: results/<log name>]")
 ]
+MaxTorqueOption = Annotated[
+    float | None, typer.Option(metavar="N·m", help="limit of the next experiment's input [default: the log's]")
+]
+MaxTravelOption = Annotated[
+    float | None, typer.Option(metavar="RAD", help="limit of its motor travel (m on a linear axis) [default: the log's]")
+]
 LogOverwriteOption = Annotated[
     bool, typer.Option("--overwrite", help="write into a folder that holds results of another log")
 ]
@@ -263,10 +269,17 @@ def identify(
     profile: Annotated[
         bool | None, typer.Option("--profile", help="add profile-likelihood intervals", show_default=False)
     ] = None,
+    next_experiment: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.csv", help="write an input that shows a gap which the motor's encoder alone does not"),
+    ] = None,
+    max_torque: MaxTorqueOption = None,
+    max_travel: MaxTravelOption = None,
     out: LogOutOption = None,
     overwrite: LogOverwriteOption = False,
 ) -> None:
     """Fit a machine's parameters to its logs, with intervals: stiffness, gap, inertias, frictions."""
+    _check_limits(next_experiment, max_torque, max_travel)
     _start_jax()
     from .config import read_log_config
 
@@ -292,7 +305,12 @@ def identify(
         summary = results_of(
             task, file, lambda task: run_identification(task, progress), write_identification_report, overwrite=overwrite
         )
-    _print(identification_lines(summary), folder)
+    lines = identification_lines(summary)
+    if next_experiment is not None:
+        from jaxbl.diagnosis.next_experiment import write_gap_experiment
+
+        lines += write_gap_experiment(folder, summary, task.record, next_experiment, max_torque, max_travel)
+    _print(lines, folder)
 
 
 def _identify_element(
@@ -329,21 +347,13 @@ def diagnose(
     next_experiment: Annotated[
         Path | None, typer.Option(metavar="FILE.csv", help="write an input that separates the effects this log cannot")
     ] = None,
-    max_torque: Annotated[
-        float | None, typer.Option(metavar="N·m", help="limit of the next experiment's input [default: the log's]")
-    ] = None,
-    max_travel: Annotated[
-        float | None, typer.Option(metavar="RAD", help="limit of its motor travel (m on a linear axis) [default: the log's]")
-    ] = None,
+    max_torque: MaxTorqueOption = None,
+    max_travel: MaxTravelOption = None,
     out: LogOutOption = None,
     overwrite: LogOverwriteOption = False,
 ) -> None:
     """Find effects that a model lacks, add them, and test on held-out data that its errors shrink."""
-    for name, limit in (("--max-torque", max_torque), ("--max-travel", max_travel)):
-        if limit is not None and next_experiment is None:
-            raise InputError(f"{name} limits what --next-experiment FILE.csv asks for; give both")
-        if limit is not None and not 0.0 < limit < math.inf:
-            raise InputError(f"{name} is {limit:g}; it has to be positive")
+    _check_limits(next_experiment, max_torque, max_travel)
     if batch is not None:
         if log or holdout is not None or next_experiment is not None:
             raise InputError("--batch FOLDER takes no logs, --holdout or --next-experiment; give these one by one")
@@ -371,10 +381,20 @@ def diagnose(
         )
     lines = diagnosis_lines(summary)
     if next_experiment is not None:
-        from jaxbl.diagnosis.next_experiment import write_next_experiment
+        from jaxbl.diagnosis.next_experiment import write_gap_experiment, write_next_experiment
 
-        lines += write_next_experiment(folder, summary, task.record, next_experiment, max_torque, max_travel)
+        write = write_gap_experiment if "backlash" in summary else write_next_experiment
+        lines += write(folder, summary, task.record, next_experiment, max_torque, max_travel)
     _print(lines, folder)
+
+
+def _check_limits(next_experiment: Path | None, torque: float | None, travel: float | None) -> None:
+    """Limits of an experiment need one, and have to be positive."""
+    for name, limit in (("--max-torque", torque), ("--max-travel", travel)):
+        if limit is not None and next_experiment is None:
+            raise InputError(f"{name} limits what --next-experiment FILE.csv asks for; give both")
+        if limit is not None and not 0.0 < limit < math.inf:
+            raise InputError(f"{name} is {limit:g}; it has to be positive")
 
 
 def _diagnose_batch(

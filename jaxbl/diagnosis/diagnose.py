@@ -38,6 +38,7 @@ from .effect_search import EffectSearch, Explanation
 from .expected_errors import Expected, expected_errors, failed
 from .judgement import exchanged, explained_share, judged
 from .localise import SIGNIFICANT, Localised, localise
+from .motor_alone import diagnose_alone
 from .numbers_by_log import contradictions
 from .observer_residual import Observed, observed_torques
 from .proof import SURE, Accepted, Control, Proof, beaten, free_values
@@ -121,6 +122,12 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
     """
     done = stage_counter(_STAGES, progress)
     with jax.enable_x64(True):
+        if task.config.drive.kind == "two_inertia" and "load" not in task.record.positions:
+            alone = diagnose_alone(task, done)
+            return Diagnosis(
+                task.config, alone.model, task.record, task.holdout, plain(alone.summary), alone.trace, {}, {}, {}, {}, {},
+                replays="excitation" in task.missing,
+            )  # fmt: skip
         doing("smoothing the log")
         setup = set_up(task)
         proof = Proof(setup)

@@ -16,14 +16,16 @@ import pandas as pd
 from jaxtyping import Array, Float
 from scipy.signal import max_len_seq
 
-from jaxbl.config import Config, read_config
+from jaxbl.config import Config, read_config, with_values
 from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
 from jaxbl.identification.compilation import jit
-from jaxbl.identification.logs import on_record
+from jaxbl.identification.logs import on_record, unit_on
 from jaxbl.identification.segments import reading_noise, segments_of
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment, trajectory
+
+from .neutral_effects import with_added
 
 _KINDS = "sine", "multisine", "chirp", "steps"
 _SHARES = 0.01, 0.03, 0.1, 0.25, 0.5, 0.75, 1.0
@@ -83,6 +85,47 @@ def write_next_experiment(
     found = next_experiment(summary, read_config(folder / "model.toml"), record, torque, travel)
     if found is None:
         return [f"No input stays within the torque and travel allowed that would part {pair[0]} from {pair[1]}."]
+    return [f"To part {pair[0]} from {pair[1]}: {_written(found, record, path)}"]
+
+
+def write_gap_experiment(
+    folder: Path,
+    summary: Mapping[str, Any],
+    record: Record,
+    path: Path,
+    torque: float | None = None,
+    travel: float | None = None,
+) -> list[str]:
+    """Write the move that would show a gap to the motor alone, where a log does not. Returns lines for the terminal.
+
+    It is the input on which the model without a gap differs most from one with the largest gap that the log leaves open, or
+    with the nominal one if that is smaller. Arguments as of :func:`write_next_experiment`; `summary` has `backlash`.
+    """
+    said = summary.get("backlash")
+    if said is None or said["shown"]:
+        return ["No gap is in doubt: no experiment is needed to show one, and none was written."]
+    half, model = float(min(said["at_most"], said["nominal"] or np.inf)), read_config(folder / "model.toml")
+    with jax.enable_x64(True):
+        models = [on_record(each, record) for each in (model, with_gap(model, said["path"], half))]
+        found = _parting(models, record, torque, travel, float(np.mean(record.torque)) if record.torque is not None else 0.0)
+    what = f"a half gap of {half:.3g} {unit_on(record, 'motor.position', 'rad')}"
+    if found is None:
+        return [f"No input stays within the torque and travel allowed that would show {what}: --max-torque, --max-travel."]
+    return [f"To show {what}: {_written(found, record, path)}"]
+
+
+def with_gap(model: Config, path: str, half: float) -> Config:
+    """A study with a half gap, rad, in the number that a path names."""
+    if path.startswith("effects."):
+        data = model.resolved()
+        effects = [one for one in data.get("effects", []) if one["kind"] != "transmission.backlash"]
+        data["effects"] = with_added(effects, [{"kind": "transmission.backlash", "half_gap": half}], lambda one: one["kind"])
+        return read_config(data)
+    return with_values(model, {path: half / (4.0 if path.endswith("dead_zone") else 1.0)})
+
+
+def _written(found: Input, record: Record, path: Path) -> str:
+    """Write an input as CSV; what it is, and where."""
     time = record.sample_period * np.arange(len(found.torque))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -90,10 +133,10 @@ def write_next_experiment(
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     clear = "" if found.apart > _DECISIVE else ": too little; --max-torque and --max-travel allow for more"
-    return [
-        f"To part {pair[0]} from {pair[1]}: {found.kind} of {found.amplitude:.3g} N m, {found.frequency:.3g} Hz, "
+    return (
+        f"{found.kind} of {found.amplitude:.3g} N m, {found.frequency:.3g} Hz, "
         f"{time[-1] + record.sample_period:.3g} s; it would separate them by up to {found.apart:.2g} nats{clear}: {path}"
-    ]
+    )
 
 
 def tied(summary: Mapping[str, Any]) -> tuple[str, str] | None:
@@ -123,27 +166,33 @@ def next_experiment(
         return _parting(models, record, torque, travel)
 
 
-def _parting(models: list[Experiment], record: Record, torque: float | None, travel: float | None) -> Input | None:
+def _parting(
+    models: list[Experiment], record: Record, torque: float | None, travel: float | None, bias: float = 0.0
+) -> Input | None:
     """The input on which two models' positions differ most, within torque and travel; None where all go beyond.
 
-    Both begin at rest in the middle of the log's motion. What another initial position or speed would make of the
-    difference does not count.
+    Sides that the log has count. Both begin at rest in the middle of the log's motion; `bias` is added to all inputs, N m.
+    What another initial position or speed would make of the difference does not count.
     """
     assert record.torque is not None
     one = models[0]
-    noise = reading_noise(segments_of(record, one.sides))
-    tried = _inputs(record, float(np.max(np.abs(record.torque))) if torque is None else torque)
+    seen = [side for side in one.sides if side in record.positions]
+    noise = reading_noise(segments_of(record, seen))
+    largest = float(np.max(np.abs(record.torque))) if torque is None else torque
+    tried = [each._replace(torque=bias + each.torque) for each in _inputs(record, max(largest - abs(bias), 0.0))]
     torques = jnp.asarray(np.stack([each.torque for each in tried]))
     start = {
         side: jnp.asarray(float(np.median(np.concatenate([values[part] for part in record.segments]))))
         for side, values in record.positions.items()
-        if side in one.sides
+        if side in seen
     }
-    if len(start) == 2:
-        start["motor"] = start["load"] * jnp.asarray(float(one.drive.ratio("load")))
+    if len(one.sides) == 2:
+        ratio = jnp.asarray(float(one.drive.ratio("load")))
+        start.setdefault("load", start["motor"] / ratio)
+        start["motor"] = start["load"] * ratio
     paths = [_runs(model, start, torques) for model in models]
     apart, inside = np.zeros(len(tried)), np.ones(len(tried), bool)
-    for side in one.sides:
+    for side in seen:
         if travel is None:
             reach = max(float(np.ptp(record.positions[side][part])) for part in record.segments)
         else:

@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter1d
 from jaxbl.drive.effects import Motion
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.regression import Kinematics, effect_path
-from jaxbl.identification.segments import Segment
+from jaxbl.identification.segments import Segment, white_noise
 from jaxbl.identification.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, smooth
 from jaxbl.simulate import Experiment
 
@@ -207,13 +207,6 @@ def beyond_nominal(experiment: Experiment, segment: Segment) -> dict[str, tuple[
     on its own, the dry friction that is to be subtracted.
     """
     return {side: (one.beyond, one.friction) for side, one in _along(experiment, segment).items()}
-
-
-def white_noise(parts: Sequence[np.ndarray]) -> float:
-    """Standard deviation of white noise on a signal in parts, by its fourth differences: what is smooth is not in them, nor
-    are jumps, of which there are few."""
-    fourth = np.concatenate([np.diff(part, n=4) for part in parts])
-    return float(np.median(np.abs(fourth)) / 0.6745 / np.sqrt(70.0))
 
 
 def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> dict[str, list[Residual]]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxbl.errors import InputError
 from jaxbl.identification.logs import default_paths, on_record
-from jaxbl.identification.segments import Segment, segments_of
+from jaxbl.identification.segments import Segment, segments_of, white_noise
 from jaxbl.identification.trajectory import Free, free_parameters
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.simulate import Experiment
@@ -20,7 +20,7 @@ from .linearised_model import Linear
 from .localise import Localised, localise
 from .neutral_effects import candidates, complete
 from .reference_log import WINDOW, ReferenceLog
-from .residuals import Residual, residual_torques, white_noise
+from .residuals import Residual, residual_torques
 
 _DIVERGED = 10.0
 """Departure from the motion on short windows, over its range, from which on a model counts as diverging."""

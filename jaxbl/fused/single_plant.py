@@ -63,20 +63,32 @@ def paths(
     plant, varying = _Plant.of(experiment, starts), varying or {}
     sides = () if gain is None else tuple(sorted(gain))
     loop = _path_loop(plant, sides, plant.places(tuple(varying)))
-    runs, samples = torque.shape
     if loop is None:
         given = starts, torque, time, dict(measured or {}), dict(varying)
-        rows = [jax.tree.map(lambda x, i=i: jnp.asarray(x[i]), given) for i in range(runs)]
+        rows = [jax.tree.map(lambda x, i=i: jnp.asarray(x[i]), given) for i in range(len(torque))]
         each = [_scanned(experiment, gain, *one) for one in rows]  # pyright: ignore[reportCallIssue]
         return jax.tree.map(lambda *x: np.stack(x), *each)
+    gains = [float(value) for side in sides for value in (gain or {})[side]]
+    others = [*((measured or {})[side] for side in sides), *varying.values()]
+    return _run(loop, plant.numbers(experiment), plant.shape, starts, torque, time, others, gains)
+
+
+def _run(
+    loop: Any,
+    numbers: np.ndarray,
+    shape: Any,
+    starts: PlantState,
+    torque: np.ndarray,
+    time: np.ndarray,
+    others: Sequence[np.ndarray],
+    gains: Sequence[float],
+) -> PlantState:
+    """Several runs of a loop; `others`: what there is of each sample beside its torque, `(runs, samples)` each."""
     from .llvm import Rows
 
-    gains = [float(value) for side in sides for value in (gain or {})[side]]
-    columns = [
-        np.ascontiguousarray(column, float)
-        for column in (torque, *((measured or {})[side] for side in sides), *varying.values())
-    ]
-    fixed = np.concatenate([plant.numbers(experiment), [0.0], gains])
+    runs, samples = torque.shape
+    columns = [np.ascontiguousarray(column, float) for column in (torque, *others)]
+    fixed = np.concatenate([numbers, [0.0], gains])
     at = len(fixed) - len(gains) - 1
     leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(starts)]
     kept, index = [np.empty((runs, samples)) for _ in leaves], np.arange(samples, dtype=np.int32)
@@ -88,7 +100,47 @@ def paths(
         loop([*carry, *given], samples, 0, 1)
 
     in_threads(one, range(runs))
-    return plant.shape.unflatten(kept)
+    return shape.unflatten(kept)
+
+
+class Runs:
+    """:func:`paths` of experiments that differ in a few numbers, many times: what is the same is found once.
+
+    Args:
+        experiment: with array leaves.
+        state: one of any values.
+        varied: dotted paths of the numbers that differ.
+        sides: that readings correct.
+    """
+
+    def __init__(self, experiment: Experiment, state: PlantState, varied: Sequence[str], sides: Sequence[str]):
+        self.experiment, self.varied, self.sides = experiment, tuple(varied), tuple(sorted(sides))
+        plant = _Plant.of(experiment, state)
+        self.shape = plant.shape
+        self.loop = _path_loop(plant, self.sides, ())
+        if self.loop is not None:
+            self.numbers, read = np.array(plant.numbers(experiment), float), _read(plant)
+            self.places = [read.index(i) if i in read else -1 for i in plant.places(self.varied)]
+
+    def __call__(
+        self,
+        values: Mapping[str, float],
+        starts: PlantState,
+        torque: np.ndarray,
+        time: np.ndarray,
+        measured: Mapping[str, np.ndarray],
+        gain: Mapping[str, np.ndarray],
+    ) -> PlantState:
+        """With these values of the varied numbers; other arguments as of :func:`paths`."""
+        if self.loop is None:
+            experiment = set_leaves(self.experiment, {path: np.asarray(values[path], float) for path in self.varied})
+            return paths(experiment, starts, torque, time, measured, gain)
+        numbers = self.numbers.copy()
+        for place, path in zip(self.places, self.varied, strict=True):
+            if place >= 0:
+                numbers[place] = values[path]
+        return _run(self.loop, numbers, self.shape, starts, torque, time, [measured[side] for side in self.sides],
+                    [float(value) for side in self.sides for value in gain[side]])  # fmt: skip
 
 
 def slopes(

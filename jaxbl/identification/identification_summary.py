@@ -148,7 +148,7 @@ def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mappin
             "noise": noise[side],
             "unit": record.findings.channels[POSITION_CHANNELS[side]].unit,
         }
-        for i, side in enumerate(fitted.sides)
+        for i, side in enumerate(side for side in fitted.sides if side in noise)
     }
     return {
         "title": task.config.title,

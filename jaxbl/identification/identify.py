@@ -6,7 +6,7 @@ with the recursive identifier (27)-(28) on their equivalent control.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +18,17 @@ from jaxbl.config import Config, read_model, with_values
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.files import plain
 from jaxbl.records import Record
+from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress
 
 from .identification_summary import by_regression, by_trajectories, on_holdout, summary_of, torque_errors
 from .intervals import profile
 from .log_columns import columns_of, observer_chain
 from .logs import Logs, LogTask, arrays, decimation, default_paths, gains_for, on_record, read_with_holdout, stage_counter
+from .motor_alone import alone_on_holdout, columns_alone, gap_summary, search_alone
 from .search import ParameterSearch
-from .segments import long_enough, segments_of
-from .trajectory import free_parameters
+from .segments import Segment, long_enough, segments_of
+from .trajectory import Free, free_parameters
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,9 +116,11 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
         nominal = on_record(config, record)
         paths = list(settings.parameters or default_paths(config, nominal))
         free = free_parameters(nominal, paths, float(np.std(record.torque)))
-        segments = segments_of(record, nominal.sides)
+        rest, sides = config.log.initial_state == "rest", [side for side in nominal.sides if side in record.positions]
+        segments = segments_of(record, sides)
         done()
-        rest = config.log.initial_state == "rest"
+        if sides != list(nominal.sides):
+            return _from_motor(task, nominal, free, segments, done)
         found = ParameterSearch(nominal, segments, settings, rest=rest, name=str(record.path)).run(free)
         done()
         values = {one.path: float(one.value(found.fit.theta[i])) for i, one in enumerate(found.free)}
@@ -144,3 +148,26 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
         done()
     model = with_values(config, values | gain_values)
     return Identification(config, model, record, plain(summary), trace, "excitation" in task.missing)
+
+
+def _from_motor(
+    task: LogTask, nominal: Experiment, free: tuple[Free, ...], segments: list[Segment], done: Callable[[], None]
+) -> Identification:
+    """The rest of an identification without the load's encoder; what needs both encoders is left out."""
+    config, record = task.config, task.record
+    rest = config.log.initial_state == "rest"
+    alone = search_alone(nominal, free, segments, config.identify, rest=rest, name=str(record.path))
+    done()
+    trace = pd.DataFrame(columns_alone(record, alone))
+    summary = summary_of(task, alone.experiment, alone.found, {})
+    summary["method"] = {"recursive": {}, "trajectory": by_trajectories(alone.found, record)}
+    summary["torque"], summary["backlash"] = {}, gap_summary(alone)
+    for one in summary["refused"]:
+        if summary["backlash"] and alone.gap_path in one["direction"] and summary["backlash"]["why"]:
+            one["why"] = summary["backlash"]["why"]
+    if task.holdout is not None:
+        summary["holdout"] = alone_on_holdout(config, task.holdout, alone)
+    done()
+    return Identification(
+        config, with_values(config, alone.values), record, plain(summary), trace, "excitation" in task.missing
+    )

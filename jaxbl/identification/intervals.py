@@ -62,7 +62,7 @@ def spread_of(residual: np.ndarray, jacobian: np.ndarray, states: int) -> Spread
     # of what diverges nothing is finite
     with np.errstate(all="ignore"):
         variance = np.sum(residual**2) / freedom
-        middle = _long_run(scores) * residual.size / freedom
+        middle = long_run(scores) * residual.size / freedom
         inverse = _pseudo_inverse(normal / np.outer(size, size))
         plain = variance * inverse / np.outer(size, size)
         sandwich = inverse @ middle @ inverse / np.outer(size, size)
@@ -80,7 +80,7 @@ def _pseudo_inverse(matrix: np.ndarray) -> np.ndarray:
     return np.linalg.pinv(matrix, 10.0 * len(matrix) * np.finfo(float).eps, hermitian=True)
 
 
-def _long_run(scores: np.ndarray) -> np.ndarray:
+def long_run(scores: np.ndarray) -> np.ndarray:
     """Sum of the autocovariances of a series under Bartlett's weights, times its length."""
     count = len(scores)
     square = np.sum(scores**2, axis=0)

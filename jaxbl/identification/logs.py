@@ -147,7 +147,7 @@ def read_with_holdout(
 
 def _from_zero_of(first: Record, record: Record, config: Config) -> Record:
     """A log whose positions count from the zero of another one, as far as torques that repeat with the turn show it."""
-    table, two = config.log, config.drive.kind == "two_inertia"
+    table, two = config.log, "load" in record.positions and config.drive.kind == "two_inertia"
     given = any(one is not None and one.offset is not None for one in (table.theta_e, table.theta_s))
     if given or "motor" not in record.positions or record.findings.channels["theta_e"].unit != "rad":
         return record
@@ -188,13 +188,19 @@ def _read_one(config: Config, log: str | Path, gear_tolerance: float) -> Record:
     record = read_record(log, config.log, gear_ratio=ratio, gear_tolerance=gear_tolerance, nominal=nominal)
     if record.contradiction:
         raise InputError(f"{record.path}: {record.contradiction}")
-    sides = ("motor", "load") if config.drive.kind == "two_inertia" else ("motor",)
-    for side in sides:
-        if side not in record.positions:
+    if "motor" not in record.positions:
+        raise InputError(
+            f"{record.path}: no motor position ({POSITION_CHANNELS['motor']}), which a {config.drive.kind} drive needs; "
+            f"the log has {', '.join(record.positions)}"
+        )
+    if config.drive.kind == "two_inertia" and "load" not in record.positions:
+        if record.torque is None:
             raise InputError(
-                f"{record.path}: no {side} position ({POSITION_CHANNELS[side]}), which a {config.drive.kind} drive needs; "
-                f"the log has {', '.join(record.positions)}"
+                f"{record.path}: neither a load position (theta_s) nor a torque (u); from the motor's encoder load and gap "
+                "show only together with the motor's torque or current: log that, too"
             )
+        first = "No load position (theta_s): load, gap and frictions are found from the motor's encoder and u alone."
+        record = dataclasses.replace(record, warnings=(*record.warnings, first))
     step = config.run.sample_period / config.run.substeps
     if record.sample_period > _MOST_STEPS * step:
         raise InputError(

@@ -49,6 +49,18 @@ class Segment:
     def __len__(self) -> int:
         return len(self.time)
 
+    def first(self, samples: int) -> "Segment":
+        """Its beginning."""
+        n = min(samples, len(self))
+        smoothed = {
+            side: one._replace(state=one.state[:n], covariance=one.covariance[:n], innovations=one.innovations[:n])
+            for side, one in self.smoothed.items()
+        }
+        readings = {side: one[:n] for side, one in self.readings.items()}
+        transmitted = None if self.transmitted is None else self.transmitted[:n]
+        rows = slice(self.rows.start, self.rows.start + n)
+        return Segment(rows, self.time[:n], self.period, self.torque[:n], readings, smoothed, transmitted)
+
     @cached_property
     def kinematics(self) -> Kinematics:
         """The smoothed motion as the equations of motion take it."""
@@ -72,6 +84,13 @@ def segments_of(record: Record, sides: Sequence[str]) -> list[Segment]:
 def reading_noise(segments: Sequence[Segment]) -> dict[str, float]:
     """Standard deviation of the readings' noise of each side, rad: the mean over the segments."""
     return {side: float(np.mean([float(one.smoothed[side].noise) for one in segments])) for side in segments[0].smoothed}
+
+
+def white_noise(parts: Sequence[np.ndarray]) -> float:
+    """Standard deviation of white noise on a signal in parts, by its fourth differences: what is smooth is not in them, nor
+    are jumps, of which there are few."""
+    fourth = np.concatenate([np.diff(part, n=4) for part in parts])
+    return float(np.median(np.abs(fourth)) / 0.6745 / np.sqrt(70.0))
 
 
 def long_enough(segments: Sequence[Segment], factor: int) -> list[Kinematics]:

@@ -267,7 +267,11 @@ def _of_transmission(record: Record, speed: np.ndarray, reversals: int, ratio: f
     gearing, channels = record.findings.gearing, record.findings.channels
     if len(record.positions) < 2:
         missing = "load" if "motor" in record.positions else "motor"
-        return _same(names, "no", f"there is no {missing} encoder: the transmission in between is not observed")
+        why = f"there is no {missing} encoder: the transmission in between is not observed"
+        if missing == "load" and record.torque is not None and reversals >= 2:
+            tried = "from the motor's encoder alone: jaxbl identify with a model of two inertias tries"
+            return [Judgement(names[0], "no", why), *_same(names[1:], "weak", f"{tried}, and says if it cannot")]
+        return _same(names, "no", why)
     if gearing is None or ratio is None:
         return _same(names, "no", "the motion does not exceed the noise")
     share = min(gearing.twist, gearing.least_twist) / gearing.motion

@@ -11,6 +11,7 @@ from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.identification.logs import unit_on
 
 from .figures import COLOURS, FAINT, MISSING, Drawn, decades, legend, stacked, style, subplots, with_unit
+from .motor_alone_figures import draw_motor_alone
 from .page import PageTable, write_log_results
 from .residuals import draw_residuals, missing_quantity, plot_torque
 
@@ -190,7 +191,9 @@ def _gap_lines(gap: Mapping[str, Any]) -> list[str]:
         for name in before
         if not name.startswith("velocity")
     ]
-    lines = [f"{place}, over windows of {gap['holdout']['window']:.2g} s, rms: {'; '.join(errors)}."]
+    window = gap["holdout"]["window"]
+    how = "predicted one sample ahead" if window is None else f"over windows of {window:.2g} s"
+    lines = [f"{place}, {how}, rms: {'; '.join(errors)}."]
     run = gap["free_run"]
     if "after" in run:
         changes = [change(name, run["before"], run["after"]) for name in run["after"] if not name.startswith("velocity")]
@@ -296,6 +299,8 @@ def _number_table(summary: Mapping[str, Any]) -> PageTable:
 @style()
 def draw_diagnosis(found: Diagnosis) -> list[Drawn]:
     """All figures of a diagnosis."""
+    if not found.located:
+        return [_verdict(found.summary), *draw_motor_alone(found)]
     unit = unit_on(found.record, "motor.torque", "N m")
     residuals = draw_residuals(found.residuals, found.coordinates, found.located, unit, found.observed)
     tables = [_tables(found)] if "torque_tables" in found.summary else []

@@ -45,7 +45,7 @@ def _headline(summary: dict[str, Any]) -> list[str]:
         and not 1.0 / _FAR < one["value"] / one["nominal"] < _FAR
     ]
     lines = [f"Doubtful: {', '.join(far)}: a unit, a factor or a sign in [log] may be wrong."] if far else []
-    lines = [*summary["warnings"], *lines]
+    lines = [*summary["warnings"], *lines, *_backlash(summary)]
     for path, one in summary["parameters"].items():
         low, high = one["interval"]
         if None in (one["value"], one["standard_error"], low, high):
@@ -56,9 +56,25 @@ def _headline(summary: dict[str, Any]) -> list[str]:
     return lines
 
 
+def _backlash(summary: dict[str, Any]) -> list[str]:
+    """What a log without the load's encoder says of a gap."""
+    said = summary.get("backlash")
+    if said is None:
+        return []
+    unit = summary["residual"]["motor"]["unit"]
+    if not said["shown"]:
+        return [f"No gap is shown: {said['why']}."]
+    return [
+        f"There is a gap: a half gap of {said['half_gap']:.4g} {unit} at the motor, from {said['crossings']} crossings; "
+        "without it the motor's readings cannot be met."
+    ]
+
+
 def _remarks(summary: dict[str, Any]) -> list[str]:
-    lines = []
+    lines, unseen = [], (summary.get("backlash") or {}).get("why")
     for refusal in summary["refused"]:
+        if refusal["why"] == unseen:
+            continue
         shares = ", ".join(f"{path} {share:+.2f}" for path, share in refusal["direction"].items())
         lines.append(f"Not identifiable: {shares}: {refusal['why']}.")
     if summary["held"]:
@@ -66,11 +82,15 @@ def _remarks(summary: dict[str, Any]) -> list[str]:
     for side, residual in summary["residual"].items():
         ratio = residual["rms"] / residual["noise"]
         meaning = "noise alone" if ratio < NOISE_ALONE else "the model is incomplete"
+        if "backlash" in summary and ratio >= NOISE_ALONE:
+            meaning = "noise of the torque, or something that the model lacks"
         size = f"{residual['rms']:.2g} {residual['unit']} rms"
         lines.append(f"{side}: position residual {size}, {ratio:.3g} times the noise: {meaning}.")
     fit = summary["method"]["trajectory"]
     lines.append(
-        f"{fit['windows']} windows of {fit['window']:.3g} s with free initial states; {fit['starts_agreeing']} of "
+        "Fitted to the prediction errors of the motor over all of the log; the load moves as the model says."
+        if "backlash" in summary
+        else f"{fit['windows']} windows of {fit['window']:.3g} s with free initial states; {fit['starts_agreeing']} of "
         f"{fit['starts']} starts agree."
     )
     if not fit["converged"]:

@@ -17,6 +17,7 @@ from jaxbl.identification.logs import unit_on
 
 from .figures import COLOURS, FAINT, SIDE_COLOURS, Drawn, legend, limits, outline, stacked, style, subplots, with_unit
 from .log_signals import LogSignals
+from .motor_alone_figures import draw_motor_alone
 
 Array = np.ndarray
 
@@ -33,6 +34,8 @@ _DENSITY = ListedColormap(mpl.colormaps["Greys"](np.linspace(0.25, 0.75, 64)))
 def draw_identification(found: Identification) -> list[Drawn]:
     """All figures of an identification."""
     log = LogSignals(found)
+    if "backlash" in found.summary:
+        return [_intervals(found), *draw_motor_alone(found), _residuals(log)]
     drawn = [_intervals(found), _residuals(log), _velocities(log)]
     drawn += [_torque(log), _hysteresis(log), _limit_cycle(log)] if log.geared else [_resistance(log), _friction(log)]
     return [*drawn, _path(log)] if found.summary["method"]["recursive"] else drawn

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from jaxbl.diagnosis.input_noise import _smooth_curve, input_jumps, smoothed_input, unfelt
-from jaxbl.diagnosis.residuals import white_noise
+from jaxbl.identification.segments import white_noise
 
 PERIOD, SAMPLES = 1e-3, 8000
 TIME = PERIOD * np.arange(SAMPLES)

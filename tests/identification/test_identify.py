@@ -235,7 +235,10 @@ BAD = {
         geared(log={"absent": ["u"]}),
         r"without u a motion shows torques only as multiples of an inertia: put a known one into \[uncertainty\] exact",
     ),
-    "no load encoder": (geared(log={"absent": ["theta_s"]}), "no load position .theta_s., which a two_inertia drive needs"),
+    "no motor encoder": (
+        geared(log={"absent": ["theta_e"]}),
+        "no motor position .theta_e., which a two_inertia drive needs",
+    ),
     "unknown number": (
         geared(identify={"parameters": ["drive.mass"]}),
         "'drive.mass' is no number of the plant; fitted can be: drive.motor_inertia",

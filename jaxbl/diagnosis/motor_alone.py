@@ -1,0 +1,287 @@
+"""What a model lacks, from the motor's encoder and torque alone: a gap, and dry friction on either side of it.
+
+Other effects are not sought: without the load's encoder most of them look alike. All of these are put into the model at
+once and fitted (:mod:`jaxbl.identification.unseen_load`); then those without which the log is met as well are taken out, one
+after the other. The held-out data are predicted with the numbers found, initial states alone fitted.
+Reference: R. Kass, A. Raftery, Bayes factors, J. American Statistical Association 90 (1995), for the probabilities.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy.special import expit
+
+from jaxbl.config import Config
+from jaxbl.drive.effects import EFFECTS, AbstractEffect, make_effect
+from jaxbl.drive.parameters import as_arrays, parameters
+from jaxbl.errors import InputError
+from jaxbl.identification.logs import default_paths, on_record, unit_on
+from jaxbl.identification.motor_alone import Alone, alone_of, alone_on_holdout, columns_alone, gap_summary, why_not
+from jaxbl.identification.segments import reading_noise, segments_of, white_noise
+from jaxbl.identification.trajectory import Free, free_parameters
+from jaxbl.identification.unseen_load import SHOWN, Point, UnseenLoad, find_gap, fitted, is_gap, widths
+from jaxbl.records import POSITION_CHANNELS
+from jaxbl.simulate import Experiment, with_effects
+from jaxbl.workers import doing
+
+from .diagnosis_summary import extended_study
+from .diagnosis_task import DiagnosisTask, input_rms
+from .expected_errors import LEVEL
+from .neutral_effects import candidates, with_added
+
+_SMALL = 1e-6
+"""Dry friction that stands for none, over the input's rms."""
+_NOISE_ERROR = 0.25
+"""Relative error of an estimated noise."""
+_LEAST = 0.01
+"""Torque over the driving torque that is too small to be named: without the load's encoder ten times that with it."""
+_FAR = 5.0
+"""Standard deviations of `[uncertainty]` that a number of the model may change by."""
+
+
+class Found(NamedTuple):
+    """What a diagnosis consists of: the study with what was missing, `diagnosis.json`, and the trace."""
+
+    model: Config
+    summary: dict[str, Any]
+    trace: pd.DataFrame
+
+
+class _Search(NamedTuple):
+    """The model with all effects that are sought.
+
+    Attributes:
+        model: with its own numbers and theirs free.
+        effects: name -> place of its number among these.
+        none: theta of the model as given: effects at next to nothing.
+    """
+
+    model: UnseenLoad
+    effects: dict[str, int]
+    none: np.ndarray
+
+    def held(self, without: Sequence[str]) -> np.ndarray:
+        """Which numbers stay as they are where some effects are left out."""
+        return np.isin(np.arange(len(self.none)), [self.effects[name] for name in without])
+
+    def at(self, theta: np.ndarray, start: np.ndarray, smoothness: float, without: Sequence[str]) -> Point:
+        """A point without some effects."""
+        return self.model.at(np.where(self.held(without), self.none, theta), start, smoothness)
+
+
+def sought(experiment: Experiment) -> list[str]:
+    """Names of the effects that the motor alone can show and a model lacks: free play, and dry friction of one level."""
+    found = []
+    taken = {(type(one).exclusive, one.place) for one in experiment.effects}
+    for name in candidates(experiment):
+        cls, place = EFFECTS[name], name.partition(".")[0]
+        numbers = [about.role.kind for _, about in parameters(cls) if about.role is not None]
+        play = cls.free_play is not AbstractEffect.free_play and cls.suits(experiment.transmission)
+        dry = cls.dry_friction is not AbstractEffect.dry_friction and numbers == ["size"]
+        if play or (dry and place in ("motor", "load") and (cls.exclusive, place) not in taken):
+            found.append(name)
+    return found
+
+
+def _set_up(task: DiagnosisTask) -> _Search:
+    config, record = task.config, task.record
+    bare = on_record(config, record)
+    names, size, ratio = sought(bare), input_rms(record), float(bare.drive.ratio("load"))
+    # the fit chooses where it begins; these are scales
+    begun = {
+        name: {
+            field.name: 0.1 * size * (ratio if name.startswith("load.") else 1.0) for field, _ in parameters(EFFECTS[name])
+        }
+        for name in names
+    }
+    added = [as_arrays(make_effect(name, **numbers), float) for name, numbers in begun.items()]
+    model = with_effects(bare, tuple(with_added(bare.effects, added, lambda one: one.name)))
+    own = default_paths(config, bare)
+    paths = {name: f"effects.{name}.{next(iter(numbers))}" for name, numbers in begun.items()}
+    free = free_parameters(model, [*own, *paths.values()], size)
+    width = widths(free, np.e)
+    width[: len(own)] = config.uncertainty.relative
+    effects = {name: len(own) + i for i, name in enumerate(names)}
+    # what the model as given has: its own numbers, and next to none of the effects
+    none = np.array([0.0 if i < len(own) else np.log(_SMALL) for i in range(len(free))])
+    rest = config.log.initial_state == "rest"
+    return _Search(UnseenLoad(model, free, width, segments_of(record, ["motor"]), rest), effects, none)
+
+
+def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> Found:
+    """Do a diagnosis without the load's encoder; `done` is called after each of its three stages.
+
+    Raises:
+        InputError: a model that diverges.
+    """
+    search = _set_up(task)
+    model, gap, why = search.model, None, ""
+    play = next((name for name, i in search.effects.items() if is_gap(model.free[i])), None)
+    if play is not None and model.gap == search.effects[play]:
+        gap = find_gap(model)
+        why = why_not(gap, model, np.e)
+        point = gap.best if gap.needed else gap.without
+    else:
+        point = fitted(model)
+    if not np.isfinite(point.deviance):
+        raise InputError(f"{task.record.path}: the model diverges on this log; its numbers should be nearer")
+    done()
+    doing("comparing effects")
+    out = [] if gap is None or gap.needed else [play or ""]
+    point, gains = _needed(search, point, out)
+    if gap is not None and gap.needed and play is not None:
+        gains[play] = gap.gain
+    held = search.held(out)
+    point, width, slope = model.settled(point, held)
+    alone = alone_of(model, point, width, slope, held, gap, why)
+    done()
+    doing("testing on held-out data")
+    summary = _summary(task, search, alone, gains, out)
+    numbers = {name: _numbers(alone, name) for name in search.effects if name not in out}
+    own = {one.path: alone.values[one.path] for one in _own(search)}
+    study = extended_study(task.config, numbers, own)
+    done()
+    return Found(study, summary, pd.DataFrame(columns_alone(task.record, alone)))
+
+
+def _own(search: _Search) -> list[Free]:
+    """The model's own numbers."""
+    return [one for i, one in enumerate(search.model.free) if i not in search.effects.values()]
+
+
+def _numbers(alone: Alone, name: str) -> dict[str, float]:
+    """Numbers of an effect, by name."""
+    start = f"effects.{name}."
+    return {path.removeprefix(start): value for path, value in alone.values.items() if path.startswith(start)}
+
+
+def _needed(search: _Search, point: Point, out: list[str]) -> tuple[Point, dict[str, float]]:
+    """The fit without the frictions that are not needed, which are added to `out`, and what each other one gains."""
+    while True:
+        tried = {}
+        for name, i in search.effects.items():
+            if name not in out and not is_gap(search.model.free[i]):
+                without = [*out, name]
+                begun = search.at(point.theta, point.start, point.smoothness, without)
+                tried[name] = search.model.finished(begun, search.held(without))
+        gains = {name: one.deviance - point.deviance for name, one in tried.items()}
+        least = min(gains, key=lambda name: gains[name], default=None)
+        if least is None or gains[least] >= SHOWN:
+            return point, gains
+        out.append(least)
+        point = tried[least]
+
+
+def _summary(
+    task: DiagnosisTask, search: _Search, alone: Alone, gains: Mapping[str, float], out: Sequence[str]
+) -> dict[str, Any]:
+    """As `diagnosis.json`."""
+    record, model = task.record, search.model
+    noise, unit = reading_noise(model.segments)["motor"], record.findings.channels[POSITION_CHANNELS["motor"]].unit
+    deviation = {one.path: alone.found.spread.covariance[i, i] ** 0.5 for i, one in enumerate(alone.found.free)}
+    values = {one.path: (one, alone.values[one.path], deviation.get(one.path)) for one in model.free}
+    holdout = alone_on_holdout(task.config, task.holdout, alone, search.none)["position"]["motor"]
+    on_log = float(np.sqrt(alone.point.variance))
+    limit = (1.0 + _NOISE_ERROR) * max(on_log, noise)
+    left, size = model.unexplained(alone.point), input_rms(record)
+    # noise of the recorded torque, which is known within a factor of two
+    allowed = max(2.0 * white_noise([one.torque for one in model.segments]), _LEAST * size)
+    far = {one.path: theta / task.config.uncertainty.relative for one, theta in _changes(search, alone)}
+    far = {path: z for path, z in far.items() if abs(z) > _FAR}
+    names = [name for name in search.effects if name not in out]
+    failed = ["theta_e"] if holdout["rms"] > limit or left > allowed else []
+    verdict = "unknown_effect" if failed or far else "explained" if names else "no_discrepancy"
+    force = unit_on(record, "motor.torque", "N m")
+    before, after = holdout["nominal_rms"] ** 2, holdout["rms"] ** 2
+    sentence = (
+        f"motor side: the model as given predicts it to {holdout['nominal_rms']:.2g} {unit} rms (noise {noise:.2g}); a "
+        f"torque of {left:.2g} {force} rms a sample is left unexplained ({100.0 * left / size:.2g} % of the driving torque)"
+    )
+    findings = []
+    for name in sorted(names, key=lambda name: -gains[name]):
+        places = [one for one in model.free if one.path.startswith(f"effects.{name}.")]
+        findings.append(
+            {
+                "effect": name,
+                "confidence": float(expit(0.5 * (gains[name] - np.log(model.count)))),
+                "parameters": {
+                    one.path.rpartition(".")[2]: {
+                        "value": alone.values[one.path],
+                        "standard_error": alone.values[one.path] * (deviation.get(one.path) or float("nan")),
+                        "unit": unit_on(record, one.path, one.unit),
+                    }
+                    for one in places
+                },
+                "alternatives": [],
+                "where": {"place": name.partition(".")[0], "sentences": {}},
+                "share": _share(search, alone, name, size),
+                "z": float(np.sqrt(max(gains[name], 0.0))),
+            }
+        )
+    notes = list(record.notes)
+    notes.append(f"From the motor's encoder alone these effects are sought and no others: {', '.join(search.effects)}.")
+    if alone.why:
+        notes.append(f"No gap is shown: {alone.why}.")
+    part = task.holdout.segments
+    times = [float(task.holdout.time[part[0].start]), float(task.holdout.time[part[-1].stop - 1])]
+    return {
+        "title": task.config.title,
+        "identity": task.identity,
+        "file": str(record.path.resolve()),
+        "samples": len(record.time),
+        "sample_period": record.sample_period,
+        "verdict": verdict,
+        "findings": findings,
+        "parameters": {
+            one.path: {
+                "value": values[one.path][1],
+                "standard_error": values[one.path][1] * (values[one.path][2] or float("nan")),
+                "nominal": one.nominal,
+                "unit": unit_on(record, one.path, one.unit),
+            }
+            for one in _own(search)
+        },
+        "where": {"motor": {"sentence": sentence}},
+        "rest": {},
+        "withdrawn": [],
+        "contradictions": [],
+        "warnings": list(record.warnings),
+        "notes": notes,
+        "explained_share": 1.0 - min(max(after - noise**2, 0.0) / max(before - noise**2, 1e-300), 1.0),
+        "backlash": None if alone.gap is None else {**(gap_summary(alone) or {}), "nominal": None},
+        "gap": {
+            "holdout": {
+                "file": str(task.holdout.path.resolve()), "separate": task.separate, "window": None,
+                "from": times[0], "to": times[1],
+            },
+            "holdout_rmse_before": {"theta_e": holdout["nominal_rms"]},
+            "holdout_rmse_after": {"theta_e": holdout["rms"]},
+            "noise_floor": {"theta_e": noise},
+            "units": {"theta_e": unit},
+            "free_run": {},
+            "expected": {"theta_e": {"limit": limit}},
+            "test": {
+                "level": LEVEL, "failed": failed, "far": far, "chance": False, "remainder": False, "powerless": False,
+                "little": False,
+            },
+            "controls": {},
+        },
+    }  # fmt: skip
+
+
+def _changes(search: _Search, alone: Alone) -> list[tuple[Free, float]]:
+    """Changes of the model's own numbers (theta)."""
+    places = {one.path: float(x) for one, x in zip(search.model.free, alone.point.theta, strict=True)}
+    return [(one, places[one.path]) for one in _own(search)]
+
+
+def _share(search: _Search, alone: Alone, name: str, size: float) -> float:
+    """Torque of an effect over the driving torque: of a friction its level, of a gap what the shaft would take instead."""
+    (value,) = _numbers(alone, name).values()
+    plant = alone.experiment.plant
+    if is_gap(search.model.free[search.effects[name]]):
+        assert plant.transmission is not None
+        return min(value * float(plant.transmission.stiffness) / size, 1.0)
+    return value / (float(plant.drive.ratio("load")) if name.startswith("load.") else 1.0) / size

@@ -1,0 +1,250 @@
+"""An identification from the motor's encoder and torque alone, in the form that one from both encoders has."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbl.config import Config
+from jaxbl.config.logs import IdentifyTable
+from jaxbl.drive.parameters import set_leaves
+from jaxbl.errors import InputError
+from jaxbl.records import POSITION_CHANNELS, Record
+from jaxbl.simulate import Experiment
+
+from .intervals import UNSEEN, Refusal, Spread, refusals
+from .search import Found
+from .segments import Segment, reading_noise, segments_of, white_noise
+from .trajectory import Free, Windows
+from .unseen_load import SHOWN, Gap, Point, UnseenLoad, as_fit, find_gap, fitted, inverse, is_known, widths
+
+
+class Alone(NamedTuple):
+    """What the motor says.
+
+    Attributes:
+        found: the fit of the numbers that the log shows, all of the log as one window.
+        values: all numbers of the fit by path, those that the log does not show among them: they belong together.
+        gap: what it says of a gap; None where the model has none to be found.
+        why: why no gap is shown, in a clause; "" where one is.
+        model: what was fitted.
+        point: its best numbers.
+    """
+
+    found: Found
+    values: dict[str, float]
+    gap: Gap | None
+    why: str
+    model: UnseenLoad
+    point: Point
+
+    @property
+    def experiment(self) -> Experiment:
+        """The model with these numbers."""
+        return set_leaves(self.model.experiment, {path: np.asarray(value) for path, value in self.values.items()})
+
+    @property
+    def gap_path(self) -> str | None:
+        """Path of the number that makes the gap, if it is sought."""
+        return None if self.model.gap is None else self.model.free[self.model.gap].path
+
+    def half(self, value: float) -> float:
+        """Half gap in rad at a value of the number that makes it."""
+        return value * (4.0 if (self.gap_path or "").endswith("dead_zone") else 1.0)
+
+
+def search_alone(
+    nominal: Experiment, free: Sequence[Free], segments: Sequence[Segment], settings: IdentifyTable, *, rest: bool, name: str
+) -> Alone:
+    """Fit a model to the motor's readings; arguments as of :class:`.search.ParameterSearch`.
+
+    Raises:
+        InputError: the model diverges.
+    """
+    model = UnseenLoad(nominal, free, widths(free, settings.spread), segments, rest)
+    held, gap, why = np.zeros(len(free), bool), None, ""
+    if model.gap is None:
+        point, width, slope = model.settled(fitted(model))
+    else:
+        gap = find_gap(model)
+        point, width, slope = gap.best, gap.spread, gap.slope
+        why = why_not(gap, model, settings.spread)
+        held[model.gap] = bool(why)
+        if not gap.needed:
+            point, width, slope = model.settled(gap.without, held)
+    if not np.isfinite(point.deviance):
+        raise InputError(f"{name}: the model diverges on this log; its nominal numbers should be nearer")
+    alone = alone_of(model, point, width, slope, held, gap, why)
+    if not_met(model, point):
+        # numbers of a model that the log contradicts have no interval
+        nothing = np.full_like(alone.found.spread.covariance, np.inf)
+        found = dataclasses.replace(alone.found, spread=alone.found.spread._replace(covariance=nothing))
+        alone = alone._replace(found=found)
+    return alone
+
+
+def alone_of(
+    model: UnseenLoad, point: Point, width: Spread, slope: np.ndarray, held: np.ndarray, gap: Gap | None, why: str
+) -> Alone:
+    """A fit in which `held` numbers are none that was found; width and slope as of :meth:`UnseenLoad.settled`."""
+    values = {path: float(value) for path, value in model.numbers(point.theta).items()}
+    if gap is not None and not gap.needed and model.gap is not None:
+        values[model.free[model.gap].path] = 0.0
+    return Alone(_found(model, point, width, slope, held), values, gap, why, model, point)
+
+
+_FACTOR, _LEFT = 6.0, 0.05
+"""Torque that the model may leave unexplained: times the noise of the recorded one, and over its rms. A fit that has missed
+the right numbers leaves more."""
+_CROSSINGS = 2
+"""Of the gap at least: one there and one back."""
+_FAR = 1.5
+"""Times the logarithm of `[identify] spread` that inertias and stiffness may be off: more is another drive, or a fit that
+went wrong."""
+
+
+def not_met(model: UnseenLoad, point: Point) -> str:
+    """Why a fit cannot be right, in a clause: a torque moves the motor that is in neither; "" if there is none."""
+    left, size = model.unexplained(point), model.torque
+    if left <= max(_FACTOR * white_noise([one.torque for one in model.segments]), _LEFT * size):
+        return ""
+    return (
+        f"a torque of {left:.2g} ({100.0 * left / size:.2g} % of the driving torque) is left unexplained; the model lacks "
+        "something else, or its nominal numbers are too far off"
+    )
+
+
+def why_not(gap: Gap, model: UnseenLoad, spread: float) -> str:
+    """Why a log does not show a gap, and what would, in one clause; "" where it does."""
+    unit_noise = reading_noise(model.segments)["motor"]
+    both_ways = "moves back and forth that drive the load both ways, wider than the gap, would show one"
+    if wrong := not_met(model, gap.best if gap.needed else gap.without):
+        return wrong
+    if not gap.needed and gap.at_most >= gap.travel:
+        return f"any half gap fits; {both_ways}"
+    if not gap.needed and gap.crossings < _CROSSINGS:
+        return f"the torque in the gear hardly changes its sign; {both_ways}"
+    if not gap.needed:
+        return (
+            f"without one the motor's readings are met as well (noise {unit_noise:.2g} rad); half gaps of up to "
+            f"{gap.at_most:.3g} are not ruled out; faster reversals would show smaller ones"
+        )
+    if gap.crossings < _CROSSINGS:
+        return f"the motor moves as if in a gap, but meets one flank at most: it is wider than this motion; {both_ways}"
+    far = {
+        one.path: float(np.exp(x))
+        for one, x in zip(model.free, gap.best.theta, strict=True)
+        if is_known(one) and abs(x) > _FAR * np.log(spread)
+    }
+    if far:
+        numbers = ", ".join(f"{path} times {factor:.3g}" for path, factor in far.items())
+        return f"the log is met only with numbers far from the nominal ones ({numbers}); check these, or the log"
+    if not gap.spread.covariance[model.gap, model.gap] ** 0.5 < UNSEEN:
+        return f"one would be met, but of any size up to {gap.travel:.3g}; {both_ways}"
+    return ""
+
+
+def _found(model: UnseenLoad, point: Point, width: Spread, slope: np.ndarray, held: np.ndarray) -> Found:
+    """The fit of the numbers that the log shows; the others were fitted with them, and their intervals allow for that."""
+    sought = np.flatnonzero(~held)
+    every = _only(width, sought)
+    refused, condition = refusals([model.free[i] for i in sought], every)
+    seen = sought[np.sqrt(np.diag(np.asarray(every.covariance))) < UNSEEN]
+    if held.any():
+        refused = [Refusal({model.free[i].path: 1.0}, float("inf")) for i in np.flatnonzero(held)] + refused
+    noise = reading_noise(model.segments)["motor"]
+    size = np.sqrt(point.variance) / noise
+    fit = as_fit(point.theta[seen], point.errors / noise, slope[:, seen] * size)
+    torque, readings = (
+        jnp.asarray(np.concatenate(each)[None])
+        for each in ([one.torque for one in model.segments], [one.readings["motor"] for one in model.segments])
+    )
+    windows = Windows(
+        torque, {"motor": readings}, jnp.zeros(1), fit.start, {"motor": jnp.asarray(noise)}, jnp.asarray([model.rest])
+    )
+    return Found(
+        free=tuple(model.free[i] for i in seen), fit=fit,
+        spread=_only(width, seen)._replace(variance=size**2),
+        windows=windows, firsts=np.zeros(1, int), smoothness={"motor": point.smoothness},
+        refused=refused, held=[], condition=condition, starts=[],
+    )  # fmt: skip
+
+
+def _only(width: Spread, which: np.ndarray) -> Spread:
+    """Of some of the numbers; what is left open of the others is no information."""
+    covariance = np.asarray(width.covariance)[np.ix_(which, which)]
+    return Spread(covariance, inverse(covariance), width.variance, np.asarray(width.inflation)[which])
+
+
+def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
+    """Columns of the log and its fit, shape (samples,): `t`, `u`, `theta_e`, the motor's smoothed motion and residual, and
+    what the model says of the load and of the torque in the gear (`load.modelled_position`, `load.modelled_velocity`,
+    `torque`), with the same torque by the motor's side (`torque_by_motor`).
+    """
+    assert record.torque is not None
+    fitted, model, point = alone.experiment, alone.model, alone.point
+    plant = fitted.plant
+    states = model.states(point.theta, point.start, point.smoothness)
+    columns = {"t": record.time, "u": record.torque, POSITION_CHANNELS["motor"]: record.positions["motor"]}
+    smoothed = [one.smoothed["motor"] for one in model.segments]
+    for order, name in ((1, "velocity"), (2, "acceleration")):
+        columns[f"motor.{name}"] = np.concatenate([np.asarray(one.state[:, order]) for one in smoothed])
+        columns[f"motor.{name}_deviation"] = np.concatenate([np.asarray(one.deviation(order)) for one in smoothed])
+    readings = record.positions["motor"]
+    columns["motor.residual"] = readings - np.concatenate([np.asarray(one.position["motor"]) for one in states])
+    for name in ("position", "velocity"):
+        columns[f"load.modelled_{name}"] = np.concatenate([getattr(one, name)["load"] for one in states])
+    torques, own = [], []
+    for segment, one in zip(model.segments, states, strict=True):
+        k = segment.kinematics
+        one = jax.tree.map(jnp.asarray, one)
+        through = jax.vmap(plant.transmitted)(one.position, one.velocity, one.effects)[0]
+        position, velocity = one.position | k.position, one.velocity | k.velocity
+        none = jnp.zeros_like(through)
+        total, level = jax.vmap(plant.torques)(position, velocity, one.effects, k.torque, k.time, none)["motor"]
+        resisting = fitted.drive.viscous("motor") * k.velocity["motor"] + level * jnp.sign(k.velocity["motor"])
+        torques.append(np.asarray(through))
+        own.append(np.asarray(total - resisting - plant.inertia("motor") * k.acceleration["motor"]))
+    return columns | {"torque": np.concatenate(torques), "torque_by_motor": np.concatenate(own)}
+
+
+def gap_summary(alone: Alone) -> dict[str, Any] | None:
+    """What the motor says of the gap, as `backlash` of `identification.json`; None where the model has none."""
+    if alone.gap is None:
+        return None
+    gap, model = alone.gap, alone.model
+    return {
+        "shown": not alone.why,
+        "path": alone.gap_path,
+        "nominal": alone.half(model.free[model.gap or 0].nominal),
+        "half_gap": None if alone.why else gap.half,
+        "at_most": gap.at_most,
+        "gain": gap.gain,
+        "needed": SHOWN,
+        "crossings": gap.crossings,
+        "starts": [list(one) for one in gap.starts],
+        "why": alone.why or None,
+    }
+
+
+def alone_on_holdout(config: Config, record: Record, alone: Alone, nominal: np.ndarray | None = None) -> dict[str, Any]:
+    """How well the numbers found predict another log of the motor, beside the nominal ones.
+
+    `nominal`: theta of the model as given where it lacks some of them, shape (free,); left out: zeros.
+    """
+    fitted, smoothness = alone.model, alone.point.smoothness
+    period = jnp.asarray(record.sample_period)
+    experiment = eqx.tree_at(lambda e: e.run.sample_period, fitted.experiment, period)
+    segments = segments_of(record, ["motor"])
+    model = UnseenLoad(experiment, fitted.free, fitted.width, segments, config.log.initial_state == "rest")
+    given = np.zeros(len(model.free)) if nominal is None else nominal
+    sizes = [float(np.sqrt(model.predicted(theta, smoothness).variance)) for theta in (given, alone.point.theta)]
+    noise = reading_noise(segments)["motor"]
+    unit = record.findings.channels[POSITION_CHANNELS["motor"]].unit
+    position = {"rms": sizes[1], "nominal_rms": sizes[0], "noise": noise, "unit": unit}
+    window = max(map(len, segments)) * record.sample_period
+    return {"file": str(record.path.resolve()), "window": window, "position": {"motor": position}, "torque": {}}

@@ -1,0 +1,634 @@
+"""A drive whose load has no encoder: its numbers, the gap above all, from the motor's encoder and torque alone.
+
+While the gap is crossed the motor turns nothing but its own inertia; then it hits the load, which has gone on with the speed
+that its own friction left it, and from there on turns both. So the model of both inertias runs along the log and the motor's
+readings correct the motor's side alone; the load moves by what the model transmits to it. Prediction errors of the motor are
+least where the numbers are right.
+
+Over the half gap the likelihood has several maxima. So the fit begins at half gaps from what the encoder resolves to what
+the motor travels, with a predictor that follows the readings closely and so remembers little; from the best of them on the
+predictor is the one with the least errors.
+References: L. Ljung, System Identification (1999), 7.2; M. Nordin, P.-O. Gutman, Controlling mechanical systems with
+backlash: a survey, Automatica 38 (2002), 4 (what a motor's side shows of a gap).
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.special import chdtri
+
+from jaxbl.drive.effects import AbstractEffect
+from jaxbl.drive.parameters import set_leaves
+from jaxbl.drive.plant import PlantState, States
+from jaxbl.fused.single_plant import Runs
+from jaxbl.simulate import Experiment
+from jaxbl.workers import doing
+
+from .intervals import Spread, long_run
+from .prediction import kalman_gain
+from .regression import settled
+from .segments import Segment
+from .trajectory import WIDE, Fit, Free
+
+_STEP, _SHORTEST = 1e-2, 1e-6
+"""Largest and least change of theta, or of a start, for derivatives."""
+_SHARE = 0.3
+"""Of a standard error: change of a number for its derivative. Impacts and standstill make corners in what a number does,
+finer than its standard error; a derivative has to see over them."""
+_FOLLOWING = 1e-2, 1e-4
+"""Smoothness q h^3 / sigma^2 of the predictors that a fit begins with: they remember some 3 and 10 samples."""
+_SMOOTHNESS = 10.0 ** np.arange(-13.0, 0.1)
+"""Values tried for the last predictor, from a free run to one that follows every reading."""
+_SHARES = 0.2, 0.5, 0.85
+"""Of the load in the frictions that a fit begins with."""
+_STARTS = 12
+"""Half gaps that a fit begins at."""
+_FEW, _MORE = 7, 12
+"""Steps of the fit: at each half gap it begins at, and with each predictor."""
+_BACK = 4
+"""Back from a fit beside it."""
+_CHOICES = 4
+"""Of the predictor that suits the fit, at most."""
+_WORTH = 20.0
+"""Independent errors that a log counts for while the model is still wrong."""
+_FINALISTS = 4
+"""Half gaps of which the fit goes on."""
+_HOPELESS = 9.0
+"""Mean square over the least from which on a fit is given up."""
+_PART = 4000
+"""Samples that the first fits are made to."""
+_SETTLED = 0.01
+"""Gain in minus twice the log-likelihood below which a fit has ended: a tenth of a standard error."""
+_MOST_REJECTED = 8
+_RESOLVED = 0.15
+"""Of a plant step times the fastest frequency of the drive: Moreau's rule is then off by a thousandth of it."""
+SHOWN = float(chdtri(1.0, 1e-3))
+"""Gain in minus twice the log-likelihood over the model without a gap from which on a gap is shown: 1 in 1000 by chance."""
+_LIMIT = float(chdtri(1.0, 0.05))
+_SKIPPED = 0.15
+"""Share of each part of a log in which the load finds its way: where it begins is not known, and many places would fit."""
+_APART = 0.2
+"""Prior standard deviation of the load's first speed about the motor's, over the motor's rms speed."""
+_STATES = 4
+"""Numbers that a part of a log begins with: positions and velocities of both sides."""
+_GAPS = "half_gap", "dead_zone"
+"""Ends of the paths of numbers that make a gap."""
+
+
+class Point(NamedTuple):
+    """Numbers tried.
+
+    Attributes:
+        theta: of the free numbers.
+        start: of each segment: motor position and velocity off the smoothed ones, in their standard deviations; twist over
+            what half gap and wind-up make; load speed off the motor's. Shape (segments, 4).
+        smoothness: of the predictor.
+        errors: prediction errors of the motor, all segments one after the other without their beginnings, rad, shape
+            (count,).
+        deviance: minus twice the log-likelihood, the noise that suits it best, with the priors; up to a constant.
+    """
+
+    theta: np.ndarray
+    start: np.ndarray
+    smoothness: float
+    errors: np.ndarray
+    deviance: float
+
+    @property
+    def variance(self) -> float:
+        """Mean square of the prediction errors, rad^2."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            return float(np.nan_to_num(np.mean(self.errors**2), nan=np.inf))
+
+
+class UnseenLoad:
+    """Fits of a model with two inertias to the motor's readings.
+
+    Args:
+        experiment: the model, with array leaves, at the log's period.
+        free: numbers to be fitted.
+        width: prior standard deviation of each one's theta, shape (free,).
+        segments: of the log, with the motor's motion.
+        rest: whether each begins at rest.
+    """
+
+    def __init__(
+        self, experiment: Experiment, free: Sequence[Free], width: np.ndarray, segments: Sequence[Segment], rest: bool
+    ):
+        self.experiment, self.free, self.width, self.rest = experiment, tuple(free), np.asarray(width), rest
+        self.segments = segments
+        self.period = float(experiment.run.sample_period)
+        self._skipped = [int(_SKIPPED * len(one)) for one in segments]
+        self.count = sum(map(len, segments)) - sum(self._skipped)
+        motions = [one.smoothed["motor"] for one in segments]
+        self._first = np.array([np.asarray(one.state[0, :2]) for one in motions])
+        self._open = np.array([[float(one.deviation(i)[0]) for i in (0, 1)] for one in motions])
+        speed = np.concatenate([np.asarray(one.velocity) for one in motions])
+        self._speed = float(np.sqrt(np.mean(speed**2)))
+        self.torque = float(np.sqrt(np.mean(np.concatenate([one.torque for one in segments]) ** 2)))
+
+    @property
+    def gap(self) -> int | None:
+        """Place of the number that makes the gap, if it is one of the free ones."""
+        return next((i for i, one in enumerate(self.free) if is_gap(one)), None)
+
+    def frictions(self) -> list[list[tuple[int, float]]]:
+        """Places of viscous and of dry frictions among the free numbers, motor and load, and the factor that makes each one
+        at the motor."""
+        plant, places = self.experiment.plant, {one.path: i for i, one in enumerate(self.free)}
+        ratio = float(plant.drive.ratio("load"))
+        viscous = {"drive.motor_viscous": 1.0, "drive.load_viscous": ratio**-2.0}
+        dry = {
+            f"effects.{one.name}.torque": 1.0 if one.place == "motor" else 1.0 / ratio
+            for one in plant.effects
+            if type(one).dry_friction is not AbstractEffect.dry_friction
+        }
+        return [[(places[path], factor) for path, factor in each.items() if path in places] for each in (viscous, dry)]
+
+    def beginnings(self) -> list[np.ndarray]:
+        """Theta to begin at, shape (free,): frictions that together are what the log shows of a drive without gap, mostly
+        the motor's and mostly the load's.
+
+        From a friction that is too large no way leads back: the load sticks, and nothing depends on it.
+        """
+        rows, torque = [], []
+        for one in self.segments:
+            k = one.kinematics
+            speed = np.asarray(k.velocity["motor"])
+            rows.append(np.stack([np.asarray(k.acceleration["motor"]), speed, np.sign(speed), np.ones(len(speed))], axis=1))
+            torque.append(np.asarray(k.torque))
+        matrix, torque = np.concatenate(rows), np.concatenate(torque)
+        moving = np.abs(matrix[:, 1]) > 0.1 * self._speed
+        found = np.linalg.lstsq(matrix[moving], torque[moving], rcond=None)[0]
+        least = np.array([1e-2 * self.torque / self._speed, 1e-2 * self.torque])
+        total, begun = np.maximum(found[1:3], least), []
+        for share in _SHARES:
+            theta = np.zeros(len(self.free))
+            for size, places in zip(total, self.frictions(), strict=True):
+                parts = [1.0] if len(places) == 1 else [1.0 - share, share]
+                for (i, factor), part in zip(places, parts, strict=False):
+                    theta[i] = np.log(part * size / factor / self.free[i].scale)
+            begun.append(theta)
+        return begun
+
+    def coarse(self) -> "UnseenLoad":
+        """The same with plant steps just short enough for the drive's fastest oscillation."""
+        plant = self.experiment.plant
+        assert plant.transmission is not None
+        ratio = float(plant.drive.ratio("load"))
+        inverse = 1.0 / float(plant.inertia("motor")) + ratio**2 / float(plant.inertia("load"))
+        # numbers may grow on the way
+        fastest = np.sqrt(2.0 * float(plant.transmission.stiffness) * inverse)
+        steps = int(np.clip(np.ceil(self.period * fastest / _RESOLVED), 1, self.experiment.run.substeps))
+        run = dataclasses.replace(self.experiment.run, substeps=steps)
+        experiment = eqx.tree_at(lambda e: e.run, self.experiment, run)
+        return UnseenLoad(experiment, self.free, self.width, self.segments, self.rest)
+
+    def numbers(self, theta: np.ndarray) -> dict[str, float]:
+        """Values by path."""
+        with np.errstate(over="ignore"):
+            values = [one.scale * np.exp(x) if one.positive else one.nominal + one.scale * x
+                      for one, x in zip(self.free, theta, strict=True)]  # fmt: skip
+        return {one.path: float(value) for one, value in zip(self.free, values, strict=True)}
+
+    def states(self, theta: np.ndarray, start: np.ndarray, smoothness: float) -> list[PlantState]:
+        """The predictor's states before it has seen each sample's reading, by segment, leaves of shape (samples,)."""
+        return [jax.tree.map(lambda x: x[0], self._runs(theta, i, one[None], smoothness)) for i, one in enumerate(start)]
+
+    def at(self, theta: np.ndarray, start: np.ndarray, smoothness: float) -> Point:
+        """Prediction errors of some numbers."""
+        found = self.states(theta, start, smoothness)
+        return self._point(theta, start, smoothness, np.concatenate([self._errors(i, one) for i, one in enumerate(found)]))
+
+    def _errors(self, which: int, states: PlantState) -> np.ndarray:
+        """What the readings of a segment differ from predictions, last axis (counted samples,)."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            errors = self.segments[which].readings["motor"] - np.asarray(states.position["motor"])
+        return errors[..., self._skipped[which] :]
+
+    def _point(self, theta: np.ndarray, start: np.ndarray, smoothness: float, errors: np.ndarray) -> Point:
+        prior = np.sum((theta / self.width) ** 2) + np.sum((start - self._expected(start)) ** 2)
+        # a model that diverges
+        with np.errstate(invalid="ignore", over="ignore"):
+            deviance = self.count * np.log(np.mean(errors**2)) + prior
+        return Point(theta, start, smoothness, errors, float(deviance) if np.isfinite(deviance) else np.inf)
+
+    @staticmethod
+    def _expected(start: np.ndarray) -> np.ndarray:
+        """Mean of the prior of a start: in contact on the flank that it is at."""
+        return np.stack([np.sign(column) if i == 2 else np.zeros(len(column)) for i, column in enumerate(start.T)], axis=1)
+
+    @cached_property
+    def _settled(self) -> list[States]:
+        """States of effects that each segment begins with."""
+        found = [settled(self.experiment, jnp.asarray(one.torque[0])) for one in self.segments]
+        return jax.tree.map(float, found)
+
+    @cached_property
+    def _model(self) -> Runs:
+        zero: Any = dict.fromkeys(("motor", "load"), 0.0)
+        return Runs(self.experiment, PlantState(zero, zero, self._settled[0]), [one.path for one in self.free], ["motor"])
+
+    @cached_property
+    def _own(self) -> dict[str, float]:
+        """Half gap, stiffness and gear ratio without the free numbers."""
+        plant = self.experiment.plant
+        assert plant.transmission is not None
+        known = {"transmission.stiffness": float(plant.transmission.stiffness), "ratio": float(plant.drive.ratio("load"))}
+        return known | {"half": 0.0 if self.gap is not None else plant.half_gap}
+
+    def _runs(self, theta: np.ndarray, which: int, starts: np.ndarray, smoothness: float) -> PlantState:
+        """Of a segment from several starts, shape (runs, 4)."""
+        segment, numbers = self.segments[which], self.numbers(theta)
+        known = self._own | numbers
+        ratio, half = known.get("drive.gear_ratio", known["ratio"]), known["half"]
+        if self.gap is not None:
+            one = self.free[self.gap]
+            half += known[one.path] * half_gap_of(one)
+        position = self._first[which, 0] + self._open[which, 0] * starts[:, 0]
+        velocity = self._first[which, 1] + self._open[which, 1] * starts[:, 1]
+        twist = starts[:, 2] * (half + self.torque / known["transmission.stiffness"])
+        load = velocity + _APART * self._speed * starts[:, 3]
+        if self.rest:
+            velocity, load = np.zeros_like(velocity), np.zeros_like(load)
+        effects = jax.tree.map(lambda x: np.full(len(starts), x), self._settled[which])
+        state = PlantState(
+            {"motor": position, "load": (position - twist) / ratio}, {"motor": velocity, "load": load / ratio}, effects
+        )
+        shape = len(starts), len(segment)
+        torque, readings = (np.broadcast_to(x, shape) for x in (segment.torque, segment.readings["motor"]))
+        time = np.full(len(starts), float(segment.time[0]))
+        gain = kalman_gain(float(smoothness), self.period)
+        return self._model(numbers, state, torque, time, {"motor": readings}, {"motor": gain})
+
+    def begun(self, theta: np.ndarray, smoothness: float) -> Point:
+        """With each segment beginning where in the gap, and with which speed of the load, suits it best."""
+        tries = np.array([[0.0, 0.0, twist, speed] for twist in (1.0, -1.0, 1e-3) for speed in (0.0, 2.0, -2.0)])
+        start, errors = [], []
+        for i in range(len(self.segments)):
+            each = self._errors(i, self._runs(theta, i, tries, smoothness))
+            with np.errstate(invalid="ignore", over="ignore"):
+                squares = np.sum(each**2, axis=1)
+            best = int(np.argmin(np.where(np.isfinite(squares), squares, np.inf)))
+            start.append(tries[best])
+            errors.append(each[best])
+        return self._point(theta, np.array(start), smoothness, np.concatenate(errors))
+
+    def predicted(self, theta: np.ndarray, smoothness: float) -> Point:
+        """Prediction errors of given numbers; initial states alone are fitted, first with predictors that follow closely."""
+        held = np.ones(len(self.free), bool)
+        point = self.begun(theta, _FOLLOWING[0])
+        for one in (*_FOLLOWING[:2], smoothness):
+            point = self.solve(self.at(theta, point.start, one), _FEW, held)
+        return point
+
+    def slopes(self, point: Point, held: np.ndarray, size: np.ndarray | None = None) -> np.ndarray:
+        """Derivatives of the errors by theta and by the starts, rad, shape (samples, free + 4 segments); 0 where held.
+
+        `size`: standard errors, all else known; shape (free + 4 segments,).
+        """
+        count, states = len(self.free), point.start.size
+        step = np.full(count + states, 1e-2 * _STEP) if size is None else np.clip(_SHARE * size, _SHORTEST, _STEP)
+        found = np.zeros((self.count, count + states))
+        for i in np.flatnonzero(~held):
+            theta = point.theta.copy()
+            theta[i] += step[i]
+            found[:, i] = (self.at(theta, point.start, point.smoothness).errors - point.errors) / step[i]
+        row, column = 0, count
+        for i, start in enumerate(point.start):
+            own = step[column : column + _STATES]
+            each = self._errors(i, self._runs(point.theta, i, start + np.diag(own), point.smoothness))
+            rows = slice(row, row + each.shape[1])
+            found[rows, column : column + _STATES] = ((each - point.errors[rows]) / own[:, None]).T
+            row, column = rows.stop, column + _STATES
+        return np.where(np.isfinite(found), found, 0.0)
+
+    def solve(self, point: Point, steps: int, held: np.ndarray | None = None) -> Point:
+        """Levenberg-Marquardt from a point, with its predictor; `held` numbers stay where they are."""
+        held = np.zeros(len(self.free), bool) if held is None else held
+        precision = np.concatenate([self.width**-2.0, np.ones(point.start.size)])
+        best, damping, size = point, 1e-3, None
+        for _ in range(steps):
+            if not np.isfinite(best.deviance):
+                break
+            slope = self.slopes(best, held, size)
+            away = np.concatenate([best.theta, (best.start - self._expected(best.start)).ravel()])
+            matrix = slope.T @ slope / best.variance + np.diag(precision)
+            size = np.diag(matrix) ** -0.5
+            towards = slope.T @ best.errors / best.variance + precision * away
+            fixed = np.concatenate([held, np.zeros(point.start.size, bool)])
+            towards[fixed] = 0.0
+            matrix[fixed], matrix[:, fixed] = 0.0, 0.0
+            matrix[fixed, fixed] = 1.0
+            gained = 0.0
+            for _ in range(_MOST_REJECTED):
+                change = -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), towards)
+                change = np.clip(change, -1.0, 1.0)
+                count = len(self.free)
+                tried = self.at(
+                    best.theta + change[:count], best.start + change[count:].reshape(-1, _STATES), best.smoothness
+                )
+                gained = best.deviance - tried.deviance
+                if gained > 0.0:
+                    best, damping = tried, max(0.1 * damping, 1e-9)
+                    break
+                damping *= 8.0
+            if gained < _SETTLED:
+                break
+        return best
+
+    def predictor(self, point: Point) -> Point:
+        """The same numbers with the predictor whose errors are least."""
+        tried = [self.at(point.theta, point.start, float(one)) for one in _SMOOTHNESS]
+        return min([point, *tried], key=lambda one: one.deviance)
+
+    def finished(self, point: Point, held: np.ndarray | None = None) -> Point:
+        """Fit with the predictor that suits it best: chosen, fitted, and so on."""
+        for _ in range(_CHOICES):
+            before = point.smoothness
+            point = self.solve(self.predictor(point), _MORE, held)
+            if point.smoothness == before:
+                break
+        return point
+
+    def followed(self, point: Point, held: np.ndarray | None = None) -> Point:
+        """From a predictor that follows the readings closely to the one that suits the model."""
+        point = self.at(point.theta, point.start, _FOLLOWING[-1])
+        return self.finished(self.solve(point, _MORE, held), held)
+
+    def unexplained(self, point: Point) -> float:
+        """Torque that moves the motor beside the model's by the predictor that suits best, white, N m rms a sample."""
+        noise = float(np.mean([float(one.smoothed["motor"].noise) for one in self.segments]))
+        inertia = self.numbers(point.theta).get("drive.motor_inertia", float(self.experiment.plant.inertia("motor")))
+        return inertia * float(np.sqrt(point.smoothness)) * noise / self.period**2
+
+    def settled(self, point: Point, held: np.ndarray | None = None) -> tuple[Point, Spread, np.ndarray]:
+        """The best of a point and of fits beside it; covariance and derivatives of the errors there, as of :meth:`spread`.
+
+        Impacts make the likelihood rough over less than its standard errors, and plant steps are finite: what predictors
+        with a longer and a shorter memory, and one with twice the plant steps, find differently counts as an error.
+        """
+        doing("standard errors")
+        fine = UnseenLoad(_stepped(self.experiment, 2), self.free, self.width, self.segments, self.rest)
+        others = [fine.solve(fine.at(point.theta, point.start, point.smoothness), _FEW, held)]
+        for factor in _OTHERS:
+            others.append(self.solve(self.at(point.theta, point.start, factor * point.smoothness), _FEW, held))
+        again = [self.solve(self.at(one.theta, one.start, point.smoothness), _BACK, held) for one in others]
+        best = min([point, *again], key=lambda one: one.deviance)
+        width, slope = self.spread(best, held)
+        changes = np.array([one.theta - best.theta for one in others if np.isfinite(one.deviance)])
+        # not their mean: some end in the valley that they came from, and say nothing
+        wide = np.asarray(width.covariance) + changes.T @ changes
+        more = np.sqrt(np.diag(wide) / np.diag(np.asarray(width.covariance)))
+        return best, width._replace(covariance=wide, inflation=width.inflation * more), slope
+
+    def spread(self, point: Point, held: np.ndarray | None = None) -> tuple[Spread, np.ndarray]:
+        """Covariance of theta, of data and priors together, and the derivatives of the errors by theta over their size."""
+        held = np.zeros(len(self.free), bool) if held is None else held
+        count = len(self.free)
+        precision = np.concatenate([np.where(held, 1e12, self.width**-2.0), np.ones(point.start.size)])
+        size = None
+        for _ in range(2):
+            slope = self.slopes(point, held, size) / np.sqrt(point.variance)
+            size = (np.sum(slope**2, axis=0) + precision) ** -0.5
+        assert size is not None
+        scores = slope * size * (point.errors / np.sqrt(point.variance))[:, None]
+        middle = long_run(scores) + np.diag(precision * size**2)
+        white = inverse((slope * size).T @ (slope * size) + np.diag(precision * size**2))
+        scale = np.outer(size, size)[:count, :count]
+        inner, sandwich = white[:count, :count] * scale, (white @ middle @ white)[:count, :count] * scale
+        # a little negative correlation is nothing to gain confidence from
+        more = np.maximum(np.sqrt(np.diag(inner) / np.diag(sandwich)), 1.0)
+        covariance = sandwich * np.outer(more, more)
+        inflation = np.sqrt(np.diag(covariance) / np.diag(inner))
+        return Spread(covariance, inverse(inner), point.variance, inflation), slope[:, :count]
+
+
+def as_fit(theta: np.ndarray, residual: np.ndarray, jacobian: np.ndarray) -> Fit:
+    """A fit of one channel as one window: residuals over their size, shape (samples,), derivatives (samples, numbers)."""
+    start = PlantState({"motor": jnp.zeros(1)}, {"motor": jnp.zeros(1)}, ())
+    return Fit(
+        jnp.asarray(theta), start, jnp.asarray(residual[None, :, None]), jnp.asarray(jacobian[None, :, None, :]),
+        jnp.asarray(0.5 * float(np.sum(residual**2))), jnp.asarray(True),
+    )  # fmt: skip
+
+
+_OTHERS = 10.0, 0.1
+"""Factors on the smoothness of predictors whose numbers are compared with the best one's."""
+
+
+def inverse(matrix: np.ndarray) -> np.ndarray:
+    """Of a symmetric positive matrix some of whose directions may be lost in rounding: these keep what rounding leaves."""
+    if not len(matrix):
+        return matrix
+    size = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
+    values = np.maximum(values, 1e-14 * len(values) * values[-1])
+    return (vectors / values) @ vectors.T / np.outer(size, size)
+
+
+class Gap(NamedTuple):
+    """What the motor says of the gap.
+
+    Attributes:
+        best: the fit with all numbers.
+        without: the best fit without a gap.
+        spread: covariance of the best fit's theta.
+        slope: derivatives of its errors by theta over their size, shape (samples, free).
+        gain: of minus twice the log-likelihood by the gap, correlation of the errors counted.
+        crossings: of the gap from flank to flank; of changes of sign of the transmitted torque without a gap.
+        at_most: the largest half gap that the log does not rule out, where it does not show one (95 %), rad.
+        starts: half gap that each fit began at, rad, and its deviance above the least.
+        half: the half gap of the best fit, rad.
+        travel: of the motor, rad.
+    """
+
+    best: Point
+    without: Point
+    spread: Spread
+    slope: np.ndarray
+    gain: float
+    crossings: int
+    at_most: float
+    starts: list[tuple[float, float]]
+    half: float
+    travel: float
+
+    @property
+    def needed(self) -> bool:
+        """Whether the readings cannot be met without a gap."""
+        return self.gain >= SHOWN
+
+
+def _stepped(experiment: Experiment, factor: int) -> Experiment:
+    """With so many times the plant steps."""
+    return eqx.tree_at(
+        lambda e: e.run, experiment, dataclasses.replace(experiment.run, substeps=factor * experiment.run.substeps)
+    )
+
+
+def is_gap(one: Free) -> bool:
+    """Whether a number makes a gap."""
+    return one.path.endswith(_GAPS)
+
+
+def half_gap_of(one: Free) -> float:
+    """Half gap for 1 of the number that makes it."""
+    return 4.0 if one.path.endswith("dead_zone") else 1.0
+
+
+def is_known(one: Free) -> bool:
+    """Whether data sheets and CAD know a number within a small factor."""
+    return one.path.endswith(("inertia", ".stiffness"))
+
+
+def widths(free: Sequence[Free], factor: float) -> np.ndarray:
+    """Prior standard deviations of theta: inertias and stiffness are known within a factor, a gap not at all."""
+    each = [_ANY if is_gap(one) else np.log(factor) if is_known(one) else WIDE for one in free]
+    return np.array(each)
+
+
+_ANY = 100.0
+"""Prior standard deviation of a gap's theta: none."""
+_NEAR = 0.3
+"""Prior standard deviation of what is known while the model is still wrong."""
+_NONE = 1e-9
+"""Half gap over the motor's travel that stands for none."""
+
+
+class _Search:
+    """The search for a gap.
+
+    Args:
+        model: with the gap among its free numbers.
+    """
+
+    def __init__(self, model: UnseenLoad):
+        self.model, self.coarse = model, model.coarse()
+        width = np.where([is_known(one) for one in model.free], np.minimum(_NEAR, model.width), model.width)
+        width = np.where([is_gap(one) for one in model.free], _ANY, width * np.sqrt(_WORTH / model.count))
+        self.near = UnseenLoad(self.coarse.experiment, model.free, width, model.segments, model.rest)
+        part = max(model.segments, key=len).first(_PART)
+        self.part = UnseenLoad(self.coarse.experiment, model.free, width, [part], model.rest)
+        assert model.gap is not None
+        self.place: int = model.gap
+        one = model.free[self.place]
+        self.one, self.factor = one, half_gap_of(one)
+        self.held = np.arange(len(model.free)) == self.place
+        readings = [segment.readings["motor"] for segment in model.segments]
+        self.travel = float(max(np.ptp(each) for each in readings))
+        self.noise = float(np.mean([float(one.smoothed["motor"].noise) for one in model.segments]))
+
+    def theta(self, half: float) -> float:
+        """Of the gap's number, at a half gap in rad."""
+        return float(np.log(half / self.factor / self.one.scale))
+
+    def half(self, theta: float) -> float:
+        return float(self.factor * self.one.scale * np.exp(theta))
+
+    def run(self) -> Gap:
+        doing("trying half gaps")
+        starts = self._starts()
+        doing("fitting the gap")
+        best, spread, slope = self.model.settled(self._best(starts))
+        doing("fitting without a gap")
+        without = self._without(best)
+        worth = float(spread.inflation[self.place]) ** 2
+        gain = max(without.deviance - best.deviance, 0.0) / max(worth, 1.0)
+        least = min(one.variance for _, one in starts)
+        tried = [(half, self.model.count * float(np.log(one.variance / least))) for half, one in starts]
+        found = Gap(
+            best, without, spread, slope, gain, 0, self.travel, tried, self.half(best.theta[self.place]), self.travel
+        )
+        if gain < SHOWN:
+            return found._replace(at_most=self._at_most(without, worth), crossings=self._reversals(without))
+        return found._replace(crossings=self._crossings(best))
+
+    def _starts(self) -> list[tuple[float, Point]]:
+        """Short fits at half gaps from the encoder's noise to more than the motor's travel, where the load is never met."""
+        low = max(2.0 * self.noise, 1e-4 * self.travel)
+        grid = [*np.geomspace(low, 0.5 * self.travel, _STARTS - 1), 2.0 * self.travel]
+        return [(float(half), self._begun(self.theta(half))) for half in grid]
+
+    def _begun(self, gap: float) -> Point:
+        """A short fit at theta of the gap, the other numbers held near to what is known of them."""
+        starts = [self.part.begun(np.where(self.held, gap, theta), _FOLLOWING[0]) for theta in self.model.beginnings()]
+        return min((self.part.solve(one, _FEW, self.held) for one in starts), key=lambda one: one.variance)
+
+    def _best(self, starts: Sequence[tuple[float, Point]]) -> Point:
+        """The best fit from the half gaps that are better than their neighbours."""
+        size = np.array([np.inf, *(one.variance for _, one in starts), np.inf])
+        valleys = [i - 1 for i in range(1, len(size) - 1) if size[i] <= min(size[i - 1], size[i + 1])]
+        chosen = sorted(valleys, key=lambda i: size[i + 1])[:_FINALISTS]
+        found = [starts[i][1].theta for i in chosen]
+        for smoothness, kept in zip(_FOLLOWING, (_FINALISTS, 2), strict=True):
+            points = [self.near.solve(self.near.begun(theta, smoothness), _MORE) for theta in found]
+            least = min(one.variance for one in points)
+            points = [one for one in points if one.variance < _HOPELESS * least]
+            found = [one.theta for one in sorted(points, key=lambda one: one.variance)[:kept]]
+        ends = [self.coarse.followed(self.coarse.begun(theta, _FOLLOWING[-1])) for theta in found]
+        return self.model.finished(min(ends, key=lambda one: one.deviance))
+
+    def _without(self, best: Point) -> Point:
+        """The best model without a gap, begun at the nominal numbers and at those of the best one with."""
+        none = self.theta(_NONE * self.travel)
+        found = []
+        for theta in (self._begun(none).theta, np.where(self.held, none, best.theta)):
+            point = self.near.solve(self.near.begun(theta, _FOLLOWING[0]), _FEW, self.held)
+            found.append(self.coarse.solve(self.coarse.at(point.theta, point.start, _FOLLOWING[1]), _MORE, self.held))
+        found = [self.coarse.followed(min(found, key=lambda one: one.deviance), self.held)]
+        return self.model.finished(min(found, key=lambda one: one.deviance), self.held)
+
+    def _at_most(self, without: Point, worth: float) -> float:
+        """The largest half gap that fits about as well as none; the motor's travel where all do."""
+        half = max(0.5 * self.noise, 1e-5 * self.travel)
+        point, last, before = without, half, 0.0
+        while half < self.travel:
+            theta = np.where(self.held, self.theta(half), point.theta)
+            point = self.model.solve(self.model.at(theta, point.start, without.smoothness), _FEW, self.held)
+            gone = (point.deviance - without.deviance) / worth
+            if gone > _LIMIT:
+                share = np.sqrt(_LIMIT) - np.sqrt(max(before, 0.0))
+                share /= np.sqrt(gone) - np.sqrt(max(before, 0.0))
+                return float(last + share * (half - last))
+            last, before, half = half, gone, 1.6 * half
+        return self.travel
+
+    def _crossings(self, point: Point) -> int:
+        """How often the load changes flanks."""
+        half = self.half(point.theta[self.place])
+        ratio = float(self.model.experiment.plant.drive.ratio("load"))
+        states = self.model.states(point.theta, point.start, point.smoothness)
+        return sum(_changes(np.asarray(one.position["motor"] - ratio * one.position["load"]), half) for one in states)
+
+    def _reversals(self, point: Point) -> int:
+        """How often the transmitted torque changes its sign, by a twentieth of the input's rms on either side."""
+        experiment = set_leaves(self.model.experiment, self.model.numbers(point.theta))
+        plant = experiment.plant
+        assert plant.transmission is not None
+        ratio, least = float(plant.drive.ratio("load")), 0.05 * self.model.torque / float(plant.transmission.stiffness)
+        states = self.model.states(point.theta, point.start, point.smoothness)
+        return sum(_changes(np.asarray(one.position["motor"] - ratio * one.position["load"]), least) for one in states)
+
+
+def _changes(values: np.ndarray, size: float) -> int:
+    """Changes of sign between values of at least some size."""
+    return int(np.count_nonzero(np.diff(np.sign(values[np.abs(values) >= size]))))
+
+
+def fitted(model: UnseenLoad) -> Point:
+    """Fit of a model without a gap to be found, from its nominal numbers."""
+    coarse = model.coarse()
+    found = [coarse.followed(coarse.begun(theta, _FOLLOWING[0])) for theta in model.beginnings()]
+    return model.finished(min(found, key=lambda one: one.deviance))
+
+
+def find_gap(model: UnseenLoad) -> Gap:
+    """Fit from many half gaps and without one."""
+    return _Search(model).run()

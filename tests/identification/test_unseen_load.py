@@ -1,0 +1,105 @@
+"""Gap and friction from the motor's encoder alone: drives by a simulator of its own, the load's channel hidden."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tomli_w
+from hidden_log import FRICTIONS, GAP, GEARED, geared
+from typer.testing import CliRunner
+
+from jaxbl import cli
+from jaxbl.errors import InputError
+from jaxbl.identification.identify import identify
+from jaxbl.identification.unseen_load import _changes
+from jaxbl.records import inspect
+
+STUDY = {
+    "title": "motor alone",
+    "drive": GEARED | {"motor_inertia": 0.052, "load_inertia": 8.0, "motor_viscous": 0.2, "load_viscous": 12.0},
+    "transmission": GAP | {"stiffness": 50.0, "half_gap": 0.03},
+    "effects": [FRICTIONS[0] | {"torque": 0.2}, FRICTIONS[1] | {"torque": 3.0}],
+    "run": {"sample_period": 2e-3, "duration": 4.0, "substeps": 4},
+}
+TRUTH = {
+    "transmission.half_gap": 0.08,
+    "transmission.stiffness": 60.0,
+    "drive.motor_inertia": 0.05,
+    "drive.load_inertia": 7.0,
+    "effects.load.coulomb_friction.torque": 6.0,
+}
+
+
+def motor_only(folder, log):
+    path = folder / "motor.csv"
+    replace(log, theta_s=None).write(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    return motor_only(tmp_path_factory.mktemp("log"), geared()[0])
+
+
+@pytest.fixture(scope="module")
+def found(log):
+    return identify(log, STUDY)
+
+
+def test_gap_and_friction_behind_the_gear_are_found(found):
+    assert found.summary["backlash"]["shown"]
+    assert found.summary["backlash"]["crossings"] >= 10
+    for path, true in TRUTH.items():
+        one = found.summary["parameters"][path]
+        assert one["value"] == pytest.approx(true, rel=0.02), path
+        assert one["interval"][0] <= true <= one["interval"][1], path
+        assert one["interval"][1] / one["interval"][0] < 1.1, path
+    assert found.model.transmission.half_gap == pytest.approx(0.08, rel=1e-3)
+
+
+def test_the_load_that_the_model_makes_of_it_is_the_true_one(found):
+    log, _ = geared()
+    # an angle that no channel holds: apart by a constant
+    apart = found.trace["load.modelled_position"].to_numpy() - log.theta_s
+    assert np.std(apart[200:]) < 0.01 * np.std(log.theta_s)
+
+
+def test_a_log_without_torque_says_what_is_missing(tmp_path, log):
+    with pytest.raises(InputError, match="neither a load position \\(theta_s\\) nor a torque \\(u\\)"):
+        identify(log, STUDY | {"log": {"absent": ["u"]}})
+
+
+def test_inspect_says_what_needs_the_load(log):
+    answers = {one.quantity: one for one in inspect(log).judgements}
+    assert answers["lost motion"].answer == "weak"
+    assert "jaxbl identify" in answers["lost motion"].why
+
+
+def test_a_drive_without_a_gap_is_refused_and_the_move_written(tmp_path, monkeypatch):
+    from hidden.cases import Log
+    from hidden.simulator import Machine, Run, simulate
+
+    t = 2e-3 * np.arange(1000)
+    shaft = {"law": "linear_shaft", "stiffness": 60.0}
+    torque = 5.0 * np.sin(2.0 * np.pi * 1.0 * t)
+    (trace,) = simulate([Run(Machine(GEARED, shaft, FRICTIONS), 2e-3, torque, motor_noise=1e-5, seed=2)])
+    path = motor_only(tmp_path, Log(trace.t, trace.u, trace.theta_e, None))
+    (tmp_path / "axis.toml").write_text(tomli_w.dumps(STUDY))
+    monkeypatch.setattr(cli, "_start_jax", lambda: None)
+    monkeypatch.chdir(tmp_path)
+    called = CliRunner().invoke(
+        cli.app, ["identify", str(path), "--model", "axis.toml", "--out", "out", "--next-experiment", "next.csv"]
+    )
+    assert called.exit_code == 0, called.output
+    assert "No gap is shown: without one the motor's readings are met as well" in called.stdout
+    assert "To show a half gap of" in called.stdout
+    assert "next.csv" in called.stdout
+    said = json.loads((tmp_path / "out" / "identification.json").read_text())
+    assert said["backlash"]["at_most"] < 0.01
+    assert "transmission.half_gap" not in said["parameters"]
+    assert (tmp_path / "next.csv").read_text().startswith("t,u\n")
+
+
+def test_changes_of_sign_count_beyond_a_size():
+    assert _changes(np.array([1.0, 0.1, -0.1, 1.0, -1.0, 0.2, -1.0, 1.0]), 0.5) == 2
