@@ -12,8 +12,11 @@ from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.parameters import as_arrays, parameters
 from jaxbl.simulate import trajectory
 
-GIVEN_ONLY = {"actuator.back_emf", "motor.tabulated", "load.tabulated"}
-"""Effects that a diagnosis does not seek: the first acts as viscous friction does, a table is no name."""
+GIVEN_ONLY = {"actuator.back_emf", "motor.tabulated", "load.tabulated"} | {
+    name for name in EFFECTS if name.startswith("encoder.")
+}
+"""Effects that a diagnosis does not seek: the first acts as viscous friction does, a table is no name, and what an encoder reads
+beside the position moves no drive."""
 KNOWN = [{"kind": "motor.coulomb_friction", "torque": 0.05}]
 
 
