@@ -15,8 +15,8 @@ from jaxbl.simulate import trajectory
 GIVEN_ONLY = {"actuator.back_emf", "motor.tabulated", "load.tabulated"} | {
     name for name in EFFECTS if name.startswith("encoder.")
 }
-"""Effects that a diagnosis does not seek: the first acts as viscous friction does, a table is no name, and what an encoder reads
-beside the position moves no drive."""
+"""Effects that a diagnosis does not seek: the first acts as viscous friction does, a table is no name, and what an encoder
+reads beside the position moves no drive."""
 KNOWN = [{"kind": "motor.coulomb_friction", "torque": 0.05}]
 
 
