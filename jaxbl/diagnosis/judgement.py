@@ -70,7 +70,7 @@ def judged(
     away = fitted.theta[: len(prior)] / prior
     far = {one.path: float(z) for one, z in zip(fitted.free, away, strict=False) if abs(z) > FAR}
     chance = any(one.kind == "permuted" and one.z < SURE for one in controls)
-    findings = tuple(_no_surer(one, fitted) for one in found.findings)
+    findings = tuple(_beside_special_case(_no_surer(one, fitted), fitted) for one in found.findings)
     for one in controls:
         if one.kind == "wrong" and found.wrong is not None:
             last = fitted.names[-1]
@@ -93,6 +93,21 @@ def _no_surer(finding: Finding, fitted: FittedModel) -> Finding:
     z = [abs(float(get_leaf(fitted.experiment, path))) / max(errors[path], 1e-300) for path in paths if path in errors]
     chance = float(2.0 * ndtr(max(z)) - 1.0) if z else 1.0
     return finding if finding.confidence <= chance else dataclasses.replace(finding, confidence=chance)
+
+
+def _beside_special_case(finding: Finding, fitted: FittedModel) -> Finding:
+    """A finding that shares its probability with a special case of it, where the number that parts the two is known no
+    better than its size: friction that bends over a length of 0.5 ± 0.6 mrad may as well not bend."""
+    cls, errors = EFFECTS[finding.effect], fitted.errors()
+    shapes = [f"effects.{finding.effect}.{leaf}" for leaf, role in cls.roles().items() if role.kind == "shape"]
+    apart = [errors[path] < abs(float(get_leaf(fitted.experiment, path))) for path in shapes if path in errors]
+    place = finding.effect.partition(".")[0]
+    plain = next((f"{place}.{kind}" for kind in cls.special_cases), None)
+    if plain is None or not apart or any(apart):
+        return finding
+    half = 0.5 * finding.confidence
+    others = ((plain, half), *(one for one in finding.alternatives if one[0] != plain))
+    return dataclasses.replace(finding, confidence=half, alternatives=tuple(sorted(others, key=lambda pair: -pair[1])))
 
 
 def _nats(model: Model, wrong: Model, z: float) -> float:

@@ -1,5 +1,6 @@
 """What a diagnosis may say of what the search found."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -75,6 +76,22 @@ def test_one_reason_is_enough_against_it(given, reason):
     none = {"failed": [], "far": {}, "chance": False, "remainder": False, "powerless": False, "little": False}
     none["contradicting"] = False
     assert {key: getattr(said, key) for key in none} == none | reason
+
+
+@pytest.mark.parametrize(("error", "sure"), [(0.02, True), (0.2, False)])
+def test_a_special_case_is_as_likely_where_nothing_parts_the_two(error, sure):
+    name = "motor.presliding_friction"
+    fitted = SimpleNamespace(
+        names=(name,),
+        theta=np.array([0.0]),
+        free=[SimpleNamespace(path="drive.motor_inertia")],
+        experiment=SimpleNamespace(effects=(make_effect(name, torque=0.1, length=0.1),)),
+        errors=lambda: {f"effects.{name}.torque": 1e-3, f"effects.{name}.length": error},
+    )
+    finding = Finding(name, 0.98, {"torque": 0.1, "length": 0.1}, ())
+    given = dataclasses.replace(found(), findings=(finding,), wrong=None)
+    (said,) = judged(given, fitted, BEFORE, NOISE, LIMITS, (), np.array([0.02]), 1.0).found.findings  # type: ignore[arg-type]
+    assert said == (finding if sure else Finding(name, 0.49, finding.numbers, (("motor.coulomb_friction", 0.49),)))
 
 
 def shared(z, **gains):
