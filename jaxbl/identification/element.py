@@ -15,7 +15,7 @@ from jaxbl.drive.effects import CoulombFriction, Damping, Hysteresis, LoadFricti
 from jaxbl.drive.transmission import DeadZone, LinearShaft
 from jaxbl.errors import InputError
 from jaxbl.files import plain
-from jaxbl.records import LogTable, Record, read_record
+from jaxbl.records import LogTable, Record, read_log_table, read_record
 from jaxbl.records.element import Element, Number, error_on
 from jaxbl.records.inspection import displacement, element_noise, element_of
 
@@ -103,14 +103,15 @@ def identify_element(
 
     Args:
         log: the file.
-        table: the `[log]` table, or its keys; `kind = "element"`.
+        table: the `[log]` table, or its keys; of the kind `element`, whatever it says.
         gear_ratio: displacement of theta_e for 1 of theta_s, where both are recorded; left out: 1.
         holdout: another log of the rig, on which what was found is tried out.
 
     Raises:
-        InputError: an unfit log, or one that shows no stiffness.
+        InputError: an unfit log or table, or a log that shows no stiffness.
     """
-    read = table if isinstance(table, LogTable) else LogTable.model_validate({"kind": "element"} | dict(table))
+    given = table.model_dump(exclude_unset=True) if isinstance(table, LogTable) else dict(table)
+    read = read_log_table(given | {"kind": "element"})
     return run_element(read_element_task(log, read, gear_ratio, holdout=holdout))
 
 

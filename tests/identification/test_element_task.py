@@ -1,0 +1,30 @@
+"""A transmission alone, from Python: its table, its gear, and what of it a study can include."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import jaxbl
+from jaxbl.config import read_config
+
+
+def test_two_displacements_and_their_gear_give_tables_of_a_study(tmp_path):
+    random, t = np.random.default_rng(0), 0.01 * np.arange(1500)
+    load = 1e-3 * np.sin(2.0 * np.pi * 0.11 * t)
+    twist = 0.03 * np.sin(2.0 * np.pi * 0.4 * t) + 0.01 * np.sin(2.0 * np.pi * 0.7 * t)
+    friction = 0.5 * np.sign(np.gradient(twist, t))
+    frame = {"t": t, "u": 80.0 * twist + friction + 0.02 * random.standard_normal(1500)}
+    frame |= {"theta_e": 10.0 * load + twist, "theta_s": load}
+    path = tmp_path / "rig.csv"
+    pd.DataFrame(frame).to_csv(path, index=False)
+    found = jaxbl.identify_element(path, {}, gear_ratio=10.0)
+    assert found.tables["transmission"]["law"] == "linear_shaft"
+    assert found.tables["transmission"]["stiffness"] == pytest.approx(80.0, rel=5e-3)
+    (effect,) = found.tables["effects"]
+    assert effect["torque"] == pytest.approx(0.5, rel=0.02)
+    drive = {"kind": "two_inertia", "motor_inertia": 0.1, "motor_viscous": 0.1, "load_inertia": 5.0, "load_viscous": 1.0}
+    rest = {"drive": drive | {"gear_ratio": 10.0}, "excitation": {"kind": "sine", "amplitude": 1.0, "frequency": 1.0}}
+    gains = {side: {"lambda": 1.0, "alpha": 1.0} for side in ("motor", "load")}
+    assert read_config(rest | {"observer": gains} | found.tables).effects[0].torque == effect["torque"]
+    with pytest.raises(jaxbl.InputError, match="log: unknown key 'gear'"):
+        jaxbl.identify_element(path, {"gear": 1})
