@@ -402,9 +402,13 @@ class UnseenLoad:
         middle = long_run(scores) + np.diag(precision * size**2)
         white = inverse((slope * size).T @ (slope * size) + np.diag(precision * size**2))
         scale = np.outer(size, size)[:count, :count]
-        inner, sandwich = white[:count, :count] * scale, (white @ middle @ white)[:count, :count] * scale
+        inner = white[:count, :count] * scale
+        # by a root of the middle: never negative, whatever rounding does
+        size_of, ways = np.linalg.eigh(middle)
+        half = (white @ (ways * np.sqrt(np.maximum(size_of, 0.0))))[:count]
+        sandwich = half @ half.T * scale
         # a little negative correlation is nothing to gain confidence from
-        more = np.maximum(np.sqrt(np.diag(inner) / np.diag(sandwich)), 1.0)
+        more = np.sqrt(np.maximum(np.diag(inner) / np.maximum(np.diag(sandwich), np.finfo(float).tiny), 1.0))
         covariance = sandwich * np.outer(more, more)
         inflation = np.sqrt(np.diag(covariance) / np.diag(inner))
         return Spread(covariance, inverse(inner), point.variance, inflation), slope[:, :count]
@@ -425,7 +429,7 @@ _OTHERS = 10.0, 0.1
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
     """Of a symmetric positive matrix some of whose directions may be lost in rounding: these keep what rounding leaves."""
-    if not len(matrix):
+    if not len(matrix) or not np.isfinite(matrix).all():
         return matrix
     size = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
