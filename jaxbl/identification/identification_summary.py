@@ -137,6 +137,9 @@ def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mappin
     noise = {side: float(one) for side, one in found.windows.noise.items()}
     record, width = task.record, np.asarray(found.spread.covariance)
     deviation = np.sqrt(np.diag(width))
+    # numbers that are not known have no correlation
+    with np.errstate(invalid="ignore"):
+        correlation = width / np.outer(deviation, deviation)
     parameters = _parameters(record, found.free, found.fit, found.spread)
     for path, one in profiles.items():
         points = [list(point) for point in zip(one.values.tolist(), one.deviance.tolist(), strict=True)]
@@ -159,7 +162,7 @@ def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mappin
         "parameters": parameters,
         "correlation": {
             "parameters": [one.path for one in found.free],
-            "matrix": width / np.outer(deviation, deviation),
+            "matrix": correlation,
         },
         "refused": [
             {"direction": one.direction, "why": _why(one), "relative_deviation": one.deviation} for one in found.refused

@@ -33,7 +33,7 @@ from jaxbl.workers import doing
 from .intervals import Spread, long_run
 from .prediction import kalman_gain
 from .regression import settled
-from .segments import Segment
+from .segments import Segment, white_noise
 from .trajectory import WIDE, Fit, Free
 
 _STEP, _SHORTEST = 1e-2, 1e-6
@@ -372,7 +372,8 @@ class UnseenLoad:
         """The best of a point and of fits beside it; covariance and derivatives of the errors there, as of :meth:`spread`.
 
         Impacts make the likelihood rough over less than its standard errors, and plant steps are finite: what predictors
-        with a longer and a shorter memory, and one with twice the plant steps, find differently counts as an error.
+        with a longer and a shorter memory, and one with twice the plant steps, find differently counts as an error; so does
+        what noise in the recorded torque, once more as much, changes.
         """
         doing("standard errors")
         fine = UnseenLoad(_stepped(self.experiment, 2), self.free, self.width, self.segments, self.rest)
@@ -382,11 +383,28 @@ class UnseenLoad:
         again = [self.solve(self.at(one.theta, one.start, point.smoothness), _BACK, held) for one in others]
         best = min([point, *again], key=lambda one: one.deviance)
         width, slope = self.spread(best, held)
+        others += self._noisier(best, held)
         changes = np.array([one.theta - best.theta for one in others if np.isfinite(one.deviance)])
         # not their mean: some end in the valley that they came from, and say nothing
         wide = np.asarray(width.covariance) + changes.T @ changes
         more = np.sqrt(np.diag(wide) / np.diag(np.asarray(width.covariance)))
         return best, width._replace(covariance=wide, inflation=width.inflation * more), slope
+
+    def _noisier(self, point: Point, held: np.ndarray | None) -> list[Point]:
+        """Fits with as much white noise again as the recorded torque has, which the drive may not have felt."""
+        noise = white_noise([one.torque for one in self.segments])
+        if noise < _QUIET * self.torque:
+            return []
+        found = []
+        for seed in range(_DRAWS):
+            random = np.random.default_rng(seed)
+            segments = [
+                dataclasses.replace(one, torque=one.torque + noise * random.standard_normal(len(one)))
+                for one in self.segments
+            ]
+            model = UnseenLoad(self.experiment, self.free, self.width, segments, self.rest)
+            found.append(model.solve(model.at(point.theta, point.start, point.smoothness), _FEW, held))
+        return found
 
     def spread(self, point: Point, held: np.ndarray | None = None) -> tuple[Spread, np.ndarray]:
         """Covariance of theta, of data and priors together, and the derivatives of the errors by theta over their size."""
@@ -423,6 +441,10 @@ def as_fit(theta: np.ndarray, residual: np.ndarray, jacobian: np.ndarray) -> Fit
     )  # fmt: skip
 
 
+_QUIET = 1e-4
+"""Noise of the recorded torque over its rms that changes nothing."""
+_DRAWS = 2
+"""Of that noise."""
 _OTHERS = 10.0, 0.1
 """Factors on the smoothness of predictors whose numbers are compared with the best one's."""
 

@@ -48,7 +48,7 @@ def _hysteresis(found: Identification | Diagnosis) -> Drawn:
         xlabel=f"twist θe − N₀ θs, the load's position by the model ({unit})", ylabel=f"torque in the gear ({force})",
         xlim=limits(twist[rows]), ylim=limits(by_motor[rows], law[rows]),
     )  # fmt: skip
-    legend(ax, 3)
+    legend(ax, 3, markerscale=4.0)
     caption = (
         "Torque in the gear over the twist. Blue: what the motor's torque, smoothed acceleration and friction leave for the "
         "gear, which uses the motor's encoder only. Black: the model. Within the gap the motor drives nothing but itself. "
