@@ -79,8 +79,8 @@ def search_alone(
     if not np.isfinite(point.deviance):
         raise InputError(f"{name}: the model diverges on this log; its nominal numbers should be nearer")
     alone = alone_of(model, point, width, slope, held, gap, why)
-    if not_met(model, point):
-        # numbers of a model that the log contradicts have no interval
+    if not_met(model, point) or (why and gap is not None and gap.needed):
+        # numbers of a model that the log contradicts, or with a gap of any size, have no interval
         nothing = np.full_like(alone.found.spread.covariance, np.inf)
         found = dataclasses.replace(alone.found, spread=alone.found.spread._replace(covariance=nothing))
         alone = alone._replace(found=found)
