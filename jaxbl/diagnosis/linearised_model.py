@@ -67,10 +67,15 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
     # by side, not by name
     names, each = sorted(sides), len(sides)
     order = [names.index(side) + i * each for i in range(2) for side in sides]
-    order += range(2 * each, len(jax.tree.leaves(motion)))
+    at = 2 * each
+    for effect, own in zip(experiment.effects, motion.effects, strict=True):
+        states_of = len(jax.tree.leaves(own))
+        # what is known has no error that a predictor could have
+        order += [] if effect.input_alone else range(at, at + states_of)
+        at += states_of
     # as they may differ from sample to sample elsewhere, where the same loop serves
     none = {path: np.zeros(size) for path in added.values()}
-    ways = _directions(free, theta, len(order), order, list(added.values()))
+    ways = _directions(free, theta, at, order, list(added.values()))
     slope, value = slopes(experiment, motion, torque, time, ways, none)
     slope, value = slope[:, order].transpose(2, 1, 0), value[order].T
     vectors = np.stack(jax.tree.leaves(motion), axis=1)[:, order]

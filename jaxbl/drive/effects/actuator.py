@@ -22,6 +22,7 @@ class Delay(ActuatorEffect):
     """Dead time of the torque, exact for an input held from sample to sample: u(t - T); before t = 0 it was zero."""
 
     kind: ClassVar[str] = "delay"
+    input_alone: ClassVar[bool] = True
     rank: ClassVar[int] = 0
     delay: Scalar = shape(
         "s", "dead time T", lambda log: [samples * log.period for samples in _DELAYS], neutral=1e-30, minimum=0.0

@@ -140,6 +140,7 @@ class AbstractEffect(eqx.Module):
         places: where it may act: motor, load, transmission, actuator, encoder.
         velocity_dependent: whether a hook looks at a velocity; it is then evaluated twice a step (predictor and
             corrector), which keeps the integrator's second order.
+        input_alone: whether its own state is what was commanded, whatever its numbers and the motion: it is then known.
         in_time: whether it depends on the time since a log began.
         corrects: the drive's number that it is the error of: `inertia` or `viscous`.
         exclusive: of effects with the same word here, a place has one.
@@ -149,6 +150,7 @@ class AbstractEffect(eqx.Module):
     kind: ClassVar[str]
     places: ClassVar[tuple[str, ...]]
     velocity_dependent: ClassVar[bool] = False
+    input_alone: ClassVar[bool] = False
     in_time: ClassVar[bool] = False
     corrects: ClassVar[str | None] = None
     exclusive: ClassVar[str | None] = None
