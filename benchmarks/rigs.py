@@ -57,8 +57,8 @@ def simulate(random: np.random.Generator) -> tuple[dict[str, float], np.ndarray,
             h[i + 1] = h[i] + step * (1.0 - h[i] ** 2 if grows else 1.0)
         u = u + size["hysteresis"] * h
     if random.random() < 0.5:
-        truth["load_friction"] = random.uniform(0.03, 0.15)
-        u = u + truth["load_friction"] * stiffness * np.abs(deflection) * direction
+        truth["friction_coefficient"] = random.uniform(0.03, 0.15)
+        u = u + truth["friction_coefficient"] * stiffness * np.abs(deflection) * direction
     noise = 1e-4 * scale
     x, u = x[::fine] + noise * random.standard_normal(count), u[::fine]
     disturbance = np.convolve(random.standard_normal(count + 19), np.ones(20) / np.sqrt(20.0), "valid")

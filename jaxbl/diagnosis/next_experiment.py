@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from scipy.signal import max_len_seq
 
 from jaxbl.config import Config, read_config, with_values
+from jaxbl.drive.effects import Backlash
 from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
 from jaxbl.identification.compilation import jit
@@ -118,8 +119,9 @@ def with_gap(model: Config, path: str, half: float) -> Config:
     """A study with a half gap, rad, in the number that a path names."""
     if path.startswith("effects."):
         data = model.resolved()
-        effects = [one for one in data.get("effects", []) if one["kind"] != "transmission.backlash"]
-        data["effects"] = with_added(effects, [{"kind": "transmission.backlash", "half_gap": half}], lambda one: one["kind"])
+        gap = f"transmission.{Backlash.kind}"
+        effects = [one for one in data.get("effects", []) if one["kind"] != gap]
+        data["effects"] = with_added(effects, [{"kind": gap, "half_gap": half}], lambda one: one["kind"])
         return read_config(data)
     return with_values(model, {path: half / (4.0 if path.endswith("dead_zone") else 1.0)})
 

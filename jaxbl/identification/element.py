@@ -25,7 +25,7 @@ _EFFECTS = {
     "dry_friction": (f"motor.{CoulombFriction.kind}", "torque"),
     "hysteresis": (f"transmission.{Hysteresis.kind}", "torque"),
     "length": (f"transmission.{Hysteresis.kind}", "length"),
-    "load_friction": (f"transmission.{LoadFriction.kind}", "coefficient"),
+    "friction_coefficient": (f"transmission.{LoadFriction.kind}", "coefficient"),
 }
 
 

@@ -53,7 +53,7 @@ _SIZES = {
     "damping": "damping",
     "dry friction": "dry_friction",
     "hysteresis": "hysteresis",
-    "friction under load": "load_friction",
+    "friction under load": "friction_coefficient",
 }
 """Number of each other term, by which it is multiplied."""
 
@@ -74,7 +74,7 @@ class Element:
     Attributes:
         numbers: `stiffness`, `offset` (torque at displacement 0, or at the centre) and what the terms need of `half_gap`,
             `centre` (displacement at the middle of the gap, or where nothing is transmitted), `damping`, `dry_friction`,
-            `hysteresis` (its largest torque), `length`, `load_friction` (friction over torque).
+            `hysteresis` (its largest torque), `length`, `friction_coefficient` (friction under load, over the torque).
         open: those of them that the log leaves uncertain by more than half.
         gains: term that is kept -> squared error without it over that with it, less 1, on blocks that were left out.
         terms: that are kept.
@@ -415,7 +415,7 @@ def _summed_up(rig: _Rig, whole: _Rig, model: _Fitted, gains: dict[str, float], 
     reach = float(stdtrit(BLOCKS - 1, 0.975))
     numbers, open_ = {}, []
     for name, value, error in zip(names, values.tolist(), errors.tolist(), strict=True):
-        if name == "load_friction":
+        if name == "friction_coefficient":
             # fitted as its product with the stiffness
             error = math.hypot(error / model.sizes[0], value * errors[0] / model.sizes[0] ** 2)
             value = value / float(model.sizes[0])
@@ -436,7 +436,7 @@ def _summed_up(rig: _Rig, whole: _Rig, model: _Fitted, gains: dict[str, float], 
 _UNITS = {
     "stiffness": ("N m/rad", "N/m"), "offset": ("N m", "N"), "damping": ("N m s/rad", "N s/m"), "dry_friction": ("N m", "N"),
     "hysteresis": ("N m", "N"), "centre": ("rad", "m"), "half_gap": ("rad", "m"), "length": ("rad", "m"),
-    "load_friction": ("", ""),
+    "friction_coefficient": ("", ""),
 }  # fmt: skip
 """Number -> unit on a turning axis, and on a linear one."""
 

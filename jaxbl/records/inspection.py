@@ -157,7 +157,7 @@ def element_noise(record: Record, gear_ratio: float | None) -> float:
 
 _WORDS = {
     "stiffness": "stiffness", "gap": "half_gap", "damping": "damping", "dry friction": "dry_friction",
-    "hysteresis": "hysteresis", "friction under load": "load_friction",
+    "hysteresis": "hysteresis", "friction under load": "friction_coefficient",
 }  # fmt: skip
 """Quantity of an element -> its number."""
 

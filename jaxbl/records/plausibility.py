@@ -208,7 +208,8 @@ def warn_units(file: LogFile, found: RigidFit, channel: str, nominal: NominalDri
         surely = not (usual or 1.0 / _SURE < ratio < _SURE * _FAR_TORQUE)
     if work is not None and not usual and not doubtful:
         text = f"friction takes {taken:.3g} W, {work:.3g} times what the nominal viscous friction would"
-        doubtful, surely, ratio = True, work < 1.0 / _SURE, 1.0 / work
+        # a data sheet may say a friction that the machine does not have
+        doubtful, surely, ratio = True, False, 1.0 / work
     if doubtful:
         file.warnings.append(f"Doubtful: {text}: check the units of t, u and {channel} in [log], and the model.")
     # two of them that are off in the same direction are no chance
