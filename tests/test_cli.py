@@ -18,6 +18,7 @@ import pandas as pd
 import pytest
 import tomli_w
 from measured import EMPS, made, real
+from passed import PASSED
 from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
 from typer.testing import CliRunner
 
@@ -657,16 +658,7 @@ DIAGNOSED = {
         "noise_floor": {"theta_e": 0.001, "torque_motor": 0.01},
         "free_run": {},
         "expected": {},
-        "test": {
-            "level": 0.01,
-            "failed": [],
-            "far": {},
-            "chance": False,
-            "remainder": False,
-            "powerless": False,
-            "contradicting": False,
-            "little": False,
-        },
+        "test": PASSED,
         "controls": {},
     },
 }

@@ -65,11 +65,7 @@ def summary_of(
             "between its jumps."
         )
     return {
-        "title": task.config.title,
-        "identity": task.identity,
-        "file": str(record.path.resolve()),
-        "samples": len(record.time),
-        "sample_period": record.sample_period,
+        **task.heading,
         "verdict": found.verdict,
         # what has the larger torque matters more
         "findings": sorted(
@@ -92,7 +88,6 @@ def summary_of(
         "where": where,
         "rest": {name: {"evidence": gain, "share": share} for name, (gain, share) in found.rest.items()},
         "withdrawn": list(withdrawn),
-        "warnings": setup.task.warnings,
         "notes": notes,
     }
 

@@ -227,11 +227,7 @@ def _summary(
     part = task.holdout.segments
     times = [float(task.holdout.time[part[0].start]), float(task.holdout.time[part[-1].stop - 1])]
     return {
-        "title": task.config.title,
-        "identity": task.identity,
-        "file": str(record.path.resolve()),
-        "samples": len(record.time),
-        "sample_period": record.sample_period,
+        **task.heading,
         "verdict": verdict,
         "findings": findings,
         "parameters": {
@@ -247,7 +243,6 @@ def _summary(
         "rest": {},
         "withdrawn": [],
         "contradictions": [],
-        "warnings": list(record.warnings),
         "notes": notes,
         "explained_share": 1.0 - min(max(after - noise**2, 0.0) / max(before - noise**2, 1e-300), 1.0),
         "backlash": None if alone.gap is None else {**(gap_summary(alone) or {}), "nominal": None},
@@ -264,7 +259,7 @@ def _summary(
             "expected": {"theta_e": {"limit": limit}},
             "test": {
                 "level": LEVEL, "failed": failed, "far": far, "chance": False, "remainder": False, "powerless": False,
-                "little": False,
+                "little": False, "contradicting": False,
             },
             "controls": {},
         },

@@ -154,11 +154,7 @@ def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mappin
         for i, side in enumerate(side for side in fitted.sides if side in noise)
     }
     return {
-        "title": task.config.title,
-        "identity": task.identity,
-        "file": str(record.path.resolve()),
-        "samples": len(record.time),
-        "sample_period": record.sample_period,
+        **task.heading,
         "parameters": parameters,
         "correlation": {
             "parameters": [one.path for one in found.free],
@@ -170,7 +166,6 @@ def summary_of(task: LogTask, fitted: Experiment, found: Found, profiles: Mappin
         "held": found.held,
         "condition": found.condition,
         "residual": residual,
-        "warnings": task.warnings,
         "notes": list(record.notes),
     }
 

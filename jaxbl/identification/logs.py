@@ -10,6 +10,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -46,10 +47,17 @@ class LogTask:
     holdout: Record | None
 
     @property
-    def warnings(self) -> list[str]:
-        """What is to be said first of the logs."""
+    def heading(self) -> dict[str, Any]:
+        """What every summary says of its logs, as in `identification.json` and `diagnosis.json`."""
         other = None if self.holdout is None or self.holdout.path == self.record.path else self.holdout
-        return [*self.record.warnings, *(f"Held-out log: {one}" for one in (other.warnings if other else ()))]
+        return {
+            "title": self.config.title,
+            "identity": self.identity,
+            "file": str(self.record.path.resolve()),
+            "samples": len(self.record.time),
+            "sample_period": self.record.sample_period,
+            "warnings": [*self.record.warnings, *(f"Held-out log: {one}" for one in (other.warnings if other else ()))],
+        }
 
     @property
     def identity(self) -> str:

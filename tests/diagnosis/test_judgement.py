@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from passed import PASSED
 
 from jaxbl.diagnosis.effect_search import Explanation, Finding
 from jaxbl.diagnosis.expected_errors import Expected
@@ -54,7 +55,7 @@ def test_a_verdict_that_held_out_data_support_stays():
     controls = [Control("wrong", NOISE, 9.0, "motor.viscous_friction"), Control("permuted", NOISE, 4.0)]
     said = judge(controls=controls)
     assert said.found.verdict == "explained" and said.found.findings[0].confidence == pytest.approx(0.98)
-    assert not any([said.failed, said.far, said.chance, said.remainder, said.powerless])
+    assert not any(getattr(said, reason) for reason in PASSED if reason != "level")
 
 
 @pytest.mark.parametrize(
@@ -73,8 +74,7 @@ def test_a_verdict_that_held_out_data_support_stays():
 def test_one_reason_is_enough_against_it(given, reason):
     said = judge(**given)
     assert said.found.verdict == "unknown_effect" and said.found.findings == found().findings
-    none = {"failed": [], "far": {}, "chance": False, "remainder": False, "powerless": False, "little": False}
-    none["contradicting"] = False
+    none = {key: value for key, value in PASSED.items() if key != "level"}
     assert {key: getattr(said, key) for key in none} == none | reason
 
 

@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from passed import PASSED
 
 from jaxbl.diagnosis.residuals import Residual
 from jaxbl.report.diagnose import _over_time, _verdict, diagnosis_lines
@@ -57,16 +58,7 @@ SUMMARY = {
             for name, value in ERRORS.items()
             if not name.startswith("velocity")
         },
-        "test": {
-            "level": 0.01,
-            "failed": [],
-            "far": {},
-            "chance": False,
-            "remainder": False,
-            "powerless": False,
-            "contradicting": False,
-            "little": False,
-        },
+        "test": PASSED,
         "controls": {
             "wrong": {"effect": "load.stribeck_friction", "rmse": scaled(0.3), "z": 12.3},
             "permuted": {"rmse": scaled(1.4) | {"theta_e": None}, "z": float("inf")},

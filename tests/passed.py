@@ -1,0 +1,12 @@
+"""What `diagnosis.json` holds of a model against which the held-out data have nothing to say."""
+
+PASSED = {
+    "level": 0.01,
+    "failed": [],
+    "far": {},
+    "chance": False,
+    "remainder": False,
+    "powerless": False,
+    "little": False,
+    "contradicting": False,
+}
