@@ -8,6 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from jaxbl.records import NominalDrive
+
 GEAR_RATIO, INERTIA, VISCOUS, COULOMB = 20.0, 0.01, 0.05, 0.1
 
 
@@ -60,6 +62,32 @@ def made(
     if resolution:
         motor, load = (np.round(x / resolution) * resolution for x in (motor, load))
     return pd.DataFrame({"t": t, "u": u, "theta_e": motor, "theta_s": load / GEAR_RATIO})
+
+
+NOMINAL = NominalDrive(
+    gear_ratio=20.0, stiffness=50.0, half_gap=0.0, motor_inertia=1e-3, motor_viscous=2e-3, load_inertia=0.4, load_viscous=1.0
+)
+
+
+def axis(skew=0.0, offset=0.0, gap=0.0, load_torque=0.0, motor_torque=0.0, stiffness=50.0, count=8000, drift=0.0, seed=0):
+    """A geared axis with dry friction at the load in multisine motion: its equations of motion, both encoders with noise."""
+    random, t = np.random.default_rng(seed), 1e-3 * np.arange(count)
+    frequency, size, phase = np.array([0.5, 0.83, 1.27, 2.1]), np.array([1.0, 0.5, 0.4, 0.2]), random.uniform(0.0, 6.3, 4)
+
+    def motion(times, derivative):
+        rate = 2.0 * np.pi * frequency
+        return (size * rate**derivative * np.sin(rate * times[:, None] + phase + 0.5 * np.pi * derivative)).sum(axis=1)
+
+    def shaft(times):
+        friction = 2.0 * np.tanh(motion(times, 1) / 0.05)
+        return (0.4 * motion(times, 2) + 1.0 * motion(times, 1) + friction) / 20.0 + load_torque
+
+    middle = t + 0.5e-3
+    twist = shaft(t) / stiffness + 0.5 * gap * np.tanh(shaft(t) / 0.02)
+    u = 20.0 * (1e-3 * motion(middle, 2) + 2e-3 * motion(middle, 1)) + shaft(middle) - motor_torque
+    motor = 20.0 * motion(t, 0) + twist + offset + 1e-4 * random.standard_normal(count)
+    load = motion(t - skew - drift * t, 0) + 5e-6 * random.standard_normal(count)
+    return pd.DataFrame({"t": t, "u": u, "theta_e": motor, "theta_s": load})
 
 
 def real(name: str) -> Path:

@@ -19,7 +19,7 @@ from jaxbl.config import Config, prepare
 from jaxbl.drive.effects import EFFECTS, EncoderEffect
 from jaxbl.drive.parameters import get_leaf, leaf_paths
 from jaxbl.errors import InputError
-from jaxbl.records import POSITION_CHANNELS, PositionTable, Record, TurningLog, join, read_record, turned
+from jaxbl.records import POSITION_CHANNELS, Record, TurningLog, join, read_record, turned
 from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress
 
@@ -116,7 +116,9 @@ def read_logs(config: Config, logs: Logs, gear_tolerance: float = 0.0, like: Rec
             if key in given and (key in record.corrections or key != "offset")
         }
         if not isinstance(log, Record) and given != record.corrections:
-            records[i] = _read_one(_corrected(config, given), log, gear_tolerance)
+            again = _read_one(_corrected(config, given), log, gear_tolerance)
+            # the reader counts what [log] gives as no correction of its own
+            records[i] = dataclasses.replace(again, corrections=given)
     first, *others = records if like is None else (like, *records)
     others = [_from_zero_of(first, one, config) for one in others]
     return join([first, *others] if like is None else others)
@@ -172,7 +174,8 @@ def _from_zero_of(first: Record, record: Record, config: Config) -> Record:
     other = f" (to theta_s 1/{ratio:g} of it)" if two else ""
     warning = (
         f"theta_e counts from another zero than in {first.path.name}, by the torque that repeats {waves} times a turn: "
-        f"{found.value:.4g} ± {found.error:.1g} rad were added{other}. [log] theta_e.offset = 0 leaves it as it is."
+        f"{found.value:.4g} ± {found.error:.1g} rad were added{other}."
+        + (" [log] theta_e.offset = 0 leaves it as it is." if table.omega_e is None else "")
     )
     positions = {
         side: values + found.value / (ratio if side == "load" else 1.0) for side, values in record.positions.items()
@@ -183,10 +186,11 @@ def _from_zero_of(first: Record, record: Record, config: Config) -> Record:
 def _corrected(config: Config, given: Mapping[str, float]) -> Config:
     """The study with a skew of theta_s and an offset of theta_e in `[log]`, as they are given."""
     table = config.log
-    for name, key in (("theta_s", "skew"), ("theta_s", "drift"), ("theta_e", "offset")):
-        if key in given:
-            position = getattr(table, name) or PositionTable()
-            table = table.model_copy(update={name: position.model_copy(update={key: given[key]})})
+    for position, key in (("theta_s", "skew"), ("theta_s", "drift"), ("theta_e", "offset")):
+        # a speed in place of a position has no key for some of them, and then no need
+        name, channel = table.position(position)
+        if key in given and (key != "offset" or name == position) and key in type(channel).model_fields:
+            table = table.model_copy(update={name: channel.model_copy(update={key: given[key]})})
     return config.model_copy(update={"log": table})
 
 

@@ -146,7 +146,7 @@ def _integral(file: LogFile, name: str, table: SpeedTable, stamps: TimeStamps) -
         f"{name} is the integral of the speed {channel}{coarse}: its errors add up over time. More than noise may be "
         "left where the model is complete, and what depends on the place of the load is found only roughly."
     )
-    return RawChannel(position, table.si_unit, 0.0, table.skew, held=False)
+    return RawChannel(position, table.si_unit, 0.0, table.skew or 0.0, held=False)
 
 
 def _torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamps, *, linear: bool) -> RawChannel:

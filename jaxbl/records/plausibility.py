@@ -13,7 +13,7 @@ from .gearing import UNRELATED, Gearing, twist_noise
 from .resampling import Grid
 from .rigid_body import RigidFit
 from .signal_quality import ChannelFigures, resolution
-from .table import POSITION_CHANNELS, LogTable, PositionTable
+from .table import POSITION_CHANNELS, LogTable
 
 
 def check_motion(file: LogFile, name: str, values: np.ndarray) -> None:
@@ -36,9 +36,9 @@ def check_distinct(file: LogFile, channels: Mapping[str, RawChannel]) -> None:
 
 
 def check_gear_ratio(
-    file: LogFile, table: LogTable, grid: Grid, found: Gearing | None, expected: float | None, tolerance: float
+    file: LogFile, table: LogTable, grid: Grid, found: Gearing | None, expected: float | None, tolerance: float, unit: str
 ) -> None:
-    """Compare the ratio of both motions with the gear ratio that is expected, if it is known.
+    """Compare the ratio of both motions with the gear ratio that is expected, if it is known; `unit` is that of theta_e.
 
     Up to a relative deviation of `tolerance` the file gets a remark. Beyond, InputError names the most likely mistake.
     """
@@ -51,7 +51,7 @@ def check_gear_ratio(
             "beyond the lost motion."
         )
     elif expected is not None and found.wide:
-        _check_twist(file, table, found, expected)
+        _check_twist(file, unit, found, expected)
     elif expected is not None:
         _check_ratio(file, table, found, expected, tolerance)
 
@@ -76,15 +76,17 @@ def _check_ratio(file: LogFile, table: LogTable, found: Gearing, expected: float
 
 def _mistakes(table: LogTable, expected: float) -> list[tuple[float, str]]:
     """Usual mistakes: the factor that each puts on the ratio of both motions, and what is wrong then."""
-    units = {name: (getattr(table, name) or PositionTable()).unit for name in ("theta_e", "theta_s")}
+    (motor, motor_table), (load, load_table) = table.position("theta_e"), table.position("theta_s")
     degrees, see = 180.0 / math.pi, "; see unit in [log]"
+    motor_text = f"{motor} is not in degrees" if motor_table.unit.startswith("deg") else f"{load} is in degrees"
+    load_text = f"{load} is not in degrees" if load_table.unit.startswith("deg") else f"{motor} is in degrees"
     return [
-        (-1.0, "the sign of one of them is wrong; set sign = -1 in [log] theta_e or theta_s"),
-        (1.0 / expected**2, "the sides are swapped; exchange the columns in [log] theta_e and theta_s"),
-        (-1.0 / expected**2, "the sides are swapped, and one has the wrong sign; see [log] theta_e and theta_s"),
-        (degrees, ("theta_s is not in degrees" if units["theta_s"] == "deg" else "theta_e is in degrees") + see),
-        (1.0 / degrees, ("theta_e is not in degrees" if units["theta_e"] == "deg" else "theta_s is in degrees") + see),
-        (1.0 / expected, "theta_s is already referred to the motor shaft; set factor = 1 / gear_ratio in [log] theta_s"),
+        (-1.0, f"the sign of one of them is wrong; set sign = -1 in [log] {motor} or {load}"),
+        (1.0 / expected**2, f"the sides are swapped; exchange the columns in [log] {motor} and {load}"),
+        (-1.0 / expected**2, f"the sides are swapped, and one has the wrong sign; see [log] {motor} and {load}"),
+        (degrees, load_text + see),
+        (1.0 / degrees, motor_text + see),
+        (1.0 / expected, f"theta_s is already referred to the motor shaft; set factor = 1 / gear_ratio in [log] {load}"),
     ]
 
 
@@ -106,9 +108,8 @@ def _check_size(file: LogFile, table: LogTable, grid: Grid, expected: float) -> 
         raise file.wrong(f"theta_e moves {size:.3g} times as far as gear_ratio {expected:g} times theta_s: {why}")
 
 
-def _check_twist(file: LogFile, table: LogTable, found: Gearing, expected: float) -> None:
+def _check_twist(file: LogFile, unit: str, found: Gearing, expected: float) -> None:
     """Where the twist is as large as the motion, so that the log fits many ratios: refuse a twist beyond the motion."""
-    unit = table.load_unit
     ranges = f"theta_e - {expected:g} theta_s ranges over {found.twist:.3g} {unit}, theta_e over {found.motion:.3g} {unit}"
     # a load that a motor moves through a gap moves no farther than the motor
     if found.twist > max(3.0 * found.least_twist, 1.5 * found.motion):
@@ -254,9 +255,9 @@ def note_skew(file: LogFile, found: Gearing, period: float) -> None:
         )
 
 
-def note_lost_motion(file: LogFile, table: LogTable, found: Gearing, figures: dict[str, ChannelFigures]) -> None:
+def note_lost_motion(file: LogFile, found: Gearing, figures: dict[str, ChannelFigures]) -> None:
     """Remark on the lost motion where it stands out of the noise of both encoders."""
-    unit = table.load_unit
+    unit = figures["theta_e"].unit
     text = f"Lost motion at the motor: {found.lost_motion_text(unit)}"
     if found.flank == "load":
         times = ", ".join(f"{t:.3g}" for t in found.flank_times[:6]) + (", ..." if len(found.flank_times) > 6 else "")

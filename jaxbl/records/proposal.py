@@ -159,7 +159,8 @@ def propose(path: str | Path, log: dict[str, Any] | None = None) -> tuple[dict[s
         found = inspect(path, table, gear_ratio=nominal.gear_ratio, nominal=nominal)
         for channel, key in (("theta_s", "skew"), ("theta_s", "drift"), ("theta_e", "offset")):
             if key in found.record.corrections:
-                table[channel] = _as_table(table.get(channel, channel)) | {key: found.record.corrections[key]}
+                name, _ = found.log.position(channel)
+                table[name] = _as_table(table.get(name, name)) | {key: found.record.corrections[key]}
     return _study(found, nominal, table), guesses, found
 
 

@@ -29,7 +29,7 @@ from .plausibility import (
 from .resampling import Delay, Grid, resampled
 from .rigid_body import RigidFit, fit_rigid_drive
 from .signal_quality import ChannelFigures, channel_figures, longest
-from .table import POSITION_CHANNELS, LogTable, PositionTable
+from .table import POSITION_CHANNELS, LogTable
 from .time_stamps import Sampling, Segments, read_time_stamps, split_at_gaps
 
 
@@ -153,7 +153,7 @@ def read_record(
         _correct_offset(file, table, grid, channels, shaft)
     # what these say of the drive
     if two:
-        check_gear_ratio(file, table, grid, gearing, gear_ratio, gear_tolerance)
+        check_gear_ratio(file, table, grid, gearing, gear_ratio, gear_tolerance, channels["theta_e"].unit)
     position, driven = grid.values[encoders[0]], drive and "u" in channels
     dynamics = fit_rigid_drive(grid.values["u"], position, grid.segments, grid.period) if driven else None
     if dynamics is not None:
@@ -167,7 +167,7 @@ def read_record(
         gearing = replace(gearing, flank_times=tuple(t - float(grid.time[0]) for t in gearing.flank_times))
         figures["theta_s"] = replace(figures["theta_s"], skew=gearing.skew, skew_error=gearing.skew_error)
         note_skew(file, gearing, grid.period)
-        note_lost_motion(file, table, gearing, figures)
+        note_lost_motion(file, gearing, figures)
     # a delay of the torque shows only where it is explained, and mostly by inertia
     if dynamics is not None and dynamics.residual < 0.1 and dynamics.shares[0] > 0.3:
         figures["u"] = replace(figures["u"], skew=dynamics.skew, skew_error=dynamics.skew_error)
@@ -209,20 +209,24 @@ def _evenly_spaced(
         grid = resampled(file, segments, channels, period, delays, interpolate=not regular)
         if table.kind == "element" or "theta_e" not in channels or "theta_s" not in channels:
             return grid, None
-        turn = None if table.load_unit == "m" else 2.0 * math.pi
+        turn = None if channels["theta_s"].unit == "m" else 2.0 * math.pi
         motor, load = grid.values["theta_e"], grid.values["theta_s"]
         return grid, fit_gearing(grid.time, motor, load, grid.segments, period, expected=gear_ratio, turn=turn)
 
     grid, gearing = attempt()
     asked = any(raw.skew == "estimate" for raw in channels.values())
-    both = "theta_e", "theta_s"
-    open_ = shaft is not None and _is_open(table, "skew", both)
-    if gearing is not None and (asked or open_) and _is_open(table, "drift", both):
-        drift = _drift(file, gearing, grid, shaft if open_ else None)
+    open_ = shaft is not None and _is_open(table, "skew")
+    said = []
+    if gearing is not None and (asked or open_) and _is_open(table, "drift"):
+        drift = _drift(gearing, grid, shaft if open_ else None)
         if drift is not None:
             middle = 0.5 * float(grid.time[0] + grid.time[-1])
             delays["theta_s"] = Delay(-drift.value * middle, drift.value)
             grid, gearing = attempt()
+            said.append(
+                f"theta_s becomes later than theta_e by {1e6 * drift.value:.4g} ± {1e6 * drift.error:.1g} us each second, "
+                "clocks that run apart: corrected."
+            )
     first = delays.get("theta_s", Delay())
     if asked:
         delays["theta_s"] = Delay(first.skew + _estimated_skew(file, gearing, period), first.drift)
@@ -232,7 +236,9 @@ def _evenly_spaced(
         if found is not None and found.sure:
             delays["theta_s"] = Delay(first.skew + found.value, first.drift)
             grid, gearing = attempt()
-            file.warnings.append(_skew_sentence(found))
+            said.append(_skew_sentence(found, " in the middle of the log" if said else ""))
+    if said:
+        file.warnings.append(" ".join([*said, _delay_advice(table, delays["theta_s"])]))
     if open_ and any(delays["theta_s"]):
         file.corrections |= {key: one for key, one in delays["theta_s"]._asdict().items() if one}
     if not regular:
@@ -248,7 +254,7 @@ def _evenly_spaced(
     return grid, gearing, regular
 
 
-def _drift(file: LogFile, gearing: Gearing, grid: Grid, shaft: NominalDrive | None) -> Drift | None:
+def _drift(gearing: Gearing, grid: Grid, shaft: NominalDrive | None) -> Drift | None:
     """A drift between the clocks of both encoders, as far as friction of the nominal drive, if one is given, is no cause."""
     motor, load = grid.values["theta_e"], grid.values["theta_s"]
     if gearing.wide:
@@ -259,10 +265,6 @@ def _drift(file: LogFile, gearing: Gearing, grid: Grid, shaft: NominalDrive | No
         shaft is not None and found.reach < windup(grid, shaft) + 6.0 * found.reach * found.error / abs(found.value)
     ):
         return None
-    file.warnings.append(
-        f"theta_s becomes later than theta_e by {1e6 * found.value:.4g} ± {1e6 * found.error:.1g} us each second, clocks "
-        f"that run apart: corrected. [log] theta_s.drift = {found.value:.4g} says the same, 0 leaves it as it is."
-    )
     return found
 
 
@@ -279,17 +281,28 @@ def _estimated_skew(file: LogFile, gearing: Gearing | None, period: float) -> fl
     return gearing.skew
 
 
-def _is_open(table: LogTable, key: str, names: Sequence[str]) -> bool:
-    """Whether `[log]` leaves a key of all these positions out."""
-    return all(getattr(getattr(table, name) or PositionTable(), key) is None for name in names)
+def _is_open(table: LogTable, key: str) -> bool:
+    """Whether `[log]` leaves a key of theta_e and theta_s out; a speed in place of theta_s may not have it."""
+    motor, load = table.position("theta_e")[1], table.position("theta_s")[1]
+    return getattr(motor, key, None) is None and getattr(load, key, 0.0) is None
 
 
-def _skew_sentence(found: Skew) -> str:
+def _skew_sentence(found: Skew, when: str) -> str:
     how = "later" if found.value > 0.0 else "earlier"
     return (
-        f"theta_s is {1e3 * abs(found.value):.3g} ± {1e3 * found.error:.1g} ms {how} than theta_e, more than friction can "
-        f"make (at most {1e3 * found.windup:.2g} ms): corrected. [log] theta_s.skew = {found.value:.4g} says the same, 0 "
-        "leaves it as it is."
+        f"theta_s is {1e3 * abs(found.value):.3g} ± {1e3 * found.error:.1g} ms {how} than theta_e{when}, more than friction "
+        f"can make (at most {1e3 * found.windup:.2g} ms): corrected."
+    )
+
+
+def _delay_advice(table: LogTable, delay: Delay) -> str:
+    """What `[log]` would say of a skew that was corrected."""
+    name, _ = table.position("theta_s")
+    if not delay.drift:
+        return f"[log] {name}.skew = {delay.skew:.4g} says the same, 0 leaves it as it is."
+    return (
+        f"[log] {name}.skew = {delay.skew:.4g}, that at the first stamp, with {name}.drift = {delay.drift:.4g} says the "
+        "same; 0 for both leaves it as it is."
     )
 
 
@@ -297,10 +310,19 @@ def _correct_offset(
     file: LogFile, table: LogTable, grid: Grid, channels: dict[str, RawChannel], nominal: NominalDrive
 ) -> None:
     """Take an offset between the encoders out of theta_e where it is sure, and say so; say that it may be one, if not."""
-    if not _is_open(table, "offset", ("theta_e", "theta_s")):
+    integrals = [name for name in POSITION_CHANNELS.values() if table.position(name)[0] != name]
+    if not integrals and not _is_open(table, "offset"):
         return
     found = encoder_offset(grid, nominal)
     if found is None:
+        return
+    if integrals:
+        # an integral counts from any place
+        name = integrals[0]
+        change = -found.value if name == "theta_e" else found.value / nominal.gear_ratio
+        grid.values[name] = grid.values[name] + change
+        channels[name] = channels[name]._replace(values=channels[name].values + change)
+        file.notes.append(f"{name} is an integral: {change:.4g} {channels[name].unit} were added to fit the other encoder.")
         return
     size = f"{found.value:.4g} ± {found.error:.1g} {channels['theta_e'].unit}"
     twist = f"theta_e - {nominal.gear_ratio:g} theta_s"

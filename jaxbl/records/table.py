@@ -130,8 +130,10 @@ class SpeedTable(_ChannelTable):
     )
     factor: float = Field(default=1.0, gt=0.0, description="units in one number of the column")
     offset: float = Field(default=0.0, description="added to the speed, in rad/s (m/s)", json_schema_extra={"unit": "rad/s"})
-    skew: float = Field(
-        default=0.0, description="by how much the stamps are later than the readings, undone", json_schema_extra=_SECONDS
+    skew: float | None = Field(
+        default=None,
+        description="by how much the stamps are later than the readings, undone; left out: 0, of omega_s one that is sure",
+        json_schema_extra=_SECONDS,
     )
 
     @property
@@ -254,7 +256,8 @@ class LogTable(StrictTable):
                 found.add(channel.minus)
         return found
 
-    @property
-    def load_unit(self) -> str:
-        """Of the load position and the twist: m on a linear axis, else rad."""
-        return (self.omega_s or self.theta_s or PositionTable()).si_unit
+    def position(self, name: str) -> tuple[str, PositionTable | SpeedTable]:
+        """What the position theta_e or theta_s is read from, itself or the speed in its place: channel and table."""
+        omega = SPEED_CHANNELS[name]
+        speed = getattr(self, omega)
+        return (omega, speed) if speed is not None else (name, getattr(self, name) or PositionTable())

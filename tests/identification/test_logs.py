@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from measured import NOMINAL, axis
 
 from jaxbl.config import read_model
 from jaxbl.errors import InputError
-from jaxbl.identification.logs import read_logs
+from jaxbl.identification.logs import read_logs, read_with_holdout
 from jaxbl.records import Record
 
 MODEL = {"drive": {"kind": "rigid", "motor_inertia": 4e-5, "motor_viscous": 1e-4}}
@@ -59,3 +60,30 @@ def test_a_model_of_a_log_has_no_effects_of_encoders(paths: list[Path]):
     config, _ = read_model(MODEL | {"effects": [{"kind": "encoder.offset", "offset": 0.1}]})
     with pytest.raises(InputError, match=r"0\.csv: encoder\.offset has no place in a model of a log: .* theta_e\.offset"):
         read_logs(config, paths[0])
+
+
+GEARED = {
+    "drive": {"kind": "two_inertia"}
+    | {
+        name: getattr(NOMINAL, name)
+        for name in ("gear_ratio", "motor_inertia", "motor_viscous", "load_inertia", "load_viscous")
+    },
+    "transmission": {"law": "linear_shaft", "stiffness": NOMINAL.stiffness},
+}
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_clock_that_one_log_is_sure_of_holds_for_all_and_for_the_held_out_log(tmp_path: Path, order: tuple[int, int]):
+    """Of a machine whose load's clock is late one log has too much noise to show it."""
+    frames = [axis(skew=3e-3, seed=seed) for seed in range(3)]
+    frames[1]["theta_s"] += 0.1 * np.random.default_rng(0).standard_normal(len(frames[1]))
+    for i, frame in enumerate(frames):
+        frame.to_parquet(tmp_path / f"{i}.parquet")
+    config, _ = read_model(GEARED)
+    alone = [read_logs(config, tmp_path / f"{i}.parquet") for i in range(3)]
+    assert [list(one.corrections) for one in alone] == [["skew"], [], ["skew"]]
+    record, held = read_with_holdout(config, [tmp_path / f"{i}.parquet" for i in order], tmp_path / "2.parquet")
+    assert held is not None
+    moved = f"theta_s: moved by its skew of {1e3 * alone[0].corrections['skew']:.4g} ms."
+    assert sum(moved in note for note in record.notes) == 2 and moved in held.notes
+    assert record.corrections == held.corrections == alone[0].corrections

@@ -1,36 +1,11 @@
 """Clock and zero of one encoder against the other's, beside a gap, friction, wind-up and constant torques."""
 
 import numpy as np
-import pandas as pd
 import pytest
+from measured import NOMINAL, axis
 
 from jaxbl.records import NominalDrive, inspect, read_record
 from jaxbl.report.inspect import summary
-
-NOMINAL = NominalDrive(
-    gear_ratio=20.0, stiffness=50.0, half_gap=0.0, motor_inertia=1e-3, motor_viscous=2e-3, load_inertia=0.4, load_viscous=1.0
-)
-
-
-def axis(skew=0.0, offset=0.0, gap=0.0, load_torque=0.0, motor_torque=0.0, stiffness=50.0, count=8000, drift=0.0, seed=0):
-    """A geared axis with dry friction at the load in multisine motion: its equations of motion, both encoders with noise."""
-    random, t = np.random.default_rng(seed), 1e-3 * np.arange(count)
-    frequency, size, phase = np.array([0.5, 0.83, 1.27, 2.1]), np.array([1.0, 0.5, 0.4, 0.2]), random.uniform(0.0, 6.3, 4)
-
-    def motion(times, derivative):
-        rate = 2.0 * np.pi * frequency
-        return (size * rate**derivative * np.sin(rate * times[:, None] + phase + 0.5 * np.pi * derivative)).sum(axis=1)
-
-    def shaft(times):
-        friction = 2.0 * np.tanh(motion(times, 1) / 0.05)
-        return (0.4 * motion(times, 2) + 1.0 * motion(times, 1) + friction) / 20.0 + load_torque
-
-    middle = t + 0.5e-3
-    twist = shaft(t) / stiffness + 0.5 * gap * np.tanh(shaft(t) / 0.02)
-    u = 20.0 * (1e-3 * motion(middle, 2) + 2e-3 * motion(middle, 1)) + shaft(middle) - motor_torque
-    motor = 20.0 * motion(t, 0) + twist + offset + 1e-4 * random.standard_normal(count)
-    load = motion(t - skew - drift * t, 0) + 5e-6 * random.standard_normal(count)
-    return pd.DataFrame({"t": t, "u": u, "theta_e": motor, "theta_s": load})
 
 
 @pytest.fixture
@@ -103,13 +78,47 @@ def test_clocks_that_run_apart_are_found_to_a_tenth_of_a_sample(read, skew, drif
     ends, found = np.array([0.0, 8.0]), record.corrections
     late = found["skew"] + found["drift"] * ends - skew - drift * ends
     assert np.abs(late).max() < 0.1e-3
-    assert any("clocks that run apart: corrected" in warning for warning in record.warnings)
+    (warning,) = record.warnings
+    assert "clocks that run apart: corrected" in warning
+    said = (
+        f"[log] theta_s.skew = {found['skew']:.4g}, that at the first stamp, with theta_s.drift = {found['drift']:.4g} says"
+    )
+    assert said in warning and warning.count("[log]") == 1
     given = read(frame, {"theta_s": {"skew": found["skew"], "drift": found["drift"]}})
     np.testing.assert_allclose(given.positions["load"], record.positions["load"], atol=1e-12)
     # without a model, on request: with the wind-up by friction, here 0.05 ms
     asked = read(frame, {"theta_s": {"skew": "estimate"}}, None)
     (said,) = [note for note in asked.notes if "growing by" in note]
     assert float(said.split("growing by ")[1].split(" us")[0]) == pytest.approx(1e6 * drift, rel=0.03)
+
+
+def test_the_zero_of_an_integral_is_none_and_its_clock_is_its_own(read):
+    """A speed in place of a position has a skew, but no offset that [log] could name."""
+    frame = axis(3.04e-3, 0.379)
+    frame["omega_e"], frame["omega_s"] = (np.gradient(frame[name], frame["t"]) for name in ("theta_e", "theta_s"))
+    motor = read(frame.drop(columns="theta_e"), {"omega_e": "omega_e"})
+    load = read(frame.drop(columns="theta_s"), {"omega_s": "omega_s"})
+    for record, name in ((motor, "theta_s"), (load, "omega_s")):
+        assert set(record.corrections) == {"skew"}
+        (warning,) = (one for one in record.warnings if "corrected" in one)
+        assert f"[log] {name}.skew = {record.corrections['skew']:.4g} says the same" in warning
+        assert not any(".offset" in one for one in record.warnings)
+        twist = record.positions["motor"] - 20.0 * record.positions["load"]
+        assert abs(np.mean(twist)) < 0.05
+    given = read(frame.drop(columns="theta_s"), {"omega_s": {"skew": load.corrections["skew"]}})
+    assert given.corrections == {}
+    np.testing.assert_allclose(given.positions["load"], load.positions["load"], atol=1e-9)
+
+
+def test_a_screw_twists_in_radians(read):
+    """A turning motor and a carriage in mm: the twist is the motor's."""
+    frame = axis(gap=0.3)
+    frame["theta_s"] *= 1e3
+    frame = frame.iloc[:4000]
+    record = read(frame, {"theta_s": {"unit": "mm"}})
+    assert record.findings.channels["theta_s"].unit == "m"
+    (note,) = (one for one in record.notes if one.startswith("Lost motion"))
+    assert " rad (95 %" in note
 
 
 def test_inspect_says_it_first(tmp_path):

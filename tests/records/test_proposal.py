@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from measured import INERTIA, VISCOUS, made, real
-from test_alignment import axis
+from measured import INERTIA, VISCOUS, axis, made, real
 
 from jaxbl.config import read_model
 from jaxbl.errors import InputError
