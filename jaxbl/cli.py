@@ -240,7 +240,8 @@ def inspect(
     else:
         from .records.proposal import propose
 
-        study, guesses, found = propose(log, None if table is None else table.model_dump(exclude_unset=True))
+        given = None if table is None else table.model_dump(exclude_unset=True)
+        study, guesses, found = propose(log, given, gear_ratio=gear_ratio, nominal=nominal)
     folder = _folder(log, out)
     claim_log_folder(folder, log, overwrite=overwrite)
     lines = write_inspection_report(found, folder)

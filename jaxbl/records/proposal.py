@@ -22,9 +22,10 @@ _VAGUE = 0.5
 _NAMES = {
     "t": r"t|time|timestamp|times|zeit|clock",
     "u": r"u|torque|tau|moment|drehmoment|force|kraft|current|strom|iq|i_q|voltage|volt|vir|vm",
-    "theta_s": r"(theta_s|load|output|arm|joint|link|secondary|enc(oder)?_?2)",
+    "load": r"(theta_s|load|output|arm|joint|link|secondary|enc(oder)?_?2)",
+    "motor": r"motor",
     "omega": r"(omega|speed|velocity|velo|drehzahl|geschwindigkeit|rpm|vel)",
-    "theta_e": r"(theta|position|pos|angle|winkel|lage|enc|q|qm|motor)",
+    "position": r"(theta|theta_[es]|position|pos|angle|winkel|lage|enc|encoder|q|qm|enc(oder)?_?[12])",
     "wanted": r"(goal|target|set|ref|command|cmd|desired|soll|demand)",
 }
 """What columns are usually called."""
@@ -37,23 +38,48 @@ _UNITS = {
 }  # fmt: skip
 """How units are written -> what `[log]` calls them."""
 _SPEEDS = ("rpm", "rad/s", "deg/s", "turn/s", "m/s", "mm/s")
+_POSITIONS = ("rad", "deg", "turn", "counts", "m", "mm")
+_TORQUES = ("N m", "N", "A", "V", "counts", "mN m", "%", "mA")
 
 
 def _split(file: LogFile, column: str | int) -> tuple[str, str]:
-    """Name of a column without its unit, in lower case, and the unit that it says; "" for none."""
+    """Name of a column without its unit, in lower case, and the unit that it says, as `[log]` calls it; "" for none."""
     name, unit = str(column).strip().lower(), str(file.units.get(column, "")).lower()
     if found := re.search(r"[\[(]\s*(.+?)\s*[\])]\s*$", name):
         name, unit = name[: found.start()].strip(" _"), unit or found[1]
     elif "_" in name and name.rsplit("_", 1)[1] in _UNITS and name.rsplit("_", 1)[1] not in ("s", "m", "v", "a", "n"):
         name, end = name.rsplit("_", 1)
         unit = unit or end
-    return name, _UNITS.get(unit, "")
+    return name, _UNITS.get(unit, unit)
 
 
 def _is(kind: str, name: str) -> bool:
-    words = [word for word in re.split(r"[^a-z0-9äöü]+", name) if word]
-    one = _NAMES[kind]
-    return any(re.fullmatch(one, word) for word in (name.replace(" ", "_"), *words))
+    """Whether a name, or a word of it, is one of a kind."""
+    return any(re.fullmatch(_NAMES[kind], one) for one in (_whole(name), *re.split(r"[^a-z0-9äöü]+", name)))
+
+
+def _whole(name: str) -> str:
+    return name.replace(" ", "_")
+
+
+def _channel(name: str, unit: str) -> str:
+    """The channel that a column is by its name and unit; "" for none."""
+    if _is("t", name):
+        return "t"
+    side = "s" if _is("load", name) else "e"
+    # a unit that is not known may be any
+    may = {kind: unit in units or unit not in _UNITS.values() for kind, units in
+           (("u", _TORQUES), ("omega", (*_SPEEDS, "counts")), ("position", _POSITIONS))}  # fmt: skip
+    speed, place = unit in _SPEEDS or _is("omega", name), _is("position", name)
+    # current_position is no current
+    if may["u"] and (re.fullmatch(_NAMES["u"], _whole(name)) or (_is("u", name) and not (speed or place))):
+        return "u"
+    if speed:
+        return f"omega_{side}" if may["omega"] else ""
+    # motor and load alone say what moves, and not which quantity it is: a temperature is one of the motor, too
+    alone = any(re.fullmatch(_NAMES[one], _whole(name)) and not unit for one in ("motor", "load"))
+    said = unit in _POSITIONS and (_is("motor", name) or _is("load", name))
+    return f"theta_{side}" if (place and may["position"]) or alone or said else ""
 
 
 def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
@@ -68,28 +94,28 @@ def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
             f"{path}: --write goes by the names of columns, and the file has none; a file with [log] for --model can give "
             "their numbers"
         )
-    table: dict[str, Any] = {}
-    guesses: list[str] = []
-    speeds: dict[str, tuple[str | int, str, np.ndarray]] = {}
+    found: dict[str, list[tuple[bool, str | int, str, np.ndarray]]] = {}
     for column in file.columns:
         name, unit = _split(file, column)
-        numbers = np.asarray(file.columns[column])
-        if numbers.dtype.kind not in "iuf" or _is("wanted", name):
-            continue
-        if "t" not in table and _is("t", name):
+        numbers, channel, wanted = np.asarray(file.columns[column]), _channel(name, unit), _is("wanted", name)
+        # a torque that was asked for stands for one that was not measured
+        if numbers.dtype.kind in "iuf" and (channel == "u" or not wanted):
+            found.setdefault(channel, []).append((wanted or _is("load", name), column, unit, numbers))
+    table: dict[str, Any] = {}
+    guesses: list[str] = []
+    for channel, columns in found.items():
+        _, column, unit, numbers = min(columns, key=lambda one: channel == "u" and one[0])
+        if channel == "t":
             table["t"] = _time(column, unit, numbers, guesses)
-        elif "u" not in table and _is("u", name):
+        elif channel == "u":
+            if _is("wanted", _split(file, column)[0]):
+                guesses.append(f"u is '{column}', the torque asked for: no column looks like a measured one.")
             table["u"] = _torque(column, unit, guesses)
-        elif _is("omega", name) or unit in _SPEEDS:
-            speeds.setdefault("omega_s" if _is("theta_s", name) else "omega_e", (column, unit, numbers))
-        elif "theta_s" not in table and _is("theta_s", name):
-            table["theta_s"] = _position(column, unit, "rad", numbers, guesses)
-        elif "theta_e" not in table and _is("theta_e", name):
-            table["theta_e"] = _position(column, unit, "rad", numbers, guesses)
-    for omega, (column, unit, numbers) in speeds.items():
+        elif channel.startswith("theta"):
+            table[channel] = _position(column, unit, numbers, guesses)
         # a measured position is better than the integral of a speed
-        if omega.replace("omega", "theta") not in table:
-            table[omega] = _position(column, unit, "rad/s", numbers, guesses)
+        elif channel and channel.replace("omega", "theta") not in found:
+            table[channel] = _speed(column, unit, guesses)
     if not {"theta_e", "theta_s", "omega_e", "omega_s"} & set(table):
         columns = ", ".join(map(str, file.columns))
         raise InputError(f"{path}: no column is called like a position or a speed: {columns}; [log] theta_e can name one")
@@ -113,48 +139,73 @@ def _time(column: str | int, unit: str, values: np.ndarray, guesses: list[str]) 
 
 def _torque(column: str | int, unit: str, guesses: list[str]) -> dict[str, Any]:
     plain = {"mN m": ("N m", 1e-3), "%": ("N m", 0.01), "mA": ("A", 1e-3)}
-    if unit in ("A", "V", "%", "mA"):
+    if unit in ("A", "V", "%", "mA", "counts"):
         guesses.append(f"u.factor: put in the torque of one {unit}; 1 is a placeholder for each A or V, and for 100 %.")
     if unit in plain:
         unit, factor = plain[unit]
         return {"column": column, "unit": unit, "factor": factor}
-    if unit in ("A", "V"):
+    if unit in ("A", "V", "counts"):
         return {"column": column, "unit": unit, "factor": 1.0}
-    if not unit:
-        guesses.append("The unit of u is not said: N m is assumed.")
-    return {"column": column} | ({"unit": unit} if unit in ("N m", "N") else {})
+    if unit in ("N m", "N"):
+        return {"column": column, "unit": unit}
+    guesses.append(_assumed("u", unit, "N m"))
+    return {"column": column}
 
 
-def _position(column: str | int, unit: str, default: str, values: np.ndarray, guesses: list[str]) -> dict[str, Any]:
+def _assumed(what: str, unit: str, default: str) -> str:
+    return f"The unit of {what} is " + (f"'{unit}': put in factor; " if unit else "not said: ") + f"{default} is assumed."
+
+
+def _position(column: str | int, unit: str, values: np.ndarray, guesses: list[str]) -> dict[str, Any]:
     whole = bool(np.isfinite(values).all() and (values == np.round(values)).all())
-    if unit == "counts" or (not unit and default == "rad" and whole):
+    if unit == "counts" or (not unit and whole):
         guesses.append(f"'{column}' looks like counts: put in counts_per_turn; 4096 is a placeholder.")
         return {"column": column, "unit": "counts", "counts_per_turn": 4096.0}
-    if not unit:
-        guesses.append(f"The unit of '{column}' is not said: {default} is assumed.")
-    return {"column": column, "unit": unit or default}
+    if unit not in _POSITIONS:
+        guesses.append(_assumed(f"'{column}'", unit, "rad"))
+    return {"column": column, "unit": unit if unit in _POSITIONS else "rad"}
 
 
-def propose(path: str | Path, log: dict[str, Any] | None = None) -> tuple[dict[str, Any], list[str], Inspection]:
+def _speed(column: str | int, unit: str, guesses: list[str]) -> dict[str, Any]:
+    if unit not in _SPEEDS:
+        guesses.append(_assumed(f"'{column}'", unit, "rad/s"))
+    return {"column": column, "unit": unit if unit in _SPEEDS else "rad/s"}
+
+
+def propose(
+    path: str | Path,
+    log: dict[str, Any] | None = None,
+    *,
+    gear_ratio: float | None = None,
+    nominal: NominalDrive | None = None,
+) -> tuple[dict[str, Any], list[str], Inspection]:
     """A study of a log for `identify` and `diagnose`, what was guessed, and the log as it reads.
 
     Args:
         path: the log.
         log: its `[log]` table; left out: guessed.
+        gear_ratio: of the drive, if it is known; left out: that of the log.
+        nominal: the drive, if it is known; left out: by a rough fit.
 
     Raises:
-        InputError: as of :func:`jaxbl.records.read_record`, or no columns can be guessed.
+        InputError: as of :func:`jaxbl.records.read_record`, or no columns can be guessed, or it is the log of a test rig.
     """
+    if log is not None and log.get("kind") == "element":
+        raise InputError("--write proposes a drive; a transmission on a test rig has none, and needs no more than its [log]")
     table, guesses = guess_log_table(path) if log is None else (log, [])
     try:
-        found = inspect(path, table)
+        found = inspect(path, table, gear_ratio=gear_ratio)
     except InputError as error:
         if log is not None or "set sign = -1 in [log] u" not in str(error):
             raise
         table["u"]["sign"] = -1
         guesses.append("u is reversed: with the sign of the file the drive would accelerate against it.")
-        found = inspect(path, table)
-    nominal = _nominal(found, guesses)
+        found = inspect(path, table, gear_ratio=gear_ratio)
+    if nominal is None or (gear_ratio is not None and not math.isfinite(nominal.stiffness)):
+        rough = vars(_nominal(found, guesses, gear_ratio))
+        nominal = NominalDrive(**{name: one if name == "gear_ratio" else _rounded(one) for name, one in rough.items()})
+    else:
+        guesses.append("The numbers of the drive are those of the model that was given.")
     if math.isfinite(nominal.stiffness):
         found = inspect(path, table, gear_ratio=nominal.gear_ratio, nominal=nominal)
         for channel, key in (("theta_s", "skew"), ("theta_s", "drift"), ("theta_e", "offset")):
@@ -168,7 +219,7 @@ def _as_table(given: Any) -> dict[str, Any]:
     return given if isinstance(given, dict) else {"column": given}
 
 
-def _nominal(found: Inspection, guesses: list[str]) -> NominalDrive:
+def _nominal(found: Inspection, guesses: list[str], known: float | None) -> NominalDrive:
     """Inertia and friction by the rough fit; of two sides half of it each, at the motor."""
     dynamics, gearing = found.record.findings.dynamics, found.record.findings.gearing
     inertia, viscous = 1.0, 0.0
@@ -180,7 +231,7 @@ def _nominal(found: Inspection, guesses: list[str]) -> NominalDrive:
             # inertia is then a small part of the torque
             inertia = 0.1 * dynamics.torque / dynamics.acceleration
             guesses.append(f"The log hardly shows the inertia: {inertia:.2g} would take a tenth of the torque.")
-        viscous = viscous if viscous > 0.0 else 0.01 * dynamics.torque / max(dynamics.acceleration, 1e-300)
+        viscous = viscous if viscous > 0.0 else 0.01 * dynamics.torque / max(dynamics.square**0.5, 1e-300)
     period = found.record.sample_period
     if gearing is None or found.gear_ratio is None or found.record.torque is None:
         return NominalDrive(inertia, viscous)
@@ -198,8 +249,10 @@ def _nominal(found: Inspection, guesses: list[str]) -> NominalDrive:
             "sign = -1 in [log] theta_e or theta_s, or leave one of them out, and give the file as --model"
         )
     ratio, whole = float(values[0]), float(round(values[0]))
+    if known is not None:
+        ratio = known
     # most ratios of one stage are whole
-    if whole and abs(ratio - whole) < max(0.005 * ratio, 5.0 * float(errors[0])):
+    elif whole and abs(ratio - whole) < max(0.005 * ratio, 5.0 * float(errors[0])):
         guesses.append(f"gear_ratio is {ratio:.4g} by the log, and taken to be {whole:g}.")
         ratio = whole
     half = 0.5 * inertia
@@ -230,11 +283,11 @@ def _study(found: Inspection, nominal: NominalDrive, table: dict[str, Any]) -> d
     names = ("motor_inertia", "motor_viscous", *(("load_inertia", "load_viscous", "gear_ratio") if two else ()))
     study: dict[str, Any] = {
         "title": record.path.stem,
-        "drive": {"kind": "two_inertia" if two else "rigid"} | {name: _rounded(getattr(nominal, name)) for name in names},
+        "drive": {"kind": "two_inertia" if two else "rigid"} | {name: getattr(nominal, name) for name in names},
     }
     fastest = 0.0
     if two:
-        law = {"law": "dead_zone", "stiffness": _rounded(nominal.stiffness), "half_gap": _rounded(nominal.half_gap)}
+        law = {"law": "dead_zone", "stiffness": nominal.stiffness, "half_gap": nominal.half_gap}
         study["transmission"] = law if nominal.half_gap else {"law": "linear_shaft", "stiffness": law["stiffness"]}
         fastest = math.sqrt(nominal.stiffness / nominal.motor_inertia)
     # ten plant steps for each radian of the shaft's own motion

@@ -1,11 +1,13 @@
 """A first study for a log, from its columns and a rough fit."""
 
 import numpy as np
+import pandas as pd
 import pytest
 from measured import INERTIA, VISCOUS, axis, made, real
 
 from jaxbl.config import read_model
 from jaxbl.errors import InputError
+from jaxbl.records import NominalDrive, read_log_table
 from jaxbl.records.proposal import guess_log_table, propose
 
 
@@ -21,6 +23,69 @@ def test_names_and_units_of_columns_are_understood(tmp_path):
         "theta_e": {"column": "position_deg", "unit": "deg"},
     }
     assert guesses == ["u.factor: put in the torque of one mA; 1 is a placeholder for each A or V, and for 100 %."]
+
+
+COLUMNS = {
+    "t, torque, motor_temperature, motor_position": {"u": "torque", "theta_e": "motor_position"},
+    "t, motor_current, motor_torque, motor_position": {"u": "motor_current", "theta_e": "motor_position"},
+    "t, torque, motor temperature [°C], load [N m], motor angle": {"u": "torque", "theta_e": "motor angle"},
+    "t, torque, load_torque, theta_m, load_pos": {"u": "torque", "theta_e": "theta_m", "theta_s": "load_pos"},
+    "t, load_torque, torque, motor, load": {"u": "torque", "theta_e": "motor", "theta_s": "load"},
+    "t, torque_cmd, position": {"u": "torque_cmd", "theta_e": "position"},
+    "t, torque_cmd, current, position_cmd, position": {"u": "current", "theta_e": "position"},
+    "t, torque, current_position": {"u": "torque", "theta_e": "current_position"},
+    "t, force, velocity [counts]": {"u": "force", "omega_e": "velocity [counts]"},
+    "t, i_q, motor shaft [deg], output shaft [deg]": {
+        "u": "i_q",
+        "theta_e": "motor shaft [deg]",
+        "theta_s": "output shaft [deg]",
+    },
+}
+
+
+@pytest.mark.parametrize("names", COLUMNS)
+def test_each_quantity_finds_its_column(names, tmp_path):
+    columns = names.split(", ")
+    pd.DataFrame({name: 0.01 * np.arange(5) + i for i, name in enumerate(columns)}).to_csv(tmp_path / "log.csv", index=False)
+    table, guesses = guess_log_table(tmp_path / "log.csv")
+    read_log_table(table)
+    assert {name: one["column"] for name, one in table.items()} == {"t": "t"} | COLUMNS[names]
+    assert (table["u"]["column"] == "torque_cmd") == any("the torque asked for" in guess for guess in guesses)
+    assert ("[counts]" in names) == any("put in factor" in guess for guess in guesses)
+
+
+def test_a_speed_beside_a_position_needs_no_offset(tmp_path):
+    """What is proposed reads the log: an integral has no zero that [log] could name."""
+    frame = axis(3.04e-3, 0.379)
+    speed = np.gradient(frame["theta_e"], frame["t"])
+    frame = frame.rename(columns={"theta_s": "load angle"}).drop(columns="theta_e").assign(**{"motor speed": speed})
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    study, _, _ = propose(tmp_path / "log.csv")
+    config, _ = read_model(study)
+    assert config.log.omega_e is not None and config.log.theta_e is None
+    assert config.log.theta_s.skew == pytest.approx(3.04e-3, abs=5e-4)
+
+
+def test_the_model_that_is_given_stands(tmp_path):
+    made().to_csv(tmp_path / "log.csv", index=False)
+    given = NominalDrive(0.004, 0.02, 2.4, 12.0, 20.0, 1234.5)
+    study, _, _ = propose(tmp_path / "log.csv", {}, gear_ratio=20.0, nominal=given)
+    assert study["transmission"] == {"law": "linear_shaft", "stiffness": 1234.5}
+    assert study["drive"]["load_inertia"] == 2.4 and study["drive"]["gear_ratio"] == 20.0
+    with pytest.raises(InputError, match="theta_e moves 20 for each 1 of theta_s, where gear_ratio is 5"):
+        propose(tmp_path / "log.csv", {}, gear_ratio=5.0, nominal=given)
+    with pytest.raises(InputError, match="--write proposes a drive; a transmission on a test rig has none"):
+        propose(tmp_path / "log.csv", {"kind": "element"})
+
+
+def test_friction_that_does_not_show_is_a_placeholder_of_its_own_unit(tmp_path):
+    """A hundredth of the torque, at the rms speed."""
+    t = 1e-3 * np.arange(4000)
+    place = np.sin(20.0 * t)
+    frame = pd.DataFrame({"t": t, "u": 0.01 * -400.0 * place - 1e-3 * 20.0 * np.cos(20.0 * t), "theta_e": place})
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    study, _, _ = propose(tmp_path / "log.csv")
+    assert study["drive"]["motor_viscous"] == pytest.approx(0.01 * 4.0 / 20.0, rel=0.05)
 
 
 def test_a_reversed_torque_and_stamps_in_ms(tmp_path):
