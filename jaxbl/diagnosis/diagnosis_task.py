@@ -103,9 +103,6 @@ def _check_machine(record: Record, other: Record) -> None:
             f"{other.path}: is sampled every {other.sample_period:.6g} s, {record.path} every {record.sample_period:.6g} s; "
             f"[log] resample = {record.sample_period:.6g} reads both alike"
         )
-    for side in record.positions:
-        if side not in other.positions:
-            raise InputError(f"{other.path}: has no {side} position, which {record.path} has; it is of another machine")
     gears = record.findings.gearing, other.findings.gearing
     if gears[0] is not None and gears[1] is not None and not (gears[0].wide or gears[1].wide):
         ratios = gears[0].ratio, gears[1].ratio

@@ -15,7 +15,7 @@ from jaxbl.drive.effects import CoulombFriction, Damping, Hysteresis, LoadFricti
 from jaxbl.drive.transmission import DeadZone, LinearShaft
 from jaxbl.errors import InputError
 from jaxbl.files import plain
-from jaxbl.records import LogTable, Record, read_log_table, read_record
+from jaxbl.records import LogTable, Record, check_positions, read_log_table, read_record
 from jaxbl.records.element import Element, Number, error_on
 from jaxbl.records.inspection import displacement, element_noise, element_of
 
@@ -88,6 +88,9 @@ def read_element_task(
     """
     records = [None if path is None else read_record(path, table) for path in (log, holdout)]
     assert records[0] is not None
+    if records[1] is not None:
+        check_positions(records[0], records[1])
+        check_positions(records[1], records[0])
     ratio = None if len(records[0].positions) < 2 else gear_ratio or 1.0
     return ElementTask(title, table, ratio, records[0], records[1])
 

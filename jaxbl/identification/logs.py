@@ -19,7 +19,7 @@ from jaxbl.config import Config, prepare
 from jaxbl.drive.effects import EFFECTS, EncoderEffect
 from jaxbl.drive.parameters import get_leaf, leaf_paths
 from jaxbl.errors import InputError
-from jaxbl.records import POSITION_CHANNELS, Record, TurningLog, join, read_record, turned
+from jaxbl.records import POSITION_CHANNELS, Record, TurningLog, check_positions, join, read_record, turned
 from jaxbl.simulate import Experiment
 from jaxbl.workers import Progress
 
@@ -98,7 +98,9 @@ def read_logs(config: Config, logs: Logs, gear_tolerance: float = 0.0, like: Rec
     several = [logs] if isinstance(logs, str | Path | Record) else list(logs)
     if not several:
         raise InputError("no log: at least one is needed")
-    records = [one if isinstance(one, Record) else _read_one(config, one, gear_tolerance) for one in several]
+    records = [
+        _checked(config, one) if isinstance(one, Record) else _read_one(config, one, gear_tolerance) for one in several
+    ]
     config = _at_one_period(config, records, like)
     for i, (log, record) in enumerate(zip(several, records, strict=True)):
         if not isinstance(log, Record) and not _alike(record.sample_period, config.log.resample or record.sample_period):
@@ -152,16 +154,18 @@ def read_with_holdout(
         config = config.model_copy(update={"log": config.log.model_copy(update={"resample": other.sample_period})})
         record = read_logs(config, logs, gear_tolerance)
         other = read_logs(config, holdout, gear_tolerance, like=record)
+    check_positions(record, other)
     return record, other
 
 
 def _from_zero_of(first: Record, record: Record, config: Config) -> Record:
     """A log whose positions count from the zero of another one, as far as torques that repeat with the turn show it."""
-    table, two = config.log, "load" in record.positions and config.drive.kind == "two_inertia"
+    table, geared = config.log, config.drive.kind == "two_inertia"
+    two = geared and all("load" in one.positions for one in (first, record))
     given = any(one is not None and one.offset is not None for one in (table.theta_e, table.theta_s))
     if given or "motor" not in record.positions or record.findings.channels["theta_e"].unit != "rad":
         return record
-    ratio = config.drive.gear_ratio if two else 1.0
+    ratio = config.drive.gear_ratio if geared else 1.0
     motions = []
     for one in (first, record):
         assert one.torque is not None
@@ -171,7 +175,7 @@ def _from_zero_of(first: Record, record: Record, config: Config) -> Record:
     if found is None:
         return record
     waves = ", ".join(map(str, found.waves))
-    other = f" (to theta_s 1/{ratio:g} of it)" if two else ""
+    other = f" (to theta_s 1/{ratio:g} of it)" if geared and "load" in record.positions else ""
     warning = (
         f"theta_e counts from another zero than in {first.path.name}, by the torque that repeats {waves} times a turn: "
         f"{found.value:.4g} ± {found.error:.1g} rad were added{other}."
@@ -197,7 +201,11 @@ def _corrected(config: Config, given: Mapping[str, float]) -> Config:
 def _read_one(config: Config, log: str | Path, gear_tolerance: float) -> Record:
     ratio = config.drive.gear_ratio if config.drive.kind == "two_inertia" else None
     nominal = config.nominal_drive()
-    record = read_record(log, config.log, gear_ratio=ratio, gear_tolerance=gear_tolerance, nominal=nominal)
+    return _checked(config, read_record(log, config.log, gear_ratio=ratio, gear_tolerance=gear_tolerance, nominal=nominal))
+
+
+def _checked(config: Config, record: Record) -> Record:
+    """A log that the study's drive can be fitted to, with what is said first; InputError where it cannot."""
     if record.contradiction:
         raise InputError(f"{record.path}: {record.contradiction}")
     if "motor" not in record.positions:
@@ -212,7 +220,7 @@ def _read_one(config: Config, log: str | Path, gear_tolerance: float) -> Record:
                 "show only together with the motor's torque or current: log that, too"
             )
         first = "No load position (theta_s): load, gap and frictions are found from the motor's encoder and u alone."
-        record = dataclasses.replace(record, warnings=(*record.warnings, first))
+        record = dataclasses.replace(record, warnings=tuple(dict.fromkeys((*record.warnings, first))))
     step = config.run.sample_period / config.run.substeps
     if record.sample_period > _MOST_STEPS * step:
         raise InputError(

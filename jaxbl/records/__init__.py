@@ -8,6 +8,7 @@ from .position_zero import TurningLog as TurningLog
 from .position_zero import turned as turned
 from .reader import Findings as Findings
 from .reader import Record as Record
+from .reader import check_positions as check_positions
 from .reader import join as join
 from .reader import read_log_table as read_log_table
 from .reader import read_record as read_record

@@ -29,7 +29,7 @@ from .plausibility import (
 from .resampling import Delay, Grid, resampled
 from .rigid_body import RigidFit, fit_rigid_drive
 from .signal_quality import ChannelFigures, channel_figures, longest
-from .table import POSITION_CHANNELS, LogTable
+from .table import ELEMENT_NEEDS, POSITION_CHANNELS, LogTable
 from .time_stamps import Sampling, Segments, read_time_stamps, split_at_gaps
 
 
@@ -141,6 +141,8 @@ def read_record(
     segments = split_at_gaps(file, stamps)
     channels = {name: raw._replace(values=raw.values[segments.distinct]) for name, raw in channels.items()}
     encoders = [name for name in POSITION_CHANNELS.values() if name in channels]
+    if table.kind == "element" and "theta_e" not in encoders:
+        raise file.wrong(f"has no theta_e: {ELEMENT_NEEDS}; [log] theta_e can name its column")
     # the sides of an element move on their own, if they move
     drive = table.kind == "drive"
     for name in encoders if drive else encoders[:1]:
@@ -358,6 +360,15 @@ def _figures(file: LogFile, name: str, raw: RawChannel, segments: Segments, sour
     )
     note_channel(file, name, figures, float(np.quantile(np.abs(np.diff(values)), 0.99)) / period)
     return figures
+
+
+def check_positions(log: Record, other: Record) -> None:
+    """Refuse another log of a machine without a position that the first one has."""
+    for side in log.positions:
+        if side not in other.positions:
+            raise InputError(
+                f"{other.path}: has no {side} position, which {log.path} has; logs of one machine should be alike"
+            )
 
 
 _PAUSE = 10

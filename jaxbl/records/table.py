@@ -175,6 +175,9 @@ POSITION_CHANNELS = {"motor": "theta_e", "load": "theta_s"}
 SPEED_CHANNELS = {"theta_e": "omega_e", "theta_s": "omega_s"}
 """Channel of a position -> that of the speed which may stand in its place."""
 
+ELEMENT_NEEDS = "an element is found from its displacement theta_e and the torque u; both are needed"
+"""Why a log of a transmission on a test rig is refused."""
+
 _Plain = Annotated[bool | int | float | str, BeforeValidator(_is_plain)]
 
 
@@ -235,7 +238,7 @@ class LogTable(StrictTable):
                 )
         if self.kind == "element":
             if "u" in absent or "theta_e" in absent:
-                raise wrong("absent: an element is found from its displacement theta_e and the torque u; both are needed")
+                raise wrong(f"absent: {ELEMENT_NEEDS}")
             if self.omega_e is not None or self.omega_s is not None or self.transmitted is not None:
                 raise wrong("an element has a displacement (theta_e, theta_s) and a torque u, no speed and no transmitted")
         if "theta_e" in absent and "theta_s" in absent:

@@ -28,3 +28,21 @@ def test_two_displacements_and_their_gear_give_tables_of_a_study(tmp_path):
     assert read_config(rest | {"observer": gains} | found.tables).effects[0].torque == effect["torque"]
     with pytest.raises(jaxbl.InputError, match="log: unknown key 'gear'"):
         jaxbl.identify_element(path, {"gear": 1})
+
+
+def test_an_element_needs_its_displacement_in_every_log(tmp_path):
+    t = 0.01 * np.arange(400)
+    frame = pd.DataFrame({"t": t, "u": np.sin(t), "theta_e": 0.1 * np.sin(t), "theta_s": 0.01 * np.sin(t)})
+    for name, columns in (("both", []), ("motor", ["theta_s"]), ("load", ["theta_e"])):
+        frame.drop(columns=columns).to_parquet(tmp_path / f"{name}.parquet")
+    both, motor, load = (tmp_path / f"{name}.parquet" for name in ("both", "motor", "load"))
+    for log, holdout in ((load, None), (both, load), (motor, load)):
+        with pytest.raises(
+            jaxbl.InputError, match=r"load\.parquet: has no theta_e: an element is found from its displacement"
+        ):
+            jaxbl.identify_element(log, {}, holdout=holdout)
+    with pytest.raises(jaxbl.InputError, match=r"load\.parquet: has no theta_e"):
+        jaxbl.inspect(load, {"kind": "element"})
+    for log, holdout in ((both, motor), (motor, both)):
+        with pytest.raises(jaxbl.InputError, match=r"motor\.parquet: has no load position, which .*both\.parquet has"):
+            jaxbl.identify_element(log, {}, holdout=holdout)

@@ -10,7 +10,7 @@ from measured import NOMINAL, axis
 from jaxbl.config import read_model
 from jaxbl.errors import InputError
 from jaxbl.identification.logs import read_logs, read_with_holdout
-from jaxbl.records import Record
+from jaxbl.records import Record, read_record
 
 MODEL = {"drive": {"kind": "rigid", "motor_inertia": 4e-5, "motor_viscous": 1e-4}}
 
@@ -87,3 +87,25 @@ def test_a_clock_that_one_log_is_sure_of_holds_for_all_and_for_the_held_out_log(
     moved = f"theta_s: moved by its skew of {1e3 * alone[0].corrections['skew']:.4g} ms."
     assert sum(moved in note for note in record.notes) == 2 and moved in held.notes
     assert record.corrections == held.corrections == alone[0].corrections
+
+
+def test_a_record_is_checked_as_a_file_is(tmp_path: Path):
+    """It was read without the study, which may need what it lacks."""
+    axis().drop(columns="u").to_parquet(tmp_path / "free.parquet")
+    free = read_record(tmp_path / "free.parquet", {"absent": ["u"]}, gear_ratio=20.0)
+    config, _ = read_model(GEARED)
+    with pytest.raises(InputError, match=r"free\.parquet: without u a motion shows torques only as multiples"):
+        read_logs(config, free)
+    known, _ = read_model(GEARED | {"uncertainty": {"exact": ["drive.motor_inertia"]}})
+    record = read_logs(known, free)
+    assert record.torque is not None and not record.torque.any()
+    assert read_logs(known, record).notes == record.notes
+
+
+def test_a_held_out_log_has_the_positions_of_the_log(tmp_path: Path):
+    axis().to_parquet(tmp_path / "both.parquet")
+    axis(seed=1).drop(columns="theta_s").to_parquet(tmp_path / "motor.parquet")
+    config, _ = read_model(GEARED)
+    with pytest.raises(InputError, match=r"motor\.parquet: has no load position, which .*both\.parquet has"):
+        read_with_holdout(config, tmp_path / "both.parquet", tmp_path / "motor.parquet")
+    assert read_with_holdout(config, tmp_path / "motor.parquet", tmp_path / "both.parquet")[1] is not None
