@@ -8,10 +8,9 @@ import pandas as pd
 
 from .errors import InputError
 from .files import make_folder, results_of
+from .records.files import LOG_ENDINGS, is_log
 from .report.diagnose import probability, rms_text
 from .workers import Progress, each, forget_programs, worth
-
-_LOGS = (".csv", ".parquet", ".mat", ".mf4", ".tdms", ".mcap")
 
 
 class LogJob(NamedTuple):
@@ -24,8 +23,8 @@ class LogJob(NamedTuple):
     overwrite: bool
 
 
-def read_batch(source: Path, model: Path | None, out: Path, *, overwrite: bool) -> list[LogJob]:
-    """The logs of a folder, each with its model and a folder for its results.
+def read_batch(source: Path, model: Path | None, out: Path, *, overwrite: bool) -> tuple[list[LogJob], list[str]]:
+    """The logs of a folder, each with its model and a folder for its results; names of what is no log, nor a model.
 
     `NAME.toml` beside a log is its model (`model` where there is none), `holdout/NAME.*` its hold-out log.
 
@@ -33,22 +32,25 @@ def read_batch(source: Path, model: Path | None, out: Path, *, overwrite: bool) 
         InputError: there is no log, a log has no model, or two logs have one name.
     """
     if not source.is_dir():
-        raise InputError(f"{source}: no such folder; --batch needs one with logs ({', '.join(_LOGS)})")
-    logs = sorted(file for file in source.iterdir() if file.suffix.lower() in _LOGS)
+        raise InputError(f"{source}: no such folder; --batch needs one with logs")
+    logs = sorted(file for file in source.iterdir() if is_log(file))
+    known = {"holdout", *(file.name for file in logs)}
+    others = (file.name for file in source.iterdir() if file.suffix != ".toml" and not file.name.startswith("."))
+    skipped = sorted({*others} - known)
     if not logs:
-        raise InputError(f"{source}: holds no log ({', '.join(_LOGS)})")
+        raise InputError(f"{source}: holds no log ({', '.join(LOG_ENDINGS)}, or a folder of a ROS 2 bag)")
     stems = [file.stem for file in logs]
     for name in stems:
         if stems.count(name) > 1:
             raise InputError(f"{source}: two logs are called {name}; each needs a name of its own for its results")
-    held = {file.stem: file for file in (source / "holdout").glob("*") if file.suffix.lower() in _LOGS}
+    held = {file.stem: file for file in (source / "holdout").glob("*") if is_log(file)}
     jobs = []
     for file in logs:
         own = file.with_suffix(".toml") if file.with_suffix(".toml").exists() else model
         if own is None:
             raise InputError(f"{file}: no model; give --model TOML, or {file.with_suffix('.toml').name} beside it")
         jobs.append(LogJob(file, own, held.get(file.stem), out / file.stem, overwrite))
-    return jobs
+    return jobs, skipped
 
 
 def run_batch(work: list[LogJob], out: Path, processes: int | None, progress: Progress) -> list[dict[str, Any]]:

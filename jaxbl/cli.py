@@ -292,6 +292,8 @@ def identify(
             raise InputError(
                 "identify: --profile is for drives; intervals of a transmission on a test rig are by a jackknife"
             )
+        if next_experiment is not None:
+            raise InputError("identify: --next-experiment is for drives; a transmission on a test rig is loaded to and fro")
         _identify_element(log[0], table, gear_ratio, holdout, _folder(log[0], out), overwrite)
         return
     from jaxbl.identification.identify import read_identification_task, run_identification
@@ -403,9 +405,11 @@ def _diagnose_batch(
 ) -> None:
     from .batch import batch_lines, read_batch, run_batch
 
-    work = read_batch(source, model, out, overwrite=overwrite)
+    work, skipped = read_batch(source, model, out, overwrite=overwrite)
     with running(context, model or source, out, unit="logs") as progress:
         rows = run_batch(work, out, jobs, progress)
+    if skipped:
+        typer.echo(f"Skipped, by their names no logs: {', '.join(skipped)}")
     for line in batch_lines(rows):
         typer.echo(line)
     typer.echo(f"{out / 'batch.csv'}")

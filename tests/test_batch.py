@@ -4,7 +4,7 @@ import math
 
 import pandas as pd
 
-from jaxbl.batch import batch_lines, batch_row
+from jaxbl.batch import batch_lines, batch_row, read_batch
 
 DIAGNOSIS = {
     "verdict": "explained",
@@ -25,3 +25,24 @@ def test_a_batch_is_a_table(tmp_path):
     table = pd.DataFrame(rows)
     assert list(table["log"]) == ["a.csv", "long.csv"]
     assert table["theta_s_before"][0] == 0.02 and math.isnan(table["theta_s_before"][1])
+
+
+def test_every_kind_of_log_is_found_and_what_is_none_is_told(tmp_path):
+    for name in (
+        "a.csv",
+        "b.txt",
+        "c.tdms",
+        "d.JSON",
+        "e/metadata.yaml",
+        "f.pdf",
+        "a.toml",
+        ".hidden",
+        "holdout/b.dat",
+        "g/x.csv",
+    ):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("")
+    work, skipped = read_batch(tmp_path, tmp_path / "a.toml", tmp_path / "out", overwrite=False)
+    assert [job.log.name for job in work] == ["a.csv", "b.txt", "c.tdms", "d.JSON", "e"]
+    assert work[1].holdout == tmp_path / "holdout" / "b.dat"
+    assert skipped == ["f.pdf", "g"]

@@ -500,12 +500,17 @@ def test_a_transmission_on_a_test_rig_is_identified_and_no_drive(call, tmp_path)
     code, out, err = call("identify", "rig.csv", "--model", model, "--out", "found", "--holdout", "again.csv")
     assert (code, err) == (0, []) and out[0].startswith("transmission.stiffness = ") and " N/m, 95 %: " in out[0]
     found = json.loads(Path("found/identification.json").read_text())["parameters"]
+    assert json.loads(Path("found/identification.json").read_text())["title"] == "Transmission of rig.csv"
     assert found["transmission.half_gap"]["value"] == pytest.approx(0.005, rel=0.01)
     assert tomllib.loads(Path("found/model.toml").read_text())["transmission"]["law"] == "dead_zone"
     assert {"figures/loop.png", "figures/residual.png", "report.html", "trace.parquet"} <= set(left(Path("found")))
     with pytest.raises(InputError, match=r"study.toml: log.kind: 'element' is a transmission alone, without the drive"):
         call("diagnose", "rig.csv", "--model", model)
-    for extra, message in ((["rig.csv"], "one log is fitted at a time"), (["--profile"], "--profile is for drives")):
+    for extra, message in (
+        (["rig.csv"], "one log is fitted at a time"),
+        (["--profile"], "--profile is for drives"),
+        (["--next-experiment", "next.csv"], "--next-experiment is for drives"),
+    ):
         with pytest.raises(InputError, match=message):
             call("identify", "rig.csv", *extra, "--model", model)
     pd.DataFrame({"t": t, "x": t, "force": u}).to_csv("rig.csv", index=False)

@@ -34,14 +34,12 @@ class ElementTask:
     """A log of a transmission on a test rig, and how it was read: everything that decides the result.
 
     Attributes:
-        title: headline of the report; "" for the file's name.
         table: how the logs are read.
         gear_ratio: of the displacements of both sides; None where there is one.
         record: the log.
         holdout: another log, on which what was found is tried out, or None.
     """
 
-    title: str
     table: LogTable
     gear_ratio: float | None
     record: Record
@@ -50,7 +48,7 @@ class ElementTask:
     @property
     def identity(self) -> str:
         """Hash of everything that decides the result."""
-        text = [self.title, self.table.model_dump(), self.gear_ratio, version("jaxbl")]
+        text = [self.table.model_dump(), self.gear_ratio, version("jaxbl")]
         total = hashlib.sha256(json.dumps(text, sort_keys=True).encode())
         for record in (self.record, self.holdout):
             if record is not None:
@@ -79,7 +77,7 @@ class ElementIdentification:
 
 
 def read_element_task(
-    log: str | Path, table: LogTable, gear_ratio: float | None = None, *, title: str = "", holdout: str | Path | None = None
+    log: str | Path, table: LogTable, gear_ratio: float | None = None, *, holdout: str | Path | None = None
 ) -> ElementTask:
     """Read the logs; `gear_ratio` is that of the displacements of both sides, 1 if left out.
 
@@ -92,7 +90,7 @@ def read_element_task(
         check_positions(records[0], records[1])
         check_positions(records[1], records[0])
     ratio = None if len(records[0].positions) < 2 else gear_ratio or 1.0
-    return ElementTask(title, table, ratio, records[0], records[1])
+    return ElementTask(table, ratio, records[0], records[1])
 
 
 def identify_element(
@@ -164,7 +162,7 @@ def _summary(task: ElementTask, found: Element) -> dict[str, Any]:
     record = task.record
     kept = {name: one for name, one in found.numbers.items() if name not in found.open}
     summary = {
-        "title": task.title,
+        "title": f"Transmission of {record.path.name}",
         "kind": "element",
         "identity": task.identity,
         "file": str(record.path.resolve()),

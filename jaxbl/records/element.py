@@ -24,6 +24,8 @@ from .signal_quality import SHORTEST, bandwidth, longest, low_passed
 
 _MOST = 20_000
 """Samples that are fitted: a loop of torque over displacement is drawn by some hundred. Of longer logs means are."""
+_LEAST = 8
+"""Means that a part between gaps has at least: fewer hold no way there and back, and have no slope to speak of."""
 _BAND = 20.0
 """Cutoff of the low-pass on the displacement, over its bandwidth: corners of a triangle stay sharp."""
 _PER_PERIOD = 100
@@ -210,6 +212,8 @@ def _means(
     parts, ends, found = [], [], 0
     for s in segments:
         left = (s.stop - s.start) // count
+        if left < _LEAST:
+            continue
         both = np.stack([position[s], torque[s]])[:, : left * count]
         parts.append(both.reshape(2, left, count).mean(axis=2))
         ends.append(slice(found, found + left))

@@ -11,6 +11,7 @@ import io
 import json
 import re
 import warnings
+from codecs import BOM_UTF8
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,8 +33,14 @@ _MARKS: tuple[tuple[bytes, str, Callable[..., dict[str | int, Any]]], ...] = (
     (b"#ROSBAG", "a ROS bag", read_bag),
 )
 """First bytes, name and reader of kinds that need a library."""
+LOG_ENDINGS = (
+    ".csv", ".txt", ".tsv", ".dat", ".parquet", ".mat", ".h5", ".hdf5", ".json", ".mf4", ".mdf", ".tdms", ".mcap", ".bag"
+)  # fmt: skip
+"""Of the files that are logs by their name."""
 _HEAD = 1 << 18
 """Bytes from which the kind of a file and the form of its rows are seen: hundreds of rows."""
+_BAG = "metadata.yaml"
+"""What the folder of a ROS 2 bag holds."""
 _ROWS = 100_000
 """Rows of text that are in memory with all their columns."""
 
@@ -103,6 +110,11 @@ class LogFile:
         return values
 
 
+def is_log(path: Path) -> bool:
+    """Whether a file, or the folder of a ROS 2 bag, is a log by its name; :func:`read_log_file` reads others, too."""
+    return (path / _BAG).is_file() or (path.is_file() and path.suffix.lower() in LOG_ENDINGS)
+
+
 def read_log_file(path: Path, wanted: Collection[str | int] = ()) -> LogFile:
     """Read columns of a log file; the suffix and the first bytes say which kind it is.
 
@@ -128,7 +140,7 @@ def read_log_file(path: Path, wanted: Collection[str | int] = ()) -> LogFile:
 
 def _columns(path: Path, wanted: Collection[str | int]) -> dict[str | int, Any]:
     suffix = path.suffix.lower()
-    if (path / "metadata.yaml").is_file():
+    if (path / _BAG).is_file():
         with _reading("a ROS bag"):
             return read_bag(path, wanted)
     with path.open("rb") as file:
@@ -138,7 +150,7 @@ def _columns(path: Path, wanted: Collection[str | int]) -> dict[str | int, Any]:
         if head.startswith(mark):
             with _reading(kind):
                 return read(path, wanted)
-    if not head.strip():
+    if not head.removeprefix(BOM_UTF8).strip():
         raise InputError(f"is empty; {_KINDS}")
     if head.startswith(b"PAR1"):
         with _reading("Parquet"):
@@ -183,11 +195,11 @@ def _parquet(path: Path) -> dict[str | int, Any]:
 
 
 @contextmanager
-def _reading(kind: str) -> Iterator[None]:
-    """Errors of the libraries that read files, which are of many classes, in one line."""
+def _reading(kind: str, *passed: type[Exception]) -> Iterator[None]:
+    """Errors of the libraries that read files, which are of many classes, in one line; those of `passed` as they are."""
     try:
         yield
-    except InputError:
+    except (InputError, *passed):
         raise
     except Exception as error:
         first = (str(error).splitlines() or [type(error).__name__])[0]
@@ -209,15 +221,13 @@ def _text(
     if skipped is None:
         raise InputError("holds only remarks; rows of numbers are needed")
     first = lines[skipped]
-    # a comma between digits may be a decimal one, but not where nothing else separates
-    separator = next((c for c in ";\t," if c in first), r"\s+")
+    separator = _separator(first)
     cells = _cells(first, separator)
     header = not any(_NUMBER.fullmatch(cell) for cell in cells)
     second = next((line for line in lines[skipped + 1 :] if line.strip()), "")
     if header and len(_cells(second, separator)) == len(cells) + 1 and second.rstrip(" ").endswith(separator):
         cells = [*cells, ""]  # a separator at the end of the rows
-    sample = "\n".join(lines[skipped + header : skipped + header + 50])
-    decimal = "," if separator != "," and re.search(r"\d,\d", sample) and not re.search(r"\d\.\d", sample) else "."
+    decimal = _decimal(lines[skipped + header :], separator)
     names = _names(cells) if header else None
 
     def rows(wanted: Collection[str | int]) -> tuple[list[str | int], dict[str | int, np.ndarray], int]:
@@ -250,7 +260,8 @@ def _text(
                         parts.setdefault(name, []).append(np.array(frame[name].to_numpy()))
         return every, {name: np.concatenate(values) for name, values in parts.items()}, count
 
-    with _reading("a table"), warnings.catch_warnings(action="error", category=pd.errors.ParserWarning):
+    # another encoding is tried then: the letter may be far behind the head
+    with _reading("a table", UnicodeDecodeError), warnings.catch_warnings(action="error", category=pd.errors.ParserWarning):
         try:
             every, values, count = rows(wanted)
         except pd.errors.EmptyDataError:
@@ -262,6 +273,20 @@ def _text(
     return {
         name: values[name] if name in values else Column(lambda name=name: rows([name])[1][name], count) for name in every
     }
+
+
+_SPACE = r"\s+"
+
+
+def _separator(line: str) -> str:
+    """What stands between the cells of a line."""
+    return next((c for c in ";\t," if c in line), _SPACE)
+
+
+def _decimal(rows: list[str], separator: str) -> str:
+    """The decimal sign of rows: a comma between digits is one where something else separates, and no point is one."""
+    text = "\n".join(rows)
+    return "," if separator != "," and re.search(r"\d,\d", text) and not re.search(r"\d\.\d", text) else "."
 
 
 _REMARKS = 100
@@ -279,16 +304,15 @@ def _behind_remarks(lines: list[str], text: Callable[[], str]) -> Columns | None
     head = [line for line in lines[:start] if line.strip() and not line.lstrip().startswith("#")]
     if len(head) < 2:
         return None
-    separator = next((c for c in ";\t," if c in lines[start]), None)
-    if separator is None:
+    separator = _separator(lines[start])
+    if separator == _SPACE:
         return None
     count = len(_cells(lines[start], separator))
     known = any(mark in line for line in head for mark in ("EPOS Studio", "Starttime of export"))
     if not known and len(_cells(head[0], separator)) == count:
         return None
     rows = [line for line in text().splitlines()[start:] if line.strip() and line.strip() != "EOF"]
-    sample = "\n".join(rows[:50])
-    decimal = "," if separator != "," and re.search(r"\d,\d", sample) and not re.search(r"\d\.\d", sample) else "."
+    decimal = _decimal(rows, separator)
     with _reading("a table"):
         frame = pd.read_csv(
             io.StringIO("\n".join(rows)), sep=separator, header=None, decimal=decimal, skipinitialspace=True, index_col=False
@@ -303,8 +327,8 @@ def _behind_remarks(lines: list[str], text: Callable[[], str]) -> Columns | None
 
 def _is_row(line: str) -> bool:
     """Whether a line holds two numbers or more, and nothing else."""
-    separator = next((c for c in ";\t," if c in line), None)
-    cells = [] if separator is None else _cells(line, separator)
+    separator = _separator(line)
+    cells = [] if separator == _SPACE else _cells(line, separator)
     cells = cells[:-1] if cells and not cells[-1] else cells
     return len(cells) > 1 and all(_NUMBER.fullmatch(cell) for cell in cells)
 
@@ -408,13 +432,19 @@ def _matlab(path: Path, wanted: Collection[str | int]) -> dict[str | int, Any]:
         known = whosmat(path)
     tops = {re.split(r"[.\[]", str(column))[0] for column in wanted}
     columns: dict[str | int, Any] = {}
+    others = []
     for name, shape, kind in known:
         if kind in ("cell", "struct"):
             # what is in them shows only once they are loaded
             if not wanted or name in tops:
                 _add(columns, name, loaded(name))
+            else:
+                others.append(name)
         elif re.fullmatch(r"double|single|logical|u?int\d+", kind):
             _add_lazily(columns, name, shape, lambda name=name: loaded(name))
+    # a message that lists columns has to know their names
+    for name in others if not any(one in columns for one in wanted) else ():
+        _add(columns, name, loaded(name))
     return _some(columns)
 
 

@@ -303,14 +303,14 @@ def _lost_motion(gearing: Gearing, reversals: int, noise: float, unit: str) -> J
 
 def _stiffness(record: Record, speed: np.ndarray, ratio: float, noise: float) -> Judgement:
     """From twist over torque within one direction of motion; `noise` is the twist's, rms."""
-    torque, dynamics = record.transmitted, record.findings.dynamics
+    torque = record.transmitted
     if torque is None:
         if record.torque is None or np.ptp(record.torque) == 0.0:
             return Judgement("stiffness", "no", "no varying torque was recorded")
         torque = record.torque
     twist = record.positions["motor"] - ratio * record.positions["load"]
     width = record.findings.channels["theta_e"].bandwidth
-    if width == 0.0 or dynamics is None:
+    if width == 0.0:
         return Judgement("stiffness", "no", "the motion does not exceed the noise")
     targets, rows = [], []
     for s in record.segments:

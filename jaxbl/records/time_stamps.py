@@ -81,7 +81,7 @@ class Segments(NamedTuple):
 
 def read_time_stamps(file: LogFile, table: LogTable) -> TimeStamps:
     """The rows that `[log]` selects, and their times; InputError where time does not increase, or too few are left."""
-    stamps = _stamps(file, table.t or TimeTable())
+    stamps = _stamps(file, table)
     start = float(stamps[0])
     stamps = stamps - start
     rows = _selected_rows(file, table, stamps)
@@ -95,13 +95,16 @@ def read_time_stamps(file: LogFile, table: LogTable) -> TimeStamps:
     return TimeStamps(stamps[rows], start, rows, len(stamps), median, max(GAP * median, 2.5 * group))
 
 
-def _stamps(file: LogFile, table: TimeTable) -> np.ndarray:
+def _stamps(file: LogFile, table: LogTable) -> np.ndarray:
     """Of all rows, s, shape (rows of the file,)."""
-    if table.period is not None:
-        length = max(len(values) for values in file.columns.values())
-        stamps = np.arange(length, dtype=float) * table.period
+    time = table.t or TimeTable()
+    if time.period is not None:
+        # other vectors of the file may be longer
+        read = (table.columns() & {*file.columns, *range(len(file.columns))}) - {"t", *(table.absent or ())}
+        length = max((len(file.columns[file.name(one)]) for one in read), default=0)
+        stamps = np.arange(length, dtype=float) * time.period
     else:
-        stamps = file.numbers(table.column_or("t"), "t.column") * _ONE[table.unit]
+        stamps = file.numbers(time.column_or("t"), "t.column") * _ONE[time.unit]
     if len(stamps) < SHORTEST:
         raise file.wrong(f"has {len(stamps)} rows; a log needs at least {SHORTEST}")
     back = np.diff(stamps) < 0.0
@@ -110,7 +113,7 @@ def _stamps(file: LogFile, table: TimeTable) -> np.ndarray:
         if back.any():
             row = int(np.argmax(back)) + 1
             wrong = f", data row {row + 1}: time goes back from {stamps[row - 1]:.9g} s to {stamps[row]:.9g} s"
-        raise file.wrong(f"column {file.name(table.column_or('t'))!r}{wrong}; stamps should increase")
+        raise file.wrong(f"column {file.name(time.column_or('t'))!r}{wrong}; stamps should increase")
     return stamps
 
 

@@ -26,9 +26,17 @@ def write_element_report(found: ElementIdentification, folder: Path) -> list[str
     ]
     tables = [PageTable("Numbers", ["path", "value", "standard error", "95 % from", "to", "unit"], rows)]
     model = "# Of a transmission alone: a study with [drive] can include it.\n" + tomli_w.dumps(found.tables)
-    title = found.task.title or f"Transmission of {found.task.record.path.name}"
     return write_results(
-        folder, "identification", title, found.summary, found.trace, model, lead, _draw(found), tables, remarks
+        folder,
+        "identification",
+        found.summary["title"],
+        found.summary,
+        found.trace,
+        model,
+        lead,
+        _draw(found),
+        tables,
+        remarks,
     )
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from jaxbl.records import element
 from jaxbl.records.element import fit_element
 
 PERIOD, STIFFNESS, GAP, CENTRE, FRICTION, TORQUE, LENGTH = 0.01, 500.0, 0.02, 0.005, 0.8, 2.0, 0.01
@@ -50,3 +51,13 @@ def test_a_shaft_is_a_shaft_and_one_way_says_nothing():
     low, high = found.numbers["stiffness"].interval
     assert low < 3.0e4 < high < 1.01 * 3.0e4
     assert fit_element(0.001 * np.arange(500.0), np.arange(500.0), [slice(0, 500)], PERIOD, noise=0.0, linear=False) is None
+
+
+def test_a_rest_behind_a_gap_of_a_long_log_is_left_out(monkeypatch):
+    """Of a long log means are fitted: of a short part behind a gap one or none is left."""
+    monkeypatch.setattr(element, "_MOST", 500)
+    x = 0.01 * np.sin(2.0 * np.pi * 0.3 * PERIOD * np.arange(4003))
+    u = 3.0e4 * x + np.random.default_rng(2).standard_normal(4003)
+    for parts in ([slice(0, 4000), slice(4000, 4003)], [slice(0, 3), slice(3, 4003)]):
+        found = fit_element(x, u, parts, PERIOD, noise=0.0, linear=True)
+        assert found is not None and found.numbers["stiffness"].value == pytest.approx(3.0e4, rel=0.01)

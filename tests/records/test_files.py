@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from jaxbl.errors import InputError
-from jaxbl.records import files
+from jaxbl.records import files, read_record
 from jaxbl.records.files import read_log_file
 from jaxbl.records.libraries import Column
 
@@ -142,6 +142,8 @@ BAD = {
     "missing": (None, "no such file"),
     "empty.csv": (b"", "is empty; text .* can be read"),
     "blank.csv": (b" \n\n", "is empty"),
+    "mark.csv": (b"\xef\xbb\xbf", "is empty"),
+    "mark and space.csv": (b"\xef\xbb\xbf \n", "is empty"),
     "remarks.csv": (b"# hello\n", "holds only remarks; rows of numbers are needed"),
     "header.csv": (b"t,u\n", "has a header and no rows"),
     "twice.csv": (b"t,u,u\n1,2,3\n", "two columns are called 'u'; names should differ"),
@@ -328,3 +330,34 @@ def test_a_missing_library_names_the_extra(tmp_path, monkeypatch, mark, package)
     (tmp_path / "log").write_bytes(mark + bytes(64))
     with pytest.raises(InputError, match=rf"needs the package {package}: pip install 'jaxbl\[logs\]'"):
         read_log_file(tmp_path / "log")
+
+
+def test_names_within_a_structure_are_told(tmp_path):
+    """Nothing wanted is in the file: its user learns what is."""
+    savemat(tmp_path / "log.mat", {"log": {"time": T, "u": U}, "rate": T[:3]})
+    with pytest.raises(InputError, match=r"no column 'theta_e'; valid: rate, log.time, log.u"):
+        read_log_file(tmp_path / "log.mat", {"t", "u", "theta_e"}).name("theta_e")
+    with pytest.raises(InputError, match=r"log.mat: no column 't'; .*log\.u"):
+        read_record(tmp_path / "log.mat")
+
+
+def test_a_letter_of_another_encoding_far_behind_the_head(tmp_path):
+    rows = "".join(f"{i},{2 * i},a\n" for i in range(40_000))
+    (tmp_path / "log.csv").write_bytes(f"t,u,note\n{rows}1,2,5 \u00b0C\n".encode("latin-1"))
+    assert len(rows) > files._HEAD
+    assert read_log_file(tmp_path / "log.csv", {"t", "u"}).numbers("u")[-1] == 2.0
+
+
+def test_a_decimal_comma_that_comes_late(tmp_path):
+    """A drive that stands still at first writes whole numbers."""
+    rows = [*(f"{i};0;0" for i in range(60)), "60,500;1,5;2"]
+    (tmp_path / "log.csv").write_text("t;u;x\n" + "\n".join(rows))
+    file = read_log_file(tmp_path / "log.csv")
+    assert file.numbers("t")[-1] == 60.5 and file.numbers("u")[-1] == 1.5
+
+
+def test_a_period_in_place_of_stamps_counts_the_channels_that_are_read(tmp_path):
+    values = np.cumsum(np.random.default_rng(0).standard_normal((2, 400)), axis=1)
+    savemat(tmp_path / "log.mat", {"u": values[0], "theta_e": values[1], "scope": np.arange(900.0)})
+    record = read_record(tmp_path / "log.mat", {"t": {"period": 1e-3}})
+    assert len(record.time) == 400

@@ -170,3 +170,11 @@ def test_real_machines(tmp_path):
     assert np.ptp(np.degrees(found.twist)) == pytest.approx(2.9, abs=0.5)
     free = inspect(real("bam_xl330/2026-01-15_10h28m17.json"), XL330 | {"where": {"torque_enable": False}})
     assert free.judgements[0].answer == "weak"
+
+
+def test_a_measured_transmitted_torque_shows_the_stiffness_without_an_input(tmp_path):
+    frame = made(noise=1e-5)
+    torque = 0.2 * np.gradient(np.gradient(frame["theta_s"], frame["t"]), frame["t"])
+    frame = frame.assign(torque=torque, theta_e=frame["theta_e"] + torque / 50.0).drop(columns="u")
+    found = answers(tmp_path, frame, {"absent": ["u"], "transmitted": "torque"})
+    assert found["stiffness"][0] == "yes", found["stiffness"]
