@@ -98,13 +98,14 @@ def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
     for column in file.columns:
         name, unit = _split(file, column)
         numbers, channel, wanted = np.asarray(file.columns[column]), _channel(name, unit), _is("wanted", name)
-        # a torque that was asked for stands for one that was not measured
+        # a torque that was asked for stands for one that was not measured, a side alone for a position
         if numbers.dtype.kind in "iuf" and (channel == "u" or not wanted):
-            found.setdefault(channel, []).append((wanted or _is("load", name), column, unit, numbers))
+            last = wanted or _is("load", name) if channel == "u" else not _is("position", name)
+            found.setdefault(channel, []).append((last, column, unit, numbers))
     table: dict[str, Any] = {}
     guesses: list[str] = []
     for channel, columns in found.items():
-        _, column, unit, numbers = min(columns, key=lambda one: channel == "u" and one[0])
+        _, column, unit, numbers = min(columns, key=lambda one: one[0])
         if channel == "t":
             table["t"] = _time(column, unit, numbers, guesses)
         elif channel == "u":
@@ -246,7 +247,8 @@ def _nominal(found: Inspection, guesses: list[str], known: float | None) -> Nomi
     if not np.isfinite(values).all() or values[0] <= 0.0:
         raise InputError(
             f"{found.record.path}: theta_e moves {gearing.ratio:.4g} for each 1 of theta_s; it should be more than 0: set "
-            "sign = -1 in [log] theta_e or theta_s, or leave one of them out, and give the file as --model"
+            f"sign = -1 in [log] {found.log.position('theta_e')[0]} or {found.log.position('theta_s')[0]}, or leave one of "
+            "them out, and give the file as --model"
         )
     ratio, whole = float(values[0]), float(round(values[0]))
     if known is not None:

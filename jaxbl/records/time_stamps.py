@@ -101,7 +101,7 @@ def _stamps(file: LogFile, table: LogTable) -> np.ndarray:
     if time.period is not None:
         # other vectors of the file may be longer
         read = (table.columns() & {*file.columns, *range(len(file.columns))}) - {"t", *(table.absent or ())}
-        length = max((len(file.columns[file.name(one)]) for one in read), default=0)
+        length = max(len(file.columns[file.name(one)]) for one in read or file.columns)
         stamps = np.arange(length, dtype=float) * time.period
     else:
         stamps = file.numbers(time.column_or("t"), "t.column") * _ONE[time.unit]

@@ -361,3 +361,6 @@ def test_a_period_in_place_of_stamps_counts_the_channels_that_are_read(tmp_path)
     savemat(tmp_path / "log.mat", {"u": values[0], "theta_e": values[1], "scope": np.arange(900.0)})
     record = read_record(tmp_path / "log.mat", {"t": {"period": 1e-3}})
     assert len(record.time) == 400
+    savemat(tmp_path / "other.mat", {"torque": values[0], "theta": values[1]})
+    with pytest.raises(InputError, match=r"no column 'theta_e' or 'theta_s'; columns: torque, theta"):
+        read_record(tmp_path / "other.mat", {"t": {"period": 1e-3}})

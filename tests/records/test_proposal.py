@@ -31,6 +31,7 @@ COLUMNS = {
     "t, torque, motor temperature [°C], load [N m], motor angle": {"u": "torque", "theta_e": "motor angle"},
     "t, torque, load_torque, theta_m, load_pos": {"u": "torque", "theta_e": "theta_m", "theta_s": "load_pos"},
     "t, load_torque, torque, motor, load": {"u": "torque", "theta_e": "motor", "theta_s": "load"},
+    "t, torque, load, load_pos, motor, motor_angle": {"u": "torque", "theta_e": "motor_angle", "theta_s": "load_pos"},
     "t, torque_cmd, position": {"u": "torque_cmd", "theta_e": "position"},
     "t, torque_cmd, current, position_cmd, position": {"u": "current", "theta_e": "position"},
     "t, torque, current_position": {"u": "torque", "theta_e": "current_position"},
