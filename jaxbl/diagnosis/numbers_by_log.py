@@ -6,6 +6,8 @@ regression of the torque that the model still lacks there on that torque's slope
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -61,29 +63,38 @@ def contradictions(
         log, holdout: what was fitted, and what was held out.
         driving: torque that drives the machine, rms, N m.
     """
-    parts = [(name, _rows_of(log, rows)) for name, rows in task.record.logs]
+    parts = [(path, _rows_of(log, rows)) for path, rows in task.record.logs]
     if task.separate:
-        parts += [(name, _rows_of(holdout, rows)) for name, rows in task.holdout.logs]
-    named = {name: one for name, one in parts if one.segments}
-    if len(named) < 2 or not fitted.free:
+        parts += [(path, _rows_of(holdout, rows)) for path, rows in task.holdout.logs]
+    parts = [(path, one) for path, one in parts if one.segments]
+    if len(parts) < 2 or not fitted.free:
         return []
-    shown = {name: _shown(fitted, one) for name, one in named.items()}
+    names, shown = _names([path for path, _ in parts]), [_shown(fitted, one) for _, one in parts]
     found = []
     for k, number in enumerate(fitted.free):
         apart = {
             (one, other): z
-            for one, other in itertools.combinations(shown, 2)
+            for one, other in itertools.combinations(range(len(shown)), 2)
             if (z := _apart(shown[one], shown[other], k, _LEAST * driving)) > _APART
         }
         if not apart:
             continue
         value, slope = (float(of(fitted.theta[k])) for of in (number.value, number.slope))
         both = [
-            OfLog(name, value + slope * float(shown[name].change[k]), abs(slope) * float(shown[name].error[k]))
-            for name in max(apart, key=lambda pair: apart[pair])
+            OfLog(names[i], value + slope * float(shown[i].change[k]), abs(slope) * float(shown[i].error[k]))
+            for i in max(apart, key=lambda pair: apart[pair])
         ]
         found.append(Contradiction(number.path, *sorted(both, key=lambda of: of.value)))
     return found
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Names of files, with as much of their folders as parts them."""
+    names = [path.name for path in paths]
+    for depth in range(2, max(len(path.parts) for path in paths) + 1):
+        longer = ["/".join(path.parts[-depth:]) for path in paths]
+        names = [name if names.count(name) == 1 else more for name, more in zip(names, longer, strict=True)]
+    return names
 
 
 class _Shown(NamedTuple):

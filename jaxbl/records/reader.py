@@ -71,7 +71,7 @@ class Record:
         contradiction: why nothing can be fitted to the nominal drive, as units are surely wrong; "" where they are not.
         findings: figures on its quality.
         intervals: between the raw stamps that were kept, s, shape (raw samples - 1,).
-        logs: name and rows of each log that it was joined from.
+        logs: file and rows of each log that it was joined from.
     """
 
     path: Path
@@ -89,7 +89,7 @@ class Record:
     contradiction: str
     findings: Findings
     intervals: np.ndarray
-    logs: tuple[tuple[str, slice], ...]
+    logs: tuple[tuple[Path, slice], ...]
 
 
 def read_log_table(log: LogTable | Mapping[str, Any] | None, name: str = "") -> LogTable:
@@ -190,7 +190,7 @@ def read_record(
         contradiction=file.contradiction,
         findings=Findings(segments.sampling, figures, gearing, dynamics),
         intervals=np.diff(segments.times),
-        logs=((file.path.name, slice(0, len(grid.time))),),
+        logs=((file.path, slice(0, len(grid.time))),),
     )
 
 
@@ -398,7 +398,7 @@ def join(records: Sequence[Record]) -> Record:
         times.append(record.time - record.time[0] + end)
         end = float(times[-1][-1]) + _PAUSE * period
         segments += [slice(part.start + rows, part.stop + rows) for part in record.segments]
-        logs += [(name, slice(part.start + rows, part.stop + rows)) for name, part in record.logs]
+        logs += [(path, slice(part.start + rows, part.stop + rows)) for path, part in record.logs]
         rows += len(record.time)
         notes += [f"{record.path.name}: {note}" for note in record.notes]
         warnings += [f"{record.path.name}: {warning}" for warning in record.warnings]

@@ -1,6 +1,7 @@
 """Logs of one machine that do not agree on its numbers, on torques that are known in closed form."""
 
 import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -38,9 +39,9 @@ class Torques:
         return {"motor": np.concatenate(found)}
 
 
-def found(first: float, second: float, turned: float = 1.0, separate: bool = False):
+def found(first: float, second: float, turned: float = 1.0, separate: bool = False, files: tuple = ("a.csv", "b.csv")):
     rows = [slice(0, SAMPLES), slice(SAMPLES, 2 * SAMPLES)]
-    names = [("a.csv", rows[0]), ("b.csv", rows[1])]
+    names = list(zip(map(Path, files), rows, strict=True))
     segments = tuple(SimpleNamespace(rows=one) for one in rows)
     task = SimpleNamespace(
         record=SimpleNamespace(logs=names[: 1 if separate else 2]),
@@ -63,6 +64,12 @@ def test_an_inertia_that_two_logs_show_to_differ(separate):
     assert one.path == "drive.motor_inertia" and (one.least.log, one.most.log) == ("a.csv", "b.csv")
     assert one.least.value == pytest.approx(INERTIA, abs=4.0 * one.least.error)
     assert one.most.value == pytest.approx(1.5 * INERTIA, rel=0.01)
+
+
+@pytest.mark.parametrize("separate", [False, True])
+def test_logs_of_one_name_are_two(separate):
+    (one,) = found(INERTIA, 1.5 * INERTIA, separate=separate, files=("data/run1/log.csv", "data/run2/log.csv"))
+    assert (one.least.log, one.most.log) == ("run1/log.csv", "run2/log.csv")
 
 
 def test_logs_of_one_machine_agree():
