@@ -302,6 +302,10 @@ def identify(
     from .report.identify import identification_lines, write_identification_report
 
     task = read_identification_task(log, model, holdout=holdout, profile=profile)
+    if next_experiment is not None:
+        from jaxbl.diagnosis.next_experiment import check_gap_sought
+
+        check_gap_sought(task)
     folder = _folder(log[0], out)
     with running(context, model, folder, unit="steps", kept=False) as progress:
         file = folder / "identification.json"

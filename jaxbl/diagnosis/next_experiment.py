@@ -21,8 +21,9 @@ from jaxbl.drive.effects import Backlash
 from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
 from jaxbl.identification.compilation import jit
-from jaxbl.identification.logs import on_record, unit_on
+from jaxbl.identification.logs import LogTask, default_paths, on_record, unit_on
 from jaxbl.identification.segments import reading_noise, segments_of
+from jaxbl.identification.unseen_load import GAPS
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment, trajectory
 
@@ -46,11 +47,12 @@ class Input(NamedTuple):
 
     Attributes:
         kind: sine, multisine, chirp or steps.
-        amplitude: largest torque, N m.
+        amplitude: largest torque, off the mean, N m.
         frequency: Hz; of a multisine the lowest, of a chirp the first, of steps one over twice their length.
         torque: shape (samples,).
         apart: nats by which readings of it favour one model over the other: half the sum of squares of the difference of
             their positions, over the variance of the readings' noise.
+        mean: of the torque, N m.
     """
 
     kind: str
@@ -58,6 +60,7 @@ class Input(NamedTuple):
     frequency: float
     torque: np.ndarray
     apart: float
+    mean: float = 0.0
 
 
 def write_next_experiment(
@@ -89,6 +92,27 @@ def write_next_experiment(
     return [f"To part {pair[0]} from {pair[1]}: {_written(found, record, path)}"]
 
 
+def check_gap_sought(task: LogTask) -> None:
+    """Refuse to seek a move that shows a gap to the motor alone where an identification does not seek one by it.
+
+    Raises:
+        InputError: a log with both encoders, or a model without a gap among the numbers to be found.
+    """
+    record, config = task.record, task.config
+    if "load" in record.positions:
+        raise InputError(
+            f"{record.path}: --next-experiment writes a move that shows a gap to the motor's encoder alone, but this log "
+            "has theta_s; jaxbl diagnose --next-experiment parts effects"
+        )
+    with jax.enable_x64(True):
+        paths = config.identify.parameters or default_paths(config, on_record(config, record))
+    if not any(path.endswith(GAPS) for path in paths):
+        raise InputError(
+            f"{record.path}: --next-experiment writes a move that shows a gap, and none is among the numbers to be found; a "
+            "half_gap (or dead_zone) in [transmission] gives one to begin with"
+        )
+
+
 def write_gap_experiment(
     folder: Path,
     summary: Mapping[str, Any],
@@ -102,8 +126,12 @@ def write_gap_experiment(
     It is the input on which the model without a gap differs most from one with the largest gap that the log leaves open, or
     with the nominal one if that is smaller. Arguments as of :func:`write_next_experiment`; `summary` has `backlash`.
     """
-    said = summary.get("backlash")
-    if said is None or said["shown"]:
+    said = summary["backlash"]
+    if said is None:
+        return [
+            "No gap is sought: the model has one, or [uncertainty] exact says that it has none; no experiment was written."
+        ]
+    if said["shown"]:
         return ["No gap is in doubt: no experiment is needed to show one, and none was written."]
     half, model = float(min(said["at_most"], said["nominal"] or np.inf)), read_config(folder / "model.toml")
     with jax.enable_x64(True):
@@ -135,8 +163,10 @@ def _written(found: Input, record: Record, path: Path) -> str:
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     clear = "" if found.apart > _DECISIVE else ": too little; --max-torque and --max-travel allow for more"
+    unit = unit_on(record, "motor.torque", "N m")
+    mean = f" about a mean of {found.mean:.3g} {unit}" if found.mean else ""
     return (
-        f"{found.kind} of {found.amplitude:.3g} N m, {found.frequency:.3g} Hz, "
+        f"{found.kind} of {found.amplitude:.3g} {unit}{mean}, {found.frequency:.3g} Hz, "
         f"{time[-1] + record.sample_period:.3g} s; it would separate them by up to {found.apart:.2g} nats{clear}: {path}"
     )
 
@@ -181,7 +211,7 @@ def _parting(
     seen = [side for side in one.sides if side in record.positions]
     noise = reading_noise(segments_of(record, seen))
     largest = float(np.max(np.abs(record.torque))) if torque is None else torque
-    tried = [each._replace(torque=bias + each.torque) for each in _inputs(record, max(largest - abs(bias), 0.0))]
+    tried = [each._replace(torque=bias + each.torque, mean=bias) for each in _inputs(record, max(largest - abs(bias), 0.0))]
     torques = jnp.asarray(np.stack([each.torque for each in tried]))
     start = {
         side: jnp.asarray(float(np.median(np.concatenate([values[part] for part in record.segments]))))
