@@ -244,7 +244,7 @@ def drawn(seed: int, count: int, refused: int) -> list[tuple[Drive, Trace]]:
     runs = list(zip(drives, simulate([drive.run for drive in drives]), strict=True))
     found = runs[:count]
     for k, kind in enumerate(REFUSED):
-        fit = [(d, t) for d, t in runs if d.kind == kind and (not d.half_gap or crossings(d, t) < 2)]
+        fit = [(d, t) for d, t in runs if d.kind == kind and (not d.half_gap or not crossings(d, t))]
         found += fit[: (refused + len(REFUSED) - 1 - k) // len(REFUSED)]
     return found
 

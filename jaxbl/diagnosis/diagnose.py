@@ -106,8 +106,8 @@ def diagnose(log: Logs, model: str | Path | Mapping[str, Any] | Config, *, holdo
     return run_diagnosis(read_diagnosis_task(log, model, holdout=holdout))
 
 
-_STAGES = 6
-"""Set-up, search, proof, controls, observers, summary."""
+_STAGES, _STAGES_ALONE = 6, 3
+"""Set-up, search, proof, controls, observers, summary; from the motor alone fit, effects, proof."""
 
 
 def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diagnosis:
@@ -120,12 +120,13 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
     Raises:
         InputError: a model that diverges.
     """
-    done = stage_counter(_STAGES, progress)
+    alone = task.config.drive.kind == "two_inertia" and "load" not in task.record.positions
+    done = stage_counter(_STAGES_ALONE if alone else _STAGES, progress)
     with jax.enable_x64(True):
-        if task.config.drive.kind == "two_inertia" and "load" not in task.record.positions:
-            alone = diagnose_alone(task, done)
+        if alone:
+            found = diagnose_alone(task, done)
             return Diagnosis(
-                task.config, alone.model, task.record, task.holdout, plain(alone.summary), alone.trace, {}, {}, {}, {}, {},
+                task.config, found.model, task.record, task.holdout, plain(found.summary), found.trace, {}, {}, {}, {}, {},
                 replays="excitation" in task.missing,
             )  # fmt: skip
         doing("smoothing the log")

@@ -99,8 +99,8 @@ def identify(
     return run_identification(read_identification_task(log, model, parameters=parameters, holdout=holdout, profile=profile))
 
 
-_STAGES = 6
-"""Smoothing, search, profiles, observers, columns of the trace, summary."""
+_STAGES, _STAGES_ALONE = 6, 3
+"""Smoothing, search, profiles, observers, columns of the trace, summary; from the motor alone the first two and the last."""
 
 
 def run_identification(task: LogTask, progress: Progress | None = None) -> Identification:
@@ -111,7 +111,8 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
     """
     config, record, settings = task.config, task.record, task.config.identify
     assert record.torque is not None
-    done = stage_counter(_STAGES, progress)
+    alone = config.drive.kind == "two_inertia" and "load" not in record.positions
+    done = stage_counter(_STAGES_ALONE if alone else _STAGES, progress)
     with jax.enable_x64(True):
         nominal = on_record(config, record)
         paths = list(settings.parameters or default_paths(config, nominal))
@@ -119,7 +120,7 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
         rest, sides = config.log.initial_state == "rest", [side for side in nominal.sides if side in record.positions]
         segments = segments_of(record, sides)
         done()
-        if sides != list(nominal.sides):
+        if alone:
             return _from_motor(task, nominal, free, segments, done)
         found = ParameterSearch(nominal, segments, settings, rest=rest, name=str(record.path)).run(free)
         done()
@@ -155,8 +156,7 @@ def _from_motor(
 ) -> Identification:
     """The rest of an identification without the load's encoder; what needs both encoders is left out."""
     config, record = task.config, task.record
-    rest = config.log.initial_state == "rest"
-    alone = search_alone(nominal, free, segments, config.identify, rest=rest, name=str(record.path))
+    alone = search_alone(nominal, free, segments, config.identify, record, config.log.initial_state == "rest")
     done()
     trace = pd.DataFrame(columns_alone(record, alone))
     summary = summary_of(task, alone.experiment, alone.found, {})
@@ -165,6 +165,9 @@ def _from_motor(
     for one in summary["refused"]:
         if summary["backlash"] and alone.gap_path in one["direction"] and summary["backlash"]["why"]:
             one["why"] = summary["backlash"]["why"]
+    if alone.why and (alone.gap_path or "").startswith("transmission."):
+        # follows from a number that was not found
+        summary["parameters"].pop("transmission.half_gap", None)
     if task.holdout is not None:
         summary["holdout"] = alone_on_holdout(config, task.holdout, alone)
     done()

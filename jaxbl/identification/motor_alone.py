@@ -17,6 +17,7 @@ from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
 
 from .intervals import UNSEEN, Refusal, Spread, refusals
+from .logs import unit_on
 from .search import Found
 from .segments import Segment, reading_noise, segments_of, white_noise
 from .trajectory import Free, Windows
@@ -58,9 +59,14 @@ class Alone(NamedTuple):
 
 
 def search_alone(
-    nominal: Experiment, free: Sequence[Free], segments: Sequence[Segment], settings: IdentifyTable, *, rest: bool, name: str
+    nominal: Experiment,
+    free: Sequence[Free],
+    segments: Sequence[Segment],
+    settings: IdentifyTable,
+    record: Record,
+    rest: bool,
 ) -> Alone:
-    """Fit a model to the motor's readings; arguments as of :class:`.search.ParameterSearch`.
+    """Fit a model to the motor's readings in a record; other arguments as of :class:`.search.ParameterSearch`.
 
     Raises:
         InputError: the model diverges.
@@ -72,14 +78,14 @@ def search_alone(
     else:
         gap = find_gap(model)
         point, width, slope = gap.best, gap.spread, gap.slope
-        why = why_not(gap, model, settings.spread)
+        why = why_not(gap, model, settings.spread, record)
         held[model.gap] = bool(why)
         if not gap.needed:
             point, width, slope = model.settled(gap.without, held)
     if not np.isfinite(point.deviance):
-        raise InputError(f"{name}: the model diverges on this log; its nominal numbers should be nearer")
+        raise InputError(f"{record.path}: the model diverges on this log; its nominal numbers should be nearer")
     alone = alone_of(model, point, width, slope, held, gap, why)
-    if not_met(model, point) or (why and gap is not None and gap.needed):
+    if not_met(model, point, record) or (why and gap is not None and gap.needed):
         # numbers of a model that the log contradicts, or with a gap of any size, have no interval
         nothing = np.full_like(alone.found.spread.covariance, np.inf)
         found = dataclasses.replace(alone.found, spread=alone.found.spread._replace(covariance=nothing))
@@ -100,40 +106,40 @@ def alone_of(
 _FACTOR, _LEFT = 6.0, 0.05
 """Torque that the model may leave unexplained: times the noise of the recorded one, and over its rms. A fit that has missed
 the right numbers leaves more."""
-_CROSSINGS = 2
-"""Of the gap at least: one there and one back."""
+_REVERSALS = 2
+"""Of the torque in the gear at least, without which a gap would not show: one there and one back."""
 _FAR = 1.5
 """Times the logarithm of `[identify] spread` that inertias and stiffness may be off: more is another drive, or a fit that
 went wrong."""
 
 
-def not_met(model: UnseenLoad, point: Point) -> str:
+def not_met(model: UnseenLoad, point: Point, record: Record) -> str:
     """Why a fit cannot be right, in a clause: a torque moves the motor that is in neither; "" if there is none."""
     left, size = model.unexplained(point), model.torque
     if left <= max(_FACTOR * white_noise([one.torque for one in model.segments]), _LEFT * size):
         return ""
     return (
-        f"a torque of {left:.2g} ({100.0 * left / size:.2g} % of the driving torque) is left unexplained; the model lacks "
-        "something else, or its nominal numbers are too far off"
+        f"a torque of {left:.2g} {unit_on(record, 'motor.torque', 'N m')} rms ({100.0 * left / size:.2g} % of the driving "
+        "torque) is left unexplained; the model lacks something else, or its nominal numbers are too far off"
     )
 
 
-def why_not(gap: Gap, model: UnseenLoad, spread: float) -> str:
+def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
     """Why a log does not show a gap, and what would, in one clause; "" where it does."""
-    unit_noise = reading_noise(model.segments)["motor"]
+    noise, unit = reading_noise(model.segments)["motor"], unit_on(record, "motor.position", "rad")
     both_ways = "moves back and forth that drive the load both ways, wider than the gap, would show one"
-    if wrong := not_met(model, gap.best if gap.needed else gap.without):
+    if wrong := not_met(model, gap.best if gap.needed else gap.without, record):
         return wrong
     if not gap.needed and gap.at_most >= gap.travel:
         return f"any half gap fits; {both_ways}"
-    if not gap.needed and gap.crossings < _CROSSINGS:
+    if not gap.needed and gap.crossings < _REVERSALS:
         return f"the torque in the gear hardly changes its sign; {both_ways}"
     if not gap.needed:
         return (
-            f"without one the motor's readings are met as well (noise {unit_noise:.2g} rad); half gaps of up to "
-            f"{gap.at_most:.3g} are not ruled out; faster reversals would show smaller ones"
+            f"without one the motor's readings are met as well (noise {noise:.2g} {unit}); half gaps of up to "
+            f"{gap.at_most:.3g} {unit} are not ruled out; faster reversals would show smaller ones"
         )
-    if gap.crossings < _CROSSINGS:
+    if gap.crossings < 1:
         return f"the motor moves as if in a gap, but meets one flank at most: it is wider than this motion; {both_ways}"
     far = {
         one.path: float(np.exp(x))
@@ -144,7 +150,7 @@ def why_not(gap: Gap, model: UnseenLoad, spread: float) -> str:
         numbers = ", ".join(f"{path} times {factor:.3g}" for path, factor in far.items())
         return f"the log is met only with numbers far from the nominal ones ({numbers}); check these, or the log"
     if not gap.spread.covariance[model.gap, model.gap] ** 0.5 < UNSEEN:
-        return f"one would be met, but of any size up to {gap.travel:.3g}; {both_ways}"
+        return f"one would be met, but of any size up to {gap.travel:.3g} {unit}; {both_ways}"
     return ""
 
 
@@ -183,23 +189,25 @@ def _only(width: Spread, which: np.ndarray) -> Spread:
 def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
     """Columns of the log and its fit, shape (samples,): `t`, `u`, `theta_e`, the motor's smoothed motion and residual, and
     what the model says of the load and of the torque in the gear (`load.modelled_position`, `load.modelled_velocity`,
-    `torque`), with the same torque by the motor's side (`torque_by_motor`).
+    `torque`), with the same torque by the motor's side (`torque_by_motor`); NaN in parts of the log that are too short.
     """
     assert record.torque is not None
     fitted, model, point = alone.experiment, alone.model, alone.point
     plant = fitted.plant
     states = model.states(point.theta, point.start, point.smoothness)
     columns = {"t": record.time, "u": record.torque, POSITION_CHANNELS["motor"]: record.positions["motor"]}
-    smoothed = [one.smoothed["motor"] for one in model.segments]
-    for order, name in ((1, "velocity"), (2, "acceleration")):
-        columns[f"motor.{name}"] = np.concatenate([np.asarray(one.state[:, order]) for one in smoothed])
-        columns[f"motor.{name}_deviation"] = np.concatenate([np.asarray(one.deviation(order)) for one in smoothed])
-    readings = record.positions["motor"]
-    columns["motor.residual"] = readings - np.concatenate([np.asarray(one.position["motor"]) for one in states])
-    for name in ("position", "velocity"):
-        columns[f"load.modelled_{name}"] = np.concatenate([getattr(one, name)["load"] for one in states])
-    torques, own = [], []
+
+    def put(name: str, segment: Segment, values: Any) -> None:
+        columns.setdefault(name, np.full(len(record.time), np.nan))[segment.rows] = values
+
     for segment, one in zip(model.segments, states, strict=True):
+        smoothed = segment.smoothed["motor"]
+        for order, name in ((1, "velocity"), (2, "acceleration")):
+            put(f"motor.{name}", segment, smoothed.state[:, order])
+            put(f"motor.{name}_deviation", segment, smoothed.deviation(order))
+        put("motor.residual", segment, segment.readings["motor"] - np.asarray(one.position["motor"]))
+        for name in ("position", "velocity"):
+            put(f"load.modelled_{name}", segment, getattr(one, name)["load"])
         k = segment.kinematics
         one = jax.tree.map(jnp.asarray, one)
         through = jax.vmap(plant.transmitted)(one.position, one.velocity, one.effects)[0]
@@ -207,9 +215,9 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
         none = jnp.zeros_like(through)
         total, level = jax.vmap(plant.torques)(position, velocity, one.effects, k.torque, k.time, none)["motor"]
         resisting = fitted.drive.viscous("motor") * k.velocity["motor"] + level * jnp.sign(k.velocity["motor"])
-        torques.append(np.asarray(through))
-        own.append(np.asarray(total - resisting - plant.inertia("motor") * k.acceleration["motor"]))
-    return columns | {"torque": np.concatenate(torques), "torque_by_motor": np.concatenate(own)}
+        put("torque", segment, through)
+        put("torque_by_motor", segment, total - resisting - plant.inertia("motor") * k.acceleration["motor"])
+    return columns
 
 
 def gap_summary(alone: Alone) -> dict[str, Any] | None:

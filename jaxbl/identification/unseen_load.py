@@ -77,7 +77,7 @@ _APART = 0.2
 """Prior standard deviation of the load's first speed about the motor's, over the motor's rms speed."""
 _STATES = 4
 """Numbers that a part of a log begins with: positions and velocities of both sides."""
-_GAPS = "half_gap", "dead_zone"
+GAPS = "half_gap", "dead_zone"
 """Ends of the paths of numbers that make a gap."""
 
 
@@ -284,7 +284,7 @@ class UnseenLoad:
         """Prediction errors of given numbers; initial states alone are fitted, first with predictors that follow closely."""
         held = np.ones(len(self.free), bool)
         point = self.begun(theta, _FOLLOWING[0])
-        for one in (*_FOLLOWING[:2], smoothness):
+        for one in (*_FOLLOWING, smoothness):
             point = self.solve(self.at(theta, point.start, one), _FEW, held)
         return point
 
@@ -491,6 +491,14 @@ class Gap(NamedTuple):
         """Whether the readings cannot be met without a gap."""
         return self.gain >= SHOWN
 
+    def of(self, model: UnseenLoad, point: Point, spread: Spread, slope: np.ndarray) -> "Gap":
+        """The same of another fit, with the gap or, where it is not needed, without; as of :meth:`UnseenLoad.settled`."""
+        if not self.needed or model.gap is None:
+            return self._replace(without=point)
+        one = model.free[model.gap]
+        half = half_gap_of(one) * model.numbers(point.theta)[one.path]
+        return self._replace(best=point, spread=spread, slope=slope, half=half)
+
 
 def _stepped(experiment: Experiment, factor: int) -> Experiment:
     """With so many times the plant steps."""
@@ -501,7 +509,7 @@ def _stepped(experiment: Experiment, factor: int) -> Experiment:
 
 def is_gap(one: Free) -> bool:
     """Whether a number makes a gap."""
-    return one.path.endswith(_GAPS)
+    return one.path.endswith(GAPS)
 
 
 def half_gap_of(one: Free) -> float:

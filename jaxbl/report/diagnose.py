@@ -88,14 +88,18 @@ def verdict_sentence(summary: Mapping[str, Any]) -> str:
     if summary["verdict"] == "no_discrepancy":
         return f"No discrepancy: {_NO_MORE}."
     where = "; ".join(one["sentence"] for one in summary.get("where_after", summary["where"]).values())
+    alone = summary.get("backlash")
+    if not names and alone and alone["why"] and alone["gain"] >= alone["needed"] and not summary["gap"]["test"]["failed"]:
+        return f"Unknown: a gap might explain what is missing, but this log does not show it: {where}."
     if not names:
         return f"Unknown: no known effect explains what is missing: {where}."
     share, test = _share(summary["explained_share"]), summary["gap"]["test"]
     rest = ", but not in a way that can be right"
     if test["failed"] or test["remainder"]:
         rest = f". The rest is none of the known effects: {where}"
+    what = "missing torque" if "backlash" not in summary else "squared prediction error of the motor beyond noise"
     return (
-        f"Partly explained: the model lacks {names}; with {them}, {share} of the missing torque is explained on data not "
+        f"Partly explained: the model lacks {names}; with {them}, {share} of the {what} is explained on data not "
         f"used for the fit{rest}."
     )
 

@@ -64,8 +64,9 @@ def _backlash(summary: dict[str, Any]) -> list[str]:
     unit = summary["residual"]["motor"]["unit"]
     if not said["shown"]:
         return [f"No gap is shown: {said['why']}."]
+    times = "1 crossing" if said["crossings"] == 1 else f"{said['crossings']} crossings"
     return [
-        f"There is a gap: a half gap of {said['half_gap']:.4g} {unit} at the motor, from {said['crossings']} crossings; "
+        f"There is a gap: a half gap of {said['half_gap']:.4g} {unit} at the motor, from {times}; "
         "without it the motor's readings cannot be met."
     ]
 

@@ -3,14 +3,18 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
-from hidden_log import FRICTIONS, GEARED, geared
+from hidden.cases import Log
+from hidden.simulator import Machine, Run, simulate
+from hidden_log import FRICTIONS, GAP, GEARED, geared
 
 from jaxbl.config import read_model
-from jaxbl.diagnosis.diagnose import diagnose
+from jaxbl.diagnosis import motor_alone
+from jaxbl.diagnosis.diagnose import diagnose, read_diagnosis_task, run_diagnosis
 from jaxbl.diagnosis.motor_alone import sought
 from jaxbl.diagnosis.next_experiment import with_gap
-from jaxbl.report.diagnose import write_diagnosis_report
+from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
 
 STUDY = {
     "title": "motor alone",
@@ -40,8 +44,61 @@ def test_a_gap_and_frictions_are_named_and_proved(tmp_path):
     assert {effect.kind for effect in found.model.effects} == set(numbers)
 
 
+SHAFT = {"law": "linear_shaft", "stiffness": 60.0}
+EXACT = STUDY | {"drive": GEARED, "transmission": SHAFT}
+
+
+def driven(torque, law, noise):
+    (trace,) = simulate([Run(Machine(GEARED, law, []), 2e-3, torque, motor_noise=noise, seed=1)])
+    return Log(trace.t, trace.u, trace.theta_e, None)
+
+
+def part(log, rows):
+    return replace(log, t=log.t[rows], u=log.u[rows], theta_e=log.theta_e[rows])
+
+
+def test_nothing_is_named_where_nothing_is_missing(tmp_path):
+    t = 2e-3 * np.arange(2060)
+    log = driven(5.0 * (np.sin(2.0 * np.pi * 0.5 * t) + np.sin(2.0 * np.pi * 1.3 * t + 1.0)), SHAFT, 1e-3)
+    # the first part is too short to be fitted, and stays in the trace
+    path, other = tmp_path / "motor.csv", tmp_path / "other.csv"
+    part(log, np.r_[0:50, 60:1560]).write(path)
+    part(log, np.r_[1560:2060]).write(other)
+    done = []
+    task = read_diagnosis_task(path, EXACT, holdout=other)
+    found = run_diagnosis(task, lambda *counted: done.append(counted))
+    assert (found.summary["verdict"], found.summary["findings"]) == ("no_discrepancy", [])
+    assert found.summary["explained_share"] is None
+    assert np.isnan(found.trace["torque"][:50]).all() and np.isfinite(found.trace["torque"][50:]).all()
+    assert done == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_one_crossing_shows_a_gap(tmp_path):
+    path = tmp_path / "motor.csv"
+    driven(5.0 * np.sin(2.0 * np.pi * 0.25 * 2e-3 * np.arange(2000)), GAP, 1e-5).write(path)
+    found = diagnose(path, EXACT).summary
+    assert found["backlash"]["crossings"] == 1
+    (finding,) = found["findings"]
+    assert finding["parameters"]["half_gap"]["value"] == found["backlash"]["half_gap"] == pytest.approx(0.08, rel=1e-3)
+    assert not any("No gap is shown" in line for line in diagnosis_lines(found))
+
+
+def test_a_gap_that_is_not_shown_is_not_named(tmp_path, monkeypatch):
+    path = tmp_path / "motor.csv"
+    driven(5.0 * np.sin(2.0 * np.pi * 0.25 * 2e-3 * np.arange(2000)), GAP, 1e-5).write(path)
+    monkeypatch.setattr(motor_alone, "why_not", lambda *_: "it may be of any size")
+    found = diagnose(path, EXACT).summary
+    assert (found["verdict"], found["findings"]) == ("unknown_effect", [])
+    lines = diagnosis_lines(found)
+    assert any(
+        line.startswith("Unknown: a gap might explain what is missing, but this log does not show it") for line in lines
+    )
+    assert "No gap is shown: it may be of any size. model.toml has the one that fits best." in lines
+
+
 def test_what_a_model_has_is_not_sought():
     bare = read_model(STUDY)[0].build()
+    assert sought(bare, ["load.coulomb_friction", "drive.gear_ratio"]) == ["motor.coulomb_friction", "transmission.backlash"]
     assert set(sought(bare)) == {"motor.coulomb_friction", "load.coulomb_friction", "transmission.backlash"}
     gap = {"law": "dead_zone", "stiffness": 61.0, "half_gap": 0.05}
     known = read_model(STUDY | {"transmission": gap, "effects": [FRICTIONS[1]]})[0].build()

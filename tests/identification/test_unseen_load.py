@@ -85,7 +85,9 @@ def test_a_drive_without_a_gap_is_refused_and_the_move_written(tmp_path, monkeyp
     torque = 5.0 * np.sin(2.0 * np.pi * 1.0 * t)
     (trace,) = simulate([Run(Machine(GEARED, shaft, FRICTIONS), 2e-3, torque, motor_noise=1e-5, seed=2)])
     path = motor_only(tmp_path, Log(trace.t, trace.u, trace.theta_e, None))
-    (tmp_path / "axis.toml").write_text(tomli_w.dumps(STUDY))
+    law = {"law": "sigmoid_backlash", "stiffness": 50.0, "dead_zone": 0.005, "slope": 200.0}
+    study = STUDY | {"transmission": law, "uncertainty": {"exact": ["transmission.slope"]}}
+    (tmp_path / "axis.toml").write_text(tomli_w.dumps(study))
     monkeypatch.setattr(cli, "_start_jax", lambda: None)
     monkeypatch.chdir(tmp_path)
     called = CliRunner().invoke(
@@ -97,7 +99,7 @@ def test_a_drive_without_a_gap_is_refused_and_the_move_written(tmp_path, monkeyp
     assert "next.csv" in called.stdout
     said = json.loads((tmp_path / "out" / "identification.json").read_text())
     assert said["backlash"]["at_most"] < 0.01
-    assert "transmission.half_gap" not in said["parameters"]
+    assert not {"transmission.dead_zone", "transmission.half_gap"} & set(said["parameters"])
     assert (tmp_path / "next.csv").read_text().startswith("t,u\n")
 
 
