@@ -227,8 +227,8 @@ def _summary(
     allowed = max(2.0 * white_noise([one.torque for one in model.segments]), _LEAST * size)
     far = {one.path: theta / task.config.uncertainty.relative for one, theta in _changes(search, alone)}
     far = {path: z for path, z in far.items() if abs(z) > _FAR}
-    # a gap that the readings call for, but do not show
-    doubtful = bool(alone.why) and alone.gap is not None and alone.gap.needed
+    # a gap that the readings call for, or leave to be so wide that the load is never met, but do not show
+    doubtful = bool(alone.why) and alone.gap is not None and (alone.gap.needed or alone.gap.unmet)
     names = [name for name, i in search.effects.items() if name not in out and not (doubtful and is_gap(model.free[i]))]
     failed = ["theta_e"] if holdout["rms"] > limit or left > allowed else []
     verdict = "unknown_effect" if failed or far or doubtful else "explained" if names else "no_discrepancy"
@@ -262,7 +262,7 @@ def _summary(
     notes = list(record.notes)
     notes.append(f"From the motor's encoder alone these effects are sought and no others: {', '.join(search.effects)}.")
     if alone.why:
-        kept = " model.toml has the one that fits best." if doubtful else ""
+        kept = " model.toml has the one that fits best." if alone.gap is not None and alone.gap.needed else ""
         notes.append(f"No gap is shown: {alone.why}.{kept}")
     part = task.holdout.segments
     times = [float(task.holdout.time[part[0].start]), float(task.holdout.time[part[-1].stop - 1])]

@@ -85,8 +85,8 @@ def search_alone(
     if not np.isfinite(point.deviance):
         raise InputError(f"{record.path}: the model diverges on this log; its nominal numbers should be nearer")
     alone = alone_of(model, point, width, slope, held, gap, why)
-    if not_met(model, point, record) or (why and gap is not None and gap.needed):
-        # numbers of a model that the log contradicts, or with a gap of any size, have no interval
+    if not_met(model, point, record) or (why and gap is not None and (gap.needed or gap.unmet)):
+        # numbers of a model that the log contradicts, with a gap of any size, or without a load have no interval
         nothing = np.full_like(alone.found.spread.covariance, np.inf)
         found = dataclasses.replace(alone.found, spread=alone.found.spread._replace(covariance=nothing))
         alone = alone._replace(found=found)
@@ -130,6 +130,10 @@ def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
     both_ways = "moves back and forth that drive the load both ways, wider than the gap, would show one"
     if wrong := not_met(model, gap.best if gap.needed else gap.without, record):
         return wrong
+    if gap.unmet:
+        return (
+            f"the readings are met without one, and as well by a motor that, within a gap, never meets the load; {both_ways}"
+        )
     if not gap.needed and gap.at_most >= gap.travel:
         return f"any half gap fits; {both_ways}"
     if not gap.needed and gap.crossings < _REVERSALS:
@@ -231,6 +235,7 @@ def gap_summary(alone: Alone) -> dict[str, Any] | None:
         "nominal": alone.half(model.free[model.gap or 0].nominal),
         "half_gap": None if alone.why else gap.half,
         "at_most": gap.at_most,
+        "unmet": gap.unmet,
         "gain": gap.gain,
         "needed": SHOWN,
         "crossings": gap.crossings,

@@ -124,8 +124,8 @@ class UnseenLoad:
         self.experiment, self.free, self.width, self.rest = experiment, tuple(free), np.asarray(width), rest
         self.segments = segments
         self.period = float(experiment.run.sample_period)
-        self._skipped = [int(_SKIPPED * len(one)) for one in segments]
-        self.count = sum(map(len, segments)) - sum(self._skipped)
+        self.skipped = [int(_SKIPPED * len(one)) for one in segments]
+        self.count = sum(map(len, segments)) - sum(self.skipped)
         motions = [one.smoothed["motor"] for one in segments]
         self._first = np.array([np.asarray(one.state[0, :2]) for one in motions])
         self._open = np.array([[float(one.deviation(i)[0]) for i in (0, 1)] for one in motions])
@@ -210,7 +210,7 @@ class UnseenLoad:
         """What the readings of a segment differ from predictions, last axis (counted samples,)."""
         with np.errstate(invalid="ignore", over="ignore"):
             errors = self.segments[which].readings["motor"] - np.asarray(states.position["motor"])
-        return errors[..., self._skipped[which] :]
+        return errors[..., self.skipped[which] :]
 
     def _point(self, theta: np.ndarray, start: np.ndarray, smoothness: float, errors: np.ndarray) -> Point:
         prior = np.sum((theta / self.width) ** 2) + np.sum((start - self._expected(start)) ** 2)
@@ -473,6 +473,7 @@ class Gap(NamedTuple):
         starts: half gap that each fit began at, rad, and its deviance above the least.
         half: the half gap of the best fit, rad.
         travel: of the motor, rad.
+        unmet: whether a load that is never met, in a gap wider than the motor's travel, meets the readings as well as none.
     """
 
     best: Point
@@ -485,6 +486,7 @@ class Gap(NamedTuple):
     starts: list[tuple[float, float]]
     half: float
     travel: float
+    unmet: bool = False
 
     @property
     def needed(self) -> bool:
@@ -532,6 +534,8 @@ _ANY = 100.0
 """Prior standard deviation of a gap's theta: none."""
 _NEAR = 0.3
 """Prior standard deviation of what is known while the model is still wrong."""
+_TOUCH = 0.01
+"""Torque in the gear over the input's, rms, below which the load was not met: a softened gap has no sharp flanks."""
 _NONE = 1e-9
 """Half gap over the motor's travel that stands for none."""
 
@@ -580,6 +584,8 @@ class _Search:
         found = Gap(
             best, without, spread, slope, gain, 0, self.travel, tried, self.half(best.theta[self.place]), self.travel
         )
+        if gain < SHOWN and self._unmet(without, starts[-1][1], worth):
+            return found._replace(unmet=True)
         if gain < SHOWN:
             return found._replace(at_most=self._at_most(without, worth), crossings=self._reversals(without))
         return found._replace(crossings=self._crossings(best))
@@ -618,6 +624,23 @@ class _Search:
             found.append(self.coarse.solve(self.coarse.at(point.theta, point.start, _FOLLOWING[1]), _MORE, self.held))
         found = [self.coarse.followed(min(found, key=lambda one: one.deviance), self.held)]
         return self.model.finished(min(found, key=lambda one: one.deviance), self.held)
+
+    def _unmet(self, without: Point, begun: Point, worth: float) -> bool:
+        """Whether the motor alone meets the readings as well as both without a gap; `begun` at more than its travel."""
+        # the load in the middle of the gap
+        point = self.near.at(begun.theta, np.zeros_like(without.start), _FOLLOWING[0])
+        point = self.near.solve(point, _FEW, self.held)
+        point = self.coarse.followed(self.coarse.at(point.theta, point.start, _FOLLOWING[1]), self.held)
+        point = self.model.finished(point, self.held)
+        if not (point.deviance - without.deviance) / worth <= _LIMIT:
+            return False
+        plant = set_leaves(self.model.experiment, self.model.numbers(point.theta)).plant
+        # on one flank, where a weight may hold the load, the load is met
+        met = []
+        for one, skip in zip(self.model.states(point.theta, point.start, point.smoothness), self.model.skipped, strict=True):
+            motion = jax.tree.map(jnp.asarray, (one.position, one.velocity, one.effects))
+            met.append(np.asarray(jax.vmap(plant.transmitted)(*motion)[0])[skip:])
+        return bool(np.sqrt(np.mean(np.concatenate(met) ** 2)) < _TOUCH * self.model.torque)
 
     def _at_most(self, without: Point, worth: float) -> float:
         """The largest half gap that fits about as well as none; the motor's travel where all do."""

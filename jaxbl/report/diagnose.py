@@ -89,7 +89,8 @@ def verdict_sentence(summary: Mapping[str, Any]) -> str:
         return f"No discrepancy: {_NO_MORE}."
     where = "; ".join(one["sentence"] for one in summary.get("where_after", summary["where"]).values())
     alone = summary.get("backlash")
-    if not names and alone and alone["why"] and alone["gain"] >= alone["needed"] and not summary["gap"]["test"]["failed"]:
+    gap = alone and alone["why"] and (alone["gain"] >= alone["needed"] or alone["unmet"])
+    if not names and gap and not summary["gap"]["test"]["failed"]:
         return f"Unknown: a gap might explain what is missing, but this log does not show it: {where}."
     if not names:
         return f"Unknown: no known effect explains what is missing: {where}."

@@ -6,6 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tomli_w
+from hidden.cases import Log
+from hidden.simulator import Machine, Run, simulate
 from hidden_log import FRICTIONS, GAP, GEARED, geared
 from typer.testing import CliRunner
 
@@ -77,16 +79,13 @@ def test_inspect_says_what_needs_the_load(log):
 
 
 def test_a_drive_without_a_gap_is_refused_and_the_move_written(tmp_path, monkeypatch):
-    from hidden.cases import Log
-    from hidden.simulator import Machine, Run, simulate
-
     t = 2e-3 * np.arange(1000)
     shaft = {"law": "linear_shaft", "stiffness": 60.0}
     torque = 5.0 * np.sin(2.0 * np.pi * 1.0 * t)
     (trace,) = simulate([Run(Machine(GEARED, shaft, FRICTIONS), 2e-3, torque, motor_noise=1e-5, seed=2)])
     path = motor_only(tmp_path, Log(trace.t, trace.u, trace.theta_e, None))
     law = {"law": "sigmoid_backlash", "stiffness": 50.0, "dead_zone": 0.005, "slope": 200.0}
-    study = STUDY | {"transmission": law, "uncertainty": {"exact": ["transmission.slope"]}}
+    study = STUDY | {"transmission": law, "uncertainty": {"exact": ["drive.gear_ratio", "transmission.slope"]}}
     (tmp_path / "axis.toml").write_text(tomli_w.dumps(study))
     monkeypatch.setattr(cli, "_start_jax", lambda: None)
     monkeypatch.chdir(tmp_path)
@@ -101,6 +100,18 @@ def test_a_drive_without_a_gap_is_refused_and_the_move_written(tmp_path, monkeyp
     assert said["backlash"]["at_most"] < 0.01
     assert not {"transmission.dead_zone", "transmission.half_gap"} & set(said["parameters"])
     assert (tmp_path / "next.csv").read_text().startswith("t,u\n")
+
+
+def test_a_load_that_may_never_be_met_has_no_numbers(tmp_path):
+    light = GEARED | {"load_inertia": 0.6, "load_viscous": 1.5}
+    torque = 0.8 * np.sin(2.0 * np.pi * 1.0 * 2e-3 * np.arange(2000))
+    machine = Machine(light, GAP | {"half_gap": 5.0}, [FRICTIONS[0], FRICTIONS[1] | {"torque": 0.3}])
+    (trace,) = simulate([Run(machine, 2e-3, torque, motor_noise=3e-3, seed=2)])
+    assert np.ptp(trace.states[2]) == 0.0
+    study = STUDY | {"drive": light, "effects": [FRICTIONS[0], FRICTIONS[1] | {"torque": 0.3}]}
+    said = identify(motor_only(tmp_path, Log(trace.t, trace.u, trace.theta_e, None)), study).summary
+    assert "by a motor that, within a gap, never meets the load" in said["backlash"]["why"]
+    assert {one["interval"][1] for one in said["parameters"].values()} == {None}
 
 
 def test_changes_of_sign_count_beyond_a_size():

@@ -157,6 +157,9 @@ def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
     assert first == partly.format("83 %") + "not used for the fit, but not in a way that can be right."
     assert second.startswith("drive.motor_inertia had to change by -50%, 25 times its [uncertainty]: findings and it may")
     assert lines(powerless=True)[3].startswith("The data not used for the fit cannot confirm it: the model as given leaves")
+    gap = SUMMARY["gap"] | {"test": SUMMARY["gap"]["test"] | {"failed": ["theta_e"]}}
+    alone = diagnosis_lines(changed(verdict="unknown_effect", gap=gap, backlash=None))[0]
+    assert "83 % of the squared prediction error of the motor beyond noise is explained on data" in alone
     assert lines(chance=True)[3] == "Shuffled in time, the torque that was added does as well."
 
 
