@@ -41,7 +41,7 @@ from .localise import SIGNIFICANT, Localised, localise
 from .motor_alone import diagnose_alone
 from .numbers_by_log import contradictions
 from .observer_residual import Observed, observed_torques
-from .proof import SURE, Accepted, Control, Proof, beaten, free_values
+from .proof import SEEN, SURE, Accepted, Control, Proof, beaten, free_values
 from .reference_log import at_period
 from .residuals import Residual, residual_torques
 from .setup import Setup, set_up
@@ -234,9 +234,9 @@ class _Proved(NamedTuple):
         drive = self.found.model.linear.drive
         return expected_errors(setup.holdout, self.accepted.fitted, self.accepted.after, setup.input_noise, drive)
 
-    def or_better(self, proof: Proof, other: "_Proved") -> "_Proved":
-        """Another one in its place, if the held-out data surely prefer that."""
-        if not other.accepted.fitted.names or beaten(proof.other, self.accepted.after, other.accepted.after) < SURE:
+    def or_better(self, proof: Proof, other: "_Proved", least: float) -> "_Proved":
+        """Another one in its place, if the held-out data prefer that by so many standard errors."""
+        if not other.accepted.fitted.names or beaten(proof.other, self.accepted.after, other.accepted.after) < least:
             return self
         gone = dict.fromkeys([*self.accepted.withdrawn, *other.accepted.withdrawn])
         named = other.accepted.fitted.names
@@ -255,12 +255,13 @@ def _proved(proof: Proof, search: EffectSearch, found: Explanation) -> tuple[_Pr
         other = new_search(proof.setup, search.bound, best.accepted.withdrawn)
         again = other.run()
         if again.model.names not in ((), best.accepted.fitted.names) and other.plausible(again):
-            best = best.or_better(proof, _exchanged(proof, other, again))
+            best = best.or_better(proof, _exchanged(proof, other, again), SURE)
     expected = best.expected(proof.setup)
     if failed(best.accepted.after.errors, expected):
         more = extended(best.search, best.found, proof.setup.fitted)
         if more is not best.found:
-            better = best.or_better(proof, _exchanged(proof, best.search, more))
+            # the log itself prefers it, too
+            better = best.or_better(proof, _exchanged(proof, best.search, more), SEEN)
             if better is not best:
                 return better, better.expected(proof.setup)
     return best, expected

@@ -26,6 +26,8 @@ _SURELY = 1.1
 _BLOCKS = 16
 """Of held-out data, over which errors are compared: many enough for a standard error, and longer than errors are correlated
 in most logs."""
+SEEN = 1.0
+"""Standard errors by which a channel shows a difference, as a stepwise regression by blocks asks."""
 SURE = 2.0
 """Standard errors that count as a difference between two models: 2 % by chance."""
 
@@ -130,19 +132,21 @@ class Proof:
     def accepted(self, search: EffectSearch, found: Explanation) -> Accepted:
         """The model with what was found, as far as the held-out data bear it out.
 
-        Withdrawn, one after the other, are effects without which a model does as well there, and while the model is worse
-        than the one given, the effect without which it does best.
+        Withdrawn, one after the other, are effects without which a model does as well there, the one of least torque first,
+        since beside it others may only seem needless; and while the model is worse than the one given, the effect without
+        which it does best.
         """
         names, withdrawn = list(found.model.names), []
         while names:
             fitted = fit_model(search, {name: found.model.numbers[name] for name in names}, found.model.theta)
             after = self.other.compare(fitted.experiment)
             gains = {name: self._gain(search, fitted, after, name) for name in names}
-            least = min(gains, key=lambda name: gains[name])
-            if gains[least] > 0.0 and not self.worse(after, self.before):
+            needless = [name for name in names if not gains[name] > 0.0]
+            if not needless and not self.worse(after, self.before):
                 return Accepted(fitted, after, withdrawn, gains)
-            withdrawn.append(least)
-            names.remove(least)
+            gone = min(needless, key=fitted.share) if needless else min(names, key=lambda name: gains[name])
+            withdrawn.append(gone)
+            names.remove(gone)
         fitted = fit_model(search, {}, found.nominal.theta)
         after = self.other.compare(fitted.experiment)
         if not self.worse(after, self.before) and is_better(after.errors, self.before.errors):
@@ -225,13 +229,24 @@ class Proof:
 
 
 def beaten(log: ReferenceLog, control: Comparison, after: Comparison) -> float:
-    """By how many standard errors a model beats a control, block by block, each channel over the model's own noise."""
-    costs = []
-    for one in (control, after):
-        floor = log.noise_floor(one.torques)
-        channels = [name for name in floor if not name.startswith("velocity")]
-        costs.append(np.sum([_blocks(one.samples[name], floor[name]) for name in channels], axis=0))
-    return _standard_errors(*costs)
+    """By how many standard errors a model beats a control, block by block, each channel over its noise.
+
+    All channels together, by the mean of their logarithms, or the channel that shows the difference best if none says
+    otherwise: a ripple is seen in the torque, and hardly in windows of the position. Torques are referred to the input: a
+    model that multiplies all of them, and the input, by one factor misses the same.
+    """
+    both = (control, after)
+    channels = [name for name in control.samples if not name.startswith("velocity")]
+    scales = [{name: one.gain if name.startswith("torque") else 1.0 for name in channels} for one in both]
+    floors = [log.noise_floor(one.torques) for one in both]
+    noise = {name: np.sqrt(np.prod([floors[i][name] / scales[i][name] for i in range(2)])) for name in channels}
+    costs = [
+        np.array([_blocks(one.samples[name], scale[name] * noise[name]) for name in channels])
+        for one, scale in zip(both, scales, strict=True)
+    ]
+    together = _standard_errors(*costs)
+    each = [_standard_errors(*one) for one in zip(*costs, strict=True)]
+    return max(together, *each) if min(each) > -SEEN and max(each) > SEEN else together
 
 
 def _blocks(errors: np.ndarray, noise: float) -> np.ndarray:
@@ -241,14 +256,15 @@ def _blocks(errors: np.ndarray, noise: float) -> np.ndarray:
 
 
 def _standard_errors(control: np.ndarray, model: np.ndarray) -> float:
-    """By how many standard errors squared errors of a model over their noise, block by block, are below those of a control.
+    """By how many standard errors squared errors of a model over their noise, block by block, are below those of a control;
+    shapes (..., blocks), in front channels.
 
     By logarithms, since a few blocks may have most of the errors, of noise and errors together: what is less than the noise
     counts for nothing, as on a drive that stands still. What structure in the noise may bring is no gain.
     """
     if not (np.isfinite(control).all() and np.isfinite(model).all()):
         return -np.inf if np.isfinite(control).all() else np.inf
-    gains = np.log1p(control) - np.log1p(model)
+    gains = np.mean(np.atleast_2d(np.log1p(control) - np.log1p(model)), axis=0)
     return float(np.mean(gains) / np.hypot(np.std(gains, ddof=1) / np.sqrt(_BLOCKS), 2.0 * FLOOR))
 
 

@@ -51,11 +51,13 @@ class Comparison(NamedTuple):
         torques: that the model lacks, by side, segment by segment.
         samples: the errors one by one, in the order of time; of positions and speeds shape (windows, samples), of torques
             behind the low-pass (samples,).
+        gain: torque on the motor for one unit of the input.
     """
 
     errors: dict[str, float]
     torques: dict[str, list[Residual]]
     samples: dict[str, np.ndarray]
+    gain: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +123,7 @@ class ReferenceLog:
             pieces = zip(torques[side], self._rows(), strict=True)
             torques[side] = [dataclasses.replace(one, torque=one.torque - table[rows]) for one, rows in pieces]
         samples = self._samples(experiment, self.samples, _STATES, added or {}) | self._narrowed(torques)
-        return Comparison(_all_rms(samples), torques, samples)
+        return Comparison(_all_rms(samples), torques, samples, float(experiment.plant.input_gain))
 
     def missing(self, experiment: Experiment) -> dict[str, np.ndarray]:
         """Torques that a model lacks behind the low-pass, N m, by side."""

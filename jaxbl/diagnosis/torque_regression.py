@@ -19,7 +19,7 @@ from jaxbl.identification.segments import Segment
 
 from .candidates import Candidate, Numbers, forces_of, variants_of
 from .effect_search import LEAST_CHANCE, EffectSearch, Explanation, Finding, Model, contains, exclusive
-from .proof import FittedModel, beaten, fit_model
+from .proof import SEEN, FittedModel, beaten, fit_model
 from .reference_log import Comparison, ReferenceLog
 from .residuals import Residual, low_passed, narrowed
 from .torque_tables import seen
@@ -30,8 +30,6 @@ _GAIN = 0.03
 """Share of the rms that a candidate has to take away by cross-validation, and by which models have to differ."""
 _TRIED = 3
 """Candidates of a regression that are put into the model."""
-_SURE = 1.0
-"""Standard errors by which a model has to be better on the log; held-out data decide later."""
 _NAMED = 0.9
 """Confidence from which on an effect is named: below it the missing torque is not that of one effect."""
 _ADDED = 3
@@ -87,7 +85,7 @@ def _with_one_more(search: EffectSearch, found: Explanation, log: ReferenceLog) 
             continue
         after = log.compare(fitted.experiment)
         z = beaten(log, compared, after)
-        if z > _SURE and _less(after, compared):
+        if z > SEEN and _less(after, compared):
             tried.append(_Tried(one.name, fitted, after, z))
     if not tried:
         return None
