@@ -1,0 +1,76 @@
+"""How two models are compared on held-out data, block by block, and which effects are withdrawn."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from jaxbl.diagnosis.proof import Proof, _standard_errors, beaten
+from jaxbl.diagnosis.reference_log import Comparison
+
+POSITION, TORQUE = 1e-4, 1e-2
+
+
+def compared(position, torque, *, gain=1.0, floor=TORQUE):
+    """A model whose errors are so many times the noise; `floor`: noise of the torques by its own inertia, N m."""
+    samples = {"theta_e": POSITION * position, "torque_motor": gain * TORQUE * torque}
+    return Comparison({name: float(np.std(one)) for name, one in samples.items()}, {"motor": floor}, samples, gain)
+
+
+LOG = SimpleNamespace(noise_floor=lambda torques: {"theta_e": POSITION, "torque_motor": torques["motor"]})
+
+
+@pytest.fixture
+def errors():
+    random = np.random.default_rng(0)
+    return lambda size: size * random.standard_normal(1600)
+
+
+def test_a_ripple_that_only_the_torque_shows_counts(errors):
+    # windows of the position go wrong by something else, which is far larger
+    control, better = compared(errors(500.0), errors(4.0)), compared(errors(500.0), errors(2.0))
+    assert beaten(LOG, control, better) > 5.0
+    assert beaten(LOG, better, control) < -2.0
+    # or one channel against the other: all together
+    assert abs(beaten(LOG, compared(errors(4.0), errors(2.0)), compared(errors(2.0), errors(4.0)))) < 3.0
+
+
+def test_one_factor_on_all_torques_and_the_input_makes_no_model_better(errors):
+    position, torque = errors(3.0), errors(3.0)
+    scaled = compared(position, torque, gain=0.6, floor=0.6 * TORQUE)
+    assert beaten(LOG, compared(position, torque), scaled) == pytest.approx(0.0, abs=1e-9)
+    # nor does a smaller inertia, by which readings make less noise of torque
+    assert beaten(LOG, compared(position, torque, floor=0.6 * TORQUE), compared(position, torque)) == 0.0
+
+
+def test_blocks_in_which_both_models_err_by_less_than_noise_count_for_nothing():
+    """A drive that stands still for a while: one model leaves exactly nothing there, the other a tenth of the noise."""
+    moving = np.linspace(20.0, 60.0, 13)
+    control, better = np.append(moving, np.zeros(3)), np.append(0.25 * moving, np.full(3, 0.01))
+    assert _standard_errors(control, better) > 5.0
+    assert _standard_errors(better, control) < -5.0
+    # few blocks have nearly all of the errors
+    few = np.append(np.full(15, 4.0), 1e6)
+    assert _standard_errors(few, few / 3.0) > 5.0
+    assert _standard_errors(np.full(16, np.inf), moving[:1].repeat(16)) == np.inf
+
+
+def test_of_needless_effects_the_one_of_least_torque_goes_first(monkeypatch, errors):
+    """Beside a delay that stands for it a ripple seems needless."""
+    shares = {"actuator.delay": 0.01, "motor.cogging": 0.2, "motor.coulomb_friction": 0.9}
+    given = compared(errors(9.0), errors(9.0))
+    proof = Proof.__new__(Proof)
+    proof.before, proof.noise = given, LOG.noise_floor({"motor": TORQUE})
+    proof.other = SimpleNamespace(compare=lambda experiment: compared(errors(1.0), errors(1.0)))
+    fitted = lambda search, numbers, theta: SimpleNamespace(experiment=None, names=tuple(numbers), share=shares.get)  # noqa: E731
+    monkeypatch.setattr("jaxbl.diagnosis.proof.fit_model", fitted)
+
+    def gain(self, search, model, after, name):
+        alone = "actuator.delay" not in model.names
+        return {"actuator.delay": -1.0, "motor.cogging": 3.0 if alone else -2.0, "motor.coulomb_friction": 9.0}[name]
+
+    monkeypatch.setattr(Proof, "_gain", gain)
+    found = SimpleNamespace(model=SimpleNamespace(names=list(shares), numbers=dict.fromkeys(shares), theta=None))
+    accepted = proof.accepted(None, found)
+    assert accepted.withdrawn == ["actuator.delay"]
+    assert accepted.fitted.names == ("motor.cogging", "motor.coulomb_friction")
