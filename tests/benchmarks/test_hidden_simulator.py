@@ -50,7 +50,7 @@ GEARED_MACHINE = Machine(
 
 
 def rigid(t, y, u, flank):
-    """A dent, hysteresis, drifting friction, torque ripple; u has been through gain, limit and lag."""
+    """A dent, hysteresis, drifting friction, torque ripple; u has been through dead time, gain, limit and lag."""
     x, v, _, _, h = y
     rate = (v - 0.5 * (abs(v) * abs(h) * h + v * h * h)) / 0.2
     level = 0.05 * (1.0 + 0.8 * (1.0 - 2.0 * t)) + 0.2 * np.exp(-(((x - 0.4) / 0.05) ** 2))
@@ -69,6 +69,7 @@ RIGID_MACHINE = Machine(
         {"kind": "unknown.hysteresis", "side": "motor", "torque": 0.1, "length": 0.2},
         {"kind": "unknown.dent", "side": "load", "torque": 0.2, "position": 0.4, "width": 0.05},
         {"kind": "motor.torque_ripple", "amplitude": 0.2, "harmonic": 7.0, "phase": -0.4},
+        {"kind": "actuator.delay", "delay": 3 * PERIOD},
         {"kind": "actuator.gain_error", "relative": 0.1},
         {"kind": "actuator.saturation", "limit": 0.25},
         {"kind": "actuator.lag", "time_constant": 0.02},
@@ -176,7 +177,7 @@ GEARED_START, RIGID_START = (0.05, 2.0, 0.01, 0.3), (0.3, 0.5, 0.0, 0.0)
 
 @pytest.fixture(scope="module")
 def truths():
-    limited = np.clip(1.1 * RIGID_INPUT, -0.25, 0.25)
+    limited = np.clip(1.1 * np.append(np.zeros(3), RIGID_INPUT[:-3]), -0.25, 0.25)
     return {
         "geared": reference(geared, (0.05, 7.0), 0.08, GEARED_START, GEARED_INPUT, 0.0),
         "rigid": reference(rigid, (0.03, 1.0), 0.0, RIGID_START, limited, 0.02),
