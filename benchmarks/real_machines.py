@@ -99,7 +99,8 @@ def _compare(row: Row, case: Case, task, model, rivals: bool) -> None:
         found = tool(terms, other)
         row.rivals[name], row.torques[name] = found.said(), found.rms
         others += [found.left] if found.rms is not None else []
-    if "jaxbl" in errors and others:
+    # beside all of them or none
+    if "jaxbl" in errors and len(others) == len(row.rivals):
         row.margin = _margin(errors["jaxbl"], min(others, key=lambda one: float(np.mean(one**2))))
 
 

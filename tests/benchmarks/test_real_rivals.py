@@ -1,0 +1,50 @@
+"""The comparison of the bench of real machines: one yardstick for all tools, and rivals that find what is there."""
+
+import numpy as np
+import pytest
+from measured import COULOMB, INERTIA, VISCOUS, made
+from real.derivatives import parts_of, terms_of, torque_error
+from real.rivals import stepwise
+from real_machines import _margin
+from small_study import rigid
+
+from jaxbl import read_config, read_record
+
+CUTOFF = 30.0
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory):
+    path = tmp_path_factory.mktemp("log") / "log.csv"
+    made(count=8000, noise=1e-5)[["t", "u", "theta_e"]].to_csv(path, index=False)
+    return read_record(path)
+
+
+def model(inertia=INERTIA, effects=()):
+    return read_config(rigid({"drive.motor_inertia": inertia, "drive.motor_viscous": VISCOUS}, effects=[*effects]))
+
+
+FRICTION = {"kind": "motor.coulomb_friction", "torque": COULOMB}
+
+
+def test_the_true_model_leaves_nothing_and_one_factor_on_all_changes_nothing(record):
+    parts = parts_of(record, ("motor",), CUTOFF)
+    left = torque_error(model(effects=[FRICTION]), record, parts)
+    without = torque_error(model(), record, parts)
+    assert np.std(left) < 0.1 * COULOMB < 0.9 * np.std(without)
+    gain = {"kind": "actuator.gain_error", "relative": 0.6}
+    # the same machine in units that are 1.6 times as small
+    other = model(1.6 * INERTIA, [gain, {"kind": "motor.viscous_friction", "viscous": 0.6 * VISCOUS}])
+    np.testing.assert_allclose(torque_error(other, record, parts), without, rtol=1e-6, atol=1e-9)
+    assert _margin(left, without) > 5.0 > -5.0 > _margin(without, left)
+
+
+def test_the_regression_adds_dry_friction_to_the_nominal_terms_first(record):
+    parts = parts_of(record, ("motor",), CUTOFF)
+    motion = [part.kinematics for part in parts]
+    spans = max(np.abs(k.velocity["motor"]).max() for k in motion), max(np.ptp(k.position["motor"]) for k in motion)
+    terms = terms_of(parts, model(), False, tuple(map(float, spans)))
+    found = stepwise(terms, terms)
+    assert found.names[:3] == ["inertia", "viscous", "Coulomb"]
+    assert found.factors["Coulomb"][0] == pytest.approx(COULOMB, rel=0.05)
+    assert found.factors["inertia"][0] == pytest.approx(INERTIA, rel=0.02)
