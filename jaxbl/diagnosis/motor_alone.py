@@ -230,13 +230,14 @@ def _summary(
     # a gap that the readings call for, or leave to be so wide that the load is never met, but do not show
     doubtful = bool(alone.why) and alone.gap is not None and (alone.gap.needed or alone.gap.unmet)
     names = [name for name, i in search.effects.items() if name not in out and not (doubtful and is_gap(model.free[i]))]
-    failed = ["theta_e"] if holdout["rms"] > limit or left > allowed else []
-    verdict = "unknown_effect" if failed or far or doubtful else "explained" if names else "no_discrepancy"
+    failed, remainder = ["theta_e"] if holdout["rms"] > limit else [], left > allowed
+    verdict = "unknown_effect" if failed or remainder or far or doubtful else "explained" if names else "no_discrepancy"
     force = unit_on(record, "motor.torque", "N m")
     before, after = holdout["nominal_rms"] ** 2, holdout["rms"] ** 2
     sentence = (
         f"motor side: the model as given predicts it to {holdout['nominal_rms']:.2g} {unit} rms (noise {noise:.2g}); a "
-        f"torque of {left:.2g} {force} rms a sample is left unexplained ({100.0 * left / size:.2g} % of the driving torque)"
+        f"torque of {left:.2g} {force} rms a sample is left unexplained ({100.0 * left / size:.2g} % of the driving torque; {allowed:.2g} {force} "
+        "may be noise)"
     )
     findings = []
     for name in sorted(names, key=lambda name: -gains[name]):
@@ -299,7 +300,7 @@ def _summary(
             "free_run": {},
             "expected": {"theta_e": {"limit": limit}},
             "test": {
-                "level": LEVEL, "failed": failed, "far": far, "chance": False, "remainder": False, "powerless": False,
+                "level": LEVEL, "failed": failed, "far": far, "chance": False, "remainder": remainder, "powerless": False,
                 "little": False, "contradicting": False,
             },
             "controls": {},

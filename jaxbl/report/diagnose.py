@@ -88,15 +88,15 @@ def verdict_sentence(summary: Mapping[str, Any]) -> str:
     if summary["verdict"] == "no_discrepancy":
         return f"No discrepancy: {_NO_MORE}."
     where = "; ".join(one["sentence"] for one in summary.get("where_after", summary["where"]).values())
-    alone = summary.get("backlash")
+    alone, test = summary.get("backlash"), summary["gap"]["test"]
+    complete = not test["failed"] and not test["remainder"]
     gap = alone and alone["why"] and (alone["gain"] >= alone["needed"] or alone["unmet"])
-    if not names and gap and not summary["gap"]["test"]["failed"]:
+    if not names and gap and complete:
         return f"Unknown: a gap might explain what is missing, but this log does not show it: {where}."
     if not names:
         return f"Unknown: no known effect explains what is missing: {where}."
-    share, test = _share(summary["explained_share"]), summary["gap"]["test"]
-    rest = ", but not in a way that can be right"
-    if test["failed"] or test["remainder"]:
+    share, rest = _share(summary["explained_share"]), ", but not in a way that can be right"
+    if not complete:
         rest = f". The rest is none of the known effects: {where}"
     what = "missing torque" if "backlash" not in summary else "squared prediction error of the motor beyond noise"
     return (
