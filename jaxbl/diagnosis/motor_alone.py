@@ -125,16 +125,17 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> Found:
     search = _set_up(task)
     model, gap, why = search.model, None, ""
     play = next((name for name, i in search.effects.items() if is_gap(model.free[i])), None)
-    if play is not None and model.gap == search.effects[play]:
+    if model.gap is not None:
+        # the model's own, or one that it lacks
         gap = find_gap(model)
-        point = gap.best if gap.needed else gap.without
+        point = gap.best if gap.needed or play is None else gap.without
     else:
         point = fitted(model)
     if not np.isfinite(point.deviance):
         raise InputError(f"{task.record.path}: the model diverges on this log; its numbers should be nearer")
     done()
     doing("comparing effects")
-    out = [] if gap is None or gap.needed else [play or ""]
+    out = [play] if gap is not None and play is not None and not gap.needed else []
     point, gains = _needed(search, point, out)
     if gap is not None and gap.needed and play is not None:
         gains[play] = gap.gain
@@ -235,9 +236,9 @@ def _summary(
     force = unit_on(record, "motor.torque", "N m")
     before, after = holdout["nominal_rms"] ** 2, holdout["rms"] ** 2
     sentence = (
-        f"motor side: the model as given predicts it to {holdout['nominal_rms']:.2g} {unit} rms (noise {noise:.2g}); a "
-        f"torque of {left:.2g} {force} rms a sample is left unexplained ({100.0 * left / size:.2g} % of the driving torque; {allowed:.2g} {force} "
-        "may be noise)"
+        f"motor side: the model as given predicts it to {holdout['nominal_rms']:.2g} {unit} rms (noise {noise:.2g}); "
+        f"fitted, it leaves a torque of {left:.2g} {force} rms a sample unexplained ({100.0 * left / size:.2g} % of the "
+        f"driving torque; {allowed:.2g} {force} may be noise)"
     )
     findings = []
     for name in sorted(names, key=lambda name: -gains[name]):

@@ -50,7 +50,8 @@ class Free(NamedTuple):
     """A number to be fitted: value = scale exp(theta) where it must stay positive, nominal + scale theta elsewhere.
 
     theta is 0 at the nominal value, and a change of theta is a relative change; of an angle, it is in rad. `role` is the
-    part that the number plays in its effect (:class:`jaxbl.drive.effects.Role`), if it is one of an effect.
+    part that the number plays in its effect (:class:`jaxbl.drive.effects.Role`), if it is one of an effect; `most`: the
+    largest value that a study may give it.
     """
 
     path: str
@@ -59,9 +60,13 @@ class Free(NamedTuple):
     scale: float
     positive: bool
     role: str = ""
+    most: float | None = None
 
     def value(self, theta: Any) -> Any:
-        return self.scale * _exp(theta) if self.positive else self.nominal + self.scale * theta
+        value = self.scale * _exp(theta) if self.positive else self.nominal + self.scale * theta
+        if self.most is None:
+            return value
+        return jnp.minimum(value, self.most) if isinstance(value, jax.Array) else np.minimum(value, self.most)
 
     def slope(self, theta: Any) -> Any:
         """Derivative of the value."""
@@ -93,7 +98,7 @@ def free_parameters(experiment: Experiment, paths: Sequence[str], torque: float)
         role = about.role.kind if about.role else ""
         # an angle has no relative size
         scale = 1.0 if role == "angle" else abs(nominal) or (torque if about.unit == "N m" else 0.0) or 1.0
-        free.append(Free(path, about.unit, nominal, scale, positive, role))
+        free.append(Free(path, about.unit, nominal, scale, positive, role, about.maximum))
     return tuple(free)
 
 

@@ -252,3 +252,11 @@ def test_the_solver_takes_the_steps_of_levenberg_and_marquardt():
     found = _solve(point, start, nothing, jnp.asarray(100), 2)
     assert bool(found.converged) and int(found.steps) < 100
     np.testing.assert_allclose(found.theta, 1.0, atol=1e-4)
+
+
+def test_a_number_stays_within_what_a_study_may_say():
+    """A fit may ask for more damping than the effect has."""
+    damped = {"kind": "load.flexibility", "inertia": 0.01, "frequency": 5.0, "damping_ratio": 0.5}
+    (one,) = free_parameters(drive(6, effects=[damped]), ["effects.load.flexibility.damping_ratio"], 1.0)
+    assert one.value(0.1) == pytest.approx(0.5 * np.exp(0.1))
+    assert float(one.value(1.0)) == float(one.value(jnp.asarray(1.0))) == 0.95
