@@ -36,7 +36,7 @@ from .diagnosis_summary import (
 from .diagnosis_task import DiagnosisTask, read_diagnosis_task
 from .effect_search import EffectSearch, Explanation
 from .expected_errors import Expected, expected_errors, failed
-from .judgement import exchanged, explained_share, judged
+from .judgement import exchanged, explained_share, is_little, judged
 from .localise import SIGNIFICANT, Localised, localise
 from .motor_alone import diagnose_alone
 from .numbers_by_log import contradictions
@@ -45,6 +45,7 @@ from .proof import SEEN, SURE, Accepted, Control, Proof, beaten, free_values
 from .reference_log import at_period
 from .residuals import Residual, residual_torques
 from .setup import Setup, set_up
+from .torque_fit import fit_to_torque
 from .torque_regression import extended
 from .torque_tables import tabulated
 
@@ -137,7 +138,8 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         search, found = _explained(setup)
         done()
         doing("testing on held-out data")
-        (search, found, (fitted, after, withdrawn, gains), controls), expected = _proved(proof, search, found)
+        (search, found, accepted, controls), expected = _proved(proof, search, found)
+        fitted, after = accepted.fitted, accepted.after
         done()
         if not np.isfinite(fitted.covariance).all():
             raise InputError(f"{task.record.path}: the model's numbers cannot be fitted to this log; is its input complete?")
@@ -156,7 +158,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         observed = _observed(setup, observing)
         trace = trace_of(setup, on_log, on_holdout, observed)
         done()
-        summary = summary_of(setup, fitted, found, withdrawn, gains)
+        summary = summary_of(setup, accepted, found)
         about, notes = observers_say(observing, observed[0], setup)
         for side, one in about.items():
             summary["where"][side]["observed"] = one
@@ -243,12 +245,27 @@ class _Proved(NamedTuple):
         accepted = other.accepted._replace(withdrawn=[name for name in gone if name not in named])
         return other._replace(accepted=accepted)
 
+    def by_torque(self, proof: Proof) -> "_Proved":
+        """The model with the numbers of least missing torque, if the held-out data prefer them."""
+        accepted = self.accepted
+        fitted = fit_to_torque(self.search, accepted.fitted, proof.setup.fitted) if accepted.fitted.names else None
+        if fitted is None:
+            return self
+        after = proof.other.compare(fitted.experiment)
+        z = beaten(proof.other, accepted.after, after)
+        if not z > SEEN or proof.worse(after, proof.before):
+            return self
+        controls = proof.controls(self.search, fitted, after, self.found.wrong)
+        # a complete model has the same numbers by both
+        found = dataclasses.replace(self.found, verdict="unknown_effect")
+        return _Proved(self.search, found, accepted._replace(fitted=fitted, after=after, by_torque=z), controls)
+
 
 def _proved(proof: Proof, search: EffectSearch, found: Explanation) -> tuple[_Proved, dict[str, Expected]]:
     """What the held-out data leave of an explanation, and the errors of a complete model there.
 
-    Where they take effects away, others are sought in their place; where more is left than a complete model would leave,
-    those that the missing torque itself shows.
+    Where they take effects away, others are sought in their place. Where more is left than a complete model would leave, so
+    are those that the missing torque itself shows, and numbers that leave less of it.
     """
     best = _exchanged(proof, search, found)
     if best.accepted.withdrawn:
@@ -261,9 +278,13 @@ def _proved(proof: Proof, search: EffectSearch, found: Explanation) -> tuple[_Pr
         more = extended(best.search, best.found, proof.setup.fitted)
         if more is not best.found:
             # the log itself prefers it, too
-            better = best.or_better(proof, _exchanged(proof, best.search, more), SEEN)
-            if better is not best:
-                return better, better.expected(proof.setup)
+            best = best.or_better(proof, _exchanged(proof, best.search, more), SEEN)
+            expected = best.expected(proof.setup)
+    after = best.accepted.after.errors
+    share = explained_share(proof.setup.nominal, proof.before.errors, after, expected)
+    if failed(after, expected) or is_little(share):
+        best = best.by_torque(proof)
+        expected = best.expected(proof.setup)
     return best, expected
 
 

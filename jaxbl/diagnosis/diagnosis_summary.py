@@ -27,27 +27,29 @@ from .localise import SIGNIFICANT, Localised
 from .neutral_effects import with_added
 from .numbers_by_log import Contradiction
 from .observer_residual import Observed, compared
-from .proof import Control, FittedModel, free_values
+from .proof import Accepted, Control, FittedModel, free_values
 from .residuals import Residual
 from .sentences import sentence_of
 from .setup import Setup
 
 
-def summary_of(
-    setup: Setup, fitted: FittedModel, found: Explanation, withdrawn: Sequence[str], gains: Mapping[str, float]
-) -> dict[str, Any]:
-    """The summary but for the proof, and for what the observers say.
-
-    `withdrawn`: effects that were found, and that the explanation is without; `gains`: standard errors by which the model
-    beats one without an effect on the held-out data, by effect.
-    """
+def summary_of(setup: Setup, accepted: Accepted, found: Explanation) -> dict[str, Any]:
+    """The summary but for the proof, and for what the observers say."""
     task, record, located = setup.task, setup.task.record, setup.located
+    fitted = accepted.fitted
     where = where_lacking(record, located)
     values, errors = free_values(fitted.free, fitted.theta), fitted.errors()
     notes = list(record.notes)
     if task.separate:
         notes += [f"{task.holdout.path.name}: {note}" for note in task.holdout.notes if note not in record.notes]
-    notes += [f"{name} was found, and withdrawn: with it the held-out data are met no better." for name in withdrawn]
+    notes += [
+        f"{name} was found, and withdrawn: with it the held-out data are met no better." for name in accepted.withdrawn
+    ]
+    if accepted.by_torque > 0.0:
+        notes.append(
+            "More than noise is left: the numbers are those of least missing torque. On the held-out data they are better "
+            f"than those of least prediction errors by {accepted.by_torque:.1f} standard errors."
+        )
     for one in found.findings:
         if task.separate and EFFECTS[one.effect].in_time:
             notes.append(f"{one.effect} is taken to run from the start of each log in the same way.")
@@ -71,7 +73,7 @@ def summary_of(
         "findings": sorted(
             (
                 _finding(record, one, values, errors, where)
-                | {"share": fitted.share(one.effect), "z": gains.get(one.effect)}
+                | {"share": fitted.share(one.effect), "z": accepted.gains.get(one.effect)}
                 for one in found.findings
             ),
             key=lambda one: -one["share"],
@@ -87,7 +89,7 @@ def summary_of(
         },
         "where": where,
         "rest": {name: {"evidence": gain, "share": share} for name, (gain, share) in found.rest.items()},
-        "withdrawn": list(withdrawn),
+        "withdrawn": list(accepted.withdrawn),
         "notes": notes,
     }
 

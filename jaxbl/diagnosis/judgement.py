@@ -78,7 +78,7 @@ def judged(
                 _shared(each, found.model, found.wrong, one.z) if each.effect == last else each for each in findings
             )
     powerless = bool(fitted.names) and not failed(before, expected)
-    little = bool(fitted.names) and share is not None and share < _LEAST_SHARE
+    little = bool(fitted.names) and is_little(share)
     verdict = "unknown_effect" if left or far or chance or powerless or little or contradicting else found.verdict
     remainder = found.verdict == "unknown_effect"
     said = dataclasses.replace(found, verdict=verdict, findings=findings)
@@ -157,6 +157,11 @@ def _shared(finding: Finding, model: Model, wrong: Model, z: float) -> Finding:
         confidence=finding.confidence / total,
         alternatives=tuple(sorted(((name, float(one)) for name, one in chances.items()), key=lambda pair: -pair[1])),
     )
+
+
+def is_little(share: float | None) -> bool:
+    """Whether an explanation takes away less of the missing torque than it has to."""
+    return share is not None and share < _LEAST_SHARE
 
 
 def explained_share(

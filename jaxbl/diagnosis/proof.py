@@ -108,12 +108,15 @@ class Accepted(NamedTuple):
         after: how it compares there.
         withdrawn: effects that were found, and that it is without.
         gains: standard errors by which the model beats the one without an effect, by effect.
+        by_torque: standard errors by which numbers of least missing torque beat those of least prediction errors; 0 where
+            they are the latter.
     """
 
     fitted: FittedModel
     after: Comparison
     withdrawn: list[str]
     gains: dict[str, float]
+    by_torque: float = 0.0
 
 
 class Proof:
