@@ -237,7 +237,10 @@ class _Proved(NamedTuple):
         return expected_errors(setup.holdout, self.accepted.fitted, self.accepted.after, setup.input_noise, drive)
 
     def or_better(self, proof: Proof, other: "_Proved", least: float) -> "_Proved":
-        """Another one in its place, if the held-out data prefer that by so many standard errors."""
+        """Another one in its place, if the held-out data prefer that by so many standard errors, and not by numbers of the
+        model that cannot be."""
+        if proof.plausible(self.accepted.fitted) and not proof.plausible(other.accepted.fitted):
+            return self
         if not other.accepted.fitted.names or beaten(proof.other, self.accepted.after, other.accepted.after) < least:
             return self
         gone = dict.fromkeys([*self.accepted.withdrawn, *other.accepted.withdrawn])
@@ -253,7 +256,7 @@ class _Proved(NamedTuple):
             return self
         after = proof.other.compare(fitted.experiment)
         z = beaten(proof.other, accepted.after, after)
-        if not z > SEEN or proof.worse(after, proof.before):
+        if not z > SEEN or proof.worse(after, proof.before) or not proof.plausible(fitted):
             return self
         controls = proof.controls(self.search, fitted, after, self.found.wrong)
         # a complete model has the same numbers by both

@@ -161,14 +161,20 @@ class Proof:
         return Accepted(given, self.before, withdrawn, {})
 
     def _gain(self, search: EffectSearch, fitted: FittedModel, after: Comparison, name: str) -> float:
-        """Standard errors by which a model beats the one without an effect, all numbers fitted anew; infinite where its own
-        numbers would then have to be what they cannot be, as the one that the effect is the error of."""
+        """Standard errors by which a model beats the one without an effect, all numbers fitted anew.
+
+        Where its own numbers can take the effect's place, the held-out data know nothing of it, and what is known of these
+        numbers decides: the deviations from it that they would need are added.
+        """
         own, prior = len(self.setup.prior), self.setup.prior
         numbers = {one: values for one, values in fitted.numbers.items() if one != name}
         fewer = fit_model(search, numbers, fitted.theta[:own])
-        if np.any((np.abs(fewer.theta[:own]) > FAR * prior) & (np.abs(fitted.theta[:own]) <= FAR * prior)):
-            return np.inf
-        return beaten(self.other, self.other.compare(fewer.experiment), after)
+        without, by = (float(np.sum((one.theta[:own] / prior) ** 2)) for one in (fewer, fitted))
+        return beaten(self.other, self.other.compare(fewer.experiment), after) + np.sqrt(max(without - by, 0.0))
+
+    def plausible(self, fitted: FittedModel) -> bool:
+        """Whether a model's own numbers are where they may be by what is known of them."""
+        return bool(np.all(np.abs(fitted.theta[: len(self.setup.prior)]) < FAR * self.setup.prior))
 
     def worse(self, after: Comparison, before: Comparison) -> bool:
         """Whether a model is worse than another in a channel: by more than new numbers may cost, and surely so by the blocks
