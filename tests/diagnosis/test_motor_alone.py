@@ -73,6 +73,23 @@ def test_nothing_is_named_where_nothing_is_missing(tmp_path):
     assert done == [(1, 3), (2, 3), (3, 3)]
 
 
+def test_a_gap_that_the_model_has_is_found_from_afar(tmp_path):
+    """Numbers 12 to 20 % off: a plain fit ends beside the least error, and leaves a torque of 0.5 N m."""
+    log = driven(
+        3.0 * np.sin(2 * np.pi * 0.5 * 2e-3 * np.arange(3000)),
+        {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08},
+        1e-5,
+    )
+    log.write(tmp_path / "motor.csv")
+    own = STUDY | {
+        "transmission": {"law": "dead_zone", "stiffness": 50.0, "half_gap": 0.07},
+        "uncertainty": {"relative": 0.2, "exact": ["drive.gear_ratio"]},
+    }
+    summary = diagnose(tmp_path / "motor.csv", own).summary
+    assert summary["verdict"] == "no_discrepancy" and summary["backlash"]["shown"]
+    assert summary["parameters"]["transmission.half_gap"]["value"] == pytest.approx(0.08, rel=1e-3)
+
+
 def test_one_crossing_shows_a_gap(tmp_path):
     path = tmp_path / "motor.csv"
     driven(5.0 * np.sin(2.0 * np.pi * 0.25 * 2e-3 * np.arange(2000)), GAP, 1e-5).write(path)
