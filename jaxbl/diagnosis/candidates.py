@@ -68,6 +68,7 @@ class Candidate:
             what is there at coefficients of 0, if anything is.
         numbers: the effect's numbers from the coefficients; None where they are not allowed.
         offset: whether something is there at coefficients of 0.
+        from_rest: whether nothing had happened before the first sample; else its input had lasted.
     """
 
     name: str
@@ -76,6 +77,7 @@ class Candidate:
     columns: Callable[["MotionTorques", Sequence[np.ndarray]], np.ndarray]
     numbers: Callable[[Sequence[float]], Numbers | None]
     offset: bool = False
+    from_rest: bool = False
 
 
 SHARE = 0.3
@@ -110,7 +112,13 @@ def _variants(name: str, log: Scales) -> Iterator[Candidate]:
     tried = [leaf for leaf, role in roles.items() if role.kind in ("harmonic", "frequency", "shape")]
     for values in itertools.product(*(roles[leaf].trials(log) for leaf in tried)):
         known = dict(zip(tried, values, strict=True))
-        yield _proportional(name, known, log) if EFFECTS[name].sizes() else _trial(name, known)
+        if EFFECTS[name].sizes():
+            yield _proportional(name, known, log)
+            continue
+        # of one that remembers its input the first samples are the clearest mark on many a log
+        remembers = name.startswith("actuator.") and bool(jax.tree.leaves(_effect(name, known).init()))
+        for from_rest in (False, True) if remembers else (False,):
+            yield _trial(name, known, from_rest)
 
 
 def _proportional(name: str, known: Numbers, log: Scales) -> Candidate:
@@ -142,7 +150,7 @@ def _proportional(name: str, known: Numbers, log: Scales) -> Candidate:
     return Candidate(name, len(effects), tuple(effects), columns, numbers_of)
 
 
-def _trial(name: str, known: Numbers) -> Candidate:
+def _trial(name: str, known: Numbers, from_rest: bool) -> Candidate:
     """An effect without sizes: the first of its numbers about the value tried."""
     leaf, value = next(iter(known.items()))
     tried = tuple(_effect(name, known | {leaf: value * math.exp(step)}) for step in (-_STEP, 0.0, _STEP))
@@ -155,7 +163,7 @@ def _trial(name: str, known: Numbers) -> Candidate:
         (change,) = values
         return known | {leaf: value * math.exp(change)} if abs(change) < 4.0 * SPACING else None
 
-    return Candidate(name, 1, tried, columns, numbers_of, offset=True)
+    return Candidate(name, 1, tried, columns, numbers_of, offset=True, from_rest=from_rest)
 
 
 def _effect(name: str, numbers: Numbers) -> AbstractEffect:
@@ -209,8 +217,9 @@ class MotionTorques:
         """Torque on a side for 1 N m at the motor."""
         return float(self.experiment.drive.ratio(side))
 
-    def of(self, effects: Sequence[AbstractEffect]) -> list[np.ndarray]:
-        """Torque that each effect adds, shape (samples, sides + 1); on top of what a model without it has."""
+    def of(self, effects: Sequence[AbstractEffect], from_rest: bool = False) -> list[np.ndarray]:
+        """Torque that each effect adds, shape (samples, sides + 1); on top of what a model without it has. Before the first
+        sample its input had lasted, or with `from_rest` nothing had happened."""
         found: list[np.ndarray] = [np.zeros(0)] * len(effects)
         names = [effect.name for effect in effects]
         for name in dict.fromkeys(names):
@@ -227,7 +236,9 @@ class MotionTorques:
                 spare = [effects[some[-1]]] * (_AT_ONCE - len(some))
                 members = (*(effects[i] for i in some), *spare)
                 stack = jax.tree.map(lambda *x: np.array([float(one) for one in x]), *members)
-                torques = {at: np.asarray(one) for at, one in _torques(bare, stack, self.moving, direction).items()}
+                torques = {
+                    at: np.asarray(one) for at, one in _torques(bare, stack, self.moving, direction, from_rest).items()
+                }
                 for row, i in enumerate(some):
                     found[i] = np.zeros((self.count, len(self.sides) + 1))
                     for at, one in torques.items():
@@ -238,15 +249,19 @@ class MotionTorques:
 def forces_of(candidates: Sequence[Candidate], signals: MotionTorques) -> np.ndarray:
     """Columns of candidates, one after the other, N m; shape (columns, samples, sides + 1)."""
     new = [one for one in candidates if one not in signals.known]
-    torques = iter(signals.of([effect for one in new for effect in one.effects]))
-    for one in new:
-        signals.known[one] = one.columns(signals, [next(torques) for _ in one.effects])
+    for from_rest in (False, True):
+        some = [one for one in new if one.from_rest == from_rest]
+        torques = iter(signals.of([effect for one in some for effect in one.effects], from_rest))
+        for one in some:
+            signals.known[one] = one.columns(signals, [next(torques) for _ in one.effects])
     none = np.zeros((0, signals.count, len(signals.sides) + 1))
     return np.concatenate([none, *(signals.known[one] for one in candidates)])
 
 
 @jit
-def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direction: jax.Array) -> dict[int, jax.Array]:
+def _torques(
+    experiment: Experiment, effects: AbstractEffect, part: Part, direction: jax.Array, from_rest: bool
+) -> dict[int, jax.Array]:
     """Torques of effects of one name, leaves of shape (effects,), in a model that has those in the gear alone; shape
     (effects, samples) by side, -1 being the input."""
     drive, sides = experiment.drive, experiment.sides
@@ -264,7 +279,7 @@ def _torques(experiment: Experiment, effects: AbstractEffect, part: Part, direct
                 0: before[0] - after[0] + (rubbed[0] - rubbed[1]) * direction,
                 1: after[1] * after[0] - before[1] * before[0],
             }
-        (state,), acting = effect_path(with_effects(experiment, (effect,)), along)
+        (state,), acting = effect_path(with_effects(experiment, (effect,)), along, from_rest)
         if place == "actuator":
             return {-1: acting - part.torque}
         driving = part.torque if place == "motor" else 0.0

@@ -61,10 +61,19 @@ class Evidence(NamedTuple):
 
 
 def evidence_of(columns: Products, variants: Sequence[Candidate] = (), which: int | None = None) -> Evidence | None:
-    """Evidence of one of the candidates, or of the model without any; None where the numbers are not allowed."""
-    c = columns
-    places = [] if which is None else list(c.places[which])
-    fixed = np.array([0] if which is None or c.offsets[which] < 0 else [0, c.offsets[which]])
+    """Evidence of one of the candidates, or of the model without any; None where the numbers are not allowed.
+
+    A candidate that is linear about a value that was tried is left at this value where it would have to go too far.
+    """
+    if which is None:
+        return _evidence(columns, (), None, None)
+    places, offset = columns.places[which], columns.offsets[which]
+    found = _evidence(columns, places, offset, variants[which])
+    return _evidence(columns, (), offset, variants[which]) if found is None and offset >= 0 else found
+
+
+def _evidence(c: Products, places: Sequence[int], offset: int | None, candidate: Candidate | None) -> Evidence | None:
+    fixed = np.array([0] if offset is None or offset < 0 else [0, offset])
     # what has no torque along this record has no coefficient either
     alive = [k for k in (*range(1, 1 + c.own), *places) if np.isfinite(c.scale[k])]
     variance, middle = c.scale**2, c.centre.copy()
@@ -86,7 +95,7 @@ def evidence_of(columns: Products, variants: Sequence[Candidate] = (), which: in
         of, factor = c.twins[k]
         values[k] = c.centre[k] + factor * c.scale[k] ** 2 / variance[of] * away[of]
         values[of] -= factor * values[k]
-    numbers = {} if which is None else variants[which].numbers(values[places].tolist())
+    numbers = {} if candidate is None else candidate.numbers(values[list(places)].tolist() if places else [0.0])
     return None if numbers is None else Evidence(log_evidence, misfit, numbers, values[1 : 1 + c.own])
 
 

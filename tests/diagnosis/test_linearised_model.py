@@ -119,6 +119,21 @@ def test_a_candidates_torque_does_what_the_effect_does(tmp_path, name):
     assert size(found - expected) < 0.03 * size(expected)
 
 
+def test_a_lag_begins_with_what_had_lasted_or_at_rest(tmp_path):
+    base = linear(tmp_path, 2)
+    (signals,), lag = base.signals, as_arrays(make_effect("actuator.lag", time_constant=0.01), float)
+    steps, torque = base.period / 0.01, signals.torque[: signals.samples]
+    settled, rested = (signals.of([lag], from_rest)[0][: signals.samples, -1] for from_rest in (False, True))
+    assert torque[0] != 0.0 and settled[0] == pytest.approx(0.0, abs=1e-12)
+    # what the state at the first sample leaves until later
+    left = torque[0] * np.exp(-steps * np.arange(len(torque))) * -np.expm1(-steps) / steps
+    np.testing.assert_allclose(settled - rested, left, atol=1e-12)
+    both = variants_of(base.experiment, ["actuator.lag", "actuator.saturation"], base.scales)
+    assert sorted({(one.name, one.from_rest) for one in both}) == [
+        ("actuator.lag", False), ("actuator.lag", True), ("actuator.saturation", False)
+    ]  # fmt: skip
+
+
 def test_numbers_of_waves_are_those_of_the_effect(tmp_path):
     """A wave's two columns make up the effect that its numbers describe."""
     base = linear(tmp_path, 2)
