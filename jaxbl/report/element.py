@@ -59,7 +59,7 @@ def _remarks(summary: dict[str, Any]) -> list[str]:
     lines = [f"Not identifiable: {next(iter(one['direction']))}: {one['why']}." for one in summary["refused"]]
     for term, gain in element["gains"].items():
         lines.append(
-            f"Without {term} the torque error on parts of the log left out is {100 * ((1 + gain) ** 0.5 - 1):.2g} % larger."
+            f"Without {term} the torque error on parts of the log left out is {(1 + gain) ** 0.5:.3g} times as large."
         )
     lines.append(
         f"Torque error: {torque['rms']:.3g} {torque['unit']} rms, {100 * torque['relative']:.2g} % of the torque; "

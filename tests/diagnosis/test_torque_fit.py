@@ -1,0 +1,38 @@
+"""Numbers of least missing torque."""
+
+import jax
+import numpy as np
+import pytest
+from hidden_log import FRICTION, logged, model
+
+from jaxbl.diagnosis.diagnose import new_search
+from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
+from jaxbl.diagnosis.proof import fit_model
+from jaxbl.diagnosis.setup import set_up
+from jaxbl.diagnosis.torque_fit import fit_to_torque
+from jaxbl.identification.trajectory import with_fitted
+
+KIND, TORQUE = FRICTION["kind"], FRICTION["torque"]
+
+
+def test_a_complete_model_has_the_same_numbers_by_torque_wherever_the_fit_begins(tmp_path):
+    logged(("friction",)).write(tmp_path / "axis.csv")
+    task = read_diagnosis_task(tmp_path / "axis.csv", model())
+    with jax.enable_x64(True):
+        setup = set_up(task)
+        search = new_search(setup)
+        fitted = fit_model(search, {KIND: {"torque": TORQUE}}, np.zeros(len(setup.own)))
+        by_torque = fit_to_torque(search, fitted, setup.fitted)
+        assert by_torque.numbers[KIND]["torque"] == pytest.approx(TORQUE, rel=0.05)
+        deviation = np.sqrt(np.diag(by_torque.covariance))
+        assert np.all(
+            np.abs(by_torque.theta - fitted.theta) < 4.0 * np.hypot(deviation, np.sqrt(np.diag(fitted.covariance)))
+        )
+        assert np.all(deviation > 0.0) and by_torque.linear is not fitted.linear
+        theta = fitted.theta + np.array([0.03, -0.03, 0.3])
+        away = fitted._replace(theta=theta, experiment=with_fitted(fitted.experiment, fitted.free, theta))
+        again = fit_to_torque(search, away, setup.fitted)
+    # the prior weighs more where more torque is missing at first
+    np.testing.assert_allclose(again.theta, by_torque.theta, atol=3.0 * np.max(deviation))
+    missing = [np.std(setup.fitted.missing(one.experiment)["motor"]) for one in (away, again)]
+    assert missing[1] < 0.5 * missing[0]
