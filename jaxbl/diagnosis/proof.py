@@ -164,13 +164,14 @@ class Proof:
         """Standard errors by which a model beats the one without an effect, all numbers fitted anew.
 
         Where its own numbers can take the effect's place, the held-out data know nothing of it, and what is known of these
-        numbers decides: the deviations from it that they would need are added.
+        numbers decides: the deviations from it that they would need, beyond two, are added.
         """
         own, prior = len(self.setup.prior), self.setup.prior
         numbers = {one: values for one, values in fitted.numbers.items() if one != name}
         fewer = fit_model(search, numbers, fitted.theta[:own])
         without, by = (float(np.sum((one.theta[:own] / prior) ** 2)) for one in (fewer, fitted))
-        return beaten(self.other, self.other.compare(fewer.experiment), after) + np.sqrt(max(without - by, 0.0))
+        # what two deviations would explain is no sign of anything
+        return beaten(self.other, self.other.compare(fewer.experiment), after) + np.sqrt(max(without - by - SURE**2, 0.0))
 
     def plausible(self, fitted: FittedModel) -> bool:
         """Whether a model's own numbers are where they may be by what is known of them."""
