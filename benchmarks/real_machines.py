@@ -108,8 +108,10 @@ _BLOCKS = 16
 """Of held-out data: many enough for a standard error."""
 
 
-def _margin(own: np.ndarray, other: np.ndarray) -> float:
-    """Standard errors by which the squares of errors are less than those of another tool."""
+def _margin(own: np.ndarray, other: np.ndarray) -> float | None:
+    """Standard errors by which the squares of errors are less than those of another tool; None of too few of them."""
+    if len(own) < 4 * _BLOCKS:
+        return None
     gains = np.array([np.mean(block) for block in np.array_split(other**2 - own**2, _BLOCKS)])
     return float(np.mean(gains) / max(np.std(gains, ddof=1) / np.sqrt(_BLOCKS), 1e-300))
 
