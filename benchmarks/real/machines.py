@@ -1,7 +1,15 @@
 """Recordings of real machines: files, splits, nominal models, and what is published of them.
 
 Nominal numbers are those of a catalogue or publication where there is one, else rough ones; `[uncertainty]` says how rough.
-No file of the recordings is part of the project: each is found by name and checked by SHA-256.
+No file of the recordings is part of the project: each is found by name and checked by SHA-256. Where they come from:
+
+- emps: A. Janot, M. Gautier, M. Brunot, Data set and reference models of EMPS, Workshop on Nonlinear System Identification
+  Benchmarks (2019);
+- servo_1khz: GitHub, TeacherRock/Lorenz_Friction at 105c789;
+- bam_xl330: Rhoban, Better Actuator Models, recordings of a Dynamixel XL330;
+- flexible_link: GitHub, gleylaz/Optimal_SysID at 6eacf84;
+- screw_drives: GitHub, RViMLab/TRO2021-Dynamic-Modelling at c3b758b;
+- servoproject_dual_encoder: Adam Baeckstroem, ServoProject.
 """
 
 import hashlib

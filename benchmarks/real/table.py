@@ -105,7 +105,7 @@ _REASONS = {
 
 def markdown(rows: Sequence[Row], rivals: bool) -> str:
     """All rows as tables."""
-    lines = ["| recordings | verdict | explained | named by jaxbl, and its numbers | published | s |"]
+    lines = ["| recordings | verdict | explained | named by jaxbl, and its numbers | known | s |"]
     lines += ["|---|---|---:|---|---|---:|"]
     for one in rows:
         where = f"{one.name}<br>{one.split}"
@@ -179,6 +179,10 @@ _LOOKS = {
 }
 
 
+_MOST = 300.0
+"""Error in the figure at most, % of the driving torque: three times that of no model. A larger one is an arrow there."""
+
+
 def _figure(rows: Sequence[Row]) -> Figure:
     figure = Figure(figsize=(9.6, 1.6 + 0.42 * len(rows)))
     left, right = figure.subplots(1, 2, sharey=True)
@@ -198,9 +202,11 @@ def _figure(rows: Sequence[Row]) -> Figure:
             value = one.torques.get(tool)
             if value is not None:
                 label, colour, marker = _LOOKS[tool]
+                share = 100.0 * value / one.driving
                 right.plot(
-                    100.0 * value / one.driving, i + 0.15 * (j - 1.5), marker, color=colour, label=label if first else ""
-                )
+                    min(share, _MOST), i + 0.15 * (j - 1.5), marker if share <= _MOST else ">", color=colour,
+                    label=label if first else "",
+                )  # fmt: skip
     left.set_yticks(range(len(rows)), [one.name for one in rows])
     left.invert_yaxis()
     for axes, title in ((left, "by jaxbl's own account"), (right, "all tools behind one low-pass")):
