@@ -281,13 +281,15 @@ def _proved(proof: Proof, search: EffectSearch, found: Explanation) -> tuple[_Pr
         more = extended(best.search, best.found, proof.setup.fitted)
         if more is not best.found:
             # the log itself prefers it, too
-            best = best.or_better(proof, _exchanged(proof, best.search, more), SEEN)
-            expected = best.expected(proof.setup)
+            better = best.or_better(proof, _exchanged(proof, best.search, more), SEEN)
+            if better is not best:
+                best, expected = better, better.expected(proof.setup)
     after = best.accepted.after.errors
     share = explained_share(proof.setup.nominal, proof.before.errors, after, expected)
     if failed(after, expected) or is_little(share):
-        best = best.by_torque(proof)
-        expected = best.expected(proof.setup)
+        better = best.by_torque(proof)
+        if better is not best:
+            return better, better.expected(proof.setup)
     return best, expected
 
 
