@@ -47,7 +47,7 @@ def summary_of(setup: Setup, accepted: Accepted, found: Explanation) -> dict[str
     ]
     if accepted.by_torque > 0.0:
         notes.append(
-            "More than noise is left: the numbers are those of least missing torque. On the held-out data they are better "
+            "The model is not complete: its numbers are those of least missing torque. On the held-out data they are better "
             f"than those of least prediction errors by {accepted.by_torque:.1f} standard errors."
         )
     for one in found.findings:
