@@ -88,7 +88,7 @@ def _errors(row: Row, kind: str) -> str:
         if name.startswith(kind):
             limit = (gap["expected"].get(name) or {}).get("limit")
             after, noise = gap["holdout_rmse_after"][name], gap["noise_floor"][name]
-            mark = " **fails**" if name in gap["test"]["failed"] else ""
+            mark = " **fails**" if name in _failed(gap["test"]) else ""
             lines.append(
                 f"{name}: {_number(before)} → {_number(after)}, limit {_number(limit)}{mark}, noise {_number(noise)} "
                 f"{gap['units'][name]}"
@@ -101,6 +101,11 @@ _REASONS = {
     "little": "less than half of the missing torque", "contradicting": "logs contradict each other",
 }  # fmt: skip
 """Reasons against a verdict, beside errors."""
+
+
+def _failed(test: Mapping[str, Any]) -> list[str]:
+    """Channels that failed at any bandwidth."""
+    return list(dict.fromkeys(name.partition(" ")[0] for name in test["failed"]))
 
 
 def markdown(rows: Sequence[Row], rivals: bool) -> str:
@@ -129,7 +134,7 @@ def markdown(rows: Sequence[Row], rivals: bool) -> str:
     lines += ["| recordings | positions | torques | failed tests |", "|---|---|---|---|"]
     for one in done:
         test = one.summary["gap"]["test"]
-        why = [*test["failed"], *test["far"]]
+        why = [*_failed(test), *test["far"]]
         why += [text for key, text in _REASONS.items() if test[key]]
         lines.append(f"| {one.name} | {_errors(one, 'theta')} | {_errors(one, 'torque')} | {', '.join(why) or 'none'} |")
     lines += ["", *_compared(rows, rivals)]

@@ -145,9 +145,8 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
             raise InputError(f"{task.record.path}: the model's numbers cannot be fitted to this log; is its input complete?")
         share = explained_share(setup.nominal, proof.before.errors, after.errors, expected)
         apart = contradictions(task, fitted, setup.fitted, setup.holdout, found.model.linear.drive)
-        judgement = judged(
-            found, fitted, proof.before.errors, after.errors, expected, controls, setup.prior, share, bool(apart)
-        )
+        errors = proof.other.with_slow(proof.before), proof.other.with_slow(after)
+        judgement = judged(found, fitted, *errors, expected, controls, setup.prior, share, bool(apart))
         found = judgement.found
         done()
         doing("running the observers")
@@ -165,7 +164,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         summary["notes"] += notes
         summary["explained_share"] = share
         summary["contradictions"] = contradictions_of(task.record, fitted, apart)
-        summary["gap"] = proof.gap(fitted, after) | tested(judgement, expected, controls)
+        summary["gap"] = proof.gap(fitted, after) | tested(judgement, *errors, expected, controls)
         if found.verdict == "unknown_effect":
             segments = setup.fitted.segments
             coordinates = all_coordinates(fitted.experiment, segments, lacking_after, setup.sliding)
@@ -277,16 +276,16 @@ def _proved(proof: Proof, search: EffectSearch, found: Explanation) -> tuple[_Pr
         if again.model.names not in ((), best.accepted.fitted.names) and other.plausible(again):
             best = best.or_better(proof, _exchanged(proof, other, again), SURE)
     expected = best.expected(proof.setup)
-    if failed(best.accepted.after.errors, expected):
+    if failed(proof.other.with_slow(best.accepted.after), expected):
         more = extended(best.search, best.found, proof.setup.fitted)
         if more is not best.found:
             # the log itself prefers it, too
             better = best.or_better(proof, _exchanged(proof, best.search, more), SEEN)
             if better is not best:
                 best, expected = better, better.expected(proof.setup)
-    after = best.accepted.after.errors
-    share = explained_share(proof.setup.nominal, proof.before.errors, after, expected)
-    if failed(after, expected) or is_little(share):
+    after = best.accepted.after
+    share = explained_share(proof.setup.nominal, proof.before.errors, after.errors, expected)
+    if failed(proof.other.with_slow(after), expected) or is_little(share):
         better = best.by_torque(proof)
         if better is not best:
             return better, better.expected(proof.setup)

@@ -118,9 +118,17 @@ def _finding(
     }
 
 
-def tested(judgement: Judgement, expected: Mapping[str, Expected], controls: Sequence[Control]) -> dict[str, Any]:
-    """What the held-out errors of a complete model would be, which of them are larger, and the controls."""
+def tested(
+    judgement: Judgement,
+    before: Mapping[str, float],
+    after: Mapping[str, float],
+    expected: Mapping[str, Expected],
+    controls: Sequence[Control],
+) -> dict[str, Any]:
+    """What the held-out errors of a complete model would be, which of them are larger, and the controls; errors `before` and
+    `after` with those of slow torques."""
     return {
+        "slow_torques": {name: {"before": before[name], "after": after[name]} for name in after if " below " in name},
         "expected": {name: one._asdict() for name, one in expected.items()},
         "test": {
             "level": LEVEL,

@@ -34,6 +34,11 @@ _STEADY = 0.3
 """Change by the shuffling, over the torque, up to which it is no control: of unrelated torques it is 1.4."""
 PREDICTABLE = 0.02
 """Share of the motion that the initial speed's uncertainty may grow to where a free run is to say anything."""
+_SLOW = (2.0, 4.0, 8.0)
+"""Factors between the bandwidth and those below which missing torques are looked at once more: noise of torques falls with
+the bandwidth to the power 2.5, so that slow ones show better there."""
+_LEAST_VALUES = 8
+"""Independent values of a slow torque on the log at least."""
 _STATES, _STATES_OF_ONE_RUN = 8, 3
 """Initial states tried for each window, and for a free run, which determines its own much better."""
 
@@ -95,6 +100,20 @@ class ReferenceLog:
         for side in self.noise:
             found[f"velocity_{side}"] = _rms([np.asarray(one.smoothed[side].deviation(1)) for one in self.segments])
         return found | {name: _rms([one]) for name, one in self._narrowed(torques, "deviation").items()}
+
+    def with_slow(self, compared: Comparison) -> dict[str, float]:
+        """Errors of a comparison, and those of slow torques besides: `torque_motor below 12 Hz`, ..."""
+        return compared.errors | _all_rms(self.slow(compared.torques))
+
+    def slow(self, torques: Mapping[str, Sequence[Residual]], name: str = "torque") -> dict[str, np.ndarray]:
+        """Missing torques, or their noise, behind narrower low-passes, N m, by `torque_motor below 12 Hz` and so on."""
+        found = {}
+        for side, pieces in torques.items():
+            for cutoff in (self.bandwidth[side] / factor for factor in _SLOW):
+                if 2.0 * cutoff * sum(len(one.time) * one.period for one in pieces) >= _LEAST_VALUES:
+                    values = [getattr(narrowed(one, cutoff)[0], name) for one in pieces]
+                    found[f"torque_{side} below {cutoff:.3g} Hz"] = np.concatenate(values)
+        return found
 
     def _narrowed(self, torques: Mapping[str, Sequence[Residual]], name: str = "torque") -> dict[str, np.ndarray]:
         """Missing torques, or their noise, behind the low-pass, N m."""

@@ -143,10 +143,11 @@ def _reasons(summary: Mapping[str, Any]) -> list[str]:
     """Why a model does not count as complete, one line each."""
     gap, test, lines = summary["gap"], summary["gap"]["test"], []
     if test["failed"]:
+        after = gap["holdout_rmse_after"] | {name: one["after"] for name, one in gap.get("slow_torques", {}).items()}
         over = [
-            f"{name} {rms_text(gap['holdout_rmse_after'][name])} {gap['units'][name]} "
+            f"{name} {rms_text(after[name])} {gap['units'][name.partition(' ')[0]]} "
             f"(at most {rms_text(gap['expected'][name]['limit'])})"
-            for name in test["failed"]
+            for name in _plainest(test["failed"], after, gap["expected"])
         ]
         lines.append(
             "More is left than noise, the uncertainty of the numbers and torques too small to be named account for "
@@ -168,6 +169,14 @@ def _reasons(summary: Mapping[str, Any]) -> list[str]:
     if test["chance"]:
         lines.append("Shuffled in time, the torque that was added does as well.")
     return lines
+
+
+def _plainest(failed: Sequence[str], after: Mapping[str, float], expected: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Of each channel the failed test that shows it best: a torque may fail at several bandwidths."""
+    best: dict[str, str] = {}
+    for name in sorted(failed, key=lambda name: -after[name] / expected[name]["limit"]):
+        best.setdefault(name.partition(" ")[0], name)
+    return list(best.values())
 
 
 def _number(leaf: str, one: Mapping[str, Any]) -> str:
@@ -230,7 +239,10 @@ def _remarks(summary: dict[str, Any]) -> list[str]:
     after = summary["gap"]["holdout_rmse_after"]
     for name, control in summary["gap"]["controls"].items():
         effect = f" ({control['effect']})" if "effect" in control else ""
-        channel = max(summary["gap"]["expected"], key=lambda name: _worse(control["rmse"], after, name))
+        channel = max(
+            (name for name in summary["gap"]["expected"] if name in after),
+            key=lambda name: _worse(control["rmse"], after, name),
+        )
         what = {"wrong": "the best model with another effect", "permuted": "the missing torque shuffled in time"}[name]
         left = control["rmse"][channel]
         error = "diverges"
