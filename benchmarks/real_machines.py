@@ -7,23 +7,21 @@ version is said in one line, and its row is left out.
     python benchmarks/real_machines.py --data ../shared/data
     python benchmarks/real_machines.py --data ../shared/data --only emps servo_1khz --rivals --out results/real
 
-`--rivals` fits two other tools to the same logs, on terms of filtered derivatives (4th-order Butterworth forth and back,
-central differences): inertia, viscous and Coulomb friction, Stribeck friction, constant torque, quadratic drag, viscous
-friction by direction, up to 40 periods a turn, and the twist of a shaft.
+`--rivals` fits three other tools to the same logs; two of them on terms of filtered derivatives (4th-order Butterworth forth
+and back, central differences): inertia, viscous and Coulomb friction, Stribeck friction, constant torque, quadratic drag,
+viscous friction by direction, up to 40 periods a turn, and the twist of a shaft.
 
 - stepwise least squares: a term is added if it takes 3 % off the rms of a blocked cross-validation, and more than one
   standard error of the blocks' gains;
-- pysindy (`pip install pysindy`): sequentially thresholded ridge regression, threshold and ridge by the same blocks.
+- pysindy (`pip install pysindy`): sequentially thresholded ridge regression, threshold and ridge by the same blocks;
+- mujoco (`pip install "mujoco[sysid]"`, 4.0): the numbers that a MuJoCo joint has (inertia, damping, dry friction, gravity
+  on a rotary axis, a spring between two inertias), fitted to the positions over windows of 0.5 s. It names nothing.
 
 All torque errors of that comparison are those of the same filtered derivatives, behind the same low-pass: the equation of
 motion of the model that jaxbl returned is applied to them as the terms of the others are, and its error is referred to the
 input. Its own account (errors before, after, limit) is on its smoothed motion, behind a low-pass that it chose; that would
 favour it in a comparison. Where the drive is at rest (a speed within its noise) nothing is compared, and nothing fitted by
 the others: dry friction takes there what it has to. All tools have the positions as jaxbl turned them to one zero.
-
-mujoco.sysid (MuJoCo 4) is not among them: it fits numbers that it is given (mass, damping, friction loss) and looks for none
-that are missing; a joint of MuJoCo has neither a ripple over the turn nor a constant torque without an actuator of its own,
-and its dry friction is a soft constraint. What is compared here is which effects are named.
 """
 
 import argparse
@@ -36,6 +34,7 @@ from pathlib import Path
 import numpy as np
 from real.derivatives import Part, parts_of, terms_of, torque_error
 from real.machines import CASES, Case, logs_of, unfit
+from real.mujoco_sysid import sysid
 from real.rivals import sindy, stepwise
 from real.table import Row, markdown, row_of, write
 
@@ -95,8 +94,13 @@ def _compare(row: Row, case: Case, task, model, rivals: bool) -> None:
     travel = max(float(np.ptp(one.kinematics.position["motor"])) for one in fitted)
     terms, other = (terms_of(parts, task.config, linear, (speed, travel)) for parts in (fitted, held))
     others = []
-    for name, tool in (("stepwise", stepwise), ("pysindy", sindy)):
-        found = tool(terms, other)
+    tools = {
+        "stepwise": lambda: stepwise(terms, other),
+        "pysindy": lambda: sindy(terms, other),
+        "mujoco": lambda: sysid(fitted, held, task.config, linear),
+    }
+    for name, tool in tools.items():
+        found = tool()
         row.rivals[name], row.torques[name] = found.said(), found.rms
         others += [found.left] if found.rms is not None else []
     # beside all of them or none

@@ -13,7 +13,7 @@ from jaxbl.report.figures import COLOURS, save, style
 
 from .machines import Case
 
-TOOLS = ("nominal", "jaxbl", "stepwise", "pysindy")
+TOOLS = ("nominal", "jaxbl", "stepwise", "pysindy", "mujoco")
 
 
 @dataclass
@@ -156,8 +156,8 @@ def _compared(rows: Sequence[Row], rivals: bool) -> list[str]:
             cells.append("–" if one.margin is None else f"{one.margin:+.1f} standard errors")
         lines.append(f"| {one.name} | {one.cutoff:g} Hz | {' | '.join(cells)} |")
     if rivals:
-        lines += ["", "| recordings | stepwise least squares | pysindy |", "|---|---|---|"]
-        lines += [f"| {one.name} | {_rival(one.rivals['stepwise'])} | {_rival(one.rivals['pysindy'])} |" for one in some]
+        lines += ["", "| recordings | stepwise least squares | pysindy | mujoco |", "|---|---|---|---|"]
+        lines += [f"| {one.name} | {' | '.join(_rival(one.rivals[tool]) for tool in TOOLS[2:])} |" for one in some]
     return lines
 
 
@@ -181,6 +181,7 @@ _LOOKS = {
     "jaxbl": ("jaxbl", COLOURS[0], "D"),
     "stepwise": ("stepwise least squares", COLOURS[1], "s"),
     "pysindy": ("pysindy", COLOURS[3], "^"),
+    "mujoco": ("mujoco.sysid", COLOURS[4], "v"),
 }
 
 
@@ -201,7 +202,13 @@ def _figure(rows: Sequence[Row]) -> Figure:
         left.plot([before, after], [i, i], color="#BBBBBB", zorder=1)
         left.plot(before, i, "o", color=COLOURS[6], label="before" if first else "")
         left.plot(after, i, "D", color=COLOURS[0], label="after" if first else "")
-        left.plot([limit, limit], [i - 0.3, i + 0.3], color=COLOURS[1], linewidth=2.0, label="limit" if first else "")
+        left.plot(
+            [limit, limit],
+            [i - 0.3, i + 0.3],
+            color=COLOURS[1],
+            linewidth=2.0,
+            label="limit, full bandwidth" if first else "",
+        )
         left.plot([noise, noise], [i - 0.3, i + 0.3], color="#999999", linestyle=":", label="noise" if first else "")
         for j, tool in enumerate(TOOLS):
             value = one.torques.get(tool)
@@ -209,7 +216,7 @@ def _figure(rows: Sequence[Row]) -> Figure:
                 label, colour, marker = _LOOKS[tool]
                 share = 100.0 * value / one.driving
                 right.plot(
-                    min(share, _MOST), i + 0.15 * (j - 1.5), marker if share <= _MOST else ">", color=colour,
+                    min(share, _MOST), i + 0.15 * (j - 2.0), marker if share <= _MOST else ">", color=colour,
                     label=label if first else "",
                 )  # fmt: skip
     left.set_yticks(range(len(rows)), [one.name for one in rows])
