@@ -12,6 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
 
+from threadpoolctl import threadpool_limits
+
 from .errors import NoResult
 
 Job = TypeVar("Job")
@@ -42,6 +44,14 @@ def doing(what: str) -> None:
     """Say what is being done now, in a few words: the progress line of a terminal shows it."""
     for listener in _listeners:
         listener(what)
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Keep BLAS to one thread: matrices are small here, and where cores are shared threads wait longer for one another than
+    they compute."""
+    with threadpool_limits(1, "blas"):
+        yield
 
 
 def cores() -> int:

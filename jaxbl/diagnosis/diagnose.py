@@ -20,7 +20,7 @@ from jaxbl.files import plain
 from jaxbl.identification.logs import Logs, arrays, gains_for, stage_counter
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
-from jaxbl.workers import Progress, doing
+from jaxbl.workers import Progress, doing, one_blas_thread
 
 from .coordinates import CoordinateValues, all_coordinates
 from .diagnosis_summary import (
@@ -123,7 +123,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
     """
     alone = task.config.drive.kind == "two_inertia" and "load" not in task.record.positions
     done = stage_counter(_STAGES_ALONE if alone else _STAGES, progress)
-    with jax.enable_x64(True):
+    with jax.enable_x64(True), one_blas_thread():
         if alone:
             found = diagnose_alone(task, done)
             return Diagnosis(
@@ -277,7 +277,7 @@ def _proved(proof: Proof, search: EffectSearch, found: Explanation) -> tuple[_Pr
             best = best.or_better(proof, _exchanged(proof, other, again), SURE)
     expected = best.expected(proof.setup)
     if failed(proof.other.with_slow(best.accepted.after), expected):
-        more = extended(best.search, best.found, proof.setup.fitted)
+        more = extended(best.search, best.found, best.accepted.fitted, proof.setup.fitted)
         if more is not best.found:
             # the log itself prefers it, too
             better = best.or_better(proof, _exchanged(proof, best.search, more), SEEN)

@@ -8,6 +8,7 @@ something else is missing.
 """
 
 import dataclasses
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
@@ -44,9 +45,9 @@ FAR = 5.0
 _WEAK = 6.0
 """Standard errors of an effect's torque below which the effect is asked for once more: an error of the first fit may be as
 large."""
-_REFIT_STEPS, _REFIT_SETTLED = 15, 2e-3
-"""Gauss-Newton steps of a refit at most, and the relative change of all numbers below which it has ended. The last fit is
-exact (:mod:`.refit`); evidences are compared at this one."""
+_REFIT_STEPS, _REFIT_SETTLED, _REFIT_GAIN = 15, 2e-3, 0.02
+"""Gauss-Newton steps of a refit at most; the relative change of all numbers, and twice the logarithm of the likelihood that
+a step may promise, below which it has ended. The last fit is exact (:mod:`.refit`); evidences are compared at this one."""
 _LEAST_GAIN = 1e-3
 """Nats; what gains less in a screening gains nothing but rounding."""
 _SAME = 3.0
@@ -66,7 +67,7 @@ _SIZES = 1.0, 0.3, 0.1, 0.03, 0.01, 0.003
 _MOST = 5
 """Effects that are sought: a servo motor shows dry and viscous friction, a constant torque, two waves of cogging."""
 _RECENT = 4
-"""Models along the record that are kept: where a refit ended, the next one begins."""
+"""Models along the record, and refits, that are kept: where one ended the next one begins; some are asked for again."""
 LEAST = 1e-3
 """Share of the driving torque that an effect must have to be named; the error of time stepping is a twentieth of it."""
 FLOOR = 0.006
@@ -174,13 +175,14 @@ class _Tried(NamedTuple):
 
 
 class _Point(NamedTuple):
-    """A model at some numbers: sum of squares with the prior's, and the linear step from there."""
+    """A model at some numbers: sum of squares with the prior's, and the linear step from there and what that promises."""
 
     linear: Linear
     values: dict[str, Numbers]
     theta: np.ndarray
     found: Evidence
     cost: float
+    promised: float
 
 
 class EffectSearch:
@@ -210,6 +212,8 @@ class EffectSearch:
         self.segments = segments
         self.floor = FLOOR * sum(map(len, segments)) * len(experiment.sides)
         self._recent: dict[tuple, Linear] = {}
+        self._models: dict[tuple, Model] = {}
+        self._asked: Counter[tuple[str, ...]] = Counter()
         self._refitted: tuple[tuple, Refined] | None = None
 
     def refitted(self, values: Mapping[str, Numbers], theta: np.ndarray) -> Refined:
@@ -244,11 +248,22 @@ class EffectSearch:
             widths = [EFFECTS[name].roles()[leaf].width for name in values for leaf in _fitted_numbers(name)]
             prior, at = np.concatenate([self.prior, widths]), np.concatenate([theta, np.zeros(len(added))])
             bound = np.concatenate([np.full(len(self.free), self.bound), np.full(len(added), np.inf)])
-            self._recent[key] = Linear(experiment, (*self.free, *added), at, prior, self.segments, bound)
+            self._recent[key] = Linear(
+                experiment, (*self.free, *added), at, prior, self.segments, bound, self._asked[(*values,)]
+            )
+            self._asked[(*values,)] += 1
         return self._recent[key]
 
     def refit(self, values: Mapping[str, Numbers], theta: np.ndarray, predictor: Predictor) -> Model:
         """Put effects into the model and refit everything."""
+        key = _key(values, theta), tuple(predictor.smoothness), predictor.deviation.tobytes()
+        if key not in self._models:
+            if len(self._models) == _RECENT:
+                self._models.pop(next(iter(self._models)))
+            self._models[key] = self._fitted(values, theta, predictor)
+        return self._models[key]
+
+    def _fitted(self, values: Mapping[str, Numbers], theta: np.ndarray, predictor: Predictor) -> Model:
         values = {name: dict(numbers) for name, numbers in values.items()}
         best: _Point | None = None
         change = np.zeros(0)
@@ -260,7 +275,7 @@ class EffectSearch:
                 best, change = point, np.clip(point.found.own, -1.0, 1.0)
             else:
                 change = 0.25 * change
-            if np.max(np.abs(change), initial=0.0) < _REFIT_SETTLED:
+            if np.max(np.abs(change), initial=0.0) < _REFIT_SETTLED or abs(best.promised) < _REFIT_GAIN:
                 break
             theta, values = self._moved(best, change)
         if best is None or not all(EFFECTS[name].possible(one) for name, one in best.values.items()):
@@ -282,9 +297,11 @@ class EffectSearch:
         if np.max(np.abs(columns.products)) < DIVERGED and np.isfinite(scale[1:]).all():
             found = evidence_of(dataclasses.replace(columns, scale=scale))
         if found is None:
-            return _Point(linear, values, theta, Evidence(-np.inf, np.inf, {}, np.zeros(0)), np.inf)
+            return _Point(linear, values, theta, Evidence(-np.inf, np.inf, {}, np.zeros(0)), np.inf, 0.0)
         cost = float(columns.products[0, 0] + np.sum((theta / self.prior) ** 2))
-        return _Point(linear, values, theta, found, cost)
+        own = len(theta)
+        promised = cost - found.misfit - float(np.sum(((theta + found.own[:own]) / self.prior) ** 2))
+        return _Point(linear, values, theta, found, cost, promised)
 
     def _moved(self, point: _Point, change: np.ndarray) -> tuple[np.ndarray, dict[str, Numbers]]:
         count = len(self.free)

@@ -13,6 +13,7 @@ References: L. Ljung, System Identification (1999), 7.4; M. Basseville, Detectin
 Automatica 24 (1988), for the local approach.
 """
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -32,19 +33,22 @@ from jaxbl.identification.prediction import kalman_gain
 from jaxbl.identification.regression import Path, effect_states
 from jaxbl.identification.segments import Segment
 from jaxbl.identification.trajectory import Free, with_fitted
-from jaxbl.simulate import Experiment
+from jaxbl.simulate import Experiment, with_effects
 
 from .candidates import SHARE, SPACING, Candidate, MotionTorques, Part, all_of_the_input, forces_of, rms
 from .evidence import Products
-from .neutral_effects import bucket, corrected, with_torques
+from .neutral_effects import acting, bucket, corrected, with_torques
 from .whittle import Spectrum, weighted_products
 
 _SAMPLES = 1024
 """Least padded length of a part, so that records of about one length share their compiled programs."""
+_OFTEN = 2**16
+"""Samples along which a model has been linearised before a program without the effects that do nothing is worth compiling: it
+takes a fifth of the time, and as long to compile as the other one takes for so many samples."""
 
 
-def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segment: Segment) -> Part:
-    """A model along a segment, where its free numbers are at theta."""
+def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segment: Segment, often: bool) -> Part:
+    """A model along a segment, where its free numbers are at theta; `often`: by a program of its own."""
     sides, smoothed = experiment.sides, segment.smoothed
     experiment, added = with_torques(experiment)
     count = len(segment)
@@ -76,6 +80,10 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
     # as they may differ from sample to sample elsewhere, where the same loop serves
     none = {path: np.zeros(size) for path in added.values()}
     ways = _directions(free, theta, at, order, list(added.values()))
+    if often:
+        kept = acting(experiment, [*(one.path for one in free), *added.values()])
+        experiment = with_effects(experiment, tuple(experiment.effects[i] for i in kept))
+        motion = dataclasses.replace(motion, effects=tuple(motion.effects[i] for i in kept))
     slope, value = slopes(experiment, motion, torque, time, ways, none)
     slope, value = slope[:, order].transpose(2, 1, 0), value[order].T
     vectors = np.stack(jax.tree.leaves(motion), axis=1)[:, order]
@@ -292,6 +300,7 @@ class Linear:
         prior: np.ndarray,
         segments: Sequence[Segment],
         bound: np.ndarray | None = None,
+        before: int = 0,
     ):
         """Linearise a model about the motion of a log.
 
@@ -301,12 +310,14 @@ class Linear:
             prior: standard deviation of each theta about 0.
             segments: of the log.
             bound: how many standard deviations each may be from 0 at most; left out: any number.
+            before: how often a model with these effects has been linearised before.
         """
         self.bound = np.full(len(free), np.inf) if bound is None else bound
         self.free, self.theta, self.prior = tuple(free), np.asarray(theta), prior
         self.experiment = with_fitted(experiment, free, self.theta)
         self.period, self.sides = segments[0].period, experiment.sides
-        self.parts = [_part(self.experiment, free, self.theta, one) for one in segments]
+        often = before * sum(map(len, segments)) > _OFTEN
+        self.parts = [_part(self.experiment, free, self.theta, one, often) for one in segments]
         self.signals = [MotionTorques(self.experiment, part) for part in self.parts]
         self.count = sum(int(one.real.sum()) for one in self.signals)
         self.states = self.parts[0].defect.shape[1]

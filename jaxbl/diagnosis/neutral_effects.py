@@ -72,6 +72,19 @@ def complete(experiment: Experiment, acting: Collection[str] = ()) -> Experiment
     return with_effects(experiment, tuple(effects))
 
 
+def acting(experiment: Experiment, free: Collection[str] = ()) -> list[int]:
+    """Indices of the effects that do something, or may: those not at neutral numbers, and those with `free` numbers."""
+    may = {path.rpartition(".")[0].removeprefix("effects.") for path in free if path.startswith("effects.")}
+    return [i for i, one in enumerate(experiment.effects) if one.name in may or not _is_neutral(one)]
+
+
+def _is_neutral(effect: AbstractEffect) -> bool:
+    if effect.name not in EFFECTS or not EFFECTS[effect.name].neutral():
+        return False
+    pairs = zip(jax.tree.leaves(effect), jax.tree.leaves(_neutral(effect.name)), strict=True)
+    return all(np.array_equal(one, other) for one, other in pairs)
+
+
 class _AddedTorque(ConstantTorque):
     """A torque on a side, beside what the model has there; a name of its own."""
 

@@ -26,7 +26,7 @@ from .linearised_model import Linear, Predictor
 _STEPS = 25
 """Of Gauss-Newton at most in a round, rejected ones among them."""
 _SETTLED = 0.02
-"""Twice the logarithm of the likelihood that a further step may gain."""
+"""Twice the logarithm of the likelihood that a further step may promise, or the last one has gained."""
 _ROUNDS = 2
 """Choices of the predictor, each followed by a fit."""
 
@@ -73,6 +73,7 @@ class _Refiner:
 
     def __init__(self, experiment: Experiment, free: Sequence[Free], width: np.ndarray, segments: Sequence[Segment]):
         self.experiment, self.free, self.width, self.segments = experiment, tuple(free), width, segments
+        self.before = 0
 
     def start(self) -> list[np.ndarray]:
         """Positions and velocities at the first sample of each segment, as they were smoothed."""
@@ -82,7 +83,9 @@ class _Refiner:
 
     def at(self, theta: np.ndarray, start: list[np.ndarray], smoothness: Sequence[float]) -> _Point:
         """Prediction errors along the path of the predictor."""
-        linear = Linear(self.experiment, self.free, theta, self.width, self._path(theta, start, smoothness))
+        path = self._path(theta, start, smoothness)
+        linear = Linear(self.experiment, self.free, theta, self.width, path, before=self.before)
+        self.before += 1
         predictor = linear.predictor(smoothness)
         cost = float(linear.count * np.sum(np.log(predictor.given)) + np.sum((theta / self.width) ** 2))
         return _Point(theta, start, linear, predictor, cost if np.isfinite(cost) else np.inf)
@@ -127,10 +130,14 @@ class _Refiner:
                 change = share * np.clip(by[0][1 : 1 + len(self.free)], -1.0, 1.0)
                 start = [one + share * at[-best.linear.states :][: len(one)] for one, at in zip(best.start, by, strict=True)]
                 tried = self.at(best.theta + change, start, smoothness)
-                if tried.cost < best.cost:
-                    best, share = tried, min(1.0, 3.0 * share)
-                else:
+                if not tried.cost < best.cost:
                     share *= 0.25
+                    continue
+                gained = best.cost - tried.cost
+                best, share = tried, min(1.0, 3.0 * share)
+                # where errors are not linear in the numbers a step may promise more than there is
+                if gained < _SETTLED:
+                    break
         return best
 
     def covariance(self, point: _Point) -> tuple[np.ndarray, np.ndarray]:

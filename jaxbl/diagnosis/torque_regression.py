@@ -53,25 +53,27 @@ class _Tried(NamedTuple):
     z: float
 
 
-def extended(search: EffectSearch, found: Explanation, log: ReferenceLog) -> Explanation:
+def extended(search: EffectSearch, found: Explanation, fitted: FittedModel, log: ReferenceLog) -> Explanation:
     """An explanation with what a regression on the missing torque adds; the same one if it adds nothing.
 
     Args:
         search: that found it.
         found: the explanation.
+        fitted: the model with it.
         log: the log that was searched, whose low-pass missing torques are looked at behind.
     """
     for _ in range(_ADDED):
-        more = _with_one_more(search, found, log)
+        more = _with_one_more(search, found, fitted, log)
         if more is None:
             break
-        found = more
+        found, fitted = more
     return found
 
 
-def _with_one_more(search: EffectSearch, found: Explanation, log: ReferenceLog) -> Explanation | None:
+def _with_one_more(
+    search: EffectSearch, found: Explanation, now: FittedModel, log: ReferenceLog
+) -> tuple[Explanation, FittedModel] | None:
     model = found.model
-    now = fit_model(search, model.numbers, model.theta)
     compared = log.compare(now.experiment)
     tried: list[_Tried] = []
     # what the search preferred a simpler effect to, with the numbers that it had there
@@ -103,7 +105,8 @@ def _with_one_more(search: EffectSearch, found: Explanation, log: ReferenceLog) 
     if confidence < _NAMED:
         return None
     findings.append(Finding(best.name, confidence, best.fitted.numbers[best.name], alternatives))
-    return search.adopted(found, best.fitted.numbers, best.fitted.theta[: len(search.free)], findings)
+    adopted = search.adopted(found, best.fitted.numbers, best.fitted.theta[: len(search.free)], findings)
+    return adopted, best.fitted
 
 
 def _less(after: Comparison, before: Comparison) -> bool:

@@ -19,7 +19,7 @@ from jaxbl.drive.parameters import set_leaves
 from jaxbl.files import plain
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
-from jaxbl.workers import Progress
+from jaxbl.workers import Progress, one_blas_thread
 
 from .identification_summary import by_regression, by_trajectories, on_holdout, summary_of, torque_errors
 from .intervals import profile
@@ -113,7 +113,7 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
     assert record.torque is not None
     alone = config.drive.kind == "two_inertia" and "load" not in record.positions
     done = stage_counter(_STAGES_ALONE if alone else _STAGES, progress)
-    with jax.enable_x64(True):
+    with jax.enable_x64(True), one_blas_thread():
         nominal = on_record(config, record)
         paths = list(settings.parameters or default_paths(config, nominal))
         free = free_parameters(nominal, paths, float(np.std(record.torque)))
