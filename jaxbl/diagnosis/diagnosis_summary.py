@@ -43,7 +43,8 @@ def summary_of(setup: Setup, accepted: Accepted, found: Explanation) -> dict[str
     if task.separate:
         notes += [f"{task.holdout.path.name}: {note}" for note in task.holdout.notes if note not in record.notes]
     notes += [
-        f"{name} was found, and withdrawn: with it the held-out data are met no better." for name in accepted.withdrawn
+        f"{name} was found, and withdrawn: with it the held-out data are not surely met better."
+        for name in accepted.withdrawn
     ]
     if accepted.by_torque > 0.0:
         notes.append(

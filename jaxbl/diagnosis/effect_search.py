@@ -248,9 +248,8 @@ class EffectSearch:
             widths = [EFFECTS[name].roles()[leaf].width for name in values for leaf in _fitted_numbers(name)]
             prior, at = np.concatenate([self.prior, widths]), np.concatenate([theta, np.zeros(len(added))])
             bound = np.concatenate([np.full(len(self.free), self.bound), np.full(len(added), np.inf)])
-            self._recent[key] = Linear(
-                experiment, (*self.free, *added), at, prior, self.segments, bound, self._asked[(*values,)]
-            )
+            before, free = self._asked[(*values,)], (*self.free, *added)
+            self._recent[key] = Linear(experiment, free, at, prior, self.segments, bound, before)
             self._asked[(*values,)] += 1
         return self._recent[key]
 

@@ -16,7 +16,8 @@ from scipy.special import gammaincinv
 
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.identification.logs import arrays
-from jaxbl.identification.segments import Segment
+from jaxbl.identification.segments import Segment, white_noise
+from jaxbl.records import POSITION_CHANNELS
 from jaxbl.simulate import Experiment
 
 from .effect_search import LEAST
@@ -63,8 +64,8 @@ class Expected(NamedTuple):
 def expected_errors(
     log: ReferenceLog, fitted: FittedModel, base: Comparison, noise: InputNoise, driving: float
 ) -> dict[str, Expected]:
-    """Errors of a model if it is complete, in positions, missing torques, and slow ones (:meth:`.ReferenceLog.slow`); speeds
-    are the positions' over again.
+    """Errors of a model if it is complete, in positions, missing torques, and slow ones
+    (:meth:`.reference_log.ReferenceLog.slow`); speeds are the positions' over again.
 
     Args:
         log: held out.
@@ -75,6 +76,12 @@ def expected_errors(
     random, slow = np.random.default_rng(0), log.slow(base.torques)
     floor = log.noise_floor(base.torques)
     floor |= {name: float(np.sqrt(np.mean(one**2))) for name, one in log.slow(base.torques, "deviation").items()}
+    for side, noise_of in log.noise.items():
+        # where a motion is rough the smoother takes noise for motion; what a torque does is never white in a position
+        more = max(white_noise(list(base.samples[POSITION_CHANNELS[side]])) / noise_of, 1.0)
+        for name in floor:
+            if name == POSITION_CHANNELS[side] or name.startswith(f"torque_{side}"):
+                floor[name] *= more
     samples = base.samples | slow
     values, vectors = np.linalg.eigh(fitted.white)
     root = vectors * np.sqrt(np.maximum(values, 0.0))

@@ -53,6 +53,7 @@ def judged(
     prior: np.ndarray,
     share: float | None,
     contradicting: bool = False,
+    gains: Mapping[str, float] | None = None,
 ) -> Judgement:
     """Judge an explanation.
 
@@ -65,12 +66,14 @@ def judged(
         prior: standard deviations of its own numbers, which are the first of `fitted`.
         share: of the missing torque that it explains (:func:`explained_share`).
         contradicting: whether the logs do not agree on its numbers (:mod:`.numbers_by_log`).
+        gains: standard errors by which the held-out data are met better with each effect than without it.
     """
     left = failed(errors, expected)
     away = fitted.theta[: len(prior)] / prior
     far = {one.path: float(z) for one, z in zip(fitted.free, away, strict=False) if abs(z) > FAR}
     chance = any(one.kind == "permuted" and one.z < SURE for one in controls)
-    findings = tuple(_beside_special_case(_no_surer(one, fitted), fitted) for one in found.findings)
+    seen = {one.effect: (gains or {}).get(one.effect, np.inf) for one in found.findings}
+    findings = tuple(_beside_special_case(_no_surer(one, fitted, seen[one.effect]), fitted) for one in found.findings)
     for one in controls:
         if one.kind == "wrong" and found.wrong is not None:
             last = fitted.names[-1]
@@ -85,13 +88,13 @@ def judged(
     return Judgement(said, left, far, chance, remainder, powerless, little, contradicting)
 
 
-def _no_surer(finding: Finding, fitted: FittedModel) -> Finding:
-    """A finding no surer than that its torque is not zero."""
+def _no_surer(finding: Finding, fitted: FittedModel, gain: float) -> Finding:
+    """A finding no surer than that its torque is not zero, nor than that it makes the model better on held-out data."""
     cls, errors = EFFECTS[finding.effect], fitted.errors()
     # of an effect without sizes its other numbers have to be known
     paths = [f"effects.{finding.effect}.{leaf}" for leaf in cls.sizes() or cls.roles()]
     z = [abs(float(get_leaf(fitted.experiment, path))) / max(errors[path], 1e-300) for path in paths if path in errors]
-    chance = float(2.0 * ndtr(max(z)) - 1.0) if z else 1.0
+    chance = min(float(2.0 * ndtr(max(z)) - 1.0) if z else 1.0, float(ndtr(gain)))
     return finding if finding.confidence <= chance else dataclasses.replace(finding, confidence=chance)
 
 

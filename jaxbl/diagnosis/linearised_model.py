@@ -43,8 +43,8 @@ from .whittle import Spectrum, weighted_products
 _SAMPLES = 1024
 """Least padded length of a part, so that records of about one length share their compiled programs."""
 _OFTEN = 2**16
-"""Samples along which a model has been linearised before a program without the effects that do nothing is worth compiling: it
-takes a fifth of the time, and as long to compile as the other one takes for so many samples."""
+"""Samples along which a model has been linearised before a program without the effects that do nothing is worth compiling:
+it takes a fifth of the time, and as long to compile as the other one takes for so many samples."""
 
 
 def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segment: Segment, often: bool) -> Part:

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import get_leaf, leaf_paths
 from jaxbl.identification.logs import unit_on
 from jaxbl.identification.trajectory import Free
@@ -68,6 +69,15 @@ class FittedModel(NamedTuple):
         """Standard errors of the values."""
         deviation = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         return {one.path: float(one.slope(self.theta[i])) * deviation[i] for i, one in enumerate(self.free)}
+
+
+def _least_gain(name: str) -> float:
+    """Standard errors by which an effect has to make a model better on held-out data.
+
+    Frequency and phase of a wave in time were chosen among many: it imitates whatever is slow or random, but then it does
+    not go on in other data.
+    """
+    return SURE if EFFECTS[name].in_time else SEEN
 
 
 def free_values(free: Sequence[Free], theta: np.ndarray) -> dict[str, float]:
@@ -135,16 +145,16 @@ class Proof:
     def accepted(self, search: EffectSearch, found: Explanation) -> Accepted:
         """The model with what was found, as far as the held-out data bear it out.
 
-        Withdrawn, one after the other, are effects without which a model does as well there, the one of least torque first,
-        since beside it others may only seem needless; and while the model is worse than the one given, the effect without
-        which it does best.
+        Withdrawn, one after the other, are effects without which a model does about as well there, the one of least torque
+        first, since beside it others may only seem needless; and while the model is worse than the one given, the effect
+        without which it does best.
         """
         names, withdrawn = list(found.model.names), []
         while names:
             fitted = fit_model(search, {name: found.model.numbers[name] for name in names}, found.model.theta)
             after = self.other.compare(fitted.experiment)
             gains = {name: self._gain(search, fitted, after, name) for name in names}
-            needless = [name for name in names if not gains[name] > 0.0]
+            needless = [name for name in names if not gains[name] > _least_gain(name)]
             if not needless and not self.worse(after, self.before):
                 return Accepted(fitted, after, withdrawn, gains)
             gone = min(needless, key=fitted.share) if needless else min(names, key=lambda name: gains[name])
