@@ -15,16 +15,22 @@ from jaxbl.diagnosis.proof import fit_model
 from jaxbl.diagnosis.setup import set_up
 
 
-def errors_of(folder, log, effects):
-    """Errors of a model with some effects on the last quarter of a log, and what is expected of a complete one."""
+def errors_of(folder, log, effects, noise=None):
+    """Errors of a model with some effects on the last quarter of a log, and what is expected of a complete one; `noise`: of
+    the readings as a smoother would have it, rad."""
     log.write(folder / "axis.csv")
     task = read_diagnosis_task(folder / "axis.csv", model())
     with jax.enable_x64(True):
         setup = set_up(task)
         fitted = fit_model(new_search(setup), effects, np.zeros(len(setup.own)))
-        after = setup.holdout.compare(fitted.experiment)
-        expected = expected_errors(setup.holdout, fitted, after, setup.input_noise, 0.5)
-        return setup.holdout.with_slow(after), expected
+        held = setup.holdout
+        if noise is not None:
+            wrong = [{side: each._replace(noise=noise) for side, each in one.smoothed.items()} for one in held.segments]
+            segments = [dataclasses.replace(one, smoothed=by) for one, by in zip(held.segments, wrong, strict=True)]
+            held = dataclasses.replace(held, segments=segments)
+        after = held.compare(fitted.experiment)
+        expected = expected_errors(held, fitted, after, setup.input_noise, 0.5)
+        return held.with_slow(after), expected
 
 
 @pytest.mark.parametrize("torque_noise", [0.0, 0.02])
@@ -67,3 +73,10 @@ def test_a_slow_torque_that_noise_hides_at_full_bandwidth_is_seen(tmp_path):
     )
     left = failed(errors, expected)
     assert "torque_motor" not in left and any(name.startswith("torque_motor below ") for name in left)
+
+
+def test_noise_that_a_smoother_takes_for_motion_is_seen_in_the_errors(tmp_path):
+    """Of a rough motion it finds too little noise; the errors of the model have no motion in them."""
+    friction = {"motor.coulomb_friction": {"torque": FRICTION["torque"]}}
+    _, expected = errors_of(tmp_path, logged(noise=1e-4), friction, noise=2e-5)
+    assert expected["theta_e"].noise == pytest.approx(1e-4, rel=0.15)

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from passed import PASSED
+from scipy import stats
 
 from jaxbl.diagnosis.effect_search import Explanation, Finding
 from jaxbl.diagnosis.expected_errors import Expected
@@ -39,6 +40,7 @@ def judge(
     error=0.001,
     share=1.0,
     contradicting=False,
+    z=9.0,
     **gains,
 ):
     fitted = SimpleNamespace(
@@ -48,7 +50,9 @@ def judge(
         experiment=SimpleNamespace(effects=(make_effect(NAME, torque=0.1),)),
         errors=lambda: {f"effects.{NAME}.torque": error},
     )
-    return judged(found(verdict, **gains), fitted, before, errors, LIMITS, controls, np.array([0.02]), share, contradicting)  # type: ignore[arg-type]
+    return judged(
+        found(verdict, **gains), fitted, before, errors, LIMITS, controls, np.array([0.02]), share, contradicting, {NAME: z}
+    )  # type: ignore[arg-type]
 
 
 def test_a_verdict_that_held_out_data_support_stays():
@@ -76,6 +80,11 @@ def test_one_reason_is_enough_against_it(given, reason):
     assert said.found.verdict == "unknown_effect" and said.found.findings == found().findings
     none = {key: value for key, value in PASSED.items() if key != "level"}
     assert {key: getattr(said, key) for key in none} == none | reason
+
+
+def test_a_finding_is_no_surer_than_what_held_out_data_say_for_it():
+    (one,) = judge(z=0.5).found.findings
+    assert one.confidence == pytest.approx(stats.norm.cdf(0.5))
 
 
 @pytest.mark.parametrize(("error", "sure"), [(0.02, True), (0.2, False)])

@@ -55,22 +55,32 @@ def test_blocks_in_which_both_models_err_by_less_than_noise_count_for_nothing():
     assert _standard_errors(np.full(16, np.inf), moving[:1].repeat(16)) == np.inf
 
 
-def test_of_needless_effects_the_one_of_least_torque_goes_first(monkeypatch, errors):
-    """Beside a delay that stands for it a ripple seems needless."""
-    shares = {"actuator.delay": 0.01, "motor.cogging": 0.2, "motor.coulomb_friction": 0.9}
-    given = compared(errors(9.0), errors(9.0))
+def accepted(monkeypatch, errors, shares, gain):
+    """What held-out data leave of effects, given by the torque of each, if `gain(name, names)` is what each one gains."""
     proof = Proof.__new__(Proof)
-    proof.before, proof.noise = given, LOG.noise_floor({"motor": TORQUE})
+    proof.before, proof.noise = compared(errors(9.0), errors(9.0)), LOG.noise_floor({"motor": TORQUE})
     proof.other = SimpleNamespace(compare=lambda experiment: compared(errors(1.0), errors(1.0)))
     fitted = lambda search, numbers, theta: SimpleNamespace(experiment=None, names=tuple(numbers), share=shares.get)  # noqa: E731
     monkeypatch.setattr("jaxbl.diagnosis.proof.fit_model", fitted)
+    monkeypatch.setattr(Proof, "_gain", lambda self, search, model, after, name: gain(name, model.names))
+    found = SimpleNamespace(model=SimpleNamespace(names=list(shares), numbers=dict.fromkeys(shares), theta=None))
+    return proof.accepted(None, found)
 
-    def gain(self, search, model, after, name):
-        alone = "actuator.delay" not in model.names
+
+def test_a_wave_in_time_has_to_go_on_in_other_data(monkeypatch, errors):
+    shares = {"load.periodic_disturbance": 0.002, "motor.cogging": 0.01}
+    said = accepted(monkeypatch, errors, shares, lambda name, names: 1.4)
+    assert said.withdrawn == ["load.periodic_disturbance"] and said.fitted.names == ("motor.cogging",)
+
+
+def test_of_needless_effects_the_one_of_least_torque_goes_first(monkeypatch, errors):
+    """Beside a delay that stands for it a ripple seems needless."""
+    shares = {"actuator.delay": 0.01, "motor.cogging": 0.2, "motor.coulomb_friction": 0.9}
+
+    def gain(name, names):
+        alone = "actuator.delay" not in names
         return {"actuator.delay": -1.0, "motor.cogging": 3.0 if alone else -2.0, "motor.coulomb_friction": 9.0}[name]
 
-    monkeypatch.setattr(Proof, "_gain", gain)
-    found = SimpleNamespace(model=SimpleNamespace(names=list(shares), numbers=dict.fromkeys(shares), theta=None))
-    accepted = proof.accepted(None, found)
-    assert accepted.withdrawn == ["actuator.delay"]
-    assert accepted.fitted.names == ("motor.cogging", "motor.coulomb_friction")
+    said = accepted(monkeypatch, errors, shares, gain)
+    assert said.withdrawn == ["actuator.delay"]
+    assert said.fitted.names == ("motor.cogging", "motor.coulomb_friction")
