@@ -16,8 +16,7 @@ from scipy.special import gammaincinv
 
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.identification.logs import arrays
-from jaxbl.identification.segments import Segment, white_noise
-from jaxbl.records import POSITION_CHANNELS
+from jaxbl.identification.segments import Segment
 from jaxbl.simulate import Experiment
 
 from .effect_search import LEAST
@@ -74,14 +73,7 @@ def expected_errors(
         driving: torque that drives the machine, rms, N m.
     """
     random, slow = np.random.default_rng(0), log.slow(base.torques)
-    floor = log.noise_floor(base.torques)
-    floor |= {name: float(np.sqrt(np.mean(one**2))) for name, one in log.slow(base.torques, "deviation").items()}
-    for side, noise_of in log.noise.items():
-        # where a motion is rough the smoother takes noise for motion; what a torque does is never white in a position
-        more = max(white_noise(list(base.samples[POSITION_CHANNELS[side]])) / noise_of, 1.0)
-        for name in floor:
-            if name == POSITION_CHANNELS[side] or name.startswith(f"torque_{side}"):
-                floor[name] *= more
+    floor = log.noise_of(base)
     samples = base.samples | slow
     values, vectors = np.linalg.eigh(fitted.white)
     root = vectors * np.sqrt(np.maximum(values, 0.0))

@@ -223,6 +223,7 @@ class Proof:
         """Errors on held-out data before and after, and the noise."""
         task, other, nominal = self.setup.task, self.other, self.setup.nominal
         record, part = task.holdout, task.holdout.segments
+        noise = other.noise_of(after)
         found: dict[str, Any] = {
             "holdout": {
                 "file": str(record.path.resolve()),
@@ -236,7 +237,7 @@ class Proof:
             "driving": {"motor": input_rms(record)},
             "holdout_rmse_before": self.before.errors,
             "holdout_rmse_after": after.errors,
-            "noise_floor": other.noise_floor(after.torques),
+            "noise_floor": {name: noise[name] for name in after.errors},
             "free_run": {},
         }
         for name, one in (("before", nominal), ("after", fitted.experiment)):

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import paths
-from jaxbl.identification.segments import Segment, reading_noise, windows_of
+from jaxbl.identification.segments import Segment, reading_noise, white_noise, windows_of
 from jaxbl.identification.trajectory import Windows
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.simulate import Experiment
@@ -100,6 +100,21 @@ class ReferenceLog:
         for side in self.noise:
             found[f"velocity_{side}"] = _rms([np.asarray(one.smoothed[side].deviation(1)) for one in self.segments])
         return found | {name: _rms([one]) for name, one in self._narrowed(torques, "deviation").items()}
+
+    def noise_of(self, compared: Comparison) -> dict[str, float]:
+        """Noise of each channel, slow torques among them: what the smoother finds or, where that is more, the white part of
+        a model's errors.
+
+        Of a rough motion the smoother takes noise for motion; what a torque does to a position is never white.
+        """
+        found = self.noise_floor(compared.torques) | _all_rms(self.slow(compared.torques, "deviation"))
+        for side, noise in self.noise.items():
+            position = POSITION_CHANNELS[side]
+            more = max(1.0, white_noise(list(compared.samples[position])) / noise)
+            for name in found:
+                if name == position or name.partition(" ")[0].endswith(f"_{side}"):
+                    found[name] *= more
+        return found
 
     def with_slow(self, compared: Comparison) -> dict[str, float]:
         """Errors of a comparison, and those of slow torques besides: `torque_motor below 12 Hz`, ..."""
