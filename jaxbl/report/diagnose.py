@@ -287,8 +287,8 @@ def _finding_tables(summary: Mapping[str, Any]) -> list[PageTable]:
     for one in summary["findings"]:
         for leaf, number in one["parameters"].items():
             error = number["standard_error"] or None
-            rows.append([one["effect"], one["confidence"], leaf, number["value"], error, number["unit"]])
-        rows += [[f"or {other['effect']}", other["confidence"], "", "", "", ""] for other in one["alternatives"]]
+            rows.append([one["effect"], probability(one["confidence"]), leaf, number["value"], error, number["unit"]])
+        rows += [[f"or {other['effect']}", probability(other["confidence"]), "", "", "", ""] for other in one["alternatives"]]
     columns = ["effect", "confidence", "parameter", "value", "standard error", "unit"]
     return [PageTable("Missing effects", columns, rows)] if rows else []
 

@@ -1,9 +1,12 @@
 """The comparison of the bench of real machines: one yardstick for all tools, and rivals that find what is there."""
 
+import sys
+
 import numpy as np
 import pytest
 from measured import COULOMB, INERTIA, VISCOUS, made
 from real.derivatives import parts_of, terms_of, torque_error
+from real.mujoco_sysid import sysid
 from real.rivals import stepwise
 from real_machines import _margin
 from small_study import rigid
@@ -48,3 +51,9 @@ def test_the_regression_adds_dry_friction_to_the_nominal_terms_first(record):
     assert found.names[:3] == ["inertia", "viscous", "Coulomb"]
     assert found.factors["Coulomb"][0] == pytest.approx(COULOMB, rel=0.05)
     assert found.factors["inertia"][0] == pytest.approx(INERTIA, rel=0.02)
+
+
+def test_without_mujoco_its_column_says_so(record, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    parts = parts_of(record, ("motor",), CUTOFF)
+    assert sysid(parts, parts, model(), linear=False).note == "mujoco[sysid] is not installed"

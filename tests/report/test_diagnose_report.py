@@ -163,6 +163,18 @@ def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
     assert lines(chance=True)[3] == "Shuffled in time, the torque that was added does as well."
 
 
+def test_of_a_torque_that_fails_at_several_bandwidths_the_clearest_is_said():
+    slow = {
+        "torque_motor below 9 Hz": {"before": 0.2, "after": 0.03},
+        "torque_motor below 18 Hz": {"before": 0.2, "after": 0.03},
+    }
+    limits = {"torque_motor below 9 Hz": {"limit": 0.01}, "torque_motor below 18 Hz": {"limit": 0.02}}
+    gap = SUMMARY["gap"] | {"slow_torques": slow, "expected": SUMMARY["gap"]["expected"] | limits}
+    gap["test"] = gap["test"] | {"failed": ["torque_motor below 18 Hz", "torque_motor below 9 Hz"]}
+    said = diagnosis_lines(changed(verdict="unknown_effect", gap=gap))[3]
+    assert said.endswith("(1 % test): torque_motor below 9 Hz 0.03 N m (at most 0.01).")
+
+
 @pytest.mark.parametrize(("relative", "told"), [(-0.98, True), (0.14, False)])
 def test_a_torque_that_is_far_off_comes_first(relative, told):
     one = SUMMARY["findings"][0] | {"parameters": {"relative": {"value": relative, "standard_error": 0.01, "unit": ""}}}
