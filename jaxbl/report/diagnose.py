@@ -288,7 +288,8 @@ def _finding_tables(summary: Mapping[str, Any]) -> list[PageTable]:
         for leaf, number in one["parameters"].items():
             error = number["standard_error"] or None
             rows.append([one["effect"], probability(one["confidence"]), leaf, number["value"], error, number["unit"]])
-        rows += [[f"or {other['effect']}", probability(other["confidence"]), "", "", "", ""] for other in one["alternatives"]]
+        others = ((other["effect"], probability(other["confidence"])) for other in one["alternatives"])
+        rows += [[f"or {name}", chance, "", "", "", ""] for name, chance in others]
     columns = ["effect", "confidence", "parameter", "value", "standard error", "unit"]
     return [PageTable("Missing effects", columns, rows)] if rows else []
 
@@ -301,6 +302,11 @@ def _gap_table(gap: Mapping[str, Any]) -> PageTable:
         + [one["rmse"].get(name) for one in controls.values()]
         for name, before in gap["holdout_rmse_before"].items()
     ]
+    for name, one in gap.get("slow_torques", {}).items():
+        channel, _, below = name.partition(" ")
+        most = gap["expected"][name]
+        row = [f"{_CHANNELS[channel]}, {below}", gap["units"][channel], one["before"], one["after"], most["noise"]]
+        rows.append([*row, most["limit"], *(None for _ in controls)])
     head = ["channel", "unit", "before", "after", "noise", "complete model at most", *controls]
     return PageTable("Held-out data, rms", head, rows)
 
