@@ -296,7 +296,7 @@ def _finding_tables(summary: Mapping[str, Any]) -> list[PageTable]:
 
 def _gap_table(gap: Mapping[str, Any]) -> PageTable:
     controls = gap["controls"]
-    rows = [
+    rows: list[list[Any]] = [
         [_CHANNELS[name], gap["units"][name], before, gap["holdout_rmse_after"][name], gap["noise_floor"][name]]
         + [gap["expected"].get(name, {}).get("limit")]
         + [one["rmse"].get(name) for one in controls.values()]
