@@ -288,8 +288,8 @@ def _finding_tables(summary: Mapping[str, Any]) -> list[PageTable]:
         for leaf, number in one["parameters"].items():
             error = number["standard_error"] or None
             rows.append([one["effect"], probability(one["confidence"]), leaf, number["value"], error, number["unit"]])
-        others = ((other["effect"], probability(other["confidence"])) for other in one["alternatives"])
-        rows += [[f"or {name}", chance, "", "", "", ""] for name, chance in others]
+        for other in one["alternatives"]:
+            rows.append([f"or {other['effect']}", probability(other["confidence"]), "", "", "", ""])
     columns = ["effect", "confidence", "parameter", "value", "standard error", "unit"]
     return [PageTable("Missing effects", columns, rows)] if rows else []
 
