@@ -171,10 +171,18 @@ def _reasons(summary: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _plainest(failed: Sequence[str], after: Mapping[str, float], expected: Mapping[str, Mapping[str, float]]) -> list[str]:
+def _plainest(
+    failed: Sequence[str], after: Mapping[str, float | None], expected: Mapping[str, Mapping[str, float | None]]
+) -> list[str]:
     """Of each channel the failed test that shows it best: a torque may fail at several bandwidths."""
+
+    def excess(name: str) -> float:
+        value, limit = after[name], expected[name]["limit"]
+        # of a model that diverges one of them is not finite
+        return value / limit if value is not None and limit else float("inf")
+
     best: dict[str, str] = {}
-    for name in sorted(failed, key=lambda name: -after[name] / expected[name]["limit"]):
+    for name in sorted(failed, key=excess, reverse=True):
         best.setdefault(name.partition(" ")[0], name)
     return list(best.values())
 

@@ -173,6 +173,9 @@ def test_of_a_torque_that_fails_at_several_bandwidths_the_clearest_is_said():
     gap["test"] = gap["test"] | {"failed": ["torque_motor below 18 Hz", "torque_motor below 9 Hz"]}
     said = diagnosis_lines(changed(verdict="unknown_effect", gap=gap))[3]
     assert said.endswith("(1 % test): torque_motor below 9 Hz 0.03 N m (at most 0.01).")
+    # of a model that diverges nothing is finite
+    slow["torque_motor below 18 Hz"]["after"] = None
+    assert "torque_motor below 18 Hz" in diagnosis_lines(changed(verdict="unknown_effect", gap=gap))[3]
 
 
 @pytest.mark.parametrize(("relative", "told"), [(-0.98, True), (0.14, False)])
