@@ -142,7 +142,7 @@ def check_torque(file: LogFile, found: RigidFit, grid: Grid, position: np.ndarra
         away += abs(float(position[s][-1] - position[s][0]))
     share = work / total if total else 0.0
     heavy = found.inflation[0] < 10.0 and found.shares[0] > 0.1
-    backwards = heavy and found.values[0] < -8.0 * found.errors[0]
+    backwards, forwards = (heavy and sign * found.values[0] > 8.0 * found.errors[0] for sign in (-1.0, 1.0))
     if away > 0.2 * travel:
         # potential energy may pay for the motion
         share = max(share, 0.0)
@@ -155,8 +155,9 @@ def check_torque(file: LogFile, found: RigidFit, grid: Grid, position: np.ndarra
     # a driven load returns work as well: no error
     if share < -0.1:
         text = f"the drive returns {-100 * share:.0f} % of the work"
-        file.warnings.append(f"Doubtful: {text}: the load drives it, or the sign of u is wrong.")
-        if share < _RETURNED:
+        file.warnings.append(f"Doubtful: {text}: the load drives it, or u has the wrong sign or acts late.")
+        # a lag turns the torque of an inertia against the speed; a wrong sign turns it against the acceleration, too
+        if share < _RETURNED and not forwards:
             file.contradiction = (
                 f"{text}, which only a drive does that its load drives: set sign = -1 in [log] u, or take a log in which "
                 "the motor drives"

@@ -508,6 +508,18 @@ def test_an_inertia_far_from_the_nominal_one_is_said_first(tmp_path, change, tim
     assert times is None or f", {times} times the nominal 0.01: check the units" in said[0]
 
 
+def test_a_torque_that_acts_late_is_doubted_and_not_refused(tmp_path):
+    """An inertia of 1 kg m² on two sines, its torque recorded 40 ms before it acts."""
+    t, w = 2e-3 * np.arange(4000), 2.0 * np.pi * np.array([[2.0], [3.3]])
+    torque = -np.sum(np.sin(w * (t + 0.04)), axis=0)
+    position = np.sum(np.sin(w * t) / w**2, axis=0)
+    record = read_record(wrote(tmp_path, pd.DataFrame({"t": t, "u": torque, "theta_e": position})))
+    said = [one for one in record.warnings if "of the work" in one]
+    assert len(said) == 1 and not record.contradiction, (record.warnings, record.contradiction)
+    assert said[0].endswith("of the work: the load drives it, or u has the wrong sign or acts late.")
+    assert float(said[0].split("returns ")[1].split(" %")[0]) > 50.0
+
+
 def test_work_far_from_that_of_the_nominal_friction_is_said_first(tmp_path):
     """A drive whose inertia does not show, as friction takes nearly all of the torque."""
     t = 2e-3 * np.arange(4000)
