@@ -32,7 +32,7 @@ import traceback
 from pathlib import Path
 
 import numpy as np
-from real.derivatives import Part, parts_of, terms_of, torque_error
+from real.derivatives import driving, parts_of, terms_of, torque_error
 from real.machines import CASES, Case, logs_of, unfit
 from real.mujoco_sysid import sysid
 from real.rivals import sindy, stepwise
@@ -83,7 +83,7 @@ def _compare(row: Row, case: Case, task, model, rivals: bool) -> None:
     fitted, held = (parts_of(one, sides, case.cutoff) for one in (task.record, task.holdout))
     linear = task.record.findings.channels["theta_e"].unit == "m"
     row.unit = "N" if linear else "N m"
-    row.driving = _driving(held, float(task.config.drive.motor_inertia))
+    row.driving = driving(held, float(task.config.drive.motor_inertia))
     errors = {"nominal": torque_error(task.config, task.holdout, held)}
     if model is not None:
         errors["jaxbl"] = torque_error(model, task.holdout, held)
@@ -118,15 +118,6 @@ def _margin(own: np.ndarray, other: np.ndarray) -> float | None:
         return None
     gains = np.array([np.mean(block) for block in np.array_split(other**2 - own**2, _BLOCKS)])
     return float(np.mean(gains) / max(np.std(gains, ddof=1) / np.sqrt(_BLOCKS), 1e-300))
-
-
-def _driving(parts: list[Part], inertia: float) -> float:
-    """Rms of the input, or where there is none of the inertia's torque, N m."""
-    torque = np.concatenate([one.low_passed(np.asarray(one.kinematics.torque)) for one in parts])
-    if np.any(torque):
-        return float(np.sqrt(np.mean(torque**2)))
-    speeding = np.concatenate([one.low_passed(np.asarray(one.kinematics.acceleration["motor"])) for one in parts])
-    return float(inertia * np.sqrt(np.mean(speeding**2)))
 
 
 def main() -> None:

@@ -83,6 +83,15 @@ def _speed_noise(record: Record, cutoff: float) -> float:
     return float(2.0 * np.pi * noise * np.sqrt(2.0 * h * min(cutoff, 0.5 / h) ** 3 / 3.0))
 
 
+def driving(parts: Sequence[Part], inertia: float) -> float:
+    """Rms of the input, or where there is none of the inertia's torque, N m."""
+    torque = np.concatenate([one.low_passed(np.asarray(one.kinematics.torque)) for one in parts])
+    if np.any(torque):
+        return float(np.sqrt(np.mean(torque**2)))
+    speeding = np.concatenate([one.low_passed(np.asarray(one.kinematics.acceleration["motor"])) for one in parts])
+    return float(inertia * np.sqrt(np.mean(speeding**2)))
+
+
 _MORE = 0.01
 """Share by which the input is raised to see what of it acts: small enough to be a derivative."""
 

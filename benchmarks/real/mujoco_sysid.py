@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxbl.config import Config
 
-from .derivatives import Part
+from .derivatives import Part, driving
 from .rivals import Found
 
 _WINDOW = 0.5
@@ -51,16 +51,18 @@ def sysid(fitted: Sequence[Part], held: Sequence[Part], model: Config, linear: b
         return Found([], note="mujoco[sysid] is not installed")
     drive, rigid, period = model.drive, model.drive.kind == "rigid", fitted[0].period
     if not rigid and float(drive.gear_ratio) != 1.0:
-        return Found([], note="a gear with a clearance is no joint of MuJoCo")
+        return Found([], note="a gear is no joint of MuJoCo")
     inertia = float(drive.motor_inertia)
     spec = _spec(model, linear, period / np.ceil(period / _STEP))
     names = ["motor"] if rigid else ["motor", "twist"]
     built = spec.compile()
     states = [np.stack(_states(one, rigid), axis=-1) for one in fitted]
-    rows = [
-        (part, state, first) for part, state in zip(fitted, states, strict=True) for first in _firsts(len(state), period)
-    ]
     length = max(round(_WINDOW / period), 2)
+    rows = [
+        (part, state, first)
+        for part, state in zip(fitted, states, strict=True)
+        for first in range(0, len(state) - length, length)
+    ]
     scale = np.std(np.concatenate([one[:, :, 0] for one in states]), axis=0)
     chosen = [rows[i] for i in np.unique(np.linspace(0, len(rows) - 1, _MOST).astype(int))]
     starts, inputs, readings = [], [], []
@@ -77,7 +79,7 @@ def sysid(fitted: Sequence[Part], held: Sequence[Part], model: Config, linear: b
         simulated = simulated.resample(measured.times)
         return (simulated.data - measured.data) / scale, simulated, measured
 
-    size = _size(fitted, inertia)
+    size = driving(fitted, inertia)
     fastest = max(float(np.max(np.abs(one[:, 0, 1]))) for one in states)
     params = tool.ParameterDict()
     for name, (start, least, most, change) in _numbers(model, linear, size, fastest).items():
@@ -143,7 +145,7 @@ def _numbers(model: Config, linear: bool, size: float, fastest: float) -> dict[s
     if drive.kind == "rigid" and not linear:
         for i, name in ((0, "gravity, cosine"), (2, "gravity, sine")):
             found[name] = (
-                0.0, -30.0 * size, 30.0 * size, lambda spec, one, i=i: gravity(spec, i, one.value[0]),
+                0.0, -_AWAY * size, _AWAY * size, lambda spec, one, i=i: gravity(spec, i, one.value[0]),
             )  # fmt: skip
     if drive.kind != "rigid":
         stiffness, load = _stiffness(model), float(drive.load_inertia)
@@ -181,19 +183,6 @@ def _states(part: Part, rigid: bool) -> list[np.ndarray]:
         motor = np.asarray(one["motor"])
         found.append(np.stack([motor] if rigid else [motor, np.asarray(one["load"]) - motor], axis=1))
     return found
-
-
-def _firsts(samples: int, period: float) -> range:
-    length = max(round(_WINDOW / period), 2)
-    return range(0, samples - length, length)
-
-
-def _size(parts: Sequence[Part], inertia: float) -> float:
-    """Rms of the input, or where there is none of the inertia's torque."""
-    torque = np.concatenate([np.asarray(one.kinematics.torque) for one in parts])
-    if not np.any(torque):
-        torque = inertia * np.concatenate([np.asarray(one.kinematics.acceleration["motor"]) for one in parts])
-    return float(np.sqrt(np.mean(torque**2)))
 
 
 def _missing(mujoco: Any, model: Any, part: Part, rigid: bool, friction: float) -> np.ndarray:

@@ -146,7 +146,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         share = explained_share(setup.nominal, proof.before.errors, after.errors, expected)
         apart = contradictions(task, fitted, setup.fitted, setup.holdout, found.model.linear.drive)
         errors = proof.other.with_slow(proof.before), proof.other.with_slow(after)
-        judgement = judged(found, fitted, *errors, expected, controls, setup.prior, share, bool(apart), accepted.gains)
+        judgement = judged(found, fitted, *errors, expected, controls, setup.prior, share, accepted.gains, bool(apart))
         found = judgement.found
         done()
         doing("running the observers")

@@ -129,8 +129,12 @@ def tested(
     """What the held-out errors of a complete model would be, which of them are larger, and the controls; errors `before` and
     `after` with those of slow torques."""
     return {
-        "slow_torques": {name: {"before": before[name], "after": after[name]} for name in after if " below " in name},
-        "expected": {name: one._asdict() for name, one in expected.items()},
+        "expected": {name: one._asdict() for name, one in expected.items() if " below " not in name},
+        "slow_torques": {
+            name: {"before": before[name], "after": after[name]} | one._asdict()
+            for name, one in expected.items()
+            if " below " in name
+        },
         "test": {
             "level": LEVEL,
             "failed": judgement.failed,

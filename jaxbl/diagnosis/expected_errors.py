@@ -40,7 +40,7 @@ of friction."""
 
 _SLOW_LEAST = 0.02
 """Share of the driving torque that slow torques may leave: the smoother rounds jumps of friction on the other side of a
-spring, which leaves up to 0.016 beside complete models of generated drives."""
+spring, which leaves up to 0.016 behind a quarter of the bandwidth beside complete models of generated drives."""
 
 
 class Expected(NamedTuple):

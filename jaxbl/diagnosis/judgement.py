@@ -52,8 +52,8 @@ def judged(
     controls: Sequence[Control],
     prior: np.ndarray,
     share: float | None,
+    gains: Mapping[str, float],
     contradicting: bool = False,
-    gains: Mapping[str, float] | None = None,
 ) -> Judgement:
     """Judge an explanation.
 
@@ -65,15 +65,16 @@ def judged(
         controls: of the model.
         prior: standard deviations of its own numbers, which are the first of `fitted`.
         share: of the missing torque that it explains (:func:`explained_share`).
-        contradicting: whether the logs do not agree on its numbers (:mod:`.numbers_by_log`).
         gains: standard errors by which the held-out data are met better with each effect than without it.
+        contradicting: whether the logs do not agree on its numbers (:mod:`.numbers_by_log`).
     """
     left = failed(errors, expected)
     away = fitted.theta[: len(prior)] / prior
     far = {one.path: float(z) for one, z in zip(fitted.free, away, strict=False) if abs(z) > FAR}
     chance = any(one.kind == "permuted" and one.z < SURE for one in controls)
-    seen = {one.effect: (gains or {}).get(one.effect, np.inf) for one in found.findings}
-    findings = tuple(_beside_special_case(_no_surer(one, fitted, seen[one.effect]), fitted) for one in found.findings)
+    findings = tuple(
+        _beside_special_case(_no_surer(one, fitted, gains.get(one.effect, np.inf)), fitted) for one in found.findings
+    )
     for one in controls:
         if one.kind == "wrong" and found.wrong is not None:
             last = fitted.names[-1]

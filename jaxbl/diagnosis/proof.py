@@ -74,8 +74,8 @@ class FittedModel(NamedTuple):
 def _least_gain(name: str) -> float:
     """Standard errors by which an effect has to make a model better on held-out data.
 
-    Frequency and phase of a wave in time were chosen among many: it imitates whatever is slow or random, but then it does
-    not go on in other data.
+    What depends on the time alone imitates whatever is slow or random, and a wave's frequency and phase were chosen among
+    many; but then it does not go on in other data.
     """
     return SURE if EFFECTS[name].in_time else SEEN
 

@@ -143,11 +143,9 @@ def _reasons(summary: Mapping[str, Any]) -> list[str]:
     """Why a model does not count as complete, one line each."""
     gap, test, lines = summary["gap"], summary["gap"]["test"], []
     if test["failed"]:
-        after = gap["holdout_rmse_after"] | {name: one["after"] for name, one in gap.get("slow_torques", {}).items()}
         over = [
-            f"{name} {rms_text(after[name])} {gap['units'][name.partition(' ')[0]]} "
-            f"(at most {rms_text(gap['expected'][name]['limit'])})"
-            for name in _plainest(test["failed"], after, gap["expected"])
+            f"{name} {rms_text(value)} {gap['units'][name.partition(' ')[0]]} (at most {rms_text(limit)})"
+            for name, value, limit in _plainest(gap)
         ]
         lines.append(
             "More is left than noise, the uncertainty of the numbers and torques too small to be named account for "
@@ -171,20 +169,21 @@ def _reasons(summary: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _plainest(
-    failed: Sequence[str], after: Mapping[str, float | None], expected: Mapping[str, Mapping[str, float | None]]
-) -> list[str]:
-    """Of each channel the failed test that shows it best: a torque may fail at several bandwidths."""
+def _plainest(gap: Mapping[str, Any]) -> list[tuple[str, float | None, float | None]]:
+    """Of each channel the failed test that shows it best, its error and limit: a torque may fail at several bandwidths."""
+    slow = gap.get("slow_torques", {})
+    tested = {name: (slow[name]["after"], slow[name]["limit"]) for name in slow}
+    tested |= {name: (gap["holdout_rmse_after"][name], one["limit"]) for name, one in gap["expected"].items()}
 
     def excess(name: str) -> float:
-        value, limit = after[name], expected[name]["limit"]
+        value, limit = tested[name]
         # of a model that diverges one of them is not finite
         return value / limit if value is not None and limit else float("inf")
 
     best: dict[str, str] = {}
-    for name in sorted(failed, key=excess, reverse=True):
+    for name in sorted(gap["test"]["failed"], key=excess, reverse=True):
         best.setdefault(name.partition(" ")[0], name)
-    return list(best.values())
+    return [(name, *tested[name]) for name in best.values()]
 
 
 def _number(leaf: str, one: Mapping[str, Any]) -> str:
@@ -247,10 +246,7 @@ def _remarks(summary: dict[str, Any]) -> list[str]:
     after = summary["gap"]["holdout_rmse_after"]
     for name, control in summary["gap"]["controls"].items():
         effect = f" ({control['effect']})" if "effect" in control else ""
-        channel = max(
-            (name for name in summary["gap"]["expected"] if name in after),
-            key=lambda name: _worse(control["rmse"], after, name),
-        )
+        channel = max(summary["gap"]["expected"], key=lambda name: _worse(control["rmse"], after, name))
         what = {"wrong": "the best model with another effect", "permuted": "the missing torque shuffled in time"}[name]
         left = control["rmse"][channel]
         error = "diverges"
@@ -312,9 +308,8 @@ def _gap_table(gap: Mapping[str, Any]) -> PageTable:
     ]
     for name, one in gap.get("slow_torques", {}).items():
         channel, _, below = name.partition(" ")
-        most = gap["expected"][name]
-        row = [f"{_CHANNELS[channel]}, {below}", gap["units"][channel], one["before"], one["after"], most["noise"]]
-        rows.append([*row, most["limit"], *(None for _ in controls)])
+        row = [f"{_CHANNELS[channel]}, {below}", gap["units"][channel], one["before"], one["after"], one["noise"]]
+        rows.append([*row, one["limit"], *(None for _ in controls)])
     head = ["channel", "unit", "before", "after", "noise", "complete model at most", *controls]
     return PageTable("Held-out data, rms", head, rows)
 

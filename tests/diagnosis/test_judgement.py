@@ -51,7 +51,7 @@ def judge(
         errors=lambda: {f"effects.{NAME}.torque": error},
     )
     return judged(
-        found(verdict, **gains), fitted, before, errors, LIMITS, controls, np.array([0.02]), share, contradicting, {NAME: z}
+        found(verdict, **gains), fitted, before, errors, LIMITS, controls, np.array([0.02]), share, {NAME: z}, contradicting
     )  # type: ignore[arg-type]
 
 
@@ -99,7 +99,7 @@ def test_a_special_case_is_as_likely_where_nothing_parts_the_two(error, sure):
     )
     finding = Finding(name, 0.98, {"torque": 0.1, "length": 0.1}, ())
     given = dataclasses.replace(found(), findings=(finding,), wrong=None)
-    (said,) = judged(given, fitted, BEFORE, NOISE, LIMITS, (), np.array([0.02]), 1.0).found.findings  # type: ignore[arg-type]
+    (said,) = judged(given, fitted, BEFORE, NOISE, LIMITS, (), np.array([0.02]), 1.0, {}).found.findings  # type: ignore[arg-type]
     assert said == (finding if sure else Finding(name, 0.49, finding.numbers, (("motor.coulomb_friction", 0.49),)))
 
 
