@@ -131,7 +131,7 @@ def test_an_effect_that_another_beats_on_held_out_data_changes_places_with_it():
     # what the log alone said for the other one is no argument any more
     fitted = SimpleNamespace(names=("motor.viscous_friction",), theta=np.zeros(1), free=[], errors=dict)
     back = [Control("wrong", NOISE, 1.8, NAME)]
-    after = judged(other, fitted, BEFORE, NOISE, LIMITS, back, np.array([0.02]), 1.0)  # type: ignore[arg-type]
+    after = judged(other, fitted, BEFORE, NOISE, LIMITS, back, np.array([0.02]), 1.0, {})  # type: ignore[arg-type]
     assert after.found.findings == (one,)
     assert exchanged(found(rival="motor.stribeck_friction"), [control[0]._replace(effect="motor.stribeck_friction")]) is None
 
