@@ -115,13 +115,18 @@ def _beside_special_case(finding: Finding, fitted: FittedModel) -> Finding:
 
 
 def _nats(model: Model, wrong: Model, z: float) -> float:
-    """Evidence for a model over one with another effect in place of its last, as far as held-out data agree (nats)."""
+    """Evidence for a model over one with another effect in place of its last, as far as held-out data agree (nats).
+
+    The better fit to the log counts as far as that model is the better one there, too; what they say besides is that of
+    a normal deviate.
+    """
     if model.names[-1].partition(".")[2] in EFFECTS[wrong.names[-1]].special_cases:
         # a more general effect does as well by its nature
         return np.inf
-    fit = max(model.log_likelihood - wrong.log_likelihood, 0.0)
-    nats = model.log_evidence - wrong.log_evidence - fit * (1.0 - float(np.clip(z / SURE, 0.0, 1.0)))
-    return nats - 0.5 * min(z, 0.0) ** 2
+    fit = model.log_likelihood - wrong.log_likelihood
+    agreed = float(np.clip((z if fit > 0.0 else -z) / SURE, 0.0, 1.0))
+    nats = model.log_evidence - wrong.log_evidence - fit * (1.0 - agreed)
+    return nats + 0.5 * z * abs(z)
 
 
 def exchanged(found: Explanation, controls: Sequence[Control]) -> Explanation | None:
@@ -146,11 +151,11 @@ def _shared(finding: Finding, model: Model, wrong: Model, z: float) -> Finding:
 
     What the numbers' prior says for it stands; what the fit says counts in full only if it shows on the held-out data, too.
     """
-    if model.log_evidence < wrong.log_evidence:
-        # the two have changed places
-        return finding
     rival, nats = wrong.names[-1], _nats(model, wrong, z)
     chances = dict(finding.alternatives)
+    if model.log_evidence < wrong.log_evidence and rival in chances:
+        # the two have changed places
+        return finding
     weight = float(finding.confidence * np.exp(np.clip(-nats, -700.0, 700.0)))
     if weight <= max(chances.get(rival, 0.0), LEAST_CHANCE):
         return finding

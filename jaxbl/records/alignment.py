@@ -144,6 +144,8 @@ def encoder_offset(grid: Grid, nominal: NominalDrive) -> Offset | None:
     error = float(np.hypot(errors[0], constant / nominal.stiffness))
     load_torque = nominal.load_inertia * load_acceleration + nominal.load_viscous * load_velocity
     both = found.flanks and constant < float(np.quantile(np.abs(load_torque / nominal.gear_ratio), 0.9))
+    # a twist that never covers the gap has not been at both ends of it
+    both = both and found.range > 2.0 * nominal.half_gap
     flank = 0.0 if both else _VAGUE * nominal.half_gap
     drive = float(np.sqrt(np.mean(torque**2)))
     if nominal.stiffness * (abs(value) - flank) < _FELT * drive or abs(value) - flank < _SURELY * float(errors[0]):
@@ -162,6 +164,7 @@ class _Regression(NamedTuple):
         values, errors: coefficients of 1, flank, velocity, acceleration; flank 0 where there is one only.
         torque, load_velocity, load_acceleration, motor_velocity, motor_acceleration: low-passed, shape (samples,).
         flanks: whether torque, velocity or acceleration of both signs occur.
+        range: of the twist without the wind-up, but for a hundredth at each end, rad (m).
         plain: whether errors that repeat with the load's turn leave the fit as it is.
     """
 
@@ -173,6 +176,7 @@ class _Regression(NamedTuple):
     motor_velocity: np.ndarray
     motor_acceleration: np.ndarray
     flanks: bool
+    range: float
     plain: bool
 
 
@@ -214,7 +218,9 @@ def _regressed(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Regress
         return None
     if not flanks:
         values, errors = np.insert(values, 1, 0.0), np.insert(errors, 1, 0.0)
-    return _Regression(values, errors, torque, velocity, acceleration, motor_velocity, motor_acceleration, flanks, plain)
+    spread = float(np.ptp(np.quantile(target, (0.01, 0.99))))
+    motion = torque, velocity, acceleration, motor_velocity, motor_acceleration
+    return _Regression(values, errors, *motion, flanks, spread, plain)
 
 
 def _motion(

@@ -142,7 +142,10 @@ def check_torque(file: LogFile, found: RigidFit, grid: Grid, position: np.ndarra
         away += abs(float(position[s][-1] - position[s][0]))
     share = work / total if total else 0.0
     heavy = found.inflation[0] < 10.0 and found.shares[0] > 0.1
-    backwards, forwards = (heavy and sign * found.values[0] > 8.0 * found.errors[0] for sign in (-1.0, 1.0))
+    # the wrong sign has to be sure; that it is the right one need only be likely
+    backwards, forwards = (
+        heavy and sign * found.values[0] > least * found.errors[0] for sign, least in ((-1.0, 8.0), (1.0, 3.0))
+    )
     if away > 0.2 * travel:
         # potential energy may pay for the motion
         share = max(share, 0.0)
@@ -172,6 +175,9 @@ factor of two."""
 
 _SURE = 30.0
 """Factor from which on it is no longer a rough number: units in place of others make 57 (degrees), 60 or 1000 of it."""
+_SURE_FAST = 1000.0
+"""The same of a motion faster than the antiresonance of the nominal drive: the load stands still there, and of a resonance
+the input has to supply only the losses."""
 _FAR_TORQUE = 1000.0
 """Factor between the torque and what the nominal inertia needs from which on a unit is rather wrong: mN m for N m. A screw
 that turns slowly against dry friction needs six hundred times the torque of its inertia."""
@@ -195,19 +201,20 @@ def warn_units(file: LogFile, found: RigidFit, channel: str, nominal: NominalDri
     taken = found.power + 0.5 * expected * found.slowing
     work = taken / normal if normal > 0.0 and taken > 0.0 else None
     usual = work is not None and 1.0 / _FAR < work < _FAR_WORK
+    least = _SURE_FAST if _is_fast(found, nominal) else _SURE
     text, doubtful, surely, ratio = "", False, False, 1.0
     # a coefficient that noise, gravity, a gap or a spring hides says nothing
     if value > 4.0 * error and found.shares[0] > 0.05 and found.inflation[0] < 10.0 and found.residual < 0.5:
         ratio = value / expected
         text = f"u moves {channel} as an inertia of {value:.3g} would, {ratio:.3g} times the nominal {expected:.3g}"
-        doubtful, surely = not 1.0 / _FAR < ratio < _FAR, not (usual or 1.0 / _SURE < ratio < _SURE)
+        doubtful, surely = not 1.0 / _FAR < ratio < _FAR, not (usual or 1.0 / least < ratio < _SURE)
     elif value:
         ratio = found.torque / (expected * found.acceleration)
         text = (
             f"u is {found.torque:.3g} rms, {ratio:.3g} times what the nominal inertia {expected:.3g} needs for this motion"
         )
         doubtful = not 1.0 / _FAR < ratio < _FAR_TORQUE
-        surely = not (usual or 1.0 / _SURE < ratio < _SURE * _FAR_TORQUE)
+        surely = not (usual or 1.0 / least < ratio < _SURE * _FAR_TORQUE)
     if work is not None and not usual and not doubtful:
         text = f"friction takes {taken:.3g} W, {work:.3g} times what the nominal viscous friction would"
         # a data sheet may say a friction that the machine does not have
@@ -224,6 +231,15 @@ def warn_units(file: LogFile, found: RigidFit, channel: str, nominal: NominalDri
         )
     if doubtful and (surely or alike):
         file.contradiction = f"{text}: a unit of t, u or {channel} in [log] is wrong, or the model's number is"
+
+
+def _is_fast(found: RigidFit, nominal: NominalDrive) -> bool:
+    """Whether the motion is faster than that at which the load stands still on its spring, by the nominal drive."""
+    load = nominal.load_inertia / nominal.gear_ratio**2
+    # of a rigid drive, or a load that is not known, there is no such motion
+    if not (load > 0.0 and found.square > 0.0 and math.isfinite(nominal.stiffness)):
+        return False
+    return found.acceleration**2 / found.square > nominal.stiffness / load
 
 
 # remarks

@@ -136,6 +136,16 @@ def test_an_effect_that_another_beats_on_held_out_data_changes_places_with_it():
     assert exchanged(found(rival="motor.stribeck_friction"), [control[0]._replace(effect="motor.stribeck_friction")]) is None
 
 
+def test_held_out_data_outweigh_a_better_fit_of_another_effect():
+    # a delay and a lag over a start that neither knows
+    def other(z):
+        return exchanged(found(fit_gain=-380.0), [Control("wrong", NOISE, z, "motor.viscous_friction")])
+
+    assert other(5.0) is None and other(-5.0) is not None and other(0.5) is not None
+    said = judge(controls=[Control("wrong", NOISE, 5.0, "motor.viscous_friction")], fit_gain=-380.0).found.findings[0]
+    assert said.confidence == pytest.approx(0.98, abs=1e-3)
+
+
 def test_what_the_prior_says_stands():
     assert shared(0.0, prior_gain=20.0)[0] == pytest.approx(0.98)
 
