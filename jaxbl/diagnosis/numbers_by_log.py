@@ -27,6 +27,9 @@ _APART = 6.0
 hundred is so by chance."""
 _LEAST = 0.05
 """Share of the driving torque that the difference has to make."""
+_CLEAR = 3.0
+"""Times that a number's torque has to be the noise of torques, or that takes more than a tenth of it away: of a load that
+hardly moves the acceleration is all noise."""
 _INFLATED = 100.0
 """Variance of a number over what it were if all others were known, from which on it depends on them."""
 
@@ -107,16 +110,18 @@ class _Shown(NamedTuple):
 
 
 def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
-    now = log.missing(fitted.experiment)
+    now, noises = log.missing(fitted.experiment), log.missing(fitted.experiment, "deviation")
     moved = [
         log.missing(set_leaves(fitted.experiment, arrays({one.path: one.value(at + _STEP)})))
         for one, at in zip(fitted.free, fitted.theta, strict=True)
     ]
     # of equal weight on both sides, whatever the gear
-    products, torque = [], np.zeros(len(moved))
+    products, torque, noise = [], np.zeros(len(moved)), 0.0
     for side, missing in now.items():
         slopes = np.stack([(one[side] - missing) / _STEP for one in moved])
-        torque = np.hypot(torque, np.sqrt(np.mean(slopes**2, axis=1)) / float(fitted.experiment.drive.ratio(side)))
+        ratio = float(fitted.experiment.drive.ratio(side))
+        torque = np.hypot(torque, np.sqrt(np.mean(slopes**2, axis=1)) / ratio)
+        noise = np.hypot(noise, np.sqrt(np.mean(noises[side] ** 2)) / ratio)
         both = np.concatenate([slopes, -missing[None]]) / max(float(np.sqrt(np.mean(missing**2))), 1e-300)
         products.append([block @ block.T for block in np.array_split(both, BLOCKS, axis=1)])
     blocks = np.sum(products, axis=0)
@@ -132,7 +137,7 @@ def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
     error = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((without - without.mean(axis=0)) ** 2, axis=0))
     # what depends on other numbers, or does nothing in this log, is not shown by it
     inverse = np.linalg.pinv(total[:-1, :-1] / np.outer(size, size), rcond=1e-10, hermitian=True)
-    alone = there & (np.diag(inverse) < _INFLATED) & (np.diag(inverse) > 0.0)
+    alone = there & (torque > _CLEAR * noise) & (np.diag(inverse) < _INFLATED) & (np.diag(inverse) > 0.0)
     return _Shown(change, np.where(alone, error, np.inf), torque)
 
 

@@ -16,11 +16,12 @@ import numpy as np
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import paths
 from jaxbl.identification.segments import Segment, reading_noise, white_noise, windows_of
+from jaxbl.identification.smoother import smooth
 from jaxbl.identification.trajectory import Windows
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.simulate import Experiment
 
-from .free_starts import best_runs
+from .free_starts import Run, best_runs
 from .neutral_effects import with_torques
 from .residuals import Residual, narrowed, residual_torques
 
@@ -159,10 +160,35 @@ class ReferenceLog:
         samples = self._samples(experiment, self.samples, _STATES, added or {}) | self._narrowed(torques)
         return Comparison(_all_rms(samples), torques, samples, float(experiment.plant.input_gain))
 
-    def missing(self, experiment: Experiment) -> dict[str, np.ndarray]:
-        """Torques that a model lacks behind the low-pass, N m, by side."""
+    def rounding(self, experiment: Experiment) -> dict[str, float]:
+        """Torques that a model seems to lack along its own motion, rms, N m, by channel, since a smoother rounds jumps of
+        friction, and with them the motion on both sides of a spring.
+
+        On the short windows, each smoothed as the log was. Nothing of a model with a memory, since a window does not show
+        what was before; its friction does not jump.
+        """
+        experiment = at_period(experiment, self.period)
+        if experiment.plant.memory or any(one.transmitted is not None for one in self.segments):
+            return {}
+        run, firsts = self._runs(experiment, self.samples, _STATES, {})
+        pieces = []
+        for i, first in enumerate(firsts):
+            whole = next(one for one in self.segments if one.rows.start <= first < one.rows.stop)
+            readings = {side: np.asarray(run.states.position[side])[i] for side in experiment.sides}
+            smoothed = {
+                side: smooth(one, self.period, known=(whole.smoothed[side].noise, whole.smoothed[side].jerk))
+                for side, one in readings.items()
+            }
+            rows = slice(int(first), int(first) + self.samples)
+            inside = slice(rows.start - whole.rows.start, rows.stop - whole.rows.start)
+            pieces.append(Segment(rows, whole.time[inside], self.period, whole.torque[inside], readings, smoothed))
+        torques = residual_torques(experiment, pieces)
+        return _all_rms(self._narrowed(torques) | self.slow(torques))
+
+    def missing(self, experiment: Experiment, name: str = "torque") -> dict[str, np.ndarray]:
+        """Torques that a model lacks behind the low-pass, or their noise (`deviation`), N m, by side."""
         torques = residual_torques(at_period(experiment, self.period), self.segments)
-        return {side: self._narrowed({side: pieces})[f"torque_{side}"] for side, pieces in torques.items()}
+        return {side: self._narrowed({side: pieces}, name)[f"torque_{side}"] for side, pieces in torques.items()}
 
     def _rows(self) -> list[np.ndarray]:
         """Sampling periods from the log's first sample to each sample, segment by segment."""
@@ -188,11 +214,8 @@ class ReferenceLog:
     ) -> dict[str, np.ndarray]:
         """Errors of positions and speeds on windows of a length, under torques added sample by sample; shape
         (windows, samples)."""
-        experiment, paths = with_torques(experiment)
-        windows, firsts = windows_of(self.segments, experiment, length, self.rest)
+        run, firsts = self._runs(experiment, length, passes, added)
         rows = firsts[:, None] + np.arange(length)[None, :]
-        varying = {path: self._along(windows, added.get(side)) for side, path in paths.items()}
-        run = best_runs(experiment, windows, passes, self.rest, varying)
         found = {
             POSITION_CHANNELS[side]: self.noise[side] * run.residual[:, :, i] for i, side in enumerate(experiment.sides)
         }
@@ -202,6 +225,15 @@ class ReferenceLog:
                 smoothed[one.rows] = one.smoothed[side].velocity
             found[f"velocity_{side}"] = np.asarray(run.states.velocity[side]) - smoothed[rows]
         return found
+
+    def _runs(
+        self, experiment: Experiment, length: int, passes: int, added: Mapping[str, np.ndarray]
+    ) -> tuple[Run, np.ndarray]:
+        """Runs on windows of a length, and the row that each begins with; arguments as of :meth:`_samples`."""
+        experiment, paths = with_torques(experiment)
+        windows, firsts = windows_of(self.segments, experiment, length, self.rest)
+        varying = {path: self._along(windows, added.get(side)) for side, path in paths.items()}
+        return best_runs(experiment, windows, passes, self.rest, varying), firsts
 
     def _along(self, windows: Windows, table: np.ndarray | None) -> np.ndarray:
         """A torque that is added, as one that resists, on windows; N m, shape (windows, samples)."""

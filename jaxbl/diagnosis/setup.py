@@ -28,6 +28,8 @@ _NOISY = 1e-3
 """Noise over the input's rms from which on it is asked whether the drive felt it."""
 _SHOWN = 3.0
 """Nats from which on it counts as shown that the drive did not: odds of twenty."""
+_BELOW = 3.0
+"""Standard errors by which a share below zero is no chance."""
 
 
 class InputNoise(NamedTuple):
@@ -126,7 +128,8 @@ def _input_noise(size: float, nominal: Experiment, own: Sequence[Free], segments
     share, error = unfelt(given.left(smoothness), smooth.left(smoothness))
     # nats that it did not feel it, rather than did
     shown = (share - 0.5) / error**2
-    possible = float(np.sqrt(np.clip(share + 2.0 * error, 0.0, 1.0)))
+    # a share below none comes of what the model lacks, which then hides how much it is
+    possible = 1.0 if share < -_BELOW * error else float(np.sqrt(np.clip(share + 2.0 * error, 0.0, 1.0)))
     return InputNoise(noise if shown > _SHOWN else 0.0, possible * noise)
 
 

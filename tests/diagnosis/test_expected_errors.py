@@ -61,8 +61,8 @@ def test_torques_too_small_to_be_named_do_not_fail_a_model(tmp_path):
 @pytest.mark.parametrize("freedom", [1, 4, 30])
 def test_the_quantile_is_that_of_sums_of_squares(freedom):
     drawn = stats.chi2.rvs(freedom, scale=3.0, size=4000, random_state=1)
-    assert _quantile(drawn) == pytest.approx(stats.chi2.ppf(1.0 - LEVEL, freedom, scale=3.0), rel=0.1)
-    assert _quantile(np.full(6, 2.0)) == 2.0 and _quantile(np.zeros(6)) == 0.0
+    assert _quantile(drawn, LEVEL) == pytest.approx(stats.chi2.ppf(1.0 - LEVEL, freedom, scale=3.0), rel=0.1)
+    assert _quantile(np.full(6, 2.0), LEVEL) == 2.0 and _quantile(np.zeros(6), LEVEL) == 0.0
 
 
 def test_a_slow_torque_that_noise_hides_at_full_bandwidth_is_seen(tmp_path):
