@@ -34,7 +34,7 @@ from .diagnosis_summary import (
     where_lacking,
 )
 from .diagnosis_task import DiagnosisTask, read_diagnosis_task
-from .effect_search import EffectSearch, Explanation
+from .effect_search import EffectSearch, Explanation, Finding
 from .expected_errors import Expected, expected_errors, failed
 from .judgement import exchanged, explained_share, is_little, judged
 from .localise import SIGNIFICANT, Localised, localise
@@ -304,7 +304,25 @@ def _exchanged(proof: Proof, search: EffectSearch, found: Explanation) -> _Prove
         other = exchanged(found, controls)
         if other is None:
             break
+    for name in accepted.fitted.names:
+        plainer = proof.plainer(search, accepted, name)
+        if plainer is not None:
+            found, accepted = _renamed(search, found, plainer, name), plainer
+            controls = proof.controls(search, accepted.fitted, accepted.after, None)
     return _Proved(search, found, accepted, controls)
+
+
+def _renamed(search: EffectSearch, found: Explanation, accepted: Accepted, name: str) -> Explanation:
+    """An explanation with a special case in place of an effect, as probable as that was."""
+    numbers = accepted.fitted.numbers
+    (plain,) = set(numbers) - {one.effect for one in found.findings}
+    findings = []
+    for one in found.findings:
+        if one.effect == name:
+            others = tuple(other for other in one.alternatives if other[0] != plain)
+            one = Finding(plain, one.confidence, numbers[plain], others)
+        findings.append(one)
+    return search.adopted(found, numbers, accepted.fitted.theta[: len(search.free)], findings)
 
 
 def _check_shown(setup: Setup, shown: float) -> None:

@@ -13,7 +13,7 @@ from jaxbl.simulate import Experiment
 
 from .effect_search import FAR, LEAST_CHANCE, Explanation, Finding, Model
 from .expected_errors import Expected, failed
-from .proof import SURE, Control, FittedModel
+from .proof import SURE, Control, FittedModel, special_case
 
 _LEAST_SHARE = 0.5
 """Of the missing torque, that an explanation takes away: with less it may pass only since its numbers are open."""
@@ -100,14 +100,9 @@ def _no_surer(finding: Finding, fitted: FittedModel, gain: float) -> Finding:
 
 
 def _beside_special_case(finding: Finding, fitted: FittedModel) -> Finding:
-    """A finding that shares its probability with a special case of it, where the number that parts the two is known no
-    better than its size: friction that bends over a length of 0.5 ± 0.6 mrad may as well not bend."""
-    cls, errors = EFFECTS[finding.effect], fitted.errors()
-    shapes = [f"effects.{finding.effect}.{leaf}" for leaf, role in cls.roles().items() if role.kind == "shape"]
-    apart = [errors[path] < abs(float(get_leaf(fitted.experiment, path))) for path in shapes if path in errors]
-    place = finding.effect.partition(".")[0]
-    plain = next((f"{place}.{kind}" for kind in cls.special_cases), None)
-    if plain is None or not apart or any(apart):
+    """A finding that shares its probability with a special case of it that it may as well be."""
+    plain = special_case(fitted, finding.effect)
+    if plain is None:
         return finding
     half = 0.5 * finding.confidence
     others = ((plain, half), *(one for one in finding.alternatives if one[0] != plain))

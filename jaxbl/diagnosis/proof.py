@@ -71,6 +71,16 @@ class FittedModel(NamedTuple):
         return {one.path: float(one.slope(self.theta[i])) * deviation[i] for i, one in enumerate(self.free)}
 
 
+def special_case(fitted: FittedModel, name: str) -> str | None:
+    """Name of a special case that an effect of a model may as well be, since the number that parts the two is known no
+    better than its size: friction that bends over a length of 0.5 ± 0.6 mrad may as well not bend."""
+    cls, errors = EFFECTS[name], fitted.errors()
+    shapes = [f"effects.{name}.{leaf}" for leaf, role in cls.roles().items() if role.kind == "shape"]
+    apart = [errors[path] < abs(float(get_leaf(fitted.experiment, path))) for path in shapes if path in errors]
+    plain = next((f"{name.partition('.')[0]}.{kind}" for kind in cls.special_cases), None)
+    return plain if apart and not any(apart) else None
+
+
 def _least_gain(name: str) -> float:
     """Standard errors by which an effect has to make a model better on held-out data.
 
@@ -182,6 +192,27 @@ class Proof:
         without, by = (float(np.sum((one.theta[:own] / prior) ** 2)) for one in (fewer, fitted))
         # what two deviations would explain is no sign of anything
         return beaten(self.other, self.other.compare(fewer.experiment), after) + np.sqrt(max(without - by - SURE**2, 0.0))
+
+    def plainer(self, search: EffectSearch, accepted: Accepted, name: str) -> Accepted | None:
+        """The model with the special case of an effect in its place, where nothing parts the two: neither the fit
+        (:func:`special_case`) nor the held-out data. None where something does."""
+        fitted = accepted.fitted
+        plain = special_case(fitted, name)
+        if plain is None or plain not in search.lacking or plain in fitted.names:
+            return None
+        reduced = EFFECTS[name].special_cases[plain.partition(".")[2]]
+        numbers = {
+            (plain if one == name else one): reduced(values) if one == name else values
+            for one, values in fitted.numbers.items()
+        }
+        less = fit_model(search, numbers, fitted.theta[: len(self.setup.prior)])
+        after = self.other.compare(less.experiment)
+        if beaten(self.other, after, accepted.after) > SEEN or self.worse(after, self.before):
+            return None
+        gains = {one: accepted.gains[one] for one in numbers if one != plain} | {
+            plain: self._gain(search, less, after, plain)
+        }
+        return Accepted(less, after, accepted.withdrawn, gains)
 
     def plausible(self, fitted: FittedModel) -> bool:
         """Whether a model's own numbers are where they may be by what is known of them."""
