@@ -208,13 +208,13 @@ def _gap_lines(gap: Mapping[str, Any]) -> list[str]:
         return f"{name} {rms_text(before[name])} -> {rms_text(after[name])} {units[name]}"
 
     errors = [
-        f"{change(name, before, after)} (noise {rms_text(floor[name])})"
+        f"{change(name, before, after)} ({rms_text(floor[name])}; {rms_text(gap['expected'][name]['limit'])})"
         for name in before
         if not name.startswith("velocity")
     ]
     window = gap["holdout"]["window"]
     how = "predicted one sample ahead" if window is None else f"over windows of {window:.2g} s"
-    lines = [f"{place}, {how}, rms: {'; '.join(errors)}."]
+    lines = [f"{place}, {how}, rms (noise; most that a complete model leaves): {', '.join(errors)}."]
     run = gap["free_run"]
     if "after" in run:
         changes = [change(name, run["before"], run["after"]) for name in run["after"] if not name.startswith("velocity")]

@@ -97,7 +97,10 @@ def test_the_headline_has_verdict_numbers_and_gap():
     )
     assert lines[1] == "load.coulomb_friction (confidence 0.93): torque = 0.274 ± 0.0021 N m; 12 % of the driving torque."
     assert lines[2] == "  Not ruled out by this log: load.stribeck_friction (0.07)."
-    assert lines[3].startswith("On other.csv, over windows of 0.5 s, rms: theta_e 0.1 -> 0.0011 rad (noise 0.001); theta_s ")
+    assert lines[3].startswith(
+        "On other.csv, over windows of 0.5 s, rms (noise; most that a complete model leaves): theta_e 0.1 -> 0.0011 rad "
+        "(0.001; 0.0012), theta_s "
+    )
     assert lines[4].startswith("In one free run: theta_e 0.1 -> 0.002 rad;")
     assert (
         "Control: the best model with another effect (load.stribeck_friction) leaves 0.006 rad in theta_s in place of "
