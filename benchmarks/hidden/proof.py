@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.signal import lsim
 
 from .cases import Case
 from .effects import dahl
@@ -59,7 +60,7 @@ def _windows(case: Case, model: Mapping[str, Any]) -> list[Run]:
     run, truth = case.runs[1], case.traces[1]
     machine = Machine(model["drive"], model.get("transmission"), model.get("effects", ()))
     acting = _acting(machine, truth.command, run.period)
-    bent = _bent(machine, truth)
+    bent, hung = _bent(machine, truth), _hung(machine, truth)
     length = min(round(WINDOW / run.period), len(truth.t))
     return [
         Run(
@@ -69,6 +70,7 @@ def _windows(case: Case, model: Mapping[str, Any]) -> list[Run]:
             initial=tuple(truth.states[:, k]),
             acting=acting[k],
             bent=bent[k],
+            hung=(hung[k, 0], hung[k, 1]),
             origin=float(truth.t[k]),
         )
         for k in range(0, len(truth.t) - length + 1, length)
@@ -105,6 +107,19 @@ def _bent(machine: Machine, truth: Trace) -> np.ndarray:
             velocity = truth.states[1 if machine.rigid or place == "motor" else 3]
             return effect["length"] * dahl(velocity, float(truth.t[1] - truth.t[0]), effect["length"])
     return np.zeros(len(truth.t))
+
+
+def _hung(machine: Machine, truth: Trace) -> np.ndarray:
+    """Twist of the spring of `load.flexibility`, rad, and velocity of the inertia behind it, rad/s, at each sample of the
+    true motion, from rest; shape (samples, 2)."""
+    for effect in machine.effects:
+        place, _, kind = effect["kind"].partition(".")
+        if kind == "flexibility":
+            velocity = truth.states[1 if machine.rigid or place == "motor" else 3]
+            rate, damping = 2.0 * math.pi * effect["frequency"], 2.0 * effect.get("damping_ratio", 0.02)
+            step, driven = [[0.0, 1.0], [-(rate**2), -damping * rate]], [[-1.0], [damping * rate]]
+            return lsim((step, driven, np.eye(2), np.zeros((2, 1))), velocity, truth.t)[1]
+    return np.zeros((len(truth.t), 2))
 
 
 def _acting(machine: Machine, command: np.ndarray, period: float) -> np.ndarray:

@@ -93,6 +93,8 @@ class Run:
         torque_limit: of the loop, N m.
         initial: θ_e, ω_e, θ_s, ω_s.
         bent: deflection of the bristles of `presliding_friction` when the run begins, rad.
+        hung: twist of the spring of `load.flexibility`, rad, and velocity of the inertia behind it, rad/s, when the run
+            begins.
         acting: torque that the actuator makes when the run begins, N m (for `actuator.lag`).
         origin: time at which the run begins, s.
         motor_noise, load_noise: rms of the encoders, rad; resolutions in rad, 0 for none.
@@ -112,6 +114,7 @@ class Run:
     initial: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     acting: float = 0.0
     bent: float = 0.0
+    hung: tuple[float, float] = (0.0, 0.0)
     origin: float = 0.0
     motor_noise: float = 0.0
     load_noise: float = 0.0
@@ -501,7 +504,8 @@ def _compiled() -> Any:
     def run(parameters, lengths, initial, torque, reference, rate, unit, noise, command, readings, states):
         for lane in numba.prange(len(parameters)):
             p = parameters[lane]
-            y = (initial[lane, 0], initial[lane, 1], initial[lane, 2], initial[lane, 3], initial[lane, 5], 0.0, 0.0, 0.0)
+            own = initial[lane]
+            y = (own[0], own[1], own[2], own[3], own[5], 0.0, own[6], own[7])
             modes = first(p, y)
             previous, velocity, lagged = initial[lane, 0], initial[lane, 1], initial[lane, 4]
             for k in range(lengths[lane]):
@@ -532,7 +536,7 @@ def _vectorised() -> Any:
     def run(parameters, lengths, initial, torque, reference, rate, unit, noise, command, readings, states):
         order = np.argsort(-lengths, kind="stable")
         p = np.ascontiguousarray(parameters[order].T)
-        y = (*initial[order, :4].T, initial[order, 5], *np.zeros((3, len(order))))
+        y = (*initial[order, :4].T, initial[order, 5], np.zeros(len(order)), *initial[order, 6:].T)
         modes = engine.first(p, y)
         previous, velocity, lagged = y[0], y[1], initial[order, 4]
         for k in range(int(lengths.max())):
@@ -617,7 +621,7 @@ def _batch(runs: Sequence[Run], step: float) -> list[Trace]:
             reference[i, :n], rate[i, :n] = run.reference
         if run.disturbance is not None:
             noise[i, : n + 1] = run.disturbance[: n + 1]
-    initial = np.array([(*run.initial, run.acting, run.bent) for run in runs], float)
+    initial = np.array([(*run.initial, run.acting, run.bent, *run.hung) for run in runs], float)
     with np.errstate(all="ignore"):
         engine()[0](parameters, lengths, initial, torque, reference, rate, unit, noise, command, readings, states)
     traces = []

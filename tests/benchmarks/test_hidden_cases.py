@@ -261,6 +261,14 @@ def test_the_proof_parts_true_from_nominal_model(found):
     assert results[2] == (None, None)
 
 
+@pytest.mark.parametrize("name", ["load.flexibility", "load.presliding_friction"])
+def test_windows_begin_with_what_the_motion_before_has_left(found, name, monkeypatch):
+    monkeypatch.setattr("hidden.proof.WINDOW", 0.1)
+    case = next(case for case in found if list(case.hidden) == [name])
+    nominal, true = foretold([(case, case.model), (case, case.oracle)])
+    assert true["theta_s"] < 0.01 * nominal["theta_s"]
+
+
 def test_files_are_read_by_the_package_and_scored_from_a_batch(found, oracle, tmp_path):
     some = found[:3]
     save(some, tmp_path / "logs")
