@@ -103,6 +103,9 @@ def _searched(model: _Model, passes: int, rest: bool) -> Run:
     still, known = best.copy(), np.ones_like(best)
     still[:, moving] = 0.0
     known[np.ix_(np.flatnonzero(windows.rest), moving)] = 0.0
+    for effect, own in zip(model.experiment.effects, places.effects, strict=True):
+        if effect.follows:
+            known[:, jax.tree.leaves(own)] = 0.0
     residual, slope = np.zeros((runs, samples, len(sides))), np.zeros((runs, samples, len(sides), count))
     states = [np.zeros((runs, samples)) for _ in leaves]
     cost, damping, tried = np.full(runs, np.inf), np.full(runs, RIDGE), best.copy()

@@ -23,6 +23,7 @@ class Delay(ActuatorEffect):
 
     kind: ClassVar[str] = "delay"
     input_alone: ClassVar[bool] = True
+    follows: ClassVar[bool] = True
     rank: ClassVar[int] = 0
     delay: Scalar = shape(
         "s", "dead time T", lambda log: [samples * log.period for samples in _DELAYS], neutral=1e-30, minimum=0.0
@@ -82,6 +83,7 @@ class Lag(ActuatorEffect):
     """First-order lag of the torque: T du_a/dt = u - u_a, advanced exactly for a held u; starts at zero torque."""
 
     kind: ClassVar[str] = "lag"
+    follows: ClassVar[bool] = True
     rank: ClassVar[int] = 3
     time_constant: Scalar = shape(
         "s", "time constant T", lambda log: [samples * log.period for samples in _LAGS], neutral=1e-30, above=0.0

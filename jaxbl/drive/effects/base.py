@@ -141,6 +141,8 @@ class AbstractEffect(eqx.Module):
         velocity_dependent: whether a hook looks at a velocity; it is then evaluated twice a step (predictor and
             corrector), which keeps the integrator's second order.
         input_alone: whether its own state is what was commanded, whatever its numbers and the motion: it is then known.
+        follows: whether its own state follows, by its numbers, from the input or from the motion as it is measured: where a
+            part of a log begins, it is then as known as these.
         in_time: whether it depends on the time since a log began.
         corrects: the drive's number that it is the error of: `inertia` or `viscous`.
         exclusive: of effects with the same word here, a place has one.
@@ -151,6 +153,7 @@ class AbstractEffect(eqx.Module):
     places: ClassVar[tuple[str, ...]]
     velocity_dependent: ClassVar[bool] = False
     input_alone: ClassVar[bool] = False
+    follows: ClassVar[bool] = False
     in_time: ClassVar[bool] = False
     corrects: ClassVar[str | None] = None
     exclusive: ClassVar[str | None] = None

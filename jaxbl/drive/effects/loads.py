@@ -167,6 +167,7 @@ class Flexibility(SideEffect):
     kind: ClassVar[str] = "flexibility"
     places: ClassVar[tuple[str, ...]] = ("load",)
     velocity_dependent: ClassVar[bool] = True
+    follows: ClassVar[bool] = True
     # behind a stiff spring
     special_cases: ClassVar = {"inertia": lambda one: {"inertia": one["inertia"]}}
     inertia: Scalar = size("kg m²", "inertia J behind the spring", minimum=0.0)
