@@ -87,7 +87,8 @@ def led_in(record: Record, rest: bool) -> Record:
 def _before(record: Record, part: slice, rest: bool) -> np.ndarray | None:
     """Input before a part of a log, N m, shape (KEPT,), where it is known."""
     assert record.torque is not None
-    if rest and any(part.start == rows.start for _, rows in record.logs):
+    # nothing is commanded of a drive that moves freely
+    if not record.torque.any() or (rest and any(part.start == rows.start for _, rows in record.logs)):
         return np.zeros(KEPT)
     first = part.start - KEPT
     apart = KEPT * record.sample_period
