@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Motion, Numbers, Scales, make_effect
 from jaxbl.identification.compilation import jit
-from jaxbl.identification.regression import Path, effect_path
+from jaxbl.identification.regression import Path, effect_path, remembers_input
 from jaxbl.simulate import Experiment, with_effects
 
 
@@ -38,6 +38,7 @@ class Part(eqx.Module):
         own: change of a step by each free number (theta), padded with zeros, shape (samples, states, numbers).
         defect: model's step less the smoothed one, shape (samples, states).
         weight: 1, or 0 where samples are padding.
+        before: input before the first sample, N m, shape (earlier,); None where that is not known.
     """
 
     time: Float[Array, " samples"]
@@ -54,6 +55,7 @@ class Part(eqx.Module):
     own: Float[Array, "samples states numbers"]
     defect: Float[Array, "samples states"]
     weight: Float[Array, " samples"]
+    before: Float[Array, " earlier"] | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -68,7 +70,7 @@ class Candidate:
             what is there at coefficients of 0, if anything is.
         numbers: the effect's numbers from the coefficients; None where they are not allowed.
         offset: whether something is there at coefficients of 0.
-        from_rest: whether nothing had happened before the first sample; else its input had lasted.
+        from_rest: whether nothing had happened before the first input known; else that one had lasted.
     """
 
     name: str
@@ -115,8 +117,9 @@ def _variants(name: str, log: Scales) -> Iterator[Candidate]:
         if EFFECTS[name].sizes():
             yield _proportional(name, known, log)
             continue
-        # of one that remembers its input the first samples are the clearest mark on many a log
-        remembers = name.startswith("actuator.") and bool(jax.tree.leaves(_effect(name, known).init()))
+        # of one that remembers its input the first samples are the clearest mark on many a log; not where all that it
+        # remembers is known
+        remembers = remembers_input(_effect(name, known)) and not EFFECTS[name].input_alone
         for from_rest in (False, True) if remembers else (False,):
             yield _trial(name, known, from_rest)
 
@@ -219,7 +222,7 @@ class MotionTorques:
 
     def of(self, effects: Sequence[AbstractEffect], from_rest: bool = False) -> list[np.ndarray]:
         """Torque that each effect adds, shape (samples, sides + 1); on top of what a model without it has. Before the first
-        sample its input had lasted, or with `from_rest` nothing had happened."""
+        input known that one had lasted, or with `from_rest` nothing had happened."""
         found: list[np.ndarray] = [np.zeros(0)] * len(effects)
         names = [effect.name for effect in effects]
         for name in dict.fromkeys(names):
@@ -265,7 +268,7 @@ def _torques(
     """Torques of effects of one name, leaves of shape (effects,), in a model that has those in the gear alone; shape
     (effects, samples) by side, -1 being the input."""
     drive, sides = experiment.drive, experiment.sides
-    along = Path(part.time, part.torque, part.position, part.velocity)
+    along = Path(part.time, part.torque, part.position, part.velocity, before=part.before)
 
     def one(effect: AbstractEffect) -> dict[int, jax.Array]:
         place = drive.place(effect.place)
@@ -301,7 +304,7 @@ def _torques(
 def _needed(experiment: Experiment, part: Part) -> dict[str, jax.Array]:
     """Torque on each side that its motion does not take up, dry friction left out, N m."""
     plant = experiment.plant
-    states, torque = effect_path(experiment, Path(part.time, part.torque, part.position, part.velocity))
+    states, torque = effect_path(experiment, Path(part.time, part.torque, part.position, part.velocity, before=part.before))
     acting = plant.torques(part.position, part.velocity, states, torque, part.time)
     found = {}
     for side in experiment.sides:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxbl.config import Config, read_model
 from jaxbl.errors import InputError
 from jaxbl.identification.logs import Logs, LogTask, read_with_holdout
+from jaxbl.identification.segments import led_in
 from jaxbl.records import Record
 
 HELD_OUT = 0.25
@@ -49,7 +50,9 @@ def read_diagnosis_task(
         record, other = split_off_last_quarter(record)
     else:
         _check_machine(record, other)
-    return DiagnosisTask(config, missing, _long(record), _long(other), holdout is not None)
+    rest = config.log.initial_state == "rest"
+    record, other = (led_in(_long(one), rest) for one in (record, other))
+    return DiagnosisTask(config, missing, record, other, holdout is not None)
 
 
 def input_rms(record: Record) -> float:

@@ -65,7 +65,8 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
     time, torque = padded(segment.time), padded(segment.torque)
     smooth: list[Any] = [{side: states[side][:, i] for side in sides} for i in range(3)]
     driven: list[Any] = [time, torque, *smooth[:2]]
-    along = Path(*driven)
+    before: Any = segment.before
+    along = Path(*driven, before=before)
     effects = effect_states(experiment, along)
     motion = PlantState(smooth[0], smooth[1], jax.tree.map(np.asarray, effects))
     # by side, not by name
@@ -95,7 +96,7 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
         defect[: count - 1] = value[: count - 1] - vectors[1:count]
     a, b, own = np.split(slope, (len(order), len(order) + each + 1), axis=2)
     weight = (np.arange(size) < count).astype(float)
-    given: list[Any] = [time, torque, read, *smooth, modelled, deviation, held, a, b, own, defect, weight]
+    given: list[Any] = [time, torque, read, *smooth, modelled, deviation, held, a, b, own, defect, weight, before]
     return Part(*given)
 
 

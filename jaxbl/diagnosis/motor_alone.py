@@ -113,7 +113,7 @@ def _set_up(task: DiagnosisTask) -> _Search:
     # what the model as given has: its own numbers, and next to none of the effects
     none = np.array([0.0 if i < len(own) else np.log(_SMALL) for i in range(len(free))])
     rest = config.log.initial_state == "rest"
-    return _Search(UnseenLoad(model, free, width, segments_of(record, ["motor"]), rest), effects, none)
+    return _Search(UnseenLoad(model, free, width, segments_of(record, ["motor"], rest), rest), effects, none)
 
 
 def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> Found:

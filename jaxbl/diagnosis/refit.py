@@ -16,7 +16,7 @@ import numpy as np
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import path
 from jaxbl.identification.intervals import spread_of
-from jaxbl.identification.regression import settled
+from jaxbl.identification.regression import begun
 from jaxbl.identification.segments import Segment
 from jaxbl.identification.trajectory import Free, with_fitted
 from jaxbl.simulate import Experiment
@@ -99,8 +99,9 @@ class _Refiner:
         found = []
         for segment, first in zip(self.segments, start, strict=True):
             position, velocity = (dict(zip(sides, half, strict=True)) for half in np.split(first, 2))
-            begun = PlantState(position, velocity, settled(experiment, segment.torque[0]))
-            states = path(experiment, begun, segment.torque, segment.time[0], segment.readings, gains)
+            effects = begun(experiment, segment.torque[:1], segment.before)
+            state = PlantState(position, velocity, effects)
+            states = path(experiment, state, segment.torque, segment.time[0], segment.readings, gains)
             filtered = {}
             for side in sides:
                 own = segment.smoothed[side]

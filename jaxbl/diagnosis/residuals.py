@@ -170,7 +170,7 @@ class _Equation(NamedTuple):
 @jit
 def _equations(experiment: Experiment, part: Kinematics, held: dict[str, Bool[Array, " samples"]]) -> dict[str, _Equation]:
     """Equations of all sides along a part; `held`: where a side is not shown to move for a while."""
-    states, torque = effect_path(experiment, part, from_rest=True)
+    states, torque = effect_path(experiment, part)
     given = part.position, part.velocity, states, torque, part.time, part.transmitted
     drive, found = experiment.drive, {}
 

@@ -93,7 +93,7 @@ def set_up(task: DiagnosisTask) -> Setup:
     own = free_parameters(bare, default_paths(config, bare), float(np.std(record.torque)))
     prior = np.full(len(own), config.uncertainty.relative)
     rest = config.log.initial_state == "rest"
-    recorded, held = (segments_of(one, nominal.sides) for one in (record, task.holdout))
+    recorded, held = (segments_of(one, nominal.sides, rest) for one in (record, task.holdout))
     _check_stable(task, nominal, ReferenceLog(recorded, {}, rest))
     noise, segments = _input_noise(input_rms(record), nominal, own, recorded), recorded
     if noise.unfelt > 0.0:

@@ -34,10 +34,11 @@ def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Expe
     """How well the numbers found serve another log, beside the nominal ones, in windows of `samples` where it is so long."""
     period = jnp.asarray(record.sample_period)
     rebased = [eqx.tree_at(lambda e: e.run.sample_period, one, period) for one in (nominal, fitted)]
-    segments = segments_of(record, nominal.sides)
+    rest = config.log.initial_state == "rest"
+    segments = segments_of(record, nominal.sides, rest)
     noise = reading_noise(segments)
     longest = max(map(len, segments))
-    windows, _ = windows_of(segments, nominal, min(samples, longest), config.log.initial_state == "rest")
+    windows, _ = windows_of(segments, nominal, min(samples, longest), rest)
     left = [jit(projected_residual)(one, windows)[0] for one in rebased]
     position = {}
     for i, side in enumerate(nominal.sides):

@@ -26,8 +26,9 @@ from .intervals import profile
 from .log_columns import columns_of, observer_chain
 from .logs import Logs, LogTask, arrays, decimation, default_paths, gains_for, on_record, read_with_holdout, stage_counter
 from .motor_alone import alone_on_holdout, columns_alone, gap_summary, search_alone
+from .regression import remembers_input
 from .search import ParameterSearch
-from .segments import Segment, long_enough, segments_of
+from .segments import Segment, led_in, long_enough, segments_of
 from .trajectory import Free, free_parameters
 
 
@@ -72,7 +73,11 @@ def read_identification_task(
     asked = {"parameters": None if parameters is None else list(parameters), "profile": profile}
     given = {key: value for key, value in asked.items() if value is not None}
     config = config.model_copy(update={"identify": config.identify.model_copy(update=given)})
-    return LogTask(config, missing, *read_with_holdout(config, log, holdout))
+    record, other = read_with_holdout(config, log, holdout)
+    if any(remembers_input(one.build()) for one in config.effects):
+        rest = config.log.initial_state == "rest"
+        record, other = led_in(record, rest), None if other is None else led_in(other, rest)
+    return LogTask(config, missing, record, other)
 
 
 def identify(
@@ -118,7 +123,7 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
         paths = list(settings.parameters or default_paths(config, nominal))
         free = free_parameters(nominal, paths, float(np.std(record.torque)))
         rest, sides = config.log.initial_state == "rest", [side for side in nominal.sides if side in record.positions]
-        segments = segments_of(record, sides)
+        segments = segments_of(record, sides, rest)
         done()
         if alone:
             return _from_motor(task, nominal, free, segments, done)

@@ -17,7 +17,7 @@ from .segments import Segment
 
 
 def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, found: Found) -> dict[str, np.ndarray]:
-    """Columns of a log and its fit, each of shape (samples,); the segments cover all of the log.
+    """Columns of a log and its fit, each of shape (samples,); NaN where the log gives none.
 
     `t`, `u`, positions (`theta_e`, ...), `transmitted` where it was measured; `SIDE.velocity` and `SIDE.acceleration` with
     their deviations; `SIDE.residual`, rad; the model's `torque` and `SIDE.effects`, N m.
@@ -27,11 +27,18 @@ def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, 
     columns |= {POSITION_CHANNELS[side]: record.positions[side] for side in fitted.sides}
     if record.transmitted is not None:
         columns["transmitted"] = record.transmitted
+
+    def whole(pieces: Sequence[Any]) -> np.ndarray:
+        column = np.full(len(record.time), np.nan)
+        for segment, one in zip(segments, pieces, strict=True):
+            column[segment.rows] = one
+        return column
+
     for side in fitted.sides:
         smoothed = [one.smoothed[side] for one in segments]
         for order, name in ((1, "velocity"), (2, "acceleration")):
-            columns[f"{side}.{name}"] = np.concatenate([np.asarray(one.state[:, order]) for one in smoothed])
-            columns[f"{side}.{name}_deviation"] = np.concatenate([np.asarray(one.deviation(order)) for one in smoothed])
+            columns[f"{side}.{name}"] = whole([one.state[:, order] for one in smoothed])
+            columns[f"{side}.{name}_deviation"] = whole([one.deviation(order) for one in smoothed])
     rows = (found.firsts[:, None] + np.arange(found.samples)[None, :]).ravel()
     for i, side in enumerate(fitted.sides):
         column = np.full(len(record.time), np.nan)
@@ -43,7 +50,7 @@ def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, 
     ]
     for name in torques[0]:
         column = "torque" if name == "transmission" else f"{name}.effects"
-        columns[column] = np.concatenate([np.asarray(one[name]) for one in torques])
+        columns[column] = whole([one[name] for one in torques])
     return columns
 
 

@@ -252,8 +252,9 @@ def alone_on_holdout(config: Config, record: Record, alone: Alone, nominal: np.n
     fitted, smoothness = alone.model, alone.point.smoothness
     period = jnp.asarray(record.sample_period)
     experiment = eqx.tree_at(lambda e: e.run.sample_period, fitted.experiment, period)
-    segments = segments_of(record, ["motor"])
-    model = UnseenLoad(experiment, fitted.free, fitted.width, segments, config.log.initial_state == "rest")
+    rest = config.log.initial_state == "rest"
+    segments = segments_of(record, ["motor"], rest)
+    model = UnseenLoad(experiment, fitted.free, fitted.width, segments, rest)
     given = np.zeros(len(model.free)) if nominal is None else nominal
     sizes = [float(np.sqrt(model.predicted(theta, smoothness).variance)) for theta in (given, alone.point.theta)]
     noise = reading_noise(segments)["motor"]

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbl.drive.effects import AbstractEffect
 from jaxbl.drive.plant import Plant, PlantState, States
 from jaxbl.records.linear_filters import low_pass_taps
 from jaxbl.simulate import Experiment, with_effects
@@ -33,12 +34,14 @@ class Path(eqx.Module):
         time: s, shape (samples,).
         torque: commanded, N m, shape (samples,).
         position, velocity: of each side, rad and rad/s, shape (samples,).
+        before: commanded before the first sample, N m, shape (earlier,); None where that is not known.
     """
 
     time: Float[Array, " samples"]
     torque: Float[Array, " samples"]
     position: dict[str, Float[Array, " samples"]]
     velocity: dict[str, Float[Array, " samples"]]
+    before: Float[Array, " earlier"] | None = eqx.field(default=None, kw_only=True)
 
 
 class Kinematics(Path):
@@ -53,19 +56,27 @@ class Kinematics(Path):
     transmitted: Float[Array, " samples"] | None = None
 
 
-def kinematics_from(time: np.ndarray, torque: np.ndarray, states: Mapping[str, Any], transmitted: Any = None) -> Kinematics:
+def kinematics_from(
+    time: np.ndarray,
+    torque: np.ndarray,
+    states: Mapping[str, Any],
+    transmitted: Any = None,
+    before: np.ndarray | None = None,
+) -> Kinematics:
     """Kinematics of a part of a record.
 
     The input torque is held from each sample to the next; `states` are position, velocity and acceleration of each side,
-    shape (samples, 3).
+    shape (samples, 3). `before`: input before the first sample, N m, shape (earlier,), where it is known.
     """
-    held = np.asarray(torque, float)
-    before = np.concatenate([held[:1], held[:-1]])
+    earlier = 0 if before is None else len(before)
+    held = np.asarray(torque if before is None else np.concatenate([before, torque]), float)
+    mean = 0.5 * (np.concatenate([held[:1], held[:-1]]) + held)
     position, velocity, acceleration = (
         {side: np.ascontiguousarray(np.asarray(state)[:, i]) for side, state in states.items()} for i in range(3)
     )
     measured = None if transmitted is None else np.asarray(transmitted)
-    return Kinematics(np.asarray(time), 0.5 * (before + held), position, velocity, acceleration, measured)  # type: ignore[arg-type]
+    given: list[Any] = [np.asarray(time), mean[earlier:], position, velocity, acceleration, measured]
+    return Kinematics(*given, before=mean[:earlier] if earlier else None)  # pyright: ignore[reportArgumentType]
 
 
 class Balance(NamedTuple):
@@ -86,7 +97,7 @@ def balance(experiment: Experiment, kinematics: Kinematics) -> dict[str, Balance
     A side's residual is the torque that the model has too much there: all torques less inertia times acceleration.
     """
     plant, drive, k = experiment.plant, experiment.drive, kinematics
-    states, torque = effect_path(experiment, k, from_rest=True)
+    states, torque = effect_path(experiment, k)
     found = {}
     if k.transmitted is not None and plant.transmission is not None:
         found["transmission"] = Balance(k.transmitted - _transmitted(plant, k, states), k.transmitted)
@@ -110,7 +121,7 @@ def model_torques(
     Within the standard deviation of the velocities, rad/s, dry friction goes through zero.
     """
     plant, k, found = experiment.plant, kinematics, {}
-    states, torque = effect_path(experiment, k, from_rest=True)
+    states, torque = effect_path(experiment, k)
     loaded: Any = 0.0
     if plant.transmission is not None:
         found["transmission"] = _transmitted(plant, k, states)
@@ -134,7 +145,7 @@ def model_torques(
 def transmitted(experiment: Experiment, k: Kinematics) -> Float[Array, " samples"]:
     """Transmitted torque by a model at known kinematics, N m."""
     gear = with_effects(experiment, tuple(one for one in experiment.effects if one.place == "transmission"))
-    return _transmitted(gear.plant, k, effect_path(gear, k, from_rest=True)[0])
+    return _transmitted(gear.plant, k, effect_path(gear, k)[0])
 
 
 def _transmitted(plant: Plant, k: Kinematics, states: States) -> Float[Array, " samples"]:
@@ -147,15 +158,46 @@ def settled(experiment: Experiment, torque: Float[Array, ""]) -> States:
     return tuple(type(effect).settled(effect, torque) for effect in experiment.effects)
 
 
+def remembers_input(effect: AbstractEffect) -> bool:
+    """Whether an effect depends on inputs before a log's first sample."""
+    return effect.place == "actuator" and bool(jax.tree.leaves(type(effect).init(effect)))
+
+
+@jit
+def begun(
+    experiment: Experiment,
+    torque: Float[Array, " samples"],
+    before: Float[Array, " earlier"] | None = None,
+    from_rest: bool = False,
+) -> States:
+    """The effects' own states at the first sample.
+
+    Args:
+        experiment: the model, at the period of the inputs.
+        torque: input from the first sample on, N m, shape (samples,).
+        before: the input before it, N m, shape (earlier,), where it is known.
+        from_rest: whether nothing had happened before the first input known; else that one had lasted.
+    """
+    plant, period = experiment.plant, experiment.run.sample_period
+    first = torque[0] if before is None else before[0]
+    start = tuple(type(one).init(one) for one in plant.effects) if from_rest else settled(experiment, first)
+    start = jax.tree.map(lambda x: jnp.asarray(x, torque.dtype), start)
+    if before is None or not any(map(remembers_input, plant.effects)):
+        return start
+
+    def sample(states: States, torque: Array) -> tuple[States, None]:
+        new, arriving = plant.receive(states, torque, period)
+        return plant.actuate(new, arriving(0.0, period), period)[0], None
+
+    return jax.lax.scan(sample, start, before)[0]
+
+
 @jit
 def effect_path(experiment: Experiment, path: Path, from_rest: bool = False) -> tuple[States, Float[Array, " samples"]]:
-    """The effects' own states at each sample of a known motion, and the torque (N m) that acts.
-
-    Before the first sample its torque had lasted, or with `from_rest` nothing had happened.
-    """
-    plant, period, dtype = experiment.plant, experiment.run.sample_period, path.torque.dtype
-    start = tuple(effect.init() for effect in plant.effects) if from_rest else settled(experiment, path.torque[0])
-    start = jax.tree.map(lambda x: jnp.asarray(x, dtype), start)
+    """The effects' own states at each sample of a known motion, and the torque (N m) that acts; they begin as
+    :func:`begun` says."""
+    plant, period = experiment.plant, experiment.run.sample_period
+    start = begun(experiment, path.torque, path.before, from_rest)
     moving = any(effect.place == "actuator" for effect in plant.effects) or plant.memory
     if not moving:
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (len(path.torque), *x.shape)), start), path.torque

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.drive.effects import AbstractEffect, Motion
+from jaxbl.drive.effects import KEPT, AbstractEffect, Motion
 from jaxbl.drive.plant import PlantState, States
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
@@ -22,6 +22,8 @@ from .trajectory import Windows, cut
 
 _FEWEST = 50
 """Samples of a segment whose torques are compared: the smoother's ends, some ten samples each, are then a small part."""
+_LONG = 10
+"""Least length of a segment that gives up its beginning, over what it gives up: it loses a tenth at most."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +38,7 @@ class Segment:
         readings: positions of each side, rad, shape (samples,).
         smoothed: the same smoothed, with derivatives.
         transmitted: measured transmitted torque, N m, shape (samples,), or None.
+        before: input before the first sample, N m, shape (earlier,); None where that is not known.
     """
 
     rows: slice
@@ -45,6 +48,7 @@ class Segment:
     readings: dict[str, np.ndarray]
     smoothed: dict[str, Smoothed]
     transmitted: np.ndarray | None = None
+    before: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.time)
@@ -59,17 +63,42 @@ class Segment:
         readings = {side: one[:n] for side, one in self.readings.items()}
         transmitted = None if self.transmitted is None else self.transmitted[:n]
         rows = slice(self.rows.start, self.rows.start + n)
-        return Segment(rows, self.time[:n], self.period, self.torque[:n], readings, smoothed, transmitted)
+        return Segment(rows, self.time[:n], self.period, self.torque[:n], readings, smoothed, transmitted, self.before)
 
     @cached_property
     def kinematics(self) -> Kinematics:
         """The smoothed motion as the equations of motion take it."""
         states = {side: one.state for side, one in self.smoothed.items()}
-        return kinematics_from(self.time, self.torque, states, self.transmitted)
+        return kinematics_from(self.time, self.torque, states, self.transmitted, self.before)
 
 
-def segments_of(record: Record, sides: Sequence[str]) -> list[Segment]:
-    """Segments of a log, the positions of each side smoothed."""
+def led_in(record: Record, rest: bool) -> Record:
+    """A log whose segments begin later by as many samples as a dead time may last, where what was commanded before them is
+    not known; but for short ones. `rest`: whether the log begins at rest, with no input before."""
+    parts = tuple(
+        slice(part.start + KEPT, part.stop)
+        if _before(record, part, rest) is None and part.stop - part.start >= _LONG * KEPT
+        else part
+        for part in record.segments
+    )
+    return dataclasses.replace(record, segments=parts)
+
+
+def _before(record: Record, part: slice, rest: bool) -> np.ndarray | None:
+    """Input before a part of a log, N m, shape (KEPT,), where it is known."""
+    assert record.torque is not None
+    # nothing is commanded of a drive that moves freely
+    if not record.torque.any() or (rest and any(part.start == rows.start for _, rows in record.logs)):
+        return np.zeros(KEPT)
+    first = part.start - KEPT
+    apart = KEPT * record.sample_period
+    if first < 0 or abs(record.time[part.start] - record.time[first] - apart) > 0.5 * record.sample_period:
+        return None
+    return record.torque[first : part.start]
+
+
+def segments_of(record: Record, sides: Sequence[str], rest: bool = False) -> list[Segment]:
+    """Segments of a log, the positions of each side smoothed; `rest`: whether the log begins at rest."""
     assert record.torque is not None
     found = []
     for rows in record.segments:
@@ -77,7 +106,8 @@ def segments_of(record: Record, sides: Sequence[str]) -> list[Segment]:
         smoothed = {side: smooth(one, record.sample_period) for side, one in readings.items()}
         time, torque = record.time[rows] - record.time[0], record.torque[rows]
         transmitted = None if record.transmitted is None else record.transmitted[rows]
-        found.append(Segment(rows, time, record.sample_period, torque, readings, smoothed, transmitted))
+        before = _before(record, rows, rest)
+        found.append(Segment(rows, time, record.sample_period, torque, readings, smoothed, transmitted, before))
     return found
 
 
@@ -132,7 +162,7 @@ def windows_of(
         if len(one) < samples:
             continue
         k = one.kinematics
-        along = Path(k.time, one.torque, k.position, k.velocity)
+        along = Path(k.time, one.torque, k.position, k.velocity, before=one.before)
         start = PlantState(k.position, k.velocity, _held(experiment, one, effect_states(experiment, along)))
         pieces.append(cut(one.torque, one.readings, one.period, start, noise, samples, float(one.time[0]), rest))
         firsts.append(one.rows.start + samples * np.arange(len(one) // samples))

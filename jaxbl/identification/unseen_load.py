@@ -32,7 +32,7 @@ from jaxbl.workers import doing
 
 from .intervals import Spread, long_run
 from .prediction import kalman_gain
-from .regression import settled
+from .regression import begun
 from .segments import Segment, white_noise
 from .trajectory import WIDE, Fit, Free
 
@@ -227,7 +227,7 @@ class UnseenLoad:
     @cached_property
     def _settled(self) -> list[States]:
         """States of effects that each segment begins with."""
-        found = [settled(self.experiment, jnp.asarray(one.torque[0])) for one in self.segments]
+        found = [begun(self.experiment, one.torque[:1], one.before) for one in self.segments]
         return jax.tree.map(float, found)
 
     @cached_property

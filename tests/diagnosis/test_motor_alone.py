@@ -14,6 +14,7 @@ from jaxbl.diagnosis import motor_alone
 from jaxbl.diagnosis.diagnose import diagnose, read_diagnosis_task, run_diagnosis
 from jaxbl.diagnosis.motor_alone import sought
 from jaxbl.diagnosis.next_experiment import with_gap
+from jaxbl.drive.effects import KEPT
 from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
 
 STUDY = {
@@ -60,7 +61,7 @@ def part(log, rows):
 def test_nothing_is_named_where_nothing_is_missing(tmp_path):
     t = 2e-3 * np.arange(2060)
     log = driven(5.0 * (np.sin(2.0 * np.pi * 0.5 * t) + np.sin(2.0 * np.pi * 1.3 * t + 1.0)), SHAFT, 1e-3)
-    # the first part is too short to be fitted, and stays in the trace
+    # the first part is too short to be fitted, and stays in the trace; the other one gives up its beginning
     path, other = tmp_path / "motor.csv", tmp_path / "other.csv"
     part(log, np.r_[0:50, 60:1560]).write(path)
     part(log, np.r_[1560:2060]).write(other)
@@ -69,7 +70,8 @@ def test_nothing_is_named_where_nothing_is_missing(tmp_path):
     found = run_diagnosis(task, lambda *counted: done.append(counted))
     assert (found.summary["verdict"], found.summary["findings"]) == ("no_discrepancy", [])
     assert found.summary["explained_share"] is None
-    assert np.isnan(found.trace["torque"][:50]).all() and np.isfinite(found.trace["torque"][50:]).all()
+    first = 50 + KEPT
+    assert np.isnan(found.trace["torque"][:first]).all() and np.isfinite(found.trace["torque"][first:]).all()
     assert done == [(1, 3), (2, 3), (3, 3)]
 
 

@@ -86,7 +86,7 @@ def test_a_lag_of_the_actuator_is_followed():
     effects = [{"kind": "actuator.lag", "time_constant": 0.05}]
     experiment = prepare(read_config(rigid({"run.sample_period": 5e-4}, effects=effects)))
     still = {"motor": jnp.zeros_like(T)}
-    found = balance(experiment, Kinematics(T, jnp.ones_like(T), still, still, still))
+    found = balance(experiment, Kinematics(T, jnp.ones_like(T), still, still, still, before=jnp.zeros(1)))
     np.testing.assert_allclose(found["motor"].residual, 1.0 - jnp.exp(-T / 0.05), atol=0.011)
 
 

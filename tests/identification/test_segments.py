@@ -1,5 +1,8 @@
 """Records cut into windows: what each begins with."""
 
+from dataclasses import replace
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,8 +13,10 @@ from scipy.signal import lfilter
 
 from jaxbl.config import read_model
 from jaxbl.diagnosis.reference_log import ReferenceLog
+from jaxbl.drive.effects import KEPT
 from jaxbl.identification.logs import on_record
-from jaxbl.identification.segments import reading_noise, segments_of, windows_of
+from jaxbl.identification.regression import Path, effect_path
+from jaxbl.identification.segments import led_in, reading_noise, segments_of, windows_of
 from jaxbl.records import read_record
 
 LAG = {"kind": "actuator.lag", "time_constant": 0.05}
@@ -37,6 +42,40 @@ def test_windows_begin_with_the_torque_that_the_actuator_makes_then(setting):
     ((found,),) = windows.start.effects
     np.testing.assert_allclose(found, made[firsts], atol=1e-3 * np.max(np.abs(made)))
     np.testing.assert_allclose(windows.start.position["motor"], segments[0].smoothed["motor"].position[jnp.asarray(firsts)])
+
+
+def test_a_segment_gives_up_its_beginning_for_the_inputs_before_it(setting):
+    whole, _, _ = setting
+    record = replace(whole, segments=(slice(0, 100), slice(100, 900), slice(1000, 2000)))
+    # nothing is known before the first part, which is too short to give up any; the others follow on known inputs
+    assert led_in(record, False).segments == record.segments
+    record = replace(record, time=whole.time + 0.5 * (np.arange(2000) >= 1000))
+    led = led_in(record, False)
+    assert led.segments == (slice(0, 100), slice(100, 900), slice(1000 + KEPT, 2000)) == led_in(led, False).segments
+    first, second, third = segments_of(led, ["motor"])
+    assert first.before is None and record.torque is not None
+    np.testing.assert_array_equal(second.before, record.torque[100 - KEPT : 100])
+    np.testing.assert_array_equal(third.before, record.torque[1000 : 1000 + KEPT])
+    # at rest nothing had been commanded
+    assert led_in(whole, True).segments == whole.segments and led_in(whole, False).segments == (slice(KEPT, 2000),)
+    np.testing.assert_array_equal(segments_of(whole, ["motor"], True)[0].before, np.zeros(KEPT))
+    free = replace(whole, torque=np.zeros(2000))
+    assert led_in(free, False).segments == whole.segments
+
+
+def test_effects_begin_with_what_the_inputs_before_left(setting):
+    """A dead time and a lag along a part of an input act as along the whole of it."""
+    record, _, _ = setting
+    late = [{"kind": "actuator.delay", "delay": 0.0246}, {"kind": "actuator.lag", "time_constant": 0.05}]
+    experiment = on_record(read_model(model(effects=late))[0], record)
+    still = {"motor": np.zeros(200)}
+    time, torque = record.time[:200], np.cos(30.0 * record.time[:200])
+    states, acting = effect_path(experiment, Path(time, torque, still, still))
+    for first in (5, 40):
+        rest = {"motor": np.zeros(200 - first)}
+        later, torques = effect_path(experiment, Path(time[first:], torque[first:], rest, rest, before=torque[:first]))
+        np.testing.assert_allclose(torques, acting[first:], atol=1e-12)
+        np.testing.assert_allclose(jax.tree.leaves(later), [one[first:] for one in jax.tree.leaves(states)], atol=1e-12)
 
 
 def test_the_true_model_of_a_lag_before_a_hard_gap_leaves_noise(tmp_path):

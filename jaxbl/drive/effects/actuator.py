@@ -9,7 +9,7 @@ from .base import EFFECTS, ActuatorEffect, shape, size
 
 _LIMITS = 0.98, 0.95, 0.92, 0.88, 0.84, 0.8, 0.75, 0.7, 0.65, 0.6, 0.55, 0.5, 0.45, 0.4, 0.35, 0.3
 """Limits tried, over the largest commanded torque."""
-_KEPT = 16
+KEPT = 16
 """Samples that a delay may last: each is a state. Of buses and controllers, few last longer than 4."""
 _DELAYS = 0.5, 1.0, 2.0, 4.0, 8.0
 """Delays tried, in samples."""
@@ -30,16 +30,16 @@ class Delay(ActuatorEffect):
     )
 
     def init(self):
-        return (jnp.zeros_like(self.delay),) * _KEPT
+        return (jnp.zeros_like(self.delay),) * KEPT
 
     def settled(self, torque):
-        return (jnp.zeros_like(self.delay) + torque,) * _KEPT
+        return (jnp.zeros_like(self.delay) + torque,) * KEPT
 
     def receive(self, state, torque, period):
         commanded = (torque, *state)
-        late = jnp.clip(self.delay / period, 0.0, _KEPT)
+        late = jnp.clip(self.delay / period, 0.0, KEPT)
         # of the commands kept, the last to have arrived when the sample begins, and the next one
-        whole = jnp.minimum(jnp.floor(late), _KEPT - 1.0)
+        whole = jnp.minimum(jnp.floor(late), KEPT - 1.0)
         first, then = (
             sum(jnp.where(whole == k, one, 0.0) for k, one in enumerate(some)) for some in (commanded[1:], commanded[:-1])
         )
@@ -47,8 +47,8 @@ class Delay(ActuatorEffect):
 
     @classmethod
     def fault(cls, numbers, period):
-        longest = _KEPT * period
-        text = f"delay: {numbers['delay']:g} s is longer than {_KEPT} samples; it should be at most {longest:g} s"
+        longest = KEPT * period
+        text = f"delay: {numbers['delay']:g} s is longer than {KEPT} samples; it should be at most {longest:g} s"
         return text if numbers["delay"] > longest * (1.0 + 1e-9) else ""
 
 
