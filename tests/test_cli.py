@@ -662,7 +662,7 @@ DIAGNOSED = {
         "holdout_rmse_after": {"theta_e": 0.001, "torque_motor": 0.01},
         "noise_floor": {"theta_e": 0.001, "torque_motor": 0.01},
         "free_run": {},
-        "expected": {},
+        "expected": {"theta_e": {"limit": 0.0012}, "torque_motor": {"limit": 0.02}},
         "test": PASSED,
         "controls": {},
     },
@@ -707,7 +707,8 @@ def test_a_log_is_diagnosed_once(axis, quick, call, tmp_path):
     )
     assert lines[1] == "motor.coulomb_friction (confidence 0.97): torque = 0.05 ± 0.001 N m; 12 % of the driving torque."
     assert lines[2].startswith(
-        "On the last part of the log (0.4 to 0.6 s), held out, over windows of 0.1 s, rms: theta_e 0.1 ->"
+        "On the last part of the log (0.4 to 0.6 s), held out, over windows of 0.1 s, rms (noise; most that a complete "
+        "model leaves): theta_e 0.1 -> 0.001 rad (0.001; 0.0012), "
     )
     assert lines[-2].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
     assert lines[-1] == "results/an axis/report.html"

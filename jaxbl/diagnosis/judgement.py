@@ -148,18 +148,21 @@ def _shared(finding: Finding, model: Model, wrong: Model, z: float) -> Finding:
     """
     rival, nats = wrong.names[-1], _nats(model, wrong, z)
     chances = dict(finding.alternatives)
-    if model.log_evidence < wrong.log_evidence and rival in chances:
-        # the two have changed places
-        return finding
     weight = float(finding.confidence * np.exp(np.clip(-nats, -700.0, 700.0)))
-    if weight <= max(chances.get(rival, 0.0), LEAST_CHANCE):
+    before = chances.get(rival, 0.0)
+    changed_places = model.log_evidence < wrong.log_evidence and rival in chances
+    if z > SURE:
+        # what the log leaves open the held-out data may decide
+        weight = max(weight, before * float(np.exp(-0.5 * z**2)))
+    elif changed_places or weight <= max(before, LEAST_CHANCE):
         return finding
-    total = 1.0 - chances.get(rival, 0.0) + weight
+    total = 1.0 - before + weight
     chances = {name: chance / total for name, chance in (chances | {rival: weight}).items()}
+    others = sorted((name for name in chances if name != rival or weight > LEAST_CHANCE), key=lambda name: -chances[name])
     return dataclasses.replace(
         finding,
         confidence=finding.confidence / total,
-        alternatives=tuple(sorted(((name, float(one)) for name, one in chances.items()), key=lambda pair: -pair[1])),
+        alternatives=tuple((name, float(chances[name])) for name in others),
     )
 
 

@@ -40,6 +40,8 @@ _SLOW = (2.0, 4.0, 8.0)
 the bandwidth to the power 2.5, so that slow ones show better there."""
 _LEAST_VALUES = 8
 """Independent values of a slow torque on the log at least."""
+_BEFORE = 512
+"""Samples before a window whose inputs its model may remember: several time constants of most lags."""
 _STATES, _STATES_OF_ONE_RUN = 8, 3
 """Initial states tried for each window, and for a free run, which determines its own much better."""
 
@@ -181,7 +183,11 @@ class ReferenceLog:
             }
             rows = slice(int(first), int(first) + self.samples)
             inside = slice(rows.start - whole.rows.start, rows.stop - whole.rows.start)
-            pieces.append(Segment(rows, whole.time[inside], self.period, whole.torque[inside], readings, smoothed))
+            known = whole.torque[:1] if whole.before is None else whole.before
+            before = np.concatenate([np.repeat(known[:1], _BEFORE), known, whole.torque[: inside.start]])[-_BEFORE:]
+            pieces.append(
+                Segment(rows, whole.time[inside], self.period, whole.torque[inside], readings, smoothed, before=before)
+            )
         torques = residual_torques(experiment, pieces)
         return _all_rms(self._narrowed(torques) | self.slow(torques))
 

@@ -146,6 +146,19 @@ def test_held_out_data_outweigh_a_better_fit_of_another_effect():
     assert said.confidence == pytest.approx(0.98, abs=1e-3)
 
 
+def test_what_a_log_leaves_open_held_out_data_decide():
+    tie = Finding(NAME, 0.51, {"torque": 0.1}, (("motor.viscous_friction", 0.49),))
+    fitted = SimpleNamespace(names=(NAME,), theta=np.zeros(1), free=[], errors=dict, experiment=None)
+
+    def said(z):
+        given = dataclasses.replace(found(fit_gain=0.0), findings=(tie,))
+        controls = [Control("wrong", NOISE, z, "motor.viscous_friction")]
+        return judged(given, fitted, BEFORE, NOISE, LIMITS, controls, np.array([0.02]), 1.0, {}).found.findings[0]  # type: ignore[arg-type]
+
+    assert said(5.0).confidence > 0.99 and said(5.0).alternatives == ()
+    assert said(1.0) == tie
+
+
 def test_what_the_prior_says_stands():
     assert shared(0.0, prior_gain=20.0)[0] == pytest.approx(0.98)
 
