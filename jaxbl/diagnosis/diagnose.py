@@ -308,7 +308,7 @@ def _exchanged(proof: Proof, search: EffectSearch, found: Explanation) -> _Prove
         plainer = proof.plainer(search, accepted, name)
         if plainer is not None:
             found, accepted = _renamed(search, found, plainer, name), plainer
-            controls = proof.controls(search, accepted.fitted, accepted.after, None)
+            controls = proof.controls(search, accepted.fitted, accepted.after, found.wrong)
     return _Proved(search, found, accepted, controls)
 
 
@@ -322,7 +322,11 @@ def _renamed(search: EffectSearch, found: Explanation, accepted: Accepted, name:
             others = tuple(other for other in one.alternatives if other[0] != plain)
             one = Finding(plain, one.confidence, numbers[plain], others)
         findings.append(one)
-    return search.adopted(found, numbers, accepted.fitted.theta[: len(search.free)], findings)
+    renamed = search.adopted(found, numbers, accepted.fitted.theta[: len(search.free)], findings)
+    # a rival stands beside the same effects
+    if found.wrong is not None and name == found.model.names[-1] and found.wrong.names[-1] != plain:
+        return dataclasses.replace(renamed, wrong=found.wrong)
+    return renamed
 
 
 def _check_shown(setup: Setup, shown: float) -> None:

@@ -100,7 +100,8 @@ def expected_errors(
     for name in names:
         squares = np.array([one[name] for one in drawn])
         unsure = _TORQUE_NOISE_ERROR if name.startswith("torque") else _NOISE_ERROR
-        limit = (1.0 + unsure) ** 2 * (floor[name] ** 2 + _quantile(squares, LEVEL / len(names))) + small[name]
+        drawn_most = (1.0 + _NOISE_ERROR) ** 2 * _quantile(squares, LEVEL / len(names))
+        limit = (1.0 + unsure) ** 2 * floor[name] ** 2 + drawn_most + small[name]
         found[name] = Expected(floor[name], float(np.sqrt(np.mean(squares))), small[name] ** 0.5, limit**0.5)
     if any(name.startswith("torque") for name in failed(log.with_slow(base), found)):
         for name, rounding in log.rounding(fitted.experiment).items():

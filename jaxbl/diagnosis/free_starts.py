@@ -92,6 +92,13 @@ def best_runs(
         return _searched(model, passes, rest)
 
 
+def _within(model: _Model) -> np.ndarray:
+    """Whether a window goes on where the one before it ends; shape (windows,)."""
+    time, period = model.windows.time, float(model.experiment.run.sample_period)
+    length = model.windows.torque.shape[1] * period
+    return np.concatenate([[False], np.abs(np.diff(time) - length) < 0.5 * period])
+
+
 def _searched(model: _Model, passes: int, rest: bool) -> Run:
     windows, sides = model.windows, model.experiment.sides
     leaves, shape = jax.tree.flatten(windows.start)
@@ -103,9 +110,11 @@ def _searched(model: _Model, passes: int, rest: bool) -> Run:
     still, known = best.copy(), np.ones_like(best)
     still[:, moving] = 0.0
     known[np.ix_(np.flatnonzero(windows.rest), moving)] = 0.0
+    within = _within(model) | windows.rest
     for effect, own in zip(model.experiment.effects, places.effects, strict=True):
-        if effect.follows:
-            known[:, jax.tree.leaves(own)] = 0.0
+        columns = jax.tree.leaves(own)
+        if columns and (effect.follows or effect.input_alone):
+            known[np.ix_(np.flatnonzero(within | effect.input_alone), columns)] = 0.0
     residual, slope = np.zeros((runs, samples, len(sides))), np.zeros((runs, samples, len(sides), count))
     states = [np.zeros((runs, samples)) for _ in leaves]
     cost, damping, tried = np.full(runs, np.inf), np.full(runs, RIDGE), best.copy()

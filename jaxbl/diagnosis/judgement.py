@@ -11,9 +11,9 @@ from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.simulate import Experiment
 
-from .effect_search import FAR, LEAST_CHANCE, Explanation, Finding, Model
+from .effect_search import FAR, LEAST_CHANCE, Explanation, Finding, Model, contains
 from .expected_errors import Expected, failed
-from .proof import SURE, Control, FittedModel, special_case
+from .proof import SEEN, SURE, Control, FittedModel
 
 _LEAST_SHARE = 0.5
 """Of the missing torque, that an explanation takes away: with less it may pass only since its numbers are open."""
@@ -72,15 +72,14 @@ def judged(
     away = fitted.theta[: len(prior)] / prior
     far = {one.path: float(z) for one, z in zip(fitted.free, away, strict=False) if abs(z) > FAR}
     chance = any(one.kind == "permuted" and one.z < SURE for one in controls)
-    findings = tuple(
-        _beside_special_case(_no_surer(one, fitted, gains.get(one.effect, np.inf)), fitted) for one in found.findings
-    )
+    findings = found.findings
     for one in controls:
         if one.kind == "wrong" and found.wrong is not None:
             last = fitted.names[-1]
             findings = tuple(
                 _shared(each, found.model, found.wrong, one.z) if each.effect == last else each for each in findings
             )
+    findings = tuple(_no_surer(one, fitted, gains.get(one.effect, np.inf)) for one in findings)
     powerless = bool(fitted.names) and not failed(before, expected)
     little = bool(fitted.names) and is_little(share)
     verdict = "unknown_effect" if left or far or chance or powerless or little or contradicting else found.verdict
@@ -99,25 +98,18 @@ def _no_surer(finding: Finding, fitted: FittedModel, gain: float) -> Finding:
     return finding if finding.confidence <= chance else dataclasses.replace(finding, confidence=chance)
 
 
-def _beside_special_case(finding: Finding, fitted: FittedModel) -> Finding:
-    """A finding that shares its probability with a special case of it that it may as well be."""
-    plain = special_case(fitted, finding.effect)
-    if plain is None:
-        return finding
-    half = 0.5 * finding.confidence
-    others = ((plain, half), *(one for one in finding.alternatives if one[0] != plain))
-    return dataclasses.replace(finding, confidence=half, alternatives=tuple(sorted(others, key=lambda pair: -pair[1])))
-
-
 def _nats(model: Model, wrong: Model, z: float) -> float:
     """Evidence for a model over one with another effect in place of its last, as far as held-out data agree (nats).
 
     The better fit to the log counts as far as that model is the better one there, too; what they say besides is that of
     a normal deviate.
     """
-    if model.names[-1].partition(".")[2] in EFFECTS[wrong.names[-1]].special_cases:
+    if contains(wrong.names[-1], model.names[-1]):
         # a more general effect does as well by its nature
         return np.inf
+    if contains(model.names[-1], wrong.names[-1]) and z < -SEEN:
+        # what the general one gains on the log the held-out data do not have
+        return -0.5 * z**2
     fit = model.log_likelihood - wrong.log_likelihood
     agreed = float(np.clip((z if fit > 0.0 else -z) / SURE, 0.0, 1.0))
     nats = model.log_evidence - wrong.log_evidence - fit * (1.0 - agreed)
@@ -130,7 +122,7 @@ def exchanged(found: Explanation, controls: Sequence[Control]) -> Explanation | 
     if found.wrong is None or not found.findings or found.findings[-1].effect != found.model.names[-1]:
         return None
     nats = _nats(found.model, found.wrong, z)
-    if nats >= 0.0:
+    if not nats < 0.0:
         return None
     *others, last = found.findings
     rival = found.wrong.names[-1]
@@ -181,7 +173,7 @@ def explained_share(
         total = 0.0
         for side in experiment.sides:
             one = expected[f"torque_{side}"]
-            more = errors[f"torque_{side}"] ** 2 - one.noise**2 - one.open**2
+            more = errors[f"torque_{side}"] ** 2 - one.noise**2 - one.open**2 - one.rounding**2
             total += max(more, 0.0) / float(experiment.drive.ratio(side)) ** 2
         return total
 

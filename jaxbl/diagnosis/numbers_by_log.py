@@ -116,12 +116,13 @@ def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
         for one, at in zip(fitted.free, fitted.theta, strict=True)
     ]
     # of equal weight on both sides, whatever the gear
-    products, torque, noise = [], np.zeros(len(moved)), 0.0
+    products, torque, clear = [], np.zeros(len(moved)), np.zeros(len(moved), bool)
     for side, missing in now.items():
         slopes = np.stack([(one[side] - missing) / _STEP for one in moved])
         ratio = float(fitted.experiment.drive.ratio(side))
-        torque = np.hypot(torque, np.sqrt(np.mean(slopes**2, axis=1)) / ratio)
-        noise = np.hypot(noise, np.sqrt(np.mean(noises[side] ** 2)) / ratio)
+        size = np.sqrt(np.mean(slopes**2, axis=1))
+        torque = np.hypot(torque, size / ratio)
+        clear |= size > _CLEAR * np.sqrt(np.mean(noises[side] ** 2))
         both = np.concatenate([slopes, -missing[None]]) / max(float(np.sqrt(np.mean(missing**2))), 1e-300)
         products.append([block @ block.T for block in np.array_split(both, BLOCKS, axis=1)])
     blocks = np.sum(products, axis=0)
@@ -137,7 +138,7 @@ def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
     error = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((without - without.mean(axis=0)) ** 2, axis=0))
     # what depends on other numbers, or does nothing in this log, is not shown by it
     inverse = np.linalg.pinv(total[:-1, :-1] / np.outer(size, size), rcond=1e-10, hermitian=True)
-    alone = there & (torque > _CLEAR * noise) & (np.diag(inverse) < _INFLATED) & (np.diag(inverse) > 0.0)
+    alone = there & clear & (np.diag(inverse) < _INFLATED) & (np.diag(inverse) > 0.0)
     return _Shown(change, np.where(alone, error, np.inf), torque)
 
 

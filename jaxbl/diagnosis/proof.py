@@ -75,7 +75,7 @@ def special_case(fitted: FittedModel, name: str) -> str | None:
     """Name of a special case that an effect of a model may as well be, since the number that parts the two is known no
     better than its size: friction that bends over a length of 0.5 ± 0.6 mrad may as well not bend."""
     cls, errors = EFFECTS[name], fitted.errors()
-    shapes = [f"effects.{name}.{leaf}" for leaf, role in cls.roles().items() if role.kind == "shape"]
+    shapes = [f"effects.{name}.{leaf}" for leaf, role in cls.roles().items() if role.kind in ("shape", "frequency")]
     apart = [errors[path] < abs(float(get_leaf(fitted.experiment, path))) for path in shapes if path in errors]
     plain = next((f"{name.partition('.')[0]}.{kind}" for kind in cls.special_cases), None)
     return plain if apart and not any(apart) else None

@@ -29,7 +29,7 @@ _NOISY = 1e-3
 _SHOWN = 3.0
 """Nats from which on it counts as shown that the drive did not: odds of twenty."""
 _BELOW = 3.0
-"""Standard errors by which a share below zero is no chance."""
+"""Standard errors by which a share below zero does not come about by chance."""
 
 
 class InputNoise(NamedTuple):
@@ -128,7 +128,7 @@ def _input_noise(size: float, nominal: Experiment, own: Sequence[Free], segments
     share, error = unfelt(given.left(smoothness), smooth.left(smoothness))
     # nats that it did not feel it, rather than did
     shown = (share - 0.5) / error**2
-    # a share below none comes of what the model lacks, which then hides how much it is
+    # below none it says nothing: a controller that hands the encoder's noise on, or what the model lacks, hides the share
     possible = 1.0 if share < -_BELOW * error else float(np.sqrt(np.clip(share + 2.0 * error, 0.0, 1.0)))
     return InputNoise(noise if shown > _SHOWN else 0.0, possible * noise)
 

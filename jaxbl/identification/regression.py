@@ -197,7 +197,11 @@ def effect_path(experiment: Experiment, path: Path, from_rest: bool = False) -> 
     """The effects' own states at each sample of a known motion, and the torque (N m) that acts; they begin as
     :func:`begun` says."""
     plant, period = experiment.plant, experiment.run.sample_period
-    start = begun(experiment, path.torque, path.before, from_rest)
+    speeds = {side: speed[0] for side, speed in path.velocity.items()}
+    start = tuple(
+        type(effect).moved(effect, own, speeds[place]) if (place := plant.drive.place(effect.place)) in speeds else own
+        for effect, own in zip(plant.effects, begun(experiment, path.torque, path.before, from_rest), strict=True)
+    )
     moving = any(effect.place == "actuator" for effect in plant.effects) or plant.memory
     if not moving:
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (len(path.torque), *x.shape)), start), path.torque

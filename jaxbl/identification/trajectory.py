@@ -227,11 +227,12 @@ def _eliminate(experiment: Experiment, window: Windows, passes: int, rest: bool)
     still, _ = ravel_pytree(PlantState(window.start.position, standing, window.start.effects))
     free = jax.tree.map(jnp.ones_like, window.start)
     moving = jax.tree.map(lambda one: jnp.where(window.rest, 0.0, one), free.velocity)
-    following = tuple(
-        jax.tree.map(jnp.zeros_like, one) if effect.follows else one
+    # others follow from numbers that are still to be found
+    effects = tuple(
+        jax.tree.map(jnp.zeros_like, one) if effect.input_alone else one
         for effect, one in zip(experiment.effects, free.effects, strict=True)
     )
-    known, _ = ravel_pytree(PlantState(free.position, moving, following))
+    known, _ = ravel_pytree(PlantState(free.position, moving, effects))
 
     def residual(start: Array) -> tuple[Array, Array]:
         value = _residual(experiment, unravel(start), window).ravel()

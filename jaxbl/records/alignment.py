@@ -144,8 +144,8 @@ def encoder_offset(grid: Grid, nominal: NominalDrive) -> Offset | None:
     error = float(np.hypot(errors[0], constant / nominal.stiffness))
     load_torque = nominal.load_inertia * load_acceleration + nominal.load_viscous * load_velocity
     both = found.flanks and constant < float(np.quantile(np.abs(load_torque / nominal.gear_ratio), 0.9))
-    # a twist that never covers the gap has not been at both ends of it
-    both = both and found.range > 2.0 * nominal.half_gap
+    # a twist that never covers the gap has not been at both ends of it; a data sheet may make it a third too wide
+    both = both and found.range > 1.5 * nominal.half_gap
     flank = 0.0 if both else _VAGUE * nominal.half_gap
     drive = float(np.sqrt(np.mean(torque**2)))
     if nominal.stiffness * (abs(value) - flank) < _FELT * drive or abs(value) - flank < _SURELY * float(errors[0]):

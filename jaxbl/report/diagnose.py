@@ -79,6 +79,9 @@ def _contradiction_lines(summary: Mapping[str, Any]) -> list[str]:
 _NO_MORE = "no more is left on data not used for the fit than noise and the uncertainty of the model's numbers account for"
 
 
+_TOO_LITTLE = "the data not used for the fit are too noisy, or too few, to show it"
+
+
 def verdict_sentence(summary: Mapping[str, Any]) -> str:
     """The verdict in one sentence."""
     names = _listed([one["effect"] for one in summary["findings"]])
@@ -93,8 +96,13 @@ def verdict_sentence(summary: Mapping[str, Any]) -> str:
     gap = alone and alone["why"] and (alone["gain"] >= alone["needed"] or alone["unmet"])
     if not names and gap and complete:
         return f"Unknown: a gap might explain what is missing, but this log does not show it: {where}."
+    if not names and summary["withdrawn"] and not test["failed"]:
+        found = _listed(summary["withdrawn"])
+        return f"Not confirmed: something is missing by the log, perhaps {found}; {_TOO_LITTLE}."
     if not names:
         return f"Unknown: no known effect explains what is missing: {where}."
+    if test["powerless"] and not any(test[reason] for reason in ("failed", "remainder", "far", "contradicting")):
+        return f"Not confirmed: by the log the model lacks {names}; {_TOO_LITTLE}."
     share, rest = _share(summary["explained_share"]), ", but not in a way that can be right"
     if not complete:
         rest = f". The rest is none of the known effects: {where}"
@@ -162,7 +170,7 @@ def _reasons(summary: Mapping[str, Any]) -> list[str]:
         lines.append(
             "The data not used for the fit cannot confirm it: the model as given leaves no more there than could be chance."
         )
-    if test["little"] and not test["failed"]:
+    if test["little"] and not test["failed"] and not test["powerless"]:
         lines.append("It takes away less than half of the torque that is missing on the data not used for the fit.")
     if test["chance"]:
         lines.append("Shuffled in time, the torque that was added does as well.")

@@ -9,18 +9,20 @@ from small_study import small
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.free_starts import best_runs
 from jaxbl.diagnosis.neutral_effects import with_torques
+from jaxbl.drive import make_effect
 from jaxbl.drive.parameters import as_arrays, set_leaves
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.segments import segments_of, windows_of
 from jaxbl.identification.trajectory import projected_residual
 from jaxbl.records import read_record
+from jaxbl.simulate import with_effects
 from jaxbl.sweeps.trial import run
 
 STUDY = small(
     {"run.duration": 2.0, "run.substeps": 5},
     excitation={"kind": "multisine", "amplitude": 5.0, "frequency": 0.7},
     transmission={"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.02},
-    effects=[{"kind": "load.coulomb_friction", "torque": 2.0}, {"kind": "actuator.lag", "time_constant": 2e-3}],
+    effects=[{"kind": "load.coulomb_friction", "torque": 2.0}, {"kind": "actuator.delay", "delay": 2e-3}],
     encoders={"noise": 1e-4},
     observer={"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}},
 )
@@ -48,11 +50,23 @@ def test_runs_are_those_of_the_fit(log, rest):
 
 
 def test_torques_may_be_added_sample_by_sample(log):
-    """Where all of the input goes over the motor's added torque, with the lag away, nothing changes."""
+    """Where all of the input goes over the motor's added torque, without a dead time, nothing changes."""
     (model, paths), record = log
-    model = set_leaves(model, {"effects.actuator.lag.time_constant": jnp.asarray(1e-30)})
+    model = set_leaves(model, {"effects.actuator.delay.delay": jnp.asarray(1e-30)})
     windows, _ = windows_of(segments_of(record, model.sides), model, 250)
     expected = best_runs(model, windows, 4, False)
     idle = type(windows)(0.0 * windows.torque, windows.measured, windows.time, windows.start, windows.noise, windows.rest)
     found = best_runs(model, idle, 4, False, {paths["motor"]: -np.asarray(windows.torque)})
     assert found.residual == pytest.approx(expected.residual, rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("rest", [False, True])
+def test_a_state_that_follows_from_the_motion_is_free_only_where_a_log_begins(log, rest):
+    (model, _), record = log
+    swinging = make_effect("load.flexibility", inertia=0.5, frequency=3.0)
+    model = with_effects(model, (*model.effects, as_arrays(swinging, float)))
+    windows, _ = windows_of(segments_of(record, model.sides, rest), model, 250, rest)
+    found = best_runs(model, windows, 4, rest)
+    for have, start in zip(found.states.effects[-1], windows.start.effects[-1], strict=True):
+        moved = np.asarray(have)[:, 0] != np.asarray(start)
+        assert not moved[1:].any() and moved[0] == (not rest)

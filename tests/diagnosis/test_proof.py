@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxbl.diagnosis.proof import Proof, _standard_errors, beaten
+from jaxbl.diagnosis.proof import Accepted, Proof, _standard_errors, beaten, special_case
 from jaxbl.diagnosis.reference_log import Comparison
+from jaxbl.drive import make_effect
 
 POSITION, TORQUE = 1e-4, 1e-2
 
@@ -84,3 +85,35 @@ def test_of_needless_effects_the_one_of_least_torque_goes_first(monkeypatch, err
     said = accepted(monkeypatch, errors, shares, gain)
     assert said.withdrawn == ["actuator.delay"]
     assert said.fitted.names == ("motor.cogging", "motor.coulomb_friction")
+
+
+@pytest.mark.parametrize(("error", "apart"), [(0.02, True), (0.2, False)])
+def test_an_effect_may_be_its_special_case_where_the_number_that_parts_them_is_open(error, apart):
+    name = "motor.presliding_friction"
+    fitted = SimpleNamespace(
+        experiment=SimpleNamespace(effects=(make_effect(name, torque=0.1, length=0.1),)),
+        errors=lambda: {f"effects.{name}.torque": 1e-3, f"effects.{name}.length": error},
+    )
+    assert special_case(fitted, name) == (None if apart else "motor.coulomb_friction")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("z", "named"), [(1.5, False), (0.5, True)])
+def test_a_special_case_is_named_where_held_out_data_do_not_part_it_either(z, named, monkeypatch):
+    general, plain = "motor.presliding_friction", "motor.coulomb_friction"
+    effect = make_effect(general, torque=0.1, length=0.1)
+    fitted = SimpleNamespace(
+        names=(general,), numbers={general: {"torque": 0.1, "length": 0.1}}, theta=np.zeros(1),
+        experiment=SimpleNamespace(effects=(effect,)), errors=lambda: {f"effects.{general}.length": 0.2},
+    )  # fmt: skip
+    fit = "jaxbl.diagnosis.proof.fit_model"
+    monkeypatch.setattr(fit, lambda _, numbers, theta: SimpleNamespace(numbers=numbers, experiment=0))
+    monkeypatch.setattr("jaxbl.diagnosis.proof.beaten", lambda *_: z)
+    proof = SimpleNamespace(
+        setup=SimpleNamespace(prior=[0.02]), other=SimpleNamespace(compare=lambda _: "after"), before=None,
+        worse=lambda *_: False, _gain=lambda *_: 7.0,
+    )  # fmt: skip
+    accepted = Accepted(fitted, "general", [], {general: 9.0})  # type: ignore[arg-type]
+    found = Proof.plainer(proof, SimpleNamespace(lacking=[plain]), accepted, general)  # type: ignore[arg-type]
+    assert (found is not None) == named
+    if found is not None:
+        assert found.fitted.numbers == {plain: {"torque": 0.1}} and found.gains == {plain: 7.0}

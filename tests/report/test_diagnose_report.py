@@ -159,7 +159,14 @@ def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
     first, _, _, second, *_ = lines(far={"drive.motor_inertia": -25.0})
     assert first == partly.format("83 %") + "not used for the fit, but not in a way that can be right."
     assert second.startswith("drive.motor_inertia had to change by -50%, 25 times its [uncertainty]: findings and it may")
-    assert lines(powerless=True)[3].startswith("The data not used for the fit cannot confirm it: the model as given leaves")
+    unsure = lines(powerless=True, little=True)
+    too_little = "the data not used for the fit are too noisy, or too few, to show it."
+    assert unsure[0] == f"Not confirmed: by the log the model lacks load.coulomb_friction; {too_little}"
+    assert unsure[3].startswith("The data not used for the fit cannot confirm it: the model as given leaves")
+    assert not any("less than half" in line for line in unsure)
+    gone = changed(verdict="unknown_effect", findings=[], withdrawn=["load.coulomb_friction"])
+    lost = "Not confirmed: something is missing by the log, perhaps load.coulomb_friction; "
+    assert diagnosis_lines(gone)[0] == lost + too_little
     gap = SUMMARY["gap"] | {"test": SUMMARY["gap"]["test"] | {"failed": ["theta_e"]}}
     alone = diagnosis_lines(changed(verdict="unknown_effect", gap=gap, backlash=None))[0]
     assert "83 % of the squared prediction error of the motor beyond noise is explained on data" in alone

@@ -23,7 +23,6 @@ class Delay(ActuatorEffect):
 
     kind: ClassVar[str] = "delay"
     input_alone: ClassVar[bool] = True
-    follows: ClassVar[bool] = True
     rank: ClassVar[int] = 0
     delay: Scalar = shape(
         "s", "dead time T", lambda log: [samples * log.period for samples in _DELAYS], neutral=1e-30, minimum=0.0

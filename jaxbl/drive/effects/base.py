@@ -141,8 +141,8 @@ class AbstractEffect(eqx.Module):
         velocity_dependent: whether a hook looks at a velocity; it is then evaluated twice a step (predictor and
             corrector), which keeps the integrator's second order.
         input_alone: whether its own state is what was commanded, whatever its numbers and the motion: it is then known.
-        follows: whether its own state follows, by its numbers, from the input or from the motion as it is measured: where a
-            part of a log begins, it is then as known as these.
+        follows: whether its own state follows, by its numbers, from the input or from the motion as it is measured: within
+            a log it is then as known as these.
         in_time: whether it depends on the time since a log began.
         corrects: the drive's number that it is the error of: `inertia` or `viscous`.
         exclusive: of effects with the same word here, a place has one.
@@ -176,6 +176,10 @@ class AbstractEffect(eqx.Module):
     def settled(self, torque: Value) -> Any:
         """The own state after a commanded torque (N m) that has lasted; at t = 0 unless the effect says otherwise."""
         return type(self).init(self)
+
+    def moved(self, state: Any, velocity: Value) -> Any:
+        """The own state :meth:`init` on a side that moves (rad/s) when a log begins, as far as that says anything."""
+        return state
 
     def advance(self, state: Any, motion: Motion, step: Value) -> Any:
         """The own state after `step` seconds at a steady velocity. The plant calls it for both halves of a step."""

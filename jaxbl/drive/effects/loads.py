@@ -187,6 +187,9 @@ class Flexibility(SideEffect):
         # twist of the spring, rad, and velocity of the inertia, rad/s
         return (jnp.zeros_like(self.frequency), jnp.zeros_like(self.frequency))
 
+    def moved(self, state, velocity):
+        return (state[0], state[1] + velocity)
+
     def advance(self, state, motion, step):
         # exact at a steady velocity
         twist, velocity = state
