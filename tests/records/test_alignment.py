@@ -59,6 +59,13 @@ def test_a_load_on_one_flank_may_be_an_offset(read):
     assert read(axis(gap=0.2, load_torque=8.0), nominal=NominalDrive(**vars(NOMINAL) | {"half_gap": 0.1})).warnings == ()
 
 
+@pytest.mark.parametrize(("half_gap", "sure"), [(0.025, True), (0.06, False)])
+def test_a_twist_that_never_covers_the_gap_has_no_sure_offset(read, half_gap, sure):
+    """A motor that moves in one half of a wide gap looks like an offset and a narrow one."""
+    record = read(axis(offset=0.3, gap=0.05), nominal=NominalDrive(**vars(NOMINAL) | {"half_gap": half_gap}))
+    assert bool(record.corrections) == sure
+
+
 def test_a_constant_torque_of_the_motor_is_no_sure_offset(read):
     record = read(axis(motor_torque=0.5))
     assert record.corrections == {}

@@ -508,6 +508,15 @@ def test_an_inertia_far_from_the_nominal_one_is_said_first(tmp_path, change, tim
     assert times is None or f", {times} times the nominal 0.01: check the units" in said[0]
 
 
+@pytest.mark.parametrize(("stiffness", "refused"), [(1e6, True), (1e-3, False)])
+def test_an_inertia_that_a_resonance_hides_is_doubted_and_not_refused(tmp_path, stiffness, refused):
+    """A fiftieth of the nominal inertia: above the antiresonance the input supplies little."""
+    nominal = NominalDrive(0.3, 0.0, load_inertia=0.3, stiffness=stiffness)
+    record = read_record(wrote(tmp_path, made().drop(columns="theta_s")), nominal=nominal)
+    assert record.warnings[0].startswith("Doubtful: u moves theta_e as an inertia of")
+    assert bool(record.contradiction) == refused
+
+
 def test_a_torque_that_acts_late_is_doubted_and_not_refused(tmp_path):
     """An inertia of 1 kg m² on two sines, its torque recorded 40 ms before it acts."""
     t, w = 2e-3 * np.arange(4000), 2.0 * np.pi * np.array([[2.0], [3.3]])
