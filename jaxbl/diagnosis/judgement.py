@@ -13,7 +13,7 @@ from jaxbl.simulate import Experiment
 
 from .effect_search import FAR, LEAST_CHANCE, Explanation, Finding, Model, contains
 from .expected_errors import Expected, failed
-from .proof import SEEN, SURE, Control, FittedModel
+from .proof import SEEN, SURE, Control, FittedModel, special_case
 
 _LEAST_SHARE = 0.5
 """Of the missing torque, that an explanation takes away: with less it may pass only since its numbers are open."""
@@ -79,7 +79,7 @@ def judged(
             findings = tuple(
                 _shared(each, found.model, found.wrong, one.z) if each.effect == last else each for each in findings
             )
-    findings = tuple(_no_surer(one, fitted, gains.get(one.effect, np.inf)) for one in findings)
+    findings = tuple(_no_surer(_beside_special_case(one, fitted), fitted, gains.get(one.effect, np.inf)) for one in findings)
     powerless = bool(fitted.names) and not failed(before, expected)
     little = bool(fitted.names) and is_little(share)
     verdict = "unknown_effect" if left or far or chance or powerless or little or contradicting else found.verdict
@@ -96,6 +96,16 @@ def _no_surer(finding: Finding, fitted: FittedModel, gain: float) -> Finding:
     z = [abs(float(get_leaf(fitted.experiment, path))) / max(errors[path], 1e-300) for path in paths if path in errors]
     chance = min(float(2.0 * ndtr(max(z)) - 1.0) if z else 1.0, float(ndtr(gain)))
     return finding if finding.confidence <= chance else dataclasses.replace(finding, confidence=chance)
+
+
+def _beside_special_case(finding: Finding, fitted: FittedModel) -> Finding:
+    """A finding that shares its probability with a special case of it that it may as well be by the fit."""
+    plain = special_case(fitted, finding.effect)
+    if plain is None:
+        return finding
+    half = 0.5 * finding.confidence
+    others = ((plain, half), *(one for one in finding.alternatives if one[0] != plain))
+    return dataclasses.replace(finding, confidence=half, alternatives=tuple(sorted(others, key=lambda pair: -pair[1])))
 
 
 def _nats(model: Model, wrong: Model, z: float) -> float:

@@ -27,9 +27,8 @@ _APART = 6.0
 hundred is so by chance."""
 _LEAST = 0.05
 """Share of the driving torque that the difference has to make."""
-_CLEAR = 3.0
-"""Times that a number's torque has to be the noise of torques, or that takes more than a tenth of it away: of a load that
-hardly moves the acceleration is all noise."""
+_LOST = 0.1
+"""Share of a number that noise may take off what a log says of it; of a load that hardly moves the acceleration is all noise."""
 _INFLATED = 100.0
 """Variance of a number over what it were if all others were known, from which on it depends on them."""
 
@@ -101,12 +100,14 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 
 class _Shown(NamedTuple):
-    """What a log says of a model's theta: by how much each number should be changed, the standard error, and the torque of a
-    change of 1 at the motor, rms, N m."""
+    """What a log says of a model's theta: by how much each number should be changed, the standard error, the torque of a
+    change of 1 at the motor, rms, N m, and by how much noise in that torque makes the change too small: a regression loses
+    the square of noise over size."""
 
     change: np.ndarray
     error: np.ndarray
     torque: np.ndarray
+    lost: np.ndarray
 
 
 def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
@@ -116,13 +117,13 @@ def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
         for one, at in zip(fitted.free, fitted.theta, strict=True)
     ]
     # of equal weight on both sides, whatever the gear
-    products, torque, clear = [], np.zeros(len(moved)), np.zeros(len(moved), bool)
+    products, torque, lost = [], np.zeros(len(moved)), np.full(len(moved), np.inf)
     for side, missing in now.items():
         slopes = np.stack([(one[side] - missing) / _STEP for one in moved])
         ratio = float(fitted.experiment.drive.ratio(side))
         size = np.sqrt(np.mean(slopes**2, axis=1))
         torque = np.hypot(torque, size / ratio)
-        clear |= size > _CLEAR * np.sqrt(np.mean(noises[side] ** 2))
+        lost = np.minimum(lost, np.mean(noises[side] ** 2) / np.maximum(size, 1e-300) ** 2)
         both = np.concatenate([slopes, -missing[None]]) / max(float(np.sqrt(np.mean(missing**2))), 1e-300)
         products.append([block @ block.T for block in np.array_split(both, BLOCKS, axis=1)])
     blocks = np.sum(products, axis=0)
@@ -138,13 +139,13 @@ def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
     error = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((without - without.mean(axis=0)) ** 2, axis=0))
     # what depends on other numbers, or does nothing in this log, is not shown by it
     inverse = np.linalg.pinv(total[:-1, :-1] / np.outer(size, size), rcond=1e-10, hermitian=True)
-    alone = there & clear & (np.diag(inverse) < _INFLATED) & (np.diag(inverse) > 0.0)
-    return _Shown(change, np.where(alone, error, np.inf), torque)
+    alone = there & (lost < _LOST) & (np.diag(inverse) < _INFLATED) & (np.diag(inverse) > 0.0)
+    return _Shown(change, np.where(alone, error, np.inf), torque, lost)
 
 
 def _apart(one: _Shown, other: _Shown, k: int, least: float) -> float:
     """Standard errors between two logs in a number; 0 where the difference makes less than a torque of `least`."""
-    apart = abs(one.change[k] - other.change[k])
+    apart = abs(one.change[k] - other.change[k]) - one.lost[k] - other.lost[k]
     if not apart * max(one.torque[k], other.torque[k]) > least:
         return 0.0
     return float(apart / max(np.hypot(one.error[k], other.error[k]), 1e-300))

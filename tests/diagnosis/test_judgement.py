@@ -87,6 +87,22 @@ def test_a_finding_is_no_surer_than_what_held_out_data_say_for_it():
     assert one.confidence == pytest.approx(stats.norm.cdf(0.5))
 
 
+@pytest.mark.parametrize(("error", "sure"), [(0.02, True), (0.2, False)])
+def test_a_special_case_is_as_likely_where_the_fit_does_not_part_the_two(error, sure):
+    name = "motor.presliding_friction"
+    fitted = SimpleNamespace(
+        names=(name,),
+        theta=np.array([0.0]),
+        free=[SimpleNamespace(path="drive.motor_inertia")],
+        experiment=SimpleNamespace(effects=(make_effect(name, torque=0.1, length=0.1),)),
+        errors=lambda: {f"effects.{name}.torque": 1e-3, f"effects.{name}.length": error},
+    )
+    finding = Finding(name, 0.98, {"torque": 0.1, "length": 0.1}, ())
+    given = dataclasses.replace(found(), findings=(finding,), wrong=None)
+    (said,) = judged(given, fitted, BEFORE, NOISE, LIMITS, (), np.array([0.02]), 1.0, {}).found.findings  # type: ignore[arg-type]
+    assert said == (finding if sure else Finding(name, 0.49, finding.numbers, (("motor.coulomb_friction", 0.49),)))
+
+
 def shared(z, **gains):
     (one,) = judge(
         controls=[Control("wrong", NOISE, z, gains.get("rival", "motor.viscous_friction"))], **gains
