@@ -28,7 +28,7 @@ hundred is so by chance."""
 _LEAST = 0.05
 """Share of the driving torque that the difference has to make."""
 _LOST = 0.1
-"""Share of a number that noise may take off what a log says of it; of a load that hardly moves the acceleration is all noise."""
+"""Share of a number that noise may take off what a log says of it: of a load that hardly moves the acceleration is noise."""
 _INFLATED = 100.0
 """Variance of a number over what it were if all others were known, from which on it depends on them."""
 
