@@ -175,7 +175,7 @@ factor of two."""
 
 _SURE = 30.0
 """Factor from which on it is no longer a rough number: units in place of others make 57 (degrees), 60 or 1000 of it."""
-_SURE_FAST = 1000.0
+_SURE_FAST = 100.0
 """The same of a motion faster than the antiresonance of the nominal drive: the load stands still there, and of a resonance
 the input has to supply only the losses."""
 _FAR_TORQUE = 1000.0
