@@ -123,7 +123,9 @@ def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
         ratio = float(fitted.experiment.drive.ratio(side))
         size = np.sqrt(np.mean(slopes**2, axis=1))
         torque = np.hypot(torque, size / ratio)
-        lost = np.minimum(lost, np.mean(noises[side] ** 2) / np.maximum(size, 1e-300) ** 2)
+        # of a number that has nothing to do with this side
+        with np.errstate(divide="ignore", over="ignore"):
+            lost = np.minimum(lost, np.mean(noises[side] ** 2) / size**2)
         both = np.concatenate([slopes, -missing[None]]) / max(float(np.sqrt(np.mean(missing**2))), 1e-300)
         products.append([block @ block.T for block in np.array_split(both, BLOCKS, axis=1)])
     blocks = np.sum(products, axis=0)
