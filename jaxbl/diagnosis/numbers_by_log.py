@@ -29,6 +29,8 @@ _LEAST = 0.05
 """Share of the driving torque that the difference has to make."""
 _LOST = 0.1
 """Share of a number that noise may take off what a log says of it: of a load that hardly moves the acceleration is noise."""
+_AGREEING = 0.01
+"""Share of the error by noise alone, below which an error by blocks is none."""
 _INFLATED = 100.0
 """Variance of a number over what it were if all others were known, from which on it depends on them."""
 
@@ -139,9 +141,12 @@ def _shown(fitted: FittedModel, log: ReferenceLog) -> _Shown:
 
     change, without = solved(total), np.array([solved(total - one) for one in blocks])
     error = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((without - without.mean(axis=0)) ** 2, axis=0))
+    # blocks that agree far better than noise allows have not been measured: of a drive that stands still the model says it
+    count = sum(map(len, now.values()))
+    agreeing = error < _AGREEING * np.sqrt(lost / count)
     # what depends on other numbers, or does nothing in this log, is not shown by it
     inverse = np.linalg.pinv(total[:-1, :-1] / np.outer(size, size), rcond=1e-10, hermitian=True)
-    alone = there & (lost < _LOST) & (np.diag(inverse) < _INFLATED) & (np.diag(inverse) > 0.0)
+    alone = there & ~agreeing & (lost < _LOST) & (np.diag(inverse) < _INFLATED) & (np.diag(inverse) > 0.0)
     return _Shown(change, np.where(alone, error, np.inf), torque, lost)
 
 
