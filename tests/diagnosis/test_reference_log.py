@@ -1,0 +1,47 @@
+"""What a model is compared with on held-out data, beside a simulation of the package."""
+
+import jax
+import numpy as np
+import pytest
+from small_study import small
+
+from jaxbl.config import prepare, read_config
+from jaxbl.diagnosis.reference_log import ReferenceLog
+from jaxbl.drive import make_effect
+from jaxbl.drive.parameters import as_arrays, set_leaves
+from jaxbl.identification.segments import segments_of
+from jaxbl.records import read_record
+from jaxbl.simulate import with_effects
+from jaxbl.sweeps.trial import run
+
+STUDY = small(
+    {"run.duration": 3.0, "run.substeps": 5},
+    excitation={"kind": "multisine", "amplitude": 5.0, "frequency": 0.7},
+    transmission={"law": "linear_shaft", "stiffness": 60.0},
+    effects=[{"kind": "load.coulomb_friction", "torque": 4.0}],
+    encoders={"noise": 1e-4},
+    observer={"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}},
+)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    file = tmp_path_factory.mktemp("log") / "log.csv"
+    run(STUDY, seed=1).trace[["t", "u", "theta_e", "theta_s"]].to_csv(file, index=False)
+    return read_record(file)
+
+
+def test_smoothing_leaves_torque_where_friction_jumps_and_little_elsewhere(log):
+    with jax.enable_x64(True):
+        model = as_arrays(prepare(read_config(STUDY)), float)
+        held = ReferenceLog(segments_of(log, model.sides), {"motor": 25.0, "load": 25.0})
+        dry = held.rounding(model)
+        smooth = held.rounding(set_leaves(model, {"effects.load.coulomb_friction.torque": np.asarray(0.0)}))
+        actual = held.with_slow(held.compare(model))
+    assert dry.keys() >= {"torque_motor", "torque_load"}
+    assert dry["torque_load"] > 3.0 * smooth["torque_load"]
+    # it is in what the true model leaves
+    assert dry["torque_load"] < 1.5 * actual["torque_load"]
+    with jax.enable_x64(True):
+        bending = as_arrays(make_effect("load.presliding_friction", torque=1.0, length=0.01), float)
+        assert held.rounding(with_effects(model, (bending,))) == {}
