@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_study import small
+from small_study import recorded, swung
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.free_starts import best_runs
@@ -14,26 +14,20 @@ from jaxbl.drive.parameters import as_arrays, set_leaves
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.segments import segments_of, windows_of
 from jaxbl.identification.trajectory import projected_residual
-from jaxbl.records import read_record
 from jaxbl.simulate import with_effects
-from jaxbl.sweeps.trial import run
 
-STUDY = small(
-    {"run.duration": 2.0, "run.substeps": 5},
-    excitation={"kind": "multisine", "amplitude": 5.0, "frequency": 0.7},
+STUDY = swung(
+    2.0,
     transmission={"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.02},
     effects=[{"kind": "load.coulomb_friction", "torque": 2.0}, {"kind": "actuator.delay", "delay": 2e-3}],
-    encoders={"noise": 1e-4},
-    observer={"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}},
 )
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    file = tmp_path_factory.mktemp("log") / "log.csv"
-    run(STUDY, seed=1).trace[["t", "u", "theta_e", "theta_s"]].to_csv(file, index=False)
+    record = recorded(STUDY, tmp_path_factory.mktemp("log"))
     model = as_arrays(prepare(read_config(STUDY)), float)
-    return with_torques(set_leaves(model, {"drive.load_inertia": model.drive.load_inertia * 1.1})), read_record(file)
+    return with_torques(set_leaves(model, {"drive.load_inertia": model.drive.load_inertia * 1.1})), record
 
 
 @pytest.mark.parametrize("rest", [False, True])

@@ -3,32 +3,25 @@
 import jax
 import numpy as np
 import pytest
-from small_study import small
+from small_study import recorded, swung
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.reference_log import ReferenceLog
 from jaxbl.drive import make_effect
 from jaxbl.drive.parameters import as_arrays, set_leaves
 from jaxbl.identification.segments import segments_of
-from jaxbl.records import read_record
 from jaxbl.simulate import with_effects
-from jaxbl.sweeps.trial import run
 
-STUDY = small(
-    {"run.duration": 3.0, "run.substeps": 5},
-    excitation={"kind": "multisine", "amplitude": 5.0, "frequency": 0.7},
+STUDY = swung(
+    3.0,
     transmission={"law": "linear_shaft", "stiffness": 60.0},
     effects=[{"kind": "load.coulomb_friction", "torque": 4.0}],
-    encoders={"noise": 1e-4},
-    observer={"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}},
 )
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    file = tmp_path_factory.mktemp("log") / "log.csv"
-    run(STUDY, seed=1).trace[["t", "u", "theta_e", "theta_s"]].to_csv(file, index=False)
-    return read_record(file)
+    return recorded(STUDY, tmp_path_factory.mktemp("log"))
 
 
 def test_smoothing_leaves_torque_where_friction_jumps_and_little_elsewhere(log):
