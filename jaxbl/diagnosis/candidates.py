@@ -8,7 +8,8 @@ the only number is of that kind, the effect at a trial value is taken as it is, 
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import lru_cache
 
 import equinox as eqx
 import jax
@@ -58,6 +59,11 @@ class Part(eqx.Module):
     before: Float[Array, " earlier"] | None = None
 
 
+Torques = dict[int, np.ndarray]
+"""Torques in N m by where they act: index of the side, or -1 for the input; shape (samples,), or (columns, samples). Nothing
+acts elsewhere."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Candidate:
     """Torques that may be missing: columns with a coefficient each.
@@ -66,8 +72,8 @@ class Candidate:
         name: of the effect, e.g. `load.coulomb_friction`.
         width: number of columns.
         effects: effects whose torques the columns are made of.
-        columns: columns in N m, shape (width, samples, sides + 1), from a motion and these torques along it; behind them
-            what is there at coefficients of 0, if anything is.
+        columns: columns from a motion and the torque of each effect along it; behind them what is there at coefficients of
+            0, if anything is.
         numbers: the effect's numbers from the coefficients; None where they are not allowed.
         offset: whether something is there at coefficients of 0.
         from_rest: whether nothing had happened before the first input known; else that one had lasted.
@@ -76,7 +82,7 @@ class Candidate:
     name: str
     width: int
     effects: tuple[AbstractEffect, ...]
-    columns: Callable[["MotionTorques", Sequence[np.ndarray]], np.ndarray]
+    columns: Callable[["MotionTorques", Sequence[Torques]], Torques]
     numbers: Callable[[Sequence[float]], Numbers | None]
     offset: bool = False
     from_rest: bool = False
@@ -137,8 +143,8 @@ def _proportional(name: str, known: Numbers, log: Scales) -> Candidate:
         effects += [_effect(name, numbers | turn) for turn in turns]
         sizes += [size] * len(turns)
 
-    def columns(_: MotionTorques, torques: Sequence[np.ndarray]) -> np.ndarray:
-        return np.stack([torque / size for torque, size in zip(torques, sizes, strict=True)])
+    def columns(_: MotionTorques, torques: Sequence[Torques]) -> Torques:
+        return {at: np.stack([torque[at] / size for torque, size in zip(torques, sizes, strict=True)]) for at in torques[0]}
 
     def numbers_of(values: Sequence[float]) -> Numbers | None:
         if phase is not None:
@@ -158,9 +164,9 @@ def _trial(name: str, known: Numbers, from_rest: bool) -> Candidate:
     leaf, value = next(iter(known.items()))
     tried = tuple(_effect(name, known | {leaf: value * math.exp(step)}) for step in (-_STEP, 0.0, _STEP))
 
-    def columns(_: MotionTorques, torques: Sequence[np.ndarray]) -> np.ndarray:
-        below, at, above = torques
-        return np.stack([(above - below) / (2.0 * _STEP), at])
+    def columns(_: MotionTorques, torques: Sequence[Torques]) -> Torques:
+        below, tried, above = torques
+        return {at: np.stack([(above[at] - below[at]) / (2.0 * _STEP), tried[at]]) for at in tried}
 
     def numbers_of(values: Sequence[float]) -> Numbers | None:
         (change,) = values
@@ -170,19 +176,69 @@ def _trial(name: str, known: Numbers, from_rest: bool) -> Candidate:
 
 
 def _effect(name: str, numbers: Numbers) -> AbstractEffect:
-    return make_effect(name, **numbers)
+    return _made(name, *numbers.items())
+
+
+@lru_cache(maxsize=4096)
+def _made(name: str, *numbers: tuple[str, float]) -> AbstractEffect:
+    """Screening after screening asks for the same ones."""
+    return make_effect(name, **dict(numbers))
 
 
 def all_of_the_input() -> Candidate:
     """The torque of the input once more."""
-    return Candidate("input", 1, (), lambda signals, _: signals.placed(signals.torque[:, None], -1), lambda values: {})
+    return Candidate("input", 1, (), lambda signals, _: {-1: signals.torque[None, : signals.samples]}, lambda values: {})
+
+
+class Forces:
+    """Columns of torques side by side.
+
+    Attributes:
+        width: number of columns.
+        runs: where columns act (as of :data:`Torques`), which, and their torques; neighbours that act alike in one piece.
+    """
+
+    def __init__(self, columns: Sequence[Torques]):
+        """Put columns beside one another."""
+        self.width, self.runs = 0, list[tuple[int, slice, np.ndarray]]()
+        for places, some in itertools.groupby(columns, key=tuple):
+            pieces = list(some)
+            each = {at: np.concatenate([np.atleast_2d(one[at]) for one in pieces]) for at in places}
+            here = slice(self.width, self.width + len(each[places[0]]))
+            self.runs += [(at, here, torques) for at, torques in each.items()]
+            self.width = here.stop
+
+    def driving(self, force: np.ndarray, rows: slice) -> np.ndarray:
+        """What the columns add to states in some samples, shape (states, rows, columns); `force`: B there, shape
+        (rows, states, sides + 1)."""
+        count, states, _ = force.shape
+        found = np.zeros((states, count, self.width))
+        for at, columns, torques in self.runs:
+            found[:, :, columns] += force[:, :, at].T[:, :, None] * torques[:, rows].T
+        return found
+
+    def squares(self, over: Mapping[int, float]) -> np.ndarray:
+        """Sum of squares of each column, over those of a number for each place; shape (columns,)."""
+        found = np.zeros(self.width)
+        for at, columns, torques in self.runs:
+            found[columns] += np.einsum("ct,ct->c", torques, torques) / over[at] ** 2
+        return found
+
+    def on(self, at: int, samples: int) -> np.ndarray:
+        """All columns at one place, shape (columns, samples)."""
+        found = np.zeros((self.width, samples))
+        for place, columns, torques in self.runs:
+            if place == at:
+                found[columns] = torques
+        return found
 
 
 class MotionTorques:
     """Torques of effects along one part of a record."""
 
-    def __init__(self, experiment: Experiment, part: Part):
-        self.experiment, self.part = experiment, part
+    def __init__(self, experiment: Experiment, part: Part, shared: dict[tuple, Torques]):
+        """Prepare to ask for torques; `shared` keeps those that are the same for all models along the part."""
+        self.experiment, self.part, self.shared = experiment, part, shared
         self.sides = experiment.sides
         self.count = len(part.time)
         self.real = np.asarray(part.weight) > 0.0
@@ -191,11 +247,12 @@ class MotionTorques:
         self.torque = np.asarray(part.torque)
         # what torques along the motion need, of one shape whatever numbers are free
         self.moving = dataclasses.replace(part, step=None, force=None, own=None, defect=None)
-        needed = _needed(experiment, self.moving)
-        self.direction = {side: self._direction(side, np.asarray(needed[side])) for side in self.sides}
-        self.known: dict[Candidate, np.ndarray] = {}
+        self.held = {side: (np.asarray(part.held[side]) > 0.0) & self.real for side in self.sides}
+        needed = _needed(experiment, self.moving) if any(one.any() for one in self.held.values()) else None
+        self.direction = {side: self._direction(side, needed) for side in self.sides}
+        self.known: dict[Candidate, Torques] = {}
 
-    def _direction(self, side: str, needed: np.ndarray) -> np.ndarray:
+    def _direction(self, side: str, needed: Mapping[str, jax.Array] | None) -> np.ndarray:
         """Direction of motion of a side, between -1 and 1; where it stands still, of the torque that holds it (`needed`)."""
         velocity, deviation = np.asarray(self.part.velocity[side]), np.asarray(self.part.deviation[side])
         period = float(self.part.time[1] - self.part.time[0])
@@ -203,30 +260,30 @@ class MotionTorques:
         step = np.maximum(np.abs(np.asarray(self.part.acceleration[side])) * period, np.finfo(float).tiny)
         passage = np.clip(velocity / np.maximum(step, deviation), -1.0, 1.0)
         moving = passage * (2.0 - np.abs(passage))
-        held = (np.asarray(self.part.held[side]) > 0.0) & self.real
-        if not held.any():
+        held = self.held[side]
+        if needed is None or not held.any():
             return moving
         # a side that is held takes what it needs, up to the level
-        level = max(float(np.quantile(np.abs(needed[held]), 0.95)), np.finfo(float).tiny)
-        return np.where(held, np.clip(needed / level, -1.0, 1.0), moving)
-
-    def placed(self, columns: np.ndarray, at: int) -> np.ndarray:
-        """Columns of shape (samples, width) as torques on the side of an index, or of the input (-1); as :meth:`of`."""
-        found = np.zeros((columns.shape[1], self.count, len(self.sides) + 1))
-        found[:, :, at] = (columns * self.real[:, None]).T
-        return found
+        holding = np.asarray(needed[side])
+        level = max(float(np.quantile(np.abs(holding[held]), 0.95)), np.finfo(float).tiny)
+        return np.where(held, np.clip(holding / level, -1.0, 1.0), moving)
 
     def over(self, side: str) -> float:
         """Torque on a side for 1 N m at the motor."""
         return float(self.experiment.drive.ratio(side))
 
-    def of(self, effects: Sequence[AbstractEffect], from_rest: bool = False) -> list[np.ndarray]:
-        """Torque that each effect adds, shape (samples, sides + 1); on top of what a model without it has. Before the first
-        input known that one had lasted, or with `from_rest` nothing had happened."""
-        found: list[np.ndarray] = [np.zeros(0)] * len(effects)
-        names = [effect.name for effect in effects]
-        for name in dict.fromkeys(names):
-            which = [i for i, one in enumerate(names) if one == name]
+    def of(self, effects: Sequence[AbstractEffect], from_rest: bool = False) -> list[Torques]:
+        """Torque that each effect adds, on top of what a model without it has. Before the first input known that one had
+        lasted, or with `from_rest` nothing had happened."""
+        found: list[Torques] = [{}] * len(effects)
+        asked: dict[str, list[int]] = {}
+        for i, effect in enumerate(effects):
+            known = self.shared.get(_key(effect, from_rest)) if self._shares(effect) else None
+            if known is None:
+                asked.setdefault(effect.name, []).append(i)
+            else:
+                found[i] = known
+        for name, which in asked.items():
             place = self.experiment.drive.place(effects[which[0]].place)
             # of the model's own only those in the gear matter, and only for others there: one structure, and one program
             gear = [one for one in self.experiment.effects if one.place == place == "transmission" and one.name != name]
@@ -239,26 +296,45 @@ class MotionTorques:
                 spare = [effects[some[-1]]] * (_AT_ONCE - len(some))
                 members = (*(effects[i] for i in some), *spare)
                 stack = jax.tree.map(lambda *x: np.array([float(one) for one in x]), *members)
-                torques = {
-                    at: np.asarray(one) for at, one in _torques(bare, stack, self.moving, direction, from_rest).items()
-                }
+                torques = _torques(bare, stack, self.moving, direction, from_rest)
+                each = {at: np.asarray(one)[:, : self.samples] for at, one in torques.items()}
                 for row, i in enumerate(some):
-                    found[i] = np.zeros((self.count, len(self.sides) + 1))
-                    for at, one in torques.items():
-                        found[i][: self.samples, at] = one[row, : self.samples]
+                    found[i] = {at: one[row] for at, one in each.items()}
+                    if self._shares(effects[i]):
+                        self.shared[_key(effects[i], from_rest)] = found[i]
         return found
 
+    def _shares(self, effect: AbstractEffect) -> bool:
+        """Whether an effect's torque follows from motion and input alone: not in the gear, where the model has torques of
+        its own; nor where the model says how it moves, or what holds it at rest."""
+        place, own = self.experiment.drive.place(effect.place), type(effect)
+        if place == "actuator":
+            return True
+        held = place in self.held and self.held[place].any()
+        return place != "transmission" and not any(
+            getattr(own, hook) is not getattr(AbstractEffect, hook)
+            for hook in ("added_inertia", *(("dry_friction", "holds") if held else ()))
+        )
 
-def forces_of(candidates: Sequence[Candidate], signals: MotionTorques) -> np.ndarray:
-    """Columns of candidates, one after the other, N m; shape (columns, samples, sides + 1)."""
+
+def _key(effect: AbstractEffect, from_rest: bool) -> tuple:
+    return effect.name, from_rest, *(float(one) for one in jax.tree.leaves(effect))
+
+
+def columns_of(candidates: Sequence[Candidate], signals: MotionTorques) -> list[Torques]:
+    """Columns of each candidate."""
     new = [one for one in candidates if one not in signals.known]
     for from_rest in (False, True):
         some = [one for one in new if one.from_rest == from_rest]
         torques = iter(signals.of([effect for one in some for effect in one.effects], from_rest))
         for one in some:
             signals.known[one] = one.columns(signals, [next(torques) for _ in one.effects])
-    none = np.zeros((0, signals.count, len(signals.sides) + 1))
-    return np.concatenate([none, *(signals.known[one] for one in candidates)])
+    return [signals.known[one] for one in candidates]
+
+
+def forces_of(candidates: Sequence[Candidate], signals: MotionTorques) -> Forces:
+    """Columns of candidates, one after the other."""
+    return Forces(columns_of(candidates, signals))
 
 
 @jit

@@ -8,7 +8,6 @@ something else is missing.
 """
 
 import dataclasses
-from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
@@ -213,7 +212,6 @@ class EffectSearch:
         self.floor = FLOOR * sum(map(len, segments)) * len(experiment.sides)
         self._recent: dict[tuple, Linear] = {}
         self._models: dict[tuple, Model] = {}
-        self._asked: Counter[tuple[str, ...]] = Counter()
         self._refitted: tuple[tuple, Refined] | None = None
 
     def refitted(self, values: Mapping[str, Numbers], theta: np.ndarray) -> Refined:
@@ -248,9 +246,7 @@ class EffectSearch:
             widths = [EFFECTS[name].roles()[leaf].width for name in values for leaf in _fitted_numbers(name)]
             prior, at = np.concatenate([self.prior, widths]), np.concatenate([theta, np.zeros(len(added))])
             bound = np.concatenate([np.full(len(self.free), self.bound), np.full(len(added), np.inf)])
-            before, free = self._asked[(*values,)], (*self.free, *added)
-            self._recent[key] = Linear(experiment, free, at, prior, self.segments, bound, before)
-            self._asked[(*values,)] += 1
+            self._recent[key] = Linear(experiment, (*self.free, *added), at, prior, self.segments, bound)
         return self._recent[key]
 
     def refit(self, values: Mapping[str, Numbers], theta: np.ndarray, predictor: Predictor) -> Model:

@@ -23,7 +23,8 @@ class Products:
 
     Attributes:
         products: of all columns with one another, over the errors' variance, initial states eliminated; shape
-            (columns, columns). Order: constant, own numbers, then each variant's columns and offset.
+            (columns, columns). Order: constant, own numbers, then each variant's columns and offset. Those of different
+            variants may be left out: no two are in a model at once.
         own: number of the model's own numbers.
         places: columns of each variant.
         offsets: column of each variant's offset, or -1.

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxbl.fused.steps import stepped
 
-from .candidates import Candidate, MotionTorques
+from .candidates import Candidate, MotionTorques, Torques
 
 _FUNCTIONS = {
     "time": ("time", 120, False), "drift": ("time", 8, True), "position": ("position", 24, False),
@@ -48,8 +48,8 @@ def functions_of(signals: Sequence[MotionTorques]) -> list[Candidate]:
 def _candidate(side: str, kind: str, width: int, shape: Callable[[MotionTorques], np.ndarray]) -> Candidate:
     """A torque on a side that is a sum of columns, shape (samples, width), each of height 1."""
 
-    def columns(signals: MotionTorques, _: Sequence[np.ndarray]) -> np.ndarray:
-        return signals.placed(-shape(signals), signals.sides.index(side))
+    def columns(signals: MotionTorques, _: Sequence[Torques]) -> Torques:
+        return {signals.sides.index(side): -shape(signals)[: signals.samples].T}
 
     return Candidate(f"{side}.{kind}", width, (), columns, lambda values: {})
 

@@ -4,6 +4,7 @@ As :func:`jaxbl.identification.trajectory.projected_residual`, for a model witho
 derivatives of their steps by loops for this machine's processor, and no more values tried for a window than it needs.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -14,6 +15,8 @@ from jaxbl.drive.plant import PlantState
 from jaxbl.fused.single_plant import Direction, paths, slopes
 from jaxbl.identification.trajectory import INFLUENCE, RIDGE, Windows
 from jaxbl.simulate import Experiment
+
+from .neutral_effects import lean
 
 _SETTLED = 1e-9
 """Share of its sum of squares that a further step of a window's search may promise where it ends: rounding is 1e-15, what
@@ -87,7 +90,8 @@ def best_runs(
         varying: numbers of the model that differ from sample to sample, by dotted paths, shape (windows, samples).
     """
     windows = jax.tree.map(np.asarray, windows)
-    model = _Model(experiment, windows, varying or {})
+    experiment, start = lean(experiment, windows.start)
+    model = _Model(experiment, dataclasses.replace(windows, start=start), varying or {})
     with np.errstate(invalid="ignore", over="ignore"):
         return _searched(model, passes, rest)
 

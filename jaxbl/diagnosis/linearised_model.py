@@ -13,18 +13,18 @@ References: L. Ljung, System Identification (1999), 7.4; M. Basseville, Detectin
 Automatica 24 (1988), for the local approach.
 """
 
-import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbl.drive.effects import EFFECTS, Scales
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
+from jaxbl.fused import in_threads
 from jaxbl.fused.recursion import Recursion
 from jaxbl.fused.single_plant import Direction, slopes
 from jaxbl.fused.steps import stepped
@@ -33,22 +33,19 @@ from jaxbl.identification.prediction import kalman_gain
 from jaxbl.identification.regression import Path, effect_states
 from jaxbl.identification.segments import Segment
 from jaxbl.identification.trajectory import Free, with_fitted
-from jaxbl.simulate import Experiment, with_effects
+from jaxbl.simulate import Experiment
 
-from .candidates import SHARE, SPACING, Candidate, MotionTorques, Part, all_of_the_input, forces_of, rms
+from .candidates import SHARE, SPACING, Candidate, Forces, MotionTorques, Part, all_of_the_input, forces_of, rms
 from .evidence import Products
-from .neutral_effects import acting, bucket, corrected, with_torques
+from .neutral_effects import bucket, corrected, lean, with_torques
 from .whittle import Spectrum, weighted_products
 
 _SAMPLES = 1024
 """Least padded length of a part, so that records of about one length share their compiled programs."""
-_OFTEN = 2**16
-"""Samples along which a model has been linearised before a program without the effects that do nothing is worth compiling:
-it takes a fifth of the time, and as long to compile as the other one takes for so many samples."""
 
 
-def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segment: Segment, often: bool) -> Part:
-    """A model along a segment, where its free numbers are at theta; `often`: by a program of its own."""
+def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segment: Segment) -> Part:
+    """A model along a segment, where its free numbers are at theta."""
     sides, smoothed = experiment.sides, segment.smoothed
     experiment, added = with_torques(experiment)
     count = len(segment)
@@ -69,6 +66,7 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
     along = Path(*driven, before=before)
     effects = effect_states(experiment, along)
     motion = PlantState(smooth[0], smooth[1], jax.tree.map(np.asarray, effects))
+    experiment, motion = lean(experiment, motion, [one.path for one in free])
     # by side, not by name
     names, each = sorted(sides), len(sides)
     order = [names.index(side) + i * each for i in range(2) for side in sides]
@@ -81,10 +79,6 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
     # as they may differ from sample to sample elsewhere, where the same loop serves
     none = {path: np.zeros(size) for path in added.values()}
     ways = _directions(free, theta, at, order, list(added.values()))
-    if often:
-        kept = acting(experiment, [*(one.path for one in free), *added.values()])
-        experiment = with_effects(experiment, tuple(experiment.effects[i] for i in kept))
-        motion = dataclasses.replace(motion, effects=tuple(motion.effects[i] for i in kept))
     slope, value = slopes(experiment, motion, torque, time, ways, none)
     slope, value = slope[:, order].transpose(2, 1, 0), value[order].T
     vectors = np.stack(jax.tree.leaves(motion), axis=1)[:, order]
@@ -131,15 +125,15 @@ class _Columns:
     """Everything that the prediction errors along a part are linear in; columns: constant, own numbers, forces, initial
     states."""
 
-    def __init__(self, part: Part, forces: np.ndarray):
+    def __init__(self, part: Part, forces: Forces):
         # behind the last sample there is nothing but filling
         self.count, self.size = int(np.sum(np.asarray(part.weight) > 0.0)), len(part.time)
         self.step, self.force, self.own, self.defect, self.readings = (
             np.asarray(one)[: self.count] for one in (part.step, part.force, part.own, part.defect, part.readings)
         )
-        self.forces = np.asarray(forces)
+        self.forces = forces
         self.states = self.defect.shape[1]
-        self.width = 1 + self.own.shape[2] + len(self.forces) + self.states
+        self.width = 1 + self.own.shape[2] + forces.width + self.states
         self.recursion = Recursion.of(self.states, self.readings.shape[1], self.width)
 
     def along(self, gains: Sequence[np.ndarray]) -> Iterator[tuple[slice, list[np.ndarray]]]:
@@ -154,24 +148,21 @@ class _Columns:
             known = np.zeros((self.states, rows.stop - first, self.width))
             known[:, :, 0] = self.defect[rows].T
             known[:, :, 1 : 1 + self.own.shape[2]] = self.own[rows].transpose(1, 0, 2)
-            if len(self.forces):
-                torques = np.ascontiguousarray(self.forces[:, rows].transpose(1, 2, 0))
-                forced = np.matmul(self.force[rows], torques).transpose(1, 0, 2)
-                known[:, :, 1 + self.own.shape[2] : self.width - self.states] = forced
+            known[:, :, 1 + self.own.shape[2] : self.width - self.states] = self.forces.driving(self.force[rows], rows)
             changes, errors = self.recursion(changes, gains, self.step[rows], known, self.readings[rows])
             yield rows, errors
 
 
-def _errors(part: Part, gain: Array | np.ndarray, forces: Array | np.ndarray) -> np.ndarray:
+def _errors(part: Part, gain: np.ndarray, forces: Forces) -> np.ndarray:
     """Prediction errors, rad, by side; columns as of :class:`_Columns`; shape (samples, sides, columns)."""
-    columns = _Columns(part, np.asarray(forces))
+    columns = _Columns(part, forces)
     found = np.zeros((columns.size, columns.readings.shape[1], columns.width))
-    for rows, (errors,) in columns.along([np.asarray(gain)]):
+    for rows, (errors,) in columns.along([gain]):
         found[rows] = errors.transpose(1, 0, 2)
     return found
 
 
-def _grams(part: Part, gains: Sequence[np.ndarray], forces: np.ndarray) -> np.ndarray:
+def _grams(part: Part, gains: Sequence[np.ndarray], forces: Forces) -> np.ndarray:
     """Products of the columns of the prediction errors with one another, rad^2, for several gains, by side;
     shape (gains, sides, columns, columns)."""
     columns = _Columns(part, forces)
@@ -228,6 +219,10 @@ _LOST = 0.01
 """Nats that rounding may take (benchmarks/NOTES.md): under too low a gain the influence of an initial state grows."""
 _VALUES = 65536
 """Samples times columns that the recursion takes at once: what it knows and finds of them stays in the cache."""
+
+
+_TOGETHER = 64
+"""Columns of candidates from which on the next ones are taken through the recursion by themselves, in another thread."""
 
 
 class Predictor:
@@ -301,7 +296,6 @@ class Linear:
         prior: np.ndarray,
         segments: Sequence[Segment],
         bound: np.ndarray | None = None,
-        before: int = 0,
     ):
         """Linearise a model about the motion of a log.
 
@@ -311,15 +305,15 @@ class Linear:
             prior: standard deviation of each theta about 0.
             segments: of the log.
             bound: how many standard deviations each may be from 0 at most; left out: any number.
-            before: how often a model with these effects has been linearised before.
         """
         self.bound = np.full(len(free), np.inf) if bound is None else bound
         self.free, self.theta, self.prior = tuple(free), np.asarray(theta), prior
         self.experiment = with_fitted(experiment, free, self.theta)
         self.period, self.sides = segments[0].period, experiment.sides
-        often = before * sum(map(len, segments)) > _OFTEN
-        self.parts = [_part(self.experiment, free, self.theta, one, often) for one in segments]
-        self.signals = [MotionTorques(self.experiment, part) for part in self.parts]
+        self.parts = [_part(self.experiment, free, self.theta, one) for one in segments]
+        self.signals = [
+            MotionTorques(self.experiment, part, segment.torques) for part, segment in zip(self.parts, segments, strict=True)
+        ]
         self.count = sum(int(one.real.sum()) for one in self.signals)
         self.states = self.parts[0].defect.shape[1]
         gain, self._inertia = _figures(self.experiment)
@@ -327,8 +321,8 @@ class Linear:
         self.drive, self.driven = self._drive()
         self._scales: dict[str, Scales] = {}
         # what the last search chose, and what the one without candidates did, which is asked for again and again
-        self._last: tuple[Predictor, list[np.ndarray]] | None = None
-        self._alone: tuple[Predictor, list[np.ndarray]] | None = None
+        self._last: tuple[Predictor, list[Forces]] | None = None
+        self._alone: tuple[Predictor, list[Forces]] | None = None
 
     def _drive(self) -> tuple[float, bool]:
         """Size of the torques, N m rms at the motor: the input's; where there is none, what the motion takes. And which."""
@@ -409,13 +403,13 @@ class Linear:
 
     def predictor(self, smoothness: Sequence[float]) -> Predictor:
         """Prediction errors under a given gain."""
-        (found,) = self._predictors([list(smoothness)], [self._forces((), one) for one in self.signals])
+        (found,) = self._predictors([list(smoothness)], [forces_of((), one) for one in self.signals])
         return found
 
     def errors(self, smoothness: Sequence[float]) -> list[np.ndarray]:
         """Prediction errors under a given gain, part by part, rad; shape (samples, sides, columns)."""
         gain = self.gain(smoothness)
-        none = [self._forces((), one) for one in self.signals]
+        none = [forces_of((), one) for one in self.signals]
         return [_errors(one.part, gain, forces) for one, forces in zip(self.signals, none, strict=True)]
 
     def choose(self, variants: Sequence[Candidate], near: Sequence[float] | None = None) -> Predictor:
@@ -426,9 +420,9 @@ class Linear:
             self._last = self._alone = self._alone or self._search((), None)
         return self._last[0]
 
-    def _search(self, variants: Sequence[Candidate], near: Sequence[float] | None) -> tuple[Predictor, list[np.ndarray]]:
+    def _search(self, variants: Sequence[Candidate], near: Sequence[float] | None) -> tuple[Predictor, list[Forces]]:
         """The predictor with the least errors, and the candidates' torques."""
-        forces = [self._forces(variants, signals) for signals in self.signals]
+        forces = [forces_of(variants, signals) for signals in self.signals]
 
         def best(options: list[list[float]]) -> Predictor:
             found = self._predictors(options, forces)
@@ -447,14 +441,10 @@ class Linear:
                 chosen = other
         return chosen, forces
 
-    def _predictors(self, options: list[list[float]], forces: list[np.ndarray]) -> list[Predictor]:
+    def _predictors(self, options: list[list[float]], forces: list[Forces]) -> list[Predictor]:
         gains = [self.gain(one) for one in options]
         grams = [_grams(part, gains, force) for part, force in zip(self.parts, forces, strict=True)]
         return [Predictor(self, one, [gram[i] for gram in grams]) for i, one in enumerate(options)]
-
-    def _forces(self, variants: Sequence[Candidate], signals: MotionTorques) -> np.ndarray:
-        """Torques of candidates, shape (columns, samples, sides + 1)."""
-        return forces_of(variants, signals)
 
     def frequencies(self, place: str) -> list[float]:
         """Frequencies (Hz) at which a disturbance of a side explains most, by the gradient of the errors' squares.
@@ -474,8 +464,7 @@ class Linear:
         span, top = real * self.period, self._highest
         few = np.geomspace(min(1.0 / span, 0.5 * top), top, _COARSE)
         phase = 2.0 * np.pi * few[:, None] * time[None, :]
-        waves = np.zeros((2 * _COARSE, len(time), len(self.sides) + 1))
-        waves[:, :, side] = np.concatenate([np.sin(phase), np.cos(phase)])
+        waves = Forces([{side: np.concatenate([np.sin(phase), np.cos(phase)])}])
         responses = _errors(part, gain, waves)[:, :, 1 + part.own.shape[2] : -self.states]
         power = np.sum((responses / deviation[None, :, None]) ** 2, axis=(0, 1)).reshape(2, -1).mean(axis=0)
         slope = _gradient(part, gain, left / deviation[None, :] ** 2)[:real, side]
@@ -502,26 +491,46 @@ class Linear:
 
     def columns(self, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray | Spectrum) -> Products:
         """Products of everything that the prediction errors are linear in, columns of candidates among it, initial states
-        eliminated; `noise`: rms of the errors by side, rad, where they are white, or their spectrum."""
+        eliminated; `noise`: rms of the errors by side, rad, where they are white, or their spectrum. Products of different
+        candidates are there for some only."""
         gain, own = self.gain(smoothness), len(self.free)
         places, offsets, at = [], [], 1 + own
+        groups: list[list[Candidate]] = [[]]
+        wide = 0
         for one in variants:
+            if wide > _TOGETHER:
+                groups, wide = [*groups, []], 0
+            groups[-1].append(one)
+            wide += one.width + one.offset
             places.append(tuple(range(at, at + one.width)))
             at += one.width
             offsets.append(at if one.offset else -1)
             at += one.offset
-        total, power = np.zeros((at, at)), np.zeros(at - 1 - own)
-        for signals in self.signals:
-            part, forces = signals.part, self._forces(variants, signals)
-            power += self._power(forces, signals)
+
+        def products(signals: MotionTorques, forces: Forces) -> tuple[np.ndarray, np.ndarray]:
             if isinstance(noise, Spectrum):
-                gram = weighted_products(_errors(part, gain, forces)[signals.real], noise)
+                gram = weighted_products(_errors(signals.part, gain, forces)[signals.real], noise)
             else:
-                gram = np.einsum("s,scd->cd", noise**-2.0, _grams(part, [gain], forces)[0])
-            total += _eliminated(gram, self.states)
+                gram = np.einsum("s,scd->cd", noise**-2.0, _grams(signals.part, [gain], forces)[0])
+            return _eliminated(gram, self.states), self._power(forces, signals)
+
+        jobs = [(one, forces_of(group, one)) for one in self.signals for group in groups]
+        total, power = np.zeros((at, at)), np.zeros(at)
+        shared, done = np.arange(1 + own), iter(in_threads(products, *zip(*jobs, strict=True)))
+        for _ in self.signals:
+            first = 1 + own
+            for i, _ in enumerate(groups):
+                gram, squares = next(done)
+                last = first + len(squares)
+                index = np.concatenate([shared, np.arange(first, last)])
+                if i > 0:
+                    gram[: 1 + own, : 1 + own] = 0.0
+                total[np.ix_(index, index)] += gram
+                power[first:last] += squares
+                first = last
         with np.errstate(divide="ignore"):
             # what has no torque along this motion cannot be found
-            size = SHARE * self.drive / np.sqrt(power / self.count)
+            size = SHARE * self.drive / np.sqrt(power[1 + own :] / self.count)
         scale = np.concatenate([[np.inf], self.prior, size])
         for one, place in zip(variants, places, strict=True):
             if one.offset:
@@ -545,10 +554,10 @@ class Linear:
                 found[1 + j] = 1 + i, slopes[j] / slopes[i]
         return found
 
-    def _power(self, torques: np.ndarray, signals: MotionTorques) -> np.ndarray:
+    def _power(self, torques: Forces, signals: MotionTorques) -> np.ndarray:
         """Sums of squares of torques, referred to the motor."""
-        over = np.array([*(signals.over(side) for side in self.sides), 1.0 / self.input_gain])
-        return np.einsum("cts,cts->cs", torques, torques) @ over**-2.0
+        over = {i: signals.over(side) for i, side in enumerate(self.sides)}
+        return torques.squares(over | {-1: 1.0 / self.input_gain})
 
     def shown(self) -> float:
         """Standard deviations by which the prediction errors show the input; infinite where the record has none."""
@@ -561,7 +570,7 @@ class Linear:
     def share(self, name: str) -> float:
         """Torque of an effect that the model has, rms over the driving torque's."""
         effect = get_leaf(self.experiment, f"effects.{name}")
-        power = sum(self._power(signals.of([effect])[0][None], signals)[0] for signals in self.signals)
+        power = sum(self._power(Forces(signals.of([effect])), signals)[0] for signals in self.signals)
         return float(np.sqrt(power / self.count)) / self.drive
 
     def size(self, name: str) -> float:

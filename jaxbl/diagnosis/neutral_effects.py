@@ -5,6 +5,7 @@ matter of numbers. An effect with a state of its own, though, would make every l
 where it acts.
 """
 
+import dataclasses
 from collections.abc import Callable, Collection, Iterable
 from functools import cache, lru_cache
 from typing import Any, ClassVar, TypeVar
@@ -14,6 +15,7 @@ import numpy as np
 
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, ConstantTorque, make_effect
 from jaxbl.drive.parameters import as_arrays
+from jaxbl.drive.plant import PlantState
 from jaxbl.simulate import Experiment, with_effects
 
 Effect = TypeVar("Effect")
@@ -72,10 +74,20 @@ def complete(experiment: Experiment, acting: Collection[str] = ()) -> Experiment
     return with_effects(experiment, tuple(effects))
 
 
-def acting(experiment: Experiment, free: Collection[str] = ()) -> list[int]:
-    """Indices of the effects that do something, or may: those not at neutral numbers, and those with `free` numbers."""
+def lean(experiment: Experiment, state: PlantState, free: Collection[str] = ()) -> tuple[Experiment, PlantState]:
+    """A model and its state without the effects that do nothing, and may not by their `free` numbers.
+
+    Loops for this machine's processor are compiled anew for each set of effects, which takes as long as three linearisations
+    along a log with all of them (benchmarks/NOTES.md).
+    """
     may = {path.rpartition(".")[0].removeprefix("effects.") for path in free if path.startswith("effects.")}
-    return [i for i, one in enumerate(experiment.effects) if one.name in may or not _is_neutral(one)]
+    both = [
+        (one, own)
+        for one, own in zip(experiment.effects, state.effects, strict=True)
+        if one.name in may or jax.tree.leaves(own) or not _is_neutral(one)
+    ]
+    effects, own = (tuple(some) for some in zip(*both, strict=True)) if both else ((), ())
+    return with_effects(experiment, effects), dataclasses.replace(state, effects=own)
 
 
 def _is_neutral(effect: AbstractEffect) -> bool:

@@ -22,7 +22,7 @@ from jaxbl.records import POSITION_CHANNELS
 from jaxbl.simulate import Experiment
 
 from .free_starts import Run, best_runs
-from .neutral_effects import with_torques
+from .neutral_effects import lean, with_torques
 from .residuals import Residual, narrowed, residual_torques
 
 WINDOW = 0.5
@@ -288,6 +288,7 @@ def _run(experiment: Experiment, windows: Windows, start: PlantState, added: Map
     """States along each window, of a model with torques that may be added (`added`: their paths)."""
     # none are: the same loop serves
     none = {path: np.zeros(windows.torque.shape) for path in added.values()}
+    experiment, start = lean(experiment, start)
     return paths(experiment, start, np.asarray(windows.torque), np.asarray(windows.time), varying=none)
 
 

@@ -22,6 +22,7 @@ from jaxbl.identification.trajectory import Free, with_fitted
 from jaxbl.simulate import Experiment
 
 from .linearised_model import Linear, Predictor
+from .neutral_effects import lean
 
 _STEPS = 25
 """Of Gauss-Newton at most in a round, rejected ones among them."""
@@ -73,7 +74,6 @@ class _Refiner:
 
     def __init__(self, experiment: Experiment, free: Sequence[Free], width: np.ndarray, segments: Sequence[Segment]):
         self.experiment, self.free, self.width, self.segments = experiment, tuple(free), width, segments
-        self.before = 0
 
     def start(self) -> list[np.ndarray]:
         """Positions and velocities at the first sample of each segment, as they were smoothed."""
@@ -84,8 +84,7 @@ class _Refiner:
     def at(self, theta: np.ndarray, start: list[np.ndarray], smoothness: Sequence[float]) -> _Point:
         """Prediction errors along the path of the predictor."""
         path = self._path(theta, start, smoothness)
-        linear = Linear(self.experiment, self.free, theta, self.width, path, before=self.before)
-        self.before += 1
+        linear = Linear(self.experiment, self.free, theta, self.width, path)
         predictor = linear.predictor(smoothness)
         cost = float(linear.count * np.sum(np.log(predictor.given)) + np.sum((theta / self.width) ** 2))
         return _Point(theta, start, linear, predictor, cost if np.isfinite(cost) else np.inf)
@@ -101,7 +100,7 @@ class _Refiner:
             position, velocity = (dict(zip(sides, half, strict=True)) for half in np.split(first, 2))
             effects = begun(experiment, segment.torque[:1], segment.before)
             state = PlantState(position, velocity, effects)
-            states = path(experiment, state, segment.torque, segment.time[0], segment.readings, gains)
+            states = path(*lean(experiment, state), segment.torque, segment.time[0], segment.readings, gains)
             filtered = {}
             for side in sides:
                 own = segment.smoothed[side]

@@ -17,7 +17,7 @@ from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.identification.segments import Segment
 
-from .candidates import Candidate, Numbers, forces_of, variants_of
+from .candidates import Candidate, Forces, Numbers, columns_of, variants_of
 from .effect_search import LEAST_CHANCE, EffectSearch, Explanation, Finding, Model, contains, exclusive
 from .proof import SEEN, FittedModel, beaten, fit_model
 from .reference_log import Comparison, ReferenceLog
@@ -155,9 +155,7 @@ class _Regression:
         forces = []
         for signals in model.linear.signals:
             there = signals.of([get_leaf(model.linear.experiment, f"effects.{name}") for name in model.names])
-            tried = forces_of([*base, *variants], signals)
-            both = np.concatenate([np.stack(there), tried]) if there else tried
-            forces.append(both[:, signals.real])
+            forces.append(Forces([*there, *columns_of([*base, *variants], signals)]))
         self.places: dict[Candidate, tuple[np.ndarray, int]] = {}
         at = len(model.names)
         for one in (*base, *variants):
@@ -168,7 +166,7 @@ class _Regression:
             _products(
                 np.concatenate(
                     [
-                        _behind(_on_side(force, i), segment, residual, side, log.bandwidth[side])
+                        _behind(_on_side(force, i, len(segment)), segment, residual, side, log.bandwidth[side])
                         for force, segment, residual in zip(forces, log.segments, lacking[side], strict=True)
                     ],
                     axis=1,
@@ -215,9 +213,9 @@ class _Regression:
         return [np.array(one) for one in squares], _solved(whole)
 
 
-def _on_side(force: np.ndarray, i: int) -> np.ndarray:
+def _on_side(forces: Forces, i: int, samples: int) -> np.ndarray:
     """Torques on a side, shape (columns, samples); those on the input act on the motor, which is the first."""
-    return force[:, :, i] + (force[:, :, -1] if i == 0 else 0.0)
+    return forces.on(i, samples) + (forces.on(-1, samples) if i == 0 else 0.0)
 
 
 def _behind(columns: np.ndarray, segment: Segment, residual: Residual, side: str, cutoff: float) -> np.ndarray:

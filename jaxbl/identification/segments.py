@@ -6,6 +6,7 @@
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -64,6 +65,12 @@ class Segment:
         transmitted = None if self.transmitted is None else self.transmitted[:n]
         rows = slice(self.rows.start, self.rows.start + n)
         return Segment(rows, self.time[:n], self.period, self.torque[:n], readings, smoothed, transmitted, self.before)
+
+    @cached_property
+    def torques(self) -> dict[Any, Any]:
+        """Torques of effects along the motion that do not depend on the model, once they have been asked for
+        (:mod:`jaxbl.diagnosis.candidates`)."""
+        return {}
 
     @cached_property
     def kinematics(self) -> Kinematics:

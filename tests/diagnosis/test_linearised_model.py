@@ -4,18 +4,19 @@ import dataclasses
 import functools
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_study import rigid, small
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis import linearised_model as module
-from jaxbl.diagnosis.candidates import forces_of, variants_of
+from jaxbl.diagnosis.candidates import Forces, MotionTorques, columns_of, forces_of, variants_of
 from jaxbl.diagnosis.linearised_model import Linear
+from jaxbl.diagnosis.whittle import spectrum_of, weighted_products
 from jaxbl.drive.effects import EFFECTS, Scales, make_effect
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.identification.segments import segments_of
+from jaxbl.identification.smoother import Smoothed
 from jaxbl.identification.trajectory import free_parameters
 from jaxbl.records import read_record
 from jaxbl.sweeps.trial import run
@@ -57,9 +58,7 @@ def linear(tmp_path, sides, change=lambda e: e, theta=0.0, disturbed=0.0, idle=0
 
 def errors(model, forces=None):
     """Prediction errors over the noise, initial states eliminated: constant, own numbers, forces."""
-    (signals,) = model.signals
-    none = np.zeros((0, signals.count, len(model.sides) + 1)) if forces is None else forces
-    found = np.asarray(module._errors(model.parts[0], model.gain([1e-6] * len(model.sides)), jnp.asarray(none)))
+    found = module._errors(model.parts[0], model.gain([1e-6] * len(model.sides)), forces or Forces([]))
     flat = found.reshape(-1, found.shape[2])
     basis = np.linalg.qr(flat[:, -model.states :])[0]
     rest = flat[:, : -model.states]
@@ -85,6 +84,7 @@ def test_own_columns_are_derivatives(tmp_path, sides):
     assert size(columns.sum(axis=1) - expected) < 1e-3 * size(expected)
 
 
+LOG = Scales(5.0, 1e-3, 10.0, 0.1, 0.3, 1.0, 0.2, travel=2.0, frequencies=(2.0,))
 SMALL = {
     "motor.coulomb_friction": {"torque": 1e-3},
     "motor.viscous_friction": {"viscous": 1e-4},
@@ -111,8 +111,7 @@ def test_a_candidates_torque_does_what_the_effect_does(tmp_path, name):
         return eqx.tree_at(lambda e: e.effects, experiment, (*experiment.effects, effect))
 
     base = linear(tmp_path, 2)
-    torque = base.signals[0].of([effect])[0][None]
-    columns = errors(base, torque)
+    columns = errors(base, Forces(base.signals[0].of([effect])))
     expected = errors(linear(tmp_path, 2, with_effect))[:, 0] - columns[:, 0]
     found = columns[:, -1]
     assert size(expected) > 0.0
@@ -123,7 +122,7 @@ def test_a_lag_begins_with_what_had_lasted_or_at_rest(tmp_path):
     base = linear(tmp_path, 2)
     (signals,), lag = base.signals, as_arrays(make_effect("actuator.lag", time_constant=0.01), float)
     steps, torque = base.period / 0.01, signals.torque[: signals.samples]
-    settled, rested = (signals.of([lag], from_rest)[0][: signals.samples, -1] for from_rest in (False, True))
+    settled, rested = (signals.of([lag], from_rest)[0][-1] for from_rest in (False, True))
     assert torque[0] != 0.0 and settled[0] == pytest.approx(0.0, abs=1e-12)
     # what the state at the first sample leaves until later
     left = torque[0] * np.exp(-steps * np.arange(len(torque))) * -np.expm1(-steps) / steps
@@ -137,7 +136,6 @@ def test_a_lag_begins_with_what_had_lasted_or_at_rest(tmp_path):
 def test_numbers_of_waves_are_those_of_the_effect(tmp_path):
     """A wave's two columns make up the effect that its numbers describe."""
     base = linear(tmp_path, 2)
-    log = Scales(5.0, 1e-3, 10.0, 0.1, 0.3, 1.0, 0.2, travel=2.0, frequencies=(2.0,))
     values = (0.3e-3, -0.4e-3)
     waves = (
         "load.gravity",
@@ -147,12 +145,14 @@ def test_numbers_of_waves_are_those_of_the_effect(tmp_path):
         "transmission.eccentricity",
     )
     seen = set()
-    for one in variants_of(base.experiment, waves, lambda name: log):
+    for one in variants_of(base.experiment, waves, lambda name: LOG):
         if one.name in waves:
-            columns = forces_of([one], base.signals[0])
+            (columns,) = columns_of([one], base.signals[0])
             effect = as_arrays(make_effect(one.name, **one.numbers(values)), float)
             (expected,) = base.signals[0].of([effect])
-            assert size(np.tensordot(values, columns, 1) - expected) < 0.02 * size(expected)
+            assert columns.keys() == expected.keys()
+            for at, torque in expected.items():
+                assert size(np.tensordot(values, columns[at], 1) - torque) < 0.02 * size(torque)
             seen.add(one.name)
     assert seen == set(waves)
 
@@ -164,6 +164,50 @@ def test_products_are_those_of_the_errors(tmp_path, sides):
     found = model.columns((), [1e-6] * sides, np.ones(sides)).products
     every = errors(model)
     assert found == pytest.approx(every.T @ every, rel=1e-6, abs=1e-9 * np.max(found))
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+def test_products_of_candidates_are_those_of_their_errors(tmp_path, coloured):
+    """Candidates are taken some at a time: those beside one another are the same as all at once."""
+    model = linear(tmp_path, 2)
+    variants = variants_of(model.experiment, list(SMALL), lambda name: LOG)
+    own, smoothness = 1 + len(model.free), [1e-6] * 2
+    noise = spectrum_of(model.left(smoothness)) if coloured else np.array([2e-5, 3e-5])
+    found = model.columns(variants, smoothness, noise)
+    assert len(found.products) > own + 2 * module._TOGETHER
+    every = module._errors(model.parts[0], model.gain(smoothness), forces_of(variants, model.signals[0]))
+    if coloured:
+        gram = weighted_products(every[model.signals[0].real], noise)
+    else:
+        gram = np.einsum("s,tsc,tsd->cd", noise**-2.0, every, every)
+    expected = module._eliminated(gram, model.states)
+    size = np.sqrt(np.diag(expected))
+    for places, offset in zip(found.places, found.offsets, strict=True):
+        at = np.array([*range(own), *places, *([offset] if offset >= 0 else [])])
+        grid = np.ix_(at, at)
+        apart = (found.products[grid] - expected[grid]) / np.outer(size[at], size[at])
+        assert np.max(np.abs(apart), where=np.isfinite(apart), initial=0.0) < 1e-9
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_torques_that_models_share_are_those_of_each(tmp_path, monkeypatch, held):
+    """A second model along the log, whose numbers are others, with what the first one has left and from scratch."""
+    if held:
+        monkeypatch.setattr(Smoothed, "held", lambda self, period: np.arange(len(self.state)) % 500 < 100)
+    first = linear(tmp_path, 2)
+    every = [name for name in EFFECTS if EFFECTS[name].neutral() and not name.startswith("encoder")]
+    variants = variants_of(first.experiment, every, lambda name: LOG)
+    columns_of(variants, first.signals[0])
+    model = linear(tmp_path, 2, theta=0.1)
+    (signals,), kept = model.signals, first.signals[0].shared
+    assert len(kept) > 100
+    shared = MotionTorques(model.experiment, model.parts[0], kept)
+    for one, with_kept, alone in zip(variants, columns_of(variants, shared), columns_of(variants, signals), strict=True):
+        assert with_kept.keys() == alone.keys()
+        for at, torque in alone.items():
+            np.testing.assert_allclose(
+                with_kept[at], torque, rtol=1e-9, atol=1e-12 * np.max(np.abs(torque)), err_msg=one.name
+            )
 
 
 def test_a_candidate_may_act_in_one_part_only(tmp_path):

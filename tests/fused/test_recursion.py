@@ -40,3 +40,15 @@ def test_one_loop_serves_all_widths():
     for width in (3, 17, 90):
         Recursion(3, 1, width)
     assert module._loop.cache_info().misses <= before + 1
+
+
+def test_what_has_decayed_is_zero():
+    """Numbers of less than the smallest normal one would take many times as long."""
+    count = 3000
+    step, known = np.tile(0.5 * np.eye(2), (count, 1, 1)), np.zeros((2, count, 3))
+    (end,), (errors,) = Recursion(2, 1, 3)([np.ones((2, 3))], [np.zeros((1, 2))], step, known, np.zeros((count, 1)))
+    assert not end.any()
+    small = np.abs(errors[errors != 0.0])
+    assert 1e-80 < np.min(small) < 1e-50
+    # until then every digit is there
+    assert errors[0, :100, 0] == pytest.approx(-(0.5 ** np.arange(100)), rel=1e-15)
