@@ -23,7 +23,7 @@ from jaxbl.drive.effects import Motion
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.regression import Kinematics, effect_path
 from jaxbl.identification.segments import Segment, white_noise
-from jaxbl.identification.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, smooth
+from jaxbl.identification.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, smoothed_accelerations
 from jaxbl.simulate import Experiment
 
 _REACH = 60.0
@@ -102,15 +102,17 @@ def _mean(spectrum: np.ndarray) -> float:
 
 
 def as_smoothed(values: np.ndarray, smoothed: Smoothed, period: float) -> np.ndarray:
-    """Values as if they were accelerations seen through a smoother, its ends included."""
+    """Values as if they were accelerations seen through a smoother, its ends included; shape (..., samples)."""
+    columns = values.reshape(-1, values.shape[-1]).T
     # a steady acceleration passes unchanged
-    steady = np.mean(values)
+    steady = np.mean(columns, axis=0)
     # of what a diverging model says nothing is finite
     with np.errstate(invalid="ignore", over="ignore"):
-        rate = np.cumsum(values - steady) * period
-        position = np.concatenate([np.zeros(1), np.cumsum(rate)[:-1] * period])
+        rate = np.cumsum(columns - steady, axis=0) * period
         # second differences of the position are the values
-        return steady + np.asarray(smooth(position, period, known=(smoothed.noise, smoothed.jerk)).acceleration)
+        position = np.concatenate([np.zeros((1, len(steady))), np.cumsum(rate, axis=0)[:-1] * period])
+        found = steady + smoothed_accelerations(position, period, (smoothed.noise, smoothed.jerk))
+    return found.T.reshape(values.shape)
 
 
 def _mean_around(values: Float[Array, " samples"]) -> Float[Array, " samples"]:

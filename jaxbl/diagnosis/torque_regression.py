@@ -21,8 +21,7 @@ from .candidates import Candidate, Forces, Numbers, columns_of, variants_of
 from .effect_search import LEAST_CHANCE, EffectSearch, Explanation, Finding, Model, contains, exclusive
 from .proof import SEEN, FittedModel, beaten, fit_model
 from .reference_log import Comparison, ReferenceLog
-from .residuals import Residual, low_passed, narrowed
-from .torque_tables import seen
+from .residuals import Residual, as_smoothed, low_passed, narrowed
 
 _BLOCKS = 10
 """Of consecutive samples, each left out once: more than the eight of which a standard error is any use."""
@@ -220,7 +219,7 @@ def _on_side(forces: Forces, i: int, samples: int) -> np.ndarray:
 
 def _behind(columns: np.ndarray, segment: Segment, residual: Residual, side: str, cutoff: float) -> np.ndarray:
     """Torques as the missing torque of a side is seen; shape (columns, rows)."""
-    return low_passed(seen(columns, segment.smoothed[side], segment.period), residual, cutoff)
+    return low_passed(as_smoothed(columns, segment.smoothed[side], segment.period), residual, cutoff)
 
 
 def _products(columns: np.ndarray, target: np.ndarray) -> np.ndarray:

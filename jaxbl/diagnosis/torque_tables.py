@@ -15,7 +15,6 @@ import numpy as np
 from jaxbl.drive.effects import Tabulated
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.identification.segments import Segment
-from jaxbl.identification.smoother import Smoothed
 from jaxbl.simulate import Experiment, with_effects
 
 from .proof import SURE, Proof, beaten
@@ -173,12 +172,7 @@ def _columns(segment: Segment, lacking: Residual, side: str, over: str, points: 
     values = np.asarray(smoothed.state)[:, 1 if over == "speed" else 0]
     values = np.mod(values, _TURN) if over == "turn" else np.clip(values, points[0], points[-1])
     hats = np.stack([np.interp(values, points, one) for one in np.eye(len(points))])
-    return low_passed(seen(hats, smoothed, segment.period), lacking, cutoff).T
-
-
-def seen(columns: np.ndarray, smoothed: Smoothed, period: float) -> np.ndarray:
-    """Torques as missing torques are seen; shape (columns, samples)."""
-    return np.stack([as_smoothed(one, smoothed, period) for one in columns])
+    return low_passed(as_smoothed(hats, smoothed, segment.period), lacking, cutoff).T
 
 
 @dataclasses.dataclass(frozen=True)

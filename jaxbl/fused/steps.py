@@ -24,26 +24,30 @@ def stepped(
     Args:
         sample: the function.
         values, carry: of each lane, shape (lanes,); the same number of all, or one.
-        inputs: of each sample, shape (samples,).
+        inputs: of each sample, shape (samples,), or of each sample and lane, shape (samples, lanes).
     """
     lanes, samples = len(carry[0]), len(inputs[0])
-    loop = _loop(sample, len(values), len(carry), len(inputs), lanes == 1)
+    inputs = [one[:, 0] if lanes == 1 and one.ndim == 2 else one for one in map(np.asarray, inputs)]
+    loop = _loop(sample, len(values), len(carry), len(inputs), lanes == 1, inputs[0].ndim == 2)
     if loop is None:
         with jax.enable_x64(True):
             given = [[jnp.asarray(one, float) for one in some] for some in (values, carry, inputs)]
             return [np.asarray(one) for one in _scanned(sample, *given)]
     whole = -(-lanes // loop.lanes) * loop.lanes
     given = [np.pad(np.asarray(one, float), (0, whole - lanes), "edge") for one in (*values, *carry)]
-    along = [np.ascontiguousarray(one, float) for one in inputs]
+    along = [
+        np.ascontiguousarray(one if one.ndim == 1 else np.pad(one, ((0, 0), (0, whole - lanes))), float) for one in inputs
+    ]
     found = [np.empty((samples, whole)) for one in loop.signature if one.name.startswith("kept")]
     loop([*given, *along, *found], samples, 0, whole)
     return [one[:, :lanes] for one in found]
 
 
 @lru_cache(maxsize=64)
-def _loop(sample: Sample, values: int, carry: int, inputs: int, alone: bool) -> Any:
-    sizes, lanes = (values, carry, inputs), 1 if alone else None
-    key = kept.key_of("steps", sample, *sizes, lanes)
+def _loop(sample: Sample, values: int, carry: int, inputs: int, alone: bool, own: bool) -> Any:
+    """`alone`: for one lane; `own`: each lane has inputs of its own."""
+    sizes, lanes, beside = (values, carry, inputs), 1 if alone else None, inputs if own else 0
+    key = kept.key_of("steps", sample, *sizes, lanes, beside)
     if (found := kept.load(key)) is not None:
         return found
     try:
@@ -53,7 +57,7 @@ def _loop(sample: Sample, values: int, carry: int, inputs: int, alone: bool) -> 
 
             with jax.enable_x64(True):
                 body = traced(sample, *([_NUMBER] * size for size in sizes))
-            loop = Loop(body, np.dtype(float), values=values, carry=carry, lanes=lanes)
+            loop = Loop(body, np.dtype(float), values=values, carry=carry, beside=beside, lanes=lanes)
             kept.save(key, loop)
             return loop
     except Unsupported as why:

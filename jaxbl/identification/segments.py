@@ -17,6 +17,7 @@ from jaxbl.drive.plant import PlantState, States
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
+from .compilation import jit
 from .regression import Kinematics, Path, effect_states, kinematics_from, shortest
 from .smoother import Smoothed, smooth
 from .trajectory import Windows, cut
@@ -135,6 +136,12 @@ def long_enough(segments: Sequence[Segment], factor: int) -> list[Kinematics]:
     return [one.kinematics for one in segments if len(one) >= max(2 * shortest(factor), _FEWEST)]
 
 
+@jit
+def _torques(experiment: Experiment, k: Kinematics, states: States) -> dict[str, Any]:
+    """Torques along a segment, as of :meth:`jaxbl.drive.plant.Plant.torques`."""
+    return jax.vmap(experiment.plant.torques)(k.position, k.velocity, states, k.torque, k.time)
+
+
 def _held(experiment: Experiment, segment: Segment, states: States) -> States:
     """States of effects along a segment; where a side is not seen to move, those of frictions with a memory that hold it.
 
@@ -144,7 +151,7 @@ def _held(experiment: Experiment, segment: Segment, states: States) -> States:
     holding = [i for i, one in enumerate(plant.effects) if type(one).holds is not AbstractEffect.holds]
     if not holding:
         return states
-    acting = jax.vmap(plant.torques)(k.position, k.velocity, states, k.torque, k.time)
+    acting = _torques(experiment, k, states)
     for i in holding:
         side = plant.drive.place(plant.effects[i].place)
         motion = Motion(

@@ -22,6 +22,8 @@ _ZOOMS = 3
 """Rounds, each over a ninth of the range before: the last leaves 3 % of the smoothness open."""
 _SPREAD = 10.0
 """Factor on what is known of the first state: it counts for a hundredth then."""
+_TOGETHER = 16
+"""Channels that are smoothed side by side: what is kept of them stays small."""
 _SHOWN = 3.0
 """Standard deviations from which on a velocity is shown."""
 
@@ -136,14 +138,14 @@ def _corrected(values: list[Any], carry: list[Any], inputs: list[Any]) -> tuple[
 
 
 def _along(sample: Any, values: list[Any], carry: list[Any], inputs: list[Any]) -> list[np.ndarray]:
-    """What a function of a sample keeps along a signal; numbers are one lane."""
+    """What a function of a sample keeps along a signal, or along several side by side; numbers are one lane."""
     found = stepped(sample, [np.ravel(one) for one in values], [np.ravel(one) for one in carry], inputs)
     return [one if np.ndim(carry[0]) else one[:, 0] for one in found]
 
 
 def _start(position: Any) -> list[Any]:
     """Nothing is known at first but the size of things."""
-    largest = np.max(np.abs(np.diff(position)))
+    largest = np.max(np.abs(np.diff(position, axis=0)), axis=0)
     spread = [_SPREAD**2 * size**2 + 1.0 for size in (1.0, largest, largest)]
     zero = 0.0 * position[0]
     return [position[0], zero, zero, spread[0] + zero, zero, zero, spread[1], zero, spread[2]]
@@ -154,7 +156,8 @@ def _first(position: Any, smoothness: Any) -> list[Any]:
 
     From an altogether unknown one the backward pass would lose all digits in the covariance of the first samples.
     """
-    *last, e, s = (one[-1] for one in _along(_predicted, [smoothness], _start(position), [position[::-1]]))
+    start = _start(position)
+    *last, e, s = (one[-1] for one in _along(_predicted, [smoothness + 0.0 * start[0]], start, [position[::-1]]))
     x, p = last[:3], last[3:]
     gain = [p[i] / s for i in _FULL[0]]
     turned = 1.0, -1.0, 1.0
@@ -194,11 +197,15 @@ def _unit(position: Any) -> Any:
     return np.maximum(guess, 1e-9 * np.ptp(position) + np.finfo(position.dtype).tiny)
 
 
+def _passes(scaled: Any, smoothness: Any) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """What the filter and the backward pass keep along a position, or along several side by side, from the first one on."""
+    zero = 0.0 * scaled[0]
+    forward = _along(_predicted, [smoothness + zero], _first(scaled, smoothness), [scaled])
+    return forward, [one[::-1] for one in _along(_corrected, [], [zero] * 9, [one[::-1] for one in forward])]
+
+
 def _smoothed(position: Any, smoothness: Any, noise: Any, period: Any) -> Smoothed:
-    scaled = (position - position[0]) / noise
-    forward = _along(_predicted, [smoothness], _first(scaled, smoothness), [scaled])
-    zero = [0.0 * scaled[0]] * 9
-    found = [one[::-1] for one in _along(_corrected, [], zero, [one[::-1] for one in forward])]
+    forward, found = _passes((position - position[0]) / noise, smoothness)
     unit = np.stack([noise, noise / period, noise / period**2])
     state = np.stack(found[:3], axis=1) * unit[None, :]
     # the position counts from the first one
@@ -238,3 +245,17 @@ def smooth(position: Float[np.ndarray, " samples"], period: float, *, known: tup
             sigma, jerk = (np.float64(one) for one in known)
             smoothness = jerk * h**5 / sigma**2
         return _smoothed(values, smoothness, sigma, h)
+
+
+def smoothed_accelerations(
+    positions: Float[np.ndarray, "samples columns"], period: float, known: tuple[Any, Any]
+) -> Float[np.ndarray, "samples columns"]:
+    """Accelerations of several channels, each smoothed as :func:`smooth` does with the same `known` numbers."""
+    sigma, jerk = known
+    smoothness, found = np.float64(jerk * period**5 / sigma**2), np.empty_like(positions)
+    with np.errstate(all="ignore"):
+        for first in range(0, positions.shape[1], _TOGETHER):
+            some = positions[:, first : first + _TOGETHER]
+            _, kept = _passes((some - some[0]) / sigma, smoothness)
+            found[:, first : first + _TOGETHER] = kept[2] * sigma / period**2
+    return found

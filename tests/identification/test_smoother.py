@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from jaxbl.identification.smoother import smooth
+from jaxbl.fused import steps
+from jaxbl.identification.smoother import smooth, smoothed_accelerations
 
 PERIOD, NOISE, JERK = 2e-3, 1e-4, 3e3
 F = np.array([[1.0, PERIOD, 0.5 * PERIOD**2], [0.0, 1.0, PERIOD], [0.0, 0.0, 1.0]])
@@ -104,3 +105,15 @@ def test_quantised_readings():
     found = [smooth(one, PERIOD) for one in readings]
     np.testing.assert_allclose([one.noise for one in found], step / np.sqrt(12.0), rtol=0.2)
     assert np.sqrt(np.mean((found[0].velocity - 4.0 * np.cos(4.0 * t)) ** 2)) < 0.02
+
+
+@pytest.mark.parametrize("machine_code", [True, False])
+@pytest.mark.parametrize("columns", [1, 3, 21])
+def test_channels_side_by_side_are_those_one_by_one(columns, machine_code, monkeypatch):
+    if not machine_code:
+        monkeypatch.setattr(steps, "_loop", lambda *_: None)
+    readings = np.stack([(1.0 + seed) * motion(seed, 300)[1] for seed in range(columns)], axis=1)
+    found = smoothed_accelerations(readings, PERIOD, (NOISE, JERK))
+    for one, position in zip(found.T, readings.T, strict=True):
+        alone = smooth(position, PERIOD, known=(NOISE, JERK)).acceleration
+        np.testing.assert_allclose(one, alone, rtol=1e-9, atol=1e-9 * np.max(np.abs(alone)))
