@@ -219,10 +219,9 @@ _LOST = 0.01
 """Nats that rounding may take (benchmarks/NOTES.md): under too low a gain the influence of an initial state grows."""
 _VALUES = 65536
 """Samples times columns that the recursion takes at once: what it knows and finds of them stays in the cache."""
-
-
 _TOGETHER = 64
-"""Columns of candidates from which on the next ones are taken through the recursion by themselves, in another thread."""
+"""Columns from which on further candidates are taken through the recursion by themselves, by another thread if there is one:
+no two candidates are in a model at once."""
 
 
 class Predictor:
@@ -493,15 +492,9 @@ class Linear:
         """Products of everything that the prediction errors are linear in, columns of candidates among it, initial states
         eliminated; `noise`: rms of the errors by side, rad, where they are white, or their spectrum. Products of different
         candidates are there for some only."""
-        gain, own = self.gain(smoothness), len(self.free)
+        gain, own, groups = self.gain(smoothness), len(self.free), _groups(variants)
         places, offsets, at = [], [], 1 + own
-        groups: list[list[Candidate]] = [[]]
-        wide = 0
         for one in variants:
-            if wide > _TOGETHER:
-                groups, wide = [*groups, []], 0
-            groups[-1].append(one)
-            wide += one.width + one.offset
             places.append(tuple(range(at, at + one.width)))
             at += one.width
             offsets.append(at if one.offset else -1)
@@ -516,18 +509,16 @@ class Linear:
 
         jobs = [(one, forces_of(group, one)) for one in self.signals for group in groups]
         total, power = np.zeros((at, at)), np.zeros(at)
-        shared, done = np.arange(1 + own), iter(in_threads(products, *zip(*jobs, strict=True)))
-        for _ in self.signals:
-            first = 1 + own
-            for i, _ in enumerate(groups):
-                gram, squares = next(done)
-                last = first + len(squares)
-                index = np.concatenate([shared, np.arange(first, last)])
-                if i > 0:
-                    gram[: 1 + own, : 1 + own] = 0.0
-                total[np.ix_(index, index)] += gram
-                power[first:last] += squares
-                first = last
+        first = 1 + own
+        for gram, squares in in_threads(products, *zip(*jobs, strict=True)):
+            last = first + len(squares)
+            index = np.array([*range(1 + own), *range(first, last)])
+            if first > 1 + own:
+                # what all candidates of a part share counts once
+                gram[: 1 + own, : 1 + own] = 0.0
+            total[np.ix_(index, index)] += gram
+            power[first:last] += squares
+            first = last if last < at else 1 + own
         with np.errstate(divide="ignore"):
             # what has no torque along this motion cannot be found
             size = SHARE * self.drive / np.sqrt(power[1 + own :] / self.count)
@@ -591,6 +582,16 @@ class Linear:
         path = corrected(name)
         value = 0.0 if path is None else float(get_leaf(self.experiment, path))
         return value if value > 0.0 else None
+
+
+def _groups(variants: Sequence[Candidate]) -> list[list[Candidate]]:
+    """Neighbours whose columns are taken through the recursion together; one empty group if there are none."""
+    found: list[list[Candidate]] = [[]]
+    for one in variants:
+        if sum(other.width + other.offset for other in found[-1]) >= _TOGETHER:
+            found.append([])
+        found[-1].append(one)
+    return found
 
 
 def _least_squares(total: np.ndarray, precision: np.ndarray, centre: np.ndarray, reach: np.ndarray) -> np.ndarray:

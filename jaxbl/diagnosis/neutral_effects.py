@@ -2,7 +2,7 @@
 
 The models that a diagnosis tries then have one structure, and one compiled program serves them all: which effects act is a
 matter of numbers. An effect with a state of its own, though, would make every linearisation larger: it is in the model only
-where it acts.
+where it acts. Loops for this machine's processor, which compile fast, get the model without those that do nothing.
 """
 
 import dataclasses

@@ -39,7 +39,7 @@ def stepped(
         np.ascontiguousarray(one if one.ndim == 1 else np.pad(one, ((0, 0), (0, whole - lanes))), float) for one in inputs
     ]
     found = [np.empty((samples, whole)) for one in loop.signature if one.name.startswith("kept")]
-    loop([*given, *along, *found], samples, 0, whole)
+    loop([*given, *(np.ascontiguousarray(one, float) for one in along), *found], samples, 0, whole)
     return [one[:, :lanes] for one in found]
 
 
