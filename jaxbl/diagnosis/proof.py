@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxbl.drive.effects import EFFECTS
-from jaxbl.drive.parameters import get_leaf, leaf_paths
+from jaxbl.drive.parameters import get_leaf, leaf_paths, parameters
 from jaxbl.identification.logs import unit_on
 from jaxbl.identification.trajectory import Free
 from jaxbl.records import Record
@@ -71,13 +71,20 @@ class FittedModel(NamedTuple):
         return {one.path: float(one.slope(self.theta[i])) * deviation[i] for i, one in enumerate(self.free)}
 
 
-def special_case(fitted: FittedModel, name: str) -> str | None:
+def special_case(fitted: FittedModel, name: str, noise: Mapping[str, float] | None = None) -> str | None:
     """Name of a special case that an effect of a model may as well be, since the number that parts the two is known no
-    better than its size: friction that bends over a length of 0.5 ± 0.6 mrad may as well not bend."""
-    cls, errors = EFFECTS[name], fitted.errors()
-    shapes = [f"effects.{name}.{leaf}" for leaf, role in cls.roles().items() if role.kind in ("shape", "frequency")]
-    apart = [errors[path] < abs(float(get_leaf(fitted.experiment, path))) for path in shapes if path in errors]
-    plain = next((f"{name.partition('.')[0]}.{kind}" for kind in cls.special_cases), None)
+    better than its size: friction that bends over a length of 0.5 ± 0.6 mrad may as well not bend. With the `noise` of each
+    side's readings, rad, nor is a way known that is shorter than that."""
+    cls, errors, place = EFFECTS[name], fitted.errors(), name.partition(".")[0]
+    least = {} if noise is None else {"rad": noise.get(place, max(noise.values()))}
+    units = {field.name: about.unit for field, about in parameters(cls)}
+    apart = []
+    for leaf, role in cls.roles().items():
+        path = f"effects.{name}.{leaf}"
+        if role.kind in ("shape", "frequency") and path in errors:
+            known = max(errors[path], least.get(units.get(leaf, ""), 0.0))
+            apart.append(known < abs(float(get_leaf(fitted.experiment, path))))
+    plain = next((f"{place}.{kind}" for kind in cls.special_cases), None)
     return plain if apart and not any(apart) else None
 
 
@@ -197,7 +204,7 @@ class Proof:
         """The model with the special case of an effect in its place, where nothing parts the two: neither the fit
         (:func:`special_case`) nor the held-out data. None where something does."""
         fitted = accepted.fitted
-        plain = special_case(fitted, name)
+        plain = special_case(fitted, name, self.other.noise)
         if plain is None or plain not in search.lacking or plain in fitted.names:
             return None
         reduced = EFFECTS[name].special_cases[plain.partition(".")[2]]

@@ -97,6 +97,17 @@ def test_an_effect_may_be_its_special_case_where_the_number_that_parts_them_is_o
     assert special_case(fitted, name) == (None if apart else "motor.coulomb_friction")  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(("noise", "apart"), [(0.05, True), (0.2, False)])
+def test_a_way_shorter_than_the_noise_of_its_position_is_not_known(noise, apart):
+    name = "load.presliding_friction"
+    fitted = SimpleNamespace(
+        experiment=SimpleNamespace(effects=(make_effect(name, torque=0.1, length=0.1),)),
+        errors=lambda: {f"effects.{name}.length": 1e-3},
+    )
+    found = special_case(fitted, name, {"motor": 1.0, "load": noise})  # type: ignore[arg-type]
+    assert found == (None if apart else "load.coulomb_friction")
+
+
 @pytest.mark.parametrize(("z", "named"), [(1.5, False), (0.5, True)])
 def test_a_special_case_is_named_where_held_out_data_do_not_part_it_either(z, named, monkeypatch):
     general, plain = "motor.presliding_friction", "motor.coulomb_friction"
@@ -109,8 +120,8 @@ def test_a_special_case_is_named_where_held_out_data_do_not_part_it_either(z, na
     monkeypatch.setattr(fit, lambda _, numbers, theta: SimpleNamespace(numbers=numbers, experiment=0))
     monkeypatch.setattr("jaxbl.diagnosis.proof.beaten", lambda *_: z)
     proof = SimpleNamespace(
-        setup=SimpleNamespace(prior=[0.02]), other=SimpleNamespace(compare=lambda _: "after"), before=None,
-        worse=lambda *_: False, _gain=lambda *_: 7.0,
+        setup=SimpleNamespace(prior=[0.02]), before=None,
+        other=SimpleNamespace(compare=lambda _: "after", noise={"motor": 1e-3}), worse=lambda *_: False, _gain=lambda *_: 7.0,
     )  # fmt: skip
     accepted = Accepted(fitted, "general", [], {general: 9.0})  # type: ignore[arg-type]
     found = Proof.plainer(proof, SimpleNamespace(lacking=[plain]), accepted, general)  # type: ignore[arg-type]
