@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from .sweeps.sweep import StudyResult as StudyResult
     from .sweeps.sweep import dry_run as dry_run
     from .sweeps.sweep import load as load
+    from .sweeps.sweep import repair as repair
     from .sweeps.sweep import sweep as sweep
     from .sweeps.trial import Trial as Trial
     from .sweeps.trial import run as run
@@ -63,7 +64,7 @@ _NAMES = {
     "report.sweep": ("write_sweep_report",),
     "report.tune": ("write_tune_report",),
     "report.verify": ("write_verify_report",),
-    "sweeps.sweep": ("StudyResult", "dry_run", "load", "sweep"),
+    "sweeps.sweep": ("StudyResult", "dry_run", "load", "repair", "sweep"),
     "sweeps.trial": ("Trial", "run"),
     "throughput": ("bench",),
 }

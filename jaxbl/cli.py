@@ -1,6 +1,8 @@
 """The command line: parse, call, print. JAX is imported only once a command has work for it."""
 
 import dataclasses
+import errno
+import functools
 import math
 import os
 import sys
@@ -83,13 +85,16 @@ def simulate(
     from jaxbl.sweeps.trial import run
 
     from .config import read_config
+    from .files import locked, removed_if_empty
     from .report.simulate import write_trial_report
 
     study = read_config(config)
     folder = _folder(config, out)
-    claim(folder, study, "simulate", overwrite=overwrite)
-    trial = run(study, seed=seed, every=every)
-    _print(write_trial_report(trial, folder), folder)
+    with removed_if_empty(folder), locked(folder):
+        claim(folder, study, "simulate", overwrite=overwrite)
+        trial = run(study, seed=seed, every=every)
+        lines = write_trial_report(trial, folder)
+    _print(lines, folder)
     if not trial.summary["metrics"]["finite"]:
         raise typer.Exit(1)
 
@@ -102,6 +107,9 @@ def sweep(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="print the expected cost, and stop")] = False,
     overwrite: OverwriteOption = False,
     backend: BackendOption = None,
+    verify_store: Annotated[
+        bool, typer.Option("--verify-store", help="read every stored part first, and compute damaged ones anew")
+    ] = False,
 ) -> None:
     """Simulate all points of a study: metrics, maps, report. Continues an interrupted sweep."""
     study, chosen = _study(config, backend)
@@ -120,7 +128,8 @@ def sweep(
         if dry_run:
             _print_cost(study, chosen)
             return
-    _compute(context, config, study, out, overwrite, chosen, run_sweep, write_sweep_report)
+    run = functools.partial(run_sweep, verify_store=verify_store)
+    _compute(context, config, study, out, overwrite, chosen, run, write_sweep_report)
 
 
 def _print_cost(study: "Config", backend: "Backend | None") -> None:
@@ -205,7 +214,8 @@ def _compute(
     if cost and cost["lanes"]:
         compiling, computing = duration(cost["compile_seconds"]), duration(cost["run_seconds"])
         lines.append(f"Compiled in {compiling}, ran {cost['lanes']:.0f} lanes in {computing}.")
-    _print([*lines, *(SCANNED % what for what in result.scanned)], folder)
+    lines += (SCANNED % what for what in result.scanned)
+    _print([*lines, *(f"Damaged, and computed anew: {what}" for what in getattr(result, "damaged", ()))], folder)
 
 
 @app.command()
@@ -446,6 +456,21 @@ def plot(
 
 
 @app.command()
+def repair(folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder of a sweep", show_default=False)]) -> None:
+    """Check a sweep's folder: keep damaged parts aside, and write a manifest that is lost or damaged anew."""
+    _start_jax()
+    from jaxbl.sweeps.sweep import repair as run_repair
+
+    whole, store = run_repair(folder)
+    for what in store.damaged:
+        typer.echo(f"Damaged: {what}")
+    parts = store.manifest["parts"]
+    typer.echo(f"{whole} of {parts} parts are whole.")
+    if whole < parts:
+        typer.echo(f"'jaxbl sweep {folder / 'study.toml'} --out {folder}' computes the others.")
+
+
+@app.command()
 def bench(
     context: typer.Context,
     quick: Annotated[
@@ -511,6 +536,12 @@ def main(run: Callable[[], object] = app) -> None:
     except (InputError, NoResult) as error:
         typer.echo(f"jaxbl: {error}", err=True)
         sys.exit(2 if isinstance(error, InputError) else 1)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+            raise
+        how = "what was written before is whole, and the same command goes on from there when that is mended"
+        typer.echo(f"jaxbl: nothing can be written ({error.strerror}); {how}", err=True)
+        sys.exit(1)
     except KeyboardInterrupt:
         typer.echo("interrupted", err=True)
         sys.exit(130)

@@ -1,8 +1,13 @@
 """Files and folders that commands write: whole or not at all, as JSON that any program reads."""
 
+import hashlib
 import json
 import math
 import os
+import re
+import shutil
+import socket
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -10,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .errors import InputError
+from .errors import InputError, NoResult
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,33 +37,136 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+_ANEW = "begin anew with --overwrite, or choose another folder with --out"
+
+
+def checksum(content: bytes) -> str:
+    """Of some bytes: 32 hexadecimal digits."""
+    return hashlib.blake2b(content, digest_size=16).hexdigest()
+
+
 def read_json(path: Path) -> dict[str, Any]:
-    """An object from a file of ours."""
+    """An object from a file of ours without its checksum, which it agrees with if it has one."""
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise InputError(f"{path}: is damaged ({error}); remove it, or choose another folder with --out") from None
+        raise InputError(f"{path}: is damaged ({error}); {_ANEW}") from None
     if not isinstance(data, dict):
         raise InputError(f"{path}: is not one of jaxbl's files; choose another folder with --out")
+    if "checksum" in data and data.pop("checksum") != _checksum_of(data):
+        raise InputError(f"{path}: is damaged (does not agree with its checksum); {_ANEW}")
     return data
 
 
+def json_text(data: Mapping[str, Any]) -> str:
+    """An object as JSON with a checksum of all else in it."""
+    # keys and numbers as they are read again
+    plain_data: dict[str, Any] = json.loads(json.dumps(data))
+    return json.dumps(plain_data | {"checksum": _checksum_of(plain_data)}, indent=1, ensure_ascii=False)
+
+
+def _checksum_of(data: Mapping[str, Any]) -> str:
+    return checksum(json.dumps(data, sort_keys=True).encode())
+
+
 def write_atomic(path: Path, content: str | bytes) -> None:
-    """Write a file so that it is either there whole or not at all."""
-    draft = _draft(path)
-    draft.write_bytes(content.encode() if isinstance(content, str) else content)
-    draft.replace(path)
+    """Write a file so that it is either there whole or not at all. Raises as :func:`written`."""
+    with written(path) as draft:
+        draft.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def write_table(path: Path, frame: "pd.DataFrame") -> None:
-    """Write a Parquet file so that it is either there whole or not at all."""
-    draft = _draft(path)
-    frame.to_parquet(draft, index=False)
-    draft.replace(path)
+    """Write a Parquet file so that it is either there whole or not at all. Raises as :func:`written`."""
+    with written(path) as draft:
+        frame.to_parquet(draft, index=False)
 
 
-def _draft(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{os.getpid()}")
+@contextmanager
+def written(path: Path) -> Iterator[Path]:
+    """A draft to be written, which takes the file's place once it is whole.
+
+    Raises:
+        NoResult: there is no room for it, or the disk fails; what was there before is still there.
+    """
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        yield draft
+        draft.replace(path)
+    except OSError as error:
+        raise NoResult(
+            f"{path}: cannot be written ({error.strerror or error}); what was written before is whole, and the same command "
+            "goes on from there when that is mended"
+        ) from None
+    finally:
+        with suppress(OSError):
+            draft.unlink()
+
+
+LOCK = ".lock"
+_DRAFT = re.compile(r"\.((probe|.+\.(json|toml|parquet|html|png))\.\d+|draft\..+)")
+"""Names of files and folders that a process leaves where it is killed while it writes."""
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keep other processes from writing into a folder, which is made.
+
+    The system frees the lock of a process that dies, on a network file system that of a machine that is lost.
+
+    Raises:
+        InputError: another process writes into it, or it cannot be written to.
+    """
+    make_folder(folder)
+    path = folder / LOCK
+    file = _taken(path)
+    if file is None:
+        holder = ""
+        with suppress(OSError):
+            holder = path.read_text()
+        raise InputError(
+            f"{folder}: {holder or 'another process'} is writing into it; wait until it has ended, or choose another folder "
+            "with --out"
+        )
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            path.unlink()
+        file.close()
+
+
+def _taken(path: Path) -> Any:
+    """The file of a lock that is ours now; None where another process has it."""
+    import fcntl
+
+    while True:
+        file = path.open("a+")
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # who had it may have removed it meanwhile
+            if os.fstat(file.fileno()).st_ino == path.stat().st_ino:
+                file.truncate(0)
+                file.write(f"process {os.getpid()} on {socket.gethostname()} (since {time.strftime('%Y-%m-%d %H:%M:%S')})")
+                file.flush()
+                return file
+        except BlockingIOError:
+            file.close()
+            return None
+        except FileNotFoundError:
+            pass
+        file.close()
+
+
+def remove_drafts(folder: Path) -> None:
+    """Remove what processes have left in a folder of ours that were killed while they wrote."""
+    for draft in folder.rglob(".*"):
+        if _DRAFT.fullmatch(draft.name):
+            shutil.rmtree(draft) if draft.is_dir() else draft.unlink(missing_ok=True)
+
+
+def is_empty(folder: Path) -> bool:
+    """Whether nothing but our lock is in a folder."""
+    return all(path.name == LOCK for path in folder.iterdir())
 
 
 def make_folder(path: Path) -> None:
@@ -84,20 +192,22 @@ def claim_log_folder(folder: Path, log: Path, *, overwrite: bool) -> None:
     """
     make_folder(folder)
     found = [folder / name for name in LOG_RESULTS if (folder / name).exists()]
-    if not found and any(folder.iterdir()):
+    if not found and not is_empty(folder):
         raise InputError(f"{folder}: is not empty and holds no results of a log; choose another folder with --out")
     for file in found:
         other = log_named_in(file)
         if other != str(log.resolve()) and not overwrite:
             name = other or "an unreadable one"
             raise InputError(f"{folder}: holds results of another log ({name}); choose another with --out, or --overwrite")
+    if found:
+        remove_drafts(folder)
 
 
 def log_named_in(file: Path) -> str | None:
-    """The log that the results in a file are of; None where the file is damaged."""
+    """The log that the results in a file are of; None where that cannot be read. The rest may be damaged."""
     try:
-        return str(read_json(file)["file"])
-    except (InputError, KeyError):
+        return str(json.loads(file.read_text(encoding="utf-8"))["file"])
+    except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
@@ -110,14 +220,15 @@ def results_of(
     Raises:
         InputError: as :func:`claim_log_folder`, or as the task does.
     """
-    claim_log_folder(file.parent, task.record.path, overwrite=overwrite)
-    with suppress(OSError, InputError):
-        found = read_json(file)
-        if found.get("identity") == task.identity and _is_newest(file):
-            return found
-    with removed_if_empty(file.parent):
+    folder = file.parent
+    with removed_if_empty(folder), locked(folder):
+        claim_log_folder(folder, task.record.path, overwrite=overwrite)
+        with suppress(OSError, InputError):
+            found = read_json(file)
+            if found.get("identity") == task.identity and _is_newest(file):
+                return found
         done = run(task)
-        write(done, file.parent)
+        write(done, folder)
     return done.summary
 
 

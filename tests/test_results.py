@@ -1,11 +1,11 @@
 """Results of a log in a folder: found again by the same call, unless another command has written over them."""
 
-import json
 from types import SimpleNamespace
 
 import pytest
 
-from jaxbl.files import results_of
+from jaxbl.errors import InputError
+from jaxbl.files import json_text, locked, read_json, results_of
 
 
 @pytest.fixture
@@ -16,7 +16,7 @@ def found(tmp_path):
 
     def write(result, folder):
         (folder / "report.html").write_text("its own")
-        (folder / "identification.json").write_text(json.dumps(result.summary))
+        (folder / "identification.json").write_text(json_text(result.summary))
 
     def call():
         def run(task):
@@ -43,3 +43,23 @@ def test_results_that_another_command_wrote_over_are_made_again(found, tmp_path,
     else:
         report.write_text("of another command")
     assert found() == 2 and report.read_text() == "its own"
+
+
+def test_results_that_do_not_agree_with_their_checksum_are_made_again(found, tmp_path):
+    found()
+    file = tmp_path / "out" / "identification.json"
+    file.write_text(file.read_text().replace("abc", "abd"))
+    with pytest.raises(InputError, match="does not agree with its checksum"):
+        read_json(file)
+    assert found() == 2 and read_json(file)["identity"] == "abc"
+    # of which log they were is not known
+    file.write_text("{")
+    with pytest.raises(InputError, match=r"holds results of another log \(an unreadable one\).* or --overwrite"):
+        found()
+
+
+def test_one_process_writes_into_a_folder(found, tmp_path):
+    with locked(tmp_path / "out"), pytest.raises(InputError, match="is writing into it; wait until it has ended"):
+        found()
+    assert found() == 1
+    assert not (tmp_path / "out" / ".lock").exists()

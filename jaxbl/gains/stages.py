@@ -1,6 +1,5 @@
 """A command that runs several studies, one after the other: their folder, backend, progress and cost."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +7,7 @@ import pandas as pd
 
 from jaxbl.config import Config
 from jaxbl.errors import InputError
-from jaxbl.files import make_folder, read_json, write_atomic
+from jaxbl.files import json_text, make_folder, read_json, write_atomic
 from jaxbl.sweeps.programs import Backend, backend_of
 from jaxbl.sweeps.store import claim, manifest_head
 from jaxbl.sweeps.sweep import StudyResult, sweep
@@ -61,7 +60,7 @@ class Stages:
         if self.folder is not None:
             make_folder(self.folder)
             manifest = manifest_head(self._config, self._command) | found | {"backend": self._backend}
-            write_atomic(self.folder / "manifest.json", json.dumps(manifest, indent=2))
+            write_atomic(self.folder / "manifest.json", json_text(manifest))
 
     def place(self, *names: str) -> Path | None:
         """A path in the folder, if there is one."""

@@ -1,7 +1,6 @@
 """The files of a report: a plain HTML page that holds everything, figures, and the results of a log, whole or not at all."""
 
 import base64
-import json
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import tomli_w
 
-from jaxbl.files import write_atomic
+from jaxbl.files import json_text, write_atomic
 
 from .figures import Drawn, save
 
@@ -102,7 +101,7 @@ def write_results(
         trace.to_parquet(draft / "trace.parquet", index=False)
         (draft / "model.toml").write_text(model, encoding="utf-8")
         lines = write_report(draft, title, lead, drawn, tables, model, remarks)
-        (draft / f"{name}.json").write_text(json.dumps(summary, indent=1, ensure_ascii=False), encoding="utf-8")
+        (draft / f"{name}.json").write_text(json_text(summary), encoding="utf-8")
         for file in sorted(draft.rglob("*"), key=lambda one: one.name == f"{name}.json"):
             if file.is_file():
                 target = folder / file.relative_to(draft)

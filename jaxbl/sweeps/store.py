@@ -5,7 +5,10 @@ import json
 import os
 import platform
 import shutil
+import time
+from collections.abc import Iterator
 from importlib.metadata import version
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +18,34 @@ import pyarrow.parquet as pq
 
 from jaxbl.config import Config
 from jaxbl.errors import InputError
-from jaxbl.files import LOG_RESULTS, log_named_in, make_folder, read_json, write_atomic, write_table
+from jaxbl.files import (
+    LOG_RESULTS,
+    is_empty,
+    json_text,
+    log_named_in,
+    make_folder,
+    read_json,
+    remove_drafts,
+    write_atomic,
+)
 
+from . import parts
+from .parts import Damaged, Mark
 from .programs import Backend, Layout
 
-FORMAT = 2
+FORMAT = 3
 """Of the manifest: raised where older versions could not read it."""
 
 _COMMANDS = {
     # command: its marker, which says whose the folder is; what it leaves; keys of the config that decide none of its numbers
     "simulate": ("summary.json", ("trace.parquet",), ("axes", "sweep", "verify", "tune")),
-    "sweep": ("manifest.json", ("study.toml", "points", "laws.json"), ("verify", "tune")),
+    "sweep": ("manifest.json", ("study.toml", "points", "laws.json", "damaged"), ("verify", "tune")),
     "verify": ("verify/manifest.json", ("verdict.json", "counterexamples.parquet", "verify"), ("tune",)),
     "tune": ("tune/manifest.json", ("gains.toml", "tuning.json", "tune"), ("axes", "verify")),
 }
 _COMMON = "figures", "report.html"
+_SAVED = 10.0
+"""Seconds from one time that the manifest is written to the next while chunks are computed: parts know what they are."""
 
 
 def identity(config: Config, command: str = "sweep") -> str:
@@ -77,16 +93,20 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
             try:
                 found[other] = read_json(folder / marker)
             except InputError:
-                if not overwrite:
+                mark = _first_mark(folder) if other == "sweep" else None
+                if mark is None and not overwrite:
                     raise
-                found[other] = {}
+                found[other] = {} if mark is None else mark.study
+        elif other == "sweep" and (mark := _first_mark(folder)) is not None:
+            found[other] = mark.study
     # a damaged file of ours is read as an empty one above
     if any(data and "single_run" not in data for data in found.values()):
         raise InputError(f"{folder}: holds files that are not of a study; choose another folder with --out")
     same = [data.get("single_run") == identity(config, "simulate") for data in found.values()]
     if command != "simulate" and command in found:
         same.append(found[command].get("identity") == identity(config, command))
-    if all(same) and (found or not any(folder.iterdir())):
+    if all(same) and (found or is_empty(folder)):
+        remove_drafts(folder)
         return
     if not found:
         for file in (folder / name for name in LOG_RESULTS if (folder / name).exists()):
@@ -107,29 +127,55 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
             path.unlink(missing_ok=True)
 
 
+def _first_mark(folder: Path) -> Mark | None:
+    """What the first whole part in a folder says of itself."""
+    for path in sorted((folder / "points").glob("part-*.parquet")):
+        try:
+            return parts.mark_of(path)
+        except (Damaged, FileNotFoundError):
+            continue
+    return None
+
+
 class Store:
-    """The folder of one study."""
+    """The folder of one study.
+
+    Attributes:
+        folder: where it is.
+        manifest: what is known of the study as a whole; `checksums` are those of whole parts, by index.
+        damaged: parts that were kept aside, and why.
+    """
 
     def __init__(self, folder: Path, manifest: dict[str, Any]):
         self.folder = folder
         self.manifest = manifest
+        self.damaged: list[str] = []
+        self._saved = 0.0
 
     @classmethod
-    def create(cls, folder: Path, config: Config, layout: Layout, backend: Backend, parts: int, rows: int) -> "Store":
-        """Open a folder that this study may have (:func:`claim`), or take up the one that is there."""
+    def create(cls, folder: Path, config: Config, layout: Layout, backend: Backend, chunks: int, rows: int) -> "Store":
+        """Open a folder that this study may have (:func:`claim`), or take up the one that is there; a manifest that is lost
+        or damaged is written anew by what the parts say."""
+        store = None
         if (folder / "manifest.json").exists():
-            store = cls.open(folder)
-        else:
+            try:
+                store = cls.open(folder)
+            except InputError:
+                if _first_mark(folder) is None:
+                    raise
+        if store is None:
+            mark = _first_mark(folder)
             manifest = {
                 "format": FORMAT,
                 **manifest_head(config, "sweep"),
-                "layout": layout._asdict(),
-                "backend": backend,
-                "parts": parts,
+                "layout": layout._asdict() if mark is None else mark.layout,
+                "backend": backend if mark is None else mark.backend,
+                "parts": chunks,
                 "rows": rows,
                 "finished": False,
                 "versions": {name: version(name) for name in ("jaxbl", "jax", "equinox", "llvmlite", "numpy")},
                 "machine": {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count()},
+                "checksums": {},
             }
             store = cls(folder, manifest)
         # the manifest first: it is what makes the folder this study's
@@ -143,6 +189,8 @@ class Store:
         """Open a study that is there. Raises `InputError` where there is none."""
         path = folder / "manifest.json"
         if not path.exists():
+            if _first_mark(folder) is not None:
+                raise InputError(f"{folder}: has lost its manifest.json; 'jaxbl repair {folder}' writes it anew")
             raise InputError(f"{folder}: holds no study (no manifest.json); run 'jaxbl sweep' first")
         manifest = read_json(path)
         if manifest.get("format") != FORMAT:
@@ -155,32 +203,77 @@ class Store:
 
     @property
     def backend(self) -> Backend:
-        """That of all chunks, but for groups that the fused loop cannot run; those of former versions were scanned."""
-        return self.manifest.get("backend", "scan")
+        """That of all chunks, but for groups that the fused loop cannot run."""
+        return self.manifest["backend"]
+
+    @property
+    def _head(self) -> dict[str, Any]:
+        return {name: self.manifest[name] for name in ("identity", "single_run")}
 
     def update(self, **values: Any) -> None:
         """Set entries of the manifest."""
         self.manifest |= values
-        write_atomic(self.folder / "manifest.json", json.dumps(self.manifest, indent=2))
+        write_atomic(self.folder / "manifest.json", json_text(self.manifest))
+        self._saved = time.monotonic()
 
     def part(self, index: int) -> Path:
         return self.folder / "points" / f"part-{index:05d}.parquet"
 
     def has(self, index: int) -> bool:
-        """Whether a chunk is there and whole."""
-        try:
-            return pq.read_metadata(self.part(index)).num_rows > 0
-        except (OSError, ValueError):
+        """Whether a chunk is there and is what was written; one that is not is kept aside.
+
+        Raises:
+            InputError: it is of another study.
+        """
+        path = self.part(index)
+        if not path.exists():
             return False
+        try:
+            known = self.manifest["checksums"].get(str(index))
+            if known is not None:
+                if parts.file_checksum(path) != known:
+                    raise Damaged("does not agree with its checksum in manifest.json")
+                return True
+            mark, _ = parts.read(path)
+            self._check(path, mark, index)
+        except Damaged as why:
+            self._put_aside(path, str(why))
+            return False
+        self.manifest["checksums"][str(index)] = parts.file_checksum(path)
+        return True
+
+    def _check(self, path: Path, mark: Mark, index: int) -> None:
+        """Whether a whole part is the one that belongs here."""
+        if {name: mark.study.get(name) for name in self._head} != self._head:
+            raise InputError(
+                f"{path}: is of another study ('{mark.study.get('title') or 'untitled'}', other numbers); move it away, and "
+                "run 'jaxbl sweep' again, which computes this part"
+            )
+        if mark.chunk != index or mark.layout != self.manifest["layout"]:
+            raise Damaged(f"is part {mark.chunk} of this study")
+
+    def _put_aside(self, path: Path, why: str) -> None:
+        """Keep a damaged file where it is in nobody's way."""
+        folder = self.folder / "damaged"
+        folder.mkdir(exist_ok=True)
+        names = (path.name if i == 0 else f"{path.name}.{i}" for i in count())
+        target = next(folder / name for name in names if not (folder / name).exists())
+        path.replace(target)
+        self.damaged.append(f"{path.relative_to(self.folder)} {why}; it is kept as {target.relative_to(self.folder)}")
 
     def write(self, index: int, frame: pd.DataFrame) -> None:
-        write_table(self.part(index), frame)
+        head = self._head | {"title": self.manifest["title"]}
+        parts.write(self.part(index), frame, Mark(head, self.manifest["layout"], self.backend, index, 0, {}))
+        self.manifest["checksums"][str(index)] = parts.file_checksum(self.part(index))
+        # not for each part: a large study's manifest is large
+        if time.monotonic() - self._saved > _SAVED:
+            self.update()
 
     def read_part(self, index: int, labels: dict[str, np.ndarray], columns: list[str]) -> pd.DataFrame | None:
-        """Some columns of a chunk, or None where it is damaged or holds other rows than those of `labels`."""
+        """Some columns of a chunk, or None where it holds other rows than those of `labels`."""
         try:
-            frame = pd.read_parquet(self.part(index), columns=[*labels, *columns])
-        except (OSError, ValueError):
+            _, frame = parts.read(self.part(index), [*labels, *columns])
+        except (Damaged, OSError):
             return None
         same = all(np.array_equal(frame[name].to_numpy(), values) for name, values in labels.items())
         return frame if same else None
@@ -194,27 +287,63 @@ class Store:
         """Say how many chunks and rows a refined study has in the end, and remove what lies beyond."""
         if (self.manifest["parts"], self.manifest["rows"]) != (parts, rows):
             self.update(parts=parts, rows=rows)
-        for path in self.parts():
-            if int(path.stem.removeprefix("part-")) >= parts:
+        for index, path in self._indexed():
+            if index is not None and index >= parts:
                 path.unlink()
+                self.manifest["checksums"].pop(str(index), None)
+
+    def _indexed(self) -> Iterator[tuple[int | None, Path]]:
+        """Files among the points with the indices that their names say."""
+        for path in sorted((self.folder / "points").glob("part-*.parquet")):
+            number = path.stem.removeprefix("part-")
+            yield (int(number) if number.isdecimal() and path == self.part(int(number)) else None), path
+
+    def refuse_others(self, *, growing: bool = False) -> None:
+        """Raise `InputError` if a file among the points is none that this study has; `growing`: how many it has in the end is
+        not known yet."""
+        for index, path in self._indexed():
+            if index is None or (index >= self.manifest["parts"] and not growing):
+                raise InputError(f"{path}: is no part of this study, which has {self.manifest['parts']}; move it away")
 
     def parts(self) -> list[Path]:
-        """Files of the chunks that are there. Raises `InputError` where there is none."""
-        parts = sorted((self.folder / "points").glob("part-*.parquet"))
-        if not parts:
+        """Files of the chunks that are there. Raises `InputError` if there is none, or one that the study does not have."""
+        self.refuse_others()
+        found = [path for _, path in self._indexed()]
+        if not found:
             raise InputError(f"{self.folder}: holds no points yet; run 'jaxbl sweep' to the end")
-        return parts
+        return found
 
     def columns(self) -> list[str]:
         """Names of the columns."""
         return pq.read_schema(self.parts()[0]).names
 
     def read(self, columns: list[str] | None = None) -> pd.DataFrame:
-        """Rows of all chunks that are there; all columns, or some."""
+        """Rows of all chunks that are there; all columns, or some.
+
+        Raises:
+            InputError: a part is damaged, or not of this study.
+        """
         frames = []
         for part in self.parts():
             try:
-                frames.append(pd.read_parquet(part, columns=columns))
-            except (OSError, ValueError):
-                raise InputError(f"{part}: is damaged; run 'jaxbl sweep' again, which computes it anew") from None
+                mark, frame = parts.read(part, columns)
+                self._check(part, mark, int(part.stem.removeprefix("part-")))
+            except Damaged as why:
+                raise InputError(
+                    f"{part}: is damaged ({why}); run 'jaxbl sweep' again, which keeps it aside and computes it anew"
+                ) from None
+            frames.append(frame)
         return pd.concat(frames, ignore_index=True)
+
+    def verify(self) -> int:
+        """Read all parts; those that are damaged are kept aside. Returns how many are whole.
+
+        Raises:
+            InputError: a part is of another study, or none that this one has.
+        """
+        self.manifest["checksums"] = {}
+        found = sum(self.has(int(path.stem.removeprefix("part-"))) for path in self.parts())
+        if self.damaged:
+            self.manifest["finished"] = False
+        self.update()
+        return found

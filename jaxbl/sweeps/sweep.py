@@ -12,6 +12,7 @@ import pandas as pd
 
 from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
+from jaxbl.files import locked, removed_if_empty
 from jaxbl.workers import Progress
 
 from .engine import Chunk, Engine, SweepEstimate
@@ -37,12 +38,14 @@ class StudyResult:
         cost: seconds of compilation and of computing, and lanes computed in this call.
         source: where the rows are: a folder, or memory.
         scanned: what the fused loop did not know of groups that this call scanned in its place.
+        damaged: parts that this call found damaged, kept aside and computed anew.
     """
 
     config: Config
     source: Store | pd.DataFrame
     cost: dict[str, float] = dataclasses.field(default_factory=dict)
     scanned: tuple[str, ...] = ()
+    damaged: tuple[str, ...] = ()
 
     @functools.cached_property
     def frame(self) -> pd.DataFrame:
@@ -105,6 +108,7 @@ def sweep(
     devices: list[Any] | None = None,
     overwrite: bool = False,
     backend: Backend | None = None,
+    verify_store: bool = False,
 ) -> StudyResult:
     """Run all points of a study.
 
@@ -116,37 +120,57 @@ def sweep(
         devices: JAX devices to use; left out, all local ones.
         overwrite: remove the results of another study from `out`.
         backend: `fused` or `scan`; left out, the faster one here. A study that goes on keeps to that of its first chunks.
+        verify_store: read each part that is there first, column by column; otherwise only files are compared with their
+            checksums.
 
     Raises:
-        InputError: wrong config, a folder that holds something else, or a backend that cannot run the study.
+        InputError: wrong config, a folder that holds something else or that another process writes into, a part of another
+            study, or a backend that cannot run the study.
+        NoResult: nothing can be written any more, as the disk is full; what was written is whole.
     """
     config = read_config(study)
     engine = Engine(config, devices=devices, backend=backend, insist=backend is not None)
-    if backend == "fused" and (out is None or not (Path(out) / "manifest.json").exists()):
+    if out is None:
+        if backend == "fused":
+            engine.check()
+        run = _Run(engine, None, progress)
+        run.all()
+        return run.result(pd.concat(run.frames, ignore_index=True))
+    folder = Path(out)
+    if backend == "fused" and not (folder / "manifest.json").exists():
         # refused, if it is, before anything is written
         engine.check()
-    store = None
-    if out is not None:
-        folder = Path(out)
+    with removed_if_empty(folder), locked(folder):
         claim(folder, config, overwrite=overwrite)
-        store = Store.create(folder, config, engine.layout, engine.backend, len(engine), engine.rows)
-        if backend not in (None, store.backend) and not store.manifest["finished"]:
-            raise InputError(
-                f"{folder}: was begun with --backend {store.backend}; go on with that, or choose another folder with --out"
-            )
-        if (store.layout, store.backend) != (engine.layout, engine.backend):
-            # taken up on another machine: the chunks must stay what they were
-            engine = Engine(config, store.layout, devices, store.backend, backend is not None)
-    run = _Run(engine, store, progress)
-    run.all()
-    if store is None:
-        source = pd.concat(run.frames, ignore_index=True)
-    else:
-        source = store
-        if not store.manifest["finished"]:
+        engine, store = _taken_up(folder, engine, insist=backend is not None)
+        store.refuse_others(growing=engine.points.refinement is not None)
+        if verify_store:
+            store.verify()
+        run = _Run(engine, store, progress)
+        run.all()
+        if run.computed or not store.manifest["finished"]:
             store.update(finished=True, seconds={"compile": engine.compile_seconds, "run": engine.run_seconds})
-    cost = {"compile_seconds": engine.compile_seconds, "run_seconds": engine.run_seconds, "lanes": run.computed}
-    return StudyResult(config, source, cost, tuple(engine.scanned))
+    return run.result(store)
+
+
+def _taken_up(folder: Path, engine: Engine, *, insist: bool) -> tuple[Engine, Store]:
+    """The store in a claimed folder, begun or gone on with, and the engine for it: chunks stay what they were when it was
+    begun, on whatever machine. `insist`: the engine's backend was asked for."""
+    config = engine.config
+    store = Store.create(folder, config, engine.layout, engine.backend, len(engine), engine.rows)
+    if insist and store.backend != engine.backend and not store.manifest["finished"]:
+        raise InputError(
+            f"{folder}: was begun with --backend {store.backend}; go on with that, or choose another folder with --out"
+        )
+    if (store.layout, store.backend) != (engine.layout, engine.backend):
+        engine = Engine(config, store.layout, engine.devices, store.backend, insist)
+        if engine.points.refinement is None and (store.manifest["parts"], store.manifest["rows"]) != (
+            len(engine),
+            engine.rows,
+        ):
+            # the manifest was lost, and begun anew for other chunks
+            store.update(parts=len(engine), rows=engine.rows)
+    return engine, store
 
 
 class _Run:
@@ -169,6 +193,13 @@ class _Run:
             self._refine(group)
         if self.store is not None:
             self.store.trim(self.chunks, self.total)
+
+    def result(self, source: Store | pd.DataFrame) -> StudyResult:
+        """What the run leaves."""
+        engine = self.engine
+        cost = {"compile_seconds": engine.compile_seconds, "run_seconds": engine.run_seconds, "lanes": self.computed}
+        damaged = () if self.store is None else tuple(self.store.damaged)
+        return StudyResult(engine.config, source, cost, tuple(engine.scanned), damaged)
 
     def _refine(self, group: int) -> None:
         """The coarse grid of a group, and what its boundaries need."""
@@ -223,6 +254,24 @@ def load(folder: str | Path) -> StudyResult:
     """Read a study's folder. Raises `InputError` where there is none."""
     store = Store.open(Path(folder))
     return StudyResult(read_config(store.folder / "study.toml"), store)
+
+
+def repair(folder: str | Path) -> tuple[int, Store]:
+    """Check a study's folder: damaged parts are kept aside, and a manifest that is lost or damaged is written anew.
+
+    Returns how many parts are whole, and the store. What is missing then, :func:`sweep` computes.
+
+    Raises:
+        InputError: no study is there, its `study.toml` is damaged, or a part is of another one.
+    """
+    folder = Path(folder)
+    if not (folder / "study.toml").exists():
+        raise InputError(f"{folder}: holds no study (no study.toml); run 'jaxbl sweep STUDY.toml --out {folder}'")
+    config = read_config(folder / "study.toml")
+    with locked(folder):
+        claim(folder, config)
+        _, store = _taken_up(folder, Engine(config), insist=False)
+        return store.verify(), store
 
 
 def dry_run(study: str | Path | Mapping[str, Any] | Config, *, backend: Backend | None = None) -> SweepEstimate:

@@ -121,7 +121,8 @@ def test_a_special_case_is_named_where_held_out_data_do_not_part_it_either(z, na
     monkeypatch.setattr("jaxbl.diagnosis.proof.beaten", lambda *_: z)
     proof = SimpleNamespace(
         setup=SimpleNamespace(prior=[0.02]), before=None,
-        other=SimpleNamespace(compare=lambda _: "after", noise={"motor": 1e-3}), worse=lambda *_: False, _gain=lambda *_: 7.0,
+        other=SimpleNamespace(compare=lambda _: "after", noise={"motor": 1e-3}),
+        worse=lambda *_: False, _gain=lambda *_: 7.0,
     )  # fmt: skip
     accepted = Accepted(fitted, "general", [], {general: 9.0})  # type: ignore[arg-type]
     found = Proof.plainer(proof, SimpleNamespace(lacking=[plain]), accepted, general)  # type: ignore[arg-type]

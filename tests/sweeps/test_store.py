@@ -1,17 +1,24 @@
 """A study's folder: what belongs to it, restart, and nothing overwritten."""
 
 import json
+import shutil
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+from random import Random
 
 import pandas as pd
 import pytest
 from small_study import ALPHA, listed, rigid
 
 from jaxbl.config import read_config
-from jaxbl.errors import InputError
-from jaxbl.files import make_folder
+from jaxbl.errors import InputError, NoResult
+from jaxbl.files import json_text, make_folder, read_json
 from jaxbl.sweeps.engine import Engine
+from jaxbl.sweeps.parts import file_checksum
 from jaxbl.sweeps.store import Store, claim, identity
-from jaxbl.sweeps.sweep import load, sweep
+from jaxbl.sweeps.sweep import load, repair, sweep
 
 FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
 
@@ -103,12 +110,18 @@ def test_a_chunk_that_is_not_whole_is_computed_again(copy, finished, computed, d
     elif damage == "draft only":
         part.with_name(f".{part.name}.1").write_bytes(content[:100])
     if damage in ("truncated", "empty"):
-        with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged; run 'jaxbl sweep' again"):
+        with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged \(.*\); run 'jaxbl sweep' again"):
             _ = load(copy).frame
     else:
         assert len(load(copy).frame) == 6
     result = sweep(study(), copy)
     assert computed == [1]
+    if damage in ("truncated", "empty"):
+        (why,) = result.damaged
+        assert why.startswith("points/part-00001.parquet") and why.endswith("it is kept as damaged/part-00001.parquet")
+        assert len(list((copy / "damaged").iterdir())) == 1
+    # drafts of processes that were killed are gone
+    assert not list(copy.rglob(".*"))
     pd.testing.assert_frame_equal(result.frame, finished[1].frame)
 
 
@@ -144,23 +157,186 @@ def test_overwriting_is_asked_for(copy, computed):
     assert computed == [0, 1, 2]
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", "3"])
-def test_damaged_manifest(copy, content):
-    (copy / "manifest.json").write_text(content)
+MANIFESTS = {
+    "lost": None, "empty": "", "cut off": "{", "a list": "[]", "a number": "3",
+    "no layout": lambda data: data.pop("layout"),
+    "another layout": lambda data: data["layout"].update(points=6),
+    "other rows": lambda data: data.update(rows=2560),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", MANIFESTS)
+def test_a_manifest_that_is_lost_or_damaged_is_written_anew_by_what_the_parts_say(copy, finished, computed, case):
+    file, content = copy / "manifest.json", MANIFESTS[case]
+    if content is None:
+        file.unlink()
+    elif isinstance(content, str):
+        file.write_text(content)
+    else:
+        data = json.loads(file.read_text())
+        content(data)
+        file.write_text(json.dumps(data))
     before = files(copy)
-    for read in (lambda: sweep(study(), copy), lambda: load(copy)):
-        with pytest.raises(InputError, match=r"manifest\.json: is") as error:
-            read()
-        assert "\n" not in str(error.value)
+    with pytest.raises(InputError, match=r"lost its manifest\.json; 'jaxbl repair|manifest\.json: is") as error:
+        load(copy)
+    assert "\n" not in str(error.value)
     assert files(copy) == before
+    # as many chunks as there were, whatever is asked for now
+    result = sweep(study(sweep={"seeds": 3, "chunk": 100}), copy)
+    assert computed == [] and result.damaged == ()
+    pd.testing.assert_frame_equal(load(copy).frame, finished[1].frame)
+    assert len(list((copy / "points").iterdir())) == 3
+
+
+def test_a_damaged_manifest_without_parts(copy):
+    (copy / "manifest.json").write_text("{")
+    for part in (copy / "points").iterdir():
+        part.unlink()
+    with pytest.raises(InputError, match=r"manifest\.json: is damaged \(.*\); begin anew with --overwrite"):
+        sweep(study(), copy)
     assert len(sweep(study(), copy, overwrite=True).frame) == 9
 
 
 def test_manifest_of_another_version(copy):
-    manifest = json.loads((copy / "manifest.json").read_text()) | {"format": 99}
-    (copy / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(InputError, match="has format 99; this version reads 2"):
+    (copy / "manifest.json").write_text(json_text(read_json(copy / "manifest.json") | {"format": 99}))
+    with pytest.raises(InputError, match="has format 99; this version reads 3"):
         load(copy)
+
+
+def flipped(folder, random):
+    """Flip a bit of one of a folder's files, which is returned."""
+    every = sorted(path for path in folder.rglob("*") if path.is_file())
+    sizes = [path.stat().st_size for path in every]
+    path = random.choices(every, sizes)[0]
+    content = path.read_bytes()
+    at = random.randrange(len(content) * 8)
+    path.write_bytes(bytes(byte ^ (1 << at % 8 if i == at // 8 else 0) for i, byte in enumerate(content)))
+    return path
+
+
+def test_flipped_bits_are_noticed_and_healed(copy, finished):
+    """None gives other numbers in silence, and one more sweep makes all well."""
+    random, noticed = Random(7), 0
+    before = files(copy)
+    for _ in range(60):
+        path = flipped(copy, random)
+        with suppress(InputError):
+            pd.testing.assert_frame_equal(load(copy).frame, finished[1].frame)
+        result = sweep(study(), copy)
+        pd.testing.assert_frame_equal(result.frame, finished[1].frame)
+        noticed += len(result.damaged)
+        shutil.rmtree(copy / "damaged", ignore_errors=True)
+        healed = files(copy)
+        assert healed.keys() == before.keys()
+        assert {name for name in healed if healed[name] != before[name]} <= {"manifest.json"}, path
+    assert noticed > 30
+
+
+def test_parts_that_changed_places_are_computed_anew(copy, finished, computed):
+    one, other = (copy / "points" / f"part-0000{i}.parquet" for i in (0, 2))
+    content = one.read_bytes(), other.read_bytes()
+    one.write_bytes(content[1])
+    other.write_bytes(content[0])
+    with pytest.raises(InputError, match=r"part-00000\.parquet: is damaged \(is part 2 of this study\)"):
+        _ = load(copy).frame
+    assert len(sweep(study(), copy).damaged) == 2
+    assert computed == [0, 2]
+    pd.testing.assert_frame_equal(load(copy).frame, finished[1].frame)
+
+
+def test_an_edited_part_is_kept_aside(copy, finished, computed):
+    part = copy / "points" / "part-00001.parquet"
+    frame = pd.read_parquet(part)
+    frame["motor.velocity_rmse"] *= 1.01
+    frame.to_parquet(part, index=False)
+    with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged \(says nothing of the study"):
+        _ = load(copy).frame
+    sweep(study(), copy)
+    assert computed == [1]
+    kept = pd.read_parquet(copy / "damaged" / "part-00001.parquet")
+    pd.testing.assert_frame_equal(kept, frame)
+
+
+def test_a_part_of_another_study_is_refused(copy, tmp_path):
+    sweep(study({"drive.motor_inertia": 0.06}), tmp_path / "other")
+    manifest = read_json(copy / "manifest.json")
+    (copy / "manifest.json").write_text(json_text(manifest | {"checksums": {}, "finished": False}))
+    part = copy / "points" / "part-00001.parquet"
+    part.write_bytes((tmp_path / "other" / "points" / part.name).read_bytes())
+    before = files(copy)
+    for read in (lambda: sweep(study(), copy), lambda: load(copy).frame, lambda: repair(copy)):
+        with pytest.raises(InputError, match=r"part-00001\.parquet: is of another study \('small', other numbers\)"):
+            read()
+    assert {name: content for name, content in files(copy).items() if name != "manifest.json"} == {
+        name: content for name, content in before.items() if name != "manifest.json"
+    }
+
+
+@pytest.mark.parametrize("name", ["part-00099.parquet", "part-3.parquet", "part-copy.parquet"])
+def test_a_part_too_many_is_refused(copy, computed, name):
+    (copy / "points" / name).write_bytes((copy / "points" / "part-00001.parquet").read_bytes())
+    for read in (lambda: load(copy).frame, lambda: sweep(study(), copy)):
+        with pytest.raises(InputError, match=f"{name}: is no part of this study, which has 3; move it away"):
+            read()
+    assert computed == []
+
+
+def test_repair_keeps_damaged_parts_aside_and_says_what_is_missing(copy, computed):
+    (copy / "manifest.json").unlink()
+    (copy / "points" / "part-00000.parquet").write_bytes(b"PAR1")
+    whole, store = repair(copy)
+    assert whole == 2 and len(store.damaged) == 1 and computed == []
+    assert not load(copy).source.manifest["finished"]
+    assert len(load(copy).frame) == 6
+    sweep(copy / "study.toml", copy)
+    assert computed == [0]
+    with pytest.raises(InputError, match=r"holds no study \(no study\.toml\)"):
+        repair(copy / "points")
+
+
+def test_all_of_it_is_read_where_it_is_asked_for(copy, computed):
+    """A part that agrees with a manifest that is wrong as well."""
+    part = copy / "points" / "part-00001.parquet"
+    frame = pd.read_parquet(part)
+    frame.to_parquet(part, index=False)
+    manifest = read_json(copy / "manifest.json")
+    manifest["checksums"]["1"] = file_checksum(part)
+    (copy / "manifest.json").write_text(json_text(manifest))
+    assert sweep(study(), copy).damaged == ()
+    assert len(sweep(study(), copy, verify_store=True).damaged) == 1
+    assert computed == [1]
+
+
+def test_two_processes_do_not_write_into_one_folder(copy):
+    program = (
+        "import sys, pathlib\nfrom jaxbl.files import locked\nwith locked(pathlib.Path(sys.argv[1])):\n"
+        "    print('has it', flush=True)\n    sys.stdin.readline()\n"
+    )
+    other = subprocess.Popen(
+        [sys.executable, "-c", program, str(copy)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert other.stdout.readline() == "has it\n"
+    with pytest.raises(InputError, match=rf"process {other.pid} on .* is writing into it; wait until it has ended"):
+        sweep(study(), copy)
+    # a process that is killed leaves no lock
+    other.kill()
+    other.communicate()
+    assert (copy / ".lock").exists()
+    sweep(study(), copy)
+    assert not (copy / ".lock").exists()
+
+
+def test_a_full_disk_is_said_in_one_line(tmp_path, monkeypatch, finished):
+    def full(table, draft, **_):
+        Path(draft).write_bytes(b"x")
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("jaxbl.sweeps.parts.pq.write_table", full)
+        with pytest.raises(NoResult, match=r"No space left on device\); what was written before is whole, and the same"):
+            sweep(study(), tmp_path / "study")
+    assert {*files(tmp_path / "study")} == {"study.toml", "manifest.json"}
+    pd.testing.assert_frame_equal(sweep(study(), tmp_path / "study").frame, finished[1].frame)
 
 
 def test_folder_with_other_files_stays_as_it_is(tmp_path):

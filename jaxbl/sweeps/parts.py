@@ -1,0 +1,104 @@
+"""A chunk's file: its rows, the study and the chunk that they are of, and a checksum of each column.
+
+What was stored years ago, or copied from elsewhere, is only read where it is what was written.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from jaxbl.files import checksum, written
+
+_KEY, _SUM = b"jaxbl.part", b"jaxbl.checksum"
+"""In the file's metadata: the mark as JSON, and its checksum."""
+
+
+class Damaged(Exception):
+    """A part that is not what was written. The message says how."""
+
+
+class Mark(NamedTuple):
+    """What a part says of itself.
+
+    Attributes:
+        study: head of the study's manifest (:func:`jaxbl.sweeps.store.manifest_head`).
+        layout: seeds and points of a chunk.
+        backend: that computed the study.
+        chunk: index.
+        rows: number of runs.
+        columns: checksum of each column.
+    """
+
+    study: dict[str, Any]
+    layout: dict[str, int]
+    backend: str
+    chunk: int
+    rows: int
+    columns: dict[str, str]
+
+
+def write(path: Path, frame: pd.DataFrame, mark: Mark) -> None:
+    """Write a part with its mark, whole or not at all; rows and checksums are those of the frame."""
+    columns = {str(name): _checksum(values) for name, values in frame.items()}
+    text = json.dumps(mark._replace(rows=len(frame), columns=columns)._asdict()).encode()
+    table = pa.Table.from_pandas(frame, preserve_index=False)
+    table = table.replace_schema_metadata({**(table.schema.metadata or {}), _KEY: text, _SUM: checksum(text).encode()})
+    with written(path) as draft:
+        pq.write_table(table, draft, write_page_checksum=True)
+
+
+def mark_of(path: Path) -> Mark:
+    """What a part says of itself. Raises `Damaged` where that cannot be read, or is not what was written."""
+    try:
+        metadata = pq.read_schema(path).metadata or {}
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError, MemoryError, pa.ArrowException) as error:
+        raise Damaged(f"cannot be read ({_first_line(error)})") from None
+    text = metadata.get(_KEY)
+    if text is None:
+        raise Damaged("says nothing of the study and the chunk that it is of")
+    if metadata.get(_SUM) != checksum(text).encode():
+        raise Damaged("what it says of itself does not agree with its checksum")
+    return Mark(**json.loads(text))
+
+
+def read(path: Path, columns: Sequence[str] | None = None) -> tuple[Mark, pd.DataFrame]:
+    """A part's mark and rows; all columns, or some. Raises `Damaged` where these are not what was written."""
+    mark = mark_of(path)
+    try:
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            frame = file.read(columns=columns).to_pandas()
+    except (OSError, ValueError, KeyError, TypeError, MemoryError, pa.ArrowException) as error:
+        raise Damaged(f"cannot be read ({_first_line(error)})") from None
+    wanted = [*mark.columns] if columns is None else [name for name in columns if name in mark.columns]
+    if [*frame.columns] != wanted or len(frame) != mark.rows:
+        raise Damaged(f"has {len(frame)} rows and {len(frame.columns)} columns, not {mark.rows} and {len(wanted)}")
+    for name in frame.columns:
+        if _checksum(frame[name]) != mark.columns[name]:
+            raise Damaged(f"column '{name}' does not agree with its checksum")
+    return mark, frame
+
+
+def _checksum(column: pd.Series) -> str:
+    values = column.to_numpy()
+    if values.dtype == object:
+        return checksum(json.dumps([str(one) for one in values]).encode())
+    return checksum(str(values.dtype).encode() + b"\0" + np.ascontiguousarray(values).tobytes())
+
+
+def file_checksum(path: Path) -> str:
+    """Of a whole file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).strip().partition("\n")[0][:120] or type(error).__name__
