@@ -299,7 +299,7 @@ class Store:
             yield (int(number) if number.isdecimal() and path == self.part(int(number)) else None), path
 
     def refuse_others(self, *, growing: bool = False) -> None:
-        """Raise `InputError` if a file among the points is none that this study has; `growing`: how many it has in the end is
+        """Raise `InputError` if a file among the points is none of this study; `growing`: how many it has in the end is
         not known yet."""
         for index, path in self._indexed():
             if index is None or (index >= self.manifest["parts"] and not growing):
