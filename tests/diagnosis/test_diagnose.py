@@ -1,7 +1,6 @@
 """From a log to what is missing: the truth comes from a simulator that shares nothing with the package."""
 
 import dataclasses
-import json
 
 import jax
 import numpy as np
@@ -20,6 +19,7 @@ from jaxbl.diagnosis.setup import set_up
 from jaxbl.drive.effects import KEPT
 from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.errors import InputError
+from jaxbl.files import read_json
 from jaxbl.records import read_record
 from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
 
@@ -142,7 +142,7 @@ def test_the_extended_model_runs_and_the_report_says_what_was_found(found, tmp_p
     assert any(line.startswith("motor.coulomb_friction (confidence") and "± " in line for line in lines)
     again = read_config(tmp_path / "model.toml")
     assert [one.kind for one in again.effects] == ["motor.coulomb_friction"]
-    summary = json.loads((tmp_path / "diagnosis.json").read_text())
+    summary = read_json(tmp_path / "diagnosis.json")
     assert summary == found.summary and diagnosis_lines(summary) == lines
     assert again.effects[0].torque == summary["findings"][0]["parameters"]["torque"]["value"]
 
