@@ -192,7 +192,12 @@ class Store:
             if _first_mark(folder) is not None:
                 raise InputError(f"{folder}: has lost its manifest.json; 'jaxbl repair {folder}' writes it anew")
             raise InputError(f"{folder}: holds no study (no manifest.json); run 'jaxbl sweep' first")
-        manifest = read_json(path)
+        try:
+            manifest = read_json(path)
+        except InputError:
+            if _first_mark(folder) is None:
+                raise
+            raise InputError(f"{path}: is damaged; 'jaxbl repair {folder}' writes it anew by what the parts say") from None
         if manifest.get("format") != FORMAT:
             raise InputError(f"{path}: has format {manifest.get('format')}; this version reads {FORMAT}")
         return cls(folder, manifest)
