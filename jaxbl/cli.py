@@ -1,7 +1,6 @@
 """The command line: parse, call, print. JAX is imported only once a command has work for it."""
 
 import dataclasses
-import errno
 import functools
 import math
 import os
@@ -536,12 +535,6 @@ def main(run: Callable[[], object] = app) -> None:
     except (InputError, NoResult) as error:
         typer.echo(f"jaxbl: {error}", err=True)
         sys.exit(2 if isinstance(error, InputError) else 1)
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
-            raise
-        how = "what was written before is whole, and the same command goes on from there when that is mended"
-        typer.echo(f"jaxbl: nothing can be written ({error.strerror}); {how}", err=True)
-        sys.exit(1)
     except KeyboardInterrupt:
         typer.echo("interrupted", err=True)
         sys.exit(130)

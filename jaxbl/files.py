@@ -82,21 +82,29 @@ def write_table(path: Path, frame: "pd.DataFrame") -> None:
 
 
 @contextmanager
-def written(path: Path) -> Iterator[Path]:
-    """A draft to be written, which takes the file's place once it is whole.
+def writing(path: Path) -> Iterator[None]:
+    """Around what is written into a file or folder: one line if the system cannot.
 
     Raises:
-        NoResult: there is no room for it, or the disk fails; what was there before is still there.
+        NoResult: there is no room for it, it may not be written, or the disk fails.
     """
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        yield draft
-        draft.replace(path)
+        yield
     except OSError as error:
         raise NoResult(
             f"{path}: cannot be written ({error.strerror or error}); what was written before is whole, and the same command "
             "goes on from there when that is mended"
         ) from None
+
+
+@contextmanager
+def written(path: Path) -> Iterator[Path]:
+    """A draft to be written, which takes the file's place once it is whole. Raises as :func:`writing`."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with writing(path):
+            yield draft
+            draft.replace(path)
     finally:
         with suppress(OSError):
             draft.unlink()

@@ -240,7 +240,6 @@ class MotionTorques:
         """Prepare to ask for torques; `shared` keeps those that are the same for all models along the part."""
         self.experiment, self.part, self.shared = experiment, part, shared
         self.sides = experiment.sides
-        self.count = len(part.time)
         self.real = np.asarray(part.weight) > 0.0
         # what is behind them only fills up
         self.samples = int(np.sum(self.real))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import tomli_w
 
-from jaxbl.files import json_text, write_atomic
+from jaxbl.files import json_text, write_atomic, writing
 
 from .figures import Drawn, save
 
@@ -59,7 +59,8 @@ def write_report(
 
 def save_all(drawn: Sequence[Drawn], folder: Path) -> list[tuple[Path, str]]:
     """Write figures into the folder's `figures/`. Returns their files and captions."""
-    return [(save(one.figure, folder / "figures" / f"{one.name}.png"), one.caption) for one in drawn]
+    with writing(folder):
+        return [(save(one.figure, folder / "figures" / f"{one.name}.png"), one.caption) for one in drawn]
 
 
 _TITLES = {"identification": "Identification from", "diagnosis": "Diagnosis of"}
@@ -96,7 +97,7 @@ def write_results(
     remarks: Sequence[str],
 ) -> list[str]:
     """As :func:`write_log_results`, of anything that has a summary, a trace and a model in TOML."""
-    with TemporaryDirectory(dir=folder, prefix=".draft.") as place:
+    with writing(folder), TemporaryDirectory(dir=folder, prefix=".draft.") as place:
         draft = Path(place)
         trace.to_parquet(draft / "trace.parquet", index=False)
         (draft / "model.toml").write_text(model, encoding="utf-8")

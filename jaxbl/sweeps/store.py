@@ -288,6 +288,13 @@ class Store:
         if rows > self.manifest["rows"]:
             self.update(parts=parts, rows=rows)
 
+    def count_parts(self) -> None:
+        """Have as many chunks as there are files, at least: of a refined study only these say how many it has so far, if its
+        manifest was lost."""
+        there = [index + 1 for index, _ in self._indexed() if index is not None]
+        if max(there, default=0) > self.manifest["parts"]:
+            self.update(parts=max(there))
+
     def trim(self, parts: int, rows: int) -> None:
         """Say how many chunks and rows a refined study has in the end, and remove what lies beyond."""
         if (self.manifest["parts"], self.manifest["rows"]) != (parts, rows):
@@ -303,11 +310,10 @@ class Store:
             number = path.stem.removeprefix("part-")
             yield (int(number) if number.isdecimal() and path == self.part(int(number)) else None), path
 
-    def refuse_others(self, *, growing: bool = False) -> None:
-        """Raise `InputError` if a file among the points is none of this study; `growing`: how many it has in the end is
-        not known yet."""
+    def refuse_others(self) -> None:
+        """Raise `InputError` if a file among the points is none of this study."""
         for index, path in self._indexed():
-            if index is None or (index >= self.manifest["parts"] and not growing):
+            if index is None or index >= self.manifest["parts"]:
                 raise InputError(f"{path}: is no part of this study, which has {self.manifest['parts']}; move it away")
 
     def parts(self) -> list[Path]:

@@ -143,7 +143,7 @@ def sweep(
     with removed_if_empty(folder), locked(folder):
         claim(folder, config, overwrite=overwrite)
         engine, store = _taken_up(folder, engine, insist=backend is not None)
-        store.refuse_others(growing=engine.points.refinement is not None)
+        store.refuse_others()
         if verify_store:
             store.verify()
         run = _Run(engine, store, progress)
@@ -164,12 +164,11 @@ def _taken_up(folder: Path, engine: Engine, *, insist: bool) -> tuple[Engine, St
         )
     if (store.layout, store.backend) != (engine.layout, engine.backend):
         engine = Engine(config, store.layout, engine.devices, store.backend, insist)
-        if engine.points.refinement is None and (store.manifest["parts"], store.manifest["rows"]) != (
-            len(engine),
-            engine.rows,
-        ):
-            # the manifest was lost, and begun anew for other chunks
-            store.update(parts=len(engine), rows=engine.rows)
+    if engine.points.refinement is not None:
+        store.count_parts()
+    elif store.manifest["parts"] != len(engine):
+        # the manifest was lost, and begun anew for other chunks
+        store.update(parts=len(engine))
     return engine, store
 
 

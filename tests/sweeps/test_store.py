@@ -294,6 +294,22 @@ def test_repair_keeps_damaged_parts_aside_and_says_what_is_missing(copy, compute
         repair(copy / "points")
 
 
+def test_a_refined_study_whose_manifest_is_lost_keeps_its_parts(tmp_path, computed):
+    """Only its parts say how many they are in the end."""
+    axes = [{"path": ALPHA, "start": 1.0, "stop": 40.0, "num": 5, "scale": "log"}]
+    refined = study(axes=axes, sweep={"seeds": 1, "chunk": 2, "refine": 3})
+    result = sweep(refined, tmp_path / "study")
+    parts, points = list(computed), files(tmp_path / "study" / "points")
+    coarse = len(Engine(read_config(refined)))
+    assert len(parts) > coarse
+    (tmp_path / "study" / "manifest.json").unlink()
+    whole, store = repair(tmp_path / "study")
+    assert (whole, store.manifest["parts"], store.damaged) == (len(parts), len(parts), [])
+    again = sweep(refined, tmp_path / "study")
+    assert computed == parts and files(tmp_path / "study" / "points") == points
+    pd.testing.assert_frame_equal(again.frame, result.frame)
+
+
 def test_all_of_it_is_read_where_it_is_asked_for(copy, computed):
     """A part that agrees with a manifest that is wrong as well."""
     part = copy / "points" / "part-00001.parquet"
