@@ -36,10 +36,14 @@ if TYPE_CHECKING:
     from .report.sweep import write_sweep_report as write_sweep_report
     from .report.tune import write_tune_report as write_tune_report
     from .report.verify import write_verify_report as write_verify_report
+    from .sweeps.status import Status as Status
+    from .sweeps.status import status as status
     from .sweeps.sweep import StudyResult as StudyResult
     from .sweeps.sweep import dry_run as dry_run
-    from .sweeps.sweep import load as load
+    from .sweeps.sweep import open_study as open_study
     from .sweeps.sweep import repair as repair
+    from .sweeps.sweep import share as share
+    from .sweeps.sweep import submit as submit
     from .sweeps.sweep import sweep as sweep
     from .sweeps.trial import Trial as Trial
     from .sweeps.trial import run as run
@@ -64,7 +68,8 @@ _NAMES = {
     "report.sweep": ("write_sweep_report",),
     "report.tune": ("write_tune_report",),
     "report.verify": ("write_verify_report",),
-    "sweeps.sweep": ("StudyResult", "dry_run", "load", "repair", "sweep"),
+    "sweeps.status": ("Status", "status"),
+    "sweeps.sweep": ("StudyResult", "dry_run", "open_study", "repair", "share", "submit", "sweep"),
     "sweeps.trial": ("Trial", "run"),
     "throughput": ("bench",),
 }

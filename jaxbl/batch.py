@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
+from .cluster import Scheduler, connected
 from .errors import InputError
 from .files import make_folder, results_of
 from .records.files import LOG_ENDINGS, is_log
@@ -21,6 +22,11 @@ class LogJob(NamedTuple):
     holdout: Path | None
     folder: Path
     overwrite: bool
+
+    def absolute(self) -> "LogJob":
+        """With paths that other processes understand."""
+        holdout = None if self.holdout is None else self.holdout.absolute()
+        return LogJob(self.log.absolute(), self.model.absolute(), holdout, self.folder.absolute(), self.overwrite)
 
 
 def read_batch(source: Path, model: Path | None, out: Path, *, overwrite: bool) -> tuple[list[LogJob], list[str]]:
@@ -53,15 +59,25 @@ def read_batch(source: Path, model: Path | None, out: Path, *, overwrite: bool) 
     return jobs, skipped
 
 
-def run_batch(work: list[LogJob], out: Path, processes: int | None, progress: Progress) -> list[dict[str, Any]]:
-    """Diagnose logs that are not diagnosed yet, and write `batch.csv`. Returns its rows."""
+def run_batch(
+    work: list[LogJob], out: Path, processes: int | None, progress: Progress, scheduler: Scheduler = None
+) -> list[dict[str, Any]]:
+    """Diagnose logs that are not diagnosed yet, in processes here or by a cluster's workers, and write `batch.csv`.
+
+    Returns its rows.
+    """
     make_folder(out)
     progress(0, len(work))
     rows = []
     processes = worth(len(work)) if processes is None else min(processes, len(work))
-    for row in each(_diagnosed, work, processes):
-        rows.append(row)
-        progress(len(rows), len(work))
+    with connected(scheduler) as cluster:
+        if cluster is None:
+            found = each(_diagnosed, work, processes)
+        else:
+            found = cluster.each(_diagnosed, [job.absolute() for job in work])
+        for row in found:
+            rows.append(row)
+            progress(len(rows), len(work))
     pd.DataFrame(rows).to_csv(out / "batch.csv", index=False)
     return rows
 

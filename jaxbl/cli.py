@@ -13,9 +13,11 @@ import typer
 
 from .errors import InputError, NoResult
 from .terminal import duration, naming, running
+from .workers import start_jax
 
 if TYPE_CHECKING:
     from jaxbl.sweeps.programs import Backend
+    from jaxbl.sweeps.status import Status
 
     from .config import Config
     from .records import LogTable
@@ -36,6 +38,12 @@ OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="remove the r
 BackendOption = Annotated[
     str | None,
     typer.Option(metavar="NAME", help="fused: one compiled loop; scan: XLA's own loop [default: the faster here]"),
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS", help="Dask cluster that computes: tcp://HOST:PORT, its scheduler's .json file, or local:N"
+    ),
 ]
 _FORMATS = "CSV, Parquet, MATLAB or JSON file"
 LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help=_FORMATS, show_default=False)]
@@ -79,7 +87,7 @@ def simulate(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Simulate a study once: trace, figures, summary."""
-    _start_jax()
+    start_jax()
     from jaxbl.sweeps.store import claim
     from jaxbl.sweeps.trial import run
 
@@ -109,8 +117,17 @@ def sweep(
     verify_store: Annotated[
         bool, typer.Option("--verify-store", help="read every stored part first, and compute damaged ones anew")
     ] = False,
+    scheduler: SchedulerOption = None,
+    detach: Annotated[bool, typer.Option("--detach", help="leave the cluster at work; see 'jaxbl status DIR'")] = False,
+    share: Annotated[
+        str | None,
+        typer.Option(metavar="I/N", help="compute the I-th of N shares into a folder that other processes write into, too"),
+    ] = None,
 ) -> None:
     """Simulate all points of a study: metrics, maps, report. Continues an interrupted sweep."""
+    which = _share(share, {"--overwrite": overwrite, "--verify-store": verify_store, "--scheduler": scheduler is not None})
+    if detach and scheduler is None:
+        raise InputError("--detach: needs the --scheduler of a cluster that stays when this command has ended")
     study, chosen = _study(config, backend)
     from jaxbl.sweeps.metrics import metric_columns
     from jaxbl.sweeps.points import Points
@@ -127,8 +144,63 @@ def sweep(
         if dry_run:
             _print_cost(study, chosen)
             return
-    run = functools.partial(run_sweep, verify_store=verify_store)
+    if detach or which is not None:
+        from jaxbl.sweeps.sweep import share as run_share
+        from jaxbl.sweeps.sweep import submit
+
+        folder = _folder(config, out)
+        with running(context, config, folder) as progress:
+            if which is None:
+                found = submit(study, folder, scheduler, backend=chosen)
+            else:
+                found = run_share(study, folder, which, progress=progress, backend=chosen)
+        if not found.complete:
+            _print_status(found)
+            typer.echo(f"When all parts are there, 'jaxbl sweep {config} --out {folder}' writes the report.")
+            return
+        # who is last collects them
+    run = functools.partial(run_sweep, verify_store=verify_store, scheduler=scheduler)
     _compute(context, config, study, out, overwrite, chosen, run, write_sweep_report)
+
+
+def _share(text: str | None, others: dict[str, bool]) -> tuple[int, int] | None:
+    """Number of a share, and of all; `others` are options that do not go with it."""
+    if text is None:
+        return None
+    for name, given in others.items():
+        if given:
+            raise InputError(f"--share: does not go with {name}: other processes may be at work in the folder")
+    number, _, count = text.partition("/")
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise InputError(f"--share {text}: should be I/N, such as 2/8: the second of eight")
+    return int(number), int(count)
+
+
+@app.command()
+def status(folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder of a study", show_default=False)]) -> None:
+    """Say how far a study is, by the parts that exist."""
+    from jaxbl.sweeps.status import statuses
+
+    for one in statuses(folder):
+        _print_status(one)
+
+
+def _print_status(found: "Status") -> None:
+    share = f"{found.parts} of {found.parts_in_all} parts ({math.floor(1000 * found.parts / found.parts_in_all) / 10:g} %)"
+    typer.echo(f"{found.folder}: '{found.title}', {share} of {found.runs} runs")
+    if found.damaged:
+        typer.echo(f"  {found.damaged} damaged files are kept in {found.folder / 'damaged'}")
+    if found.finished and found.complete:
+        typer.echo("  finished")
+        return
+    rate, left = found.parts_per_second, found.remaining
+    speed = f", {60.0 * rate:.3g} parts a minute" if rate else ""
+    if found.complete:
+        typer.echo("  all parts are there; 'jaxbl sweep' on it reads them and writes the report")
+    elif found.held_by:
+        typer.echo(f"  {found.held_by} is at work{speed}{'' if left is None else f', {duration(left)} left'}")
+    else:
+        typer.echo(f"  no process is at work in it{speed and f' (it went at{speed[1:]})'}; 'jaxbl sweep' goes on")
 
 
 def _print_cost(study: "Config", backend: "Backend | None") -> None:
@@ -154,6 +226,7 @@ def tune(
     out: OutOption = None,
     overwrite: OverwriteOption = False,
     backend: BackendOption = None,
+    scheduler: SchedulerOption = None,
 ) -> None:
     """Choose lambda and alpha of both observers: gains.toml, comparison, report. Continues an interrupted search."""
     study, chosen = _study(config, backend)
@@ -161,7 +234,8 @@ def tune(
 
     from .report.tune import write_tune_report
 
-    _compute(context, config, study, out, overwrite, chosen, run_tune, write_tune_report)
+    run = functools.partial(run_tune, scheduler=scheduler)
+    _compute(context, config, study, out, overwrite, chosen, run, write_tune_report)
 
 
 @app.command()
@@ -171,6 +245,7 @@ def verify(
     out: OutOption = None,
     overwrite: OverwriteOption = False,
     backend: BackendOption = None,
+    scheduler: SchedulerOption = None,
 ) -> None:
     """Test the gain conditions by simulation: counterexamples, maps, report. Continues an interrupted verification."""
     study, chosen = _study(config, backend)
@@ -178,12 +253,13 @@ def verify(
 
     from .report.verify import write_verify_report
 
-    _compute(context, config, study, out, overwrite, chosen, run_verify, write_verify_report)
+    run = functools.partial(run_verify, scheduler=scheduler)
+    _compute(context, config, study, out, overwrite, chosen, run, write_verify_report)
 
 
 def _study(config: Path, backend: str | None) -> tuple["Config", "Backend | None"]:
     """A study, and the backend that is asked for."""
-    _start_jax()
+    start_jax()
     from jaxbl.sweeps.programs import backend_of
 
     from .config import read_config
@@ -290,7 +366,7 @@ def identify(
 ) -> None:
     """Fit a machine's parameters to its logs, with intervals: stiffness, gap, inertias, frictions."""
     _check_limits(next_experiment, max_torque, max_travel)
-    _start_jax()
+    start_jax()
     from .config import read_log_config
 
     table, gear_ratio, _ = read_log_config(model)
@@ -360,6 +436,7 @@ def diagnose(
         typer.Option(metavar="FOLDER", help="diagnose every log of a folder; NAME.toml beside NAME.csv is its model"),
     ] = None,
     jobs: Annotated[int | None, typer.Option(metavar="N", min=1, help="processes for --batch [default: one a core]")] = None,
+    scheduler: SchedulerOption = None,
     next_experiment: Annotated[
         Path | None, typer.Option(metavar="FILE.csv", help="write an input that separates the effects this log cannot")
     ] = None,
@@ -373,16 +450,17 @@ def diagnose(
     if batch is not None:
         if log or holdout is not None or next_experiment is not None:
             raise InputError("--batch FOLDER takes no logs, --holdout or --next-experiment; give these one by one")
-        _start_jax()
-        _diagnose_batch(context, batch, model, out if out is not None else Path("results") / batch.name, jobs, overwrite)
+        start_jax()
+        folder = out if out is not None else Path("results") / batch.name
+        _diagnose_batch(context, batch, model, folder, jobs, overwrite, scheduler)
         return
-    if jobs is not None:
-        raise InputError("--jobs goes with --batch: one log is one process's work")
+    if jobs is not None or scheduler is not None:
+        raise InputError(f"{'--scheduler' if jobs is None else '--jobs'} goes with --batch: one log is one process's work")
     if not log:
         raise InputError("diagnose: no log; give one or several of one machine, or a folder with --batch")
     if model is None:
         raise InputError("diagnose: no model; give a study with nominal parameters: --model TOML")
-    _start_jax()
+    start_jax()
     from jaxbl.diagnosis.diagnose import read_diagnosis_task, run_diagnosis
 
     from .files import results_of
@@ -414,13 +492,19 @@ def _check_limits(next_experiment: Path | None, torque: float | None, travel: fl
 
 
 def _diagnose_batch(
-    context: typer.Context, source: Path, model: Path | None, out: Path, jobs: int | None, overwrite: bool
+    context: typer.Context,
+    source: Path,
+    model: Path | None,
+    out: Path,
+    jobs: int | None,
+    overwrite: bool,
+    scheduler: str | None,
 ) -> None:
     from .batch import batch_lines, read_batch, run_batch
 
     work, skipped = read_batch(source, model, out, overwrite=overwrite)
     with running(context, model or source, out, unit="logs") as progress:
-        rows = run_batch(work, out, jobs, progress)
+        rows = run_batch(work, out, jobs, progress, scheduler)
     if skipped:
         typer.echo(f"Skipped, by their names no logs: {', '.join(skipped)}")
     for line in batch_lines(rows):
@@ -438,14 +522,14 @@ def plot(
     ] = None,
 ) -> None:
     """Draw figures and report of a sweep again from its stored points, without simulating."""
-    _start_jax()
+    start_jax()
     from jaxbl.sweeps.store import Store, identity
-    from jaxbl.sweeps.sweep import load
+    from jaxbl.sweeps.sweep import open_study
 
     from .config import read_config
     from .report.sweep import write_sweep_report
 
-    result = load(folder)
+    result = open_study(folder)
     if config is not None:
         study = read_config(config)
         if identity(study) != Store.open(folder).manifest["identity"]:
@@ -457,7 +541,7 @@ def plot(
 @app.command()
 def repair(folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder of a sweep", show_default=False)]) -> None:
     """Check a sweep's folder: keep damaged parts aside, and write a manifest that is lost or damaged anew."""
-    _start_jax()
+    start_jax()
     from jaxbl.sweeps.sweep import repair as run_repair
 
     whole, store = run_repair(folder)
@@ -478,7 +562,7 @@ def bench(
     out: Annotated[Path, typer.Option(metavar="DIR", help="folder for the results")] = Path("results/bench"),
 ) -> None:
     """Time the same work by jaxbl, C++, numba, diffrax, NumPy, SciPy and OpenSMC: table, chart, bench.json."""
-    _start_jax()
+    start_jax()
     import jax
 
     from .files import make_folder, removed_if_empty
@@ -498,28 +582,6 @@ def bench(
 
 def _folder(config: Path, out: Path | None) -> Path:
     return out if out is not None else Path("results") / config.stem
-
-
-def _start_jax() -> None:
-    """Use every core as a device, and keep compiled programs between runs."""
-    # matrices are small here: threads of BLAS would wait for one another longer than they compute; before NumPy is loaded
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    import jax
-
-    from .fused.kept import PROGRAMS
-    from .workers import collect_rarely, cores
-
-    collect_rarely()
-    if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
-        jax.config.update("jax_num_cpu_devices", cores())
-    if jax.config.values["jax_compilation_cache_dir"] is None:
-        # of this Python's own: another one packs programs otherwise
-        cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "jaxbl" / sys.implementation.cache_tag
-        jax.config.update("jax_compilation_cache_dir", str(cache))
-        # also what takes less than a second: a study has many of them
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    # and what was compiled is found without tracing it; processes that this one starts do so, too
-    os.environ.setdefault(PROGRAMS, f"{jax.config.values['jax_compilation_cache_dir']}/programs")
 
 
 def _print(lines: list[str], folder: Path) -> None:

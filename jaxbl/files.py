@@ -1,5 +1,6 @@
 """Files and folders that commands write: whole or not at all, as JSON that any program reads."""
 
+import errno
 import hashlib
 import json
 import math
@@ -115,54 +116,78 @@ _DRAFT = re.compile(r"\.((probe|.+\.(json|toml|parquet|html|png))\.\d+|draft\..+
 """Names of files and folders that a process leaves where it is killed while it writes."""
 
 
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Keep other processes from writing into a folder, which is made.
+class Busy(InputError):
+    """A folder that another process writes into."""
 
-    The system frees the lock of a process that dies, on a network file system that of a machine that is lost.
+
+@contextmanager
+def locked(folder: Path, *, shared: bool = False, wait: float = 0.0) -> Iterator[None]:
+    """Keep other processes from writing into a folder, which is made; with `shared`, those that do not share it.
+    Another process that has it is waited for so many seconds.
+
+    The system frees the lock of a process that dies, on a network file system that of a machine that is lost. A file system
+    without locks has none.
 
     Raises:
-        InputError: another process writes into it, or it cannot be written to.
+        Busy: another process writes into it.
+        InputError: it cannot be written to.
     """
     make_folder(folder)
     path = folder / LOCK
-    file = _taken(path)
+    latest = time.monotonic() + wait
+    while (file := _taken(path, shared)) is None and time.monotonic() < latest:
+        time.sleep(0.05)
     if file is None:
-        holder = ""
-        with suppress(OSError):
-            holder = path.read_text()
-        raise InputError(
-            f"{folder}: {holder or 'another process'} is writing into it; wait until it has ended, or choose another folder "
-            "with --out"
+        raise Busy(
+            f"{folder}: {holder(folder) or 'another process'} is writing into it; wait until it has ended, or choose "
+            "another folder with --out"
         )
     try:
         yield
     finally:
         with suppress(OSError):
-            path.unlink()
+            # those that share it still have it
+            if not shared or _lock(file, shared=False):
+                path.unlink()
         file.close()
 
 
-def _taken(path: Path) -> Any:
-    """The file of a lock that is ours now; None where another process has it."""
-    import fcntl
+def holder(folder: Path) -> str:
+    """The process that writes into a folder, its host, and since when; empty where none does."""
+    with suppress(OSError), (folder / LOCK).open("r+") as file:
+        return "" if _lock(file, shared=False) else file.read()
+    return ""
 
+
+def _taken(path: Path, shared: bool) -> Any:
+    """The file of a lock that is ours now; None where another process has it."""
     while True:
         file = path.open("a+")
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # who had it may have removed it meanwhile
+        if not _lock(file, shared):
+            file.close()
+            return None
+        # who had it may have removed it meanwhile
+        with suppress(FileNotFoundError):
             if os.fstat(file.fileno()).st_ino == path.stat().st_ino:
                 file.truncate(0)
                 file.write(f"process {os.getpid()} on {socket.gethostname()} (since {time.strftime('%Y-%m-%d %H:%M:%S')})")
                 file.flush()
                 return file
-        except BlockingIOError:
-            file.close()
-            return None
-        except FileNotFoundError:
-            pass
         file.close()
+
+
+def _lock(file: Any, shared: bool) -> bool:
+    """Lock an open file. Returns whether that was possible."""
+    import fcntl
+
+    try:
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if error.errno not in (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK):
+            raise
+    return True
 
 
 def remove_drafts(folder: Path) -> None:

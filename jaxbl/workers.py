@@ -4,6 +4,7 @@ import gc
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -110,6 +111,32 @@ def _interrupted(number: int, frame: object) -> None:
     _stopped = True
     if _busy:
         raise KeyboardInterrupt
+
+
+PROGRAMS = "JAXBL_PROGRAMS"
+"""Name of the environment variable with the folder of compiled programs (:mod:`jaxbl.fused.kept`); without one, or where it
+is empty, none are kept."""
+
+
+def start_jax(devices: int | None = None) -> None:
+    """Use every core as a device, or so many, and keep compiled programs between runs."""
+    # matrices are small here: threads of BLAS would wait for one another longer than they compute; before NumPy is loaded
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    import jax
+
+    collect_rarely()
+    if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+        # it has begun already: a later job of one worker
+        with suppress(RuntimeError):
+            jax.config.update("jax_num_cpu_devices", cores() if devices is None else devices)
+    if jax.config.values["jax_compilation_cache_dir"] is None:
+        # of this Python's own: another one packs programs otherwise
+        cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "jaxbl" / sys.implementation.cache_tag
+        jax.config.update("jax_compilation_cache_dir", str(cache))
+        # also what takes less than a second: a study has many of them
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    # and what was compiled is found without tracing it; processes that this one starts do so, too
+    os.environ.setdefault(PROGRAMS, f"{jax.config.values['jax_compilation_cache_dir']}/programs")
 
 
 def collect_rarely() -> None:

@@ -46,7 +46,7 @@ def jaxbl(*arguments, cwd, **environment):
 @pytest.fixture
 def call(monkeypatch, tmp_path):
     """The command in this process: exit code, lines on stdout, lines on stderr."""
-    monkeypatch.setattr(cli, "_start_jax", lambda: None)
+    monkeypatch.setattr(cli, "start_jax", lambda: None)
     monkeypatch.chdir(tmp_path)
 
     def run(*arguments):
@@ -230,7 +230,7 @@ def test_bad_input_is_one_line_and_exit_2(case, tmp_path, monkeypatch, capsys):
     (tmp_path / "full" / "thesis.tex").write_text("mine")
     before = left(tmp_path)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli, "_start_jax", lambda: None)
+    monkeypatch.setattr(cli, "start_jax", lambda: None)
     monkeypatch.setattr(sys, "argv", ["jaxbl", *arguments])
     with pytest.raises(SystemExit) as end:
         cli.main()
@@ -349,7 +349,7 @@ def test_tune_leaves_gains_numbers_figures_and_report(call, tmp_path, monkeypatc
 def test_a_search_that_finds_nothing_leaves_no_gains_and_exits_1(tmp_path, monkeypatch, capsys):
     write(tmp_path, tunable(margin_exact=1e4))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli, "_start_jax", lambda: None)
+    monkeypatch.setattr(cli, "start_jax", lambda: None)
     monkeypatch.setattr(sys, "argv", ["jaxbl", "tune", "study.toml"])
     with pytest.raises(SystemExit) as end:
         cli.main()

@@ -24,7 +24,7 @@ MODULES = [".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix("
 FLOORS = [
     {"errors"},
     {"files", "validation", "workers"},
-    {"drive"},
+    {"cluster", "drive"},
     {"observer", "records"},
     {"simulate"},
     {"config", "fused"},
@@ -39,7 +39,7 @@ BELOW = {part: set().union(*FLOORS[:i]) for i, floor in enumerate(FLOORS) for pa
 
 
 def test_public_names_resolve_and_are_documented():
-    assert {"run", "sweep", "load", "read_config", "Config", "InputError"} <= set(dir(jaxbl))
+    assert {"run", "sweep", "open_study", "read_config", "Config", "InputError"} <= set(dir(jaxbl))
     for name in dir(jaxbl):
         assert inspect.getdoc(getattr(jaxbl, name)), name
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):

@@ -25,11 +25,11 @@ from typing import Any
 import equinox as eqx
 import jax
 
+from jaxbl.workers import PROGRAMS
+
 _STANDS_ON = "equinox", "jax", "jaxlib", "lineax", "llvmlite", "numpy", "optimistix"
 _OLD = 30.0
 """Days after which programs of another version of the package are deleted, if nothing has used them."""
-PROGRAMS = "JAXBL_PROGRAMS"
-"""Name of the environment variable with their folder; without one, or where it is empty, none are kept."""
 
 
 class Unknown(Exception):

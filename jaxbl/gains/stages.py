@@ -1,17 +1,36 @@
 """A command that runs several studies, one after the other: their folder, backend, progress and cost."""
 
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from jaxbl.cluster import Cluster, Scheduler, connected
 from jaxbl.config import Config
 from jaxbl.errors import InputError
-from jaxbl.files import json_text, make_folder, read_json, write_atomic
+from jaxbl.files import json_text, locked, make_folder, read_json, removed_if_empty, write_atomic
 from jaxbl.sweeps.programs import Backend, backend_of
 from jaxbl.sweeps.store import claim, manifest_head
 from jaxbl.sweeps.sweep import StudyResult, sweep
 from jaxbl.workers import Progress
+
+
+@contextmanager
+def stages_in(
+    config: Config, command: str, out: str | Path | None, scheduler: Scheduler, **given: Any
+) -> "Iterator[Stages]":
+    """Stages in a folder that no other process writes into, with a cluster if there is one; `given` as of :class:`Stages`.
+
+    Raises:
+        InputError: as of :class:`Stages`; another process writes into the folder, or there is no such cluster.
+    """
+    with ExitStack() as held:
+        if out is not None:
+            held.enter_context(removed_if_empty(Path(out)))
+            held.enter_context(locked(Path(out)))
+        yield Stages(config, command, out, cluster=held.enter_context(connected(scheduler)), **given)
 
 
 class Stages:
@@ -30,8 +49,10 @@ class Stages:
         devices: list[Any] | None = None,
         overwrite: bool = False,
         backend: Backend | None = None,
+        cluster: Cluster | None = None,
     ):
         self.folder: Path | None = None
+        self._cluster = cluster
         self.devices = devices
         self.found: dict[str, Any] = {}
         """The manifest that an earlier call left."""
@@ -82,6 +103,7 @@ class Stages:
             devices=self.devices,
             overwrite=self._overwrite,
             backend=self._backend,
+            scheduler=self._cluster,
         )
         self.scanned |= dict.fromkeys(result.scanned)
         self.cost = {key: value + result.cost[key] for key, value in self.cost.items()}

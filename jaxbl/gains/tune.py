@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from jaxbl.cluster import Scheduler
 from jaxbl.config import TUNE_NAMES, Config, TuneTable, read_config
 from jaxbl.errors import NoResult
 from jaxbl.sweeps.metrics import undisturbed
@@ -24,7 +25,7 @@ from jaxbl.sweeps.programs import Backend
 from jaxbl.workers import Progress
 
 from .pilot import Scenarios, pilot, scenarios_of
-from .stages import Stages
+from .stages import Stages, stages_in
 from .tune_summary import COMPARED, Summary, compared_figures
 
 Gains = dict[str, tuple[float, float]]
@@ -69,10 +70,12 @@ def tune(
     devices: list[Any] | None = None,
     overwrite: bool = False,
     backend: Backend | None = None,
+    scheduler: Scheduler = None,
 ) -> Tuning:
     """Choose lambda and alpha of both observers for a study.
 
-    `out`, `progress`, `devices`, `overwrite` and `backend` are as in :func:`jaxbl.sweep`, over all runs of the search.
+    `out`, `progress`, `devices`, `overwrite`, `backend` and `scheduler` are as in :func:`jaxbl.sweep`, over all runs of the
+    search.
 
     Args:
         study: TOML file, mapping or config; its `[tune]` table says what is asked of the gains, its axes are not used.
@@ -85,7 +88,12 @@ def tune(
     table = config.tune or TuneTable()
     config = config.model_copy(update={"tune": table})
     scenarios = scenarios_of(config, table)
-    stages = Stages(config, "tune", out, progress, devices, overwrite, backend)
+    given = {"progress": progress, "devices": devices, "overwrite": overwrite, "backend": backend}
+    with stages_in(config, "tune", out, scheduler, **given) as stages:
+        return _tuned(config, table, scenarios, stages)
+
+
+def _tuned(config: Config, table: TuneTable, scenarios: Scenarios, stages: Stages) -> Tuning:
     found = stages.found.get("pilot")
     search = Search(scenarios, table, found or pilot(scenarios, table), stages)
     if found is None:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from jaxbl.cluster import Scheduler
 from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import plain, write_atomic, write_table
@@ -35,7 +36,7 @@ from .error_system import (
     simulate_error_system,
 )
 from .marks import judge_marks
-from .stages import Stages
+from .stages import Stages, stages_in
 
 _MOST_LISTED = 200
 """Counterexamples in `verdict.json`: what a reader may look through; the Parquet file has all."""
@@ -71,11 +72,12 @@ def verify(
     devices: list[Any] | None = None,
     overwrite: bool = False,
     backend: Backend | None = None,
+    scheduler: Scheduler = None,
 ) -> Verdict:
     """Check every gain condition on three levels, and list where it held and the observer failed all the same.
 
-    `out`, `progress`, `devices`, `overwrite` and `backend` are as in :func:`jaxbl.sweep`, over the runs of the study's
-    levels; the folder gets `verdict.json` and `counterexamples.parquet` as well.
+    `out`, `progress`, `devices`, `overwrite`, `backend` and `scheduler` are as in :func:`jaxbl.sweep`, over the runs of the
+    study's levels; the folder gets `verdict.json` and `counterexamples.parquet` as well.
 
     Args:
         study: TOML file, mapping or config, with axes over alpha and lambda of an observer or both.
@@ -86,7 +88,12 @@ def verify(
     """
     config = read_config(study)
     sides = judged_sides(config)
-    stages = Stages(config, "verify", out, progress, devices, overwrite, backend)
+    given = {"progress": progress, "devices": devices, "overwrite": overwrite, "backend": backend}
+    with stages_in(config, "verify", out, scheduler, **given) as stages:
+        return _verified(config, sides, stages)
+
+
+def _verified(config: Config, sides: list[str], stages: Stages) -> Verdict:
     stages.keep()
     studies = {"drive": _ideal(config), "sampled": _only(config)}
     stages.total = sum(len(Points(study)) * study.sweep.seeds for study in studies.values())

@@ -5,9 +5,10 @@ that what depends on neither (the excitation, the plant in a gain map) is comput
 """
 
 import dataclasses
+import functools
 import math
 import time
-from collections.abc import Iterator
+from collections import OrderedDict
 from typing import Any, NamedTuple
 
 import jax
@@ -70,6 +71,23 @@ def _refined_layout(config: Config, devices: int, chunk: int | None) -> Layout:
     return Layout(seeds, max(math.ceil(capacity / seeds / devices), 2) * devices)
 
 
+_PROGRAMS = 16
+"""Compiled programs that are kept, one a group."""
+
+
+def _coarse_first(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Place of each of some blocks in an order that covers them coarsely first, and its level `(count,)`.
+
+    Level 0 is the first block; each further level halves the distance between them (bit-reversed order, van der Corput).
+    """
+    bits = max(count - 1, 0).bit_length()
+    index = np.arange(count)
+    place = np.zeros(count, int)
+    for bit in range(bits):
+        place |= (index >> bit & 1) << (bits - 1 - bit)
+    return place, np.frexp(place)[1]
+
+
 class Engine:
     """Compiles and runs the chunks of a study.
 
@@ -94,12 +112,12 @@ class Engine:
         self.points = Points(config)
         self.devices = devices or jax.local_devices()
         self.backend: Backend = backend_of(backend) or self._faster()
-        self._insist = insist
+        self.insist = insist
         self.layout = layout or layout_for(config, self.points, self.devices, self.backend, config.sweep.chunk)
         self.compile_seconds = 0.0
         self.run_seconds = 0.0
         self.scanned: list[str] = []
-        self._compiled: tuple[int, tuple[Program, list[str]]] | None = None
+        self._compiled: OrderedDict[int, tuple[Program, list[str]]] = OrderedDict()
 
     def _faster(self) -> Backend:
         """By the study, however it is cut: roundings differ between backends."""
@@ -116,15 +134,31 @@ class Engine:
         """Number of chunks that some points of a group take."""
         return math.ceil(self.config.sweep.seeds / self.layout.seeds) * math.ceil(points / self.layout.points)
 
-    def chunks(self) -> Iterator[Chunk]:
-        """All chunks; of a refined study, those of its coarse grid."""
-        index = 0
-        for group in range(len(self.points.groups)):
-            for seeds in self._seeds():
-                for first in range(0, self.points.coarse_lanes, self.layout.points):
-                    last = min(first + self.layout.points, self.points.coarse_lanes)
-                    yield Chunk(index, group, seeds, self.points.coarse(np.arange(first, last)))
-                    index += 1
+    def chunk(self, index: int) -> Chunk:
+        """A chunk by its index; of a refined study, one of its coarse grid."""
+        blocks = math.ceil(self.points.coarse_lanes / self.layout.points)
+        group, rest = divmod(index, len(self._seeds) * blocks)
+        seeds, block = divmod(rest, blocks)
+        first = block * self.layout.points
+        last = min(first + self.layout.points, self.points.coarse_lanes)
+        return Chunk(index, group, self._seeds[seeds], self.points.coarse(np.arange(first, last)))
+
+    def lanes(self, index: int) -> int:
+        """Lanes of a chunk."""
+        chunk = self.chunk(index)
+        return len(chunk.seeds) * len(chunk.points)
+
+    def order(self) -> list[int]:
+        """Indices of all chunks, those first that cover the grid coarsely: the first seeds of every second block of points,
+        of those between, and so on, then the next seeds. Groups take turns where their programs can all be kept."""
+        blocks = math.ceil(self.points.coarse_lanes / self.layout.points)
+        shape = len(self.points.groups), len(self._seeds), blocks
+        group, seeds, block = np.unravel_index(np.arange(math.prod(shape)), shape)
+        place, level = _coarse_first(blocks)
+        turns = level[block] if shape[0] <= _PROGRAMS else np.zeros_like(block)
+        outer = (seeds, turns, group) if shape[0] <= _PROGRAMS else (group, seeds, turns)
+        # the last key is the first one to be sorted by
+        return np.lexsort((place[block], *reversed(outer))).tolist()
 
     def split(self, group: int, points: np.ndarray, first_index: int = 0) -> list[Chunk]:
         """Chunks for any points of a group, given by their indices `(points,)`, with all seeds; numbered from `first_index`.
@@ -132,14 +166,17 @@ class Engine:
         They share the compiled program of all chunks. Points come in their order, all of them for some seeds first.
         """
         parts = [points[first : first + self.layout.points] for first in range(0, len(points), self.layout.points)]
-        crossed = [(seeds, part) for seeds in self._seeds() for part in parts]
+        crossed = [(seeds, part) for seeds in self._seeds for part in parts]
         return [Chunk(index, group, *both) for index, both in enumerate(crossed, first_index)]
 
-    def _seeds(self) -> Iterator[np.ndarray]:
+    @functools.cached_property
+    def _seeds(self) -> list[np.ndarray]:
         """All seeds, as many at once as a chunk takes."""
         end = self.config.sweep.first_seed + self.config.sweep.seeds
-        for first in range(self.config.sweep.first_seed, end, self.layout.seeds):
-            yield np.arange(first, min(first + self.layout.seeds, end))
+        return [
+            np.arange(first, min(first + self.layout.seeds, end))
+            for first in range(self.config.sweep.first_seed, end, self.layout.seeds)
+        ]
 
     @property
     def rows(self) -> int:
@@ -180,22 +217,25 @@ class Engine:
         return padded, pad(seeds.astype(np.uint32), self.layout.seeds)
 
     def check(self) -> None:
-        """Compile the programs of all groups; the first one is kept. Raises `InputError` if the backend cannot be had."""
+        """Compile the programs of all groups; the first ones are kept. Raises `InputError` if the backend cannot be had."""
         for group in reversed(range(len(self.points.groups))):
             self._program(group)
 
     def _program(self, group: int) -> tuple[Program, list[str]]:
-        """The compiled program of a group and the names of its figures; the last one is kept."""
-        if self._compiled is None or self._compiled[0] != group:
-            self._compiled = (group, self._compile(self.points.groups[group].config))
-        return self._compiled[1]
+        """The compiled program of a group and the names of its figures; those used last are kept."""
+        if group not in self._compiled:
+            self._compiled[group] = self._compile(self.points.groups[group].config)
+        self._compiled.move_to_end(group)
+        while len(self._compiled) > _PROGRAMS:
+            self._compiled.popitem(last=False)
+        return self._compiled[group]
 
     def _compile(self, config: Config) -> tuple[Program, list[str]]:
         with precision(config):
             experiment = prepare(config)
             columns, _ = self._arguments(config, self.points.columns(np.arange(1)), np.arange(1))
             start = time.perf_counter()
-            program = compile_program(experiment, self.layout, self.devices, self.backend, columns, insist=self._insist)
+            program = compile_program(experiment, self.layout, self.devices, self.backend, columns, insist=self.insist)
             self.compile_seconds += time.perf_counter() - start
             if program.instead is not None and program.instead not in self.scanned:
                 self.scanned.append(program.instead)

@@ -78,10 +78,11 @@ def manifest_head(config: Config, command: str) -> dict[str, Any]:
     return {"identity": identity(config, command), "single_run": identity(config, "simulate"), "title": config.title}
 
 
-def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bool = False) -> None:
+def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bool = False, alone: bool = True) -> None:
     """Make sure that a command may write its results for a study into a folder; make the folder.
 
-    All commands of one study may share one folder. With `overwrite`, results of other studies are removed from it first.
+    All commands of one study may share one folder. With `overwrite`, results of other studies are removed from it first;
+    what killed processes left half written is removed if no other process writes there (`alone`).
 
     Raises:
         InputError: the folder holds another study or other files, or cannot be written to.
@@ -106,7 +107,8 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
     if command != "simulate" and command in found:
         same.append(found[command].get("identity") == identity(config, command))
     if all(same) and (found or is_empty(folder)):
-        remove_drafts(folder)
+        if alone:
+            remove_drafts(folder)
         return
     if not found:
         for file in (folder / name for name in LOG_RESULTS if (folder / name).exists()):
@@ -144,10 +146,12 @@ class Store:
         folder: where it is.
         manifest: what is known of the study as a whole; `checksums` are those of whole parts, by index.
         damaged: parts that were kept aside, and why.
+        keeps_manifest: whether it writes the manifest while parts are added; one process does.
     """
 
-    def __init__(self, folder: Path, manifest: dict[str, Any]):
+    def __init__(self, folder: Path, manifest: dict[str, Any], *, keeps_manifest: bool = True):
         self.folder = folder
+        self.keeps_manifest = keeps_manifest
         self.manifest = manifest
         self.damaged: list[str] = []
         self._saved = 0.0
@@ -185,7 +189,7 @@ class Store:
         return store
 
     @classmethod
-    def open(cls, folder: Path) -> "Store":
+    def open(cls, folder: Path, *, keeps_manifest: bool = True) -> "Store":
         """Open a study that is there. Raises `InputError` where there is none."""
         path = folder / "manifest.json"
         if not path.exists():
@@ -200,7 +204,7 @@ class Store:
             raise InputError(f"{path}: is damaged; 'jaxbl repair {folder}' writes it anew by what the parts say") from None
         if manifest.get("format") != FORMAT:
             raise InputError(f"{path}: has format {manifest.get('format')}; this version reads {FORMAT}")
-        return cls(folder, manifest)
+        return cls(folder, manifest, keeps_manifest=keeps_manifest)
 
     @property
     def layout(self) -> Layout:
@@ -269,10 +273,18 @@ class Store:
     def write(self, index: int, frame: pd.DataFrame) -> None:
         head = self._head | {"title": self.manifest["title"]}
         parts.write(self.part(index), frame, Mark(head, self.manifest["layout"], self.backend, index, 0, {}))
-        self.manifest["checksums"][str(index)] = parts.file_checksum(self.part(index))
+        self.note({index: parts.file_checksum(self.part(index))})
+
+    def note(self, checksums: dict[int, str]) -> None:
+        """Add parts that were written, by their checksums, to the manifest."""
+        self.manifest["checksums"] |= {str(index): value for index, value in checksums.items()}
         # not for each part: a large study's manifest is large
-        if time.monotonic() - self._saved > _SAVED:
+        if self.keeps_manifest and time.monotonic() - self._saved > _SAVED:
             self.update()
+
+    def existing(self) -> list[Path]:
+        """Files of parts, whole or damaged, in no order."""
+        return list((self.folder / "points").glob("part-*.parquet"))
 
     def read_part(self, index: int, labels: dict[str, np.ndarray], columns: list[str]) -> pd.DataFrame | None:
         """Some columns of a chunk, or None where it holds other rows than those of `labels`."""

@@ -7,19 +7,21 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pandas as pd
 
+from jaxbl.cluster import Scheduler, connected
 from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import locked, removed_if_empty
 from jaxbl.workers import Progress
 
-from .engine import Chunk, Engine, SweepEstimate
+from .bundles import ClusterRun, hand_over
+from .engine import Engine, SweepEstimate
 from .metrics import metric_of
 from .programs import Backend
-from .refine import refine
-from .store import Store, claim
+from .run import Run, begun, joined
+from .status import Status, status
+from .store import Store
 
 if TYPE_CHECKING:
     import xarray
@@ -109,6 +111,7 @@ def sweep(
     overwrite: bool = False,
     backend: Backend | None = None,
     verify_store: bool = False,
+    scheduler: Scheduler = None,
 ) -> StudyResult:
     """Run all points of a study.
 
@@ -122,135 +125,115 @@ def sweep(
         backend: `fused` or `scan`; left out, the faster one here. A study that goes on keeps to that of its first chunks.
         verify_store: read each part that is there first, column by column; otherwise only files are compared with their
             checksums.
+        scheduler: Dask cluster whose workers compute, and write into `out`, which they have to see: an address,
+            a scheduler's file, `local:N` for N processes of this machine, or a `distributed.Client`; left out, this process.
 
     Raises:
         InputError: wrong config, a folder that holds something else or that another process writes into, a part of another
-            study, or a backend that cannot run the study.
-        NoResult: nothing can be written any more, as the disk is full; what was written is whole.
+            study, a backend that cannot run the study, or no such cluster.
+        NoResult: nothing can be written any more, as the disk is full, or the cluster is lost; what was written is whole.
     """
     config = read_config(study)
     engine = Engine(config, devices=devices, backend=backend, insist=backend is not None)
     if out is None:
+        if scheduler is not None:
+            raise InputError("--scheduler: its workers write into a folder; name it with --out")
         if backend == "fused":
             engine.check()
-        run = _Run(engine, None, progress)
+        run = Run(engine, None, progress)
         run.all()
-        return run.result(pd.concat(run.frames, ignore_index=True))
+        return _result(run, run.frame())
     folder = Path(out)
     if backend == "fused" and not (folder / "manifest.json").exists():
         # refused, if it is, before anything is written
         engine.check()
-    with removed_if_empty(folder), locked(folder):
-        claim(folder, config, overwrite=overwrite)
-        engine, store = _taken_up(folder, engine, insist=backend is not None)
-        store.refuse_others()
-        if verify_store:
-            store.verify()
-        run = _Run(engine, store, progress)
+    with removed_if_empty(folder), connected(scheduler) as cluster:
+        with locked(folder):
+            engine, store = begun(folder, engine, insist=backend is not None, overwrite=overwrite)
+            store.refuse_others()
+            if verify_store:
+                store.verify()
+            run = Run(engine, store, progress) if cluster is None else ClusterRun(cluster, engine, store, progress)
+            if cluster is None:
+                run.all()
+                run.finish()
+        if cluster is not None:
+            with locked(folder, shared=True):
+                run.all()
+            # a worker may just let go of it
+            with locked(folder, wait=60.0):
+                run.finish()
+    return _result(run, store)
+
+
+def _result(run: Run, source: Store | pd.DataFrame) -> StudyResult:
+    """What a run leaves."""
+    work = run.work
+    cost = {"compile_seconds": work.compile_seconds, "run_seconds": work.run_seconds, "lanes": work.lanes}
+    return StudyResult(run.engine.config, source, cost, work.scanned, work.damaged)
+
+
+def share(
+    study: str | Path | Mapping[str, Any] | Config,
+    out: str | Path,
+    which: tuple[int, int],
+    *,
+    progress: Progress | None = None,
+    devices: list[Any] | None = None,
+    backend: Backend | None = None,
+) -> Status:
+    """Compute the i-th of n shares of a study's chunks, `which` is (i, n), but for those that are there; other processes may
+    compute other shares into the same folder at the same time. Once all chunks are there, :func:`sweep` only reads them.
+
+    Other arguments are as of :func:`sweep`.
+
+    Raises:
+        InputError: as of :func:`sweep`; a refined study, whose points depend on one another.
+        NoResult: nothing can be written any more.
+    """
+    config, folder = read_config(study), Path(out)
+    engine = Engine(config, devices=devices, backend=backend, insist=backend is not None)
+    _check_independent(engine, "--share")
+    number, count = which
+    with removed_if_empty(folder), joined(folder, engine, insist=backend is not None) as (engine, store):
+        run = Run(engine, store, progress, engine.order()[number - 1 :: count])
         run.all()
-        if run.computed or not store.manifest["finished"]:
-            store.update(finished=True, seconds={"compile": engine.compile_seconds, "run": engine.run_seconds})
-    return run.result(store)
+    return status(folder)
 
 
-def _taken_up(folder: Path, engine: Engine, *, insist: bool) -> tuple[Engine, Store]:
-    """The store in a claimed folder, begun or gone on with, and the engine for it: chunks stay what they were when it was
-    begun, on whatever machine. `insist`: the engine's backend was asked for."""
-    config = engine.config
-    store = Store.create(folder, config, engine.layout, engine.backend, len(engine), engine.rows)
-    if insist and store.backend != engine.backend and not store.manifest["finished"]:
-        raise InputError(
-            f"{folder}: was begun with --backend {store.backend}; go on with that, or choose another folder with --out"
-        )
-    if (store.layout, store.backend) != (engine.layout, engine.backend):
-        engine = Engine(config, store.layout, engine.devices, store.backend, insist)
+def submit(
+    study: str | Path | Mapping[str, Any] | Config,
+    out: str | Path,
+    scheduler: Scheduler,
+    *,
+    devices: list[Any] | None = None,
+    backend: Backend | None = None,
+) -> Status:
+    """Hand a study's chunks to a cluster, and do not wait for them: :func:`status` says how far it is, and :func:`sweep`
+    reads what is there and computes what is missing. Arguments are as of :func:`sweep`.
+
+    Raises:
+        InputError: as of :func:`sweep`; a refined study, whose points depend on one another, or a cluster that would end
+            with this process.
+    """
+    config, folder = read_config(study), Path(out)
+    engine = Engine(config, devices=devices, backend=backend, insist=backend is not None)
+    _check_independent(engine, "--detach")
+    with removed_if_empty(folder), connected(scheduler) as cluster:
+        if cluster is None or cluster.local:
+            raise InputError("--detach: needs the --scheduler of a cluster that stays when this command has ended")
+        with joined(folder, engine, insist=backend is not None) as (engine, store):
+            hand_over(cluster, engine, store)
+    return status(folder)
+
+
+def _check_independent(engine: Engine, option: str) -> None:
     if engine.points.refinement is not None:
-        store.count_parts()
-    elif store.manifest["parts"] != len(engine):
-        # the manifest was lost, and begun anew for other chunks
-        store.update(parts=len(engine))
-    return engine, store
+        raise InputError(f"{option}: sweep.refine makes points depend on one another; leave {option} out, or sweep.refine")
 
 
-class _Run:
-    """Chunk after chunk of a study, those that are stored already left out."""
-
-    def __init__(self, engine: Engine, store: Store | None, progress: Progress | None):
-        self.engine, self.store, self.progress = engine, store, progress
-        self.frames: list[pd.DataFrame] = []
-        self.computed = self.done = 0
-        self.chunks, self.total = len(engine), engine.rows
-        self._next = 0
-
-    def all(self) -> None:
-        """Run the whole study."""
-        if self.engine.points.refinement is None:
-            for chunk in self.engine.chunks():
-                self._take(chunk)
-            return
-        for group in range(len(self.engine.points.groups)):
-            self._refine(group)
-        if self.store is not None:
-            self.store.trim(self.chunks, self.total)
-
-    def result(self, source: Store | pd.DataFrame) -> StudyResult:
-        """What the run leaves."""
-        engine = self.engine
-        cost = {"compile_seconds": engine.compile_seconds, "run_seconds": engine.run_seconds, "lanes": self.computed}
-        damaged = () if self.store is None else tuple(self.store.damaged)
-        return StudyResult(engine.config, source, cost, tuple(engine.scanned), damaged)
-
-    def _refine(self, group: int) -> None:
-        """The coarse grid of a group, and what its boundaries need."""
-        assert self.engine.points.refinement is not None
-        _, grid, criterion = self.engine.points.refinement
-        columns, seeds = list(criterion.columns), self.engine.config.sweep.seeds
-        expected = self.engine.points.coarse_lanes
-
-        def evaluate(points: np.ndarray) -> np.ndarray:
-            nonlocal expected
-            # the coarse grid is counted from the start
-            self.total += (len(points) - expected) * seeds
-            self.chunks += self.engine.chunks_for(len(points)) - self.engine.chunks_for(expected)
-            expected = 0
-            if self.store is not None:
-                self.store.grow(self.chunks, self.total)
-            values = np.empty((seeds, len(points), len(columns)))
-            row = column = 0
-            for chunk in self.engine.split(group, points, self._next):
-                shape = (len(chunk.seeds), len(chunk.points), len(columns))
-                found = self._take(chunk, columns)[columns].to_numpy(float).reshape(shape)
-                values[row : row + shape[0], column : column + shape[1]] = found
-                column += shape[1]
-                if column == len(points):
-                    row, column = row + shape[0], 0
-            return values.swapaxes(0, 1)
-
-        refine(grid, evaluate, criterion.differ)
-
-    def _take(self, chunk: Chunk, columns: list[str] | None = None) -> pd.DataFrame:
-        """Compute a chunk, or read some columns of it where it is stored; with no columns, nothing is read."""
-        frame = None
-        if self.store is not None and self.store.has(chunk.index):
-            frame = (
-                pd.DataFrame() if columns is None else self.store.read_part(chunk.index, self.engine.labels(chunk), columns)
-            )
-        if frame is None:
-            frame = self.engine.run(chunk)
-            self.computed += len(frame)
-            if self.store is None:
-                self.frames.append(frame)
-            else:
-                self.store.write(chunk.index, frame)
-        self._next = chunk.index + 1
-        self.done += len(chunk.seeds) * len(chunk.points)
-        if self.progress:
-            self.progress(self.done, self.total)
-        return frame
-
-
-def load(folder: str | Path) -> StudyResult:
-    """Read a study's folder. Raises `InputError` where there is none."""
+def open_study(folder: str | Path) -> StudyResult:
+    """Read a study's folder, finished or not. Raises `InputError` where there is none."""
     store = Store.open(Path(folder))
     return StudyResult(read_config(store.folder / "study.toml"), store)
 
@@ -268,8 +251,7 @@ def repair(folder: str | Path) -> tuple[int, Store]:
         raise InputError(f"{folder}: holds no study (no study.toml); run 'jaxbl sweep STUDY.toml --out {folder}'")
     config = read_config(folder / "study.toml")
     with locked(folder):
-        claim(folder, config)
-        _, store = _taken_up(folder, Engine(config), insist=False)
+        _, store = begun(folder, Engine(config), insist=False)
         return store.verify(), store
 
 

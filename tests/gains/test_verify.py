@@ -17,7 +17,7 @@ from jaxbl.gains.counterexamples import repeated
 from jaxbl.gains.stages import Stages
 from jaxbl.gains.verify import verify
 from jaxbl.sweeps.engine import Engine
-from jaxbl.sweeps.sweep import load, sweep
+from jaxbl.sweeps.sweep import open_study, sweep
 
 ATLAS = {
     "q": 0.3,
@@ -356,7 +356,7 @@ def test_a_long_period_is_the_cause_and_a_quarter_of_the_runs_own_mends_it(check
     assert set(chosen[PERIOD]) == {16e-3}
     assert set(chosen["cause"]) == {"explicit discretisation", "period too long or explicit discretisation"}
     periods = [
-        load(place).config.run.sample_period for place in (folder / "verify/causes").glob("sampled-*-period_too_long")
+        open_study(place).config.run.sample_period for place in (folder / "verify/causes").glob("sampled-*-period_too_long")
     ]
     assert sorted(periods) == [0.25e-3, 4e-3]
 

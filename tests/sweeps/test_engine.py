@@ -40,7 +40,7 @@ def reference(study):
     """All 36 lanes in one chunk on one device."""
     engine = Engine(study, Layout(3, 12), jax.devices()[:1])
     assert len(engine) == 1
-    return by_point(engine.run(next(engine.chunks())))
+    return by_point(engine.run(engine.chunk(0)))
 
 
 def test_a_lane_is_the_single_run_of_its_point(study, reference):
@@ -63,7 +63,7 @@ def test_same_numbers_whatever_the_chunk_size_and_device_count(study, reference,
     engine = Engine(config, devices=jax.devices()[:devices])
     # padded: the last chunk of points is not full, or there are more seeds than are left
     assert len(engine) == 1 if chunk == 36 else len(engine) > 1
-    frame = by_point(pd.concat([engine.run(chunk) for chunk in engine.chunks()]))
+    frame = by_point(pd.concat([engine.run(chunk) for chunk in map(engine.chunk, engine.order())]))
     exact = [column for column in frame if engine.layout.seeds > 1 or column not in BOUND]
     assert_equal(frame[exact], reference[exact])
     assert_equal(frame, reference, rtol=1e-15)
@@ -189,7 +189,7 @@ def test_seeds_of_one_point_share_chunks():
     config = read_config(rigid(sweep={"seeds": 10, "chunk": 4}))
     engine = Engine(config)
     assert (tuple(engine.layout), len(engine), engine.rows) == ((4, 1), 3, 10)
-    frame = pd.concat([engine.run(chunk) for chunk in engine.chunks()])
+    frame = pd.concat([engine.run(chunk) for chunk in map(engine.chunk, engine.order())])
     assert list(frame["seed"]) == list(range(10))
     assert frame["motor.velocity_rmse"].nunique() == 10
 

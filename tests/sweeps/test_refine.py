@@ -19,7 +19,7 @@ from jaxbl.sweeps.engine import Engine, Layout
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.programs import BACKENDS
 from jaxbl.sweeps.refine import CellGrid, Criterion, refine
-from jaxbl.sweeps.sweep import StudyResult, dry_run, load, sweep
+from jaxbl.sweeps.sweep import StudyResult, dry_run, open_study, sweep
 
 # ---------------------------------------------------------------- geometry, on functions instead of runs
 
@@ -531,14 +531,14 @@ def test_a_refined_study_in_a_folder(finished, computed):
     assert manifest(folder)["finished"]
     assert manifest(folder)["rows"] == len(result.frame)
     assert manifest(folder)["parts"] == parts(folder) > 3
-    pd.testing.assert_frame_equal(load(folder).frame, result.frame)
+    pd.testing.assert_frame_equal(open_study(folder).frame, result.frame)
     pd.testing.assert_frame_equal(sweep(study()).frame, result.frame)
     computed.clear()
     before = files(folder)
     again = sweep(study(), folder)
     assert (computed, again.cost["lanes"]) == ([], 0)
     assert files(folder) == before
-    lines = headline(load(folder))
+    lines = headline(open_study(folder))
     share = f"{100 * len(result.frame) / 33**2:.2g}"
     assert lines[0].startswith(f"{len(result.frame)} of 1089 grid points simulated ({share} %), {len(result.frame)} runs. ")
     assert "not finished" not in "".join(lines)
@@ -557,7 +557,7 @@ def test_an_interrupted_study_replays_its_decisions_and_computes_nothing_twice(t
         sweep(study(), tmp_path / "study", progress=interrupt)
     assert computed == list(range(stop + 1))
     assert not manifest(tmp_path / "study")["finished"]
-    assert "The study is not finished" in headline(load(tmp_path / "study"))[1]
+    assert "The study is not finished" in headline(open_study(tmp_path / "study"))[1]
     seen.clear()
     # with other chunks asked for: those of the folder stay
     result = sweep(study(chunk=4096), tmp_path / "study", progress=lambda *done: seen.append(done))

@@ -18,7 +18,7 @@ from jaxbl.files import json_text, make_folder, read_json
 from jaxbl.sweeps.engine import Engine
 from jaxbl.sweeps.parts import file_checksum
 from jaxbl.sweeps.store import Store, claim, identity
-from jaxbl.sweeps.sweep import load, repair, sweep
+from jaxbl.sweeps.sweep import open_study, repair, sweep
 
 FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
 
@@ -77,7 +77,7 @@ def test_finished_study_is_only_read(copy, finished, computed):
     assert result.cost["lanes"] == 0
     assert files(copy) == before
     pd.testing.assert_frame_equal(result.frame, finished[1].frame)
-    pd.testing.assert_frame_equal(load(copy).frame, finished[1].frame)
+    pd.testing.assert_frame_equal(open_study(copy).frame, finished[1].frame)
 
 
 def test_interrupted_study_goes_on_where_it_stopped(tmp_path, finished, computed):
@@ -111,9 +111,9 @@ def test_a_chunk_that_is_not_whole_is_computed_again(copy, finished, computed, d
         part.with_name(f".{part.name}.1").write_bytes(content[:100])
     if damage in ("truncated", "empty"):
         with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged \(.*\); run 'jaxbl sweep' again"):
-            _ = load(copy).frame
+            _ = open_study(copy).frame
     else:
-        assert len(load(copy).frame) == 6
+        assert len(open_study(copy).frame) == 6
     result = sweep(study(), copy)
     assert computed == [1]
     if damage in ("truncated", "empty"):
@@ -146,13 +146,13 @@ def test_only_title_notes_and_figures_changed_is_the_same_study(copy, computed):
     config = read_config(study({"title": "other", "notes": ["a"]}, figures=[FIGURE]))
     sweep(config, copy)
     assert computed == []
-    assert load(copy).config.resolved() == config.resolved()
+    assert open_study(copy).config.resolved() == config.resolved()
 
 
 def test_overwriting_is_asked_for(copy, computed):
     result = sweep(study(OTHER["other number"]["changes"]), copy, overwrite=True)
     assert computed == [0, 1, 2]
-    assert len(load(copy).frame) == len(result.frame) == 9
+    assert len(open_study(copy).frame) == len(result.frame) == 9
     sweep(study(OTHER["other number"]["changes"]), copy, overwrite=True)
     assert computed == [0, 1, 2]
 
@@ -178,13 +178,13 @@ def test_a_manifest_that_is_lost_or_damaged_is_written_anew_by_what_the_parts_sa
         file.write_text(json.dumps(data))
     before = files(copy)
     with pytest.raises(InputError, match=r"lost its manifest\.json; 'jaxbl repair|manifest\.json: is") as error:
-        load(copy)
+        open_study(copy)
     assert "\n" not in str(error.value)
     assert files(copy) == before
     # as many chunks as there were, whatever is asked for now
     result = sweep(study(sweep={"seeds": 3, "chunk": 100}), copy)
     assert computed == [] and result.damaged == ()
-    pd.testing.assert_frame_equal(load(copy).frame, finished[1].frame)
+    pd.testing.assert_frame_equal(open_study(copy).frame, finished[1].frame)
     assert len(list((copy / "points").iterdir())) == 3
 
 
@@ -200,7 +200,7 @@ def test_a_damaged_manifest_without_parts(copy):
 def test_manifest_of_another_version(copy):
     (copy / "manifest.json").write_text(json_text(read_json(copy / "manifest.json") | {"format": 99}))
     with pytest.raises(InputError, match="has format 99; this version reads 3"):
-        load(copy)
+        open_study(copy)
 
 
 def flipped(folder, random):
@@ -221,7 +221,7 @@ def test_flipped_bits_are_noticed_and_healed(copy, finished):
     for _ in range(60):
         path = flipped(copy, random)
         with suppress(InputError):
-            pd.testing.assert_frame_equal(load(copy).frame, finished[1].frame)
+            pd.testing.assert_frame_equal(open_study(copy).frame, finished[1].frame)
         result = sweep(study(), copy)
         pd.testing.assert_frame_equal(result.frame, finished[1].frame)
         noticed += len(result.damaged)
@@ -238,10 +238,10 @@ def test_parts_that_changed_places_are_computed_anew(copy, finished, computed):
     one.write_bytes(content[1])
     other.write_bytes(content[0])
     with pytest.raises(InputError, match=r"part-00000\.parquet: is damaged \(is part 2 of this study\)"):
-        _ = load(copy).frame
+        _ = open_study(copy).frame
     assert len(sweep(study(), copy).damaged) == 2
     assert computed == [0, 2]
-    pd.testing.assert_frame_equal(load(copy).frame, finished[1].frame)
+    pd.testing.assert_frame_equal(open_study(copy).frame, finished[1].frame)
 
 
 def test_an_edited_part_is_kept_aside(copy, finished, computed):
@@ -250,7 +250,7 @@ def test_an_edited_part_is_kept_aside(copy, finished, computed):
     frame["motor.velocity_rmse"] *= 1.01
     frame.to_parquet(part, index=False)
     with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged \(says nothing of the study"):
-        _ = load(copy).frame
+        _ = open_study(copy).frame
     sweep(study(), copy)
     assert computed == [1]
     kept = pd.read_parquet(copy / "damaged" / "part-00001.parquet")
@@ -264,7 +264,7 @@ def test_a_part_of_another_study_is_refused(copy, tmp_path):
     part = copy / "points" / "part-00001.parquet"
     part.write_bytes((tmp_path / "other" / "points" / part.name).read_bytes())
     before = files(copy)
-    for read in (lambda: sweep(study(), copy), lambda: load(copy).frame, lambda: repair(copy)):
+    for read in (lambda: sweep(study(), copy), lambda: open_study(copy).frame, lambda: repair(copy)):
         with pytest.raises(InputError, match=r"part-00001\.parquet: is of another study \('small', other numbers\)"):
             read()
     assert {name: content for name, content in files(copy).items() if name != "manifest.json"} == {
@@ -275,7 +275,7 @@ def test_a_part_of_another_study_is_refused(copy, tmp_path):
 @pytest.mark.parametrize("name", ["part-00099.parquet", "part-3.parquet", "part-copy.parquet"])
 def test_a_part_too_many_is_refused(copy, computed, name):
     (copy / "points" / name).write_bytes((copy / "points" / "part-00001.parquet").read_bytes())
-    for read in (lambda: load(copy).frame, lambda: sweep(study(), copy)):
+    for read in (lambda: open_study(copy).frame, lambda: sweep(study(), copy)):
         with pytest.raises(InputError, match=f"{name}: is no part of this study, which has 3; move it away"):
             read()
     assert computed == []
@@ -286,8 +286,8 @@ def test_repair_keeps_damaged_parts_aside_and_says_what_is_missing(copy, compute
     (copy / "points" / "part-00000.parquet").write_bytes(b"PAR1")
     whole, store = repair(copy)
     assert whole == 2 and len(store.damaged) == 1 and computed == []
-    assert not load(copy).source.manifest["finished"]
-    assert len(load(copy).frame) == 6
+    assert not open_study(copy).source.manifest["finished"]
+    assert len(open_study(copy).frame) == 6
     sweep(copy / "study.toml", copy)
     assert computed == [0]
     with pytest.raises(InputError, match=r"holds no study \(no study\.toml\)"):
@@ -386,7 +386,7 @@ def test_folders_without_a_study_or_without_points(tmp_path, copy):
     for part in (copy / "points").iterdir():
         part.unlink()
     with pytest.raises(InputError, match="holds no points yet"):
-        _ = load(copy).frame
+        _ = open_study(copy).frame
 
 
 def test_a_record_is_known_by_its_content(tmp_path):

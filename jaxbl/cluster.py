@@ -1,0 +1,198 @@
+"""Jobs on the workers of a Dask cluster: one that is there already, or processes of this machine (`local:N`).
+
+Needs the extra `distributed`. Functions that workers call are found by name: they have the same version of jaxbl installed.
+"""
+
+import os
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.metadata import version
+from threading import Lock
+from typing import TYPE_CHECKING, Any, TypeVar, Union
+
+from .errors import InputError, NoResult
+from .workers import cores, doing, start_jax
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+Scheduler = Union[str, "Client", "Cluster", None]
+"""How a cluster is given (:func:`connected`)."""
+
+_ANSWER = 15.0
+"""Seconds in which a scheduler has to answer."""
+_LOOK = 0.2
+"""Seconds between two looks at what is done."""
+_ONE_AT_A_TIME = Lock()
+"""A job uses all cores of its worker, whatever number of threads takes jobs there."""
+
+
+class Cluster:
+    """A connection to a Dask scheduler.
+
+    Attributes:
+        local: whether its workers end with this process.
+    """
+
+    def __init__(self, client: "Client", *, local: bool):
+        self.local = local
+        self._client = client
+
+    @property
+    def workers(self) -> int:
+        """How many there are now, at least one: a cluster may start them as they are needed."""
+        return max(len(self._client.scheduler_info(n_workers=-1)["workers"]), 1)
+
+    def each(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> Iterator[Result]:
+        """Results of a function (importable by name), in the order of its arguments."""
+        found: dict[int, Result] = {}
+        following = 0
+        for index, result in self.done(function, list(enumerate(jobs))):
+            found[index] = result
+            while following in found:
+                yield found.pop(following)
+                following += 1
+
+    def done(
+        self, function: Callable[[Job], Result], jobs: Sequence[tuple[Any, Job]], look: Callable[[], object] = lambda: None
+    ) -> Iterator[tuple[Any, Result]]:
+        """Names and results of named jobs as they are done, the first ones begun first; a job whose worker is lost is done
+        anew by another. `look` is called every so often meanwhile.
+
+        Raises:
+            InputError, NoResult: of a job, of workers that cannot run one, or where the scheduler is lost.
+        """
+        from distributed import as_completed
+
+        futures = self._submit(function, [job for _, job in jobs])
+        names = {future.key: name for future, (name, _) in zip(futures, jobs, strict=True)}
+        finished = as_completed(futures)
+        try:
+            while names:
+                batch = list(finished.next_batch(block=False))
+                for future in batch:
+                    yield names.pop(future.key), self._result(future)
+                if self._client.status != "running":
+                    raise NoResult(_LOST)
+                look()
+                if not batch:
+                    time.sleep(_LOOK)
+        finally:
+            if names and self._client.status == "running":
+                self._client.cancel(futures, force=True)
+
+    def leave(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> None:
+        """Have jobs done without waiting for them, also when this process has ended."""
+        from distributed import fire_and_forget
+
+        fire_and_forget(self._submit(function, jobs))
+
+    def _submit(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Any]:
+        # a name of its own for each call: an earlier one may have been given up; Dask takes equal priorities in their order
+        token = f"jaxbl-{socket.gethostname()}-{os.getpid()}-{time.time_ns()}"
+        keys = [f"{token}-{index:07d}" for index in range(len(jobs))]
+        call = _Call(function, version("jaxbl"))
+        return self._client.map(call, jobs, key=keys, pure=False, batch_size=1000)
+
+    def _result(self, future: Any) -> Any:
+        from distributed import KilledWorker
+
+        if future.status == "cancelled" or future.status == "lost":
+            raise NoResult(_LOST)
+        try:
+            return future.result()
+        except KilledWorker as error:
+            raise NoResult(
+                f"a job has ended {error.allowed_failures + 1} workers, perhaps for want of memory (the last one: "
+                f"{error.last_worker.address}); what is finished is kept"
+            ) from None
+        except ModuleNotFoundError as error:
+            raise InputError(
+                f"--scheduler: its workers lack a module ({error}); install jaxbl {version('jaxbl')} there"
+            ) from None
+
+
+_LOST = "the connection to the scheduler is lost; what is finished is kept, and the same command goes on from there"
+
+
+class _Call:
+    """A function for a worker, which has to have the version of jaxbl that asks."""
+
+    def __init__(self, function: Callable[[Any], Any], asking: str):
+        self.function, self.asking = function, asking
+        self.__name__ = getattr(function, "__name__", "job")
+
+    def __call__(self, job: Any) -> Any:
+        here = version("jaxbl")
+        if here != self.asking:
+            raise InputError(f"--scheduler: worker {socket.gethostname()} has jaxbl {here}; install {self.asking} there")
+        from distributed import get_worker
+
+        with _ONE_AT_A_TIME:
+            start_jax(get_worker().state.nthreads)
+            return self.function(job)
+
+
+@contextmanager
+def connected(scheduler: Scheduler) -> Iterator[Cluster | None]:
+    """A cluster by its scheduler: an address (`tcp://host:8786`), a scheduler's file (`….json`), `local:N` for N processes
+    of this machine, or a client that is connected already; None for None.
+
+    Raises:
+        InputError: no scheduler is there, or Dask is not installed.
+    """
+    if scheduler is None or isinstance(scheduler, Cluster):
+        yield scheduler
+        return
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError("--scheduler: needs Dask; install it with: pip install 'jaxbl[distributed]'") from None
+    if not isinstance(scheduler, str):
+        yield Cluster(scheduler, local=False)
+        return
+    kind, _, number = scheduler.partition(":")
+    if kind == "local":
+        if not number.isdecimal() or not 1 <= int(number) <= 1024:
+            raise InputError(f"--scheduler {scheduler}: local:N needs the number of processes, 1 to 1024")
+        with _local(int(number)) as client:
+            yield Cluster(client, local=True)
+        return
+    file, address = (scheduler, None) if scheduler.endswith(".json") else (None, scheduler)
+    try:
+        client = Client(address, scheduler_file=file, timeout=_ANSWER, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(
+            f"--scheduler {scheduler}: no Dask scheduler answers there ({str(error).partition(chr(10))[0][:120]}); "
+            "it should be an address (tcp://host:8786), a scheduler's file (….json), or local:N"
+        ) from None
+    with client:
+        yield Cluster(client, local=False)
+
+
+@contextmanager
+def _local(count: int) -> "Iterator[Client]":
+    """Processes of this machine as workers; they share its cores."""
+    from dask import config
+    from distributed import Client, LocalCluster
+
+    doing("starting workers")
+    # a process that was forked would share the locks of this one's compiler
+    with (
+        config.set({"distributed.worker.multiprocessing-method": "spawn"}),
+        LocalCluster(
+            n_workers=count,
+            threads_per_worker=max(cores() // count, 1),
+            processes=True,
+            dashboard_address=None,  # pyright: ignore[reportArgumentType]
+            memory_limit=0,
+            silence_logs=50,
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        yield client

@@ -1,0 +1,154 @@
+"""Chunks of a study on a cluster: bundles that take a worker long enough, so that a large study is thousands of jobs.
+
+Workers write parts into the study's folder themselves, and leave out what is there: a bundle may be done twice.
+"""
+
+import functools
+import math
+import socket
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxbl.cluster import Cluster
+from jaxbl.config import read_config
+from jaxbl.errors import InputError
+from jaxbl.files import locked
+from jaxbl.workers import Progress
+
+from .engine import Chunk, Engine
+from .programs import Backend, Layout
+from .run import Run, Work
+from .store import Store
+
+_SECONDS = 20.0
+"""Of a bundle: a scheduler spends some 1 ms on one, and what a lost worker has begun is lost."""
+_MOST = 50_000
+"""Bundles of a study: a scheduler keeps some 6 kB of each, and is slow above 100 000 (Dask's distributed#3691, #3898)."""
+_TURNS = 4
+"""Bundles that each worker gets at least: they end together then."""
+_LOOK = 2.0
+"""Seconds between two looks at the parts that exist."""
+_SEEN = 30.0
+"""Seconds until a part that a worker has written is seen here: network file systems remember what was not there."""
+
+
+class Bundle(NamedTuple):
+    """Chunks for a worker, by their indices, or themselves where they are of a refined study."""
+
+    folder: str
+    identity: str
+    layout: Layout
+    backend: Backend
+    insist: bool
+    chunks: tuple[int | Chunk, ...]
+
+
+class _Done(NamedTuple):
+    """What a worker has done of a bundle: checksums of its parts by index."""
+
+    checksums: dict[int, str]
+    work: Work
+    host: str
+
+
+class ClusterRun(Run):
+    """A run whose chunks are computed by a cluster's workers.
+
+    Raises, where a :class:`Run` does not:
+        InputError: workers do not see the store's folder, or cannot run the study.
+        NoResult: the cluster is lost.
+    """
+
+    def __init__(self, cluster: Cluster, engine: Engine, store: Store, progress: Progress | None):
+        super().__init__(engine, store, progress)
+        self._cluster = cluster
+        self._looked = time.monotonic()
+
+    def ensure(self, chunks: Iterable[Chunk]) -> None:
+        missing = []
+        for chunk in chunks:
+            if self.is_there(chunk):
+                self.count(chunk)
+            else:
+                missing.append(chunk)
+        # one chunk a worker says how long one takes
+        first, before = self._cluster.workers, self.work.run_seconds
+        self._wave(missing[:first], 1)
+        rest = missing[first:]
+        self._wave(rest, _size((self.work.run_seconds - before) / first, len(rest), self._cluster.workers))
+
+    def _wave(self, chunks: list[Chunk], size: int) -> None:
+        for part, done in self._cluster.done(compute, _bundles(self.engine, self.kept, chunks, size), self._look):
+            for chunk in part:
+                _wait_for(self.kept.part(chunk.index), done.host)
+                self.count(chunk)
+            self.kept.note(done.checksums)
+            self.elsewhere += done.work
+
+    def _look(self) -> None:
+        """Tell progress by the parts that exist: bundles take long."""
+        if time.monotonic() - self._looked > _LOOK:
+            self._looked = time.monotonic()
+            self.tell(len(self.kept.existing()))
+
+
+def hand_over(cluster: Cluster, engine: Engine, store: Store) -> None:
+    """Have all chunks of a study computed that are missing, without waiting for more than the first. Raises as
+    :class:`ClusterRun`."""
+    missing = [chunk for chunk in map(engine.chunk, engine.order()) if not store.has(chunk.index)]
+    seconds = 0.0
+    for _, done in cluster.done(compute, _bundles(engine, store, missing[:1], 1)):
+        seconds = done.work.run_seconds
+    rest = missing[1:]
+    size = _size(seconds, len(rest), cluster.workers)
+    cluster.leave(compute, [bundle for _, bundle in _bundles(engine, store, rest, size)])
+
+
+def _size(seconds: float, chunks: int, workers: int) -> int:
+    """Chunks of a bundle, where one takes so long and so many are left."""
+    by_time = int(_SECONDS / max(seconds, 1e-3))
+    return max(min(by_time, math.ceil(chunks / (workers * _TURNS))), math.ceil(chunks / _MOST), 1)
+
+
+def _bundles(engine: Engine, store: Store, chunks: Sequence[Chunk], size: int) -> list[tuple[list[Chunk], Bundle]]:
+    """Chunks, `size` of them at once, with what a worker needs to know."""
+    refined = engine.points.refinement is not None
+    about = str(store.folder.absolute()), store.manifest["identity"], store.layout, store.backend, engine.insist
+    parts = [list(chunks[first : first + size]) for first in range(0, len(chunks), size)]
+    return [(part, Bundle(*about, tuple(part if refined else [chunk.index for chunk in part]))) for part in parts]
+
+
+def _wait_for(part: Path, host: str) -> None:
+    latest = time.monotonic() + _SEEN
+    while not part.exists():
+        if time.monotonic() > latest:
+            raise InputError(
+                f"{part}: was written by worker {host}, and is not seen here; --out should name a folder that all machines "
+                "share"
+            )
+        time.sleep(0.2)
+
+
+def compute(bundle: Bundle) -> _Done:
+    """Compute the chunks of a bundle that are not there, on a worker."""
+    folder, host = Path(bundle.folder), socket.gethostname()
+    if not (folder / "manifest.json").exists():
+        raise InputError(f"{folder}: is not seen by worker {host}; --out should name a folder that all machines share")
+    with locked(folder, shared=True, wait=_SEEN):
+        store = Store.open(folder, keeps_manifest=False)
+        if store.manifest["identity"] != bundle.identity:
+            raise InputError(f"{folder}: holds another study by now")
+        engine = _engine(*bundle[:-1])
+        engine.compile_seconds = engine.run_seconds = 0.0
+        run = Run(engine, store)
+        run.ensure(engine.chunk(one) if isinstance(one, int) else one for one in bundle.chunks)
+    indices = [one if isinstance(one, int) else one.index for one in bundle.chunks]
+    return _Done({index: store.manifest["checksums"][str(index)] for index in indices}, run.work, host)
+
+
+@functools.lru_cache(maxsize=2)
+def _engine(folder: str, identity: str, layout: Layout, backend: Backend, insist: bool) -> Engine:
+    """The engine of a study, with its compiled programs, from one bundle to the next."""
+    return Engine(read_config(Path(folder) / "study.toml"), layout, backend=backend, insist=insist)
