@@ -71,7 +71,7 @@ class Cluster:
 
         futures = self._submit(function, [job for _, job in jobs])
         names = {future.key: name for future, (name, _) in zip(futures, jobs, strict=True)}
-        finished = as_completed(futures)
+        finished = as_completed(futures, loop=self._client.loop)
         try:
             while names:
                 batch = list(finished.next_batch(block=False))

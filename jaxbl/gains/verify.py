@@ -136,9 +136,9 @@ def _verified(config: Config, sides: list[str], stages: Stages) -> Verdict:
             "counterexamples_in_all": len(true),
         }
     )
-    if out is not None:
-        write_table(Path(out) / "counterexamples.parquet", every)
-        write_atomic(Path(out) / "verdict.json", json.dumps(summary, indent=1, ensure_ascii=False))
+    if stages.folder is not None:
+        write_table(stages.folder.parent / "counterexamples.parquet", every)
+        write_atomic(stages.folder.parent / "verdict.json", json.dumps(summary, indent=1, ensure_ascii=False))
     return Verdict(config, summary, normalised, levels, every, tuple(stages.scanned))
 
 
