@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -84,6 +84,10 @@ def draw(result: StudyResult) -> list[Drawn]:
             drawing = _laws(config, frame, figure, [law for law in laws if law.figure == i])
         else:
             drawing = _lines(config, selected(config, frame, figure), figure)
+        if not result.is_finished(len(frame)):
+            drawing = drawing._replace(
+                caption=f"{drawing.caption} The study is not finished: {len(frame)} runs so far, white where none is."
+            )
         same = sum(one.name.partition("-")[0] == drawing.name for one in drawn)
         drawn.append(drawing._replace(name=f"{drawing.name}-{same + 1}") if same else drawing)
     return drawn
@@ -304,8 +308,12 @@ def _map_panel(
     edges = cell_edges(xs, logs[0]), cell_edges(ys, logs[1])
     handles = []
     if gridded:
-        ax.set_facecolor(MISSING)
         ax.pcolormesh(*edges, grid, cmap=MAP, norm=norm, rasterized=True)
+        # what an unfinished study has not computed yet stays white
+        undefined = np.isnan(grid) if filling is not None else table.isna().unstack(fill_value=False).to_numpy(bool)
+        if undefined.any():
+            cells = np.ma.masked_array(np.zeros(grid.shape), ~undefined)
+            ax.pcolormesh(*edges, cells, cmap=ListedColormap([MISSING]), rasterized=True)
         side = spec.value.partition(".")[0]
         column = f"{side}.converged"
         if column in part and spec.value != column:

@@ -57,12 +57,11 @@ def headline(result: StudyResult) -> list[str]:
             f"{simulated} of {len(points)} grid points simulated ({share:.2g} %), {len(frame)} runs. "
             f"The observers converged in {shares} of those on the coarse grid."
         ]
-    if isinstance(result.source, Store):
-        manifest = result.source.manifest
-        going = refined and not manifest["finished"]
-        if going or len(frame) < manifest["rows"]:
-            more = " so far" if going else ""
-            lines.append(f"The study is not finished: it has {manifest['rows']} runs{more}. Go on with 'jaxbl sweep'.")
+    if isinstance(result.source, Store) and not result.is_finished(len(frame)):
+        more = " so far" if refined else ""
+        lines.append(
+            f"The study is not finished: it has {result.source.manifest['rows']} runs{more}. Go on with 'jaxbl sweep'."
+        )
     diverged = int((~frame["finite"].astype(bool)).sum())
     if diverged:
         lines.append(f"{diverged} runs diverged: finite = false in the table, grey in the figures.")

@@ -78,13 +78,15 @@ _PROGRAMS = 16
 def _coarse_first(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Place of each of some blocks in an order that covers them coarsely first, and its level `(count,)`.
 
-    Level 0 is the first block; each further level halves the distance between them (bit-reversed order, van der Corput).
+    Level 0 is one block, and each further level doubles their number, one in each part of the whole: van der Corput's
+    sequence, scrambled (Owen 1995), as blocks at even distances would fall together with rows of a map.
     """
-    bits = max(count - 1, 0).bit_length()
+    rng, bits = np.random.default_rng(0), max(count - 1, 0).bit_length()
     index = np.arange(count)
     place = np.zeros(count, int)
-    for bit in range(bits):
-        place |= (index >> bit & 1) << (bits - 1 - bit)
+    for level in range(bits):
+        swapped = rng.integers(0, 2, 1 << level)[index >> bits - level]
+        place |= (index >> bits - 1 - level & 1 ^ swapped) << level
     return place, np.frexp(place)[1]
 
 

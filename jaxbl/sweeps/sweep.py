@@ -59,6 +59,14 @@ class StudyResult:
         """Names of all columns."""
         return self.source.columns() if isinstance(self.source, Store) else list(self.source.columns)
 
+    def is_finished(self, rows: int) -> bool:
+        """Whether so many rows are all that the study has."""
+        if not isinstance(self.source, Store):
+            return True
+        manifest = self.source.manifest
+        # a refined study knows at the end how many it has
+        return rows >= manifest["rows"] and (manifest["finished"] or self.config.sweep.refine is None)
+
     def read(self, columns: Iterable[str] | None = None) -> pd.DataFrame:
         """Some columns of the frame, read for this call: a large study need not fit into memory whole."""
         names = None if columns is None else list(dict.fromkeys(columns))
