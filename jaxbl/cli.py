@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .errors import InputError, NoResult
+from .files import place
 from .terminal import duration, naming, running
 from .workers import start_jax
 
@@ -32,7 +33,13 @@ app = typer.Typer(
 
 ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML study", show_default=False)]
 OutOption = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="folder for the results [default: results/<config name>]")
+    Path | None,
+    typer.Option(
+        metavar="DIR", parser=place, help="folder for the results, or s3://BUCKET/FOLDER [default: results/<config name>]"
+    ),
+]
+FolderArgument = Annotated[
+    Path, typer.Argument(metavar="DIR", parser=place, help="folder of a sweep, verify or tune", show_default=False)
 ]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="remove the results of another study from the folder")]
 BackendOption = Annotated[
@@ -177,7 +184,7 @@ def _share(text: str | None, others: dict[str, bool]) -> tuple[int, int] | None:
 
 
 @app.command()
-def status(folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder of a study", show_default=False)]) -> None:
+def status(folder: FolderArgument) -> None:
     """Say how far a study is, by the parts that exist."""
     from jaxbl.sweeps.status import statuses
 
@@ -516,7 +523,7 @@ def _diagnose_batch(
 
 @app.command()
 def plot(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder of a sweep", show_default=False)],
+    folder: FolderArgument,
     config: Annotated[
         Path | None, typer.Option(metavar="CONFIG", help="take title, notes and figures from this study")
     ] = None,
@@ -539,7 +546,7 @@ def plot(
 
 
 @app.command()
-def repair(folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder of a sweep", show_default=False)]) -> None:
+def repair(folder: FolderArgument) -> None:
     """Check a sweep's folder: keep damaged parts aside, and write a manifest that is lost or damaged anew."""
     start_jax()
     from jaxbl.sweeps.sweep import repair as run_repair

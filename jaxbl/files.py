@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +24,33 @@ if TYPE_CHECKING:
 
 LOG_RESULTS = ("inspection.json", "identification.json", "diagnosis.json")
 """What `inspect`, `identify` and `diagnose` write into a folder; each names the log that the results are of."""
+
+
+def place(name: str | Path) -> Path:
+    """A folder by its name: a path, or the address of an object store (`s3://bucket/folder`), which has those of a path's
+    methods that are needed here.
+
+    Raises:
+        InputError: a package for such addresses is missing.
+    """
+    if "://" not in str(name):
+        return Path(name)
+    try:
+        from upath import UPath
+
+        # other processes write there, too
+        return UPath(name, use_listings_cache=False)  # pyright: ignore[reportReturnType]
+    except ImportError as error:
+        raise InputError(
+            f"{name}: needs another package ({error}); pip install 'jaxbl[distributed]', s3fs for s3://"
+        ) from None
+    except ValueError as error:
+        raise InputError(f"{name}: is no place for results ({error})") from None
+
+
+def is_remote(path: Path) -> bool:
+    """Whether a path is in an object store: files there are always whole, there are no folders, and no locks."""
+    return not isinstance(path, Path)
 
 
 def plain(value: Any) -> Any:
@@ -82,6 +110,24 @@ def write_table(path: Path, frame: "pd.DataFrame") -> None:
         frame.to_parquet(draft, index=False)
 
 
+def listed(folder: Path, pattern: str) -> list[Path]:
+    """Files and folders in a folder by a pattern of their names, sorted; none where it is not there."""
+    try:
+        return sorted(folder.glob(pattern))
+    except FileNotFoundError:
+        return []
+
+
+def remove(path: Path) -> None:
+    """Remove a file, or a folder with all that is in it; there may be none."""
+    if not path.is_dir():
+        path.unlink(missing_ok=True)
+    elif isinstance(path, Path):
+        shutil.rmtree(path)
+    else:
+        path.rmdir(recursive=True)
+
+
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Around what is written into a file or folder: one line if the system cannot.
@@ -101,6 +147,11 @@ def writing(path: Path) -> Iterator[None]:
 @contextmanager
 def written(path: Path) -> Iterator[Path]:
     """A draft to be written, which takes the file's place once it is whole. Raises as :func:`writing`."""
+    if is_remote(path):
+        with TemporaryDirectory() as folder, writing(path):
+            yield Path(folder) / path.name
+            path.write_bytes((Path(folder) / path.name).read_bytes())
+        return
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with writing(path):
@@ -133,6 +184,9 @@ def locked(folder: Path, *, shared: bool = False, wait: float = 0.0) -> Iterator
         InputError: it cannot be written to.
     """
     make_folder(folder)
+    if is_remote(folder):
+        yield
+        return
     path = folder / LOCK
     latest = time.monotonic() + wait
     while (file := _taken(path, shared)) is None and time.monotonic() < latest:
@@ -154,6 +208,8 @@ def locked(folder: Path, *, shared: bool = False, wait: float = 0.0) -> Iterator
 
 def holder(folder: Path) -> str:
     """The process that writes into a folder, its host, and since when; empty where none does."""
+    if is_remote(folder):
+        return ""
     with suppress(OSError), (folder / LOCK).open("r+") as file:
         return "" if _lock(file, shared=False) else file.read()
     return ""
@@ -192,18 +248,41 @@ def _lock(file: Any, shared: bool) -> bool:
 
 def remove_drafts(folder: Path) -> None:
     """Remove what processes have left in a folder of ours that were killed while they wrote."""
-    for draft in folder.rglob(".*"):
+    for draft in [] if is_remote(folder) else folder.rglob(".*"):
         if _DRAFT.fullmatch(draft.name):
-            shutil.rmtree(draft) if draft.is_dir() else draft.unlink(missing_ok=True)
+            remove(draft)
 
 
 def is_empty(folder: Path) -> bool:
     """Whether nothing but our lock is in a folder."""
-    return all(path.name == LOCK for path in folder.iterdir())
+    return all(path.name == LOCK for path in listed(folder, "*"))
+
+
+@contextmanager
+def access(path: Path, how: str) -> Iterator[None]:
+    """Around what an object store is asked for. Raises `InputError` where it fails; `how` is what cannot be done then."""
+    try:
+        yield
+    except Exception as error:  # of any kind: each store has its own
+        why = str(error).partition("\n")[0] or type(error).__name__
+        raise InputError(f"{path}: cannot be {how} ({why}); name another folder, or mend the access to it") from None
+
+
+def has_file(folder: Path, name: str) -> bool:
+    """Whether a file is in a folder. Raises `InputError` where an object store cannot be asked."""
+    if is_remote(folder):
+        with access(folder, "read"):
+            return (folder / name).exists()
+    return (folder / name).exists()
 
 
 def make_folder(path: Path) -> None:
     """Make a folder that can be written to. Raises `InputError` where that is not possible."""
+    if is_remote(path):
+        with access(path, "written to"):
+            (path / ".probe").write_bytes(b"")
+            (path / ".probe").unlink()
+        return
     try:
         path.mkdir(parents=True, exist_ok=True)
         probe = path / f".probe.{os.getpid()}"
@@ -280,5 +359,6 @@ def removed_if_empty(folder: Path) -> Iterator[None]:
     except BaseException:
         # suppressed: it is not empty
         with suppress(OSError):
-            folder.rmdir()
+            if not is_remote(folder):
+                folder.rmdir()
         raise

@@ -10,7 +10,7 @@ import pandas as pd
 from jaxbl.cluster import Cluster, Scheduler, connected
 from jaxbl.config import Config
 from jaxbl.errors import InputError
-from jaxbl.files import json_text, locked, make_folder, read_json, removed_if_empty, write_atomic
+from jaxbl.files import json_text, locked, make_folder, place, read_json, removed_if_empty, write_atomic
 from jaxbl.sweeps.programs import Backend, backend_of
 from jaxbl.sweeps.store import claim, manifest_head
 from jaxbl.sweeps.sweep import StudyResult, sweep
@@ -28,8 +28,8 @@ def stages_in(
     """
     with ExitStack() as held:
         if out is not None:
-            held.enter_context(removed_if_empty(Path(out)))
-            held.enter_context(locked(Path(out)))
+            held.enter_context(removed_if_empty(place(out)))
+            held.enter_context(locked(place(out)))
         yield Stages(config, command, out, cluster=held.enter_context(connected(scheduler)), **given)
 
 
@@ -66,8 +66,8 @@ class Stages:
         self._done = 0
         if out is None:
             return
-        claim(Path(out), config, command, overwrite=overwrite)
-        self.folder = Path(out) / command
+        claim(place(out), config, command, overwrite=overwrite)
+        self.folder = place(out) / command
         if (self.folder / "manifest.json").exists():
             self.found = read_json(self.folder / "manifest.json")
             begun = self.found.get("backend")

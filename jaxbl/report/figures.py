@@ -14,6 +14,8 @@ from matplotlib.layout_engine import TightLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import NullLocator
 
+from jaxbl.files import is_remote, written
+
 SIDES = ("motor", "load")
 
 # Okabe and Ito, in an order that also parts in grey
@@ -69,10 +71,12 @@ def with_unit(label: str, unit: str) -> str:
 @style()
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG, making its folder. Returns the path."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    if not is_remote(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
     if figure.get_layout_engine() is None:
         _lay_out(figure)
-    figure.savefig(path)
+    with written(path) as draft:
+        figure.savefig(draft, format="png")
     return path
 
 

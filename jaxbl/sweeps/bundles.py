@@ -12,15 +12,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxbl.cluster import Cluster
-from jaxbl.config import read_config
 from jaxbl.errors import InputError
-from jaxbl.files import locked
+from jaxbl.files import is_remote, locked, place
 from jaxbl.workers import Progress
 
 from .engine import Chunk, Engine
 from .programs import Backend, Layout
 from .run import Run, Work
-from .store import Store
+from .store import Store, config_of
 
 _SECONDS = 20.0
 """Of a bundle: a scheduler spends some 1 ms on one, and what a lost worker has begun is lost."""
@@ -115,7 +114,8 @@ def _size(seconds: float, chunks: int, workers: int) -> int:
 def _bundles(engine: Engine, store: Store, chunks: Sequence[Chunk], size: int) -> list[tuple[list[Chunk], Bundle]]:
     """Chunks, `size` of them at once, with what a worker needs to know."""
     refined = engine.points.refinement is not None
-    about = str(store.folder.absolute()), store.manifest["identity"], store.layout, store.backend, engine.insist
+    folder = store.folder if is_remote(store.folder) else store.folder.absolute()
+    about = str(folder), store.manifest["identity"], store.layout, store.backend, engine.insist
     parts = [list(chunks[first : first + size]) for first in range(0, len(chunks), size)]
     return [(part, Bundle(*about, tuple(part if refined else [chunk.index for chunk in part]))) for part in parts]
 
@@ -133,7 +133,7 @@ def _wait_for(part: Path, host: str) -> None:
 
 def compute(bundle: Bundle) -> _Done:
     """Compute the chunks of a bundle that are not there, on a worker."""
-    folder, host = Path(bundle.folder), socket.gethostname()
+    folder, host = place(bundle.folder), socket.gethostname()
     if not (folder / "manifest.json").exists():
         raise InputError(f"{folder}: is not seen by worker {host}; --out should name a folder that all machines share")
     with locked(folder, shared=True, wait=_SEEN):
@@ -151,4 +151,4 @@ def compute(bundle: Bundle) -> _Done:
 @functools.lru_cache(maxsize=2)
 def _engine(folder: str, identity: str, layout: Layout, backend: Backend, insist: bool) -> Engine:
     """The engine of a study, with its compiled programs, from one bundle to the next."""
-    return Engine(read_config(Path(folder) / "study.toml"), layout, backend=backend, insist=insist)
+    return Engine(config_of(place(folder)), layout, backend=backend, insist=insist)

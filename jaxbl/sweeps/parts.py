@@ -5,7 +5,9 @@ What was stored years ago, or copied from elsewhere, is only read where it is wh
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +16,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from jaxbl.files import checksum, written
+from jaxbl.files import access, checksum, has_file, is_remote, written
 
 _KEY, _SUM = b"jaxbl.part", b"jaxbl.checksum"
 """In the file's metadata: the mark as JSON, and its checksum."""
@@ -57,7 +59,8 @@ def write(path: Path, frame: pd.DataFrame, mark: Mark) -> None:
 def mark_of(path: Path) -> Mark:
     """What a part says of itself. Raises `Damaged` where that cannot be read, or is not what was written."""
     try:
-        metadata = pq.read_schema(path).metadata or {}
+        with _opened(path) as file:
+            metadata = pq.read_schema(file).metadata or {}
     except FileNotFoundError:
         raise
     except (OSError, ValueError, MemoryError, pa.ArrowException) as error:
@@ -74,7 +77,7 @@ def read(path: Path, columns: Sequence[str] | None = None) -> tuple[Mark, pd.Dat
     """A part's mark and rows; all columns, or some. Raises `Damaged` where these are not what was written."""
     mark = mark_of(path)
     try:
-        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+        with _opened(path) as source, pq.ParquetFile(source, page_checksum_verification=True) as file:
             frame = file.read(columns=columns).to_pandas()
     except (OSError, ValueError, KeyError, TypeError, MemoryError, pa.ArrowException) as error:
         raise Damaged(f"cannot be read ({_first_line(error)})") from None
@@ -85,6 +88,19 @@ def read(path: Path, columns: Sequence[str] | None = None) -> tuple[Mark, pd.Dat
         if _checksum(frame[name]) != mark.columns[name]:
             raise Damaged(f"column '{name}' does not agree with its checksum")
     return mark, frame
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """What pyarrow reads a file from: its path, or its bytes where it is in an object store."""
+    if is_remote(path):
+        if not has_file(path.parent, path.name):
+            raise FileNotFoundError(path)
+        with access(path, "read"):
+            content = path.read_bytes()
+        yield BytesIO(content)
+    else:
+        yield path
 
 
 def _checksum(column: pd.Series) -> str:

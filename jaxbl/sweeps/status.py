@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxbl.files import holder
+from jaxbl.files import holder, listed, place
 
 from .store import Store
 
@@ -52,12 +52,11 @@ class Status:
 
 def status(folder: str | Path) -> Status:
     """How far the study in a folder is. Raises `InputError` where there is none."""
-    folder = Path(folder)
+    folder = place(folder)
     store = Store.open(folder)
     times = np.sort([path.stat().st_mtime for path in store.existing()])
     recent = times[times > times[-1] - _RECENT] if len(times) else times
     span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
-    aside = folder / "damaged"
     return Status(
         folder=folder,
         title=store.manifest["title"] or "untitled",
@@ -65,7 +64,7 @@ def status(folder: str | Path) -> Status:
         parts_in_all=store.manifest["parts"],
         runs=store.manifest["rows"],
         finished=store.manifest["finished"],
-        damaged=len(list(aside.iterdir())) if aside.is_dir() else 0,
+        damaged=len(listed(folder / "damaged", "*")),
         held_by=holder(folder),
         parts_per_second=float((len(recent) - 1) / span) if span > 0.0 else 0.0,
     )
@@ -74,9 +73,8 @@ def status(folder: str | Path) -> Status:
 def statuses(folder: str | Path) -> list[Status]:
     """How far the study in a folder is, and those that `verify` and `tune` run for it. Raises `InputError` where there is
     none."""
-    folder = Path(folder)
-    stages = [
-        path.parent for path in sorted(folder.glob("*/*/manifest.json")) if path.parent.parent.name in ("tune", "verify")
-    ]
+    folder = place(folder)
+    found = (listed(folder, f"{command}/*/manifest.json") for command in ("verify", "tune"))
+    stages = [path.parent for paths in found for path in paths]
     own = [folder] if (folder / "manifest.json").exists() or not stages else []
     return [status(one) for one in [*own, *stages]]

@@ -4,27 +4,31 @@ import hashlib
 import json
 import os
 import platform
-import shutil
 import time
+import tomllib
 from collections.abc import Iterator
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow.parquet as pq
 
-from jaxbl.config import Config
+from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import (
     LOG_RESULTS,
+    has_file,
     is_empty,
+    is_remote,
     json_text,
+    listed,
     log_named_in,
     make_folder,
     read_json,
+    remove,
     remove_drafts,
     write_atomic,
 )
@@ -123,15 +127,19 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
         )
     left = [name for marker, outputs, _ in _COMMANDS.values() for name in (marker, *outputs)]
     for path in (folder / name for name in (*left, *_COMMON)):
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
+        remove(path)
+
+
+def config_of(folder: Path) -> Config:
+    """The study of a folder. Raises `InputError` where it is damaged."""
+    path = folder / "study.toml"
+    # it stands alone: what it included is in it
+    return read_config(tomllib.loads(path.read_text()) if is_remote(path) else path)
 
 
 def _first_mark(folder: Path) -> Mark | None:
     """What the first whole part in a folder says of itself."""
-    for path in sorted((folder / "points").glob("part-*.parquet")):
+    for path in listed(folder / "points", "part-*.parquet"):
         try:
             return parts.mark_of(path)
         except (Damaged, FileNotFoundError):
@@ -154,6 +162,7 @@ class Store:
         self.keeps_manifest = keeps_manifest
         self.manifest = manifest
         self.damaged: list[str] = []
+        self._copies: TemporaryDirectory[str] | None = None
         self._saved = 0.0
 
     @classmethod
@@ -184,7 +193,8 @@ class Store:
             store = cls(folder, manifest)
         # the manifest first: it is what makes the folder this study's
         store.update()
-        (folder / "points").mkdir(exist_ok=True)
+        if not is_remote(folder):
+            (folder / "points").mkdir(exist_ok=True)
         write_atomic(folder / "study.toml", config.to_toml())
         return store
 
@@ -192,7 +202,7 @@ class Store:
     def open(cls, folder: Path, *, keeps_manifest: bool = True) -> "Store":
         """Open a study that is there. Raises `InputError` where there is none."""
         path = folder / "manifest.json"
-        if not path.exists():
+        if not has_file(folder, path.name):
             if _first_mark(folder) is not None:
                 raise InputError(f"{folder}: has lost its manifest.json; 'jaxbl repair {folder}' writes it anew")
             raise InputError(f"{folder}: holds no study (no manifest.json); run 'jaxbl sweep' first")
@@ -264,7 +274,8 @@ class Store:
     def _put_aside(self, path: Path, why: str) -> None:
         """Keep a damaged file where it is in nobody's way."""
         folder = self.folder / "damaged"
-        folder.mkdir(exist_ok=True)
+        if not is_remote(folder):
+            folder.mkdir(exist_ok=True)
         names = (path.name if i == 0 else f"{path.name}.{i}" for i in count())
         target = next(folder / name for name in names if not (folder / name).exists())
         path.replace(target)
@@ -283,8 +294,8 @@ class Store:
             self.update()
 
     def existing(self) -> list[Path]:
-        """Files of parts, whole or damaged, in no order."""
-        return list((self.folder / "points").glob("part-*.parquet"))
+        """Files of parts, whole or damaged."""
+        return listed(self.folder / "points", "part-*.parquet")
 
     def read_part(self, index: int, labels: dict[str, np.ndarray], columns: list[str]) -> pd.DataFrame | None:
         """Some columns of a chunk, or None where it holds other rows than those of `labels`."""
@@ -318,7 +329,7 @@ class Store:
 
     def _indexed(self) -> Iterator[tuple[int | None, Path]]:
         """Files among the points with the indices that their names say."""
-        for path in sorted((self.folder / "points").glob("part-*.parquet")):
+        for path in self.existing():
             number = path.stem.removeprefix("part-")
             yield (int(number) if number.isdecimal() and path == self.part(int(number)) else None), path
 
@@ -338,7 +349,8 @@ class Store:
 
     def columns(self) -> list[str]:
         """Names of the columns."""
-        return pq.read_schema(self.parts()[0]).names
+        mark = _first_mark(self.folder)
+        return list(mark.columns) if mark is not None else list(self.read().columns)
 
     def read(self, columns: list[str] | None = None) -> pd.DataFrame:
         """Rows of all chunks that are there; all columns, or some.
@@ -349,7 +361,7 @@ class Store:
         frames = []
         for part in self.parts():
             try:
-                mark, frame = parts.read(part, columns)
+                mark, frame = parts.read(self._near(part), columns)
                 self._check(part, mark, int(part.stem.removeprefix("part-")))
             except Damaged as why:
                 raise InputError(
@@ -357,6 +369,17 @@ class Store:
                 ) from None
             frames.append(frame)
         return pd.concat(frames, ignore_index=True)
+
+    def _near(self, part: Path) -> Path:
+        """A part where it is read fast: of an object store, a copy for as long as this lives, as a report reads it often."""
+        if not is_remote(part):
+            return part
+        if self._copies is None:
+            self._copies = TemporaryDirectory()
+        copy = Path(self._copies.name) / part.name
+        if not copy.exists():
+            copy.write_bytes(part.read_bytes())
+        return copy
 
     def verify(self) -> int:
         """Read all parts; those that are damaged are kept aside. Returns how many are whole.

@@ -12,7 +12,7 @@ import pandas as pd
 from jaxbl.cluster import Scheduler, connected
 from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
-from jaxbl.files import locked, removed_if_empty
+from jaxbl.files import locked, place, removed_if_empty
 from jaxbl.workers import Progress
 
 from .bundles import ClusterRun, hand_over
@@ -21,7 +21,7 @@ from .metrics import metric_of
 from .programs import Backend
 from .run import Run, begun, joined
 from .status import Status, status
-from .store import Store
+from .store import Store, config_of
 
 if TYPE_CHECKING:
     import xarray
@@ -151,7 +151,7 @@ def sweep(
         run = Run(engine, None, progress)
         run.all()
         return _result(run, run.frame())
-    folder = Path(out)
+    folder = place(out)
     if backend == "fused" and not (folder / "manifest.json").exists():
         # refused, if it is, before anything is written
         engine.check()
@@ -199,7 +199,7 @@ def share(
         InputError: as of :func:`sweep`; a refined study, whose points depend on one another.
         NoResult: nothing can be written any more.
     """
-    config, folder = read_config(study), Path(out)
+    config, folder = read_config(study), place(out)
     engine = Engine(config, devices=devices, backend=backend, insist=backend is not None)
     _check_independent(engine, "--share")
     number, count = which
@@ -224,7 +224,7 @@ def submit(
         InputError: as of :func:`sweep`; a refined study, whose points depend on one another, or a cluster that would end
             with this process.
     """
-    config, folder = read_config(study), Path(out)
+    config, folder = read_config(study), place(out)
     engine = Engine(config, devices=devices, backend=backend, insist=backend is not None)
     _check_independent(engine, "--detach")
     with removed_if_empty(folder), connected(scheduler) as cluster:
@@ -242,8 +242,8 @@ def _check_independent(engine: Engine, option: str) -> None:
 
 def open_study(folder: str | Path) -> StudyResult:
     """Read a study's folder, finished or not. Raises `InputError` where there is none."""
-    store = Store.open(Path(folder))
-    return StudyResult(read_config(store.folder / "study.toml"), store)
+    store = Store.open(place(folder))
+    return StudyResult(config_of(store.folder), store)
 
 
 def repair(folder: str | Path) -> tuple[int, Store]:
@@ -254,10 +254,10 @@ def repair(folder: str | Path) -> tuple[int, Store]:
     Raises:
         InputError: no study is there, its `study.toml` is damaged, or a part is of another one.
     """
-    folder = Path(folder)
+    folder = place(folder)
     if not (folder / "study.toml").exists():
         raise InputError(f"{folder}: holds no study (no study.toml); run 'jaxbl sweep STUDY.toml --out {folder}'")
-    config = read_config(folder / "study.toml")
+    config = config_of(folder)
     with locked(folder):
         _, store = begun(folder, Engine(config), insist=False)
         return store.verify(), store
