@@ -189,7 +189,8 @@ def _local(count: int) -> "Iterator[Client]":
             n_workers=count,
             threads_per_worker=max(cores() // count, 1),
             processes=True,
-            dashboard_address=None,  # pyright: ignore[reportArgumentType]
+            # any free port: with None it would be 8787, open to the network
+            dashboard_address="127.0.0.1:0",
             memory_limit=0,
             silence_logs=50,
         ) as cluster,

@@ -15,8 +15,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from .errors import InputError, NoResult
 
 if TYPE_CHECKING:
@@ -59,6 +57,9 @@ def plain(value: Any) -> Any:
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
+    # the command line needs this module before it needs NumPy
+    import numpy as np
+
     value = np.asarray(value)
     if value.ndim:
         return [plain(item) for item in value.tolist()]
@@ -102,6 +103,20 @@ def write_atomic(path: Path, content: str | bytes) -> None:
     """Write a file so that it is either there whole or not at all. Raises as :func:`written`."""
     with written(path) as draft:
         draft.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def begin_file(path: Path, content: str) -> bool:
+    """Write a file that is not there yet; returns False where another process was first. An object store decides that, if it
+    knows puts on condition; the system's files are ours (:func:`locked`). Raises as :func:`written`."""
+    if not is_remote(path):
+        write_atomic(path, content)
+        return True
+    with writing(path):
+        try:
+            path.fs.pipe_file(path.path, content.encode(), mode="create")  # pyright: ignore[reportAttributeAccessIssue]
+        except FileExistsError:
+            return False
+    return True
 
 
 def write_table(path: Path, frame: "pd.DataFrame") -> None:

@@ -20,6 +20,8 @@ from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import (
     LOG_RESULTS,
+    Busy,
+    begin_file,
     has_file,
     is_empty,
     is_remote,
@@ -169,8 +171,8 @@ class Store:
     def create(cls, folder: Path, config: Config, layout: Layout, backend: Backend, chunks: int, rows: int) -> "Store":
         """Open a folder that this study may have (:func:`claim`), or take up the one that is there; a manifest that is lost
         or damaged is written anew by what the parts say."""
-        store = None
-        if (folder / "manifest.json").exists():
+        store, there = None, (folder / "manifest.json").exists()
+        if there:
             try:
                 store = cls.open(folder)
             except InputError:
@@ -192,7 +194,10 @@ class Store:
             }
             store = cls(folder, manifest)
         # the manifest first: it is what makes the folder this study's
-        store.update()
+        if there:
+            store.update()
+        elif not begin_file(folder / "manifest.json", json_text(store.manifest)):
+            raise Busy(f"{folder}: another process began a study there just now; run the same command again")
         if not is_remote(folder):
             (folder / "points").mkdir(exist_ok=True)
         write_atomic(folder / "study.toml", config.to_toml())

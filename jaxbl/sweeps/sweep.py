@@ -12,7 +12,7 @@ import pandas as pd
 from jaxbl.cluster import Scheduler, connected
 from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
-from jaxbl.files import locked, place, removed_if_empty
+from jaxbl.files import locked, place, remove_drafts, removed_if_empty
 from jaxbl.workers import Progress
 
 from .bundles import ClusterRun, hand_over
@@ -170,6 +170,8 @@ def sweep(
                 run.all()
             # a worker may just let go of it
             with locked(folder, wait=60.0):
+                # of workers that were lost
+                remove_drafts(folder)
                 run.finish()
     return _result(run, store)
 

@@ -28,14 +28,6 @@ def study(changes=None, **tables):
     return rigid(changes, **{"axes": [listed(ALPHA, 5.0, 9.0, 20.0)], "sweep": {"seeds": 3, "chunk": 2}} | tables)
 
 
-@pytest.fixture
-def computed(monkeypatch):
-    """Indices of the chunks that are computed."""
-    indices, compute = [], Engine.run
-    monkeypatch.setattr(Engine, "run", lambda engine, chunk: indices.append(chunk.index) or compute(engine, chunk))
-    return indices
-
-
 def files(folder):
     """Every file of a folder with its content."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
