@@ -2,8 +2,8 @@
 
     python slurm.py STUDY.toml FOLDER --jobs 20 --cores 8 --memory 16GB
 
-Queue, account, time limit and network interface are Dask's own settings (`jobqueue.slurm` in ~/.config/dask/jobqueue.yaml, or
-DASK_JOBQUEUE__SLURM__QUEUE, ..__ACCOUNT, ..__WALLTIME, ..__INTERFACE in the environment).
+Queue, account, time limit and network interface are Dask's own settings: `jobqueue.slurm` in ~/.config/dask/jobqueue.yaml,
+or DASK_JOBQUEUE__SLURM__QUEUE, .._ACCOUNT, .._WALLTIME and .._INTERFACE in the environment.
 """
 
 import argparse
