@@ -143,6 +143,15 @@ def remove(path: Path) -> None:
         path.rmdir(recursive=True)
 
 
+def move(path: Path, target: Path) -> None:
+    """Give a file another name in the same folder or store."""
+    if is_remote(path):
+        target.write_bytes(path.read_bytes())
+        path.unlink()
+    else:
+        path.replace(target)
+
+
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Around what is written into a file or folder: one line if the system cannot.

@@ -4,13 +4,15 @@ import hashlib
 import json
 import os
 import platform
+import shutil
+import tempfile
 import time
 import tomllib
+import weakref
 from collections.abc import Iterator
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -29,6 +31,7 @@ from jaxbl.files import (
     listed,
     log_named_in,
     make_folder,
+    move,
     read_json,
     remove,
     remove_drafts,
@@ -164,7 +167,7 @@ class Store:
         self.keeps_manifest = keeps_manifest
         self.manifest = manifest
         self.damaged: list[str] = []
-        self._copies: TemporaryDirectory[str] | None = None
+        self._copies: Path | None = None
         self._saved = 0.0
 
     @classmethod
@@ -283,7 +286,7 @@ class Store:
             folder.mkdir(exist_ok=True)
         names = (path.name if i == 0 else f"{path.name}.{i}" for i in count())
         target = next(folder / name for name in names if not (folder / name).exists())
-        path.replace(target)
+        move(path, target)
         self.damaged.append(f"{path.relative_to(self.folder)} {why}; it is kept as {target.relative_to(self.folder)}")
 
     def write(self, index: int, frame: pd.DataFrame) -> None:
@@ -380,8 +383,9 @@ class Store:
         if not is_remote(part):
             return part
         if self._copies is None:
-            self._copies = TemporaryDirectory()
-        copy = Path(self._copies.name) / part.name
+            self._copies = Path(tempfile.mkdtemp())
+            weakref.finalize(self, shutil.rmtree, self._copies, ignore_errors=True)
+        copy = self._copies / part.name
         if not copy.exists():
             copy.write_bytes(part.read_bytes())
         return copy
