@@ -97,12 +97,16 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
         InputError: the folder holds another study or other files, or cannot be written to.
     """
     make_folder(folder)
-    found = {}
+    found, unsure = {}, False
     for other, (marker, _, _) in _COMMANDS.items():
         if (folder / marker).exists():
             try:
                 found[other] = read_json(folder / marker)
             except InputError:
+                if other == command != "sweep" and not overwrite:
+                    # its stages are studies, which say whose they are (:class:`jaxbl.gains.stages.Stages`)
+                    unsure = True
+                    continue
                 mark = _first_mark(folder) if other == "sweep" else None
                 if mark is None and not overwrite:
                     raise
@@ -115,7 +119,7 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
     same = [data.get("single_run") == identity(config, "simulate") for data in found.values()]
     if command != "simulate" and command in found:
         same.append(found[command].get("identity") == identity(config, command))
-    if all(same) and (found or is_empty(folder)):
+    if all(same) and (found or unsure or is_empty(folder)):
         if alone:
             remove_drafts(folder)
         return
