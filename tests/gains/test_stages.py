@@ -38,7 +38,7 @@ def test_a_damaged_manifest_does_not_make_the_folder_anothers(tmp_path):
     path = tmp_path / "tune" / "manifest.json"
     path.write_text(path.read_text().replace("1.5", "1.6"))
     before = path.read_bytes(), parts(tmp_path / "tune" / "coarse")
-    with pytest.raises(InputError, match="is of another study|holds another study"):
+    with pytest.raises(InputError, match=r"is of another study|holds another study"):
         stage(tmp_path, {"encoders": {"noise": 1e-3}})
     (tmp_path / "tune" / "table.parquet").unlink()
     with pytest.raises(InputError, match="holds another study"):
