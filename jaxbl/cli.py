@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .errors import InputError, NoResult
-from .files import place
+from .files import Busy, place
 from .terminal import duration, naming, running
 from .workers import start_jax
 
@@ -147,6 +147,8 @@ def sweep(
         if dry_run:
             _print_cost(study, chosen)
             return
+    run = functools.partial(run_sweep, verify_store=verify_store, scheduler=scheduler)
+    collect = functools.partial(_compute, context, config, study, out, overwrite, chosen, run, write_sweep_report)
     if detach or which is not None:
         from jaxbl.sweeps.sweep import share as run_share
         from jaxbl.sweeps.sweep import submit
@@ -162,8 +164,12 @@ def sweep(
             typer.echo(f"When all parts are there, 'jaxbl sweep {config} --out {folder}' writes the report.")
             return
         # who is last collects them
-    run = functools.partial(run_sweep, verify_store=verify_store, scheduler=scheduler)
-    _compute(context, config, study, out, overwrite, chosen, run, write_sweep_report)
+        try:
+            collect()
+        except Busy:
+            _print_status(found)
+        return
+    collect()
 
 
 def _share(text: str | None, others: dict[str, bool]) -> tuple[int, int] | None:
