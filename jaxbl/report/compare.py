@@ -68,8 +68,8 @@ def _noise(comparison: Comparison) -> str:
     if not comparison.knows_noise:
         common = "one common seed" if seeds == 1 else "no two seeds in common" if seeds == 0 else f"{seeds} common seeds"
         return (
-            f"Noise: not known ({common}); points are counted that differ by more than rounding. With sweep.seeds of 4 or more "
-            "in both studies it is known."
+            f"Noise: not known ({common}); points are counted that differ by more than rounding. With 4 or more seeds in both "
+            "studies (sweep.seeds) it is known."
         )
     how = f"differences seed by seed, {seeds} seeds" if comparison.paired else "means over seeds, none of them in common"
     return f"Noise: by {how}; of the points counted at most {100 * FALSE:g} % on average are not different."
@@ -172,13 +172,14 @@ def _wrapped(text: str, indent: str) -> str:
 
 @style()
 def draw_comparison(comparison: Comparison, config: Config) -> list[Drawn]:
-    """Where the metrics that changed most did so: a map over the last two axes, or lines over one; nothing where none did, or
-    no axis has several numbers."""
+    """Where the metrics that changed most did so: a map over the last two axes, or lines over one; nothing where none did,
+    or no axis has several numbers."""
     shown = sorted((one for one in comparison.metrics if one.count), key=lambda one: not one.better)[:_PANELS]
     if not shown:
         return []
     frames = [comparison.frame(one.metric) for one in shown]
-    axes = [p for p in comparison.axes if pd.api.types.is_numeric_dtype(frames[0][p]) and frames[0][p].nunique() > 1]
+    values = {path: frames[0][path] for path in comparison.axes}
+    axes = [path for path, one in values.items() if pd.api.types.is_numeric_dtype(one) and len(one.unique()) > 1]
     if not axes:
         return []
     size = (4.4 * len(shown), 3.8) if len(axes) > 1 else (4.2 * len(shown), 3.4)
@@ -195,7 +196,8 @@ def draw_comparison(comparison: Comparison, config: Config) -> list[Drawn]:
         names = [Patch(facecolor="white", edgecolor="black", hatch="//", label=f"within {beyond}")]
         figure.legend(handles=names, loc="outside lower center")
         what = "Factor from the first study to the second (of what is true or false, difference of the share)"
-        caption = f"{what} over {axes[-1]} and {axes[-2]}{others}; hatched: at most half of the points differ by more than {beyond}."
+        hatched = f"hatched: at most half of the points differ by more than {beyond}"
+        caption = f"{what} over {axes[-1]} and {axes[-2]}{others}; {hatched}."
     else:
         panels[-1].legend()
         caption = f"Both studies over {axes[0]}; filled points differ by more than {beyond}."
@@ -253,14 +255,19 @@ def _line(ax: Axes, config: Config, frame: pd.DataFrame, path: str) -> None:
     for i, name in enumerate(("first", "second")):
         ax.plot(x, frame[name], "-", color=COLOURS[i], label=name)
         ax.plot(x[far], frame.loc[far, name], "o", ms=4, color=COLOURS[i])
-    labels = numeric_paths(config)
-    ax.set(xlabel=with_unit(path, labels[path].unit if path in labels else ""))
+    ax.set(xlabel=_label(config, path))
     if _drawn_log(config, path, x):
         ax.set_xscale("log")
     drawn = frame[["first", "second"]].to_numpy(float)
     drawn = drawn[np.isfinite(drawn)]
     if len(drawn) and drawn.min() > 0.0 and drawn.max() / drawn.min() > 30.0:
         ax.set_yscale("log")
+
+
+def _label(config: Config, path: str) -> str:
+    """A path with its unit, where this study has it."""
+    known = numeric_paths(config)
+    return with_unit(path, known[path].unit if path in known else "")
 
 
 def _drawn_log(config: Config, path: str, values: np.ndarray) -> bool:

@@ -4,9 +4,9 @@ Points are matched by the values of their axes, runs by their seeds. A seed has 
 spread of the differences seed by seed is the noise that a change has to exceed (a paired t-test at each point). With no two
 seeds in common, means are compared by the spread over the seeds of each (Welch's t-test).
 
-Thousands of points are tested, and the same seeds make their differences depend on one another. Points are therefore named as
-different by the rule of Benjamini and Yekutieli (Annals of Statistics 29, 2001): whatever the dependence, on average at most
-:data:`FALSE` of those named are not. For that reason, too, no spread is borrowed from other points.
+Thousands of points are tested, and the same seeds make their differences depend on one another. Points are therefore named
+as different by the rule of Benjamini and Yekutieli (Annals of Statistics 29, 2001): whatever the dependence, on average at
+most :data:`FALSE` of those named are not. For that reason, too, no spread is borrowed from other points.
 """
 
 # pandas' and SciPy's own annotations are wider than what their functions return
@@ -40,8 +40,8 @@ _DECIDES_NOTHING = "title", "notes", "figures"
 
 
 class Moved(NamedTuple):
-    """How a metric moved over all common points: the factor from the first study to the second (geometric mean over points), of
-    `converged` and `finite` the difference of the share.
+    """How a metric moved over all common points: the factor from the first study to the second (geometric mean over points),
+    of `converged` and `finite` the difference of the share.
 
     Attributes:
         value: the factor or difference; NaN where no point has one.
@@ -67,14 +67,13 @@ class MetricChange:
         better: which of two values is better, `less`, `more`, or neither (empty).
         points: that have a number in both.
         only: runs that have a number in the first study alone, and in the second alone.
-        changed: points that differ by more than rounding; of `converged` and `finite`, those where the share of seeds crosses
-            one half.
-        differs: points that differ by more than noise; None where the seeds do not tell noise, and of `converged` and `finite`.
+        changed: points that differ by more than rounding; of `converged` and `finite`, where the share of seeds crosses half.
+        differs: points that differ by more than noise; None where the seeds do not tell it, and of `converged` and `finite`.
         up: how many of these (or, where noise is not known, of `changed`) have the larger value in the second study.
         size: mean over points of the logarithm of the factor, without sign, of points that differ; of `converged` and
             `finite`, of the difference. Metrics are sorted by it.
         moved: over all common points.
-        where: least and largest value among the points that differ, or the words, of each axis of which they take a part only.
+        where: least and largest value among the points that differ, or the words, of each axis that they take a part of.
         most: the point that differs most: axis values, `first` and `second` (means over seeds); None where none does.
     """
 
@@ -146,8 +145,8 @@ class Comparison:
         return plain(data)
 
     def frame(self, metric: str) -> pd.DataFrame:
-        """A metric at the common points: values of the axes, `first` and `second` (means over the seeds compared), and `differs`
-        by more than noise, or, where that is not known, than rounding."""
+        """A metric at the common points: values of the axes, `first` and `second` (means over the seeds compared), and whether
+        it `differs` by more than noise, or, where that is not known, than rounding."""
         assert self._studies is not None
         values = _Values(metric, *self._studies, self.paired)
         places = self._studies[0].places.reset_index(drop=True)
@@ -158,8 +157,8 @@ class Comparison:
 def compare(first: str | Path | StudyResult, second: str | Path | StudyResult) -> Comparison:
     """Compare two studies, or folders of such, at the points that both have; unfinished ones as far as they are.
 
-    An axis that only one of them has is compared at the value that the other's config gives this number. Memory grows with the
-    number of runs: some 100 bytes a run.
+    An axis that only one of them has is compared at the value that the other's config gives this number. Memory grows with
+    the number of runs.
 
     Raises:
         InputError: a folder holds no study, or a part of it is damaged.
@@ -231,7 +230,7 @@ def _different(first: dict[str, Any], second: dict[str, Any]) -> dict[str, tuple
 class _Side:
     """A study's rows at the common points.
 
-    `index` are the positions of rows, `(points, seeds)`, -1 where there is none; `places` the values of the axes at the points.
+    `index` are the positions of rows, `(points, seeds)`, -1 where there is none; `places` the points' values of the axes.
     """
 
     study: StudyResult
@@ -248,8 +247,8 @@ class _Side:
 
 
 def _matched(studies: list[StudyResult], paths: list[str]) -> tuple[tuple[_Side, _Side], tuple[int, int, int], int, bool]:
-    """Both studies' rows at common points; points in both, in the first and in the second alone; common seeds; whether pairs of
-    them are compared."""
+    """Both studies' rows at common points; points in both, in the first and in the second alone; common seeds; whether pairs
+    of them are compared."""
     frames = [_keys(study, paths) for study in studies]
     codes = [np.zeros(len(frame), np.int64) for frame in frames]
     for path in paths:

@@ -384,9 +384,8 @@ class Store:
             yield frame
 
     def dataset(self, check: bool) -> "Dataset":
-        """Rows of the chunks that are there as a dataset of pyarrow, which reads what is asked of it. Each page that it reads
-        is compared with its checksum by pyarrow; with `check`, each file with that in the manifest first, else each part's
-        mark.
+        """Rows of the chunks that are there as a dataset of pyarrow, which reads what is asked of it, and compares each page
+        with its checksum. With `check` each file is first compared with that in the manifest, else each part's mark read.
 
         Raises:
             InputError: a part is damaged, or not of this study.

@@ -80,7 +80,7 @@ class StudyResult:
 
         Args:
             columns: names; left out, all.
-            filters: which rows, as of `pandas.read_parquet`: `[("encoders.noise", "<", 1e-3)]`, tuples that all have to hold,
+            filters: which rows, as of `pandas.read_parquet`: tuples that all have to hold, `[("encoders.noise", "<", 1e-3)]`,
                 or lists of such, of which one has to.
 
         Raises:
@@ -289,8 +289,8 @@ def _check_independent(engine: Engine, option: str) -> None:
 
 
 def open_study(folder: str | Path) -> StudyResult:
-    """A study's folder, finished or not: its config, and its rows as a frame, a dataset of pyarrow or of xarray, each read on
-    first use. Raises `InputError` where there is none."""
+    """A study's folder, finished or not: its config, and its rows as a frame, a dataset of pyarrow or of xarray, each read
+    on first use. Raises `InputError` where there is none."""
     store = Store.open(place(folder))
     return StudyResult(config_of(store.folder), store)
 
