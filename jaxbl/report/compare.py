@@ -68,8 +68,8 @@ def _noise(comparison: Comparison) -> str:
     if not comparison.knows_noise:
         common = "one common seed" if seeds == 1 else "no two seeds in common" if seeds == 0 else f"{seeds} common seeds"
         return (
-            f"Noise: not known ({common}); points are counted that differ by more than rounding. With 4 or more seeds in both "
-            "studies (sweep.seeds) it is known."
+            f"Noise: not known ({common}); points are counted that differ by more than rounding. With 4 or more seeds in "
+            "both studies (sweep.seeds) it is known."
         )
     how = f"differences seed by seed, {seeds} seeds" if comparison.paired else "means over seeds, none of them in common"
     return f"Noise: by {how}; of the points counted at most {100 * FALSE:g} % on average are not different."
@@ -228,11 +228,7 @@ def _map(figure: Figure, ax: Axes, config: Config, one: MetricChange, frame: pd.
         far = share.to_numpy() > 0.5
         ax.plot(at.loc[~far, x], at.loc[~far, y], ".", ms=3, color=MISSING)
         ax.scatter(at.loc[far, x], at.loc[far, y], c=table.to_numpy(float)[far], cmap=colours, norm=norm, s=14)
-    labels = numeric_paths(config)
-    ax.set(
-        xlabel=with_unit(x, labels[x].unit if x in labels else ""),
-        ylabel=with_unit(y, labels[y].unit if y in labels else ""),
-    )
+    ax.set(xlabel=_label(config, x), ylabel=_label(config, y))
     ax.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
     figure.colorbar(ScalarMappable(norm, colours), ax=ax, pad=0.02, aspect=28)
 

@@ -67,7 +67,7 @@ class MetricChange:
         better: which of two values is better, `less`, `more`, or neither (empty).
         points: that have a number in both.
         only: runs that have a number in the first study alone, and in the second alone.
-        changed: points that differ by more than rounding; of `converged` and `finite`, where the share of seeds crosses half.
+        changed: points that differ by more than rounding; of `converged` and `finite`, where the share crosses half.
         differs: points that differ by more than noise; None where the seeds do not tell it, and of `converged` and `finite`.
         up: how many of these (or, where noise is not known, of `changed`) have the larger value in the second study.
         size: mean over points of the logarithm of the factor, without sign, of points that differ; of `converged` and
@@ -145,8 +145,8 @@ class Comparison:
         return plain(data)
 
     def frame(self, metric: str) -> pd.DataFrame:
-        """A metric at the common points: values of the axes, `first` and `second` (means over the seeds compared), and whether
-        it `differs` by more than noise, or, where that is not known, than rounding."""
+        """A metric at the common points: values of the axes, `first` and `second` (means over the seeds compared), and
+        whether it `differs` by more than noise, or, where that is not known, than rounding."""
         assert self._studies is not None
         values = _Values(metric, *self._studies, self.paired)
         places = self._studies[0].places.reset_index(drop=True)

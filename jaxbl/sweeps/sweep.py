@@ -80,8 +80,8 @@ class StudyResult:
 
         Args:
             columns: names; left out, all.
-            filters: which rows, as of `pandas.read_parquet`: tuples that all have to hold, `[("encoders.noise", "<", 1e-3)]`,
-                or lists of such, of which one has to.
+            filters: which rows, as of `pandas.read_parquet`: tuples such as `("encoders.noise", "<", 1e-3)` that all
+                have to hold, or lists of such, of which one has to.
 
         Raises:
             InputError: a part is damaged, or not of this study.
