@@ -548,6 +548,33 @@ def plot(
 
 
 @app.command()
+def compare(
+    first: Annotated[Path, typer.Argument(metavar="DIR1", parser=place, help="folder of a sweep", show_default=False)],
+    second: Annotated[Path, typer.Argument(metavar="DIR2", parser=place, help="of another one", show_default=False)],
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="folder for the results [default: results/compare-DIR1-DIR2]")
+    ] = None,
+) -> None:
+    """Compare two sweeps: what changed in the config, and where metrics differ by more than noise."""
+    start_jax()
+    from jaxbl.sweeps.compare import compare as run_compare
+    from jaxbl.sweeps.sweep import open_study
+
+    from .files import is_empty, make_folder, removed_if_empty
+    from .report.compare import write_comparison
+
+    studies = open_study(first), open_study(second)
+    folder = out if out is not None else Path("results") / f"compare-{first.name}-{second.name}"
+    make_folder(folder)
+    if not is_empty(folder) and not (folder / "comparison.json").exists():
+        raise InputError(f"{folder}: is not empty and holds no comparison; choose another folder with --out")
+    with removed_if_empty(folder):
+        lines = write_comparison(run_compare(*studies), studies[0].config, folder)
+    for line in [*lines, "", str(folder / "comparison.json")]:
+        typer.echo(line)
+
+
+@app.command()
 def repair(folder: FolderArgument) -> None:
     """Check a sweep's folder: keep damaged parts aside, and write a manifest that is lost or damaged anew."""
     start_jax()
