@@ -33,14 +33,10 @@ app = typer.Typer(
 
 ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML study", show_default=False)]
 OutOption = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="DIR", parser=place, help="folder for the results, or s3://BUCKET/FOLDER [default: results/<config name>]"
-    ),
+    str | None,
+    typer.Option(metavar="DIR", help="folder for the results, or s3://BUCKET/FOLDER [default: results/<config name>]"),
 ]
-FolderArgument = Annotated[
-    Path, typer.Argument(metavar="DIR", parser=place, help="folder of a sweep, verify or tune", show_default=False)
-]
+FolderArgument = Annotated[str, typer.Argument(metavar="DIR", help="folder of a sweep, verify or tune", show_default=False)]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="remove the results of another study from the folder")]
 BackendOption = Annotated[
     str | None,
@@ -285,7 +281,7 @@ def _compute(
     context: typer.Context,
     config: Path,
     study: "Config",
-    out: Path | None,
+    out: str | None,
     overwrite: bool,
     backend: "Backend | None",
     run: Callable[..., Any],
@@ -542,13 +538,40 @@ def plot(
     from .config import read_config
     from .report.sweep import write_sweep_report
 
-    result = open_study(folder)
+    where, result = place(folder), open_study(folder)
     if config is not None:
         study = read_config(config)
-        if identity(study) != Store.open(folder).manifest["identity"]:
+        if identity(study) != Store.open(where).manifest["identity"]:
             raise InputError(f"{config}: is not the study in {folder}; only title, notes and figures may differ")
         result = dataclasses.replace(result, config=study)
-    _print(write_sweep_report(result, folder), folder)
+    _print(write_sweep_report(result, where), where)
+
+
+@app.command()
+def compare(
+    first: Annotated[Path, typer.Argument(metavar="DIR1", parser=place, help="folder of a sweep", show_default=False)],
+    second: Annotated[Path, typer.Argument(metavar="DIR2", parser=place, help="of another one", show_default=False)],
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="folder for the results [default: results/compare-DIR1-DIR2]")
+    ] = None,
+) -> None:
+    """Compare two sweeps: what changed in the config, and where metrics differ by more than noise."""
+    start_jax()
+    from jaxbl.sweeps.compare import compare as run_compare
+    from jaxbl.sweeps.sweep import open_study
+
+    from .files import is_empty, make_folder, removed_if_empty
+    from .report.compare import write_comparison
+
+    studies = open_study(first), open_study(second)
+    folder = out if out is not None else Path("results") / f"compare-{first.name}-{second.name}"
+    make_folder(folder)
+    if not is_empty(folder) and not (folder / "comparison.json").exists():
+        raise InputError(f"{folder}: is not empty and holds no comparison; choose another folder with --out")
+    with removed_if_empty(folder):
+        lines = write_comparison(run_compare(*studies), studies[0].config, folder)
+    for line in [*lines, "", str(folder / "comparison.json")]:
+        typer.echo(line)
 
 
 @app.command()
@@ -563,7 +586,7 @@ def repair(folder: FolderArgument) -> None:
     parts = store.manifest["parts"]
     typer.echo(f"{whole} of {parts} parts are whole.")
     if whole < parts:
-        typer.echo(f"'jaxbl sweep {folder / 'study.toml'} --out {folder}' computes the others.")
+        typer.echo(f"'jaxbl sweep STUDY.toml --out {folder}' with the same study computes the others.")
 
 
 @app.command()
@@ -593,8 +616,8 @@ def bench(
         typer.echo(line)
 
 
-def _folder(config: Path, out: Path | None) -> Path:
-    return out if out is not None else Path("results") / config.stem
+def _folder(config: Path, out: str | Path | None) -> Path:
+    return place(out) if out is not None else Path("results") / config.stem
 
 
 def _print(lines: list[str], folder: Path) -> None:

@@ -25,7 +25,7 @@ from jaxbl.config import Config, FigureTable, is_boolean, numeric_paths
 from jaxbl.errors import InputError
 from jaxbl.gains.accuracy_laws import Law, accuracy_laws, check_selection, fixed_values, selected
 from jaxbl.observer.conditions import CONDITIONS, Condition
-from jaxbl.sweeps.metrics import metric_of
+from jaxbl.sweeps.metrics import is_magnitude, metric_of
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 from jaxbl.validation import nearest
@@ -127,13 +127,8 @@ def _text(value: Any) -> str:
 def _value_label(value: str) -> str:
     side, _, _ = value.rpartition(".")
     about = metric_of(value)
-    label = f"|{about.label}|" if _is_magnitude(value) else about.label
+    label = f"|{about.label}|" if is_magnitude(value) else about.label
     return with_unit(f"{side}: {label}" if side else label, about.unit)
-
-
-def _is_magnitude(value: str) -> bool:
-    """Signed relative errors are drawn by their size: a median over seeds must not cancel them."""
-    return value.endswith("_error")
 
 
 def _reduce(frame: pd.DataFrame, keys: list[str], value: str) -> pd.Series:
@@ -189,7 +184,7 @@ def cell_edges(centres: np.ndarray, log: bool) -> np.ndarray:
     return np.exp(edges) if log else edges
 
 
-def _is_log(config: Config, path: str, values: np.ndarray) -> bool:
+def is_log(config: Config, path: str, values: np.ndarray) -> bool:
     """Whether an axis is drawn logarithmically: as declared, or listed values that grow geometrically."""
     axis = next(a for a in config.axes if a.path == path)
     if axis.values is None:
@@ -303,7 +298,7 @@ def _map_panel(
         xs, ys, grid = _dense(table, filling)
     else:
         xs, ys = (np.unique(part[path].to_numpy(float)) for path in (spec.x, spec.y))
-    logs = [_is_log(config, path, values) for path, values in ((spec.x, xs), (spec.y, ys))]
+    logs = [is_log(config, path, values) for path, values in ((spec.x, xs), (spec.y, ys))]
     ax.set(xscale="log" if logs[0] else "linear", yscale="log" if logs[1] else "linear")
     edges = cell_edges(xs, logs[0]), cell_edges(ys, logs[1])
     handles = []
@@ -342,8 +337,9 @@ def hatch_failures(
     edges: tuple[np.ndarray, np.ndarray],
     share: np.ndarray,
     label: str,
+    colour: Any = _HATCH,
 ) -> list[Patch]:
-    """Hatch the cells of a map in which less than half of the runs pass. Returns the legend's handles.
+    """Hatch the cells of a map in which at most half of the runs pass. Returns the legend's handles.
 
     `centres` and `edges` are those of the cells along x and y, `share` of the runs that pass is `(rows, columns)`.
     """
@@ -353,7 +349,7 @@ def hatch_failures(
     share = np.pad(share, 1, mode="edge")
     xs, ys = (np.concatenate([e[:1], c, e[-1:]]) for c, e in zip(centres, edges, strict=True))
     hatched = ax.contourf(xs, ys, share, levels=[-1.0, 0.5], colors="none", hatches=["//"])
-    hatched.set(edgecolor=_HATCH, linewidth=0.0)
+    hatched.set(edgecolor=colour, linewidth=0.0)
     if share.max() >= 0.5:
         lines = ax.contour(xs, ys, share, levels=[0.5], colors="white", linewidths=1.8)
         lines.set_path_effects([path_effects.Stroke(linewidth=3.2, foreground="black"), path_effects.Normal()])
@@ -365,7 +361,7 @@ def _shown(part: pd.DataFrame, value: str) -> pd.Series:
     values = part[value].astype(float)
     if value == "finite":
         return values
-    values = values.abs() if _is_magnitude(value) else values
+    values = values.abs() if is_magnitude(value) else values
     return values.where(part["finite"].astype(bool)).replace([np.inf, -np.inf], np.nan)
 
 
@@ -425,7 +421,7 @@ def _lines(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
                 band = "; band: least to largest"
                 ax.fill_between(middle.index, by_x.min(), by_x.max(), color=colour, alpha=0.18, linewidth=0)
         xs = np.unique(part[spec.x].to_numpy(float))
-        log = _is_log(config, spec.x, xs)
+        log = is_log(config, spec.x, xs)
         if log:
             ax.set_xscale("log")
         if isinstance(color_norm(shown.to_numpy(float), spec.scale), LogNorm):

@@ -34,6 +34,8 @@ class Metric(abc.ABC):
     label: ClassVar[str]
     """Short name for axes of figures; what it means is in `doc`."""
     doc: ClassVar[str]
+    better: ClassVar[str] = ""
+    """Which is better of two values: `less` or `more`, or neither."""
 
     @classmethod
     def of(cls, name: str, unit: str, label: str, doc: str, **rest: Any) -> type[Self]:
@@ -170,6 +172,8 @@ class Peak(SignalMetric):
 class IdentificationError(RunMetric):
     """Relative error of an identified parameter that the law reports (`AbstractTransmission.errors`)."""
 
+    better = "less"
+
     def applies(self, experiment):
         return experiment.identifier is not None and self.name in getattr(experiment.transmission, "errors", ())
 
@@ -185,6 +189,7 @@ class Converged(RunMetric):
     name = "converged"
     label = "converged"
     doc = "position and velocity errors stay within tolerance over the last quarter"
+    better = "more"
     carry = "last_outside"
 
     def init(self, zero):
@@ -204,6 +209,7 @@ class ConvergenceTime(Converged):
     unit = "s"
     label = "convergence time"
     doc = "time from which both errors stay within tolerance; NaN where not converged"
+    better = "less"
 
     def result(self, carry, end):
         entered = jnp.where(carry < 0.0, 0.0, carry + end.experiment.run.sample_period)
@@ -217,6 +223,7 @@ class Chatter(RunMetric):
     unit = "rad/s"
     label = "chatter of the velocity"
     doc = "rms sample-to-sample change of the velocity error, divided by √2"
+    better = "less"
 
     def init(self, zero):
         return zero, zero
@@ -271,11 +278,14 @@ for _metric in (
         "longest convergence time that a disturbance within f_plus can cause; inf where ρ ≥ 1",
         judge=_time(conditions.convergence_time_worst),
     ),
-    Rms.of("position_rmse", "rad", "position error, rms", "rms position error", signal=lambda _, at: at.position_error),
-    Rms.of("velocity_rmse", "rad/s", "velocity error, rms", "rms velocity error", signal=lambda _, at: at.velocity_error),
+    Rms.of("position_rmse", "rad", "position error, rms", "rms position error", better="less",
+           signal=lambda _, at: at.position_error),
+    Rms.of("velocity_rmse", "rad/s", "velocity error, rms", "rms velocity error", better="less",
+           signal=lambda _, at: at.velocity_error),
     Rms.of(
         "torque_rmse", "N m", "torque error, rms",
         "rms error of the transmitted torque from this side's equivalent control",
+        better="less",
         signal=lambda _, at: at.torque_error,
     ),
     Rms.of(
@@ -426,13 +436,18 @@ def _judged(lambda_: Array, alpha: Array, position_error: Array, velocity_error:
     return {name: jnp.where(jnp.isnan(f_plus), jnp.nan, value) for name, value in out.items()}
 
 
-_FINITE = Metric.of("finite", "", "finite", "no number of the lane overflowed")
+_FINITE = Metric.of("finite", "", "finite", "no number of the lane overflowed", better="more")
 """The one column that is not of a side."""
 
 
 def metric_of(column: str) -> type[Metric]:
     """The metric of a column such as `motor.velocity_rmse`."""
     return _FINITE if column == "finite" else SIDE_METRICS[column.partition(".")[2]]
+
+
+def is_magnitude(column: str) -> bool:
+    """Whether a metric counts by its size: a median or mean of signed relative errors must not cancel them."""
+    return column.endswith("_error")
 
 
 def metric_columns(experiment: Experiment) -> list[str]:

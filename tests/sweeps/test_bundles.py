@@ -2,6 +2,7 @@
 
 import time
 
+import jax
 import pandas as pd
 import pytest
 from distributed import Client, LocalCluster
@@ -16,17 +17,6 @@ from jaxbl.sweeps.bundles import Bundle, _size, compute
 from jaxbl.sweeps.programs import Layout
 from jaxbl.sweeps.status import status
 from jaxbl.sweeps.sweep import submit, sweep
-
-
-@pytest.fixture(scope="module")
-def client():
-    """Two workers of this process."""
-    with (
-        LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0") as workers,
-        Client(workers, set_as_default=False) as connection,
-    ):
-        yield connection
-
 
 _submit = Cluster._submit
 
@@ -55,6 +45,19 @@ def test_the_same_table_by_workers_of_which_each_chunk_is_computed_once(tmp_path
     assert len(sweep(thirty(), tmp_path / "cluster", scheduler=client).damaged) == 1
     assert parts(tmp_path / "cluster") == parts(tmp_path / "alone")
     assert not list(tmp_path.rglob(".*"))
+
+
+@pytest.mark.slow
+def test_processes_of_this_machine_give_the_same_table(tmp_path):
+    sweep(thirty(), tmp_path / "alone")
+    other = thirty(sweep={"seeds": 2, "chunk": 256})
+    whole = sweep(other, tmp_path / "whole", devices=jax.devices()[:1]).frame
+    found = sweep(thirty(), tmp_path / "study", scheduler="local:2")
+    assert parts(tmp_path / "study") == parts(tmp_path / "alone")
+    # in other chunks, on one device
+    points = [ALPHA, LAMBDA, "seed"]
+    frames = [frame.sort_values(points, ignore_index=True) for frame in (found.frame, whole)]
+    pd.testing.assert_frame_equal(*frames, check_exact=True)
 
 
 def test_a_refined_study_on_a_cluster(tmp_path, client):
