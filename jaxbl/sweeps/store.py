@@ -314,7 +314,8 @@ class Store:
 
     def existing(self) -> list[Path]:
         """Files of parts, whole or damaged."""
-        return listed(self.folder / "points", "part-*.parquet")
+        # a sixth digit comes after five
+        return sorted(listed(self.folder / "points", "part-*.parquet"), key=lambda path: (len(path.name), path.name))
 
     def read_part(self, index: int, labels: dict[str, np.ndarray], columns: list[str]) -> pd.DataFrame | None:
         """Some columns of a chunk, or None where it holds other rows than those of `labels`."""
