@@ -3,7 +3,8 @@
     python benchmarks/large_study.py [--points 1e4 1e5 1e6] [--chunk N]
 
 The process is that of the command, with clocks around the functions that compute chunks (and make frames of them), store,
-schedule and report. Times are processor time of all threads: other work on the machine does not count, nor does waiting for the disk.
+schedule and report. Times are processor time of all threads: other work on the machine does not count, nor does waiting for
+the disk.
 """
 
 import argparse

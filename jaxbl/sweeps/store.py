@@ -4,14 +4,16 @@ import hashlib
 import json
 import os
 import platform
+import shutil
 import time
 import tomllib
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -177,7 +179,7 @@ class Store:
         self.keeps_manifest = keeps_manifest
         self.manifest = manifest
         self.damaged: list[str] = []
-        self._copies: TemporaryDirectory[str] | None = None
+        self._copies: Path | None = None
         self._saved = 0.0
 
     @classmethod
@@ -414,8 +416,9 @@ class Store:
         if not is_remote(part):
             return part
         if self._copies is None:
-            self._copies = TemporaryDirectory()
-        copy = Path(self._copies.name) / part.name
+            self._copies = Path(mkdtemp())
+            weakref.finalize(self, shutil.rmtree, self._copies, ignore_errors=True)
+        copy = self._copies / part.name
         if not copy.exists():
             copy.write_bytes(part.read_bytes())
         return copy
