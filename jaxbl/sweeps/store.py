@@ -5,7 +5,6 @@ import json
 import os
 import platform
 import shutil
-import tempfile
 import time
 import tomllib
 import weakref
@@ -14,6 +13,7 @@ from contextlib import contextmanager
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -23,8 +23,6 @@ from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import (
     LOG_RESULTS,
-    Busy,
-    begin_file,
     has_file,
     is_empty,
     is_remote,
@@ -32,7 +30,6 @@ from jaxbl.files import (
     listed,
     log_named_in,
     make_folder,
-    move,
     read_json,
     remove,
     remove_drafts,
@@ -101,16 +98,12 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
         InputError: the folder holds another study or other files, or cannot be written to.
     """
     make_folder(folder)
-    found, unsure = {}, False
+    found = {}
     for other, (marker, _, _) in _COMMANDS.items():
         if (folder / marker).exists():
             try:
                 found[other] = read_json(folder / marker)
             except InputError:
-                if other == command != "sweep" and not overwrite:
-                    # its stages are studies, which say whose they are (:class:`jaxbl.gains.stages.Stages`)
-                    unsure = True
-                    continue
                 mark = _first_mark(folder) if other == "sweep" else None
                 if mark is None and not overwrite:
                     raise
@@ -123,7 +116,7 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
     same = [data.get("single_run") == identity(config, "simulate") for data in found.values()]
     if command != "simulate" and command in found:
         same.append(found[command].get("identity") == identity(config, command))
-    if all(same) and (found or unsure or is_empty(folder)):
+    if all(same) and (found or is_empty(folder)):
         if alone:
             remove_drafts(folder)
         return
@@ -193,8 +186,8 @@ class Store:
     def create(cls, folder: Path, config: Config, layout: Layout, backend: Backend, chunks: int, rows: int) -> "Store":
         """Open a folder that this study may have (:func:`claim`), or take up the one that is there; a manifest that is lost
         or damaged is written anew by what the parts say."""
-        store, there = None, (folder / "manifest.json").exists()
-        if there:
+        store = None
+        if (folder / "manifest.json").exists():
             try:
                 store = cls.open(folder)
             except InputError:
@@ -216,10 +209,7 @@ class Store:
             }
             store = cls(folder, manifest)
         # the manifest first: it is what makes the folder this study's
-        if there:
-            store.update()
-        elif not begin_file(folder / "manifest.json", json_text(store.manifest)):
-            raise Busy(f"{folder}: another process began a study there just now; run the same command again")
+        store.update()
         if not is_remote(folder):
             (folder / "points").mkdir(exist_ok=True)
         write_atomic(folder / "study.toml", config.to_toml())
@@ -309,7 +299,7 @@ class Store:
             folder.mkdir(exist_ok=True)
         names = (path.name if i == 0 else f"{path.name}.{i}" for i in count())
         target = next(folder / name for name in names if not (folder / name).exists())
-        move(path, target)
+        path.replace(target)
         self.damaged.append(f"{path.relative_to(self.folder)} {why}; it is kept as {target.relative_to(self.folder)}")
 
     def write(self, index: int, frame: pd.DataFrame) -> None:
@@ -326,7 +316,8 @@ class Store:
 
     def existing(self) -> list[Path]:
         """Files of parts, whole or damaged."""
-        return listed(self.folder / "points", "part-*.parquet")
+        # a sixth digit comes after five
+        return sorted(listed(self.folder / "points", "part-*.parquet"), key=lambda path: (len(path.name), path.name))
 
     def read_part(self, index: int, labels: dict[str, np.ndarray], columns: list[str]) -> pd.DataFrame | None:
         """Some columns of a chunk, or None where it holds other rows than those of `labels`."""
@@ -425,7 +416,7 @@ class Store:
         if not is_remote(part):
             return part
         if self._copies is None:
-            self._copies = Path(tempfile.mkdtemp())
+            self._copies = Path(mkdtemp())
             weakref.finalize(self, shutil.rmtree, self._copies, ignore_errors=True)
         copy = self._copies / part.name
         if not copy.exists():
