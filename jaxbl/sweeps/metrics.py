@@ -408,14 +408,26 @@ def with_conditions(figures: Mapping[str, Any], gains: dict[str, ObserverGains])
     """
     found = {name: np.asarray(value) for name, value in figures.items()}
     f_plus = np.stack([found[f"{side}.f_plus"] for side in gains])
-    columns = [
-        np.stack([np.broadcast_to(np.asarray(x, f_plus.dtype), f_plus.shape[1:]) for x in given])
-        for given in zip(*gains.values(), strict=True)
-    ]
-    judged = in_pieces(_judged, [one.ravel() for one in (*columns, f_plus)])
-    for name, value in judged.items():
-        found |= {f"{side}.{name}": one for side, one in zip(gains, value.reshape(f_plus.shape), strict=True)}
+    columns = [[np.asarray(x, f_plus.dtype) for x in given] for given in zip(*gains.values(), strict=True)]
+    for side, *given in zip(gains, *columns, f_plus, strict=True):
+        # gains and f_plus of all seeds and points, and which of those that differ each is
+        rows = np.stack([np.broadcast_to(one, f_plus.shape[1:]).ravel() for one in given], axis=1)
+        different, which = _different(rows)
+        judged = in_pieces(_judged, list(different.T))
+        found |= {f"{side}.{name}": value[which].reshape(f_plus.shape[1:]) for name, value in judged.items()}
     return found
+
+
+def _different(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows that differ in a bit, and the place among them of each: lanes share what their axes leave alone."""
+    whole = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.shape[1] * rows.itemsize)))[:, 0]
+    _, first, which = np.unique(whole, return_index=True, return_inverse=True)
+    return rows[first], which
+
+
+def compile_conditions(dtype: str) -> None:
+    """Compile what :func:`with_conditions` computes, once for all studies of a precision."""
+    in_pieces(_judged, [np.ones(1, dtype)] * (len(ObserverGains._fields) + 1))
 
 
 @jax.jit
