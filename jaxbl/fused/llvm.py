@@ -74,11 +74,9 @@ class Argument(NamedTuple):
     dtype: np.dtype
     holds: str
 
-    def check(self, array: np.ndarray, steps: int, lanes: int, blocks: int) -> None:
+    def check(self, array: np.ndarray, counts: dict[str, int]) -> None:
         """Refuse an array of wrong type or length, or with gaps, by `ValueError`."""
-        count = {
-            "one": 1, "lanes": lanes, "samples": steps, "blocks": blocks, "both": steps * lanes, "marks": blocks * lanes
-        }[self.holds]  # fmt: skip
+        count = counts[self.holds]
         if array.dtype != self.dtype or array.size != count or not array.flags.c_contiguous:
             wrong = f"not {array.size} of {array.dtype}"
             raise ValueError(f"{self.name} of a loop needs {count} contiguous numbers of type {self.dtype}, {wrong}")
@@ -203,7 +201,10 @@ class Arrays:
         block: int | None = None,
     ):
         self.steps, self.lanes, self.block = steps, lanes, block or max(steps, 1)
-        sizes = steps, lanes, -(-steps // self.block)
+        blocks = -(-steps // self.block)
+        counts = {
+            "one": 1, "lanes": lanes, "samples": steps, "blocks": blocks, "both": steps * lanes, "marks": blocks * lanes
+        }  # fmt: skip
         count = sum(len(one.array) if isinstance(one, Rows) else 1 for one in arrays)
         if count != len(signature):
             raise ValueError(f"a loop needs {len(signature)} arrays, not {count}")
@@ -211,11 +212,12 @@ class Arrays:
         for one in arrays:
             each = signature[len(addresses) : len(addresses) + (len(one.array) if isinstance(one, Rows) else 1)]
             if not isinstance(one, Rows):
-                each[0].check(one, *sizes)
+                each[0].check(one, counts)
                 addresses.append(_address(one))
             elif each:
-                each[0].check(one.array[:1], *sizes)
-                other = next((two for two in each if two[1:] != each[0][1:]), None)
+                each[0].check(one.array[:1], counts)
+                _, dtype, holds = each[0]
+                other = next((two for two in each if two.holds != holds or two.dtype != dtype), None)
                 if other is not None or not one.array.flags.c_contiguous:
                     raise ValueError(f"{(other or each[0]).name} of a loop is no row of one array")
                 begin, stride = _address(one.array), one.array.strides[0]

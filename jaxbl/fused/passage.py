@@ -23,6 +23,8 @@ _KEPT = 2**24
 """Bytes of what lanes share, of some seeds, that stay for the next lanes."""
 _WORTH = 0.875
 """Share of lanes down to which those that are done stay: to move the others costs as much as some samples."""
+_SHARE = 2**17
+"""Samples of lanes, some 0.1 ms, that are worth a thread."""
 _CALL = 2**20
 """Samples of lanes that a call of the loop takes, some 1 ms: after it, lanes that are done leave."""
 
@@ -163,22 +165,30 @@ class HostPassage(Passage):
         dtype = np.dtype(jnp.result_type(experiment.run.sample_period))
         self._together = vector_lanes(dtype)
         super().__init__(experiment, reducers, paths, lanes, self._together)
-        # a thread a share: its stretches come one after the other, whatever the others do
-        shares = min(threads, self._filled // self._together)
-        self._threads = [ThreadPoolExecutor(1) for _ in range(shares)]
         self._loop = Loop(self._body, self._dtype, values=len(paths), carry=self.carried, around=self._around)
+        self._of = {
+            name: [one.dtype for one in self._loop.signature if one.name.startswith(name)]
+            for name in ("input at the end", "mark of a block", "result")
+        }
+        # a thread a share: its stretches come one after the other, whatever the others do
+        shares = min(threads, self._filled // self._together, max(self._filled * self._steps // _SHARE, 1))
+        self._threads = [ThreadPoolExecutor(1) for _ in range(shares)]
 
     def _march(self, given, stretches):
         # dealt in turns: lanes that are done together, as neighbours often are, are then missed by all threads
         count = len(self._threads)
         rows = np.stack(given) if given else np.empty((0, self._filled), self._dtype)
         dealt = [rows.reshape(len(given), -1, self._together)[:, i::count].reshape(len(given), -1) for i in range(count)]
-        shares = [_Share(self._loop, np.ascontiguousarray(values), self._length) for values in dealt]
+        shares = [self._share(np.ascontiguousarray(values)) for values in dealt]
         running: deque[list[Future[None]]] = deque()
         stretch = None
         for stretch in stretches:
             # what lanes share is computed meanwhile, a stretch or two ahead of them
             own = int(stretch.ends is not None)
+            if not running:
+                # threads do nothing then but compute: they would wait for the interpreter
+                for share in shares:
+                    share.prepare(stretch)
             running.append([t.submit(s.run, stretch) for t, s in zip(self._threads[own:], shares[own:], strict=True)])
             while len(running) > 2:
                 _wait(running.popleft())
@@ -190,11 +200,16 @@ class HostPassage(Passage):
                 _wait(running.popleft())
         assert stretch is not None
         parts = [share.results() for share in shares]
+        if count == 1:
+            return parts[0], stretch.figures
         found = [np.empty(self._filled, column.dtype) for column in parts[0]]
         for i, part in enumerate(parts):
             for whole, own in zip(found, part, strict=True):
                 whole.reshape(-1, self._together)[i::count] = own.reshape(-1, self._together)
         return found, stretch.figures
+
+    def _share(self, values: np.ndarray) -> "_Share":
+        return _Share(self._loop, self._of, values, np.empty((self.carried, values.shape[1]), self._dtype), self._length)
 
 
 def _wait(futures: Iterable[Future[None]]) -> None:
@@ -206,24 +221,19 @@ class _Share:
     """Lanes of one thread on their way, with `values` `(paths, lanes)`. Those that are done leave, with the carry that they
     have then, and the others move together."""
 
-    def __init__(self, loop: Loop, values: np.ndarray, block: int):
-        self._loop, self._block, self._begun = loop, block, False
-        self._of = {
-            name: [one.dtype for one in loop.signature if one.name.startswith(name)]
-            for name in ("carry", "input at the end", "mark of a block", "result")
-        }
+    def __init__(self, loop: Loop, of: dict[str, list[np.dtype]], values: np.ndarray, carry: np.ndarray, block: int):
+        self._loop, self._of, self._block, self._begun = loop, of, block, False
         # of the lanes that are computed: their places, behind which others only fill up
-        self._lanes, self._values = np.arange(values.shape[1]), values
-        self._carry = np.empty((len(self._of["carry"]), values.shape[1]), values.dtype)
+        self._lanes, self._values, self._carry = np.arange(values.shape[1]), values, carry
+        self._given: tuple[list[np.ndarray], list[np.ndarray], Arrays] | None = None
         self._left: list[tuple[np.ndarray, ...]] = []
         self._found: list[tuple[np.ndarray, list[np.ndarray]]] = []
 
     def run(self, stretch: Stretch) -> None:
         """Take lanes through a stretch, in calls of so many blocks as are worth one."""
-        at, arrays = 0, None
+        at = 0
         while at < stretch.length and len(self._lanes):
-            if arrays is None:
-                marks, results, arrays = self._arrays(stretch)
+            marks, results, arrays = self._given or self.prepare(stretch)
             size = self._values.shape[1]
             upto = min(at + max(_CALL // (size * self._block), 1) * self._block, stretch.length)
             ends = stretch.ends is not None and upto == stretch.length
@@ -231,14 +241,26 @@ class _Share:
             self._begun, at = True, upto
             if ends:
                 self._found.append((self._lanes, results))
-            elif len(marks) and self._leave(marks[0][(upto - 1) // self._block]):
-                arrays = None
+            elif len(marks):
+                self._leave(marks[0][(upto - 1) // self._block])
+        self._given = None
         if stretch.ends is not None and self._left:
             self._lanes, self._values, self._carry = (np.concatenate(one, axis=-1) for one in zip(*self._left, strict=True))
             self._move(np.arange(len(self._lanes)))
-            _, results, arrays = self._arrays(stretch)
+            _, results, arrays = self.prepare(stretch)
             self._loop(arrays, 0, 0, self._values.shape[1], block=self._block, ends=True)
             self._found.append((self._lanes, results))
+
+    def prepare(self, stretch: Stretch) -> tuple[list[np.ndarray], list[np.ndarray], Arrays]:
+        """Marks and results of a stretch, and all that the loop is given."""
+        size = self._values.shape[1]
+        marks = [np.empty((-(-stretch.length // self._block), size), dtype) for dtype in self._of["mark of a block"]]
+        results = [np.empty(size, dtype) for dtype in self._of["result"]]
+        unread = [np.zeros((), dtype) for dtype in self._of["input at the end"]]
+        ends = unread if stretch.ends is None else stretch.ends
+        every = [Rows(self._values), Rows(self._carry), *stretch.handed, *stretch.last, *ends, *marks, *results]
+        self._given = marks, results, Arrays(self._loop.signature, every, stretch.length, size, self._block)
+        return self._given
 
     def results(self) -> list[np.ndarray]:
         """Of all lanes."""
@@ -251,32 +273,20 @@ class _Share:
                 one[lanes] = own[: len(lanes)]
         return merged
 
-    def _arrays(self, stretch: Stretch) -> tuple[list[np.ndarray], list[np.ndarray], Arrays]:
-        """Marks and results, and all that the loop is given."""
-        size = self._values.shape[1]
-        unread = [np.zeros((), dtype) for dtype in self._of["input at the end"]]
-        marks = [np.empty((-(-stretch.length // self._block), size), dtype) for dtype in self._of["mark of a block"]]
-        results = [np.empty(size, dtype) for dtype in self._of["result"]]
-        ends = unread if stretch.ends is None else stretch.ends
-        every = [Rows(self._values), Rows(self._carry), *stretch.handed, *stretch.last, *ends, *marks, *results]
-        return marks, results, Arrays(self._loop.signature, every, stretch.length, size, self._block)
-
-    def _leave(self, marks: np.ndarray) -> bool:
-        """Whether lanes have left: enough of them for the move to be worth while."""
+    def _leave(self, marks: np.ndarray) -> None:
+        """Lanes that are done, if so many are that the move is worth while."""
         done = marks[: len(self._lanes)]
         others = np.flatnonzero(~done)
-        if -(-len(others) // self._loop.lanes) * self._loop.lanes > _WORTH * self._values.shape[1]:
-            return False
-        gone = np.flatnonzero(done)
-        self._left.append((self._lanes[gone], self._values[:, gone], self._carry[:, gone]))
-        self._move(others)
-        return True
+        if -(-len(others) // self._loop.lanes) * self._loop.lanes <= _WORTH * self._values.shape[1]:
+            gone = np.flatnonzero(done)
+            self._left.append((self._lanes[gone], self._values[:, gone], self._carry[:, gone]))
+            self._move(others)
 
     def _move(self, lanes: np.ndarray) -> None:
         """Only these stay."""
         whole = -(-len(lanes) // self._loop.lanes) * self._loop.lanes
         filled = np.pad(lanes, (0, whole - len(lanes)), "edge") if len(lanes) else lanes
-        self._lanes = self._lanes[lanes]
+        self._lanes, self._given = self._lanes[lanes], None
         self._values, self._carry = (np.take(one, filled, axis=1) for one in (self._values, self._carry))
 
 
