@@ -1,5 +1,6 @@
 """The workload by this package: the scan over time, vmapped, and the fused loop."""
 
+from itertools import count
 from typing import Any
 
 import jax
@@ -35,11 +36,13 @@ class Scan(Chunked):
 
 
 class Fused:
-    """The loop over time in registers, threads side by side."""
+    """The loop over time in registers, threads side by side. It makes input and noise by itself, of another seed each time."""
 
     def __init__(self, workload: Workload, threads: int):
         self._passage = HostPassage(workload.experiment(), (FIGURES,), tuple(RANGES), workload.lanes, threads)
-        self._values = workload.values()
+        self._values, self._seeds = workload.values(), count(SEED)
 
     def __call__(self) -> dict[str, np.ndarray]:
-        return self._passage(self._values, SEED)
+        # nothing is kept for the next lanes
+        self._passage.keep(())
+        return self._passage(self._values, next(self._seeds))

@@ -10,6 +10,7 @@ namespace stdx = std::experimental;
 struct Constants {
   double period, motor_inertia, motor_viscous, load_inertia, load_viscous, gear_ratio, stiffness, slope, share;
   double motor_error;  // velocity error of the motor's observer at t = 0
+  double amplitude, frequency;
 };
 
 template <class V>
@@ -153,20 +154,99 @@ void run_block(const Constants& c, int steps, int start, int window, const T* to
     for (int j = 0; j < SUMS; ++j) (&total[k].first)[j].copy_to(out[j] + first + k * W, stdx::element_aligned);
 }
 
+using Floats = stdx::native_simd<float>;
+using Words = stdx::rebind_simd_t<std::uint32_t, Floats>;
+constexpr int SAMPLES = Floats::size();
+
+// Threefry-2x32 of 20 rounds, as JAX's generator has it (Salmon et al., 2011).
+inline void threefry(Words k0, Words k1, Words& a, Words& b) {
+  constexpr int turns[2][4] = {{13, 15, 26, 6}, {17, 29, 16, 24}};
+  const Words keys[3] = {k0, k1, k0 ^ k1 ^ 0x1BD11BDAu};
+  a += keys[0], b += keys[1];
+#pragma GCC unroll 5
+  for (int i = 0; i < 5; ++i) {
+#pragma GCC unroll 4
+    for (int j = 0; j < 4; ++j) {
+      const int turn = turns[i % 2][j];
+      a += b, b = ((b << turn) | (b >> (32 - turn))) ^ a;
+    }
+    a += keys[(i + 1) % 3], b += keys[(i + 2) % 3] + std::uint32_t(i + 1);
+  }
+}
+
+// Cephes' logf, for numbers above the smallest normal one.
+inline Floats log_of(Floats x) {
+  const Words bits = std::bit_cast<Words>(x);
+  Floats e = stdx::static_simd_cast<Floats>(std::bit_cast<stdx::rebind_simd_t<std::int32_t, Floats>>(bits >> 23)) - 126.0f;
+  Floats m = std::bit_cast<Floats>((bits & 0x007FFFFFu) | 0x3F000000u);
+  const auto low = m < 0.707106781186547524f;
+  stdx::where(low, e) = e - 1.0f;
+  stdx::where(low, m) = m + m;
+  m -= 1.0f;
+  const Floats z = m * m;
+  Floats p = Floats(7.0376836292e-2f);
+  for (float next : {-1.1514610310e-1f, 1.1676998740e-1f, -1.2420140846e-1f, 1.4249322787e-1f, -1.6668057665e-1f,
+                     2.0000714765e-1f, -2.4999993993e-1f, 3.3333331174e-1f})
+    p = p * m + next;
+  return e * 0.693359375f + (e * -2.12194440e-4f + (m * z * p - 0.5f * z) + m);
+}
+
+// Normal numbers of random bits: JAX's way to uniform ones, and the inverse of erf by M. Giles (2010) that XLA has, too.
+inline Floats normal_of(Words bits) {
+  const Floats share = std::bit_cast<Floats>((bits >> 9) | 0x3F800000u) - 1.0f;
+  const Floats x = stdx::max(Floats(-0.99999994f), share * 1.99999994f - 0.99999994f);
+  const Floats w = -log_of((1.0f - x) * (1.0f + x)), near = w - 2.5f, far = stdx::sqrt(w) - 3.0f;
+  Floats p = Floats(2.81022636e-08f), q = Floats(-0.000200214257f);
+  for (float next : {3.43273939e-07f, -3.5233877e-06f, -4.39150654e-06f, 0.00021858087f, -0.00125372503f, -0.00417768164f,
+                     0.246640727f, 1.50140941f})
+    p = p * near + next;
+  for (float next : {0.000100950558f, 0.00134934322f, -0.00367342844f, 0.00573950773f, -0.0076224613f, 0.00943887047f,
+                     1.00167406f, 2.83297682f})
+    q = q * far + next;
+  stdx::where(w >= 5.0f, p) = q;
+  return 1.41421356f * (p * x);
+}
+
+// Torque and unit noise of some samples, whole vectors of them: jaxbl's noise but for rounding.
+template <class T>
+void make_inputs(const Constants& c, std::uint32_t seed, int first, T* torque, T* noise) {
+  Words k0 = 0u, k1([first](auto i) { return std::uint32_t(first + int(i)); });
+  threefry(0u, seed, k0, k1);
+  Floats drawn[2];
+#pragma GCC unroll 2
+  for (int side = 0; side < 2; ++side) {
+    Words a = 0u, b = std::uint32_t(side);
+    threefry(k0, k1, a, b);
+    drawn[side] = normal_of(a ^ b);
+  }
+  for (int i = 0; i < SAMPLES; ++i) {
+    noise[2 * (first + i)] = T(drawn[0][i]), noise[2 * (first + i) + 1] = T(drawn[1][i]);
+    torque[first + i] = T(c.amplitude) * std::sin(T(6.283185307179586 * c.frequency) * (T(first + i) * T(c.period)));
+  }
+}
+
+// `own`: torque and noise, of whole vectors of samples, are made here, from the seed.
 template <class T, int U>
-void run_all(const Constants& c, int steps, int start, int window, const T* torque, const T* noise, int lanes,
-             const T* const* given, T* const* out, int threads) {
+void run_all(const Constants& c, int steps, int start, int window, T* torque, T* noise, int lanes, const T* const* given,
+             T* const* out, int threads, bool own, std::uint32_t seed) {
   constexpr int block = U * stdx::native_simd<T>::size();
-#pragma omp parallel for schedule(static) num_threads(threads)
-  for (int first = 0; first < lanes; first += block)
-    run_block<T, U>(c, steps, start, window, torque, noise, lanes, first, given, out);
+#pragma omp parallel num_threads(threads)
+  {
+    if (own) {
+#pragma omp for schedule(static)
+      for (int first = 0; first < steps; first += SAMPLES) make_inputs(c, seed, first, torque, noise);
+    }
+#pragma omp for schedule(static)
+    for (int first = 0; first < lanes; first += block)
+      run_block<T, U>(c, steps, start, window, torque, noise, lanes, first, given, out);
+  }
 }
 
 // Two vectors at a time: one's latency hides behind the other's (four are no faster).
 #define ENTRY(NAME, T)                                                                                                \
-  extern "C" void NAME(const Constants* c, int steps, int start, int window, const T* torque, const T* noise,          \
-                       int lanes, const T* const* given, T* const* out, int threads) {                                 \
-    run_all<T, 2>(*c, steps, start, window, torque, noise, lanes, given, out, threads);                                \
+  extern "C" void NAME(const Constants* c, int steps, int start, int window, T* torque, T* noise, int lanes,           \
+                       const T* const* given, T* const* out, int threads, int own, std::uint32_t seed) {               \
+    run_all<T, 2>(*c, steps, start, window, torque, noise, lanes, given, out, threads, own, seed);                     \
   }
 ENTRY(chain_float32, float)
 ENTRY(chain_float64, double)
