@@ -302,8 +302,10 @@ class _Writer:
                 return found[:carry]
 
             before, finish = around.before, around.finish
-            state = read("carry") if before is None else (
-                self.either(begins, lambda: self.run(before, numbers), lambda: read("carry"))
+            state = (
+                read("carry")
+                if before is None
+                else (self.either(begins, lambda: self.run(before, numbers), lambda: read("carry")))
             )
             state = self.count(start, steps, state, block, by=length)
             if finish is None:

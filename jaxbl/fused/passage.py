@@ -18,7 +18,6 @@ from .llvm import Arrays, Loop, Rows, vector_lanes
 from .noise import host
 from .split import Around, Kind, carry_kinds, split
 
-
 _KEPT = 2**24
 """Bytes of what lanes share, of some seeds, that stay for the next lanes."""
 _WORTH = 0.875
@@ -150,9 +149,7 @@ class Passage(abc.ABC):
             yield Stretch(length, handed, last, ends, figures)
 
     @abc.abstractmethod
-    def _march(
-        self, given: list[np.ndarray], stretches: Iterator[Stretch]
-    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    def _march(self, given: list[np.ndarray], stretches: Iterator[Stretch]) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """The lanes' figures `(lanes,)` each, and those that they share `()`."""
 
 

@@ -106,7 +106,7 @@ def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tu
 
     with jax.default_device(devices[0]):
         # what draws the noise is compiled at its first use
-        next(passage.blocks(0, []))
+        next(passage.stretches(0))
 
     def run(values: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[dict[str, Any], dict[str, ObserverGains]]:
         with jax.default_device(devices[0]):
