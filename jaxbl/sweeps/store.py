@@ -5,6 +5,7 @@ import json
 import os
 import platform
 import shutil
+import tempfile
 import time
 import tomllib
 import weakref
@@ -13,7 +14,6 @@ from contextlib import contextmanager
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -23,6 +23,8 @@ from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import (
     LOG_RESULTS,
+    Busy,
+    begin_file,
     has_file,
     is_empty,
     is_remote,
@@ -30,6 +32,7 @@ from jaxbl.files import (
     listed,
     log_named_in,
     make_folder,
+    move,
     read_json,
     remove,
     remove_drafts,
@@ -98,12 +101,16 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
         InputError: the folder holds another study or other files, or cannot be written to.
     """
     make_folder(folder)
-    found = {}
+    found, unsure = {}, False
     for other, (marker, _, _) in _COMMANDS.items():
         if (folder / marker).exists():
             try:
                 found[other] = read_json(folder / marker)
             except InputError:
+                if other == command != "sweep" and not overwrite:
+                    # its stages are studies, which say whose they are (:class:`jaxbl.gains.stages.Stages`)
+                    unsure = True
+                    continue
                 mark = _first_mark(folder) if other == "sweep" else None
                 if mark is None and not overwrite:
                     raise
@@ -116,7 +123,7 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
     same = [data.get("single_run") == identity(config, "simulate") for data in found.values()]
     if command != "simulate" and command in found:
         same.append(found[command].get("identity") == identity(config, command))
-    if all(same) and (found or is_empty(folder)):
+    if all(same) and (found or unsure or is_empty(folder)):
         if alone:
             remove_drafts(folder)
         return
@@ -186,8 +193,8 @@ class Store:
     def create(cls, folder: Path, config: Config, layout: Layout, backend: Backend, chunks: int, rows: int) -> "Store":
         """Open a folder that this study may have (:func:`claim`), or take up the one that is there; a manifest that is lost
         or damaged is written anew by what the parts say."""
-        store = None
-        if (folder / "manifest.json").exists():
+        store, there = None, (folder / "manifest.json").exists()
+        if there:
             try:
                 store = cls.open(folder)
             except InputError:
@@ -209,7 +216,10 @@ class Store:
             }
             store = cls(folder, manifest)
         # the manifest first: it is what makes the folder this study's
-        store.update()
+        if there:
+            store.update()
+        elif not begin_file(folder / "manifest.json", json_text(store.manifest)):
+            raise Busy(f"{folder}: another process began a study there just now; run the same command again")
         if not is_remote(folder):
             (folder / "points").mkdir(exist_ok=True)
         write_atomic(folder / "study.toml", config.to_toml())
@@ -299,7 +309,7 @@ class Store:
             folder.mkdir(exist_ok=True)
         names = (path.name if i == 0 else f"{path.name}.{i}" for i in count())
         target = next(folder / name for name in names if not (folder / name).exists())
-        path.replace(target)
+        move(path, target)
         self.damaged.append(f"{path.relative_to(self.folder)} {why}; it is kept as {target.relative_to(self.folder)}")
 
     def write(self, index: int, frame: pd.DataFrame) -> None:
@@ -416,7 +426,7 @@ class Store:
         if not is_remote(part):
             return part
         if self._copies is None:
-            self._copies = Path(mkdtemp())
+            self._copies = Path(tempfile.mkdtemp())
             weakref.finalize(self, shutil.rmtree, self._copies, ignore_errors=True)
         copy = self._copies / part.name
         if not copy.exists():
