@@ -2,6 +2,7 @@
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
+# pyright: reportAssignmentType=false
 
 import math
 import textwrap
