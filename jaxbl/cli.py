@@ -570,7 +570,7 @@ def compare(
         raise InputError(f"{folder}: is not empty and holds no comparison; choose another folder with --out")
     with removed_if_empty(folder):
         lines = write_comparison(run_compare(*studies), studies[0].config, folder)
-    for line in [*lines, "", str(folder / "comparison.json")]:
+    for line in [*lines, str(folder / "comparison.json")]:
         typer.echo(line)
 
 

@@ -29,6 +29,7 @@ class Rows:
         result: the study.
         columns: names.
         changed: applied to each part.
+        needs: columns that this looks at.
     """
 
     def __init__(
@@ -36,13 +37,19 @@ class Rows:
         result: StudyResult,
         columns: Iterable[str],
         changed: Callable[[pd.DataFrame], pd.DataFrame] = lambda frame: frame,
+        needs: Iterable[str] = (),
     ):
         self._result, self._columns, self._changed = result, list(dict.fromkeys(columns)), changed
+        self._needs = tuple(needs)
 
     def __iter__(self) -> Iterator[pd.DataFrame]:
+        return self.some(self._columns)
+
+    def some(self, columns: Iterable[str]) -> Iterator[pd.DataFrame]:
+        """Some of the columns, or more."""
         if self._result.runs * len(self._columns) <= _MOST_KEPT:
             return iter([self.frame])
-        return map(self._changed, self._result.batches(self._columns))
+        return map(self._changed, self._result.batches([*columns, *self._needs]))
 
     @functools.cached_property
     def frame(self) -> pd.DataFrame:
@@ -81,6 +88,17 @@ class Spread(NamedTuple):
     quantiles: np.ndarray
 
 
+def _some(rows: Iterable[pd.DataFrame], columns: Iterable[str]) -> Iterable[pd.DataFrame]:
+    return rows.some(columns) if isinstance(rows, Rows) else rows
+
+
+class Column(NamedTuple):
+    """Numbers of each row, from some columns of it."""
+
+    needs: Sequence[str]
+    of: Callable[[pd.DataFrame], Any]
+
+
 class Groups:
     """Rows that have the same values of some columns, sorted by these; one group of all rows without any.
 
@@ -95,7 +113,7 @@ class Groups:
         distinct, first = Distinct(), {}
         self.varied: set[str] = set()
         self.rows = 0
-        for frame in rows:
+        for frame in _some(rows, [*self._keys, *others]):
             self.rows += len(frame)
             if self._keys:
                 distinct.add(frame[self._keys])
@@ -125,15 +143,16 @@ class Groups:
         """The group of each row."""
         return np.searchsorted(self._known, self._flat(frame)) if self._keys else np.zeros(len(frame), np.int64)
 
-    def means(self, columns: dict[str, Callable[[pd.DataFrame], Any]]) -> pd.DataFrame:
+    def means(self, columns: dict[str, Column]) -> pd.DataFrame:
         """Means of numbers by group, NaN left out, and the number of rows in `rows`."""
         sums = {name: np.zeros(len(self)) for name in columns}
         counts = {name: np.zeros(len(self), np.int64) for name in ("rows", *columns)}
-        for frame in self._rows:
+        needs = [name for column in columns.values() for name in column.needs]
+        for frame in _some(self._rows, [*self._keys, *needs]):
             groups = self.of(frame)
             np.add.at(counts["rows"], groups, 1)
             for name, column in columns.items():
-                values = np.asarray(column(frame), float)
+                values = np.asarray(column.of(frame), float)
                 there = ~np.isnan(values)
                 np.add.at(sums[name], groups[there], values[there])
                 np.add.at(counts[name], groups[there], 1)
@@ -141,13 +160,16 @@ class Groups:
             found = {name: sums[name] / counts[name] for name in columns}
         return pd.DataFrame({"rows": counts["rows"], **found}, index=self.index)
 
-    def spread(self, column: Callable[[pd.DataFrame], Any], quantiles: Sequence[float] = (0.5,)) -> Spread:
+    def spread(self, column: Column, quantiles: Sequence[float] = (0.5,)) -> Spread:
         """How the numbers of a column are spread in each group."""
-        return spread(
-            lambda: ((self.of(frame), np.asarray(column(frame), float)) for frame in self._rows), len(self), quantiles
-        )
 
-    def medians(self, column: Callable[[pd.DataFrame], Any]) -> pd.Series:
+        def numbers() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+            for frame in _some(self._rows, [*self._keys, *column.needs]):
+                yield self.of(frame), np.asarray(column.of(frame), float)
+
+        return spread(numbers, len(self), quantiles)
+
+    def medians(self, column: Column) -> pd.Series:
         """The median of a column in each group."""
         return pd.Series(self.spread(column).quantiles[0], self.index)
 

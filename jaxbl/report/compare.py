@@ -2,6 +2,7 @@
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
+# pyright: reportAssignmentType=false
 
 import math
 import textwrap
@@ -26,6 +27,7 @@ from .maps import cell_edges, hatch_failures, is_log
 from .page import save_all
 
 _WIDTH = 80
+_FIGURE = "comparison"
 _PANELS = 3
 _LISTED = 12
 """Rows of a list in the text; `comparison.json` has all."""
@@ -36,9 +38,11 @@ def write_comparison(comparison: Comparison, config: Config, folder: Path) -> li
 
     Returns the lines for the terminal.
     """
-    save_all(draw_comparison(comparison, config), folder)
+    # of an earlier comparison
+    (folder / "figures" / f"{_FIGURE}.png").unlink(missing_ok=True)
+    saved = save_all(draw_comparison(comparison, config), folder)
     write_atomic(folder / "comparison.json", json_text(comparison.to_dict()))
-    return comparison_lines(comparison)
+    return [*comparison_lines(comparison), *(_wrapped(f"{path}: {caption}", "  ") for path, caption in saved)]
 
 
 def comparison_lines(comparison: Comparison) -> list[str]:
@@ -72,7 +76,8 @@ def _noise(comparison: Comparison) -> str:
             "both studies (sweep.seeds) it is known."
         )
     how = f"differences seed by seed, {seeds} seeds" if comparison.paired else "means over seeds, none of them in common"
-    return f"Noise: by {how}; of the points counted at most {100 * FALSE:g} % on average are not different."
+    few = " So few seeds show only what is far beyond it." if comparison.paired and seeds < 4 else ""
+    return f"Noise: by {how}; of the points counted at most {100 * FALSE:g} % on average are not different.{few}"
 
 
 def _metric_lines(comparison: Comparison) -> list[str]:
@@ -180,6 +185,9 @@ def draw_comparison(comparison: Comparison, config: Config) -> list[Drawn]:
     frames = [comparison.frame(one.metric) for one in shown]
     values = {path: frames[0][path] for path in comparison.axes}
     axes = [path for path, one in values.items() if pd.api.types.is_numeric_dtype(one) and len(one.unique()) > 1]
+    # of axes that advance together one is enough
+    labels = {axis.path: axis.zip or axis.path for axis in config.axes}
+    axes = list({labels.get(path, path): path for path in reversed(axes)}.values())[::-1]
     if not axes:
         return []
     size = (4.4 * len(shown), 3.8) if len(axes) > 1 else (4.2 * len(shown), 3.4)
@@ -191,7 +199,9 @@ def draw_comparison(comparison: Comparison, config: Config) -> list[Drawn]:
             _line(ax, config, frame, axes[0])
         ax.set_title(with_unit(one.metric, "" if len(axes) > 1 else metric_of(one.metric).unit))
     beyond = "noise" if comparison.knows_noise else "rounding"
-    others = f"; median over {', '.join(axes[:-2])}" if len(axes) > 2 else ""
+    drawn = {labels.get(path, path) for path in axes[-2:]}
+    others = ", ".join(path for path, one in values.items() if labels.get(path, path) not in drawn and len(one.unique()) > 1)
+    others = f", median over {others}" if others else ""
     if len(axes) > 1:
         names = [Patch(facecolor="white", edgecolor="black", hatch="//", label=f"within {beyond}")]
         figure.legend(handles=names, loc="outside lower center")
@@ -200,8 +210,8 @@ def draw_comparison(comparison: Comparison, config: Config) -> list[Drawn]:
         caption = f"{what} over {axes[-1]} and {axes[-2]}{others}; {hatched}."
     else:
         panels[-1].legend()
-        caption = f"Both studies over {axes[0]}; filled points differ by more than {beyond}."
-    return [Drawn("comparison", figure, caption)]
+        caption = f"Both studies over {axes[0]}{others}; where there are points, they differ by more than {beyond}."
+    return [Drawn(_FIGURE, figure, caption)]
 
 
 def _map(figure: Figure, ax: Axes, config: Config, one: MetricChange, frame: pd.DataFrame, over: list[str]) -> None:
@@ -245,9 +255,10 @@ def _norm(values: np.ndarray, boolean: bool) -> Normalize:
 
 def _line(ax: Axes, config: Config, frame: pd.DataFrame, path: str) -> None:
     """Both studies over one axis."""
-    frame = frame.sort_values(path)
-    x = frame[path].to_numpy(float)
-    far = frame["differs"].to_numpy(bool)
+    groups = frame.groupby(path, sort=True)
+    frame = groups[["first", "second"]].median()
+    x = frame.index.to_numpy(float)
+    far = groups["differs"].any().to_numpy(bool)
     for i, name in enumerate(("first", "second")):
         ax.plot(x, frame[name], "-", color=COLOURS[i], label=name)
         ax.plot(x[far], frame.loc[far, name], "o", ms=4, color=COLOURS[i])

@@ -2,7 +2,7 @@
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
-# pyright: reportReturnType=false
+# pyright: reportReturnType=false, reportAssignmentType=false
 
 import re
 import textwrap
@@ -30,7 +30,7 @@ from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 from jaxbl.validation import nearest
 
-from .aggregates import Groups, Rows
+from .aggregates import Column, Groups, Rows
 from .figures import COLOURS, MAP, MARKERS, MISSING, SIDES, Drawn, style, subplots, with_unit
 from .refined_maps import Filling, on_coarse_values
 
@@ -115,7 +115,8 @@ def _rows(result: StudyResult, figure: FigureTable, points: Points | None) -> Ro
             frame = frame[frame[dots.name].isin(dots)]
         return selected(config, frame, figure)
 
-    return Rows(result, columns, shown)
+    needs = [*(figure.where or {}), *([] if dots is None else [dots.name]), *([] if points is None else columns)]
+    return Rows(result, columns, shown, needs)
 
 
 def _dots(result: StudyResult, figure: FigureTable) -> pd.Series | None:
@@ -170,10 +171,7 @@ def _value_label(value: str) -> str:
 
 def _middle(groups: Groups, value: str) -> pd.Series:
     """One number for each group: the median over what else varies, or the share that is true."""
-
-    def shown(frame: pd.DataFrame) -> pd.Series:
-        return _shown(frame, value)
-
+    shown = _shown_column(value)
     return groups.means({value: shown})[value] if is_boolean(value) else groups.medians(shown)
 
 
@@ -260,7 +258,7 @@ def _map_panels(
     groups = Groups(used, [*facets, *keys], paths)
     side = spec.value.partition(".")[0]
     columns = [name for name in ("finite", f"{side}.converged") if name in next(iter(used))]
-    shares = groups.means({name: lambda frame, name=name: frame[name].astype(float) for name in columns})
+    shares = groups.means({name: Column([name], lambda frame, name=name: frame[name].astype(float)) for name in columns})
     tables = _middle(groups, spec.value)
     if spec.value != "finite":
         # an average of the runs that did not diverge would hide that one did
@@ -292,17 +290,25 @@ def _bounds(rows: Iterable[pd.DataFrame], spec: FigureTable, points: Points | No
     if none did."""
     side = spec.x.split(".")[1]
 
-    def bounds(frame: pd.DataFrame, converged: bool) -> np.ndarray:
-        kept = np.ones(len(frame), bool) if points is None else points.always_simulated(frame)
-        if converged:
-            kept = kept & frame[f"{side}.converged"].to_numpy(bool)
-        return np.where(kept, frame[f"{side}.f_plus"], np.nan)
+    converged, bound = f"{side}.converged", f"{side}.f_plus"
+    paths = [] if points is None or points.refinement is None else points.refinement.paths
+    needs = [converged, bound, *paths]
 
-    # most points of a refined study lie at its boundary: the median is that of the coarse grid
+    def known(frame: pd.DataFrame) -> np.ndarray:
+        # most points of a refined study lie at its boundary: the median is that of the coarse grid
+        kept = np.ones(len(frame), bool) if points is None else points.always_simulated(frame)
+        return kept & frame[bound].notna().to_numpy()
+
+    def good(frame: pd.DataFrame) -> np.ndarray:
+        return known(frame) & frame[converged].to_numpy(bool)
+
     groups = Groups(rows, [] if spec.facet is None else [spec.facet])
-    shares = groups.means({"converged": lambda frame: frame[f"{side}.converged"].where(~np.isnan(bounds(frame, False)))})
-    of_all = groups.medians(lambda frame: bounds(frame, False)) if (shares["converged"] == 0.0).any() else np.nan
-    return groups.medians(lambda frame: bounds(frame, True)).where(shares["converged"] > 0.0, of_all)
+    shares = groups.means({"converged": Column(needs, lambda frame: frame[converged].where(known(frame)))})
+    of_all = np.nan
+    if (shares["converged"] == 0.0).any():
+        of_all = groups.medians(Column(needs, lambda frame: frame[bound].where(known(frame))))
+    medians = groups.medians(Column(needs, lambda frame: frame[bound].where(good(frame))))
+    return medians.where(shares["converged"] > 0.0, of_all)
 
 
 def _grid_of_axes(
@@ -455,6 +461,10 @@ def _shown(part: pd.DataFrame, value: str) -> pd.Series:
     return values.where(part["finite"].astype(bool)).replace([np.inf, -np.inf], np.nan)
 
 
+def _shown_column(value: str) -> Column:
+    return Column([value, "finite"], lambda frame: _shown(frame, value))
+
+
 def _best(panel: _Panel, spec: FigureTable) -> tuple[float, float, float] | None:
     """Place and value of the smallest figure, for errors and times, among the points that converged if any did."""
     if not re.search(r"rmse|chatter|convergence_time$", spec.value):
@@ -490,8 +500,8 @@ def condition_curves(
 def _lines(config: Config, rows: Rows, spec: FigureTable) -> Drawn:
     keys = [path for path in (spec.facet, spec.series, spec.x) if path is not None]
     groups = Groups(rows, keys, [axis.path for axis in config.axes])
-    spread = groups.spread(lambda frame: _shown(frame, spec.value))
-    found = groups.means({"middle": lambda frame: _shown(frame, spec.value)})
+    spread = groups.spread(_shown_column(spec.value))
+    found = groups.means({"middle": _shown_column(spec.value)})
     if not is_boolean(spec.value):
         found["middle"] = spread.quantiles[0]
     found = found.assign(least=spread.least, largest=spread.largest).reset_index()

@@ -180,7 +180,7 @@ def compare(first: str | Path | StudyResult, second: str | Path | StudyResult) -
     return Comparison(
         names=names,
         config=_different(*configs),
-        made_by=_different(*(_makers(one) for one in studies)),
+        made_by=_made_by(*studies),
         points=counts,
         axes=tuple(paths),
         seeds=seeds,
@@ -202,12 +202,12 @@ def _names(first: Any, second: Any) -> tuple[str, str]:
     return (names[0], names[1]) if names[0] != names[1] else (f"{names[0]} (first)", f"{names[1]} (second)")
 
 
-def _makers(study: StudyResult) -> dict[str, Any]:
-    """What computed a study."""
-    if not isinstance(study.source, Store):
+def _made_by(first: StudyResult, second: StudyResult) -> dict[str, tuple[Any, Any]]:
+    """What computed the studies, where it differs and both are stored."""
+    if not (isinstance(first.source, Store) and isinstance(second.source, Store)):
         return {}
-    manifest = study.source.manifest
-    return {"backend": manifest["backend"], **manifest["versions"]}
+    manifests = first.source.manifest, second.source.manifest
+    return _different(*({"backend": one["backend"], **one["versions"]} for one in manifests))
 
 
 def _flat(value: Any, prefix: str = "") -> dict[str, Any]:

@@ -58,7 +58,8 @@ _COMMANDS = {
 }
 _COMMON = "figures", "report.html"
 _SAVED = 10.0
-"""Seconds from one time that the manifest is written to the next while chunks are computed: parts know what they are."""
+"""Seconds at least from one time that the manifest is written to the next while chunks are computed: parts know what they
+are."""
 
 
 def identity(config: Config, command: str = "sweep") -> str:
@@ -187,7 +188,7 @@ class Store:
         self.manifest = manifest
         self.damaged: list[str] = []
         self._copies: Path | None = None
-        self._saved = 0.0
+        self._saved, self._pause = 0.0, _SAVED
 
     @classmethod
     def create(cls, folder: Path, config: Config, layout: Layout, backend: Backend, chunks: int, rows: int) -> "Store":
@@ -259,8 +260,11 @@ class Store:
     def update(self, **values: Any) -> None:
         """Set entries of the manifest."""
         self.manifest |= values
+        begun = time.monotonic()
         write_atomic(self.folder / "manifest.json", json_text(self.manifest))
         self._saved = time.monotonic()
+        # of very many parts it is long
+        self._pause = max(_SAVED, 100.0 * (self._saved - begun))
 
     def part(self, index: int) -> Path:
         return self.folder / "points" / f"part-{index:05d}.parquet"
@@ -321,7 +325,7 @@ class Store:
         """Add parts that were written, by their checksums, to the manifest."""
         self.manifest["checksums"] |= {str(index): value for index, value in checksums.items()}
         # not for each part: a large study's manifest is large
-        if self.keeps_manifest and time.monotonic() - self._saved > _SAVED:
+        if self.keeps_manifest and time.monotonic() - self._saved > self._pause:
             self.update()
 
     def existing(self) -> list[Path]:

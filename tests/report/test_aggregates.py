@@ -6,7 +6,7 @@ import pytest
 from small_study import ALPHA, LAMBDA, NOISE, listed, made, rigid, spaced
 
 from jaxbl.report import aggregates
-from jaxbl.report.aggregates import Groups, spread
+from jaxbl.report.aggregates import Column, Groups, spread
 from jaxbl.report.maps import draw
 from jaxbl.report.sweep import write_sweep_report
 from jaxbl.sweeps.engine import Engine
@@ -49,11 +49,12 @@ def test_groups_are_those_of_pandas():
     parts = [frame.iloc[i : i + 90] for i in range(0, 500, 90)]
     groups = Groups(parts, ["a", "b"], ["a", "c"])
     expected = frame.groupby(["a", "b"], sort=True)["v"]
-    means = groups.means({"v": lambda part: part["v"]})
+    column = Column(["v"], lambda part: part["v"])
+    means = groups.means({"v": column})
     assert (groups.rows, groups.varied) == (500, {"a"})
     pd.testing.assert_series_equal(means["v"], expected.mean())
     pd.testing.assert_series_equal(means["rows"], expected.size(), check_names=False)
-    pd.testing.assert_series_equal(groups.medians(lambda part: part["v"]), expected.median(), check_names=False)
+    pd.testing.assert_series_equal(groups.medians(column), expected.median(), check_names=False)
 
 
 def stored(folder, data, **columns):
