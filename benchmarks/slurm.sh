@@ -2,7 +2,7 @@
 # A sweep by a real SLURM, on this machine: two nodes of one core. The files of docs/cluster/ are run as they are, and every
 # table has to equal that of a plain `jaxbl sweep`, bit for bit.
 #
-#     benchmarks/slurm.sh        # some two minutes; prints what was run, and ends with "equal" or with the first difference
+#     benchmarks/slurm.sh        # some three minutes on idle cores; prints what was run and "equal" for each table, or the first difference
 #
 # Needs: Debian's packages slurm-wlm and munge (22.05 was used; its slurmd may run several times on one machine); two cores;
 # `jaxbl` and `dask` in PATH with the extra `distributed`, and dask-jobqueue; root, as slurmd changes to the user of each job.
@@ -119,12 +119,16 @@ timed sbatch --wait --array=1-2 "$tree/docs/cluster/array.sbatch" study.toml arr
 jaxbl status array
 compare array
 # again: nothing is left to do
+stat -c '%n %y' array/points/* >before
 timed sbatch --wait --array=1-2 "$tree/docs/cluster/array.sbatch" study.toml array
+stat -c '%n %y' array/points/* | diff before -
 
 timed python "$tree/docs/cluster/slurm.py" study.toml jobqueue --jobs 2 --cores 1 --memory 2GB
 compare jobqueue
 
-# a job is lost on the way, with the node that it has: another one takes its place
+# a job is lost on the way: another one takes its place
+jobs() { squeue --states=all --noheader --name=dask-worker --format=%i | wc -l; }
+before=$(jobs)
 python "$tree/docs/cluster/slurm.py" study.toml lost --jobs 2 --cores 1 --memory 2GB &
 client=$!
 until [ "$(ls lost/points 2>/dev/null | wc -l)" -ge 8 ]; do
@@ -135,6 +139,8 @@ echo "> scancel --signal=KILL $victim, after $(ls lost/points | wc -l) parts"
 scancel --signal=KILL --full "$victim"
 wait $client
 compare lost
+echo "  $(($(jobs) - before)) jobs"
+[ $(($(jobs) - before)) -ge 3 ]
 
 # a scheduler that is there, and workers that come to it
 dask scheduler --interface lo --scheduler-file scheduler.json --no-dashboard >scheduler.log 2>&1 &

@@ -63,7 +63,7 @@ class ClusterRun(Run):
     def __init__(self, cluster: Cluster, engine: Engine, store: Store, progress: Progress | None):
         super().__init__(engine, store, progress)
         self._cluster = cluster
-        self._looked = time.monotonic()
+        self._next_look = time.monotonic() + _LOOK
 
     def ensure(self, chunks: Iterable[Chunk]) -> None:
         missing: list[int | Chunk] = []
@@ -90,9 +90,11 @@ class ClusterRun(Run):
 
     def _look(self) -> None:
         """Tell progress by the parts that exist: bundles take long."""
-        if time.monotonic() - self._looked > _LOOK:
-            self._looked = time.monotonic()
+        if time.monotonic() > self._next_look:
+            start = time.monotonic()
             self.tell(len(self.kept.existing()))
+            # a list of 300 000 files takes seconds
+            self._next_look = time.monotonic() + max(_LOOK, 10.0 * (time.monotonic() - start))
 
 
 def hand_over(cluster: Cluster, engine: Engine, store: Store) -> None:
