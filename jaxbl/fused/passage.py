@@ -18,12 +18,11 @@ from .llvm import Arrays, Loop, Rows, vector_lanes
 from .noise import host
 from .split import Around, Kind, carry_kinds, split
 
-
 _KEPT = 2**24
 """Bytes of what lanes share, of some seeds, that stay for the next lanes."""
 _WORTH = 0.875
 """Share of lanes down to which those that are done stay: to move the others costs as much as some samples."""
-_SHARE = 2**17
+_SHARE = 2**16
 """Samples of lanes, some 0.1 ms, that are worth a thread."""
 _CALL = 2**20
 """Samples of lanes that a call of the loop takes, some 1 ms: after it, lanes that are done leave."""
@@ -150,9 +149,7 @@ class Passage(abc.ABC):
             yield Stretch(length, handed, last, ends, figures)
 
     @abc.abstractmethod
-    def _march(
-        self, given: list[np.ndarray], stretches: Iterator[Stretch]
-    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    def _march(self, given: list[np.ndarray], stretches: Iterator[Stretch]) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """The lanes' figures `(lanes,)` each, and those that they share `()`."""
 
 

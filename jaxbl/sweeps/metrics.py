@@ -370,7 +370,9 @@ _OVERFLOW = ("position_rmse", "velocity_rmse", "torque_rmse", "f_plus", "f_plus_
 """Metrics that overflow with the lane: they show whether it stayed finite."""
 
 
-def _found(experiment: Experiment, totals: dict[str, tuple], state: State, side: str, names: Iterable[str]) -> dict[str, Any]:
+def _found(
+    experiment: Experiment, totals: dict[str, tuple], state: State, side: str, names: Iterable[str]
+) -> dict[str, Any]:
     """Some metrics of a side, from its states so far, and whether it stayed finite."""
     first, run = window_start(experiment.run.steps), experiment.run
     parameters = identified(experiment, state).get(side, {})
