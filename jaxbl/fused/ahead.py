@@ -11,7 +11,7 @@ from . import Unsupported
 from .jaxprs import flat
 from .llvm import Loop
 from .noise import LONGEST_STRETCH, draw
-from .split import Around, recursion
+from .split import recursion
 
 Shares = tuple[list[Any], list[Any], list[Any]]
 """Next state of what lanes share, what follows each block of a stretch of samples reads of it `(blocks,)`, and what each
@@ -83,10 +83,10 @@ class Looped:
         self._loop = None
         self._dtypes: list[list[np.dtype]] = [[], []]
         if shared.state:
-            after = flat(lambda *state: sum(shared.outer(state, ()), []), *shared.state)
+            after = flat(lambda *state: jax.tree.leaves(shared.outer(state, ())), *shared.state)
             count = len(shared.state)
             self._dtypes = [[out.dtype for out in part.out_avals[count:]] for part in (after, parts.step)]
-            self._loop = Loop(parts.step, np.dtype(float), carry=count, lanes=1, around=Around(None, after, None))
+            self._loop = Loop(parts.step, np.dtype(float), carry=count, lanes=1, after=after)
 
     def __call__(self, state: list[Any], seed: int, first: int, count: int) -> Shares:
         shared = self._shared

@@ -83,9 +83,15 @@ class Argument(NamedTuple):
 
 
 def signature_of(
-    body: ClosedJaxpr, around: Around | None, values: int, carry: int, fixed: int, beside: int = 0
+    body: ClosedJaxpr,
+    after: ClosedJaxpr | None,
+    finish: ClosedJaxpr | None,
+    values: int,
+    carry: int,
+    fixed: int,
+    beside: int = 0,
 ) -> list[Argument]:
-    """The arrays of a loop in their order; arguments as of :class:`Loop`."""
+    """The arrays of a loop in their order; arguments as of :class:`Loop` and :class:`Around`."""
     own, read = values + carry, body.jaxpr.invars
     groups: list[tuple[str, str, Sequence[Any]]] = [
         ("value", "lanes", read[:values]),
@@ -93,11 +99,11 @@ def signature_of(
         ("fixed number", "one", read[own : own + fixed]),
         ("input", "samples", read[own + fixed : len(read) - beside]),
         ("lane's input", "both", read[len(read) - beside :]),
-        ("input of a block", "blocks", around.after.jaxpr.invars[own:] if around else []),
-        ("input at the end", "one", around.finish.jaxpr.invars[own:] if around and around.finish else []),
+        ("input of a block", "blocks", after.jaxpr.invars[own:] if after else []),
+        ("input at the end", "one", finish.jaxpr.invars[own:] if finish else []),
         ("kept number", "both", body.jaxpr.outvars[carry:]),
-        ("mark of a block", "marks", around.after.jaxpr.outvars[carry:] if around else []),
-        ("result", "lanes", around.finish.jaxpr.outvars if around and around.finish else []),
+        ("mark of a block", "marks", after.jaxpr.outvars[carry:] if after else []),
+        ("result", "lanes", finish.jaxpr.outvars if finish else []),
     ]
     return [Argument(f"{name} {i}", _dtype(v), holds) for name, holds, some in groups for i, v in enumerate(some)]
 
@@ -111,7 +117,7 @@ class Loop:
         dtype: of the lanes' numbers.
         values, carry, fixed, beside: how many differ from lane to lane, a lane carries, all lanes read unchanged in a call,
             and a lane alone reads at each sample.
-        around: left out, nothing.
+        around: left out, nothing; or `after` alone, what follows each block.
         lanes: that are computed together; left out, as many as suit the machine.
 
     Raises:
@@ -128,12 +134,14 @@ class Loop:
         fixed: int = 0,
         beside: int = 0,
         around: Around | None = None,
+        after: ClosedJaxpr | None = None,
         lanes: int | None = None,
     ):
         self.lanes = lanes or vector_lanes(dtype)
-        self.signature = signature_of(body, around, values, carry, fixed, beside)
+        after = around.after if around else after
+        self.signature = signature_of(body, after, around and around.finish, values, carry, fixed, beside)
         module = ir.Module("loop")
-        _Writer(module, self.lanes).loop(body, around, self.signature)
+        _Writer(module, self.lanes).loop(body, around, after, self.signature)
         parsed = binding.parse_assembly(str(module))
         options = binding.create_pipeline_tuning_options(speed_level=3)
         passes = binding.create_pass_builder(_machine(), options)
@@ -169,9 +177,9 @@ class Loop:
     ) -> None:
         """Take lanes from `first` up to `last` (multiples of `lanes`) through samples; the carry's arrays are overwritten.
 
-        What is kept is written `(steps, lanes)`, marks `(blocks, lanes)`, with no more lanes than run. Samples come in blocks
-        of `block`, all in one where it is left out; `start`, where a block begins, is the first of those up to `steps` that
-        are run. What `begins` a run does not read the carry; what `ends` it writes results in its place. `ValueError` for
+        What is kept is written `(steps, lanes)`, marks `(blocks, lanes)`, with no more lanes than run. Samples come in
+        blocks of `block`, all in one where it is left out; `start`, where a block begins, is the first of those up to
+        `steps` that are run. What `begins` a run does not read the carry; what `ends` it writes results in its place. `ValueError` for
         arrays that do not fit the signature.
         """
         given = arrays if isinstance(arrays, Arrays) else Arrays(self.signature, arrays, steps, last, block)
@@ -189,8 +197,8 @@ class Rows(NamedTuple):
 
 
 class Arrays:
-    """Arrays for a loop, which reads where they lie: checked against its signature for so many samples, in blocks of so many,
-    and lanes."""
+    """Arrays for a loop, which reads where they lie: checked against its signature for so many samples, in blocks of so
+    many, and lanes."""
 
     def __init__(
         self,
@@ -238,7 +246,9 @@ class _Writer:
         self.constant: set[Vector] = set()
         """Those that do not change in the loop over time."""
 
-    def loop(self, body: ClosedJaxpr, around: Around | None, signature: Sequence[Argument]) -> None:
+    def loop(
+        self, body: ClosedJaxpr, around: Around | None, after: ClosedJaxpr | None, signature: Sequence[Argument]
+    ) -> None:
         function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [_POINTER, *[_INT] * _NUMBERS]), "loop")
         # what registers have no room for lies on the stack: no vector of it over two lines of the cache
         function.attributes.alignstack = 64
@@ -290,26 +300,22 @@ class _Writer:
                 write("kept number", found[carry:], place)
                 return found[:carry]
 
-            if around is None:
+            if after is None:
                 return write("carry", self.count(start, steps, read("carry"), sample), lane)
 
             def block(begin: Vector, state: list[Vector]) -> list[Vector]:
                 end = build.add(begin, length)
                 state = self.count(begin, build.select(build.icmp_signed("<", end, steps), end, steps), state, sample)
                 number = build.sdiv(begin, length)
-                found = self.run(around.after, [*numbers, *state, *(scalar(i, number) for i in group["input of a block"])])
+                found = self.run(after, [*numbers, *state, *(scalar(i, number) for i in group["input of a block"])])
                 write("mark of a block", found[carry:], build.add(build.mul(number, width), build.sub(lane, first)))
                 return found[:carry]
 
+            if around is None:
+                return write("carry", self.count(start, steps, read("carry"), block, by=length), lane)
             before, finish = around.before, around.finish
-            state = (
-                read("carry")
-                if before is None
-                else (self.either(begins, lambda: self.run(before, numbers), lambda: read("carry")))
-            )
+            state = self.either(begins, lambda: self.run(before, numbers), lambda: read("carry"))
             state = self.count(start, steps, state, block, by=length)
-            if finish is None:
-                return write("carry", state, lane)
             return self.either(
                 ends,
                 lambda: write("result", self.run(finish, [*numbers, *state, *at_end]), lane),

@@ -23,7 +23,7 @@ LONGEST_STRETCH = 4 * LONGEST_BLOCK
 """Samples whose noise is drawn at once, at most: a call of XLA takes some 30 us, whatever their number."""
 SIDES = ("motor", "load")
 _TURNS = (13, 15, 26, 6), (17, 29, 16, 24)
-"""Rotations of Threefry-2x32, whose rounds come in fours (Salmon et al., Parallel random numbers: as easy as 1, 2, 3, 2011)."""
+"""Rotations of Threefry-2x32 in its rounds, four at a time (Salmon et al., Parallel random numbers, 2011)."""
 _PARITY = 0x1BD11BDA
 _WORD = jax.ShapeDtypeStruct((), jnp.uint32)
 
@@ -62,7 +62,8 @@ def _by_xla() -> Callable[[int, int, int], Any]:
 
 def _by_loop() -> Callable[[int, int, int], Any]:
     """`Unsupported` where JAX draws otherwise."""
-    if jax.config.jax_default_prng_impl != "threefry2x32" or not jax.config.jax_threefry_partitionable:
+    settings: Any = jax.config
+    if settings.jax_default_prng_impl != "threefry2x32" or not settings.jax_threefry_partitionable:
         raise Unsupported("random bits by another generator")
     with attempted():
         loop = Loop(traced(_bits, _WORD, _WORD), np.dtype(np.float32), fixed=1, beside=1)

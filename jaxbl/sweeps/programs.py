@@ -110,8 +110,10 @@ def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tu
 
     def run(values: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[dict[str, Any], dict[str, ObserverGains]]:
         with jax.default_device(devices[0]):
-            # seeds that only fill up the last chunk are copies of one
-            found = {seed: passage(values, seed) for seed in dict.fromkeys(int(seed) for seed in seeds)}
+            # seeds that only fill up the last chunk are copies of one; those of a chunk are likely those of the next
+            different = dict.fromkeys(int(seed) for seed in seeds)
+            passage.keep(different)
+            found = {seed: passage(values, seed) for seed in different}
         stacked = {name: np.stack([found[int(seed)][name] for seed in seeds]) for name in found[int(seeds[0])]}
         return stacked, observer_gains(set_leaves(experiment, values))
 
