@@ -49,18 +49,16 @@ class Program(NamedTuple):
 
 
 @contextmanager
-def not_put_into_cache(*, read: bool = True) -> Iterator[None]:
-    """What is compiled inside is not put into JAX's cache of programs, and taken from it where it may be `read`: compiling
-    takes as long as it would without."""
-    changed = {"jax_persistent_cache_min_compile_time_secs": math.inf, "jax_enable_compilation_cache": read}
-    before = {name: jax.config.values[name] for name in changed}
-    for name, value in changed.items():
-        jax.config.update(name, value)
+def not_put_into_cache() -> Iterator[None]:
+    """What is compiled inside is not put into JAX's cache of programs, and taken from it if it is there: compiling takes as
+    long as it would without."""
+    least = "jax_persistent_cache_min_compile_time_secs"
+    before = jax.config.values[least]
+    jax.config.update(least, math.inf)
     try:
         yield
     finally:
-        for name, value in before.items():
-            jax.config.update(name, value)
+        jax.config.update(least, before)
 
 
 def compile_program(
