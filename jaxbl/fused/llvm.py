@@ -69,11 +69,12 @@ def vector_lanes(dtype: np.dtype) -> int:
 class Argument(NamedTuple):
     """An array that a loop reads or writes where it lies: its group and place there (`input 2`), type, and how many numbers
     it holds: "one", one for each of "lanes", of "samples" or of "blocks" of samples, or "both": one for each sample of each
-    lane; "marks": for each block of each lane."""
+    lane; "marks": for each block of each lane. So many, from this one on, are of one type and hold as many."""
 
     name: str
     dtype: np.dtype
     holds: str
+    alike: int
 
     def check(self, array: np.ndarray, counts: dict[str, int]) -> None:
         """Refuse an array of wrong type or length, or with gaps, by `ValueError`."""
@@ -106,7 +107,11 @@ def signature_of(
         ("mark of a block", "marks", after.jaxpr.outvars[carry:] if after else []),
         ("result", "lanes", finish.jaxpr.outvars if finish else []),
     ]
-    return [Argument(f"{name} {i}", _dtype(v), holds) for name, holds, some in groups for i, v in enumerate(some)]
+    found: list[Argument] = []
+    every = [(f"{name} {i}", _dtype(v), holds) for name, holds, some in groups for i, v in enumerate(some)]
+    for one in reversed(every):
+        found.append(Argument(*one, 1 + found[-1].alike if found and found[-1][1:3] == one[1:] else 1))
+    return found[::-1]
 
 
 class Loop:
@@ -232,10 +237,9 @@ class Arrays:
                 addresses.append(_address(one))
             elif each:
                 each[0].check(one.array[:1], counts)
-                _, dtype, holds = each[0]
-                other = next((two for two in each if two.holds != holds or two.dtype != dtype), None)
-                if other is not None or not one.array.flags.c_contiguous:
-                    raise ValueError(f"{(other or each[0]).name} of a loop is no row of one array")
+                if each[0].alike < len(each) or not one.array.flags.c_contiguous:
+                    odd = each[each[0].alike] if each[0].alike < len(each) else each[0]
+                    raise ValueError(f"{odd.name} of a loop is no row of one array")
                 begin, stride = _address(one.array), one.array.strides[0]
                 addresses += range(begin, begin + len(each) * stride, stride)
         # an array of ctypes takes twenty times as long to make

@@ -197,14 +197,12 @@ class HostPassage(Passage):
             while own and running:
                 _wait(running.popleft())
         assert stretch is not None
-        parts = [share.results() for share in shares]
-        if count == 1:
-            return parts[0], stretch.figures
-        found = [np.empty(self._filled, column.dtype) for column in parts[0]]
-        for i, part in enumerate(parts):
-            for whole, own in zip(found, part, strict=True):
-                whole.reshape(-1, self._together)[i::count] = own.reshape(-1, self._together)
-        return found, stretch.figures
+        found = [np.empty((len(rows), self._filled), rows.dtype) for rows in shares[0].results]
+        for i, share in enumerate(shares):
+            for whole, part in zip(found, share.results, strict=True):
+                dealt = whole.reshape(len(whole), -1, self._together)
+                dealt[:, i::count] = part.reshape(len(part), -1, self._together)
+        return [one for rows in found for one in rows], stretch.figures
 
 
 def _wait(futures: Iterable[Future[None]]) -> None:
@@ -224,7 +222,7 @@ class _Share:
         self._own[: len(values)] = values
         self._given: tuple[list[np.ndarray], list[np.ndarray], Arrays] | None = None
         self._left: list[tuple[np.ndarray, np.ndarray]] = []
-        self._found: list[tuple[np.ndarray, list[np.ndarray]]] = []
+        self._results: list[tuple[np.ndarray, list[np.ndarray]]] = []
 
     def run(self, stretch: Stretch) -> None:
         """Take lanes through a stretch, in calls of so many blocks as are worth one."""
@@ -237,7 +235,7 @@ class _Share:
             self._loop(arrays, upto, 0, size, start=at, block=self._block, begins=not self._begun, ends=ends)
             self._begun, at = True, upto
             if ends:
-                self._found.append((self._lanes, results))
+                self._results.append((self._lanes, results))
             elif len(marks):
                 self._leave(marks[0][(upto - 1) // self._block])
         self._given = None
@@ -246,10 +244,10 @@ class _Share:
             self._move(np.arange(len(self._lanes)))
             _, results, arrays = self.prepare(stretch)
             self._loop(arrays, 0, 0, self._own.shape[1], block=self._block, ends=True)
-            self._found.append((self._lanes, results))
+            self._results.append((self._lanes, results))
 
     def prepare(self, stretch: Stretch) -> tuple[list[np.ndarray], list[np.ndarray], Arrays]:
-        """Marks and results of a stretch, and all that the loop is given."""
+        """Marks of a stretch, results `(figures of one type, lanes)`, and all that the loop is given."""
         size = self._own.shape[1]
         marks = [np.empty((-(-stretch.length // self._block), size), dtype) for dtype in self._of["mark of a block"]]
         found = [np.empty((len(list(some)), size), dtype) for dtype, some in groupby(self._of["result"])]
@@ -257,18 +255,19 @@ class _Share:
         ends = unread if stretch.ends is None else stretch.ends
         every = [Rows(self._own), stretch.handed, stretch.last, *ends, *marks, *map(Rows, found)]
         arrays = Arrays(self._loop.signature, every, stretch.length, size, self._block)
-        self._given = marks, [one for rows in found for one in rows], arrays
+        self._given = marks, found, arrays
         return self._given
 
+    @property
     def results(self) -> list[np.ndarray]:
-        """Of all lanes."""
-        if len(self._found) == 1 and not self._left:
-            return self._found[0][1]
-        count = sum(len(lanes) for lanes, _ in self._found)
-        merged = [np.empty(count, dtype) for dtype in self._of["result"]]
-        for lanes, found in self._found:
+        """Of all lanes, `(figures of one type, lanes)` each."""
+        if not self._left:
+            return self._results[0][1]
+        count = sum(len(lanes) for lanes, _ in self._results)
+        merged = [np.empty((len(rows), count), rows.dtype) for rows in self._results[0][1]]
+        for lanes, found in self._results:
             for one, own in zip(merged, found, strict=True):
-                one[lanes] = own[: len(lanes)]
+                one[:, lanes] = own[:, : len(lanes)]
         return merged
 
     def _leave(self, marks: np.ndarray) -> None:
