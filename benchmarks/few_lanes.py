@@ -63,7 +63,7 @@ def measured(work: Workload, folder: Path, given: argparse.Namespace) -> list[fl
     end = time.perf_counter() + given.seconds
     while time.perf_counter() < end:
         for i, runner in enumerate(runners):
-            for _ in range(6):
+            for _ in range(20):
                 start = time.perf_counter()
                 runner()
                 best[i] = min(best[i], time.perf_counter() - start)

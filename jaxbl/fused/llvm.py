@@ -5,6 +5,7 @@ of the machine it runs on. Calls into it release the interpreter's lock, so that
 """
 
 import ctypes
+from array import array
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import reduce
@@ -68,11 +69,12 @@ def vector_lanes(dtype: np.dtype) -> int:
 class Argument(NamedTuple):
     """An array that a loop reads or writes where it lies: its group and place there (`input 2`), type, and how many numbers
     it holds: "one", one for each of "lanes", of "samples" or of "blocks" of samples, or "both": one for each sample of each
-    lane; "marks": for each block of each lane."""
+    lane; "marks": for each block of each lane. So many, from this one on, are of one type and hold as many."""
 
     name: str
     dtype: np.dtype
     holds: str
+    alike: int
 
     def check(self, array: np.ndarray, counts: dict[str, int]) -> None:
         """Refuse an array of wrong type or length, or with gaps, by `ValueError`."""
@@ -105,7 +107,11 @@ def signature_of(
         ("mark of a block", "marks", after.jaxpr.outvars[carry:] if after else []),
         ("result", "lanes", finish.jaxpr.outvars if finish else []),
     ]
-    return [Argument(f"{name} {i}", _dtype(v), holds) for name, holds, some in groups for i, v in enumerate(some)]
+    found: list[Argument] = []
+    every = [(f"{name} {i}", _dtype(v), holds) for name, holds, some in groups for i, v in enumerate(some)]
+    for one in reversed(every):
+        found.append(Argument(*one, 1 + found[-1].alike if found and found[-1][1:3] == one[1:] else 1))
+    return found[::-1]
 
 
 class Loop:
@@ -165,7 +171,7 @@ class Loop:
 
     def __call__(
         self,
-        arrays: "Arrays | Sequence[np.ndarray | Rows]",
+        arrays: "Arrays | Given",
         steps: int,
         first: int,
         last: int,
@@ -179,15 +185,15 @@ class Loop:
 
         What is kept is written `(steps, lanes)`, marks `(blocks, lanes)`, with no more lanes than run. Samples come in
         blocks of `block`, all in one where it is left out; `start`, where a block begins, is the first of those up to
-        `steps` that are run. What `begins` a run does not read the carry; what `ends` it writes results in its place. `ValueError` for
-        arrays that do not fit the signature.
+        `steps` that are run. What `begins` a run does not read the carry; what `ends` it writes results in its place.
+        `ValueError` for arrays that do not fit the signature.
         """
         given = arrays if isinstance(arrays, Arrays) else Arrays(self.signature, arrays, steps, last, block)
         if steps > given.steps or last > given.lanes:
             raise ValueError(f"{steps} samples of lanes up to {last}: arrays were made for {given.steps} and {given.lanes}")
         if start % given.block:
             raise ValueError(f"no block of {given.block} samples begins at {start}")
-        self._call(ctypes.addressof(given.addresses), start, steps, given.block, first, last, begins, ends)
+        self._call(given.table, start, steps, given.block, first, last, begins, ends)
 
 
 class Rows(NamedTuple):
@@ -196,46 +202,57 @@ class Rows(NamedTuple):
     array: np.ndarray
 
 
+class Placed:
+    """In the place of several arrays for a loop: these, and where they lie, which takes NumPy long to say."""
+
+    def __init__(self, arrays: Sequence[np.ndarray]):
+        self.arrays, self.addresses = arrays, [_address(one) for one in arrays]
+
+
+Given = Sequence[np.ndarray | Rows | Placed]
+
+
 class Arrays:
     """Arrays for a loop, which reads where they lie: checked against its signature for so many samples, in blocks of so
     many, and lanes."""
 
-    def __init__(
-        self,
-        signature: Sequence[Argument],
-        arrays: "Sequence[np.ndarray | Rows]",
-        steps: int,
-        lanes: int,
-        block: int | None = None,
-    ):
+    def __init__(self, signature: Sequence[Argument], arrays: Given, steps: int, lanes: int, block: int | None = None):
         self.steps, self.lanes, self.block = steps, lanes, block or max(steps, 1)
         blocks = -(-steps // self.block)
         counts = {
             "one": 1, "lanes": lanes, "samples": steps, "blocks": blocks, "both": steps * lanes, "marks": blocks * lanes
         }  # fmt: skip
-        count = sum(len(one.array) if isinstance(one, Rows) else 1 for one in arrays)
+        count = sum(_count(one) for one in arrays)
         if count != len(signature):
             raise ValueError(f"a loop needs {len(signature)} arrays, not {count}")
         addresses: list[int] = []
         for one in arrays:
-            each = signature[len(addresses) : len(addresses) + (len(one.array) if isinstance(one, Rows) else 1)]
-            if not isinstance(one, Rows):
+            each = signature[len(addresses) : len(addresses) + _count(one)]
+            if isinstance(one, Placed):
+                for argument, own in zip(each, one.arrays, strict=True):
+                    argument.check(own, counts)
+                addresses += one.addresses
+            elif not isinstance(one, Rows):
                 each[0].check(one, counts)
                 addresses.append(_address(one))
             elif each:
                 each[0].check(one.array[:1], counts)
-                _, dtype, holds = each[0]
-                other = next((two for two in each if two.holds != holds or two.dtype != dtype), None)
-                if other is not None or not one.array.flags.c_contiguous:
-                    raise ValueError(f"{(other or each[0]).name} of a loop is no row of one array")
+                if each[0].alike < len(each) or not one.array.flags.c_contiguous:
+                    odd = each[each[0].alike] if each[0].alike < len(each) else each[0]
+                    raise ValueError(f"{odd.name} of a loop is no row of one array")
                 begin, stride = _address(one.array), one.array.strides[0]
                 addresses += range(begin, begin + len(each) * stride, stride)
-        self._kept = list(arrays)
-        self.addresses = (ctypes.c_void_p * count)(*addresses)
+        # an array of ctypes takes twenty times as long to make
+        self._kept, self._table = list(arrays), array("Q", addresses)
+        self.table = self._table.buffer_info()[0]
 
 
-def _address(array: np.ndarray) -> int:
-    return array.__array_interface__["data"][0]
+def _count(one: np.ndarray | Rows | Placed) -> int:
+    return len(one.array) if isinstance(one, Rows) else len(one.arrays) if isinstance(one, Placed) else 1
+
+
+def _address(one: np.ndarray) -> int:
+    return one.__array_interface__["data"][0]
 
 
 class _Writer:

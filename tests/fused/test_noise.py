@@ -20,7 +20,7 @@ def test_noise_is_that_of_the_scan(seed, first, count):
 
 
 def test_another_generator_of_jax_is_left_to_xla(monkeypatch):
-    monkeypatch.setattr(module, "_drawing", module._drawing.__wrapped__)
+    monkeypatch.setattr(module, "_drawing", module._drawing.__wrapped__)  # compiled anew
     before = draw(3, 5, 40)
     with jax.threefry_partitionable(False):
         found = draw(3, 5, 40)
