@@ -227,8 +227,8 @@ class Reducer(NamedTuple):
     """A figure over a whole run, computed as it goes: memory does not grow with duration.
 
     `init(experiment)` gives the carry, `update(experiment, carry, index, signals)` takes in sample `index`, and
-    `result(experiment, carry, state)` gives a dict of numbers from the last carry and the last state. `done(experiment, carry,
-    state)`, where there is one, says that no further sample can change them: a lane may then stop.
+    `result(experiment, carry, state)` gives a dict of numbers from the last carry and the last state. `done(experiment,
+    carry, state)`, where there is one, says that no further sample can change them: a lane may then stop.
     """
 
     init: Callable[[Experiment], Any]
@@ -298,8 +298,8 @@ def figures(experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry)
 def done(experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry) -> Array | None:
     """Whether no further sample can change the figures; None where a reducer cannot know."""
     state, totals = carry
-    each = [r.done and r.done(experiment, total, state) for r, total in zip(reducers, totals, strict=True)]
-    return None if not each or None in each else functools.reduce(jnp.logical_and, each)
+    each = [r.done(experiment, total, state) for r, total in zip(reducers, totals, strict=True) if r.done is not None]
+    return functools.reduce(jnp.logical_and, each) if each and len(each) == len(reducers) else None
 
 
 def scan(

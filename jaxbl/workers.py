@@ -129,6 +129,8 @@ def start_jax(devices: int | None = None) -> None:
         # it has begun already: a later job of one worker
         with suppress(RuntimeError):
             jax.config.update("jax_num_cpu_devices", cores() if devices is None else devices)
+    # every program's results are waited for: to hand each to another thread takes longer than many of them run
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
     if jax.config.values["jax_compilation_cache_dir"] is None:
         # of this Python's own: another one packs programs otherwise
         cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "jaxbl" / sys.implementation.cache_tag

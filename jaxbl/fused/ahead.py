@@ -11,7 +11,7 @@ from . import Unsupported
 from .jaxprs import flat
 from .llvm import Loop
 from .noise import LONGEST_STRETCH, draw
-from .split import Around, recursion
+from .split import recursion
 
 Shares = tuple[list[Any], list[Any], list[Any]]
 """Next state of what lanes share, what follows each block of a stretch of samples reads of it `(blocks,)`, and what each
@@ -78,27 +78,39 @@ class Looped:
     def __init__(self, shared: Shared):
         parts = recursion(shared.inner, shared.state, shared.shapes())
         self._shared, self._direct = shared, parts.direct
-        # one program for all stretches: what it computes beyond the last sample is left unread
-        self._parallel = jax.jit(jax.vmap(parts.ahead)).lower(shared.shapes(shared.stretch)).compile()
+        # one program for all stretches, what it computes beyond the last sample is left unread; and few arrays, as each
+        # takes XLA and NumPy some microseconds
+        given, ahead = shared.shapes(shared.stretch), jax.vmap(parts.ahead)
+        dtypes = [one.dtype for one in jax.tree.leaves(jax.eval_shape(ahead, given))]
+        self._groups = [[i for i, one in enumerate(dtypes) if one == dtype] for dtype in dict.fromkeys(dtypes)]
+
+        def stacked(given: Any) -> list[Any]:
+            made = jax.tree.leaves(ahead(given))
+            return [jnp.stack([made[i] for i in group]) for group in self._groups]
+
+        self._parallel = jax.jit(stacked).lower(given).compile()
         self._loop = None
         self._dtypes: list[list[np.dtype]] = [[], []]
         if shared.state:
-            after = flat(lambda *state: sum(shared.outer(state, ()), []), *shared.state)
+            after = flat(lambda *state: jax.tree.leaves(shared.outer(state, ())), *shared.state)
             count = len(shared.state)
             self._dtypes = [[out.dtype for out in part.out_avals[count:]] for part in (after, parts.step)]
-            self._loop = Loop(parts.step, np.dtype(float), carry=count, lanes=1, around=Around(None, after, None))
+            self._loop = Loop(parts.step, np.dtype(float), carry=count, lanes=1, after=after)
 
     def __call__(self, state: list[Any], seed: int, first: int, count: int) -> Shares:
         shared = self._shared
-        direct, read = self._parallel(shared.given(seed, first, shared.stretch))
-        direct, read = ([np.asarray(one)[:count] for one in some] for some in (direct, read))
+        made: dict[int, np.ndarray] = {}
+        for group, rows in zip(self._groups, self._parallel(shared.given(seed, first, shared.stretch)), strict=True):
+            made |= zip(group, np.asarray(rows)[:, :count], strict=True)
+        alone = sum(self._direct)
+        direct, read = ([made[i] for i in some] for some in (range(alone), range(alone, len(made))))
         sizes = -(-count // shared.length), count
         state = [np.array([leaf]) for leaf in state]
         last, kept = ([np.empty(size, dtype) for dtype in some] for size, some in zip(sizes, self._dtypes, strict=True))
         if self._loop is not None:
             self._loop([*state, *read, *kept, *last], count, 0, 1, block=shared.length)
         own, rest = iter(direct), iter(kept)
-        return [leaf[0] for leaf in state], last, [next(own) if alone else next(rest) for alone in self._direct]
+        return [leaf[0] for leaf in state], last, [next(own) if one else next(rest) for one in self._direct]
 
 
 def ahead_of_lanes(shared: Shared) -> Ahead:

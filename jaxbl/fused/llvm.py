@@ -5,6 +5,7 @@ of the machine it runs on. Calls into it release the interpreter's lock, so that
 """
 
 import ctypes
+from array import array
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import reduce
@@ -68,11 +69,12 @@ def vector_lanes(dtype: np.dtype) -> int:
 class Argument(NamedTuple):
     """An array that a loop reads or writes where it lies: its group and place there (`input 2`), type, and how many numbers
     it holds: "one", one for each of "lanes", of "samples" or of "blocks" of samples, or "both": one for each sample of each
-    lane; "marks": for each block of each lane."""
+    lane; "marks": for each block of each lane. So many, from this one on, are of one type and hold as many."""
 
     name: str
     dtype: np.dtype
     holds: str
+    alike: int
 
     def check(self, array: np.ndarray, counts: dict[str, int]) -> None:
         """Refuse an array of wrong type or length, or with gaps, by `ValueError`."""
@@ -83,9 +85,15 @@ class Argument(NamedTuple):
 
 
 def signature_of(
-    body: ClosedJaxpr, around: Around | None, values: int, carry: int, fixed: int, beside: int = 0
+    body: ClosedJaxpr,
+    after: ClosedJaxpr | None,
+    finish: ClosedJaxpr | None,
+    values: int,
+    carry: int,
+    fixed: int,
+    beside: int = 0,
 ) -> list[Argument]:
-    """The arrays of a loop in their order; arguments as of :class:`Loop`."""
+    """The arrays of a loop in their order; arguments as of :class:`Loop` and :class:`Around`."""
     own, read = values + carry, body.jaxpr.invars
     groups: list[tuple[str, str, Sequence[Any]]] = [
         ("value", "lanes", read[:values]),
@@ -93,13 +101,17 @@ def signature_of(
         ("fixed number", "one", read[own : own + fixed]),
         ("input", "samples", read[own + fixed : len(read) - beside]),
         ("lane's input", "both", read[len(read) - beside :]),
-        ("input of a block", "blocks", around.after.jaxpr.invars[own:] if around else []),
-        ("input at the end", "one", around.finish.jaxpr.invars[own:] if around and around.finish else []),
+        ("input of a block", "blocks", after.jaxpr.invars[own:] if after else []),
+        ("input at the end", "one", finish.jaxpr.invars[own:] if finish else []),
         ("kept number", "both", body.jaxpr.outvars[carry:]),
-        ("mark of a block", "marks", around.after.jaxpr.outvars[carry:] if around else []),
-        ("result", "lanes", around.finish.jaxpr.outvars if around and around.finish else []),
+        ("mark of a block", "marks", after.jaxpr.outvars[carry:] if after else []),
+        ("result", "lanes", finish.jaxpr.outvars if finish else []),
     ]
-    return [Argument(f"{name} {i}", _dtype(v), holds) for name, holds, some in groups for i, v in enumerate(some)]
+    found: list[Argument] = []
+    every = [(f"{name} {i}", _dtype(v), holds) for name, holds, some in groups for i, v in enumerate(some)]
+    for one in reversed(every):
+        found.append(Argument(*one, 1 + found[-1].alike if found and found[-1][1:3] == one[1:] else 1))
+    return found[::-1]
 
 
 class Loop:
@@ -111,7 +123,7 @@ class Loop:
         dtype: of the lanes' numbers.
         values, carry, fixed, beside: how many differ from lane to lane, a lane carries, all lanes read unchanged in a call,
             and a lane alone reads at each sample.
-        around: left out, nothing.
+        around: left out, nothing; or `after` alone, what follows each block.
         lanes: that are computed together; left out, as many as suit the machine.
 
     Raises:
@@ -128,12 +140,14 @@ class Loop:
         fixed: int = 0,
         beside: int = 0,
         around: Around | None = None,
+        after: ClosedJaxpr | None = None,
         lanes: int | None = None,
     ):
         self.lanes = lanes or vector_lanes(dtype)
-        self.signature = signature_of(body, around, values, carry, fixed, beside)
+        after = around.after if around else after
+        self.signature = signature_of(body, after, around and around.finish, values, carry, fixed, beside)
         module = ir.Module("loop")
-        _Writer(module, self.lanes).loop(body, around, self.signature)
+        _Writer(module, self.lanes).loop(body, around, after, self.signature)
         parsed = binding.parse_assembly(str(module))
         options = binding.create_pipeline_tuning_options(speed_level=3)
         passes = binding.create_pass_builder(_machine(), options)
@@ -157,7 +171,7 @@ class Loop:
 
     def __call__(
         self,
-        arrays: "Arrays | Sequence[np.ndarray | Rows]",
+        arrays: "Arrays | Given",
         steps: int,
         first: int,
         last: int,
@@ -169,17 +183,17 @@ class Loop:
     ) -> None:
         """Take lanes from `first` up to `last` (multiples of `lanes`) through samples; the carry's arrays are overwritten.
 
-        What is kept is written `(steps, lanes)`, marks `(blocks, lanes)`, with no more lanes than run. Samples come in blocks
-        of `block`, all in one where it is left out; `start`, where a block begins, is the first of those up to `steps` that
-        are run. What `begins` a run does not read the carry; what `ends` it writes results in its place. `ValueError` for
-        arrays that do not fit the signature.
+        What is kept is written `(steps, lanes)`, marks `(blocks, lanes)`, with no more lanes than run. Samples come in
+        blocks of `block`, all in one where it is left out; `start`, where a block begins, is the first of those up to
+        `steps` that are run. What `begins` a run does not read the carry; what `ends` it writes results in its place.
+        `ValueError` for arrays that do not fit the signature.
         """
         given = arrays if isinstance(arrays, Arrays) else Arrays(self.signature, arrays, steps, last, block)
         if steps > given.steps or last > given.lanes:
             raise ValueError(f"{steps} samples of lanes up to {last}: arrays were made for {given.steps} and {given.lanes}")
         if start % given.block:
             raise ValueError(f"no block of {given.block} samples begins at {start}")
-        self._call(ctypes.addressof(given.addresses), start, steps, given.block, first, last, begins, ends)
+        self._call(given.table, start, steps, given.block, first, last, begins, ends)
 
 
 class Rows(NamedTuple):
@@ -188,46 +202,57 @@ class Rows(NamedTuple):
     array: np.ndarray
 
 
-class Arrays:
-    """Arrays for a loop, which reads where they lie: checked against its signature for so many samples, in blocks of so many,
-    and lanes."""
+class Placed:
+    """In the place of several arrays for a loop: these, and where they lie, which takes NumPy long to say."""
 
-    def __init__(
-        self,
-        signature: Sequence[Argument],
-        arrays: "Sequence[np.ndarray | Rows]",
-        steps: int,
-        lanes: int,
-        block: int | None = None,
-    ):
+    def __init__(self, arrays: Sequence[np.ndarray]):
+        self.arrays, self.addresses = arrays, [_address(one) for one in arrays]
+
+
+Given = Sequence[np.ndarray | Rows | Placed]
+
+
+class Arrays:
+    """Arrays for a loop, which reads where they lie: checked against its signature for so many samples, in blocks of so
+    many, and lanes."""
+
+    def __init__(self, signature: Sequence[Argument], arrays: Given, steps: int, lanes: int, block: int | None = None):
         self.steps, self.lanes, self.block = steps, lanes, block or max(steps, 1)
         blocks = -(-steps // self.block)
         counts = {
             "one": 1, "lanes": lanes, "samples": steps, "blocks": blocks, "both": steps * lanes, "marks": blocks * lanes
         }  # fmt: skip
-        count = sum(len(one.array) if isinstance(one, Rows) else 1 for one in arrays)
+        count = sum(_count(one) for one in arrays)
         if count != len(signature):
             raise ValueError(f"a loop needs {len(signature)} arrays, not {count}")
         addresses: list[int] = []
         for one in arrays:
-            each = signature[len(addresses) : len(addresses) + (len(one.array) if isinstance(one, Rows) else 1)]
-            if not isinstance(one, Rows):
+            each = signature[len(addresses) : len(addresses) + _count(one)]
+            if isinstance(one, Placed):
+                for argument, own in zip(each, one.arrays, strict=True):
+                    argument.check(own, counts)
+                addresses += one.addresses
+            elif not isinstance(one, Rows):
                 each[0].check(one, counts)
                 addresses.append(_address(one))
             elif each:
                 each[0].check(one.array[:1], counts)
-                _, dtype, holds = each[0]
-                other = next((two for two in each if two.holds != holds or two.dtype != dtype), None)
-                if other is not None or not one.array.flags.c_contiguous:
-                    raise ValueError(f"{(other or each[0]).name} of a loop is no row of one array")
+                if each[0].alike < len(each) or not one.array.flags.c_contiguous:
+                    odd = each[each[0].alike] if each[0].alike < len(each) else each[0]
+                    raise ValueError(f"{odd.name} of a loop is no row of one array")
                 begin, stride = _address(one.array), one.array.strides[0]
                 addresses += range(begin, begin + len(each) * stride, stride)
-        self._kept = list(arrays)
-        self.addresses = (ctypes.c_void_p * count)(*addresses)
+        # an array of ctypes takes twenty times as long to make
+        self._kept, self._table = list(arrays), array("Q", addresses)
+        self.table = self._table.buffer_info()[0]
 
 
-def _address(array: np.ndarray) -> int:
-    return array.__array_interface__["data"][0]
+def _count(one: np.ndarray | Rows | Placed) -> int:
+    return len(one.array) if isinstance(one, Rows) else len(one.arrays) if isinstance(one, Placed) else 1
+
+
+def _address(one: np.ndarray) -> int:
+    return one.__array_interface__["data"][0]
 
 
 class _Writer:
@@ -238,7 +263,9 @@ class _Writer:
         self.constant: set[Vector] = set()
         """Those that do not change in the loop over time."""
 
-    def loop(self, body: ClosedJaxpr, around: Around | None, signature: Sequence[Argument]) -> None:
+    def loop(
+        self, body: ClosedJaxpr, around: Around | None, after: ClosedJaxpr | None, signature: Sequence[Argument]
+    ) -> None:
         function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [_POINTER, *[_INT] * _NUMBERS]), "loop")
         # what registers have no room for lies on the stack: no vector of it over two lines of the cache
         function.attributes.alignstack = 64
@@ -290,26 +317,22 @@ class _Writer:
                 write("kept number", found[carry:], place)
                 return found[:carry]
 
-            if around is None:
+            if after is None:
                 return write("carry", self.count(start, steps, read("carry"), sample), lane)
 
             def block(begin: Vector, state: list[Vector]) -> list[Vector]:
                 end = build.add(begin, length)
                 state = self.count(begin, build.select(build.icmp_signed("<", end, steps), end, steps), state, sample)
                 number = build.sdiv(begin, length)
-                found = self.run(around.after, [*numbers, *state, *(scalar(i, number) for i in group["input of a block"])])
+                found = self.run(after, [*numbers, *state, *(scalar(i, number) for i in group["input of a block"])])
                 write("mark of a block", found[carry:], build.add(build.mul(number, width), build.sub(lane, first)))
                 return found[:carry]
 
+            if around is None:
+                return write("carry", self.count(start, steps, read("carry"), block, by=length), lane)
             before, finish = around.before, around.finish
-            state = (
-                read("carry")
-                if before is None
-                else (self.either(begins, lambda: self.run(before, numbers), lambda: read("carry")))
-            )
+            state = self.either(begins, lambda: self.run(before, numbers), lambda: read("carry"))
             state = self.count(start, steps, state, block, by=length)
-            if finish is None:
-                return write("carry", state, lane)
             return self.either(
                 ends,
                 lambda: write("result", self.run(finish, [*numbers, *state, *at_end]), lane),

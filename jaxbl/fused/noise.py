@@ -23,7 +23,7 @@ LONGEST_STRETCH = 4 * LONGEST_BLOCK
 """Samples whose noise is drawn at once, at most: a call of XLA takes some 30 us, whatever their number."""
 SIDES = ("motor", "load")
 _TURNS = (13, 15, 26, 6), (17, 29, 16, 24)
-"""Rotations of Threefry-2x32, whose rounds come in fours (Salmon et al., Parallel random numbers: as easy as 1, 2, 3, 2011)."""
+"""Rotations of Threefry-2x32 in its rounds, four at a time (Salmon et al., Parallel random numbers, 2011)."""
 _PARITY = 0x1BD11BDA
 _WORD = jax.ShapeDtypeStruct((), jnp.uint32)
 
@@ -38,45 +38,52 @@ def host() -> Any:
 
 def draw(seed: int, first: int, count: int) -> dict[str, np.ndarray]:
     """Noise of each side `(count,)`, of at most `LONGEST_STRETCH` samples from `first` on."""
-    return dict(zip(SIDES, np.asarray(_drawing()(seed, first, count))[:, :count], strict=True))
+    size = max(LONGEST_STRETCH // 4, 1 << (count - 1).bit_length())
+    return dict(zip(SIDES, np.asarray(_drawing(size)(seed, first, count))[:, :count], strict=True))
 
 
 @cache
-def _drawing() -> Callable[[int, int, int], Any]:
-    """Compiled once for all studies."""
+def _drawing(size: int) -> Callable[[int, int, int], Any]:
+    """For at most so many samples; compiled once for all studies."""
     with jax.default_device(host()):
         try:
-            return _by_loop()
+            return _by_loop(size)
         except Unsupported:
-            return _by_xla()
+            return _by_xla(size)
 
 
-def _by_xla() -> Callable[[int, int, int], Any]:
+def _by_xla(size: int) -> Callable[[int, int, int], Any]:
     def noise(seed: Any, first: Any) -> Any:
-        drawn = unit_noise(seed, first + jnp.arange(LONGEST_STRETCH, dtype=jnp.int32), SIDES)
+        drawn = unit_noise(seed, first + jnp.arange(size, dtype=jnp.int32), SIDES)
         return jnp.stack([drawn[side] for side in SIDES])
 
     program = jax.jit(noise).lower(np.uint32(0), np.int32(0)).compile()
     return lambda seed, first, count: program(np.uint32(seed), np.int32(first))
 
 
-def _by_loop() -> Callable[[int, int, int], Any]:
+def _by_loop(size: int) -> Callable[[int, int, int], Any]:
     """`Unsupported` where JAX draws otherwise."""
-    if jax.config.jax_default_prng_impl != "threefry2x32" or not jax.config.jax_threefry_partitionable:
+    settings: Any = jax.config
+    if settings.jax_default_prng_impl != "threefry2x32" or not settings.jax_threefry_partitionable:
         raise Unsupported("random bits by another generator")
     with attempted():
-        loop = Loop(traced(_bits, _WORD, _WORD), np.dtype(np.float32), fixed=1, beside=1)
-        bits = jax.ShapeDtypeStruct((2, LONGEST_STRETCH), jnp.uint32)
+        loop = _random()
+        bits = jax.ShapeDtypeStruct((2, size), jnp.uint32)
         program = jax.jit(jax.vmap(jax.vmap(_normal))).lower(bits).compile()
 
     def noise(seed: int, first: int, count: int) -> Any:
         whole = -(-count // loop.lanes) * loop.lanes
-        found = np.zeros((2, LONGEST_STRETCH), np.uint32)
+        found = np.zeros((2, size), np.uint32)
         samples = np.arange(first, first + whole, dtype=np.uint32)
         loop([np.array(seed, np.uint32), samples, *found[:, :whole]], 1, 0, whole)
         return program(found)
 
     return noise
+
+
+@cache
+def _random() -> Loop:
+    return Loop(traced(_bits, _WORD, _WORD), np.dtype(np.float32), fixed=1, beside=1)
 
 
 def _bits(seed: Any, index: Any) -> tuple[Any, Any]:

@@ -4,6 +4,7 @@ import abc
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +15,7 @@ from jaxbl.drive.parameters import set_leaves
 from jaxbl.simulate import Experiment, Reducer, advance, begin, block_length, done, end_of_block, figures
 
 from .ahead import Shared, ahead_of_lanes
-from .llvm import Arrays, Loop, Rows, vector_lanes
+from .llvm import Arrays, Loop, Placed, Rows, vector_lanes
 from .noise import host
 from .split import Around, Kind, carry_kinds, split
 
@@ -22,7 +23,7 @@ _KEPT = 2**24
 """Bytes of what lanes share, of some seeds, that stay for the next lanes."""
 _WORTH = 0.875
 """Share of lanes down to which those that are done stay: to move the others costs as much as some samples."""
-_SHARE = 2**17
+_SHARE = 2**16
 """Samples of lanes, some 0.1 ms, that are worth a thread."""
 _CALL = 2**20
 """Samples of lanes that a call of the loop takes, some 1 ms: after it, lanes that are done leave."""
@@ -33,15 +34,15 @@ class Stretch(NamedTuple):
     block `(blocks,)`; of the last stretch those of a lane's figures `()`, and the figures that lanes share `()`."""
 
     length: int
-    handed: list[np.ndarray]
-    last: list[np.ndarray]
+    handed: Placed
+    last: Placed
     ends: list[np.ndarray] | None
     figures: list[np.ndarray]
 
     @property
     def size(self) -> int:
         """Bytes."""
-        return sum(one.nbytes for one in (*self.handed, *self.last))
+        return sum(one.nbytes for part in (self.handed, self.last) for one in part.arrays)
 
 
 class Passage(abc.ABC):
@@ -146,7 +147,7 @@ class Passage(abc.ABC):
             ends, figures = None, []
             if first + length == self._steps:
                 figures, ends = ([np.asarray(x) for x in some] for some in self._closing(state))
-            yield Stretch(length, handed, last, ends, figures)
+            yield Stretch(length, *(Placed([np.asarray(x) for x in part]) for part in (handed, last)), ends, figures)
 
     @abc.abstractmethod
     def _march(self, given: list[np.ndarray], stretches: Iterator[Stretch]) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -162,7 +163,13 @@ class HostPassage(Passage):
         dtype = np.dtype(jnp.result_type(experiment.run.sample_period))
         self._together = vector_lanes(dtype)
         super().__init__(experiment, reducers, paths, lanes, self._together)
-        self._loop = Loop(self._body, self._dtype, values=len(paths), carry=self.carried, around=self._around)
+        if any(eqn.primitive.name == "scan" for eqn in self._body.jaxpr.eqns):
+            # plant steps of a sample: few numbers, each of which waits for the one before
+            self._together *= 2
+            self._filled = -(-lanes // self._together) * self._together
+        self._loop = Loop(
+            self._body, self._dtype, values=len(paths), carry=self.carried, around=self._around, lanes=self._together
+        )
         self._of = {
             name: [one.dtype for one in self._loop.signature if one.name.startswith(name)]
             for name in ("input at the end", "mark of a block", "result")
@@ -176,7 +183,7 @@ class HostPassage(Passage):
         count = len(self._threads)
         rows = np.stack(given) if given else np.empty((0, self._filled), self._dtype)
         dealt = [rows.reshape(len(given), -1, self._together)[:, i::count].reshape(len(given), -1) for i in range(count)]
-        shares = [self._share(np.ascontiguousarray(values)) for values in dealt]
+        shares = [_Share(self._loop, self._of, values, self.carried, self._length) for values in dealt]
         running: deque[list[Future[None]]] = deque()
         stretch = None
         for stretch in stretches:
@@ -196,17 +203,12 @@ class HostPassage(Passage):
             while own and running:
                 _wait(running.popleft())
         assert stretch is not None
-        parts = [share.results() for share in shares]
-        if count == 1:
-            return parts[0], stretch.figures
-        found = [np.empty(self._filled, column.dtype) for column in parts[0]]
-        for i, part in enumerate(parts):
-            for whole, own in zip(found, part, strict=True):
-                whole.reshape(-1, self._together)[i::count] = own.reshape(-1, self._together)
-        return found, stretch.figures
-
-    def _share(self, values: np.ndarray) -> "_Share":
-        return _Share(self._loop, self._of, values, np.empty((self.carried, values.shape[1]), self._dtype), self._length)
+        found = [np.empty((len(rows), self._filled), rows.dtype) for rows in shares[0].results]
+        for i, share in enumerate(shares):
+            for whole, part in zip(found, share.results, strict=True):
+                dealt = whole.reshape(len(whole), -1, self._together)
+                dealt[:, i::count] = part.reshape(len(part), -1, self._together)
+        return [one for rows in found for one in rows], stretch.figures
 
 
 def _wait(futures: Iterable[Future[None]]) -> None:
@@ -215,76 +217,79 @@ def _wait(futures: Iterable[Future[None]]) -> None:
 
 
 class _Share:
-    """Lanes of one thread on their way, with `values` `(paths, lanes)`. Those that are done leave, with the carry that they
-    have then, and the others move together."""
+    """Lanes of one thread on their way, with `values` `(paths, lanes)`. Those that are done leave, with what they carry
+    then, and the others move together."""
 
-    def __init__(self, loop: Loop, of: dict[str, list[np.dtype]], values: np.ndarray, carry: np.ndarray, block: int):
+    def __init__(self, loop: Loop, of: dict[str, list[np.dtype]], values: np.ndarray, carried: int, block: int):
         self._loop, self._of, self._block, self._begun = loop, of, block, False
-        # of the lanes that are computed: their places, behind which others only fill up
-        self._lanes, self._values, self._carry = np.arange(values.shape[1]), values, carry
+        # of the lanes that are computed: their places, values and carry; behind them others only fill up
+        self._lanes = np.arange(values.shape[1])
+        self._own = np.empty((len(values) + carried, values.shape[1]), values.dtype)
+        self._own[: len(values)] = values
         self._given: tuple[list[np.ndarray], list[np.ndarray], Arrays] | None = None
-        self._left: list[tuple[np.ndarray, ...]] = []
-        self._found: list[tuple[np.ndarray, list[np.ndarray]]] = []
+        self._left: list[tuple[np.ndarray, np.ndarray]] = []
+        self._results: list[tuple[np.ndarray, list[np.ndarray]]] = []
 
     def run(self, stretch: Stretch) -> None:
         """Take lanes through a stretch, in calls of so many blocks as are worth one."""
         at = 0
         while at < stretch.length and len(self._lanes):
             marks, results, arrays = self._given or self.prepare(stretch)
-            size = self._values.shape[1]
+            size = self._own.shape[1]
             upto = min(at + max(_CALL // (size * self._block), 1) * self._block, stretch.length)
             ends = stretch.ends is not None and upto == stretch.length
             self._loop(arrays, upto, 0, size, start=at, block=self._block, begins=not self._begun, ends=ends)
             self._begun, at = True, upto
             if ends:
-                self._found.append((self._lanes, results))
+                self._results.append((self._lanes, results))
             elif len(marks):
                 self._leave(marks[0][(upto - 1) // self._block])
         self._given = None
         if stretch.ends is not None and self._left:
-            self._lanes, self._values, self._carry = (np.concatenate(one, axis=-1) for one in zip(*self._left, strict=True))
+            self._lanes, self._own = (np.concatenate(one, axis=-1) for one in zip(*self._left, strict=True))
             self._move(np.arange(len(self._lanes)))
             _, results, arrays = self.prepare(stretch)
-            self._loop(arrays, 0, 0, self._values.shape[1], block=self._block, ends=True)
-            self._found.append((self._lanes, results))
+            self._loop(arrays, 0, 0, self._own.shape[1], block=self._block, ends=True)
+            self._results.append((self._lanes, results))
 
     def prepare(self, stretch: Stretch) -> tuple[list[np.ndarray], list[np.ndarray], Arrays]:
-        """Marks and results of a stretch, and all that the loop is given."""
-        size = self._values.shape[1]
+        """Marks of a stretch, results `(figures of one type, lanes)`, and all that the loop is given."""
+        size = self._own.shape[1]
         marks = [np.empty((-(-stretch.length // self._block), size), dtype) for dtype in self._of["mark of a block"]]
-        results = [np.empty(size, dtype) for dtype in self._of["result"]]
+        found = [np.empty((len(list(some)), size), dtype) for dtype, some in groupby(self._of["result"])]
         unread = [np.zeros((), dtype) for dtype in self._of["input at the end"]]
         ends = unread if stretch.ends is None else stretch.ends
-        every = [Rows(self._values), Rows(self._carry), *stretch.handed, *stretch.last, *ends, *marks, *results]
-        self._given = marks, results, Arrays(self._loop.signature, every, stretch.length, size, self._block)
+        every = [Rows(self._own), stretch.handed, stretch.last, *ends, *marks, *map(Rows, found)]
+        arrays = Arrays(self._loop.signature, every, stretch.length, size, self._block)
+        self._given = marks, found, arrays
         return self._given
 
+    @property
     def results(self) -> list[np.ndarray]:
-        """Of all lanes."""
-        if len(self._found) == 1 and not self._left:
-            return self._found[0][1]
-        count = sum(len(lanes) for lanes, _ in self._found)
-        merged = [np.empty(count, dtype) for dtype in self._of["result"]]
-        for lanes, found in self._found:
+        """Of all lanes, `(figures of one type, lanes)` each."""
+        if not self._left:
+            return self._results[0][1]
+        count = sum(len(lanes) for lanes, _ in self._results)
+        merged = [np.empty((len(rows), count), rows.dtype) for rows in self._results[0][1]]
+        for lanes, found in self._results:
             for one, own in zip(merged, found, strict=True):
-                one[lanes] = own[: len(lanes)]
+                one[:, lanes] = own[:, : len(lanes)]
         return merged
 
     def _leave(self, marks: np.ndarray) -> None:
         """Lanes that are done, if so many are that the move is worth while."""
         done = marks[: len(self._lanes)]
         others = np.flatnonzero(~done)
-        if -(-len(others) // self._loop.lanes) * self._loop.lanes <= _WORTH * self._values.shape[1]:
+        if -(-len(others) // self._loop.lanes) * self._loop.lanes <= _WORTH * self._own.shape[1]:
             gone = np.flatnonzero(done)
-            self._left.append((self._lanes[gone], self._values[:, gone], self._carry[:, gone]))
+            self._left.append((self._lanes[gone], self._own[:, gone]))
             self._move(others)
 
     def _move(self, lanes: np.ndarray) -> None:
         """Only these stay."""
         whole = -(-len(lanes) // self._loop.lanes) * self._loop.lanes
         filled = np.pad(lanes, (0, whole - len(lanes)), "edge") if len(lanes) else lanes
-        self._lanes, self._given = self._lanes[lanes], None
-        self._values, self._carry = (np.take(one, filled, axis=1) for one in (self._values, self._carry))
+        self._lanes, self._own, self._given = self._lanes[lanes], np.take(self._own, filled, axis=1), None
 
 
 class DevicePassage(Passage):
@@ -319,6 +324,6 @@ class DevicePassage(Passage):
     def inputs(stretches: Iterable[Stretch]) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
         """What the kernel reads of all stretches: each sample's, each block's, and the figures' own."""
         every = list(stretches)
-        handed = [np.concatenate(column) for column in zip(*(one.handed for one in every), strict=True)]
-        last = [np.concatenate(column) for column in zip(*(one.last for one in every), strict=True)]
+        handed = [np.concatenate(column) for column in zip(*(one.handed.arrays for one in every), strict=True)]
+        last = [np.concatenate(column) for column in zip(*(one.last.arrays for one in every), strict=True)]
         return handed, last, every[-1].ends or []

@@ -43,11 +43,11 @@ class Parts(NamedTuple):
 class Around(NamedTuple):
     """What is done around the loop over a block of samples, jaxprs of scalars of one lane: before the first block (values ->
     carry), after each (values, carry, inputs -> carry, and marks that are kept of each block), and to finish (values, carry,
-    inputs -> results). Without the first and the last, there is only the carry."""
+    inputs -> results)."""
 
-    before: ClosedJaxpr | None
+    before: ClosedJaxpr
     after: ClosedJaxpr
-    finish: ClosedJaxpr | None
+    finish: ClosedJaxpr
 
 
 def carry_kinds(start: Callable[..., Any], functions: Iterable[tuple[Callable[..., Any], Any]], values: Any) -> list[Kind]:

@@ -253,7 +253,7 @@ def measured(devices: list[Any]) -> Costs:
 def _times(config: Config, devices: list[Any], wanted: Sequence[Tried]) -> tuple[dict[Tried, float], dict[Backend, float]]:
     """Seconds that a sample takes, the least of some rounds in turns; and those that a backend takes to compile."""
     runs, compiling = {}, dict.fromkeys(BACKENDS, math.inf)
-    with precision(config), not_put_into_cache(read=False):
+    with precision(config), not_put_into_cache():
         experiment = prepare(config)
         for backend, path, count in wanted:
             columns = {path: np.full(count, get_leaf(experiment, path))}

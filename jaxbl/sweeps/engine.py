@@ -114,6 +114,7 @@ class Engine:
         self.run_seconds = 0.0
         self.scanned: list[str] = []
         self._compiled: OrderedDict[int, tuple[Program, list[str]]] = OrderedDict()
+        self._judging: set[str] = set()
 
     def _faster(self) -> Backend:
         """By the study, however it is cut: roundings differ between backends."""
@@ -205,7 +206,12 @@ class Engine:
         with precision(group.config):
             given = self._arguments(group.config, self.points.columns(chunk.points), chunk.seeds)
             start = time.perf_counter()
-            figures = jax.block_until_ready(with_conditions(*program.run(*given)))
+            found = jax.block_until_ready(program.run(*given))
+            self.run_seconds += time.perf_counter() - start
+            # only now, as the first lanes need not wait for them
+            self._compile_conditions(group.config.run.precision)
+            start = time.perf_counter()
+            figures = with_conditions(*found)
             self.run_seconds += time.perf_counter() - start
         data = self.labels(chunk)
         for name in names:
@@ -251,11 +257,17 @@ class Engine:
             columns, _ = self._arguments(config, self.points.columns(np.arange(1)), np.arange(1))
             start = time.perf_counter()
             program = compile_program(experiment, self.layout, self.devices, self.backend, columns, insist=self.insist)
-            compile_conditions(config.run.precision)
             self.compile_seconds += time.perf_counter() - start
             if program.instead is not None and program.instead not in self.scanned:
                 self.scanned.append(program.instead)
             return program, metric_columns(experiment)
+
+    def _compile_conditions(self, dtype: str) -> None:
+        if dtype not in self._judging:
+            self._judging.add(dtype)
+            start = time.perf_counter()
+            compile_conditions(dtype)
+            self.compile_seconds += time.perf_counter() - start
 
     def estimate(self) -> "SweepEstimate":
         """Memory and time of all chunks, from a compilation and short runs of a chunk of the group that has most samples."""
@@ -264,7 +276,10 @@ class Engine:
         config, chunk = groups[group].config, self.chunk(group * (len(self) // len(groups)))
         with not_put_into_cache():
             program, _ = self._compile(config)
-        compiling = self.compile_seconds
+            a_program = self.compile_seconds
+            with precision(config):
+                self._compile_conditions(config.run.precision)
+        compiling = a_program * len(groups) + self.compile_seconds - a_program
         backend: Backend = "scan" if program.instead is not None else self.backend
         # long enough for what a call costs not to count
         expected = self._seconds(backend, config) / config.run.steps
@@ -295,7 +310,7 @@ class Engine:
             most_points=len(self.points),
             chunks=len(self),
             lanes_a_chunk=lanes,
-            compile_seconds=compiling * len(groups),
+            compile_seconds=compiling,
             run_seconds=run_seconds,
             lane_steps_per_second=chunks * lanes * sum(one.config.run.steps for one in groups) / run_seconds,
             megabytes=program.megabytes,

@@ -49,18 +49,16 @@ class Program(NamedTuple):
 
 
 @contextmanager
-def not_put_into_cache(*, read: bool = True) -> Iterator[None]:
-    """What is compiled inside is not put into JAX's cache of programs, and taken from it where it may be `read`: compiling
-    takes as long as it would without."""
-    changed = {"jax_persistent_cache_min_compile_time_secs": math.inf, "jax_enable_compilation_cache": read}
-    before = {name: jax.config.values[name] for name in changed}
-    for name, value in changed.items():
-        jax.config.update(name, value)
+def not_put_into_cache() -> Iterator[None]:
+    """What is compiled inside is not put into JAX's cache of programs, and taken from it if it is there: compiling takes as
+    long as it would without."""
+    least = "jax_persistent_cache_min_compile_time_secs"
+    before = jax.config.values[least]
+    jax.config.update(least, math.inf)
     try:
         yield
     finally:
-        for name, value in before.items():
-            jax.config.update(name, value)
+        jax.config.update(least, before)
 
 
 def compile_program(
@@ -110,8 +108,10 @@ def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tu
 
     def run(values: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[dict[str, Any], dict[str, ObserverGains]]:
         with jax.default_device(devices[0]):
-            # seeds that only fill up the last chunk are copies of one
-            found = {seed: passage(values, seed) for seed in dict.fromkeys(int(seed) for seed in seeds)}
+            # seeds that only fill up the last chunk are copies of one; those of a chunk are likely those of the next
+            different = dict.fromkeys(int(seed) for seed in seeds)
+            passage.keep(different)
+            found = {seed: passage(values, seed) for seed in different}
         stacked = {name: np.stack([found[int(seed)][name] for seed in seeds]) for name in found[int(seeds[0])]}
         return stacked, observer_gains(set_leaves(experiment, values))
 

@@ -36,7 +36,7 @@ class Scan(Chunked):
 
 
 class Fused:
-    """The loop over time in registers, threads side by side. It makes input and noise by itself, of another seed each time."""
+    """The loop over time in registers, threads side by side; input and noise by itself, of another seed each time."""
 
     def __init__(self, workload: Workload, threads: int):
         self._passage = HostPassage(workload.experiment(), (FIGURES,), tuple(RANGES), workload.lanes, threads)

@@ -44,9 +44,9 @@ def test_the_loop_does_what_the_scan_does(monkeypatch, precision, excitation, pa
     made = []
 
     class Noted(Looped):
-        def __init__(self, shared, lengths):
-            super().__init__(shared, lengths)
-            made.append((self, Scanned(shared, lengths), shared))
+        def __init__(self, shared):
+            super().__init__(shared)
+            made.append((self, Scanned(shared), shared))
 
     monkeypatch.setattr(module, "Looped", Noted)
     with jax.enable_x64(precision == "float64"):
@@ -66,5 +66,9 @@ def test_the_loop_does_what_the_scan_does(monkeypatch, precision, excitation, pa
                     tolerance = 1e-9 if precision == "float64" else 1e-2
                     size = np.max(np.abs(np.asarray(other, float))) + 1e-30
                     np.testing.assert_allclose(one, other, rtol=tolerance, atol=tolerance * size)
+        # both blocks in one stretch: the loop settles its state between them
+        whole, twice, _ = looped([np.zeros((), leaf.dtype) for leaf in shared.state], 3, 0, 600)
+        np.testing.assert_array_equal(whole, ours)
+        assert [one[-1] for one in twice] == [one[0] for one in last]
         assert len(handed) > 0
         assert any(np.ptp(np.asarray(one, float)) > 0.0 for one in handed)

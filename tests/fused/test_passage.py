@@ -14,6 +14,7 @@ from jaxbl.drive.excitation import Chirp, Sine
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.drive.transmission import DeadZone
 from jaxbl.fused import Unsupported
+from jaxbl.fused import passage as module
 from jaxbl.fused.ahead import Looped
 from jaxbl.fused.jaxprs import contracted, substituted
 from jaxbl.fused.pallas import LANES, Kernel
@@ -211,6 +212,77 @@ def test_an_error_of_a_thread_reaches_the_caller(monkeypatch):
         passage(work.values(), SEED)
     monkeypatch.undo()
     assert np.isfinite(passage(work.values(), SEED)["motor.velocity_rmse"]).all()
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("order", ["one after the other", "mixed"])
+def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precision, order):
+    """Lanes with a shaft too stiff for the plant's step overflow, some at once, some later, some on one side alone."""
+    monkeypatch.setattr(module, "_CALL", 1)
+    monkeypatch.setattr(module, "_SHARE", 1)
+    lanes, samples = 300, []
+    stiffness = np.concatenate([np.full(100, 60.0), np.geomspace(1e5, 1e7, 200)])
+    if order == "mixed":
+        stiffness = np.random.default_rng(0).permutation(stiffness)
+    with jax.enable_x64(precision == "float64"):
+        whole = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41, precision=precision)
+        values = {"transmission.stiffness": stiffness}
+        staying = METRICS._replace(done=None)
+        expected = HostPassage(whole, (staying,), tuple(values), lanes, 1)(values, 3)
+        assert 0 < np.count_nonzero(expected["finite"]) < lanes
+        for threads in (1, 2):
+            passage = HostPassage(whole, (METRICS,), tuple(values), lanes, threads)
+            assert len(passage._threads) == threads
+            loop = passage._loop
+
+            def counted(arrays, upto, first, last, loop=loop, **options):
+                samples.append((upto - options.get("start", 0)) * last)
+                loop(arrays, upto, first, last, **options)
+
+            counted.signature, counted.lanes = loop.signature, loop.lanes
+            monkeypatch.setattr(passage, "_loop", counted)
+            samples.clear()
+            found = passage(values, 3)
+            assert set(found) == set(expected)
+            for name, figure in found.items():
+                assert figure.dtype == expected[name].dtype
+                np.testing.assert_array_equal(figure, expected[name], err_msg=name)
+            # some two thirds of the lanes leave
+            assert sum(samples) < 0.6 * lanes * whole.run.steps
+
+
+def test_all_lanes_may_leave(monkeypatch):
+    monkeypatch.setattr(module, "_CALL", 1)
+    whole = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41)
+    passage = HostPassage(whole, (METRICS,), ("transmission.stiffness",), 5, 1)
+    found = passage({"transmission.stiffness": np.full(5, 1e8)}, 3)
+    assert not found["finite"].any()
+    assert not found["load.converged"].any()
+    assert np.isnan(found["load.velocity_rmse"]).all()
+
+
+def test_what_lanes_share_is_kept_for_the_same_seeds_alone(monkeypatch):
+    work = Workload(40, 300, "float64")
+    passage = HostPassage(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
+    drawn = []
+    ahead = passage._ahead
+    monkeypatch.setattr(passage, "_ahead", lambda state, seed, *rest: drawn.append(seed) or ahead(state, seed, *rest))
+    first = passage(work.values(), 1)
+    for seed in (1, 2, 1):
+        again = passage(work.values(), seed)
+    assert drawn == [1, 2]
+    for name, figure in first.items():
+        np.testing.assert_array_equal(again[name], figure)
+    passage.keep([2])
+    for seed in (2, 1):
+        passage(work.values(), seed)
+    assert drawn == [1, 2, 1]
+    # no room
+    monkeypatch.setattr(module, "_KEPT", 100)
+    passage.keep([])
+    for seed in (2, 2):
+        passage(work.values(), seed)
+    assert drawn == [1, 2, 1, 2, 2]
 
 
 def test_an_unknown_operation_is_refused_by_name():

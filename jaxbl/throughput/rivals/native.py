@@ -55,8 +55,8 @@ WHOLE = 64
 
 
 class Native:
-    """One workload, ready to run; arrays are the kernel's, so that a run allocates nothing. `own`: it makes input and noise by
-    itself, of another seed each time; else they are given."""
+    """One workload, ready to run; arrays are the kernel's, so that a run allocates nothing. `own`: it makes input and noise
+    by itself, of another seed each time; else they are given."""
 
     def __init__(self, workload: Workload, threads: int, folder: Path, *, own: bool = False):
         self.workload, self.threads, self._own, self._seeds = workload, threads, own, count(SEED)

@@ -30,7 +30,7 @@ struct Observer {
   }
   // Backward Euler of the correction; estimates and the switching term.
   template <class F>
-  void step(V measured, double h, F acceleration, V& position, V& velocity, V& control) {
+  [[gnu::always_inline]] void step(V measured, double h, F acceleration, V& position, V& velocity, V& control) {
     const V innovation = measured - seen;
     const V sliding = stdx::max(-reach, stdx::min(reach, innovation)), beyond = innovation - sliding;
     const V half = beyond / stdx::max(damping + stdx::sqrt(square + 4.0 * stdx::abs(beyond)), V(2.2250738585072014e-308));
@@ -61,14 +61,14 @@ struct Kick {
     load_keep = (load_mass - load_drag) / (load_mass + load_drag), load_gain = 1.0 / (load_mass + load_drag);
   }
   template <class X>
-  X transmitted(X z, X gap) const {
+  [[gnu::always_inline]] X transmitted(X z, X gap) const {
     if constexpr (std::is_same_v<X, double>)
       return stiffness * (z - gap * std::tanh(slope * z));
     else
       return stiffness * (z - gap * tanh_of(X(slope * z)));
   }
   template <class X>
-  void step(Plant<X>& p, double u, X gap) const {
+  [[gnu::always_inline]] void step(Plant<X>& p, double u, X gap) const {
     const X motor = p.motor + half * p.motor_rate, load = p.load + half * p.load_rate;
     const X through = transmitted(X(motor - ratio * load), gap);
     p.motor_rate = motor_keep * p.motor_rate + motor_gain * (u - through);
@@ -137,8 +137,8 @@ void run_block(const Study& c, const double* torque, const double* noise, const 
           motor_acceleration = V(s.motor_acceleration), load_acceleration = V(s.load_acceleration);
         }
         const V motor_read = now[k].motor + motor_noise[k] * n0, load_read = now[k].load + load_noise[k] * n1;
-        auto of_motor = [&](V v) { return u * motor_inverse - motor_drag * v; };
-        auto of_load = [&](V v) { return -load_drag * v; };
+        auto of_motor = [&](V v) __attribute__((always_inline)) { return u * motor_inverse - motor_drag * v; };
+        auto of_load = [&](V v) __attribute__((always_inline)) { return -load_drag * v; };
         V motor_at, motor_speed, motor_control, load_at, load_speed, load_control;
         motor[k].step(motor_read, h, of_motor, motor_at, motor_speed, motor_control);
         load[k].step(load_read, h, of_load, load_at, load_speed, load_control);
@@ -155,7 +155,7 @@ void run_block(const Study& c, const double* torque, const double* noise, const 
         sum.motor_first += one_counted * motor_torque, sum.motor_second += two_counted * motor_torque;
         sum.load_first += one_counted * load_torque, sum.load_second += two_counted * load_torque;
         auto measure = [&](Metrics& m, V at, V rate, V estimate, V speed, V torque_estimate, V acceleration, V expected,
-                           double gear) {
+                           double gear) __attribute__((always_inline)) {
           const V position = at - estimate, velocity = rate - speed, lost = through[k] - torque_estimate;
           const auto outside = !(stdx::abs(position) * gear <= c.position_tolerance) ||
                                !(stdx::abs(velocity) * gear <= c.velocity_tolerance);

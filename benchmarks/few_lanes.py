@@ -1,0 +1,74 @@
+"""Few lanes: the fused loop beside C++ that does the same work, for 64 to 1024 lanes of the bench's workload.
+
+    python benchmarks/few_lanes.py [--steps 1000] [--seconds 4] [--threads 2]
+
+Two comparisons. In the first both make input and noise by themselves, of another seed in each run: C++ by the same
+generator, vectorised, samples shared by its threads. In the second both have them: C++ is given them, and the fused loop has
+kept them from the run before, as it does for the next lanes of a study. All take turns, several runs in a row; the least
+time of some seconds counts.
+"""
+
+import argparse
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from jaxbl.workers import cores, start_jax
+
+start_jax()
+
+import jax  # noqa: E402
+
+from jaxbl.throughput.ours import Fused  # noqa: E402
+from jaxbl.throughput.rivals.native import Native  # noqa: E402
+from jaxbl.throughput.workload import SEED, Workload  # noqa: E402
+
+
+class Kept(Fused):
+    """The same lanes of one seed again."""
+
+    def __call__(self):
+        return self._passage(self._values, SEED)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--seconds", type=float, default=4.0)
+    parser.add_argument("--threads", type=int, default=cores())
+    given = parser.parse_args()
+    print(f"{given.steps} samples, {given.threads} threads; microseconds a run")
+    print("precision  lanes   C++ own  fused own  ratio   C++ given  fused kept  ratio")
+    with TemporaryDirectory() as folder:
+        for precision in ("float32", "float64"):
+            for lanes in (64, 128, 256, 512, 1024):
+                with jax.enable_x64(precision == "float64"):
+                    own, ours, has, kept = measured(Workload(lanes, given.steps, precision), Path(folder), given)
+                print(
+                    f"{precision:9s} {lanes:6d} {own:9.0f} {ours:10.0f} {own / ours:6.2f} {has:11.0f} {kept:11.0f} "
+                    f"{has / kept:6.2f}",
+                    flush=True,
+                )
+
+
+def measured(work: Workload, folder: Path, given: argparse.Namespace) -> list[float]:
+    """Least time of each, us."""
+    runners = [
+        Native(work, given.threads, folder, own=True),
+        Fused(work, given.threads),
+        Native(work, given.threads, folder),
+        Kept(work, given.threads),
+    ]
+    best = [float("inf")] * len(runners)
+    end = time.perf_counter() + given.seconds
+    while time.perf_counter() < end:
+        for i, runner in enumerate(runners):
+            for _ in range(20):
+                start = time.perf_counter()
+                runner()
+                best[i] = min(best[i], time.perf_counter() - start)
+    return [1e6 * least for least in best]
+
+
+if __name__ == "__main__":
+    main()
