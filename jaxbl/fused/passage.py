@@ -20,7 +20,7 @@ from .noise import host
 from .split import Around, Kind, carry_kinds, split
 
 _KEPT = 2**24
-"""Bytes of what lanes share, of some seeds, that stay for the next lanes."""
+"""Bytes of what lanes share, of some seeds, that a program keeps for the next lanes."""
 _WORTH = 0.875
 """Share of lanes down to which those that are done stay: to move the others costs as much as some samples."""
 _SHARE = 2**16
@@ -147,7 +147,8 @@ class Passage(abc.ABC):
             ends, figures = None, []
             if first + length == self._steps:
                 figures, ends = ([np.asarray(x) for x in some] for some in self._closing(state))
-            yield Stretch(length, *(Placed([np.asarray(x) for x in part]) for part in (handed, last)), ends, figures)
+            each, blocks = (Placed([np.asarray(x) for x in part]) for part in (handed, last))
+            yield Stretch(length, each, blocks, ends, figures)
 
     @abc.abstractmethod
     def _march(self, given: list[np.ndarray], stretches: Iterator[Stretch]) -> tuple[list[np.ndarray], list[np.ndarray]]:
