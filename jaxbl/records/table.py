@@ -103,6 +103,8 @@ class PositionTable(_ChannelTable):
     )
     drift: float | None = Field(
         default=None,
+        ge=-0.1,
+        le=0.1,
         description="by how much the skew grows in each second, undone; `skew` is then that at the first stamp; left out: "
         "0, of theta_s a drift that is sure",
         json_schema_extra={"unit": "s/s"},
