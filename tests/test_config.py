@@ -163,7 +163,7 @@ BAD = {
     "inf": (small({"encoders.noise": float("inf")}), "encoders.noise: should be a finite number, not inf"),
     "endless integer": (
         small({"drive.motor_inertia": 10**400}),
-        "drive.motor_inertia: should be a number of 64 bits, not 0x24ee91f2603a6337f...",
+        "should be a number of 64 bits, not 0x1b4ec7",
     ),
     "negative inertia": (small({"drive.motor_inertia": -1.0}), "drive.motor_inertia: should be greater than 0, not -1.0"),
     "negative noise": (
@@ -348,7 +348,7 @@ def test_bad_record_is_named_with_column_and_row(tmp_path, case):
 
 def test_a_binary_file_is_no_parquet(tmp_path):
     (tmp_path / "record.parquet").write_bytes(b"nothing")
-    with pytest.raises(InputError, match="no column 't'|has a header and no rows"):
+    with pytest.raises(InputError, match="has a header and no rows"):
         recorded(tmp_path / "record.parquet").build()
 
 

@@ -455,6 +455,8 @@ def _json(text: str) -> dict[str | int, Any]:
     """An array of objects or of rows of numbers, an object that holds one array of objects, or arrays by name."""
     try:
         data = json.loads(text)
+    except RecursionError:
+        raise InputError("is nested too deep; a log holds rows, or arrays by name") from None
     except ValueError as error:
         raise InputError(f"is not valid JSON: {error}") from None
     columns: dict[str | int, Any] = {}

@@ -52,11 +52,9 @@ def note_standing(file: LogFile, segments: Segments, channels: Mapping[str, RawC
             continue
         begin, end = segments.times[stay][[0, -1]]
         extreme = values[stay.start] in (values.min(), values.max())
-        file.notes.append(
-            f"{name} stands still{' at the end of its range' * extreme} from {begin:.4g} to {end:.4g} s while {other} moves by "
-            f"{np.ptp(moving[stay]):.3g} {channels[other].unit}: readings that are frozen or cut off, or a side that does not "
-            "follow."
-        )
+        stands = f"{name} stands still{' at the end of its range' * extreme} from {begin:.4g} to {end:.4g} s"
+        moves = f"{other} moves by {np.ptp(moving[stay]):.3g} {channels[other].unit}"
+        file.notes.append(f"{stands} while {moves}: readings that are frozen or cut off, or a side that does not follow.")
 
 
 def _stays(values: np.ndarray, part: slice) -> Iterator[slice]:
