@@ -221,5 +221,5 @@ def even_grid(stamps: np.ndarray) -> EvenGrid:
     largest = float(np.abs(stamps - middle - period * index).max())
     # 2 % of a period changes no result; stamps that were rounded, say to milliseconds, are off by up to half a step
     rounding = resolution(np.diff(stamps))
-    even = largest <= 0.02 * period or largest <= 0.55 * min(rounding, 20.0 * period)
+    even = period > 0.0 and (largest <= 0.02 * period or largest <= 0.55 * min(rounding, 20.0 * period))
     return EvenGrid(even, period, float(middle + period * index[0]))
