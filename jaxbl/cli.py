@@ -537,9 +537,11 @@ def plot(
     from jaxbl.sweeps.sweep import open_study
 
     from .config import read_config
+    from .files import make_folder
     from .report.sweep import write_sweep_report
 
     where, result = place(folder), open_study(folder)
+    make_folder(where, "copy it to where you may write, and plot that")
     if config is not None:
         study = read_config(config)
         if identity(study) != Store.open(where).manifest["identity"]:

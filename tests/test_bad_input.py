@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -111,8 +112,8 @@ def test_five_hundred_generated_ones(what, tmp_path):
     assert 50 < named < len(found) - 20
 
 
-def command(*arguments: str, cwd: Path, **environment: str) -> subprocess.CompletedProcess:
-    call = [sys.executable, "-m", "jaxbl", *arguments]
+def command(*arguments: str, cwd: Path, before: tuple[str, ...] = (), **environment: str) -> subprocess.CompletedProcess:
+    call = [*before, sys.executable, "-m", "jaxbl", *arguments]
     return subprocess.run(
         call, cwd=cwd, env=os.environ | environment, capture_output=True, text=True, timeout=300, check=False
     )
@@ -134,13 +135,24 @@ def test_letters_of_a_file_s_name_do_not_reach_the_terminal(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_name_is_no_mathematics(tmp_path):
+def test_a_name_is_no_mathematics_and_a_folder_may_be_read_only(tmp_path):
     """The figures come after all computing: a name must not make them fail."""
     axes = [listed(ALPHA, 5.0, 9.0)]
     figures = [{"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}]
     (tmp_path / "study.toml").write_text(tomli_w.dumps(rigid(title=r"$\frac{$ 漢", axes=axes, figures=figures)))
     done = command("sweep", "study.toml", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
+    # and where the results may only be read, that is said before the figures are drawn
+    folder = tmp_path / "results" / "study"
+    folder.chmod(0o555)
+    # the superuser may write anywhere, unless that right is given up
+    before = () if os.geteuid() else ("setpriv", "--bounding-set=-dac_override")
+    if before and shutil.which("setpriv") is None:
+        return
+    done = command("plot", str(folder), cwd=tmp_path, before=before)
+    folder.chmod(0o755)
+    said = f"{folder}: cannot be written to (Permission denied); copy it to where you may write, and plot that"
+    assert (done.returncode, done.stderr) == (2, f"jaxbl: {said}\n")
 
 
 @pytest.mark.slow
