@@ -84,7 +84,7 @@ def chain_fused(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
 def chain_kernel(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
     """The fused kernel alone, as the CUDA kernel is timed: input and noise lie on the device."""
     passage = DevicePassage(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes)
-    given = jax.device_put((passage.filled_up(work.values()), passage.inputs(passage.blocks(SEED, []))))
+    given = jax.device_put((passage.filled_up(work.values()), passage.inputs(passage.stretches(SEED))))
     names = sorted(NAMES)
     return lambda: {name: np.asarray(x)[: work.lanes] for name, x in zip(names, passage.kernel(*given), strict=True)}
 

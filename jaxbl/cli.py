@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .errors import InputError, NoResult, printable
-from .files import place
+from .files import Busy, place
 from .terminal import duration, naming, running
 from .workers import start_jax
 
@@ -146,6 +146,8 @@ def sweep(
         if dry_run:
             _print_cost(study, chosen)
             return
+    run = functools.partial(run_sweep, verify_store=verify_store, scheduler=scheduler)
+    collect = functools.partial(_compute, context, config, study, out, overwrite, chosen, run, write_sweep_report)
     if detach or which is not None:
         from jaxbl.sweeps.sweep import share as run_share
         from jaxbl.sweeps.sweep import submit
@@ -161,8 +163,12 @@ def sweep(
             typer.echo(f"When all parts are there, 'jaxbl sweep {config} --out {folder}' writes the report.")
             return
         # who is last collects them
-    run = functools.partial(run_sweep, verify_store=verify_store, scheduler=scheduler)
-    _compute(context, config, study, out, overwrite, chosen, run, write_sweep_report)
+        try:
+            collect()
+        except Busy:
+            _print_status(found)
+        return
+    collect()
 
 
 def _share(text: str | None, others: dict[str, bool]) -> tuple[int, int] | None:
@@ -548,6 +554,33 @@ def plot(
             raise InputError(f"{config}: is not the study in {folder}; only title, notes and figures may differ")
         result = dataclasses.replace(result, config=study)
     _print(write_sweep_report(result, where), where)
+
+
+@app.command()
+def compare(
+    first: Annotated[Path, typer.Argument(metavar="DIR1", parser=place, help="folder of a sweep", show_default=False)],
+    second: Annotated[Path, typer.Argument(metavar="DIR2", parser=place, help="of another one", show_default=False)],
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="folder for the results [default: results/compare-DIR1-DIR2]")
+    ] = None,
+) -> None:
+    """Compare two sweeps: what changed in the config, and where metrics differ by more than noise."""
+    start_jax()
+    from jaxbl.sweeps.compare import compare as run_compare
+    from jaxbl.sweeps.sweep import open_study
+
+    from .files import is_empty, make_folder, removed_if_empty
+    from .report.compare import write_comparison
+
+    studies = open_study(first), open_study(second)
+    folder = out if out is not None else Path("results") / f"compare-{first.name}-{second.name}"
+    make_folder(folder)
+    if not is_empty(folder) and not (folder / "comparison.json").exists():
+        raise InputError(f"{folder}: is not empty and holds no comparison; choose another folder with --out")
+    with removed_if_empty(folder):
+        lines = write_comparison(run_compare(*studies), studies[0].config, folder)
+    for line in [*lines, "", str(folder / "comparison.json")]:
+        typer.echo(line)
 
 
 @app.command()

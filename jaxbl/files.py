@@ -106,17 +106,24 @@ def write_atomic(path: Path, content: str | bytes) -> None:
 
 
 def begin_file(path: Path, content: str) -> bool:
-    """Write a file that is not there yet; returns False where another process was first. An object store decides that, if it
-    knows puts on condition; the system's files are ours (:func:`locked`). Raises as :func:`written`."""
+    """Write a file that is not there yet; returns False where another process was first. Raises as :func:`written`.
+
+    An object store decides that by a put on condition, if it has one. Some ignore the condition: of two processes that write
+    at the same time, the later one is first then. The system's files are ours (:func:`locked`).
+    """
     if not is_remote(path):
         write_atomic(path, content)
         return True
     with writing(path):
+        if path.exists():
+            return False
         try:
             path.fs.pipe_file(path.path, content.encode(), mode="create")  # pyright: ignore[reportAttributeAccessIssue]
         except FileExistsError:
             return False
-    return True
+        except NotImplementedError:
+            path.write_bytes(content.encode())
+        return path.read_bytes() == content.encode()
 
 
 def write_table(path: Path, frame: "pd.DataFrame") -> None:

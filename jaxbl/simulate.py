@@ -5,6 +5,7 @@ without a trace, with any reducers: :func:`scan` for simulated and :func:`replay
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -227,12 +228,14 @@ class Reducer(NamedTuple):
     """A figure over a whole run, computed as it goes: memory does not grow with duration.
 
     `init(experiment)` gives the carry, `update(experiment, carry, index, signals)` takes in sample `index`, and
-    `result(experiment, carry, state)` gives a dict of numbers from the last carry and the last state.
+    `result(experiment, carry, state)` gives a dict of numbers from the last carry and the last state. `done(experiment, carry,
+    state)`, where there is one, says that no further sample can change them: a lane may then stop.
     """
 
     init: Callable[[Experiment], Any]
     update: Callable[[Experiment, Any, Int[Array, ""], Signals], Any]
     result: Callable[[Experiment, Any, State], dict[str, Array]]
+    done: Callable[[Experiment, Any, State], Array] | None = None
 
 
 def unit_noise(seed: Int[Array, ""], indices: Int[Array, " samples"], sides: tuple[str, ...]) -> dict[str, Array]:
@@ -291,6 +294,13 @@ def figures(experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry)
     for reducer, total in zip(reducers, totals, strict=True):
         found |= reducer.result(experiment, total, state)
     return found
+
+
+def done(experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry) -> Array | None:
+    """Whether no further sample can change the figures; None where a reducer cannot know."""
+    state, totals = carry
+    each = [r.done and r.done(experiment, total, state) for r, total in zip(reducers, totals, strict=True)]
+    return None if not each or None in each else functools.reduce(jnp.logical_and, each)
 
 
 def scan(

@@ -25,7 +25,9 @@ def naming(config: Path, folder: Path | None = None) -> Iterator[None]:
     except InputError as error:
         message = str(error)
         named = "/" in message.split(":")[0] or (folder is not None and message.startswith(f"{folder}:"))
-        raise InputError(message if named else f"{config}: {message}") from None
+        if named:
+            raise
+        raise InputError(f"{config}: {message}") from None
 
 
 @contextmanager

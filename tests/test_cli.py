@@ -24,6 +24,7 @@ from typer.testing import CliRunner
 
 from jaxbl import cli, terminal
 from jaxbl.errors import InputError
+from jaxbl.files import locked
 from jaxbl.sweeps.engine import Engine
 
 FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
@@ -366,6 +367,20 @@ def tunable(**table):
     """A drive under a constant torque, its observer starting 0.1 rad/s off."""
     changes = {"encoders.noise": 1e-5, "observer.motor.velocity_error": 0.1, "run.position_tolerance": 0.01}
     return rigid(changes, effects=[{"kind": "motor.constant_torque", "torque": 0.05}], tune=TUNE | table)
+
+
+def test_shares_by_the_command_of_which_the_last_writes_the_report(call, tmp_path):
+    write(tmp_path, small(axes=AXES, sweep={"seeds": 2, "chunk": 4}))
+    code, lines, _ = call("sweep", "study.toml", "--share", "1/2")
+    assert code == 0 and "1 of 2 parts (50 %) of 6 runs" in lines[0]
+    assert lines[-1] == "When all parts are there, 'jaxbl sweep study.toml --out results/study' writes the report."
+    with locked(tmp_path / "results" / "study", shared=True):
+        # another one is still at work: it is the last
+        code, lines, _ = call("sweep", "study.toml", "--share", "2/2")
+        assert code == 0 and "2 of 2 parts (100 %)" in lines[0] and "all parts are there" in lines[1]
+        assert not (tmp_path / "results" / "study" / "report.html").exists()
+    code, lines, _ = call("sweep", "study.toml", "--share", "2/2")
+    assert code == 0 and lines[-1] == "results/study/report.html"
 
 
 @pytest.mark.slow

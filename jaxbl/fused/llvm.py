@@ -29,6 +29,8 @@ _KINDS = {
     "bool": ir.IntType(8),
 }
 """How numbers lie in memory."""
+_NUMBERS = 7
+"""That a loop is given beside its arrays."""
 Vector = Any
 """A value of LLVM (which has no types that a checker could use): a number in all lanes, or an index."""
 _FLAGS = ("contract",)
@@ -65,15 +67,16 @@ def vector_lanes(dtype: np.dtype) -> int:
 
 class Argument(NamedTuple):
     """An array that a loop reads or writes where it lies: its group and place there (`input 2`), type, and how many numbers
-    it holds: "one", one for each of "lanes" or of "samples", or "both": one for each sample of each lane."""
+    it holds: "one", one for each of "lanes", of "samples" or of "blocks" of samples, or "both": one for each sample of each
+    lane; "marks": for each block of each lane."""
 
     name: str
     dtype: np.dtype
     holds: str
 
-    def check(self, array: np.ndarray, steps: int, lanes: int) -> None:
+    def check(self, array: np.ndarray, counts: dict[str, int]) -> None:
         """Refuse an array of wrong type or length, or with gaps, by `ValueError`."""
-        count = {"one": 1, "lanes": lanes, "samples": steps, "both": steps * lanes}[self.holds]
+        count = counts[self.holds]
         if array.dtype != self.dtype or array.size != count or not array.flags.c_contiguous:
             wrong = f"not {array.size} of {array.dtype}"
             raise ValueError(f"{self.name} of a loop needs {count} contiguous numbers of type {self.dtype}, {wrong}")
@@ -90,9 +93,11 @@ def signature_of(
         ("fixed number", "one", read[own : own + fixed]),
         ("input", "samples", read[own + fixed : len(read) - beside]),
         ("lane's input", "both", read[len(read) - beside :]),
-        ("input afterwards", "one", [v for part in (around or ())[1:] for v in part.jaxpr.invars[own:]]),
+        ("input of a block", "blocks", around.after.jaxpr.invars[own:] if around else []),
+        ("input at the end", "one", around.finish.jaxpr.invars[own:] if around and around.finish else []),
         ("kept number", "both", body.jaxpr.outvars[carry:]),
-        ("result", "lanes", around.finish.jaxpr.outvars if around else []),
+        ("mark of a block", "marks", around.after.jaxpr.outvars[carry:] if around else []),
+        ("result", "lanes", around.finish.jaxpr.outvars if around and around.finish else []),
     ]
     return [Argument(f"{name} {i}", _dtype(v), holds) for name, holds, some in groups for i, v in enumerate(some)]
 
@@ -141,7 +146,7 @@ class Loop:
         self._engine.add_object_file(binding.ObjectFileRef.from_data(code))
         self._engine.finalize_object()
         address = self._engine.get_function_address("loop")
-        self._call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, *[ctypes.c_int64] * 5)(address)
+        self._call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, *[ctypes.c_int64] * _NUMBERS)(address)
 
     def __getstate__(self) -> tuple[int, list[Argument], bytes]:
         return self.lanes, self.signature, self._code
@@ -157,18 +162,24 @@ class Loop:
         first: int,
         last: int,
         *,
+        start: int = 0,
+        block: int | None = None,
         begins: bool = False,
         ends: bool = False,
     ) -> None:
         """Take lanes from `first` up to `last` (multiples of `lanes`) through samples; the carry's arrays are overwritten.
 
-        What is kept is written `(steps, lanes)` with no more lanes than run. A block that `begins` a run does not read the
-        carry; one that `ends` it writes results in its place. `ValueError` for arrays that do not fit the signature.
+        What is kept is written `(steps, lanes)`, marks `(blocks, lanes)`, with no more lanes than run. Samples come in blocks
+        of `block`, all in one where it is left out; `start`, where a block begins, is the first of those up to `steps` that
+        are run. What `begins` a run does not read the carry; what `ends` it writes results in its place. `ValueError` for
+        arrays that do not fit the signature.
         """
-        given = arrays if isinstance(arrays, Arrays) else Arrays(self.signature, arrays, steps, last)
+        given = arrays if isinstance(arrays, Arrays) else Arrays(self.signature, arrays, steps, last, block)
         if steps > given.steps or last > given.lanes:
             raise ValueError(f"{steps} samples of lanes up to {last}: arrays were made for {given.steps} and {given.lanes}")
-        self._call(ctypes.addressof(given.addresses), steps, first, last, begins, ends)
+        if start % given.block:
+            raise ValueError(f"no block of {given.block} samples begins at {start}")
+        self._call(ctypes.addressof(given.addresses), start, steps, given.block, first, last, begins, ends)
 
 
 class Rows(NamedTuple):
@@ -178,9 +189,22 @@ class Rows(NamedTuple):
 
 
 class Arrays:
-    """Arrays for a loop, which reads where they lie: checked against its signature for so many samples and lanes."""
+    """Arrays for a loop, which reads where they lie: checked against its signature for so many samples, in blocks of so many,
+    and lanes."""
 
-    def __init__(self, signature: Sequence[Argument], arrays: "Sequence[np.ndarray | Rows]", steps: int, lanes: int):
+    def __init__(
+        self,
+        signature: Sequence[Argument],
+        arrays: "Sequence[np.ndarray | Rows]",
+        steps: int,
+        lanes: int,
+        block: int | None = None,
+    ):
+        self.steps, self.lanes, self.block = steps, lanes, block or max(steps, 1)
+        blocks = -(-steps // self.block)
+        counts = {
+            "one": 1, "lanes": lanes, "samples": steps, "blocks": blocks, "both": steps * lanes, "marks": blocks * lanes
+        }  # fmt: skip
         count = sum(len(one.array) if isinstance(one, Rows) else 1 for one in arrays)
         if count != len(signature):
             raise ValueError(f"a loop needs {len(signature)} arrays, not {count}")
@@ -188,16 +212,17 @@ class Arrays:
         for one in arrays:
             each = signature[len(addresses) : len(addresses) + (len(one.array) if isinstance(one, Rows) else 1)]
             if not isinstance(one, Rows):
-                each[0].check(one, steps, lanes)
+                each[0].check(one, counts)
                 addresses.append(_address(one))
             elif each:
-                each[0].check(one.array[:1], steps, lanes)
-                other = next((two for two in each if two[1:] != each[0][1:]), None)
+                each[0].check(one.array[:1], counts)
+                _, dtype, holds = each[0]
+                other = next((two for two in each if two.holds != holds or two.dtype != dtype), None)
                 if other is not None or not one.array.flags.c_contiguous:
                     raise ValueError(f"{(other or each[0]).name} of a loop is no row of one array")
                 begin, stride = _address(one.array), one.array.strides[0]
                 addresses += range(begin, begin + len(each) * stride, stride)
-        self.steps, self.lanes, self._kept = steps, lanes, list(arrays)
+        self._kept = list(arrays)
         self.addresses = (ctypes.c_void_p * count)(*addresses)
 
 
@@ -214,11 +239,11 @@ class _Writer:
         """Those that do not change in the loop over time."""
 
     def loop(self, body: ClosedJaxpr, around: Around | None, signature: Sequence[Argument]) -> None:
-        function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [_POINTER, *[_INT] * 5]), "loop")
+        function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [_POINTER, *[_INT] * _NUMBERS]), "loop")
         # what registers have no room for lies on the stack: no vector of it over two lines of the cache
         function.attributes.alignstack = 64
         function.attributes.add("nounwind")  # without another one it is not written
-        table, steps, first, last, begins, ends = function.args
+        table, start, steps, length, first, last, begins, ends = function.args
         build: Any = ir.IRBuilder(function.append_basic_block("entry"))
         self.build = build
         group: defaultdict[str, list[int]] = defaultdict(list)
@@ -241,7 +266,7 @@ class _Writer:
             return build.shuffle_vector(one, nothing, ir.Constant(self.vector(ir.IntType(32)), None))
 
         steady = [scalar(i, _INT(0)) for i in group["fixed number"]]
-        afterwards = [scalar(i, _INT(0)) for i in group["input afterwards"]]
+        at_end = [scalar(i, _INT(0)) for i in group["input at the end"]]
         width = build.sub(last, first)
 
         def lanes(lane: Vector, _: list[Vector]) -> list[Vector]:
@@ -266,15 +291,28 @@ class _Writer:
                 return found[:carry]
 
             if around is None:
-                return write("carry", self.count(_INT(0), steps, read("carry"), sample), lane)
-            before, after, finish = around
-            behind = len(after.in_avals) - len(own)
-            state = self.either(begins, lambda: self.run(before, numbers), lambda: read("carry"))
-            state = self.count(_INT(0), steps, state, sample)
-            state = self.run(after, [*numbers, *state, *afterwards[:behind]])
+                return write("carry", self.count(start, steps, read("carry"), sample), lane)
+
+            def block(begin: Vector, state: list[Vector]) -> list[Vector]:
+                end = build.add(begin, length)
+                state = self.count(begin, build.select(build.icmp_signed("<", end, steps), end, steps), state, sample)
+                number = build.sdiv(begin, length)
+                found = self.run(around.after, [*numbers, *state, *(scalar(i, number) for i in group["input of a block"])])
+                write("mark of a block", found[carry:], build.add(build.mul(number, width), build.sub(lane, first)))
+                return found[:carry]
+
+            before, finish = around.before, around.finish
+            state = (
+                read("carry")
+                if before is None
+                else (self.either(begins, lambda: self.run(before, numbers), lambda: read("carry")))
+            )
+            state = self.count(start, steps, state, block, by=length)
+            if finish is None:
+                return write("carry", state, lane)
             return self.either(
                 ends,
-                lambda: write("result", self.run(finish, [*numbers, *state, *afterwards[behind:]]), lane),
+                lambda: write("result", self.run(finish, [*numbers, *state, *at_end]), lane),
                 lambda: write("carry", state, lane),
             )
 
@@ -306,7 +344,7 @@ class _Writer:
         last: Vector,
         state: list[Vector],
         body: Callable[[Vector, list[Vector]], list[Vector]],
-        by: int = 1,
+        by: Vector = 1,
     ) -> list[Vector]:
         """for index in range(first, last, by): state = body(index, state)."""
         build = self.build
@@ -320,7 +358,7 @@ class _Writer:
         build.cbranch(build.icmp_signed("<", index, last), inside, behind)
         build.position_at_end(inside)
         new = body(index, list(carried))
-        new = [build.add(index, _INT(by)), *new]
+        new = [build.add(index, _INT(by) if isinstance(by, int) else by), *new]
         for phi, value in zip((index, *carried), new, strict=True):
             phi.add_incoming(value, build.block)
         build.branch(head)
@@ -498,6 +536,7 @@ _OF_INTEGERS: dict[str, Callable[..., Vector]] = {
     **{name: _instruction(name) for name in ("add", "sub", "mul", "xor")},
     **{name: _instruction(f"{name}_") for name in ("and", "or", "not")},
     "shift_left": _instruction("shl"),
+    "shift_right_logical": _instruction("lshr"),
 }
 _OF_ALL: dict[str, Callable[..., Vector]] = {
     **dict(zip(("gt", "lt", "ge", "le", "eq", "ne"), map(_comparison, (">", "<", ">=", "<=", "==", "!=")), strict=True)),

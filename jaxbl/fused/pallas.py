@@ -103,7 +103,8 @@ class Kernel:
         def block(number: Any, state: list[Array], end: Any = None) -> list[Array]:
             begin = number * self._length
             state = jax.lax.fori_loop(begin, begin + self._length if end is None else end, sample, state)
-            return self._after(*numbers, *state, *read(1, number))
+            # marks of lanes that are done are of no use here: a program has as many as it has
+            return self._after(*numbers, *state, *read(1, number))[: len(state)]
 
         whole, rest = divmod(self._steps, self._length)
         state = jax.lax.fori_loop(0, whole, block, self._before(*numbers))

@@ -2,10 +2,8 @@
 
 import abc
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -13,21 +11,37 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.drive.parameters import set_leaves
-from jaxbl.simulate import Experiment, Reducer, advance, begin, block_length, end_of_block, figures
+from jaxbl.simulate import Experiment, Reducer, advance, begin, block_length, done, end_of_block, figures
 
-from .ahead import Shared, ahead_of_lanes, host
-from .llvm import Arrays, Loop, vector_lanes
+from .ahead import Shared, ahead_of_lanes
+from .llvm import Arrays, Loop, Rows, vector_lanes
+from .noise import host
 from .split import Around, Kind, carry_kinds, split
 
+_KEPT = 2**24
+"""Bytes of what lanes share, of some seeds, that stay for the next lanes."""
+_WORTH = 0.875
+"""Share of lanes down to which those that are done stay: to move the others costs as much as some samples."""
+_SHARE = 2**17
+"""Samples of lanes, some 0.1 ms, that are worth a thread."""
+_CALL = 2**20
+"""Samples of lanes that a call of the loop takes, some 1 ms: after it, lanes that are done leave."""
 
-class Block(NamedTuple):
-    """What lanes need for a block of samples: inputs of each sample `(length,)`, of what follows the block `()`, and, of the
-    last block, of a lane's figures `()`."""
+
+class Stretch(NamedTuple):
+    """What lanes need for a stretch of samples, in whole blocks: inputs of each sample `(samples,)` and of what follows each
+    block `(blocks,)`; of the last stretch those of a lane's figures `()`, and the figures that lanes share `()`."""
 
     length: int
     handed: list[np.ndarray]
     last: list[np.ndarray]
     ends: list[np.ndarray] | None
+    figures: list[np.ndarray]
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return sum(one.nbytes for one in (*self.handed, *self.last))
 
 
 class Passage(abc.ABC):
@@ -61,7 +75,8 @@ class Passage(abc.ABC):
             return advance(own(values), reducers, carry, *given)[0]
 
         def settle(values: list[Any], carry: Any, given: Any) -> Any:
-            return end_of_block(own(values), carry)
+            carry = end_of_block(own(values), carry)
+            return carry, done(own(values), reducers, carry)
 
         def result(values: list[Any], carry: Any, given: Any) -> dict[str, Any]:
             return figures(own(values), reducers, carry)
@@ -74,11 +89,14 @@ class Passage(abc.ABC):
         # by each lane; what all share is not among them
         self.carried = len(kinds) - len(one)
         begins, inner = split(start, values, (), (), [], kinds), split(sample, values, carry, given, kinds, kinds)
-        outer, ends = split(settle, values, carry, (), kinds, kinds), split(result, values, carry, (), kinds)
+        # whether a lane is done, where that can be known
+        marks = [Kind.LANE] * (len(jax.tree.leaves(jax.eval_shape(settle, values, carry, ()))) - len(kinds))
+        outer, ends = split(settle, values, carry, (), kinds, [*kinds, *marks]), split(result, values, carry, (), kinds)
         self._body, self._around = inner.lane, Around(begins.lane, outer.lane, ends.lane)
         # compiled now, so that a call only runs
-        lengths = {min(self._length, self._steps), self._steps % self._length} - {0}
-        self._ahead = ahead_of_lanes(Shared(inner.shared, outer.shared, one, experiment.sides), lengths)
+        shared = Shared(inner.shared, outer.shared, one, experiment.sides, self._steps, self._length)
+        self._ahead, self._stretch = ahead_of_lanes(shared), shared.stretch
+        self._kept: dict[int, list[Stretch]] = {}
         self._first = [np.asarray(leaf) for leaf in jax.jit(lambda: begins.shared([], ())[0])()]
         self._closing = jax.jit(lambda state: ends.shared(state, ())).lower(one).compile()
         names = sorted(jax.eval_shape(result, values, carry, ()))
@@ -87,14 +105,28 @@ class Passage(abc.ABC):
 
     def __call__(self, values: dict[str, np.ndarray], seed: int) -> dict[str, np.ndarray]:
         """Figures `(lanes,)` of one seed, by name; `values` `(lanes,)` by path, in SI units."""
-        # the figures that lanes share come with the last block
-        shared: list[np.ndarray] = []
-        lanes = iter(self._march(self.filled_up(values), self.blocks(seed, shared)))
-        others = iter(shared)
+        found, shared = self._march(self.filled_up(values), self._run(seed))
+        lanes, others = iter(found), iter(shared)
         return {
             name: next(lanes)[: self._lanes] if own else np.full(self._lanes, next(others))
             for name, own in self._of_lane.items()
         }
+
+    def keep(self, seeds: Collection[int]) -> None:
+        """What lanes share is kept for the next lanes of these seeds, as far as there is room, and of no others."""
+        self._kept = {seed: run for seed, run in self._kept.items() if seed in seeds}
+
+    def _run(self, seed: int) -> Iterator[Stretch]:
+        if seed in self._kept:
+            yield from self._kept[seed]
+            return
+        made, room = [], _KEPT - sum(one.size for run in self._kept.values() for one in run)
+        for stretch in self.stretches(seed):
+            room -= stretch.size
+            made = [*made, stretch] if room >= 0 else []
+            yield stretch
+        if room >= 0:
+            self._kept[seed] = made
 
     def filled_up(self, values: dict[str, np.ndarray]) -> list[np.ndarray]:
         """Values of as many lanes as are computed."""
@@ -105,22 +137,20 @@ class Passage(abc.ABC):
         more = (0, self._filled - self._lanes)
         return [np.pad(one, more, "edge") for one in given] if any(more) else given
 
-    def blocks(self, seed: int, shared: list[np.ndarray]) -> Iterator[Block]:
-        """Block after block of a run; figures that lanes share are added to `shared` with the last one."""
+    def stretches(self, seed: int) -> Iterator[Stretch]:
+        """Stretch after stretch of a run."""
         state = self._first
-        for first in range(0, self._steps, self._length):
-            length = min(self._length, self._steps - first)
+        for first in range(0, self._steps, self._stretch):
+            length = min(self._stretch, self._steps - first)
             state, last, handed = self._ahead(state, seed, first, length)
-            ends = None
+            ends, figures = None, []
             if first + length == self._steps:
-                figures, read = self._closing(state)
-                shared += map(np.asarray, figures)
-                ends = [np.asarray(x) for x in read]
-            yield Block(length, [np.asarray(x) for x in handed], [np.asarray(x) for x in last], ends)
+                figures, ends = ([np.asarray(x) for x in some] for some in self._closing(state))
+            yield Stretch(length, handed, last, ends, figures)
 
     @abc.abstractmethod
-    def _march(self, given: list[np.ndarray], blocks: Iterator[Block]) -> list[np.ndarray]:
-        """The lanes' figures `(lanes,)` each."""
+    def _march(self, given: list[np.ndarray], stretches: Iterator[Stretch]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """The lanes' figures `(lanes,)` each, and those that they share `()`."""
 
 
 class HostPassage(Passage):
@@ -132,29 +162,129 @@ class HostPassage(Passage):
         dtype = np.dtype(jnp.result_type(experiment.run.sample_period))
         self._together = vector_lanes(dtype)
         super().__init__(experiment, reducers, paths, lanes, self._together)
-        # a thread a share: its blocks come one after the other, whatever the others do
-        shares = min(threads, self._filled // self._together)
-        self._threads = [ThreadPoolExecutor(1) for _ in range(shares)]
         self._loop = Loop(self._body, self._dtype, values=len(paths), carry=self.carried, around=self._around)
-        self._unread = [np.zeros((), aval.dtype) for aval in self._around.finish.in_avals[len(paths) + self.carried :]]
+        self._of = {
+            name: [one.dtype for one in self._loop.signature if one.name.startswith(name)]
+            for name in ("input at the end", "mark of a block", "result")
+        }
+        # a thread a share: its stretches come one after the other, whatever the others do
+        shares = min(threads, self._filled // self._together, max(self._filled * self._steps // _SHARE, 1))
+        self._threads = [ThreadPoolExecutor(1) for _ in range(shares)]
 
-    def _march(self, given, blocks):
-        carry = [np.empty(self._filled, self._dtype) for _ in range(self.carried)]
-        found = [np.empty(self._filled, dtype) for dtype in self._figure_dtypes]
-        parts = self._filled // self._together
-        edges = [parts * i // len(self._threads) * self._together for i in range(len(self._threads) + 1)]
+    def _march(self, given, stretches):
+        # dealt in turns: lanes that are done together, as neighbours often are, are then missed by all threads
+        count = len(self._threads)
+        rows = np.stack(given) if given else np.empty((0, self._filled), self._dtype)
+        dealt = [rows.reshape(len(given), -1, self._together)[:, i::count].reshape(len(given), -1) for i in range(count)]
+        shares = [self._share(np.ascontiguousarray(values)) for values in dealt]
         running: deque[list[Future[None]]] = deque()
-        for number, block in enumerate(blocks):
-            ends = self._unread if block.ends is None else block.ends
-            every = [*given, *carry, *block.handed, *block.last, *ends, *found]
-            arrays = Arrays(self._loop.signature, every, block.length, self._filled)
-            run = partial(self._loop, arrays, block.length, begins=number == 0, ends=block.ends is not None)
-            running.append([thread.submit(run, *part) for thread, part in zip(self._threads, pairwise(edges), strict=True)])
-            # what lanes share is computed meanwhile, a block or two ahead of them
-            while len(running) > (2 if block.ends is None else 0):
-                for one in running.popleft():
-                    one.result()
-        return found
+        stretch = None
+        for stretch in stretches:
+            # what lanes share is computed meanwhile, a stretch or two ahead of them
+            own = int(stretch.ends is not None)
+            if not running:
+                # threads do nothing then but compute: they would wait for the interpreter
+                for share in shares:
+                    share.prepare(stretch)
+            running.append([t.submit(s.run, stretch) for t, s in zip(self._threads[own:], shares[own:], strict=True)])
+            while len(running) > 2:
+                _wait(running.popleft())
+            if own:
+                # nothing is left to do here
+                _wait(one[0] for one in list(running)[:-1])
+                shares[0].run(stretch)
+            while own and running:
+                _wait(running.popleft())
+        assert stretch is not None
+        parts = [share.results() for share in shares]
+        if count == 1:
+            return parts[0], stretch.figures
+        found = [np.empty(self._filled, column.dtype) for column in parts[0]]
+        for i, part in enumerate(parts):
+            for whole, own in zip(found, part, strict=True):
+                whole.reshape(-1, self._together)[i::count] = own.reshape(-1, self._together)
+        return found, stretch.figures
+
+    def _share(self, values: np.ndarray) -> "_Share":
+        return _Share(self._loop, self._of, values, np.empty((self.carried, values.shape[1]), self._dtype), self._length)
+
+
+def _wait(futures: Iterable[Future[None]]) -> None:
+    for one in futures:
+        one.result()
+
+
+class _Share:
+    """Lanes of one thread on their way, with `values` `(paths, lanes)`. Those that are done leave, with the carry that they
+    have then, and the others move together."""
+
+    def __init__(self, loop: Loop, of: dict[str, list[np.dtype]], values: np.ndarray, carry: np.ndarray, block: int):
+        self._loop, self._of, self._block, self._begun = loop, of, block, False
+        # of the lanes that are computed: their places, behind which others only fill up
+        self._lanes, self._values, self._carry = np.arange(values.shape[1]), values, carry
+        self._given: tuple[list[np.ndarray], list[np.ndarray], Arrays] | None = None
+        self._left: list[tuple[np.ndarray, ...]] = []
+        self._found: list[tuple[np.ndarray, list[np.ndarray]]] = []
+
+    def run(self, stretch: Stretch) -> None:
+        """Take lanes through a stretch, in calls of so many blocks as are worth one."""
+        at = 0
+        while at < stretch.length and len(self._lanes):
+            marks, results, arrays = self._given or self.prepare(stretch)
+            size = self._values.shape[1]
+            upto = min(at + max(_CALL // (size * self._block), 1) * self._block, stretch.length)
+            ends = stretch.ends is not None and upto == stretch.length
+            self._loop(arrays, upto, 0, size, start=at, block=self._block, begins=not self._begun, ends=ends)
+            self._begun, at = True, upto
+            if ends:
+                self._found.append((self._lanes, results))
+            elif len(marks):
+                self._leave(marks[0][(upto - 1) // self._block])
+        self._given = None
+        if stretch.ends is not None and self._left:
+            self._lanes, self._values, self._carry = (np.concatenate(one, axis=-1) for one in zip(*self._left, strict=True))
+            self._move(np.arange(len(self._lanes)))
+            _, results, arrays = self.prepare(stretch)
+            self._loop(arrays, 0, 0, self._values.shape[1], block=self._block, ends=True)
+            self._found.append((self._lanes, results))
+
+    def prepare(self, stretch: Stretch) -> tuple[list[np.ndarray], list[np.ndarray], Arrays]:
+        """Marks and results of a stretch, and all that the loop is given."""
+        size = self._values.shape[1]
+        marks = [np.empty((-(-stretch.length // self._block), size), dtype) for dtype in self._of["mark of a block"]]
+        results = [np.empty(size, dtype) for dtype in self._of["result"]]
+        unread = [np.zeros((), dtype) for dtype in self._of["input at the end"]]
+        ends = unread if stretch.ends is None else stretch.ends
+        every = [Rows(self._values), Rows(self._carry), *stretch.handed, *stretch.last, *ends, *marks, *results]
+        self._given = marks, results, Arrays(self._loop.signature, every, stretch.length, size, self._block)
+        return self._given
+
+    def results(self) -> list[np.ndarray]:
+        """Of all lanes."""
+        if len(self._found) == 1 and not self._left:
+            return self._found[0][1]
+        count = sum(len(lanes) for lanes, _ in self._found)
+        merged = [np.empty(count, dtype) for dtype in self._of["result"]]
+        for lanes, found in self._found:
+            for one, own in zip(merged, found, strict=True):
+                one[lanes] = own[: len(lanes)]
+        return merged
+
+    def _leave(self, marks: np.ndarray) -> None:
+        """Lanes that are done, if so many are that the move is worth while."""
+        done = marks[: len(self._lanes)]
+        others = np.flatnonzero(~done)
+        if -(-len(others) // self._loop.lanes) * self._loop.lanes <= _WORTH * self._values.shape[1]:
+            gone = np.flatnonzero(done)
+            self._left.append((self._lanes[gone], self._values[:, gone], self._carry[:, gone]))
+            self._move(others)
+
+    def _move(self, lanes: np.ndarray) -> None:
+        """Only these stay."""
+        whole = -(-len(lanes) // self._loop.lanes) * self._loop.lanes
+        filled = np.pad(lanes, (0, whole - len(lanes)), "edge") if len(lanes) else lanes
+        self._lanes, self._given = self._lanes[lanes], None
+        self._values, self._carry = (np.take(one, filled, axis=1) for one in (self._values, self._carry))
 
 
 class DevicePassage(Passage):
@@ -181,14 +311,14 @@ class DevicePassage(Passage):
         kernel = Kernel(self._body, self._around, len(paths), self._filled, self._steps, self._length, interpret=interpret)
         self.kernel = kernel.compiled()
 
-    def _march(self, given, blocks):
-        return [np.asarray(figure) for figure in self.kernel(given, self.inputs(blocks))]
+    def _march(self, given, stretches):
+        every = list(stretches)
+        return [np.asarray(figure) for figure in self.kernel(given, self.inputs(every))], every[-1].figures
 
     @staticmethod
-    def inputs(blocks: Iterator[Block]) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
-        """What the kernel reads of all blocks: each sample's, each block's, and the figures' own."""
-        every = list(blocks)
-        # a rest of samples stands behind the whole blocks
-        handed = [np.concatenate(column) for column in zip(*(block.handed for block in every), strict=True)]
-        last = [np.stack(column) for column in zip(*(block.last for block in every), strict=True)]
+    def inputs(stretches: Iterable[Stretch]) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+        """What the kernel reads of all stretches: each sample's, each block's, and the figures' own."""
+        every = list(stretches)
+        handed = [np.concatenate(column) for column in zip(*(one.handed for one in every), strict=True)]
+        last = [np.concatenate(column) for column in zip(*(one.last for one in every), strict=True)]
         return handed, last, every[-1].ends or []

@@ -14,9 +14,10 @@ import numpy as np
 from jaxbl.simulate import Experiment, Reducer, Signals, State, advance, begin, block_length, end_of_block, figures
 
 from . import Unsupported
-from .ahead import Shared, ahead_of_lanes, host
+from .ahead import Shared, ahead_of_lanes
 from .jaxprs import flat
 from .llvm import Loop
+from .noise import host
 
 
 def recorded(
@@ -46,13 +47,13 @@ def recorded(
             return figures(experiment, reducers, tree.unflatten(state))
 
         steps = experiment.run.steps
-        length = min(block_length(steps), steps)
-        ahead = ahead_of_lanes(Shared(sample, settle, leaves, experiment.sides), {length, steps % length} - {0})
+        shared = Shared(sample, settle, leaves, experiment.sides, steps, block_length(steps))
+        ahead = ahead_of_lanes(shared)
         state, columns = _once(lambda: jax.tree.leaves(begin(experiment, reducers))), [[] for _ in names]
-        for first in range(0, steps, length):
-            state, _, handed = ahead(state, seed, first, min(length, steps - first))
+        for first in range(0, steps, shared.stretch):
+            state, _, handed = ahead(state, seed, first, min(shared.stretch, steps - first))
             for column, part in zip(columns, handed, strict=True):
-                # copied: what is kept of a block does not keep the rest of it
+                # copied: what is kept of a stretch does not keep the rest of it
                 column.append(np.array(part[-first % every :: every]))
         found = dict(zip(sorted(jax.eval_shape(result, *leaves)), _once(result, *state), strict=True))
     return found, {name: np.concatenate(column) for name, column in zip(names, columns, strict=True)}

@@ -42,11 +42,12 @@ class Parts(NamedTuple):
 
 class Around(NamedTuple):
     """What is done around the loop over a block of samples, jaxprs of scalars of one lane: before the first block (values ->
-    carry), after each (values, carry, inputs -> carry), and to finish (values, carry, inputs -> results)."""
+    carry), after each (values, carry, inputs -> carry, and marks that are kept of each block), and to finish (values, carry,
+    inputs -> results). Without the first and the last, there is only the carry."""
 
-    before: ClosedJaxpr
+    before: ClosedJaxpr | None
     after: ClosedJaxpr
-    finish: ClosedJaxpr
+    finish: ClosedJaxpr | None
 
 
 def carry_kinds(start: Callable[..., Any], functions: Iterable[tuple[Callable[..., Any], Any]], values: Any) -> list[Kind]:

@@ -10,10 +10,11 @@ import time
 import tomllib
 import weakref
 from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pandas as pd
@@ -41,6 +42,9 @@ from jaxbl.files import (
 from . import parts
 from .parts import Damaged, Mark
 from .programs import Backend, Layout
+
+if TYPE_CHECKING:
+    from pyarrow.dataset import Dataset
 
 FORMAT = 3
 """Of the manifest: raised where older versions could not read it."""
@@ -156,6 +160,17 @@ def _first_mark(folder: Path) -> Mark | None:
     return None
 
 
+@contextmanager
+def _refusing(part: Path) -> Iterator[None]:
+    """Around what reads a part: one line where it is damaged."""
+    try:
+        yield
+    except Damaged as why:
+        raise InputError(
+            f"{part}: is damaged ({why}); run 'jaxbl sweep' again, which keeps it aside and computes it anew"
+        ) from None
+
+
 class Store:
     """The folder of one study.
 
@@ -260,18 +275,22 @@ class Store:
         if not path.exists():
             return False
         try:
-            known = self.manifest["checksums"].get(str(index))
-            if known is not None:
-                if parts.file_checksum(path) != known:
-                    raise Damaged("does not agree with its checksum in manifest.json")
-                return True
-            mark, _ = parts.read(path)
-            self._check(path, mark, index)
+            self._check_file(path, index)
         except Damaged as why:
             self._put_aside(path, str(why))
             return False
-        self.manifest["checksums"][str(index)] = parts.file_checksum(path)
         return True
+
+    def _check_file(self, path: Path, index: int) -> None:
+        """Whether a part's file is what was written, by the manifest or else by itself. Raises `Damaged`, or `InputError`
+        where it is of another study."""
+        known = self.manifest["checksums"].get(str(index))
+        if known is None:
+            mark, _ = parts.read(path)
+            self._check(path, mark, index)
+            self.manifest["checksums"][str(index)] = parts.file_checksum(path)
+        elif parts.file_checksum(path) != known:
+            raise Damaged("does not agree with its checksum in manifest.json")
 
     def _check(self, path: Path, mark: Mark, index: int) -> None:
         """Whether a whole part is the one that belongs here."""
@@ -307,7 +326,8 @@ class Store:
 
     def existing(self) -> list[Path]:
         """Files of parts, whole or damaged."""
-        return listed(self.folder / "points", "part-*.parquet")
+        # a sixth digit comes after five
+        return sorted(listed(self.folder / "points", "part-*.parquet"), key=lambda path: (len(path.name), path.name))
 
     def read_part(self, index: int, labels: dict[str, np.ndarray], columns: list[str]) -> pd.DataFrame | None:
         """Some columns of a chunk, or None where it holds other rows than those of `labels`."""
@@ -362,25 +382,44 @@ class Store:
     def columns(self) -> list[str]:
         """Names of the columns."""
         mark = _first_mark(self.folder)
-        return list(mark.columns) if mark is not None else list(self.read().columns)
+        return list(mark.columns) if mark is not None else list(next(self.batches()).columns)
 
-    def read(self, columns: list[str] | None = None) -> pd.DataFrame:
-        """Rows of all chunks that are there; all columns, or some.
+    def batches(self, columns: list[str] | None = None) -> Iterator[pd.DataFrame]:
+        """Rows of the chunks that are there, one after the other; all columns, or some.
 
         Raises:
             InputError: a part is damaged, or not of this study.
         """
-        frames = []
         for part in self.parts():
-            try:
+            with _refusing(part):
                 mark, frame = parts.read(self._near(part), columns)
                 self._check(part, mark, int(part.stem.removeprefix("part-")))
-            except Damaged as why:
-                raise InputError(
-                    f"{part}: is damaged ({why}); run 'jaxbl sweep' again, which keeps it aside and computes it anew"
-                ) from None
-            frames.append(frame)
-        return pd.concat(frames, ignore_index=True)
+            yield frame
+
+    def dataset(self, check: bool) -> "Dataset":
+        """Rows of the chunks that are there as a dataset of pyarrow, which reads what is asked of it, and compares each page
+        with its checksum. With `check` each file is first compared with that in the manifest, else each part's mark read.
+
+        Raises:
+            InputError: a part is damaged, or not of this study.
+        """
+        from pyarrow import dataset
+
+        found = self.parts()
+        for part in found:
+            index = int(part.stem.removeprefix("part-"))
+            with _refusing(part):
+                if check:
+                    self._check_file(part, index)
+                else:
+                    self._check(part, parts.mark_of(part), index)
+        form = dataset.ParquetFileFormat(
+            default_fragment_scan_options=dataset.ParquetFragmentScanOptions(page_checksum_verification=True)
+        )
+        remote: Any = found[0]
+        system = remote.fs if is_remote(remote) else None
+        names = [str(part.path if system else part) for part in cast(Any, found)]
+        return cast("Dataset", dataset.dataset(names, format=form, filesystem=system))
 
     def _near(self, part: Path) -> Path:
         """A part where it is read fast: of an object store, a copy for as long as this lives, as a report reads it often."""

@@ -1,5 +1,6 @@
 """The workload by this package: the scan over time, vmapped, and the fused loop."""
 
+from itertools import count
 from typing import Any
 
 import jax
@@ -10,9 +11,11 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxbl.drive import set_leaves
 from jaxbl.fused.passage import HostPassage
 from jaxbl.simulate import scan
-from jaxbl.sweeps.engine import LANES_PER_DEVICE
 
 from .workload import FIGURES, RANGES, SEED, Chunked, Workload
+
+LANES = 2**12
+"""That a device scans at once: what they carry then stays in a core's cache (benchmarks/NOTES.md)."""
 
 
 class Scan(Chunked):
@@ -28,16 +31,18 @@ class Scan(Chunked):
         sweep = jax.shard_map(
             jax.vmap(lane, (0, None)), mesh=mesh, in_specs=(lanes, PartitionSpec()), out_specs=lanes, check_vma=False
         )
-        chunk = min(LANES_PER_DEVICE["scan"] * devices, -(-workload.lanes // devices) * devices)
+        chunk = min(LANES * devices, -(-workload.lanes // devices) * devices)
         super().__init__(sweep, workload, chunk, jnp.asarray(SEED))
 
 
 class Fused:
-    """The loop over time in registers, threads side by side."""
+    """The loop over time in registers, threads side by side. It makes input and noise by itself, of another seed each time."""
 
     def __init__(self, workload: Workload, threads: int):
         self._passage = HostPassage(workload.experiment(), (FIGURES,), tuple(RANGES), workload.lanes, threads)
-        self._values = workload.values()
+        self._values, self._seeds = workload.values(), count(SEED)
 
     def __call__(self) -> dict[str, np.ndarray]:
-        return self._passage(self._values, SEED)
+        # nothing is kept for the next lanes
+        self._passage.keep(())
+        return self._passage(self._values, next(self._seeds))

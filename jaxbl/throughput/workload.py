@@ -33,7 +33,9 @@ RANGES = {
 """What differs from lane to lane, from and to; spread by the logarithm."""
 _PERIOD, _MISS = 1e-3, 0.5
 """Sample period (s), velocity error of the motor's observer at t = 0 (rad/s)."""
-_DRIVE = {"motor_inertia": 0.05, "motor_viscous": 0.15, "load_inertia": 7.0, "load_viscous": 16.0, "gear_ratio": 5.0}
+DRIVE = {"motor_inertia": 0.05, "motor_viscous": 0.15, "load_inertia": 7.0, "load_viscous": 16.0, "gear_ratio": 5.0}
+INPUT = {"amplitude": 0.1, "frequency": 0.16}
+"""The sine that is the input, N m and Hz."""
 _STIFFNESS, _SLOPE, _LOW_PASS = 1.0, 20.0, 0.01
 """The paper's drive and law (N m/rad, 1/rad), and the low-pass of the equivalent control (s)."""
 
@@ -103,11 +105,11 @@ class Workload(NamedTuple):
     def experiment(self) -> Experiment:
         """With array leaves of the precision; lanes set those of `RANGES`."""
         experiment = Experiment(
-            drive=TwoInertia(**_DRIVE),
+            drive=TwoInertia(**DRIVE),
             transmission=SigmoidBacklash(_STIFFNESS, 0.02, _SLOPE),
             effects=(),
             initial=Initial(),
-            excitation=Sine(0.1, 0.16),
+            excitation=Sine(**INPUT),
             encoders=Encoders(1e-4),
             observer=Observers(ExplicitSuperTwisting(4.0, 9.0, velocity_error=_MISS), ExplicitSuperTwisting(0.5, 0.2)),
             equivalent_control=EquivalentControl(_LOW_PASS),
@@ -152,7 +154,7 @@ def constants() -> dict[str, float]:
     """The numbers that all lanes share, for those who write the chain themselves."""
     return {
         "period": _PERIOD,
-        **_DRIVE,
+        **DRIVE,
         "stiffness": _STIFFNESS,
         "slope": _SLOPE,
         "share": -math.expm1(-_PERIOD / _LOW_PASS),

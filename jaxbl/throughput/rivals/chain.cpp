@@ -1,15 +1,11 @@
 // The workload by hand: SIMD over lanes, the loop over time innermost with a lane's state in registers, OpenMP over blocks
 // of lanes. What this machine can do in practice.
-#include <bit>
-#include <cmath>
-#include <cstdint>
-#include <experimental/simd>
-
-namespace stdx = std::experimental;
+#include "vectors.hpp"
 
 struct Constants {
   double period, motor_inertia, motor_viscous, load_inertia, load_viscous, gear_ratio, stiffness, slope, share;
   double motor_error;  // velocity error of the motor's observer at t = 0
+  double amplitude, frequency;
 };
 
 template <class V>
@@ -17,54 +13,6 @@ struct alignas(64) Sums {
   V first, both, second, motor_first, motor_second, load_first, load_second, motor_rate, load_rate;
 };
 constexpr int SUMS = 9;
-
-// Rational approximation of float accuracy (a few units in the last place), as vector libraries and XLA have it.
-template <class V>
-inline V tanh_of(V x) requires(sizeof(typename V::value_type) == 4) {
-  x = stdx::max(V(-7.90531110763549805f), stdx::min(V(7.90531110763549805f), x));
-  const V z = x * x;
-  V p = V(-2.76076847742355e-16f);
-  p = p * z + 2.00018790482477e-13f;
-  p = p * z + -8.60467152213735e-11f;
-  p = p * z + 5.12229709037114e-08f;
-  p = p * z + 1.48572235717979e-05f;
-  p = p * z + 6.37261928875436e-04f;
-  p = p * z + 4.89352455891786e-03f;
-  V q = V(1.19825839466702e-06f);
-  q = q * z + 1.18534705686654e-04f;
-  q = q * z + 2.26843463243900e-03f;
-  q = q * z + 4.89352518554385e-03f;
-  return x * p / q;
-}
-
-// S. L. Moshier's Cephes: a rational function near zero, 1 - 2 / (exp(2 |x|) + 1) beyond.
-template <class V>
-inline V tanh_of(V x) requires(sizeof(typename V::value_type) == 8) {
-  const V a = stdx::min(stdx::abs(x), V(22.0)), z = a * a;
-  const V p = (V(-9.64399179425052238628e-1) * z - 9.92877231001918586564e1) * z - 1.61468768441708447952e3;
-  const V q = ((z + 1.12811678491632931402e2) * z + 2.23548839060100448583e3) * z + 4.84406305325125486048e3;
-  const V near = a + a * z * p / q;
-  const V y = 2.0 * a, shifter = V(6755399441055744.0);  // 1.5 * 2^52: rounds, and leaves the integer in the low bits
-  const V shifted = y * 1.4426950408889634 + shifter;
-  const V n = shifted - shifter;
-  const V r = (y - n * 6.93145751953125e-1) - n * 1.42860682030941723212e-6, s = r * r;
-  const V up = r * ((V(1.26177193074810590878e-4) * s + 3.02994407707441961300e-2) * s + 9.99999999999999999910e-1);
-  const V down = ((V(3.00198505138664455042e-6) * s + 2.52448340349684104192e-3) * s + 2.27265548208155028766e-1) * s + 2.0;
-  using Bits = stdx::rebind_simd_t<std::int64_t, V>;
-  const V power = std::bit_cast<V>((std::bit_cast<Bits>(shifted) + Bits(1023)) << 52);
-  const V e = (1.0 + 2.0 * up / (down - up)) * power;
-  V far = 1.0 - 2.0 / (e + 1.0);
-  stdx::where(a < 0.625, far) = near;
-  return stdx::copysign(far, x);
-}
-
-template <class V>
-inline V sign_of(V x) {
-  V s = V(0);
-  stdx::where(x > 0, s) = V(1);
-  stdx::where(x < 0, s) = V(-1);
-  return s;
-}
 
 template <class T, int U>
 void run_block(const Constants& c, int steps, int start, int window, const T* torque, const T* noise, int lanes, int first,
@@ -153,20 +101,36 @@ void run_block(const Constants& c, int steps, int start, int window, const T* to
     for (int j = 0; j < SUMS; ++j) (&total[k].first)[j].copy_to(out[j] + first + k * W, stdx::element_aligned);
 }
 
+// Torque and unit noise of some samples, whole vectors of them.
+template <class T>
+void make_inputs(const Constants& c, std::uint32_t seed, int first, T* torque, T* noise) {
+  make_noise(seed, first, noise);
+  for (int i = 0; i < SAMPLES; ++i)
+    torque[first + i] = T(c.amplitude) * std::sin(T(6.283185307179586 * c.frequency) * (T(first + i) * T(c.period)));
+}
+
+// `own`: torque and noise, of whole vectors of samples, are made here, from the seed.
 template <class T, int U>
-void run_all(const Constants& c, int steps, int start, int window, const T* torque, const T* noise, int lanes,
-             const T* const* given, T* const* out, int threads) {
+void run_all(const Constants& c, int steps, int start, int window, T* torque, T* noise, int lanes, const T* const* given,
+             T* const* out, int threads, bool own, std::uint32_t seed) {
   constexpr int block = U * stdx::native_simd<T>::size();
-#pragma omp parallel for schedule(static) num_threads(threads)
-  for (int first = 0; first < lanes; first += block)
-    run_block<T, U>(c, steps, start, window, torque, noise, lanes, first, given, out);
+#pragma omp parallel num_threads(threads)
+  {
+    if (own) {
+#pragma omp for schedule(static)
+      for (int first = 0; first < steps; first += SAMPLES) make_inputs(c, seed, first, torque, noise);
+    }
+#pragma omp for schedule(static)
+    for (int first = 0; first < lanes; first += block)
+      run_block<T, U>(c, steps, start, window, torque, noise, lanes, first, given, out);
+  }
 }
 
 // Two vectors at a time: one's latency hides behind the other's (four are no faster).
 #define ENTRY(NAME, T)                                                                                                \
-  extern "C" void NAME(const Constants* c, int steps, int start, int window, const T* torque, const T* noise,          \
-                       int lanes, const T* const* given, T* const* out, int threads) {                                 \
-    run_all<T, 2>(*c, steps, start, window, torque, noise, lanes, given, out, threads);                                \
+  extern "C" void NAME(const Constants* c, int steps, int start, int window, T* torque, T* noise, int lanes,           \
+                       const T* const* given, T* const* out, int threads, int own, std::uint32_t seed) {               \
+    run_all<T, 2>(*c, steps, start, window, torque, noise, lanes, given, out, threads, own, seed);                     \
   }
 ENTRY(chain_float32, float)
 ENTRY(chain_float64, double)

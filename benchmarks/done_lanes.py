@@ -1,0 +1,115 @@
+"""Lanes that are done stop costing: nine of ten diverge after a tenth of the run, and leave the fused loop.
+
+    python benchmarks/done_lanes.py [--lanes 8192] [--steps 10000] [--precision float64] [--rounds 5]
+
+The shaft's stiffness is an axis. Above a limit that the step of the plant sets, a lane's numbers grow until they overflow;
+the stiffness of these lanes is the least at which that happens within a tenth of the run. All cases take turns; the least
+time of several rounds counts. Every case's metrics are compared, bit for bit, with those of the loop that no lane leaves.
+"""
+
+import argparse
+import os
+import time
+from typing import Any
+
+os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(len(os.sched_getaffinity(0))))
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbl.drive import Encoders, Initial, LinearShaft, TwoInertia, as_arrays
+from jaxbl.drive.excitation import Sine
+from jaxbl.fused.passage import HostPassage
+from jaxbl.observer import EquivalentControl, Identifier, ImplicitSuperTwisting, Observers
+from jaxbl.simulate import Experiment, Reducer, Run
+from jaxbl.sweeps.metrics import METRICS
+
+PATH, SANE = "transmission.stiffness", 60.0
+SHARE, TIME = 0.9, 0.1
+"""Of lanes that diverge, and of the run after which they do."""
+
+
+def experiment(steps: int, dtype: np.dtype) -> Experiment:
+    return as_arrays(
+        Experiment(
+            drive=TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0),
+            transmission=LinearShaft(SANE),
+            effects=(),
+            initial=Initial(),
+            excitation=Sine(5.0, 0.8),
+            encoders=Encoders(1e-4),
+            observer=Observers(ImplicitSuperTwisting(10.0, 90.0), ImplicitSuperTwisting(2.5, 8.2)),
+            equivalent_control=EquivalentControl(0.01),
+            identifier=Identifier(0.1),
+            run=Run(1e-3, steps, 1),
+        ),
+        dtype,
+    )
+
+
+def _lasting(experiment: Experiment, total: Any, index: Any, signals: Any) -> Any:
+    finite = [jnp.isfinite(signals.side(side).true.perturbation) for side in experiment.sides]
+    return total + jnp.logical_or(*finite).astype(total.dtype)
+
+
+LASTED = Reducer(
+    lambda experiment: jnp.zeros_like(experiment.run.sample_period),
+    _lasting,
+    lambda experiment, total, state: {"samples": total},
+)
+"""Samples until both sides have overflowed."""
+
+
+def limit(whole: Experiment, steps: int) -> float:
+    """The least stiffness at which a lane is done before so many samples."""
+    passage, low, high = HostPassage(whole, (LASTED,), (PATH,), 256, 1), SANE, 1e9
+    for _ in range(4):
+        tried = np.linspace(low, high, 256)
+        last = int(np.flatnonzero(passage({PATH: tried}, 0)["samples"] >= steps)[-1])
+        low, high = tried[last], tried[last + 1]
+    return float(high)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--lanes", type=int, default=8192)
+    parser.add_argument("--steps", type=int, default=10_000)
+    parser.add_argument("--precision", choices=("float32", "float64"), default="float64")
+    parser.add_argument("--rounds", type=int, default=5)
+    given = parser.parse_args()
+    with jax.enable_x64(given.precision == "float64"):
+        measure(given.lanes, given.steps, np.dtype(given.precision), given.rounds)
+
+
+def measure(lanes: int, steps: int, dtype: np.dtype, rounds: int) -> None:
+    whole = experiment(steps, dtype)
+    least = limit(whole, int(TIME * steps))
+    threads = len(jax.local_devices())
+    leaving = HostPassage(whole, (METRICS,), (PATH,), lanes, threads)
+    staying = HostPassage(whole, (METRICS._replace(done=None),), (PATH,), lanes, threads)
+    sane, gone = SANE * np.linspace(1.0, 1.1, lanes), np.arange(lanes) < SHARE * lanes
+    mixed = np.random.default_rng(0).permutation(gone)
+    cases = {
+        "none diverges": (leaving, sane),
+        "none diverges, none may leave": (staying, sane),
+        "nine of ten, one after the other": (leaving, np.where(gone, least, sane)),
+        "nine of ten, mixed": (leaving, np.where(mixed, least, sane)),
+        "nine of ten, mixed, none may leave": (staying, np.where(mixed, least, sane)),
+    }
+    best = dict.fromkeys(cases, np.inf)
+    for passage, values in cases.values():
+        found, expected = passage({PATH: values}, 0), staying({PATH: values}, 0)
+        assert all(np.array_equal(found[name], expected[name], equal_nan=True) for name in expected)
+    for _ in range(rounds):
+        for name, (passage, values) in cases.items():
+            start = time.perf_counter()
+            passage({PATH: values}, 0)
+            best[name] = min(best[name], time.perf_counter() - start)
+    print(f"{lanes} lanes of {steps} samples, {dtype}, {threads} threads; stiffness {least:.4g} and more diverge")
+    for name, seconds in best.items():
+        print(f"{name:36s} {seconds:8.3f} s   {seconds / best['none diverges']:.2f}")
+
+
+if __name__ == "__main__":
+    main()
