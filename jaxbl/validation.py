@@ -4,9 +4,9 @@ import difflib
 import stat
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
 from .errors import InputError, shortened
@@ -20,7 +20,8 @@ _DEPTH = 16
 _VALUES = 300_000
 """Values of a study, some seconds of reading. More are given as start, stop and num, or by a recorded file."""
 _LEAST, LARGEST = 1e-30, 1e30
-"""Magnitudes of a number: float32 ends at 1e38, and no drive has quantities near that in SI units."""
+"""The least positive number that may be divided by, and the largest magnitude of any: float32 ends at 1e-38 and 1e38, and no
+drive has quantities near that in SI units."""
 
 
 def check_file(path: Path, most: int | None = None) -> None:
@@ -37,9 +38,14 @@ def check_file(path: Path, most: int | None = None) -> None:
         raise InputError(f"has {found.st_size / 1e6:.0f} MB; it should have at most {most / 1e6:.0f} MB")
 
 
-def unusable(number: float) -> bool:
-    """Whether a finite number is too large or too small to be computed with; 0 is not."""
-    return number != 0.0 and not _LEAST <= abs(number) <= LARGEST
+def _not_tiny(number: float) -> float:
+    if 0.0 < number < _LEAST:
+        raise wrong(f"should be at least {_LEAST:g}, not {number:g}")
+    return number
+
+
+Positive = Annotated[float, AfterValidator(_not_tiny)]
+"""Type of a key that has to be above 0, as it is divided by."""
 
 
 def check_sizes(data: Any) -> None:
@@ -96,8 +102,8 @@ def _fault(value: Any, longest: int = _TEXT) -> str:
             )
             return f"should have no control characters such as {bad!r}" if bad else ""
     elif isinstance(value, float):
-        if abs(value) < float("inf") and unusable(value):
-            return f"should be 0, or between {_LEAST:g} and {LARGEST:g} in magnitude, not {value:g}"
+        if LARGEST < abs(value) < float("inf"):
+            return f"should be at most {LARGEST:g} in magnitude, not {value:g}"
     elif isinstance(value, int) and not -(2**63) <= value < 2**63:
         return f"should be a number of 64 bits, not {shortened(hex(value), 40)}"
     return ""

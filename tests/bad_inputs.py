@@ -1,7 +1,7 @@
 """Inputs that nobody should give, and what becomes of them: a script, so that its process has limits of its own.
 
-`python bad_inputs.py listed|toml|logs FOLDER` reads inputs and writes what was said of each as JSON. It ends with an error if
-one takes over 10 s of processor time, waits for long, takes over 2 GB, or ends in anything but a result or one line.
+`python bad_inputs.py listed|toml|logs FOLDER` reads inputs and writes what was said of each as JSON. It ends with an error
+where one takes over 10 s of processor time, waits for long, takes over 2 GB, or ends in anything but a result or one line.
 """
 
 import copy

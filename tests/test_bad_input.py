@@ -18,7 +18,7 @@ HERE = Path(__file__).parent
 
 # said of the inputs that :mod:`bad_inputs` lists; "" where there is nothing to say
 SAID = {
-    "study inertia": "drive.motor_inertia: should be 0, or between 1e-30 and 1e+30 in magnitude, not 4.94066e-324",
+    "study inertia": "drive.motor_inertia: should be at least 1e-30, not 4.94066e-324",
     "study substeps of 1e30": "run.substeps: should be a number of 64 bits, not 0xc9f2c9cd04674edea40000000",
     "study substeps of 1e9": "run.substeps: should be less than or equal to 100000, not 1000000000",
     "study nested": "tables or arrays are nested too deep",
