@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .errors import InputError, NoResult
+from .errors import InputError, NoResult, printable
 from .files import Busy, place
 from .terminal import duration, naming, running
 from .workers import start_jax
@@ -94,11 +94,10 @@ def simulate(
     from jaxbl.sweeps.store import claim
     from jaxbl.sweeps.trial import run
 
-    from .config import read_config
     from .files import locked, removed_if_empty
     from .report.simulate import write_trial_report
 
-    study = read_config(config)
+    study = _read(config)
     folder = _folder(config, out)
     with removed_if_empty(folder), locked(folder):
         claim(folder, study, "simulate", overwrite=overwrite)
@@ -196,7 +195,7 @@ def status(folder: FolderArgument) -> None:
 
 def _print_status(found: "Status") -> None:
     share = f"{found.parts} of {found.parts_in_all} parts ({math.floor(1000 * found.parts / found.parts_in_all) / 10:g} %)"
-    typer.echo(f"{found.folder}: '{found.title}', {share} of {found.runs} runs")
+    typer.echo(f"{found.folder}: '{printable(found.title)}', {share} of {found.runs} runs")
     if found.damaged:
         typer.echo(f"  {found.damaged} damaged files are kept in {found.folder / 'damaged'}")
     if found.finished and found.complete:
@@ -271,10 +270,18 @@ def _study(config: Path, backend: str | None) -> tuple["Config", "Backend | None
     start_jax()
     from jaxbl.sweeps.programs import backend_of
 
+    chosen = backend_of(backend, "--backend")
+    return _read(config), chosen
+
+
+def _read(config: Path) -> "Config":
+    """A study; what is valid in it and perhaps not meant is said first."""
     from .config import read_config
 
-    chosen = backend_of(backend, "--backend")
-    return read_config(config), chosen
+    study = read_config(config)
+    for remark in study.remarks():
+        typer.echo(printable(f"jaxbl: {config}: {remark}"), err=True)
+    return study
 
 
 def _compute(
@@ -515,9 +522,9 @@ def _diagnose_batch(
     with running(context, model or source, out, unit="logs") as progress:
         rows = run_batch(work, out, jobs, progress, scheduler)
     if skipped:
-        typer.echo(f"Skipped, by their names no logs: {', '.join(skipped)}")
+        typer.echo(printable(f"Skipped, by their names no logs: {', '.join(skipped)}"))
     for line in batch_lines(rows):
-        typer.echo(line)
+        typer.echo(printable(line))
     typer.echo(f"{out / 'batch.csv'}")
     if all(row["refused"] for row in rows):
         raise typer.Exit(2)
@@ -536,9 +543,11 @@ def plot(
     from jaxbl.sweeps.sweep import open_study
 
     from .config import read_config
+    from .files import make_folder
     from .report.sweep import write_sweep_report
 
     where, result = place(folder), open_study(folder)
+    make_folder(where, "copy it to where you may write, and plot that")
     if config is not None:
         study = read_config(config)
         if identity(study) != Store.open(where).manifest["identity"]:
@@ -623,7 +632,7 @@ def _folder(config: Path, out: str | Path | None) -> Path:
 def _print(lines: list[str], folder: Path) -> None:
     """Print what was found, and where the report is."""
     for line in [*lines, str(folder / "report.html")]:
-        typer.echo(line)
+        typer.echo(printable(line))
 
 
 def main(run: Callable[[], object] = app) -> None:

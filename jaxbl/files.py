@@ -307,8 +307,8 @@ def has_file(folder: Path, name: str) -> bool:
     return (folder / name).exists()
 
 
-def make_folder(path: Path) -> None:
-    """Make a folder that can be written to. Raises `InputError` where that is not possible."""
+def make_folder(path: Path, instead: str = "choose another folder with --out") -> None:
+    """Make a folder that can be written to. Raises `InputError` where that is not possible; `instead` is what to do then."""
     if is_remote(path):
         with access(path, "written to"):
             (path / ".probe").write_bytes(b"")
@@ -324,7 +324,7 @@ def make_folder(path: Path) -> None:
     except NotADirectoryError:
         raise InputError(f"{path}: lies under a file; --out should name a folder") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be written to ({error.strerror}); choose another folder with --out") from None
+        raise InputError(f"{path}: cannot be written to ({error.strerror}); {instead}") from None
 
 
 def claim_log_folder(folder: Path, log: Path, *, overwrite: bool) -> None:
