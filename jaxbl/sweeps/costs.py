@@ -229,10 +229,9 @@ def measured(devices: list[Any]) -> Costs:
     works = {path: work_of(config, [path]) for path in _PATHS}
     few, many, more = _FEW * count, _MANY * count, _MORE * count
     # few scans: XLA compiles longer than they run
-    wanted: list[Tried] = []
-    wanted += [("fused", path, lanes) for path in _PATHS for lanes in (few, many)]
-    wanted += [("scan", _PATHS[0], lanes) for lanes in (few, many, more)]
-    took, compiling = _times(config, devices, [*wanted, ("scan", _PATHS[1], many)])
+    fused: list[Tried] = [("fused", path, lanes) for path in _PATHS for lanes in (few, many)]
+    scans: list[Tried] = [("scan", _PATHS[0], lanes) for lanes in (few, many, more)]
+    took, compiling = _times(config, devices, [*fused, *scans, ("scan", _PATHS[1], many)])
 
     def cost(backend: Backend) -> Cost:
         rows = []
