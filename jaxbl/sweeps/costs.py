@@ -229,9 +229,9 @@ def measured(devices: list[Any]) -> Costs:
     works = {path: work_of(config, [path]) for path in _PATHS}
     few, many, more = _FEW * count, _MANY * count, _MORE * count
     # few scans: XLA compiles longer than they run
-    wanted: list[Tried] = [("fused", path, lanes) for path in _PATHS for lanes in (few, many)]
-    wanted += [("scan", _PATHS[0], lanes) for lanes in (few, many, more)]
-    took, compiling = _times(config, devices, [*wanted, ("scan", _PATHS[1], many)])
+    fused: list[Tried] = [("fused", path, lanes) for path in _PATHS for lanes in (few, many)]
+    scans: list[Tried] = [("scan", _PATHS[0], lanes) for lanes in (few, many, more)]
+    took, compiling = _times(config, devices, [*fused, *scans, ("scan", _PATHS[1], many)])
 
     def cost(backend: Backend) -> Cost:
         rows = []
@@ -244,7 +244,8 @@ def measured(devices: list[Any]) -> Costs:
         table, size = np.stack(rows), np.max(rows, axis=0)
         size[size == 0.0] = 1.0
         found, _ = nnls(table / size, np.ones(len(rows)))
-        return Cost(*(found / size).tolist(), compiling[backend] / works[_PATHS[0]].equations)
+        sample, operation, lane = (found / size).tolist()
+        return Cost(sample, operation, lane, compiling[backend] / works[_PATHS[0]].equations)
 
     fits = took["scan", _PATHS[0], more] / more < 1.15 * took["scan", _PATHS[0], many] / many
     return Costs(cost("fused"), cost("scan"), (_MORE if fits else _MANY) * works[_PATHS[0]].carried)

@@ -121,9 +121,11 @@ class Engine:
         if not self.points.columns(np.arange(1)):
             # lanes that differ in nothing but their seed
             return "scan"
-        layouts = {backend: self._layout(backend, None) for backend in BACKENDS}
+        layouts: dict[Backend, Layout] = {backend: self._layout(backend, None) for backend in BACKENDS}
         steps = sum(group.config.run.steps for group in self.points.groups)
-        samples = {b: steps * self._chunks(layout, self.points.coarse_lanes) for b, layout in layouts.items()}
+        samples: dict[Backend, int] = {
+            b: steps * self._chunks(layout, self.points.coarse_lanes) for b, layout in layouts.items()
+        }
         return faster(self.devices, self._work, layouts, samples, len(self.points.groups))
 
     def _layout(self, backend: Backend, chunk: int | None) -> Layout:
