@@ -20,6 +20,8 @@ export SLURM_CONF="$work/slurm.conf"
 finish() {
     status=$?
     trap - EXIT
+    # else the daemons leave the jobs' processes behind
+    scancel --partition=all 2>/dev/null && sleep 4 || true
     for file in "$work"/*.pid; do
         kill "$(cat "$file")" 2>/dev/null || true
     done
