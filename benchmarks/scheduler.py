@@ -7,7 +7,7 @@ from the system for each process: on a machine of few cores, which workers share
 inverse what scheduler or client could do at best.
 
     python benchmarks/scheduler.py --workers 10 100 1000 --bundles 1000 10000 100000
-    python benchmarks/scheduler.py --workers 10 --bundles 100000 --leave          # all handed over at once
+    python benchmarks/scheduler.py --workers 10 --bundles 100000 --leave          # all known at once, none done
     python benchmarks/scheduler.py --workers 1000 --bundles 10000 --heartbeat 60  # where idle workers take all cores
 
 Needs the extra `distributed`; open files: 12 for each worker (`ulimit -n`).
@@ -162,10 +162,11 @@ class Pass:
         assert count == max(marks)
         self.peaks.stop.set()
 
-    def left(self, client: Client, bundles: int, seconds: float) -> None:
-        Cluster(client, local=False).leave(done, [job for _, job in jobs(bundles, seconds)])
+    def left(self, client: Client, bundles: int) -> None:
+        """Hand over bundles of which none ends, until the scheduler knows them all."""
+        Cluster(client, local=False).leave(done, [job for _, job in jobs(bundles, 1e6)])
         self.first = time.perf_counter() - self.start
-        while client.run_on_scheduler(lambda dask_scheduler: len(dask_scheduler.tasks)):
+        while client.run_on_scheduler(lambda dask_scheduler: len(dask_scheduler.tasks)) < bundles:
             time.sleep(0.5)
         self.row(bundles)
         self.peaks.stop.set()
@@ -177,7 +178,7 @@ def main() -> None:
     parser.add_argument("--bundles", type=int, nargs="+", default=[1000, 10_000, 100_000])
     parser.add_argument("--sleep", type=float, default=0.0, help="seconds of a bundle")
     parser.add_argument("--heartbeat", type=float, help="of a worker, s [default: Dask's, 1 + workers / 200]")
-    parser.add_argument("--leave", action="store_true", help="hand bundles over, and wait for the scheduler to be empty")
+    parser.add_argument("--leave", action="store_true", help="hand all over at once; none is done")
     given = parser.parse_args()
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
@@ -214,8 +215,7 @@ def run(count: int, given: argparse.Namespace, folder: str) -> None:
     )
     with Client(address, set_as_default=False, timeout=120) as client:
         if given.leave:
-            for bundles in given.bundles:
-                Pass(scheduler, workers).left(client, bundles, given.sleep)
+            Pass(scheduler, workers).left(client, max(given.bundles))
         else:
             Pass(scheduler, workers).by_client(client, given.bundles, given.sleep)
     for channel in channels[::-1]:

@@ -53,9 +53,10 @@ class Cluster:
     def workers(self) -> int:
         """How many there are now, at least one: a cluster may start them as they are needed."""
         try:
-            return max(len(self._client.nthreads()), 1)
+            workers: Any = self._client.nthreads()
         except OSError:
             raise NoResult(_LOST) from None
+        return max(len(workers), 1)
 
     def each(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
         """Results of a function (importable by name), in the order of its arguments."""

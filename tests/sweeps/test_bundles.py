@@ -1,5 +1,6 @@
 """Studies on a cluster: the table that one process gives, parts that are there left out, and what goes wrong in one line."""
 
+import itertools
 import time
 
 import jax
@@ -140,6 +141,16 @@ def test_errors_of_workers_reach_who_asked(client, monkeypatch):
         monkeypatch.setattr(cluster, "version", lambda name: asking.pop() if asking else "0.0.1")
         with pytest.raises(InputError, match=r"worker .* has jaxbl 0\.0\.1; install .* there"):
             list(workers.each(abs, [1]))
+
+
+def test_jobs_are_taken_as_they_are_needed(client):
+    taken = []
+    with connected(client) as workers:
+        results = workers.each(abs, (taken.append(number) or number for number in itertools.count()))
+        assert [next(results) for _ in range(40)] == list(range(40))
+        # in flight, and done but not yet asked for
+        assert len(taken) <= 40 + 2 * cluster._FEWEST_AHEAD
+        results.close()
 
 
 def test_a_scheduler_that_is_lost_is_said(client):
