@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from jaxbl.report.figures import limits, outline
+from jaxbl.report.figures import limits, literal, outline, save, subplots
 
 
 def test_the_base_and_the_report_of_inspect_need_no_jax():
@@ -35,3 +35,15 @@ def test_a_few_outliers_do_not_set_the_ends_of_an_axis():
     assert -1.5 < ends[0] < -1.0 and 2.0 < ends[1] < 2.5
     assert limits(np.array([np.nan])) is None
     assert limits(np.array([3.0, 3.0])) == pytest.approx((2.7, 3.3))
+
+
+def test_a_user_s_name_is_drawn_as_it_is(tmp_path):
+    """No mathematics, no line breaks, no warning where the font lacks a letter, and not longer than a legend is wide."""
+    figure, (ax,) = subplots(3.0, 2.0)
+    for name in (r"$\frac{$", r"a\$b$", "\x1b[31m\n", "漢", "x" * 5000):
+        ax.plot([0.0, 1.0], label=literal(name))
+    ax.legend()
+    save(figure, tmp_path / "figure.png")
+    shown = [text.get_text().replace(r"\$", "$") for text in ax.get_legend().get_texts()]
+    assert shown[:4] == [r"$\frac{$", r"a\$b$", r"\x1b[31m\n", "漢"]
+    assert len(shown[4]) == 40
