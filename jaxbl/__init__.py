@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from .report.sweep import write_sweep_report as write_sweep_report
     from .report.tune import write_tune_report as write_tune_report
     from .report.verify import write_verify_report as write_verify_report
+    from .sweeps.compare import Comparison as Comparison
+    from .sweeps.compare import compare as compare
     from .sweeps.status import Status as Status
     from .sweeps.status import status as status
     from .sweeps.sweep import StudyResult as StudyResult
@@ -68,6 +70,7 @@ _NAMES = {
     "report.sweep": ("write_sweep_report",),
     "report.tune": ("write_tune_report",),
     "report.verify": ("write_verify_report",),
+    "sweeps.compare": ("Comparison", "compare"),
     "sweeps.status": ("Status", "status"),
     "sweeps.sweep": ("StudyResult", "dry_run", "open_study", "repair", "share", "submit", "sweep"),
     "sweeps.trial": ("Trial", "run"),

@@ -1,6 +1,28 @@
-"""`python -m jaxbl`: the command line."""
+"""The command line, from the first moment on: `jaxbl` and `python -m jaxbl`."""
 
-from .cli import program
+import os
+import signal
+import sys
+from types import FrameType
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    """End at once: foreign code that is being loaded may swallow an interrupt, and nothing is written before work begins."""
+    os.write(2, b"interrupted\n")
+    os._exit(130)
+
+
+# processes that a command starts load this module, too, and are ended by it
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler and "multiprocessing.spawn" not in sys.modules:
+    signal.signal(signal.SIGINT, _leave)
+
+
+def program() -> None:
+    """Entry point: what takes its time to load is loaded under the handler above."""
+    from .cli import program
+
+    program()
+
 
 if __name__ == "__main__":
     program()

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .errors import InputError, NoResult
-from .files import place
+from .errors import InputError, NoResult, printable
+from .files import Busy, place
 from .terminal import duration, naming, running
 from .workers import start_jax
 
@@ -33,14 +33,10 @@ app = typer.Typer(
 
 ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML study", show_default=False)]
 OutOption = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="DIR", parser=place, help="folder for the results, or s3://BUCKET/FOLDER [default: results/<config name>]"
-    ),
+    str | None,
+    typer.Option(metavar="DIR", help="folder for the results, or s3://BUCKET/FOLDER [default: results/<config name>]"),
 ]
-FolderArgument = Annotated[
-    Path, typer.Argument(metavar="DIR", parser=place, help="folder of a sweep, verify or tune", show_default=False)
-]
+FolderArgument = Annotated[str, typer.Argument(metavar="DIR", help="folder of a sweep, verify or tune", show_default=False)]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="remove the results of another study from the folder")]
 BackendOption = Annotated[
     str | None,
@@ -98,11 +94,10 @@ def simulate(
     from jaxbl.sweeps.store import claim
     from jaxbl.sweeps.trial import run
 
-    from .config import read_config
     from .files import locked, removed_if_empty
     from .report.simulate import write_trial_report
 
-    study = read_config(config)
+    study = _read(config)
     folder = _folder(config, out)
     with removed_if_empty(folder), locked(folder):
         claim(folder, study, "simulate", overwrite=overwrite)
@@ -151,6 +146,8 @@ def sweep(
         if dry_run:
             _print_cost(study, chosen)
             return
+    run = functools.partial(run_sweep, verify_store=verify_store, scheduler=scheduler)
+    collect = functools.partial(_compute, context, config, study, out, overwrite, chosen, run, write_sweep_report)
     if detach or which is not None:
         from jaxbl.sweeps.sweep import share as run_share
         from jaxbl.sweeps.sweep import submit
@@ -166,8 +163,12 @@ def sweep(
             typer.echo(f"When all parts are there, 'jaxbl sweep {config} --out {folder}' writes the report.")
             return
         # who is last collects them
-    run = functools.partial(run_sweep, verify_store=verify_store, scheduler=scheduler)
-    _compute(context, config, study, out, overwrite, chosen, run, write_sweep_report)
+        try:
+            collect()
+        except Busy:
+            _print_status(found)
+        return
+    collect()
 
 
 def _share(text: str | None, others: dict[str, bool]) -> tuple[int, int] | None:
@@ -194,7 +195,7 @@ def status(folder: FolderArgument) -> None:
 
 def _print_status(found: "Status") -> None:
     share = f"{found.parts} of {found.parts_in_all} parts ({math.floor(1000 * found.parts / found.parts_in_all) / 10:g} %)"
-    typer.echo(f"{found.folder}: '{found.title}', {share} of {found.runs} runs")
+    typer.echo(f"{found.folder}: '{printable(found.title)}', {share} of {found.runs} runs")
     if found.damaged:
         typer.echo(f"  {found.damaged} damaged files are kept in {found.folder / 'damaged'}")
     if found.finished and found.complete:
@@ -269,17 +270,25 @@ def _study(config: Path, backend: str | None) -> tuple["Config", "Backend | None
     start_jax()
     from jaxbl.sweeps.programs import backend_of
 
+    chosen = backend_of(backend, "--backend")
+    return _read(config), chosen
+
+
+def _read(config: Path) -> "Config":
+    """A study; what is valid in it and perhaps not meant is said first."""
     from .config import read_config
 
-    chosen = backend_of(backend, "--backend")
-    return read_config(config), chosen
+    study = read_config(config)
+    for remark in study.remarks():
+        typer.echo(printable(f"jaxbl: {config}: {remark}"), err=True)
+    return study
 
 
 def _compute(
     context: typer.Context,
     config: Path,
     study: "Config",
-    out: Path | None,
+    out: str | None,
     overwrite: bool,
     backend: "Backend | None",
     run: Callable[..., Any],
@@ -513,9 +522,9 @@ def _diagnose_batch(
     with running(context, model or source, out, unit="logs") as progress:
         rows = run_batch(work, out, jobs, progress, scheduler)
     if skipped:
-        typer.echo(f"Skipped, by their names no logs: {', '.join(skipped)}")
+        typer.echo(printable(f"Skipped, by their names no logs: {', '.join(skipped)}"))
     for line in batch_lines(rows):
-        typer.echo(line)
+        typer.echo(printable(line))
     typer.echo(f"{out / 'batch.csv'}")
     if all(row["refused"] for row in rows):
         raise typer.Exit(2)
@@ -534,15 +543,44 @@ def plot(
     from jaxbl.sweeps.sweep import open_study
 
     from .config import read_config
+    from .files import make_folder
     from .report.sweep import write_sweep_report
 
-    result = open_study(folder)
+    where, result = place(folder), open_study(folder)
+    make_folder(where, "copy it to where you may write, and plot that")
     if config is not None:
         study = read_config(config)
-        if identity(study) != Store.open(folder).manifest["identity"]:
+        if identity(study) != Store.open(where).manifest["identity"]:
             raise InputError(f"{config}: is not the study in {folder}; only title, notes and figures may differ")
         result = dataclasses.replace(result, config=study)
-    _print(write_sweep_report(result, folder), folder)
+    _print(write_sweep_report(result, where), where)
+
+
+@app.command()
+def compare(
+    first: Annotated[Path, typer.Argument(metavar="DIR1", parser=place, help="folder of a sweep", show_default=False)],
+    second: Annotated[Path, typer.Argument(metavar="DIR2", parser=place, help="of another one", show_default=False)],
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="folder for the results [default: results/compare-DIR1-DIR2]")
+    ] = None,
+) -> None:
+    """Compare two sweeps: what changed in the config, and where metrics differ by more than noise."""
+    start_jax()
+    from jaxbl.sweeps.compare import compare as run_compare
+    from jaxbl.sweeps.sweep import open_study
+
+    from .files import is_empty, make_folder, removed_if_empty
+    from .report.compare import write_comparison
+
+    studies = open_study(first), open_study(second)
+    folder = out if out is not None else Path("results") / f"compare-{first.name}-{second.name}"
+    make_folder(folder)
+    if not is_empty(folder) and not (folder / "comparison.json").exists():
+        raise InputError(f"{folder}: is not empty and holds no comparison; choose another folder with --out")
+    with removed_if_empty(folder):
+        lines = write_comparison(run_compare(*studies), studies[0].config, folder)
+    for line in [*lines, str(folder / "comparison.json")]:
+        typer.echo(line)
 
 
 @app.command()
@@ -557,7 +595,7 @@ def repair(folder: FolderArgument) -> None:
     parts = store.manifest["parts"]
     typer.echo(f"{whole} of {parts} parts are whole.")
     if whole < parts:
-        typer.echo(f"'jaxbl sweep {folder / 'study.toml'} --out {folder}' computes the others.")
+        typer.echo(f"'jaxbl sweep STUDY.toml --out {folder}' with the same study computes the others.")
 
 
 @app.command()
@@ -587,14 +625,14 @@ def bench(
         typer.echo(line)
 
 
-def _folder(config: Path, out: Path | None) -> Path:
-    return out if out is not None else Path("results") / config.stem
+def _folder(config: Path, out: str | Path | None) -> Path:
+    return place(out) if out is not None else Path("results") / config.stem
 
 
 def _print(lines: list[str], folder: Path) -> None:
     """Print what was found, and where the report is."""
     for line in [*lines, str(folder / "report.html")]:
-        typer.echo(line)
+        typer.echo(printable(line))
 
 
 def main(run: Callable[[], object] = app) -> None:

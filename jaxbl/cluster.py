@@ -6,9 +6,10 @@ Needs the extra `distributed`. Functions that workers call are found by name: th
 import os
 import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
+from itertools import islice
 from threading import Lock
 from typing import TYPE_CHECKING, Any, TypeVar, Union
 
@@ -26,8 +27,13 @@ Scheduler = Union[str, "Client", "Cluster", None]
 
 _ANSWER = 15.0
 """Seconds in which a scheduler has to answer."""
-_LOOK = 0.2
+_LOOK = 0.05
 """Seconds between two looks at what is done."""
+_AHEAD, _FEWEST_AHEAD = 4, 16
+"""Jobs a worker, and in all at least, that the scheduler knows at once: workers never wait for the next one, and neither
+scheduler nor client grows with the number of jobs (docs/scale.md)."""
+_COUNT = 2.0
+"""Seconds between two looks at how many workers there are."""
 _ONE_AT_A_TIME = Lock()
 """A job uses all cores of its worker, whatever number of threads takes jobs there."""
 
@@ -46,45 +52,59 @@ class Cluster:
     @property
     def workers(self) -> int:
         """How many there are now, at least one: a cluster may start them as they are needed."""
-        return max(len(self._client.scheduler_info(n_workers=-1)["workers"]), 1)
+        try:
+            return max(len(self._client.nthreads()), 1)
+        except OSError:
+            raise NoResult(_LOST) from None
 
-    def each(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> Iterator[Result]:
+    def each(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
         """Results of a function (importable by name), in the order of its arguments."""
         found: dict[int, Result] = {}
         following = 0
-        for index, result in self.done(function, list(enumerate(jobs))):
+        for index, result in self.done(function, enumerate(jobs)):
             found[index] = result
             while following in found:
                 yield found.pop(following)
                 following += 1
 
     def done(
-        self, function: Callable[[Job], Result], jobs: Sequence[tuple[Any, Job]], look: Callable[[], object] = lambda: None
+        self, function: Callable[[Job], Result], jobs: Iterable[tuple[Any, Job]], look: Callable[[], object] = lambda: None
     ) -> Iterator[tuple[Any, Result]]:
         """Names and results of named jobs as they are done, the first ones begun first; a job whose worker is lost is done
-        anew by another. `look` is called every so often meanwhile.
+        anew by another. `jobs` are taken from as they are needed, and `look` is called every so often meanwhile.
 
         Raises:
             InputError, NoResult: of a job, of workers that cannot run one, or where the scheduler is lost.
         """
         from distributed import as_completed
 
-        futures = self._submit(function, [job for _, job in jobs])
-        names = {future.key: name for future, (name, _) in zip(futures, jobs, strict=True)}
-        finished = as_completed(futures, loop=self._client.loop)
+        waiting, begun = iter(jobs), {}
+        finished = as_completed(loop=self._client.loop)
+        most, counted = 0, -_COUNT
         try:
-            while names:
-                batch = list(finished.next_batch(block=False))
-                for future in batch:
-                    yield names.pop(future.key), self._result(future)
+            while True:
                 if self._client.status != "running":
                     raise NoResult(_LOST)
+                if time.monotonic() - counted > _COUNT:
+                    most, counted = max(_AHEAD * self.workers, _FEWEST_AHEAD), time.monotonic()
+                more = list(islice(waiting, max(most - len(begun), 0)))
+                futures = self._submit(function, [job for _, job in more])
+                begun |= {future.key: (name, future) for future, (name, _) in zip(futures, more, strict=True)}
+                finished.update(futures)
+                # what is not referred to any more, the scheduler forgets
+                del futures
+                if not begun:
+                    return
+                batch = list(finished.next_batch(block=False))
+                for future in batch:
+                    name, _ = begun.pop(future.key)
+                    yield name, self._result(future)
                 look()
                 if not batch:
                     time.sleep(_LOOK)
         finally:
-            if names and self._client.status == "running":
-                self._client.cancel(futures, force=True)
+            if begun and self._client.status == "running":
+                self._client.cancel([future for _, future in begun.values()], force=True)
 
     def leave(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> None:
         """Have jobs done without waiting for them, also when this process has ended."""
@@ -93,6 +113,8 @@ class Cluster:
         fire_and_forget(self._submit(function, jobs))
 
     def _submit(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Any]:
+        if not jobs:
+            return []
         # a name of its own for each call: an earlier one may have been given up; Dask takes equal priorities in their order
         token = f"jaxbl-{socket.gethostname()}-{os.getpid()}-{time.time_ns()}"
         keys = [f"{token}-{index:07d}" for index in range(len(jobs))]
@@ -189,7 +211,8 @@ def _local(count: int) -> "Iterator[Client]":
             n_workers=count,
             threads_per_worker=max(cores() // count, 1),
             processes=True,
-            dashboard_address=None,  # pyright: ignore[reportArgumentType]
+            # any free port: with None it would be 8787, open to the network
+            dashboard_address="127.0.0.1:0",
             memory_limit=0,
             silence_logs=50,
         ) as cluster,

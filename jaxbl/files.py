@@ -15,8 +15,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from .errors import InputError, NoResult
 
 if TYPE_CHECKING:
@@ -59,6 +57,9 @@ def plain(value: Any) -> Any:
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
+    # the command line needs this module before it needs NumPy
+    import numpy as np
+
     value = np.asarray(value)
     if value.ndim:
         return [plain(item) for item in value.tolist()]
@@ -104,6 +105,27 @@ def write_atomic(path: Path, content: str | bytes) -> None:
         draft.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
+def begin_file(path: Path, content: str) -> bool:
+    """Write a file that is not there yet; returns False where another process was first. Raises as :func:`written`.
+
+    An object store decides that by a put on condition, if it has one. Some ignore the condition: of two processes that write
+    at the same time, the later one is first then. The system's files are ours (:func:`locked`).
+    """
+    if not is_remote(path):
+        write_atomic(path, content)
+        return True
+    with writing(path):
+        if path.exists():
+            return False
+        try:
+            path.fs.pipe_file(path.path, content.encode(), mode="create")  # pyright: ignore[reportAttributeAccessIssue]
+        except FileExistsError:
+            return False
+        except NotImplementedError:
+            path.write_bytes(content.encode())
+        return path.read_bytes() == content.encode()
+
+
 def write_table(path: Path, frame: "pd.DataFrame") -> None:
     """Write a Parquet file so that it is either there whole or not at all. Raises as :func:`written`."""
     with written(path) as draft:
@@ -126,6 +148,15 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.rmdir(recursive=True)
+
+
+def move(path: Path, target: Path) -> None:
+    """Give a file another name in the same folder or store."""
+    if is_remote(path):
+        target.write_bytes(path.read_bytes())
+        path.unlink()
+    else:
+        path.replace(target)
 
 
 @contextmanager
@@ -276,8 +307,8 @@ def has_file(folder: Path, name: str) -> bool:
     return (folder / name).exists()
 
 
-def make_folder(path: Path) -> None:
-    """Make a folder that can be written to. Raises `InputError` where that is not possible."""
+def make_folder(path: Path, instead: str = "choose another folder with --out") -> None:
+    """Make a folder that can be written to. Raises `InputError` where that is not possible; `instead` is what to do then."""
     if is_remote(path):
         with access(path, "written to"):
             (path / ".probe").write_bytes(b"")
@@ -293,7 +324,7 @@ def make_folder(path: Path) -> None:
     except NotADirectoryError:
         raise InputError(f"{path}: lies under a file; --out should name a folder") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be written to ({error.strerror}); choose another folder with --out") from None
+        raise InputError(f"{path}: cannot be written to ({error.strerror}); {instead}") from None
 
 
 def claim_log_folder(folder: Path, log: Path, *, overwrite: bool) -> None:

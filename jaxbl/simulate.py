@@ -35,7 +35,8 @@ class Run(eqx.Module):
 
     sample_period: Scalar = parameter("s", "period of encoders, observers, identifier", default=1e-3, above=0.0, fixed=True)
     steps: int = eqx.field(static=True, default=20_000)
-    substeps: int = option("plant steps per sample", default=10, minimum=1)
+    # the largest frequency of a drive that is still to be resolved at 1 ms is then 2e8 rad/s
+    substeps: int = option("plant steps per sample", default=10, minimum=1, maximum=100_000)
     position_tolerance: Scalar = parameter(
         "rad", "largest position error of a converged observer (load: divided by the gear ratio)", default=1e-3, above=0.0
     )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from .errors import InputError
+from .errors import InputError, printable
 
 if TYPE_CHECKING:
     from .workers import Progress
@@ -25,7 +25,9 @@ def naming(config: Path, folder: Path | None = None) -> Iterator[None]:
     except InputError as error:
         message = str(error)
         named = "/" in message.split(":")[0] or (folder is not None and message.startswith(f"{folder}:"))
-        raise InputError(message if named else f"{config}: {message}") from None
+        if named:
+            raise
+        raise InputError(f"{config}: {message}") from None
 
 
 @contextmanager
@@ -62,7 +64,7 @@ def running(
         if not (interrupted or isinstance(error, KeyboardInterrupt)):
             raise
         state = "what is finished is kept. Go on with" if kept else "nothing was written. Start again with"
-        typer.echo(f"interrupted; {state}: {_call_again(context, folder, kept=kept)}", err=True)
+        typer.echo(printable(f"interrupted; {state}: {_call_again(context, folder, kept=kept)}"), err=True)
         raise typer.Exit(130) from None
     finally:
         signal.signal(signal.SIGINT, before)

@@ -15,7 +15,7 @@ from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from .errors import NoResult
+from .errors import NoResult, printable
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -133,12 +133,52 @@ def start_jax(devices: int | None = None) -> None:
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     if jax.config.values["jax_compilation_cache_dir"] is None:
         # of this Python's own: another one packs programs otherwise
-        cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "jaxbl" / sys.implementation.cache_tag
-        jax.config.update("jax_compilation_cache_dir", str(cache))
+        cache = _cache()
+        if cache is not None:
+            jax.config.update("jax_compilation_cache_dir", str(cache))
         # also what takes less than a second: a study has many of them
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     # and what was compiled is found without tracing it; processes that this one starts do so, too
-    os.environ.setdefault(PROGRAMS, f"{jax.config.values['jax_compilation_cache_dir']}/programs")
+    folder = jax.config.values["jax_compilation_cache_dir"]
+    os.environ.setdefault(PROGRAMS, f"{folder}/programs" if folder else "")
+
+
+def _cache() -> Path | None:
+    """The folder of compiled programs among the user's caches; None where it cannot be had, or is not only this user's."""
+    given = os.environ.get("XDG_CACHE_HOME", "")
+    # an empty or relative one says nothing, by the XDG base directory specification
+    try:
+        folder = (Path(given) if Path(given).is_absolute() else Path.home() / ".cache") / "jaxbl"
+    except RuntimeError:
+        return None  # a user without a home
+    own = folder / sys.implementation.cache_tag
+    return own if own_folder(folder) and own_folder(own) else None
+
+
+def own_folder(folder: Path) -> bool:
+    """Make a folder for what will be run as code, with access for its user alone if it is new.
+
+    Returns whether it is there, this user's, and nobody else may write into it; one line says so where it is not.
+    """
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.stat()
+    except OSError:
+        return False
+    why = ""
+    if found.st_uid != os.geteuid():
+        why = "is another user's"
+    elif found.st_mode & 0o022:
+        why = "can be written to by others; remove it, to have it made anew"
+    if why and folder not in _refused:
+        _refused.add(folder)
+        print(f"jaxbl: {printable(str(folder))}: {why}; compiled programs are not kept there", file=sys.stderr)
+    return not why
+
+
+_refused: set[Path] = set()
+"""Folders of which that was said."""
 
 
 def collect_rarely() -> None:

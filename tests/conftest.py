@@ -43,3 +43,15 @@ def _few_programs():
     """Over a thousand tests, compiled programs would use up what the system lets a process map into memory."""
     yield
     forget_programs()
+
+
+@pytest.fixture(scope="session")
+def client():
+    """A Dask cluster of two workers in this process."""
+    from distributed import Client, LocalCluster
+
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0") as workers,
+        Client(workers, set_as_default=False) as connection,
+    ):
+        yield connection

@@ -52,6 +52,17 @@ def small(changes: dict[str, Any] | None = None, **tables: Any) -> dict[str, Any
     return data
 
 
+def thirty(**tables: Any) -> dict[str, Any]:
+    """Thirty runs of one inertia in eight chunks: 2 seeds of 15 points, 4 at once."""
+    axes = [spaced(ALPHA, 5.0, 20.0, 5), listed(LAMBDA, 0.3, 1.0, 5.0)]
+    return rigid(**{"axes": axes, "sweep": {"seeds": 2, "chunk": 4}} | tables)
+
+
+def parts(folder: Path) -> dict[str, bytes]:
+    """A sweep's parts by their names."""
+    return {path.name: path.read_bytes() for path in (folder / "points").iterdir()}
+
+
 def swung(duration: float, **tables: Any) -> dict[str, Any]:
     """The study under a multisine that moves it well, for a log of so many seconds."""
     observer = {"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}}

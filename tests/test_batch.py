@@ -1,10 +1,12 @@
 """A batch of diagnoses: the rows of its table, and how the terminal shows them."""
 
 import math
+from pathlib import Path
 
 import pandas as pd
 
-from jaxbl.batch import batch_lines, batch_row, read_batch
+from jaxbl import batch
+from jaxbl.batch import batch_lines, batch_row, read_batch, run_batch
 
 DIAGNOSIS = {
     "verdict": "explained",
@@ -46,3 +48,21 @@ def test_every_kind_of_log_is_found_and_what_is_none_is_told(tmp_path):
     assert [job.log.name for job in work] == ["a.csv", "b.txt", "c.tdms", "d.JSON", "e"]
     assert work[1].holdout == tmp_path / "holdout" / "b.dat"
     assert skipped == ["f.pdf", "g"]
+
+
+def _found(job):
+    assert all(path.is_absolute() for path in (job.log, job.model, job.folder))
+    return batch_row(job.log, DIAGNOSIS)
+
+
+def test_a_clusters_workers_diagnose(tmp_path, client, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.csv", "b.csv", "c.csv", "a.toml"):
+        (tmp_path / name).write_text("")
+    work, _ = read_batch(Path(), Path("a.toml"), Path("out"), overwrite=False)
+    seen = []
+    monkeypatch.setattr(batch, "_diagnosed", _found)
+    rows = run_batch(work, Path("out"), None, lambda *done: seen.append(done), client)
+    assert [row["log"] for row in rows] == ["a.csv", "b.csv", "c.csv"]
+    assert seen == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    assert list(pd.read_csv("out/batch.csv")["verdict"]) == ["explained"] * 3

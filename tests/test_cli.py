@@ -24,6 +24,7 @@ from typer.testing import CliRunner
 
 from jaxbl import cli, terminal
 from jaxbl.errors import InputError
+from jaxbl.files import locked
 from jaxbl.sweeps.engine import Engine
 
 FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
@@ -206,6 +207,34 @@ BAD = {
         "full: is not empty and holds no study; choose another folder with --out",
     ),
     "nothing to include": (["tune", "part.toml"], "part.toml: include: none.toml: no such file"),
+    "no such share": (
+        ["sweep", "study.toml", "--share", "3/2"],
+        "--share 3/2: should be I/N, such as 2/8: the second of eight",
+    ),
+    "a share of a cluster": (
+        ["sweep", "study.toml", "--share", "1/2", "--scheduler", "local:2"],
+        "--share: does not go with --scheduler: other processes may be at work in the folder",
+    ),
+    "leaving no cluster": (
+        ["sweep", "study.toml", "--detach"],
+        "--detach: needs the --scheduler of a cluster that stays when this command has ended",
+    ),
+    "a cluster for one log": (
+        ["diagnose", "log.csv", "--scheduler", "local:2"],
+        "--scheduler goes with --batch: one log is one process's work",
+    ),
+    "no such cluster": (
+        ["sweep", "study.toml", "--scheduler", "local:0"],
+        "study.toml: --scheduler local:0: local:N needs the number of processes, 1 to 1024",
+    ),
+    "no such store": (
+        ["sweep", "study.toml", "--out", "foo://bucket/a"],
+        "foo://bucket/a: is no place for results (Unsupported filesystem: 'foo')",
+    ),
+    "nothing of which to say the status": (
+        ["status", "full"],
+        "full: holds no study (no manifest.json); run 'jaxbl sweep' first",
+    ),
     "nothing to plot": (["plot", "full"], "full: holds no study (no manifest.json); run 'jaxbl sweep' first"),
     "nowhere to plot": (["plot", "none"], "none: holds no study (no manifest.json); run 'jaxbl sweep' first"),
 }
@@ -258,6 +287,21 @@ def test_dry_run_says_the_cost_and_writes_nothing(call, tmp_path):
     assert lines[0] == "points       3 (12 runs with all seeds)"
     assert lines[1] == "chunks       4 of 4 lanes"
     assert [line.split()[0] for line in lines[2:]] == ["memory", "compilation", "run"]
+
+
+def test_shares_and_how_far_they_are(call, tmp_path):
+    write(tmp_path, rigid(axes=AXES, sweep={"seeds": 4, "chunk": 4}, title="small [red]"))
+    code, lines, _ = call("sweep", "study.toml", "--share", "2/2", "--out", "a")
+    assert code == 0
+    assert lines[0] == "a: 'small [red]', 2 of 4 parts (50 %) of 12 runs"
+    assert lines[1].startswith("  no process is at work in it")
+    assert lines[2] == "When all parts are there, 'jaxbl sweep study.toml --out a' writes the report."
+    assert call("status", "a")[1] == lines[:2]
+    # who is last writes the report
+    code, lines, _ = call("sweep", "study.toml", "--share", "1/2", "--out", "a")
+    assert code == 0 and lines[0].startswith("12 runs.") and lines[-1] == "a/report.html"
+    assert call("status", "a")[1] == ["a: 'small [red]', 4 of 4 parts (100 %) of 12 runs", "  finished"]
+    assert len(left(tmp_path / "a" / "points")) == 4 and (tmp_path / "a" / "report.html").is_file()
 
 
 def test_plot_draws_other_figures_from_the_stored_points(call, tmp_path, monkeypatch):
@@ -323,6 +367,20 @@ def tunable(**table):
     """A drive under a constant torque, its observer starting 0.1 rad/s off."""
     changes = {"encoders.noise": 1e-5, "observer.motor.velocity_error": 0.1, "run.position_tolerance": 0.01}
     return rigid(changes, effects=[{"kind": "motor.constant_torque", "torque": 0.05}], tune=TUNE | table)
+
+
+def test_shares_by_the_command_of_which_the_last_writes_the_report(call, tmp_path):
+    write(tmp_path, small(axes=AXES, sweep={"seeds": 2, "chunk": 4}))
+    code, lines, _ = call("sweep", "study.toml", "--share", "1/2")
+    assert code == 0 and "1 of 2 parts (50 %) of 6 runs" in lines[0]
+    assert lines[-1] == "When all parts are there, 'jaxbl sweep study.toml --out results/study' writes the report."
+    with locked(tmp_path / "results" / "study", shared=True):
+        # another one is still at work: it is the last
+        code, lines, _ = call("sweep", "study.toml", "--share", "2/2")
+        assert code == 0 and "2 of 2 parts (100 %)" in lines[0] and "all parts are there" in lines[1]
+        assert not (tmp_path / "results" / "study" / "report.html").exists()
+    code, lines, _ = call("sweep", "study.toml", "--share", "2/2")
+    assert code == 0 and lines[-1] == "results/study/report.html"
 
 
 @pytest.mark.slow

@@ -134,7 +134,19 @@ def test_architecture_shows_the_floors():
 INSTEAD = {
     "make demo": "jaxbl sweep sweeps/gain_map.toml",  # test_demo_is_this_command; the environment is imitated below
     "make test": "",  # this is it
+    # benchmarks/slurm.sh runs these files by a SLURM
+    "sbatch --array=1-20 --cpus-per-task=8 docs/cluster/array.sbatch": (
+        "SLURM_ARRAY_TASK_ID=2 SLURM_ARRAY_TASK_MAX=2 sh docs/cluster/array.sbatch"
+    ),
+    "python docs/cluster/slurm.py .*": "",
+    "dask scheduler .*": "",
+    "sbatch .* docs/cluster/workers.sbatch .*": "",
+    "jaxbl sweep sweeps/gain_map.toml --scheduler scheduler.json": "",
 }
+
+
+EXTRAS = {"cluster.md": "distributed"}
+"""What pages say that it has to be installed."""
 
 
 class Block(NamedTuple):
@@ -161,11 +173,12 @@ def imports_of(requirement):
     return {"pytest-xdist": "xdist"}.get(found := re.match(r"[\w-]+", requirement)[0], found)
 
 
-def environment(folder):
-    """That of the README's `make demo`: what only tests and benchmarks need cannot be imported."""
+def environment(folder, extra=None):
+    """That of the README's `make demo`: what only tests and benchmarks need, or another extra, cannot be imported."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    optional = chain.from_iterable(project["optional-dependencies"].values())
-    hidden = sorted({imports_of(one) for one in optional} - {"jaxbl"})
+    optional = project["optional-dependencies"]
+    shown = {"jaxbl", *map(imports_of, optional[extra] if extra else [])}
+    hidden = sorted(set(map(imports_of, chain.from_iterable(optional.values()))) - shown)
     site = folder / "site"
     site.mkdir()
     (site / "sitecustomize.py").write_text(f"import sys\nsys.modules.update(dict.fromkeys({hidden!r}))\n")
@@ -186,10 +199,11 @@ def test_demo_is_this_command():
 @pytest.mark.parametrize("page", sorted(PAGES, key=lambda page: -len(blocks_of(page))), ids=name)
 def test_page_runs_as_written(page, tmp_path):
     """Blocks of one page in order, in a folder with the studies of a clone; TOML blocks of the tutorial make `axis.toml`."""
-    env = environment(tmp_path)
+    env = environment(tmp_path, EXTRAS.get(page.name))
     clone = tmp_path / "clone"
     clone.mkdir()
     shutil.copytree(ROOT / "sweeps", clone / "sweeps")
+    shutil.copytree(ROOT / "docs" / "cluster", clone / "docs" / "cluster")
     for language, text in blocks_of(page):
         if language == "toml" and page.name == "tutorial.md":
             with (clone / "axis.toml").open("a", encoding="utf-8") as file:

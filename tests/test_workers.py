@@ -11,8 +11,9 @@ from pathlib import Path
 import jax
 import pytest
 
+from jaxbl import workers
 from jaxbl.errors import NoResult
-from jaxbl.workers import doing, each, forget_programs, listening, worth
+from jaxbl.workers import _cache, doing, each, forget_programs, listening, worth
 
 
 def square(x):
@@ -115,3 +116,44 @@ def test_what_is_being_done_is_heard_while_someone_listens():
         doing("trying load.gravity")
     doing("afterwards")
     assert heard == ["trying load.gravity"]
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(workers, "_refused", set())
+    return tmp_path
+
+
+@pytest.mark.parametrize("given", [None, "", "relative"])
+def test_compiled_programs_are_kept_in_a_folder_of_the_user_alone(home, monkeypatch, given):
+    """An empty or relative XDG_CACHE_HOME says nothing, least of all the working folder."""
+    monkeypatch.chdir(home)
+    if given is not None:
+        monkeypatch.setenv("XDG_CACHE_HOME", given)
+    own = home / ".cache" / "jaxbl"
+    assert _cache() == own / sys.implementation.cache_tag
+    assert [folder.stat().st_mode & 0o777 for folder in (own, _cache())] == [0o700, 0o700]
+    assert [path.name for path in home.iterdir()] == [".cache"]
+
+
+def test_compiled_programs_of_others_are_not_run(home, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(home / "caches"))
+    own = home / "caches" / "jaxbl"
+    assert _cache() == own / sys.implementation.cache_tag
+    own.chmod(0o770)
+    assert [_cache(), _cache()] == [None, None]
+    said = (
+        f"jaxbl: {own}: can be written to by others; remove it, to have it made anew; compiled programs are not kept there"
+    )
+    assert capsys.readouterr().err == f"{said}\n"
+    own.chmod(0o700)
+    monkeypatch.setattr(os, "geteuid", lambda: own.stat().st_uid + 1)
+    assert _cache() is None
+
+
+def test_a_user_without_a_home_keeps_no_programs(home, monkeypatch):
+    monkeypatch.delenv("HOME")
+    monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("no home")))
+    assert _cache() is None

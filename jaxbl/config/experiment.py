@@ -20,14 +20,15 @@ from jaxbl.errors import InputError
 from jaxbl.observer.equivalent_control import EquivalentControl
 from jaxbl.observer.recursive import Identifier
 from jaxbl.observer.super_twisting import OBSERVERS, AbstractSuperTwisting, Observers
+from jaxbl.records.files import read_log_file
 from jaxbl.simulate import Run
-from jaxbl.validation import nearest, wrong
+from jaxbl.validation import wrong
 
 from .tables import Table, table_for, tagged
 
 
 class RecordedTable(Table):
-    """Input from a CSV or Parquet file, played back with zero-order hold."""
+    """Input from a CSV or Parquet file (or a log file of another kind), played back with zero-order hold."""
 
     kind: Literal["recorded"]
     file: str = Field(description="CSV or Parquet file; relative to the config file")
@@ -36,27 +37,26 @@ class RecordedTable(Table):
     gain: float = Field(default=1.0, description="factor on the recorded torque")
 
     def build(self) -> Recorded:
-        import pandas as pd
-
-        path = Path(self.file)
-        try:
-            frame = pd.read_parquet(path) if path.suffix == ".parquet" else pd.read_csv(path)
-        except (OSError, ValueError) as error:
-            raise InputError(f"{path}: cannot be read as CSV or Parquet: {str(error).splitlines()[0]}") from None
-        columns = []
-        for column in (self.time_column, self.torque_column):
-            if column not in frame:
-                raise InputError(f"{path}: no column '{column}'; {nearest(column, map(str, frame.columns))}")
-            values = np.asarray(pd.to_numeric(frame[column], errors="coerce"), dtype=float)
-            if len(values) == 0 or not np.isfinite(values).all():
-                row = 0 if len(values) == 0 else int(np.argmin(np.isfinite(values)))
-                raise InputError(f"{path}: column '{column}', row {row}: should be a finite number")
-            columns.append(values)
-        times, torques = columns
-        if (np.diff(times) <= 0.0).any():
-            row = int(np.argmax(np.diff(times) <= 0.0)) + 1
-            raise InputError(f"{path}: column '{self.time_column}', row {row}: times should increase")
+        times, torques = self._columns()
         return Recorded(times=times - times[0], torques=torques, gain=self.gain)  # type: ignore[arg-type]
+
+    @property
+    def length(self) -> float:
+        """Time from the first to the last value, s."""
+        times, _ = self._columns()
+        return float(times[-1] - times[0])
+
+    def _columns(self) -> tuple[np.ndarray, np.ndarray]:
+        """Times, s, and torques, N m, shape (rows,). Raises `InputError`."""
+        path = Path(self.file)
+        file = read_log_file(path, (self.time_column, self.torque_column))
+        times = file.numbers(self.time_column)
+        file.check_length(file.name(self.torque_column), len(times))
+        torques = file.numbers(self.torque_column)
+        if (np.diff(times) <= 0.0).any():
+            row = int(np.argmax(np.diff(times) <= 0.0)) + 2
+            raise InputError(f"{path}: column '{self.time_column}', data row {row}: times should increase")
+        return times, torques
 
 
 DriveTable = tagged([table_for(cls, kind=name) for name, cls in DRIVES.items()], "kind")

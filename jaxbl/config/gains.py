@@ -46,7 +46,7 @@ class GainPairTable(Table):
 class CompareTable(Table):
     """Other gains that tuned ones are compared with."""
 
-    name: str = Field(min_length=1, description="how tables and figures call them")
+    name: str = Field(min_length=1, max_length=100, description="how tables and figures call them")
     motor: GainPairTable = Field(description="gains of the motor observer")
     load: GainPairTable | None = Field(default=None, description="gains of the load observer; none on a rigid drive")
 
@@ -81,7 +81,7 @@ class TuneTable(Table):
         default=None,
         description="a table as [excitation]: input that gains are compared on; left out: the study's, with other noise",
     )
-    compare: list[CompareTable] = Field(default=[], description="named gains to compare with")
+    compare: list[CompareTable] = Field(default=[], max_length=50, description="named gains to compare with")
 
     @model_validator(mode="after")
     def _consistent(self) -> "TuneTable":
@@ -111,7 +111,7 @@ class RangeTable(_SpanTable):
 class MarkTable(GainPairTable):
     """A pair of gains to be marked in the atlas, run once on the study's drive."""
 
-    name: str = Field(description="label")
+    name: str = Field(max_length=100, description="label")
     side: Literal["motor", "load"] = Field(default="motor", description="observer that has these gains")
 
 
@@ -127,9 +127,10 @@ class VerifyTable(Table):
     )
     damping: list[Annotated[float, Field(gt=0.0, le=1000.0)]] = Field(
         default=[0.1, 0.3, 1.0],
+        max_length=100,
         description="dampings (friction / inertia × velocity error / f_plus) whose boundaries are simulated",
     )
-    marks: list[MarkTable] = Field(default=[], description="gains to be marked")
+    marks: list[MarkTable] = Field(default=[], max_length=100, description="gains to be marked")
 
     @model_validator(mode="after")
     def _possible(self) -> "VerifyTable":

@@ -1,10 +1,11 @@
 """Reading studies: TOML files, what they include, and one line about what is wrong with them."""
 
 import copy
+import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
@@ -12,9 +13,26 @@ from jaxbl.errors import InputError
 from jaxbl.records import NominalDrive
 from jaxbl.records.reader import read_log_table
 from jaxbl.records.table import LogTable
-from jaxbl.validation import Key, brief, first_error
+from jaxbl.validation import Key, brief, check_file, check_sizes, first_error
 
 from .study import Config, nearest_path, numeric_paths
+
+_MOST_BYTES = 8_000_000
+"""Of a TOML file: 300 000 numbers of full length, some seconds of reading."""
+_MOST_FILES = 100
+"""That a study includes, those that these include as well: files that include each other twice are read 2^n times."""
+_LONG_KEY = re.compile(r"""(?<![\w"'-])(?:[\w"'-]+[ \t]*\.[ \t]*){50}""")
+"""A key of fifty parts, which `tomllib` takes quadratic time for."""
+
+
+class Origin(NamedTuple):
+    """The file that a key came from, and the keys within it."""
+
+    file: str
+    keys: "Origins"
+
+
+Origins = dict[str, Origin]
 
 
 def read_config(source: str | Path | Mapping[str, Any] | Config) -> Config:
@@ -72,11 +90,16 @@ def _model(source: str | Path | Mapping[str, Any] | Config) -> tuple[Config, fro
     return _validate(name, data, origins), frozenset(missing)
 
 
-def _read(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any], dict[Key, str]]:
+def _read(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any], Origins]:
     """How messages call a study, its data with what it includes, and the file that each key came from."""
     if isinstance(source, Mapping):
-        return "config", *_included(copy.deepcopy(dict(source)), "config", Path(), [])
-    return str(Path(source)), *_file(Path(source), [])
+        data = dict(source)
+        try:
+            check_sizes(data)
+        except InputError as error:
+            raise InputError(f"config: {error}") from None
+        return "config", *_included(copy.deepcopy(data), "config", Path(), [], [])
+    return str(Path(source)), *_file(Path(source), [], [])
 
 
 def read_log_config(path: Path) -> tuple[LogTable, float | None, NominalDrive | None]:
@@ -85,7 +108,7 @@ def read_log_config(path: Path) -> tuple[LogTable, float | None, NominalDrive | 
     Raises:
         InputError: unreadable file, bad TOML, unknown key, wrong type or range; one line that names file and key.
     """
-    data, _ = _file(path, [])
+    data, _ = _file(path, [], [])
     if set(data) <= {"title", "notes", "log"}:
         return read_log_table(data.get("log"), str(path)), None, None
     config, _ = _model(path)
@@ -93,20 +116,30 @@ def read_log_config(path: Path) -> tuple[LogTable, float | None, NominalDrive | 
     return config.log, ratio, config.nominal_drive()
 
 
-def _file(path: Path, chain: list[Path]) -> tuple[dict[str, Any], dict[Key, str]]:
-    """A TOML file with what it includes; `chain` are the files that led here. Files that it names become absolute."""
+def _file(path: Path, chain: list[Path], read: list[Path]) -> tuple[dict[str, Any], Origins]:
+    """A TOML file with what it includes; `chain` are the files that led here, `read` all so far. Files that it names become
+    absolute."""
     data = _load(path)
+    read.append(path)
     tune = data.get("tune")
     for table in (data.get("excitation"), tune.get("holdout") if isinstance(tune, dict) else None):
         if isinstance(table, dict) and isinstance(table.get("file"), str):
             table["file"] = str((path.parent / table["file"]).resolve())
-    return _included(data, str(path), path.parent, [*chain, path.resolve()])
+    return _included(data, str(path), path.parent, [*chain, path.resolve()], read)
 
 
 def _load(path: Path) -> dict[str, Any]:
     """A TOML file as it stands."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        check_file(path, _MOST_BYTES)
+        text = path.read_text(encoding="utf-8-sig")
+        if long := _LONG_KEY.search(text):
+            raise InputError(
+                f"line {text.count(chr(10), 0, long.start()) + 1}: a key of more than 50 parts; none has as many"
+            )
+        data = tomllib.loads(text)
+        check_sizes(data)
+        return data
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except IsADirectoryError:
@@ -115,63 +148,74 @@ def _load(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: is not text in UTF-8; a TOML file is needed") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError:
+        raise InputError(f"{path}: tables or arrays are nested too deep") from None
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    # numbers of thousands of digits are a ValueError of another kind
+    except ValueError as error:
         raise InputError(f"{path}: not valid TOML: {error}") from None
 
 
-def _included(data: dict[str, Any], name: str, folder: Path, chain: list[Path]) -> tuple[dict[str, Any], dict[Key, str]]:
+def _included(
+    data: dict[str, Any], name: str, folder: Path, chain: list[Path], read: list[Path]
+) -> tuple[dict[str, Any], Origins]:
     """The data with the files that it includes (from `folder`) merged in, and the file that each key came from."""
     files = data.pop("include", [])
     files = [files] if isinstance(files, str) else files
     if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
         raise InputError(f"{name}: include: should be a file name or an array of them, not {brief(files)}")
     merged: dict[str, Any] = {}
-    origins: dict[Key, str] = {}
+    origins: Origins = {}
     for file in files:
         path = folder / file
-        if not path.exists():
-            raise InputError(f"{name}: include: {path}: no such file")
+        if len(read) > _MOST_FILES:
+            raise InputError(
+                f"{name}: include: more than {_MOST_FILES} files, with those that they include; fewer are needed"
+            )
+        try:
+            path.stat()
+        except OSError as error:
+            why = "no such file" if isinstance(error, FileNotFoundError) else error.strerror
+            raise InputError(f"{name}: include: {path}: {why}") from None
         if path.resolve() in chain:
             raise InputError(f"{name}: include: {path} includes this file in turn; files should not include one another")
-        _merge(merged, *_file(path, chain), origins)
-    _merge(merged, data, dict.fromkeys(_keys(data), name), origins)
+        _merge(merged, *_file(path, chain, read), origins)
+    _merge(merged, data, _origins(data, name), origins)
     return merged, origins
 
 
-def _keys(data: Any, key: Key = ()) -> Iterator[Key]:
-    """Places of everything in a config."""
-    pairs = data.items() if isinstance(data, Mapping) else enumerate(data) if isinstance(data, list) else ()
-    for name, value in pairs:
-        yield (*key, name)
-        yield from _keys(value, (*key, name))
+def _origins(data: Mapping[str, Any], file: str) -> Origins:
+    """All keys come from one file."""
+    return {name: Origin(file, _origins(one, file) if isinstance(one, Mapping) else {}) for name, one in data.items()}
 
 
-def _merge(into: dict[str, Any], data: dict[str, Any], new: dict[Key, str], origins: dict[Key, str], key: Key = ()) -> None:
+def _merge(into: dict[str, Any], data: dict[str, Any], new: Origins, origins: Origins) -> None:
     """Put the keys of `data` over those of `into`, and `new` over their `origins`."""
     for name, value in data.items():
-        here, old = (*key, name), into.get(name)
-        origins[here] = new[here]
+        old = into.get(name)
         # a table of another kind is another table
         if (
             isinstance(old, dict)
             and isinstance(value, dict)
             and all(value.get(tag, old.get(tag)) == old.get(tag) for tag in ("kind", "law"))
         ):
-            _merge(old, value, new, origins, here)
+            origins[name] = Origin(new[name].file, origins[name].keys)
+            _merge(old, value, new[name].keys, origins[name].keys)
         else:
-            into[name] = copy.deepcopy(value)
-            origins |= {place: file for place, file in new.items() if place[: len(here)] == here}
+            into[name], origins[name] = value, new[name]
 
 
-def _validate(name: str, data: dict[str, Any], origins: Mapping[Key, str]) -> Config:
+def _validate(name: str, data: dict[str, Any], origins: Origins) -> Config:
     try:
         return Config.model_validate(data)
     except ValidationError as error:
         place, text = _describe(error)
         # the file that the key came from, where that is not the one asked for
-        while place and place not in origins:
-            place = place[:-1]
-        name = origins.get(place, name)
+        for key in place:
+            if key not in origins:
+                break
+            name, origins = origins[key]  # type: ignore[index]
         raise InputError(f"{name}: {text}" if name else text) from None
 
 

@@ -17,10 +17,11 @@ import tomli_w
 from pydantic import Field, model_validator
 
 from jaxbl.drive.effects import EFFECTS
-from jaxbl.drive.parameters import Parameter, as_arrays
+from jaxbl.drive.excitation import EXCITATIONS
+from jaxbl.drive.parameters import Parameter, as_arrays, parameters
 from jaxbl.records import NominalDrive
 from jaxbl.records.table import LogTable
-from jaxbl.simulate import Experiment
+from jaxbl.simulate import Experiment, Run
 from jaxbl.validation import wrong
 
 from .experiment import (
@@ -50,11 +51,11 @@ class Config(Table):
         description="TOML files, relative to this one, whose tables are merged in key by key: keys of this file win, those "
         "of later files over those of earlier ones; arrays, and tables of another kind or law, are replaced as a whole",
     )
-    title: str = Field(default="", description="headline of the report")
+    title: str = Field(default="", max_length=500, description="headline of the report")
     notes: list[str] = Field(default=[], description="remarks of the author, repeated in summary and report")
     drive: DriveTable = Field(description="what is driven")
     transmission: TransmissionTable | None = Field(default=None, description="law of the gear; none on a rigid drive")
-    effects: list[EffectTable] = Field(default=[], description="effects beyond the nominal drive")
+    effects: list[EffectTable] = Field(default=[], max_length=100, description="effects beyond the nominal drive")
     initial: InitialTable = Field(default_factory=InitialTable, description="state at t = 0")
     excitation: ExcitationTable = Field(description="input torque")
     encoders: EncodersTable = Field(default_factory=EncodersTable, description="position sensors")
@@ -70,8 +71,8 @@ class Config(Table):
     log: LogTable = Field(default_factory=LogTable)
     identify: IdentifyTable = Field(default_factory=IdentifyTable)
     verify: VerifyTable = Field(default_factory=VerifyTable)
-    axes: list[AxisTable] = Field(default=[])
-    figures: list[FigureTable] = Field(default=[])
+    axes: list[AxisTable] = Field(default=[], max_length=50)
+    figures: list[FigureTable] = Field(default=[], max_length=200)
 
     @model_validator(mode="after")
     def _consistent(self) -> "Config":
@@ -79,6 +80,7 @@ class Config(Table):
             raise wrong("include is for read_config, which merges the files in")
         _check_sides(self)
         _check_effects(self)
+        _check_input(self)
         known = numeric_paths(self)
         for path in self.uncertainty.exact:
             if path not in known and path != "drive.gear_ratio" and path not in EFFECTS:
@@ -120,9 +122,22 @@ class Config(Table):
         """The whole config as plain data, defaults filled in."""
         return self.model_dump(by_alias=True, exclude_none=True)
 
+    def remarks(self) -> list[str]:
+        """What is valid and perhaps not meant, in sentences."""
+        found, run = [], self.run
+        for key, table in (("excitation", self.excitation), ("tune.holdout", self.tune and self.tune.holdout)):
+            # half a sample for the rounding of times, one for the last value's own hold
+            if table is not None and table.kind == "recorded" and table.length < run.duration - 2.0 * run.sample_period:
+                ends = f"{table.file} ends after {table.length:g} s, the run after {run.duration:g} s"
+                found.append(f"{key}: {ends}; its last value is held for the rest.")
+        return found
+
     def to_toml(self) -> str:
         """The whole config as TOML that :func:`.reading.read_config` takes."""
         return tomli_w.dumps(self.resolved())
+
+
+_MOST_SUBSTEPS = next(known.maximum for field, known in parameters(Run) if field.name == "substeps")
 
 
 def _check_sides(config: Config) -> None:
@@ -147,6 +162,11 @@ def _check_sides(config: Config) -> None:
         rate *= 1.0 / config.drive.motor_inertia + config.drive.gear_ratio**2 / config.drive.load_inertia
         # the scheme is stable while step * frequency < 2
         least = math.floor(config.run.sample_period * math.sqrt(rate) / 2.0) + 1
+        if least > _MOST_SUBSTEPS:
+            raise wrong(
+                f"drive, transmission: inertias and stiffness make an oscillation of {math.sqrt(rate):.3g} rad/s, which "
+                f"{_MOST_SUBSTEPS} plant steps a sample cannot resolve; check their units"
+            )
         if config.run.substeps < least:
             raise wrong(
                 f"run.substeps: {config.run.substeps} plant steps a sample are unstable for this stiffness and "
@@ -174,6 +194,14 @@ def _check_effects(config: Config) -> None:
             raise wrong(
                 f"effects: {kind} leaves a total inertia of {total:g} on the {side}; it should stay above -{nominal:g}"
             )
+
+
+def _check_input(config: Config) -> None:
+    """The samples of an input have to show it."""
+    period, holdout = config.run.sample_period, None if config.tune is None else config.tune.holdout
+    for key, table in (("excitation", config.excitation), ("tune.holdout", holdout)):
+        if table is not None and (fault := EXCITATIONS[table.kind].fault(dict(table), period)):
+            raise wrong(f"{key}: {fault}")
 
 
 def numeric_paths(config: Config) -> dict[str, Parameter]:

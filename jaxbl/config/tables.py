@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Union
 from pydantic import Field, create_model
 
 from jaxbl.drive.parameters import key_of, parameters
-from jaxbl.validation import StrictTable
+from jaxbl.validation import Positive, StrictTable
 
 
 class Table(StrictTable):
@@ -40,7 +40,8 @@ def table_for(module: type, factory: Callable[..., Any] | None = None, base: typ
     fields: dict[str, Any] = {key: (Literal[value], ...) for key, value in tag.items()}
     for field, known in parameters(module):
         # lists of numbers are empty by default
-        kind: Any = field.type if field.metadata.get("static") else list[float] if field.default == () else float
+        number = Positive if known.above == 0.0 else float
+        kind: Any = field.type if field.metadata.get("static") else list[float] if field.default == () else number
         optional = field.default is None
         fields[field.name] = (
             kind | None if optional else kind,

@@ -4,8 +4,9 @@ Further packages add inputs through the entry-point group `jaxbl.excitations`; t
 """
 
 import abc
+from collections.abc import Mapping
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -25,6 +26,26 @@ class AbstractExcitation(eqx.Module):
     def __call__(self, time: Float[Array, ""]) -> Float[Array, ""]:
         """Torque in N m at a time in s."""
 
+    @classmethod
+    def fault(cls, numbers: Mapping[str, Any], period: float) -> str:
+        """What is wrong with the numbers of a study whose samples are `period` seconds apart, beyond the range of each, and
+        what would be right; "" if nothing is."""
+        return ""
+
+
+def _too_fast(what: str, frequency: float, period: float) -> str:
+    """A wave is sampled before it is held: from half the sampling rate on, its samples are those of a slower one."""
+    if frequency * period < 0.5:
+        return ""
+    return f"{what} {frequency:g} Hz has to be below half the sampling rate, {0.5 / period:g} Hz; run.sample_period sets it"
+
+
+def _too_short(hold: float, period: float) -> str:
+    """Levels that are shorter than a sample are mostly never seen."""
+    if hold > (1.0 - 1e-6) * period:
+        return ""
+    return f"hold {hold:g} s has to be at least run.sample_period, {period:g} s"
+
 
 EXCITATIONS = Registry("jaxbl.excitations", partial(check_module, base=AbstractExcitation))
 """The inputs by name: the built-in ones and those of installed packages."""
@@ -39,6 +60,10 @@ class Sine(AbstractExcitation):
     frequency: Scalar = parameter("Hz", "frequency", minimum=0.0)
     phase: Scalar = parameter("rad", "phase at t = 0", default=0.0)
     offset: Scalar = parameter("N m", "constant part", default=0.0)
+
+    @classmethod
+    def fault(cls, numbers, period):
+        return _too_fast("frequency", numbers["frequency"], period)
 
     def __call__(self, time):
         return self.offset + self.amplitude * jnp.sin(2.0 * jnp.pi * self.frequency * time + self.phase)
@@ -55,7 +80,12 @@ class Multisine(AbstractExcitation):
     name: ClassVar[str] = "multisine"
     amplitude: Scalar = parameter("N m", "amplitude of the sine of equal power")
     frequency: Scalar = parameter("Hz", "fundamental frequency", above=0.0)
-    count: int = option("number of harmonics", default=8, minimum=1)
+    # each is computed anew at every sample of every lane; more of them are a recorded input
+    count: int = option("number of harmonics", default=8, minimum=1, maximum=10_000)
+
+    @classmethod
+    def fault(cls, numbers, period):
+        return _too_fast("the highest harmonic,", numbers["count"] * numbers["frequency"], period)
 
     def __call__(self, time):
         k = jnp.arange(1, self.count + 1, dtype=jnp.result_type(time))
@@ -73,6 +103,10 @@ class Chirp(AbstractExcitation):
     start_frequency: Scalar = parameter("Hz", "frequency at t = 0", minimum=0.0)
     stop_frequency: Scalar = parameter("Hz", "frequency at the end of the sweep", minimum=0.0)
     sweep_time: Scalar = parameter("s", "length of the sweep", above=0.0)
+
+    @classmethod
+    def fault(cls, numbers, period):
+        return _too_fast("the highest frequency,", max(numbers["start_frequency"], numbers["stop_frequency"]), period)
 
     def __call__(self, time):
         swept = jnp.minimum(time, self.sweep_time)
@@ -101,6 +135,10 @@ class Steps(AbstractExcitation):
     hold: Scalar = parameter("s", "time that each level is held", above=0.0)
     seed: int = option("seed of the levels", default=0, minimum=0)
 
+    @classmethod
+    def fault(cls, numbers, period):
+        return _too_short(numbers["hold"], period)
+
     def __call__(self, time):
         # a stream of its own: encoder noise is drawn from the plain key of its seed
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self.seed), 0x57E9), _held(self.hold, time))
@@ -116,6 +154,10 @@ class Prbs(AbstractExcitation):
     amplitude: Scalar = parameter("N m", "amplitude")
     hold: Scalar = parameter("s", "time of one bit", above=0.0)
     order: int = option("bits of the shift register; the sequence has 2^order - 1 bits", default=10, minimum=2, maximum=20)
+
+    @classmethod
+    def fault(cls, numbers, period):
+        return _too_short(numbers["hold"], period)
 
     def __call__(self, time):
         from scipy.signal import max_len_seq  # half a second that only this input needs

@@ -73,7 +73,8 @@ class TwoInertia(AbstractDrive):
     motor_viscous: Scalar = parameter("N m s/rad", "motor viscous friction f_e", minimum=0.0)
     load_inertia: Scalar = parameter("kg m²", "load inertia J_s", above=0.0)
     load_viscous: Scalar = parameter("N m s/rad", "load viscous friction f_s", minimum=0.0)
-    gear_ratio: Scalar = parameter("", "gear ratio N_0: motor turns for one load turn", above=0.0)
+    # on a linear axis rad for one m: a screw with a lead of a micrometre has 6e6
+    gear_ratio: Scalar = parameter("", "gear ratio N_0: motor turns for one load turn", minimum=1e-7, maximum=1e7)
 
     def ratio(self, side):
         return 1.0 if side == "motor" else self.gear_ratio

@@ -1,7 +1,8 @@
 """Elementary functions from arithmetic alone, for a compiler of vectors that has no others.
 
 Accurate to a few units in the last place: within `LIMIT` of them against NumPy (tests). Minimax coefficients are those of
-S. L. Moshier's Cephes library; of tanh in float32 those that XLA has as well.
+S. L. Moshier's Cephes library; of tanh in float32 those that XLA has as well; of the exponential function in float64 our own
+(relative error 1.8e-17 of e^r - 1 for |r| <= ln 2 / 2).
 """
 
 from collections.abc import Callable, Sequence
@@ -40,12 +41,12 @@ def _exponential(x: Number) -> tuple[Number, Number]:
     n = lax.round(x * 1.4426950408889634, lax.RoundingMethod.TO_NEAREST_EVEN)
     if _is_double(x):
         r = (x - n * 6.93145751953125e-1) - n * 1.42860682030941723212e-6
-        s = r * r
-        up = r * _polynomial(s, (1.26177193074810590878e-4, 3.02994407707441961300e-2, 9.99999999999999999910e-1))
-        down = (3.00198505138664455042e-6, 2.52448340349684104192e-3, 2.27265548208155028766e-1, 2.00000000000000000005)
-        return 2.0 * up / (_polynomial(s, down) - up), _power_of_two(n)
-    r = (x - n * 0.693359375) - n * -2.12194440e-4
-    series = (1.9875691500e-4, 1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1)
+        series = (2.5053924629252286e-08, 2.7626042389919065e-07, 2.7557407082504333e-06, 2.480150526060296e-05,
+                  0.00019841269719503187, 0.0013888888931578205, 0.008333333333389335, 0.0416666666665767,
+                  0.1666666666666659, 0.5000000000000006)  # fmt: skip
+    else:
+        r = (x - n * 0.693359375) - n * -2.12194440e-4
+        series = (1.9875691500e-4, 1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1)
     return _polynomial(r, series) * r * r + r, _power_of_two(n)
 
 
@@ -73,7 +74,7 @@ def expm1(x: Number) -> Number:
 
 
 def tanh(x: Number) -> Number:
-    """tanh x: a rational function near zero, from e^(2 |x|) beyond; float32 by one rational function."""
+    """tanh x: float32 by one rational function, float64 from e^(2 |x|) - 1. A division takes as long as ten products."""
     if not _is_double(x):
         edge = jnp.full_like(x, 7.90531110763549805)
         a = lax.clamp(-edge, x, edge)
@@ -82,13 +83,9 @@ def tanh(x: Number) -> Number:
               1.48572235717979e-05, 6.37261928875436e-04, 4.89352455891786e-03)  # fmt: skip
         down = (1.19825839466702e-06, 1.18534705686654e-04, 2.26843463243900e-03, 4.89352518554385e-03)
         return a * _polynomial(z, up) / _polynomial(z, down)
-    a = lax.abs(x)
-    z = a * a
-    up = (-9.64399179425052238628e-1, -9.92877231001918586564e1, -1.61468768441708447952e3)
-    down = (1.0, 1.12811678491632931402e2, 2.23548839060100448583e3, 4.84406305325125486048e3)
-    near = a + a * z * (_polynomial(z, up) / _polynomial(z, down))
-    far = 1.0 - 2.0 / (exp(2.0 * lax.min(a, jnp.full_like(a, 22.0))) + 1.0)
-    value = lax.select(a < 0.625, near, far)
+    beyond, power = _exponential(2.0 * lax.min(lax.abs(x), jnp.full_like(x, 22.0)))
+    less_one = beyond * power + (power - 1.0)
+    value = less_one / (less_one + 2.0)
     return lax.select(x != x, x, lax.select(x < 0.0, -value, value))
 
 

@@ -25,7 +25,7 @@ from typing import Any
 import equinox as eqx
 import jax
 
-from jaxbl.workers import PROGRAMS
+from jaxbl.workers import PROGRAMS, own_folder
 
 _STANDS_ON = "equinox", "jax", "jaxlib", "lineax", "llvmlite", "numpy", "optimistix"
 _OLD = 30.0
@@ -46,8 +46,10 @@ def keeping() -> Path | None:
 @functools.cache
 def _folder(name: str) -> Path | None:
     own = Path(name) / _version()
+    # what is in them is run
+    if not (own_folder(own.parent) and own_folder(own)):
+        return None
     try:
-        own.mkdir(parents=True, exist_ok=True)
         os.utime(own)
         for other in own.parent.iterdir():
             if time.time() - other.stat().st_mtime > 86400.0 * _OLD:

@@ -164,7 +164,13 @@ class HostPassage(Passage):
         dtype = np.dtype(jnp.result_type(experiment.run.sample_period))
         self._together = vector_lanes(dtype)
         super().__init__(experiment, reducers, paths, lanes, self._together)
-        self._loop = Loop(self._body, self._dtype, values=len(paths), carry=self.carried, around=self._around)
+        if any(eqn.primitive.name == "scan" for eqn in self._body.jaxpr.eqns):
+            # plant steps of a sample: few numbers, each of which waits for the one before
+            self._together *= 2
+            self._filled = -(-lanes // self._together) * self._together
+        self._loop = Loop(
+            self._body, self._dtype, values=len(paths), carry=self.carried, around=self._around, lanes=self._together
+        )
         self._of = {
             name: [one.dtype for one in self._loop.signature if one.name.startswith(name)]
             for name in ("input at the end", "mark of a block", "result")

@@ -210,7 +210,10 @@ def accuracy_laws(result: "StudyResult", figures: list[FigureTable] | None = Non
         check_selection(config, figure, index)
         side = figure.value.partition(".")[0]
         sizes = [f"{side}.{name}" for name in _SIZES if f"{side}.{name}" in result.columns]
-        frame = result.read([*(axis.path for axis in config.axes), "finite", figure.value, *sizes])
+        # a line is judged beside those without noise and at other periods
+        fixed = {path: value for path, value in fixed_values(config, figure).items() if path not in (NOISE, PERIOD)}
+        parts = result.batches([*(axis.path for axis in config.axes), "finite", figure.value, *sizes])
+        frame = pd.concat([_rows(part, fixed) for part in parts], ignore_index=True)
         found += _of_figure(config, frame, figure, index)
     return found
 

@@ -4,7 +4,6 @@ and what the gain conditions ask for, there and anywhere."""
 import dataclasses
 from collections.abc import Callable
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,7 +12,6 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config
-from jaxbl.files import write_table
 from jaxbl.observer.conditions import CONDITIONS, Condition, least_lambda_davila_fridman, peak_ratio
 from jaxbl.observer.worst_case import half_cycle, least_lambda_simulated
 from jaxbl.sweeps.pieces import in_pieces
@@ -82,21 +80,11 @@ def simulate_error_system(config: Config, stages: Stages) -> Normalised:
         return pd.DataFrame({"alpha_ratio": columns[0], "damping": columns[1], "least_lambda_ratio": least})
 
     with jax.enable_x64(True):
-        map_ = _kept(stages.place("normalised.parquet"), plane)
-        boundary = _kept(stages.place("boundaries.parquet"), borders)["least_lambda_ratio"].to_numpy()
+        map_ = stages.table("normalised.parquet", plane)
+        boundary = stages.table("boundaries.parquet", borders)["least_lambda_ratio"].to_numpy()
     ratio, closed = (map_[name].to_numpy().reshape(shape) for name in ("ratio", "closed_form"))
     boundaries = dict(zip(dampings, boundary.reshape(len(dampings), -1), strict=True))
     return Normalised(alpha, lambda_, ratio, closed, boundaries.pop(0.0), boundaries)
-
-
-def _kept(path: Path | None, compute: Callable[[], pd.DataFrame]) -> pd.DataFrame:
-    """A table from its file, or computed and kept there."""
-    if path is not None and path.exists():
-        return pd.read_parquet(path)
-    table = compute()
-    if path is not None:
-        write_table(path, table)
-    return table
 
 
 @cache

@@ -1,7 +1,7 @@
 """A command that runs several studies, one after the other: their folder, backend, progress and cost."""
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from jaxbl.cluster import Cluster, Scheduler, connected
 from jaxbl.config import Config
 from jaxbl.errors import InputError
 from jaxbl.files import json_text, locked, make_folder, place, read_json, removed_if_empty, write_atomic
+from jaxbl.sweeps import parts
 from jaxbl.sweeps.programs import Backend, backend_of
 from jaxbl.sweeps.store import claim, manifest_head
 from jaxbl.sweeps.sweep import StudyResult, sweep
@@ -64,12 +65,19 @@ class Stages:
         self._config, self._command, self._progress, self._overwrite = config, command, progress, overwrite
         self._backend: Backend | None = backend_of(backend)
         self._done = 0
+        self._unsure = False
+        """The manifest is damaged: written anew once a stage has not been refused, as the folder is this study's then."""
+        self._kept: dict[str, Any] = {}
         if out is None:
             return
         claim(place(out), config, command, overwrite=overwrite)
         self.folder = place(out) / command
         if (self.folder / "manifest.json").exists():
-            self.found = read_json(self.folder / "manifest.json")
+            try:
+                self.found = read_json(self.folder / "manifest.json")
+            except InputError:
+                self._unsure = True
+                return
             begun = self.found.get("backend")
             if backend not in (None, begun):
                 how = f"with --backend {begun}; go on with that" if begun else "without --backend; go on without it"
@@ -79,6 +87,9 @@ class Stages:
     def keep(self, **found: Any) -> None:
         """Write the manifest, which makes the folder this study's, with something that was found before the stages."""
         if self.folder is not None:
+            self._kept = found
+            if self._unsure:
+                return
             make_folder(self.folder)
             manifest = manifest_head(self._config, self._command) | found | {"backend": self._backend}
             write_atomic(self.folder / "manifest.json", json_text(manifest))
@@ -86,6 +97,25 @@ class Stages:
     def place(self, *names: str) -> Path | None:
         """A path in the folder, if there is one."""
         return None if self.folder is None else self.folder.joinpath(*names)
+
+    def table(self, name: str, compute: Callable[[], pd.DataFrame]) -> pd.DataFrame:
+        """A table from its file, or computed and kept there; one that is damaged is computed anew.
+
+        Raises:
+            InputError: the file is of another study.
+        """
+        path, head = self.place(name), manifest_head(self._config, self._command)
+        if path is None:
+            return compute()
+        with suppress(FileNotFoundError, parts.Damaged):
+            mark, frame = parts.read(path)
+            if mark.study.get("identity") != head["identity"]:
+                raise InputError(f"{path}: is of another study; choose another folder with --out, or --overwrite")
+            return frame
+        frame = compute()
+        if not self._unsure:
+            parts.write(path, frame, parts.Mark(head, {}, "", 0, 0, {}))
+        return frame
 
     def run(self, study: Config | dict[str, Any], name: str) -> StudyResult:
         """Run a stage, or go on with it."""
@@ -105,6 +135,9 @@ class Stages:
             backend=self._backend,
             scheduler=self._cluster,
         )
+        if self._unsure:
+            self._unsure = False
+            self.keep(**self._kept)
         self.scanned |= dict.fromkeys(result.scanned)
         self.cost = {key: value + result.cost[key] for key, value in self.cost.items()}
         return result

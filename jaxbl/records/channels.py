@@ -12,6 +12,9 @@ from .signal_quality import resolution
 from .table import POSITION_CHANNELS, SPEED_CHANNELS, LogTable, PositionTable, SpeedTable, TorqueTable
 from .time_stamps import TimeStamps
 
+_LEAST_MOTION, _LEAST_TORQUE = 1e-12, 1e-15
+"""In rad (m) and N m (N), a millionth of what the finest encoders and sensors show: less is no measurement."""
+
 
 class RawChannel(NamedTuple):
     """A channel in SI units at its own time stamps.
@@ -86,7 +89,8 @@ def _is_recorded(file: LogFile, table: LogTable, name: str) -> bool:
 
 def _numbers(file: LogFile, name: str, column: str | int, bits: int | None, stamps: TimeStamps) -> np.ndarray:
     """Numbers of a column at the rows that are read, unsigned words made signed."""
-    values = file.same_length(file.numbers(column, f"{name}.column"), stamps.total, column)
+    file.check_length(file.name(column, f"{name}.column"), stamps.total)
+    values = file.numbers(column, f"{name}.column")
     if bits is not None:
         outside = (values != np.round(values)) | (values < -(2.0 ** (bits - 1))) | (values >= 2.0**bits)
         if outside.any():
@@ -122,6 +126,8 @@ def _position(file: LogFile, name: str, table: PositionTable, stamps: TimeStamps
         "mm": 1e-3,
     }[table.unit]
     values = table.sign * table.factor * one * values + (table.offset or 0.0)
+    if np.ptp(values) < _LEAST_MOTION:
+        raise file.wrong(f"{name} moves by only {np.ptp(values):.3g} {table.si_unit}; see its unit and factor in [log]")
     return RawChannel(values, table.si_unit, 0.0, table.skew or 0.0, held=False, drift=table.drift or 0.0)
 
 
@@ -170,6 +176,8 @@ def _torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamps, *,
         saturated = float(np.mean(np.abs(values) >= table.saturation * (1.0 - 1e-9)))
     factor = 1.0 if table.factor is None else table.factor
     values = table.sign * factor * values + table.offset
+    if 0.0 < np.abs(values).max() < _LEAST_TORQUE:
+        raise file.wrong(f"{name} is at most {np.abs(values).max():.3g}; see its unit and factor in [log]")
     return RawChannel(values, "N" if linear else "N m", saturated, table.skew, held=name == "u")
 
 

@@ -9,19 +9,20 @@ Only columns that are wanted stay in memory; others are loaded if they are asked
 import csv
 import io
 import json
+import math
 import re
 import warnings
 from codecs import BOM_UTF8
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
 
-from jaxbl.errors import InputError
-from jaxbl.validation import nearest
+from jaxbl.errors import InputError, printable
+from jaxbl.validation import LARGEST, check_file, nearest
 
 from .libraries import Column, Columns, read_bag, read_mcap, read_mdf, read_tdms
 
@@ -43,6 +44,14 @@ _BAG = "metadata.yaml"
 """What the folder of a ROS 2 bag holds."""
 _ROWS = 100_000
 """Rows of text that are in memory with all their columns."""
+_MOST_COLUMNS = 10_000
+"""Of a text file: exports of whole machines have hundreds."""
+_MOST_ROWS = 100_000_000
+"""Numbers of a column, a day at 1 kHz: each column that is used is 0.8 GB then."""
+_MOST_WHOLE = 128_000_000
+"""Bytes of a file that is held whole while it is read, JSON and exports with remarks; Python takes ten times as many."""
+_LONGEST_LINE = 1 << 20
+"""Bytes of a line of text: ten thousand numbers of full length have a fifth of it."""
 
 
 class LogFile:
@@ -87,27 +96,66 @@ class LogFile:
             )
         raise self.wrong(f"no column '{column}'; {nearest(column, map(str, names))}{key}")
 
+    def length(self, name: str | int) -> int:
+        """Number of values of a column, which is not loaded; InputError where there are too many."""
+        if (count := len(self.columns[name])) > _MOST_ROWS:
+            raise self.wrong(f"column {name!r} has {count} values; at most {_MOST_ROWS} can be read")
+        return count
+
+    def values(self, name: str | int) -> np.ndarray:
+        """A column as the file has it, shape (rows,). InputError where it is too long, or cannot be read."""
+        self.length(name)
+        try:
+            with _reading(f"column {name!r}"):
+                return np.asarray(self.columns[name])
+        except InputError as error:
+            raise self.wrong(str(error)) from None
+
+    def seconds(self, column: str | int, unit: float, channel: str = "") -> np.ndarray:
+        """A column of time stamps, s, shape (rows,), of numbers of so many seconds each, or of dates, from the first one on.
+
+        InputError as :meth:`numbers`.
+        """
+        name = self.name(column, channel)
+        stamps = self.values(name)
+        if stamps.dtype.kind not in "Mm":
+            return self.numbers(column, channel) * unit
+        if unit != 1.0:
+            raise self.wrong(f"column {name!r} holds dates or times, which have a unit of their own; leave [log] t.unit out")
+        if np.isnat(stamps).any():
+            raise self.wrong(
+                f"column {name!r}, data row {int(np.argmax(np.isnat(stamps))) + 1} is empty; it should be a time"
+            )
+        if stamps.dtype.kind == "M" and len(stamps):
+            self.notes.append(f"Time is counted from {np.datetime_as_string(stamps[0])}.")
+        # of whole nanoseconds: seconds since 1970 are rounded to tenths of a microsecond
+        return 1e-9 * (stamps - stamps[:1]).astype("timedelta64[ns]").astype(np.int64)
+
     def numbers(self, column: str | int, channel: str = "") -> np.ndarray:
         """A column of finite numbers, shape (rows,); InputError names the first row, counted from 1, that holds none."""
         name = self.name(column, channel)
-        given = np.asarray(self.columns[name])
+        given = self.values(name)
+        if given.dtype.kind in "cMm":
+            kind = "complex numbers" if given.dtype.kind == "c" else "dates or times"
+            raise self.wrong(f"column {name!r} holds {kind}; it should hold real numbers")
         values = np.asarray(pd.to_numeric(pd.Series(given), errors="coerce"), dtype=float)
-        finite = np.isfinite(values)
+        finite = np.abs(values) <= LARGEST
         if not finite.all():
             row = int(np.argmin(finite))
             cell = np.asarray(given, dtype=object)[row]
+            if np.isfinite(values[row]):
+                raise self.wrong(
+                    f"column {name!r}, data row {row + 1} is {values[row]:g}; a reading should be below {LARGEST:g}"
+                )
             empty = cell is None or (isinstance(cell, float) and np.isnan(cell))
             what = "empty or not a number" if empty else repr(cell)
             raise self.wrong(f"column {name!r}, data row {row + 1} is {what}; it should be a finite number")
         return values
 
-    def same_length(self, values: np.ndarray, length: int, column: str | int) -> np.ndarray:
-        """The values of a column; InputError where they are not as many as there are time stamps."""
-        if len(values) != length:
-            raise self.wrong(
-                f"column {column!r} has {len(values)} values and the time {length}; they should be equally many"
-            )
-        return values
+    def check_length(self, name: str | int, length: int) -> None:
+        """InputError where the values of a column are not as many as there are time stamps."""
+        if (count := self.length(name)) != length:
+            raise self.wrong(f"column {name!r} has {count} values and the time {length}; they should be equally many")
 
 
 def is_log(path: Path) -> bool:
@@ -126,13 +174,19 @@ def read_log_file(path: Path, wanted: Collection[str | int] = ()) -> LogFile:
         InputError: the file is missing, empty, or of no known kind.
     """
     try:
-        return LogFile(path, _columns(path, wanted))
+        check_file(path)
+        columns = _columns(path, wanted)
+        if not all(str(name).isprintable() for name in columns):
+            named = {printable(one) if isinstance(one, str) else one: values for one, values in columns.items()}
+            columns.clear()
+            columns.update(named)
+        return LogFile(path, columns)
     except FileNotFoundError:
         why = "no such file"
     except IsADirectoryError:
         why = "is a folder; a log file is needed"
     except OSError as error:
-        why = f"cannot be read: {error.strerror}"
+        why = f"cannot be read: {error.strerror or error}"
     except InputError as error:
         why = str(error)
     raise InputError(f"{path}: {why}")
@@ -175,11 +229,29 @@ def _columns(path: Path, wanted: Collection[str | int]) -> dict[str | int, Any]:
 
 def _of_text(path: Path, head: str, encoding: str, whole: bool, wanted: Collection[str | int]) -> dict[str | int, Any]:
     def text() -> str:
+        check_file(path, _MOST_WHOLE)
         return head if whole else path.read_text(encoding=encoding)
 
     if path.suffix.lower() == ".json" or head.lstrip()[0] in "[{":
-        return _json(text())
-    return _text(path, head, encoding, text, wanted)
+        with _reading("JSON"):
+            return _json(text())
+    _check_lines(path)
+    with _reading("a table", UnicodeDecodeError):
+        return _text(path, head, encoding, text, wanted)
+
+
+def _check_lines(path: Path) -> None:
+    """Refuse lines that no row has: their cells would take a hundred times their size in memory."""
+    count = since = 0
+    with path.open("rb") as file:
+        while block := file.read(_LONGEST_LINE):
+            ends = block.count(b"\n") or block.count(b"\r")
+            since = 0 if ends else since + len(block)
+            if since >= _LONGEST_LINE:
+                raise InputError(
+                    f"line {count + 1} has more than {_LONGEST_LINE / 1e6:.0f} MB; a log has a line for each row"
+                )
+            count += ends
 
 
 def _parquet(path: Path) -> dict[str | int, Any]:
@@ -189,7 +261,10 @@ def _parquet(path: Path) -> dict[str | int, Any]:
         names, rows = [str(name) for name in file.schema_arrow.names], file.metadata.num_rows
 
     def loaded(name: str) -> np.ndarray:
-        return pd.read_parquet(path, columns=[name])[name].to_numpy()
+        values = pd.read_parquet(path, columns=[name])[name]
+        if isinstance(values.dtype, pd.DatetimeTZDtype):
+            values = values.dt.tz_convert(None)
+        return values.to_numpy()
 
     return {name: Column(lambda name=name: loaded(name), rows) for name in names}
 
@@ -215,6 +290,8 @@ def _text(
 ) -> dict[str | int, Any]:
     """Comma, semicolon, tab or white space between columns; a header or none; # before remarks."""
     lines = head.splitlines()
+    if max(map(len, lines)) == len(head) and len(head) > _HEAD // 2:
+        raise InputError(f"has no line break in its first {len(head)} characters; a log has a line for each row")
     if (block := _behind_remarks(lines, text)) is not None:
         return block
     skipped = next((i for i, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), None)
@@ -223,6 +300,8 @@ def _text(
     first = lines[skipped]
     separator = _separator(first)
     cells = _cells(first, separator)
+    if len(cells) > _MOST_COLUMNS:
+        raise InputError(f"has {len(cells)} columns; at most {_MOST_COLUMNS} can be read")
     header = not any(_NUMBER.fullmatch(cell) for cell in cells)
     second = next((line for line in lines[skipped + 1 :] if line.strip()), "")
     if header and len(_cells(second, separator)) == len(cells) + 1 and second.rstrip(" ").endswith(separator):
@@ -366,9 +445,9 @@ def _cells(line: str, separator: str) -> list[str]:
 def _names(cells: list[str]) -> list[str]:
     if cells and not cells[-1]:
         cells = [*cells[:-1], f"column {len(cells) - 1}"]  # a separator at the end of the lines
-    for i, cell in enumerate(cells):
-        if cell in cells[:i]:
-            raise InputError(f"two columns are called '{cell}'; names should differ")
+    if len({*cells}) < len(cells):
+        twice = next(cell for i, cell in enumerate(cells) if cell in cells[:i])
+        raise InputError(f"two columns are called '{twice}'; names should differ")
     return cells
 
 
@@ -376,6 +455,8 @@ def _json(text: str) -> dict[str | int, Any]:
     """An array of objects or of rows of numbers, an object that holds one array of objects, or arrays by name."""
     try:
         data = json.loads(text)
+    except RecursionError:
+        raise InputError("is nested too deep; a log holds rows, or arrays by name") from None
     except ValueError as error:
         raise InputError(f"is not valid JSON: {error}") from None
     columns: dict[str | int, Any] = {}
@@ -390,7 +471,7 @@ def _json(text: str) -> dict[str | int, Any]:
         data = rows[0]
     if _is_matrix(data):
         return dict(enumerate(np.asarray(data, dtype=float).T))
-    if not data or not all(isinstance(row, dict) for row in data):
+    if not isinstance(data, list) or not data or not all(isinstance(row, dict) for row in data):
         raise InputError("should hold an array of objects, one a row, or of rows of equally many numbers")
     names = dict.fromkeys(name for row in data for name in row)
     return {name: _plain([row.get(name) for row in data]) for name in names}
@@ -448,6 +529,9 @@ def _matlab(path: Path, wanted: Collection[str | int]) -> dict[str | int, Any]:
     return _some(columns)
 
 
+_Some = TypeVar("_Some", bound=dict[str | int, Any])
+
+
 def _add(columns: dict[str | int, Any], name: str, value: Any) -> None:
     value = np.asarray(value)
     if value.dtype.names:
@@ -467,6 +551,8 @@ def _add(columns: dict[str | int, Any], name: str, value: Any) -> None:
 def _add_lazily(columns: dict[str | int, Any], name: str, shape: tuple[int, ...], load: Callable[[], Any]) -> None:
     """A vector, or the columns of a matrix, of which `load` gives the values; `shape` may have ones that are squeezed."""
     shape = tuple(one for one in shape if one != 1)
+    if len(shape) == 2 and (min(shape) > _MOST_COLUMNS or math.prod(shape) > _MOST_ROWS):
+        return
     if len(shape) == 1:
         columns[name] = Column(lambda: np.squeeze(load()), shape[0])
     elif len(shape) == 2:
@@ -477,37 +563,57 @@ def _add_lazily(columns: dict[str | int, Any], name: str, shape: tuple[int, ...]
 
 
 def _hdf5(path: Path) -> dict[str | int, Any]:
-    """MATLAB 7.3, or any HDF5 file of vectors."""
+    """MATLAB 7.3, or any HDF5 file of vectors. What a file takes from other files is not read: it could be any of them."""
     import h5py
 
-    columns: dict[str | int, Any] = {}
+    columns = Columns()
+    seen: set[Any] = set()
+    elsewhere: list[str] = []
 
     def loaded(place: str) -> np.ndarray:
         with _reading("a MATLAB file"), h5py.File(path) as file:
             return np.asarray(file[place])
 
     def add(name: str, item: Any) -> None:
+        # groups may hold one another, or themselves
+        place = h5py.h5o.get_info(item.id).addr
         if isinstance(item, h5py.Group):
-            for key, inner in item.items():
-                add(f"{name}.{key}", inner)
+            if place not in seen:
+                seen.add(place)
+                add_all(item, f"{name}.")
+        elif item.is_virtual or item.external:
+            elsewhere.append(name)
         elif item.attrs.get("MATLAB_class") == b"char":
             return
         elif item.dtype.kind in "biuf":
             _add_lazily(columns, name, item.shape, lambda place=item.name: loaded(place))
         elif h5py.check_ref_dtype(item.dtype) is not None:
             # cells, and structures of several entries
+            if item.size > _MOST_COLUMNS or place in seen:
+                return
+            seen.add(place)
             for i, reference in enumerate(np.ravel(item[()])):
                 if reference:
                     add(f"{name}[{i}]", item.file[reference])
 
+    def add_all(group: Any, prefix: str) -> None:
+        for key in group:
+            if not prefix and key.startswith("#"):
+                continue
+            if isinstance(group.get(key, getlink=True), h5py.ExternalLink):
+                elsewhere.append(f"{prefix}{key}")
+            elif (item := group.get(key)) is not None:
+                add(f"{prefix}{key}", item)
+
     with _reading("a MATLAB file"), h5py.File(path) as file:
-        for name, item in file.items():
-            if not name.startswith("#"):
-                add(name, item)
+        seen.add(h5py.h5o.get_info(file.id).addr)
+        add_all(file, "")
+    if elsewhere:
+        columns.notes.append(f"Not read, as the data are in other files: {', '.join(elsewhere[:20])}.")
     return _some(columns)
 
 
-def _some(columns: dict[str | int, Any]) -> dict[str | int, Any]:
+def _some(columns: _Some) -> _Some:
     if not columns:
         raise InputError("holds no vectors of numbers; a log needs them")
     return columns

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.linalg import blas
 
 
 def filtered(values: np.ndarray, numerator: Sequence[float], denominator: Sequence[float]) -> np.ndarray:
@@ -30,6 +29,9 @@ def filtered(values: np.ndarray, numerator: Sequence[float], denominator: Sequen
     bands = np.ones((len(denominator) + 1, count), order="F")
     bands[1:] = np.asarray(denominator)[:, None]
     columns = driven.reshape(count, -1).T
+    # here, as a study that reads no log need not wait for it
+    from scipy.linalg import blas
+
     solve: Any = blas.dtbsv  # pyright: ignore[reportAttributeAccessIssue]
     solved = [solve(len(denominator), bands, np.ascontiguousarray(one), lower=1, diag=1) for one in columns]
     return np.stack(solved, axis=1).reshape(driven.shape) + steady

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from .resampling import Grid
 from .rigid_body import RigidFit
 from .signal_quality import ChannelFigures, resolution
 from .table import POSITION_CHANNELS, LogTable
+from .time_stamps import Segments
 
 
 def check_motion(file: LogFile, name: str, values: np.ndarray) -> None:
@@ -33,6 +34,33 @@ def check_distinct(file: LogFile, channels: Mapping[str, RawChannel]) -> None:
             continue
         if np.array_equal(one.values, two.values, equal_nan=True) and np.any(one.values):
             raise file.wrong(f"{name} and {other} are the same in every row; each needs a column of its own")
+
+
+_STAND = 20
+"""Equal readings in a row from which an encoder stands still: fewer are its resolution, or a reversal."""
+
+
+def note_standing(file: LogFile, segments: Segments, channels: Mapping[str, RawChannel]) -> None:
+    """Remark on an encoder that stands exactly still while the other one moves by a fifth of its range."""
+    for name, other in (("theta_e", "theta_s"), ("theta_s", "theta_e")):
+        values, moving = channels[name].values, channels[other].values
+        # what its resolution hides is no standing
+        hidden = 2.0 * resolution(values) * np.ptp(moving) / np.ptp(values)
+        stays = (stay for part in segments.parts for stay in _stays(values, part))
+        stay = next((one for one in stays if np.ptp(moving[one]) > max(0.2 * np.ptp(moving), hidden)), None)
+        if stay is None:
+            continue
+        begin, end = segments.times[stay][[0, -1]]
+        extreme = values[stay.start] in (values.min(), values.max())
+        stands = f"{name} stands still{' at the end of its range' * extreme} from {begin:.4g} to {end:.4g} s"
+        moves = f"{other} moves by {np.ptp(moving[stay]):.3g} {channels[other].unit}"
+        file.notes.append(f"{stands} while {moves}: readings that are frozen or cut off, or a side that does not follow.")
+
+
+def _stays(values: np.ndarray, part: slice) -> Iterator[slice]:
+    """Where values of a part are equal for long."""
+    ends = np.flatnonzero(np.diff(values[part], prepend=np.nan, append=np.nan) != 0.0) + part.start
+    yield from (slice(a, b) for a, b in itertools.pairwise(ends.tolist()) if b - a >= _STAND)
 
 
 def check_gear_ratio(

@@ -97,7 +97,10 @@ def guess_log_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
     found: dict[str, list[tuple[bool, str | int, str, np.ndarray]]] = {}
     for column in file.columns:
         name, unit = _split(file, column)
-        numbers, channel, wanted = np.asarray(file.columns[column]), _channel(name, unit), _is("wanted", name)
+        channel, wanted = _channel(name, unit), _is("wanted", name)
+        if not channel:
+            continue
+        numbers = file.values(column)
         # a torque that was asked for stands for one that was not measured, a side alone for a position
         if numbers.dtype.kind in "iuf" and (channel == "u" or not wanted):
             last = wanted or _is("load", name) if channel == "u" else not _is("position", name)

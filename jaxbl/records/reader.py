@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from jaxbl.errors import InputError
-from jaxbl.validation import first_error
+from jaxbl.validation import check_sizes, first_error
 
 from .alignment import NominalDrive, Skew, clock_skew, encoder_offset, windup
 from .channels import RawChannel, read_channels
@@ -24,6 +24,7 @@ from .plausibility import (
     note_channel,
     note_lost_motion,
     note_skew,
+    note_standing,
     warn_units,
 )
 from .resampling import Delay, Grid, resampled
@@ -101,6 +102,10 @@ def read_log_table(log: LogTable | Mapping[str, Any] | None, name: str = "") -> 
     if isinstance(log, LogTable):
         return log
     try:
+        check_sizes(log)
+    except InputError as error:
+        raise InputError(f"{name}: log.{error}" if name else f"log.{error}") from None
+    try:
         return LogTable.model_validate({} if log is None else dict(log))
     except ValidationError as error:
         location = ["log", *error.errors()[0]["loc"]]
@@ -147,6 +152,8 @@ def read_record(
     drive = table.kind == "drive"
     for name in encoders if drive else encoders[:1]:
         check_motion(file, name, channels[name].values)
+    if drive and len(encoders) == 2:
+        note_standing(file, segments, channels)
     # from there to evenly spaced samples
     two = drive and len(encoders) == 2
     shaft = nominal if nominal is not None and math.isfinite(nominal.stiffness) and two else None

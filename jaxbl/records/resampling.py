@@ -11,6 +11,9 @@ from .files import LogFile
 from .signal_quality import SHORTEST, interpolated
 from .time_stamps import Segments
 
+_FINEST = 100
+"""Samples for each of the log: between its own there is nothing new, and memory ends."""
+
 
 class Grid(NamedTuple):
     """Evenly spaced samples of all channels.
@@ -85,6 +88,10 @@ def _common_grid(
         # where the channels without skew have their samples
         low = first + period * math.ceil((low - first) / period - 1e-6)
     count = math.floor((high - low) / period + 1e-6) + 1
+    if count > _FINEST * len(stamps) + SHORTEST:
+        raise file.wrong(
+            f"a period of {period:g} s makes {count} samples of {len(stamps)}; at least a hundredth of the log's is needed"
+        )
     if count < SHORTEST // 2:
         raise file.wrong(
             f"with these skews and this period a segment has {max(count, 0)} samples; at least {SHORTEST // 2} are needed"

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from jaxbl.validation import StrictTable, wrong
+from jaxbl.validation import Positive, StrictTable, wrong
 
 
 def _is_column(value: Any) -> Any:
@@ -62,7 +62,7 @@ class TimeTable(_ColumnTable):
     """The time stamps of a log."""
 
     unit: Literal["s", "ms", "us", "ns"] = Field(default="s", description="unit of the stamps")
-    period: float | None = Field(
+    period: Positive | None = Field(
         default=None, gt=0.0, description="sampling period of a log without stamps", json_schema_extra=_SECONDS
     )
 
@@ -86,10 +86,10 @@ class PositionTable(_ChannelTable):
     """An encoder's column."""
 
     unit: Literal["rad", "deg", "turn", "counts", "m", "mm"] = Field(default="rad", description="unit of the column")
-    counts_per_turn: float | None = Field(default=None, gt=0.0, description="counts of one turn; for unit counts")
+    counts_per_turn: Positive | None = Field(default=None, gt=0.0, description="counts of one turn; for unit counts")
     factor: float = Field(default=1.0, gt=0.0, description="units in one number of the column")
     minus: _Column | None = Field(default=None, description="column to be subtracted, in the same unit")
-    wrap: float | None = Field(
+    wrap: Positive | None = Field(
         default=None, gt=0.0, description="period, in numbers of the column, after which it starts again; undone"
     )
     offset: float | None = Field(
@@ -103,6 +103,8 @@ class PositionTable(_ChannelTable):
     )
     drift: float | None = Field(
         default=None,
+        ge=-0.1,
+        le=0.1,
         description="by how much the skew grows in each second, undone; `skew` is then that at the first stamp; left out: "
         "0, of theta_s a drift that is sure",
         json_schema_extra={"unit": "s/s"},
@@ -154,7 +156,7 @@ class TorqueTable(_ChannelTable):
         description="N m (N on a linear axis) in one number of the column; needed for V, A and counts; else 1",
     )
     offset: float = Field(default=0.0, description="added last, in SI units")
-    saturation: float | None = Field(
+    saturation: Positive | None = Field(
         default=None, gt=0.0, description="magnitude, in numbers of the column, at which it saturates"
     )
     skew: float = Field(
@@ -213,7 +215,7 @@ class LogTable(StrictTable):
     stop: float | None = Field(
         default=None, gt=0.0, description="reads up to here, counted from the first stamp", json_schema_extra=_SECONDS
     )
-    resample: float | None = Field(
+    resample: Positive | None = Field(
         default=None,
         gt=0.0,
         description="period to resample to; left out: the log's own, uneven stamps to their median",

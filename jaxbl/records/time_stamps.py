@@ -16,6 +16,8 @@ _ONE = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Unit of the stamps -> s."""
 _SLOW = 0.5
 """Period in s from which a remark asks for the unit of the stamps: drives are sampled much faster."""
+_SHORTEST_PERIOD, _LONGEST_PERIOD = 1e-9, 1e10
+"""Periods in s that are possible at all; the longest are seconds in stamps of nanoseconds that pass for seconds."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,8 @@ def read_time_stamps(file: LogFile, table: LogTable) -> TimeStamps:
     median = float(np.median(intervals)) or float(np.mean(intervals))
     # stamps that were rounded to more than a period come in groups
     group = 0.0 if np.median(intervals) else float(np.median(intervals[intervals > 0.0]))
+    if not _SHORTEST_PERIOD <= median <= _LONGEST_PERIOD:
+        raise file.wrong(f"the period of the time stamps is {median:g} s, as no drive is sampled; see [log] t.unit")
     if median >= _SLOW:
         file.warnings.append(f"Doubtful: the period is {median:g} s; if the stamps are not in s, set [log] t.unit.")
     # 2.5: one group may be missing
@@ -101,10 +105,10 @@ def _stamps(file: LogFile, table: LogTable) -> np.ndarray:
     if time.period is not None:
         # other vectors of the file may be longer
         read = (table.columns() & {*file.columns, *range(len(file.columns))}) - {"t", *(table.absent or ())}
-        length = max(len(file.columns[file.name(one)]) for one in read or file.columns)
+        length = max(file.length(file.name(one)) for one in read or file.columns)
         stamps = np.arange(length, dtype=float) * time.period
     else:
-        stamps = file.numbers(time.column_or("t"), "t.column") * _ONE[time.unit]
+        stamps = file.seconds(time.column_or("t"), _ONE[time.unit], "t.column")
     if len(stamps) < SHORTEST:
         raise file.wrong(f"has {len(stamps)} rows; a log needs at least {SHORTEST}")
     back = np.diff(stamps) < 0.0
@@ -121,7 +125,8 @@ def _selected_rows(file: LogFile, table: LogTable, stamps: np.ndarray) -> np.nda
     """Numbers of the rows that `where`, `start` and `stop` leave; stamps from the first one on."""
     keep = np.ones(len(stamps), dtype=bool)
     for column, value in (table.where or {}).items():
-        given = file.same_length(np.asarray(file.columns[file.name(column)]), len(stamps), column)
+        file.check_length(file.name(column), len(stamps))
+        given = file.values(file.name(column))
         keep &= given == value
         if not keep.any():
             found = ", ".join(repr(v.item() if hasattr(v, "item") else v) for v in np.unique(given.astype(object))[:6])
@@ -216,5 +221,5 @@ def even_grid(stamps: np.ndarray) -> EvenGrid:
     largest = float(np.abs(stamps - middle - period * index).max())
     # 2 % of a period changes no result; stamps that were rounded, say to milliseconds, are off by up to half a step
     rounding = resolution(np.diff(stamps))
-    even = largest <= 0.02 * period or largest <= 0.55 * min(rounding, 20.0 * period)
+    even = period > 0.0 and (largest <= 0.02 * period or largest <= 0.55 * min(rounding, 20.0 * period))
     return EvenGrid(even, period, float(middle + period * index[0]))

@@ -85,6 +85,12 @@ def throughput_lines(result: BenchResult) -> list[str]:
     lines.insert(0, f"{on}; {result.rows[0].steps} samples a run")
     lines += ["", f"A small study from nothing, {study['lanes']} lanes of {study['steps']} samples, {study['precision']}:"]
     lines += [f"  {row['name'].ljust(widths[0])}  {row['seconds']:.2f} s" for row in result.study]
+    if result.studies:
+        lines += ["", "Studies as they stand, float64, several seeds, every metric of a run, all cores:"]
+    for row in result.studies:
+        about = f"{row['name']}, {row['seeds']} seeds of {row['lanes']} lanes of {row['steps']} samples"
+        share = f"{row['jaxbl'] / row['c++']:.2g}"
+        lines.append(f"  {about}: jaxbl {row['jaxbl']:.3g} lane-steps/s, C++ {row['c++']:.3g}, {share} of it")
     lines += [f"{name}: left out, {why}" for name, why in result.left_out.items()]
     return lines
 

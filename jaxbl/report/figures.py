@@ -1,6 +1,7 @@
 """What figures share: how they look, their axes, names and files, and long signals in few points."""
 
 import contextlib
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from matplotlib.layout_engine import TightLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import NullLocator
 
+from jaxbl.errors import printable, shortened
 from jaxbl.files import is_remote, written
 
 SIDES = ("motor", "load")
@@ -68,14 +70,25 @@ def with_unit(label: str, unit: str) -> str:
     return f"{label} ({unit})" if unit else label
 
 
+_LONGEST_NAME = 40
+"""Characters of a name in a figure: a legend with more leaves no room for the axes."""
+
+
+def literal(name: str) -> str:
+    """A name that a user chose, as text of a figure: no mathematics, one line, not too long."""
+    return shortened(printable(name), _LONGEST_NAME).replace("$", r"\$")
+
+
 @style()
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG, making its folder. Returns the path."""
     if not is_remote(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    if figure.get_layout_engine() is None:
-        _lay_out(figure)
-    with written(path) as draft:
+    # a name may have letters that the font lacks, drawn as boxes
+    with warnings.catch_warnings(), written(path) as draft:
+        warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
+        if figure.get_layout_engine() is None:
+            _lay_out(figure)
         figure.savefig(draft, format="png")
     return path
 

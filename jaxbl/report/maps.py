@@ -2,12 +2,12 @@
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
-# pyright: reportReturnType=false
+# pyright: reportReturnType=false, reportAssignmentType=false
 
 import re
 import textwrap
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Container, Iterable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,16 +25,19 @@ from jaxbl.config import Config, FigureTable, is_boolean, numeric_paths
 from jaxbl.errors import InputError
 from jaxbl.gains.accuracy_laws import Law, accuracy_laws, check_selection, fixed_values, selected
 from jaxbl.observer.conditions import CONDITIONS, Condition
-from jaxbl.sweeps.metrics import metric_of
+from jaxbl.sweeps.metrics import is_magnitude, metric_of
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 from jaxbl.validation import nearest
 
+from .aggregates import Column, Groups, Rows
 from .figures import COLOURS, MAP, MARKERS, MISSING, SIDES, Drawn, style, subplots, with_unit
 from .refined_maps import Filling, on_coarse_values
 
 _HATCH = (1.0, 1.0, 1.0, 0.45)
 """White that lets the colour beneath be read."""
+
+_MOST_DOTS = 100_000
 
 _CURVES = {
     "davila_fridman": ("-", "#FF5FA2"),
@@ -61,8 +64,12 @@ def default_figures(config: Config) -> list[FigureTable]:
     return [FigureTable(kind="heatmap", x=varying[-1], y=varying[-2], value=value, facet=(None, None, *varying)[-3])]
 
 
-def draw(result: StudyResult) -> list[Drawn]:
-    """All figures of a study.
+def draw(result: StudyResult, laws: list[Law] | None = None) -> list[Drawn]:
+    """All figures of a study, in memory that does not grow with its number of runs (of a refined study, with its points).
+
+    Args:
+        result: the study.
+        laws: those of its figures, where they are known already.
 
     Raises:
         InputError: a figure names an axis or a metric that the study does not have.
@@ -72,25 +79,56 @@ def draw(result: StudyResult) -> list[Drawn]:
     check_figures(config, figures, result.columns)
     points = Points(config) if config.sweep.refine is not None else None
     drawn: list[Drawn] = []
-    laws = accuracy_laws(result, figures)
+    laws = accuracy_laws(result, figures) if laws is None else laws
+    runs = None
     for i, figure in enumerate(figures):
-        wanted = {figure.value, "finite", *(f"{side}.{name}" for side in SIDES for name in ("converged", "f_plus"))}
-        frame = result.read([*(axis.path for axis in config.axes), *(c for c in result.columns if c in wanted)])
-        if points is not None:
-            frame = on_coarse_values(points, frame, [figure.x, figure.y or figure.x])
-        if figure.kind == "heatmap":
-            drawing = _heatmap(config, frame, figure, points)
-        elif figure.theory is not None:
-            drawing = _laws(config, frame, figure, [law for law in laws if law.figure == i])
+        if figure.theory is not None:
+            drawing = _laws(config, figure, [law for law in laws if law.figure == i])
+        elif figure.kind == "heatmap":
+            drawing = _heatmap(config, _rows(result, figure, points), figure, points)
         else:
-            drawing = _lines(config, selected(config, frame, figure), figure)
-        if not result.is_finished(len(frame)):
+            drawing = _lines(config, _rows(result, figure, points), figure)
+        if (dots := _dots(result, figure)) is not None:
+            drawing = drawing._replace(caption=f"{drawing.caption} The first {len(dots)} points of the design are shown.")
+        runs = sum(map(len, result.batches(["seed"]))) if runs is None else runs
+        if not result.is_finished(runs):
             drawing = drawing._replace(
-                caption=f"{drawing.caption} The study is not finished: {len(frame)} runs so far, white where none is."
+                caption=f"{drawing.caption} The study is not finished: {runs} runs so far, white where none is."
             )
         same = sum(one.name.partition("-")[0] == drawing.name for one in drawn)
         drawn.append(drawing._replace(name=f"{drawing.name}-{same + 1}") if same else drawing)
     return drawn
+
+
+def _rows(result: StudyResult, figure: FigureTable, points: Points | None) -> Rows:
+    """The rows that a figure shows, with the columns that it needs."""
+    config = result.config
+    wanted = {figure.value, "finite", *(f"{side}.{name}" for side in SIDES for name in ("converged", "f_plus"))}
+    columns = [*(axis.path for axis in config.axes), *(name for name in result.columns if name in wanted)]
+    keys = [figure.x, figure.y or figure.x]
+    dots = _dots(result, figure)
+
+    def shown(frame: pd.DataFrame) -> pd.DataFrame:
+        if points is not None:
+            frame = on_coarse_values(points, frame, keys)
+        if dots is not None:
+            frame = frame[frame[dots.name].isin(dots)]
+        return selected(config, frame, figure)
+
+    needs = [*(figure.where or {}), *([] if dots is None else [dots.name]), *([] if points is None else columns)]
+    return Rows(result, columns, shown, needs)
+
+
+def _dots(result: StudyResult, figure: FigureTable) -> pd.Series | None:
+    """Where a figure has a dot for each run of a quasi-random design that has more of them than can be seen: the values that
+    one axis has at the points that are drawn."""
+    config, sampled = result.config, _sampled(result.config)
+    dotted = bool(sampled) and (figure.kind == "heatmap" or {figure.x, figure.facet, figure.series} & set(sampled))
+    if not dotted or figure.theory is not None or result.runs <= _MOST_DOTS:
+        return None
+    values = Points(config).values(sampled[0])
+    # the first points of a design cover its ranges evenly, too
+    return pd.Series(values[: max(len(values) * _MOST_DOTS // result.runs, 1)], name=sampled[0])
 
 
 def check_figures(config: Config, figures: list[FigureTable], columns: list[str]) -> None:
@@ -127,30 +165,21 @@ def _text(value: Any) -> str:
 def _value_label(value: str) -> str:
     side, _, _ = value.rpartition(".")
     about = metric_of(value)
-    label = f"|{about.label}|" if _is_magnitude(value) else about.label
+    label = f"|{about.label}|" if is_magnitude(value) else about.label
     return with_unit(f"{side}: {label}" if side else label, about.unit)
 
 
-def _is_magnitude(value: str) -> bool:
-    """Signed relative errors are drawn by their size: a median over seeds must not cancel them."""
-    return value.endswith("_error")
+def _middle(groups: Groups, value: str) -> pd.Series:
+    """One number for each group: the median over what else varies, or the share that is true."""
+    shown = _shown_column(value)
+    return groups.means({value: shown})[value] if is_boolean(value) else groups.medians(shown)
 
 
-def _reduce(frame: pd.DataFrame, keys: list[str], value: str) -> pd.Series:
-    """One number for each combination of keys: the median over what else varies, or the share that is true."""
-    groups = frame.groupby(keys, sort=True)[value]
-    return groups.mean() if is_boolean(value) else groups.median()
-
-
-def _over(config: Config, frame: pd.DataFrame, spec: FigureTable) -> str:
-    """What was averaged over, for the caption."""
+def _over(config: Config, varied: Container[str], spec: FigureTable) -> str:
+    """What was averaged over, of the axes that varied, for the caption."""
     keys = (spec.x, spec.y, spec.facet, spec.series)
     zipped = {axis.zip for axis in config.axes if axis.path in keys and axis.zip}
-    others = [
-        axis.path
-        for axis in config.axes
-        if axis.path not in keys and axis.zip not in zipped and frame[axis.path].nunique() > 1
-    ]
+    others = [axis.path for axis in config.axes if axis.path not in keys and axis.zip not in zipped and axis.path in varied]
     if any(path in _sampled(config) for path in keys):  # one point of the design at each place
         others = [path for path in others if path not in _sampled(config)]
     if config.sweep.seeds > 1:
@@ -189,7 +218,7 @@ def cell_edges(centres: np.ndarray, log: bool) -> np.ndarray:
     return np.exp(edges) if log else edges
 
 
-def _is_log(config: Config, path: str, values: np.ndarray) -> bool:
+def is_log(config: Config, path: str, values: np.ndarray) -> bool:
     """Whether an axis is drawn logarithmically: as declared, or listed values that grow geometrically."""
     axis = next(a for a in config.axes if a.path == path)
     if axis.values is None:
@@ -198,10 +227,88 @@ def _is_log(config: Config, path: str, values: np.ndarray) -> bool:
     return bool(len(values) > 2 and values[0] > 0.0 and values[-1] / values[0] > 20.0)
 
 
-def _panels(config: Config, frame: pd.DataFrame, facet: str | None) -> list[tuple[str, pd.DataFrame]]:
-    if facet is None:
-        return [("", frame)]
-    return [(_with_value(config, facet, value), part) for value, part in frame.groupby(facet, sort=True)]
+class _Panel(NamedTuple):
+    """A panel of a map: its title, values over (y, x), shares of runs that stayed finite and that converged (None where the
+    study does not say), the f_plus that conditions are drawn for, and its rows where each is a dot."""
+
+    title: str
+    table: pd.Series
+    finite: pd.Series
+    converged: pd.Series | None
+    bound: float | None
+    dots: pd.DataFrame | None
+
+
+def _map_panels(
+    config: Config, rows: Rows, spec: FigureTable, points: Points | None
+) -> tuple[list[_Panel], Filling | None, set[str]]:
+    """The panels of a map, of a refined study what fills its places, and the axes that varied."""
+    assert spec.y is not None
+    keys, facets = [spec.y, spec.x], [] if spec.facet is None else [spec.facet]
+    paths = [axis.path for axis in config.axes]
+    filling, used, varied = None, rows, None
+    if points is not None:
+        # a refined study has its points for their places: all of them are filled
+        frame = rows.frame
+        filling = Filling(points, frame, spec.x, spec.y)
+        varied = Groups([frame], [], paths).varied
+        others = [path for path in paths if path not in (*keys, *facets)]
+        panels = [part for _, part in frame.groupby(facets, sort=True)] if facets else [frame]
+        used = [filling.complete(part, others) for part in panels]
+    groups = Groups(used, [*facets, *keys], paths)
+    side = spec.value.partition(".")[0]
+    columns = [name for name in ("finite", f"{side}.converged") if name in next(iter(used))]
+    shares = groups.means({name: Column([name], lambda frame, name=name: frame[name].astype(float)) for name in columns})
+    tables = _middle(groups, spec.value)
+    if spec.value != "finite":
+        # an average of the runs that did not diverge would hide that one did
+        tables = tables.where(shares["finite"] == 1.0)
+    shares = shares.assign(table=tables)
+    bounds = _bounds(used, spec, points) if spec.overlays else None
+    gridded = config.sweep.design == "grid"
+    found = []
+    for i, value in enumerate(groups.index.unique(level=0) if facets else [None]):
+        of = shares.xs(value, level=0) if facets else shares
+        dots = None
+        if not gridded:
+            dots = rows.frame if spec.facet is None else rows.frame[rows.frame[spec.facet] == value]
+        found.append(
+            _Panel(
+                title="" if spec.facet is None else _with_value(config, spec.facet, value),
+                table=of["table"],
+                finite=of["finite"],
+                converged=of[columns[1]] if len(columns) > 1 else None,
+                bound=None if bounds is None else float(bounds.iloc[i]),
+                dots=dots,
+            )
+        )
+    return found, filling, groups.varied if varied is None else varied
+
+
+def _bounds(rows: Iterable[pd.DataFrame], spec: FigureTable, points: Points | None) -> pd.Series:
+    """The f_plus that conditions are drawn for: by panel, the median of the true bounds of its converged points, or of all
+    if none did."""
+    side = spec.x.split(".")[1]
+
+    converged, bound = f"{side}.converged", f"{side}.f_plus"
+    paths = [] if points is None or points.refinement is None else points.refinement.paths
+    needs = [converged, bound, *paths]
+
+    def known(frame: pd.DataFrame) -> np.ndarray:
+        # most points of a refined study lie at its boundary: the median is that of the coarse grid
+        kept = np.ones(len(frame), bool) if points is None else points.always_simulated(frame)
+        return kept & frame[bound].notna().to_numpy()
+
+    def good(frame: pd.DataFrame) -> np.ndarray:
+        return known(frame) & frame[converged].to_numpy(bool)
+
+    groups = Groups(rows, [] if spec.facet is None else [spec.facet])
+    shares = groups.means({"converged": Column(needs, lambda frame: frame[converged].where(known(frame)))})
+    of_all = np.nan
+    if (shares["converged"] == 0.0).any():
+        of_all = groups.medians(Column(needs, lambda frame: frame[bound].where(known(frame))))
+    medians = groups.medians(Column(needs, lambda frame: frame[bound].where(good(frame))))
+    return medians.where(shares["converged"] > 0.0, of_all)
 
 
 def _grid_of_axes(
@@ -227,48 +334,34 @@ def _grid_of_axes(
     return figure, list(axes[:count])
 
 
-def _table(part: pd.DataFrame, keys: list[str], value: str) -> pd.Series:
-    """The values of a map; empty where any run diverged: an average of the other runs would hide that."""
-    table = _reduce(part.assign(**{value: _shown(part, value)}), keys, value)
-    return table if value == "finite" else table.where(_reduce(part, keys, "finite") == 1.0)
-
-
 @style()
-def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable, points: Points | None) -> Drawn:
+def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points | None) -> Drawn:
     """A map; with `points` of a refined study, those that were not simulated show the nearest that was."""
     assert spec.y is not None
-    panels = _panels(config, frame, spec.facet)
-    keys = [spec.y, spec.x]
-    filling = None
-    if points is not None:
-        filling = Filling(points, frame, spec.x, spec.y)
-        others = [axis.path for axis in config.axes if axis.path not in (*keys, spec.facet)]
-        panels = [(title, filling.complete(part, others)) for title, part in panels]
-    tables = [_table(part, keys, spec.value) for _, part in panels]
+    panels, filling, varied = _map_panels(config, rows, spec, points)
+    tables = [panel.table for panel in panels]
     values = np.concatenate([table.to_numpy(float) for table in tables])
     norm = Normalize(0.0, 1.0) if is_boolean(spec.value) else color_norm(values, spec.scale)
     figure, axes = _grid_of_axes(config, spec, len(panels), (3.5, 3.4), _label(config, spec.y), beside=1.0)
     hatches, curves = [], []
     gridded = config.sweep.design == "grid"
     missing = diverged = 0
-    for ax, (title, part), table in zip(axes, panels, tables, strict=True):
-        xs, ys, hatch = _map_panel(ax, config, part, table, spec, norm, filling)
+    for ax, panel in zip(axes, panels, strict=True):
+        xs, ys, hatch = _map_panel(ax, config, panel, spec, norm, filling)
         hatches = hatches or hatch
-        missing += int(table.isna().sum())
-        diverged += int((_reduce(part, keys, "finite")[table.isna()] < 1.0).sum())
+        missing += int(panel.table.isna().sum())
+        diverged += int((panel.finite[panel.table.isna()] < 1.0).sum())
         under = []
-        if gridded and (best := _best(table, part, spec)) is not None:
+        if gridded and (best := _best(panel, spec)) is not None:
             ax.plot(best[0], best[1], "*", ms=13, mfc="white", mec="black", mew=1.0, clip_on=False, zorder=5)
             under.append(f"best ★ {best[2]:.2g} {metric_of(spec.value).unit}".rstrip())
-        if spec.overlays:
-            # most points of a refined study lie at its boundary: the median is that of the coarse grid
-            bound = _bound(part if points is None else part[points.always_simulated(part)], spec)
+        if panel.bound is not None:
             alpha_is_x = spec.x.endswith(".alpha")
             alphas = xs if alpha_is_x else ys
             conditions = {name: CONDITIONS[name] for name in spec.overlays}
-            curves = condition_curves(ax, conditions, bound, (alphas[0], alphas[-1]), alpha_is_x)
-            under.append(f"f⁺ = {bound:.3g} rad/s²")
-        ax.set_title("\n".join(line for line in (title, ",  ".join(under)) if line))
+            curves = condition_curves(ax, conditions, panel.bound, (alphas[0], alphas[-1]), alpha_is_x)
+            under.append(f"f⁺ = {panel.bound:.3g} rad/s²")
+        ax.set_title("\n".join(line for line in (panel.title, ",  ".join(under)) if line))
     handles: list[Any] = [*hatches, *curves]
     if missing:
         word = "diverged" if diverged == missing else "not converged" if "time" in spec.value else "undefined"
@@ -282,15 +375,14 @@ def _heatmap(config: Config, frame: pd.DataFrame, spec: FigureTable, points: Poi
     if handles:
         most = max(int(figure.get_figwidth() / 2.4), 1)
         figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), most))
-    caption = f"{_value_label(spec.value)} over {spec.x} and {spec.y}{_over(config, frame, spec)}."
+    caption = f"{_value_label(spec.value)} over {spec.x} and {spec.y}{_over(config, varied, spec)}."
     return Drawn(_file_name(spec), figure, caption)
 
 
 def _map_panel(
     ax: Axes,
     config: Config,
-    part: pd.DataFrame,
-    table: pd.Series,
+    panel: _Panel,
     spec: FigureTable,
     norm: Normalize,
     filling: Filling | None,
@@ -298,16 +390,16 @@ def _map_panel(
     """Cells of a grid, or dots of a quasi-random design. Returns the values of both axes and the legend's handles."""
     assert spec.y is not None
     ax.grid(False)
-    gridded = config.sweep.design == "grid"
-    if gridded:
+    table, dots = panel.table, panel.dots
+    if dots is None:
         xs, ys, grid = _dense(table, filling)
     else:
-        xs, ys = (np.unique(part[path].to_numpy(float)) for path in (spec.x, spec.y))
-    logs = [_is_log(config, path, values) for path, values in ((spec.x, xs), (spec.y, ys))]
+        xs, ys = (np.unique(dots[path].to_numpy(float)) for path in (spec.x, spec.y))
+    logs = [is_log(config, path, values) for path, values in ((spec.x, xs), (spec.y, ys))]
     ax.set(xscale="log" if logs[0] else "linear", yscale="log" if logs[1] else "linear")
     edges = cell_edges(xs, logs[0]), cell_edges(ys, logs[1])
     handles = []
-    if gridded:
+    if dots is None:
         ax.pcolormesh(*edges, grid, cmap=MAP, norm=norm, rasterized=True)
         # what an unfinished study has not computed yet stays white
         undefined = np.isnan(grid) if filling is not None else table.isna().unstack(fill_value=False).to_numpy(bool)
@@ -315,13 +407,12 @@ def _map_panel(
             cells = np.ma.masked_array(np.zeros(grid.shape), ~undefined)
             ax.pcolormesh(*edges, cells, cmap=ListedColormap([MISSING]), rasterized=True)
         side = spec.value.partition(".")[0]
-        column = f"{side}.converged"
-        if column in part and spec.value != column:
-            *_, share = _dense(_reduce(part, [spec.y, spec.x], column), filling)
+        if panel.converged is not None and spec.value != f"{side}.converged":
+            *_, share = _dense(panel.converged, filling)
             handles = hatch_failures(ax, (xs, ys), edges, share, f"{side} not converged")
     else:
-        shown = _shown(part, spec.value)
-        there, gone = part[shown.notna()], part[shown.isna()]
+        shown = _shown(dots, spec.value)
+        there, gone = dots[shown.notna()], dots[shown.isna()]
         ax.scatter(there[spec.x], there[spec.y], c=shown[shown.notna()], cmap=MAP, norm=norm, s=16, linewidths=0)
         ax.plot(gone[spec.x], gone[spec.y], "x", ms=4, color=MISSING)
     ax.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
@@ -342,8 +433,9 @@ def hatch_failures(
     edges: tuple[np.ndarray, np.ndarray],
     share: np.ndarray,
     label: str,
+    colour: Any = _HATCH,
 ) -> list[Patch]:
-    """Hatch the cells of a map in which less than half of the runs pass. Returns the legend's handles.
+    """Hatch the cells of a map in which at most half of the runs pass. Returns the legend's handles.
 
     `centres` and `edges` are those of the cells along x and y, `share` of the runs that pass is `(rows, columns)`.
     """
@@ -353,7 +445,7 @@ def hatch_failures(
     share = np.pad(share, 1, mode="edge")
     xs, ys = (np.concatenate([e[:1], c, e[-1:]]) for c, e in zip(centres, edges, strict=True))
     hatched = ax.contourf(xs, ys, share, levels=[-1.0, 0.5], colors="none", hatches=["//"])
-    hatched.set(edgecolor=_HATCH, linewidth=0.0)
+    hatched.set(edgecolor=colour, linewidth=0.0)
     if share.max() >= 0.5:
         lines = ax.contour(xs, ys, share, levels=[0.5], colors="white", linewidths=1.8)
         lines.set_path_effects([path_effects.Stroke(linewidth=3.2, foreground="black"), path_effects.Normal()])
@@ -365,28 +457,25 @@ def _shown(part: pd.DataFrame, value: str) -> pd.Series:
     values = part[value].astype(float)
     if value == "finite":
         return values
-    values = values.abs() if _is_magnitude(value) else values
+    values = values.abs() if is_magnitude(value) else values
     return values.where(part["finite"].astype(bool)).replace([np.inf, -np.inf], np.nan)
 
 
-def _best(table: pd.Series, part: pd.DataFrame, spec: FigureTable) -> tuple[float, float, float] | None:
+def _shown_column(value: str) -> Column:
+    return Column([value, "finite"], lambda frame: _shown(frame, value))
+
+
+def _best(panel: _Panel, spec: FigureTable) -> tuple[float, float, float] | None:
     """Place and value of the smallest figure, for errors and times, among the points that converged if any did."""
     if not re.search(r"rmse|chatter|convergence_time$", spec.value):
         return None
-    assert spec.y is not None
-    kept = table[_reduce(part, [spec.y, spec.x], f"{spec.value.partition('.')[0]}.converged") >= 0.5].dropna()
-    kept = kept if len(kept) else table.dropna()
+    assert panel.converged is not None
+    kept = panel.table[panel.converged >= 0.5].dropna()
+    kept = kept if len(kept) else panel.table.dropna()
     if not len(kept):
         return None
     y, x = kept.idxmin()
     return float(x), float(y), float(kept[(y, x)])
-
-
-def _bound(part: pd.DataFrame, spec: FigureTable) -> float:
-    """The f_plus that conditions are drawn for: median of the true bounds of the panel's converged points."""
-    side = spec.x.split(".")[1]
-    converged = part[part[f"{side}.converged"].astype(bool)]
-    return float((converged if len(converged) else part)[f"{side}.f_plus"].median())
 
 
 def condition_curves(
@@ -408,37 +497,43 @@ def condition_curves(
 
 
 @style()
-def _lines(config: Config, frame: pd.DataFrame, spec: FigureTable) -> Drawn:
-    panels = _panels(config, frame, spec.facet)
+def _lines(config: Config, rows: Rows, spec: FigureTable) -> Drawn:
+    keys = [path for path in (spec.facet, spec.series, spec.x) if path is not None]
+    groups = Groups(rows, keys, [axis.path for axis in config.axes])
+    spread = groups.spread(_shown_column(spec.value))
+    found = groups.means({"middle": _shown_column(spec.value)})
+    if not is_boolean(spec.value):
+        found["middle"] = spread.quantiles[0]
+    found = found.assign(least=spread.least, largest=spread.largest).reset_index()
+    panels = [("", found)]
+    if spec.facet is not None:
+        panels = [(_with_value(config, spec.facet, value), part) for value, part in found.groupby(spec.facet, sort=True)]
     figure, axes = _grid_of_axes(config, spec, len(panels), (4.2, 3.4), _wrap(_value_label(spec.value)), single=(6.4, 4.2))
-    shown = _shown(frame, spec.value)
     sampled, band = spec.x in _sampled(config), ""
     for ax, (title, part) in zip(axes, panels, strict=True):
-        groups = [("", part)] if spec.series is None else list(part.groupby(spec.series, sort=True))
-        for i, (name, group) in enumerate(groups):
-            by_x = shown.loc[group.index].groupby(group[spec.x], sort=True)
-            middle = by_x.mean() if is_boolean(spec.value) else by_x.median()
-            colour = COLOURS[i % len(COLOURS)]
+        lines = [("", part)] if spec.series is None else list(part.groupby(spec.series, sort=True))
+        for i, (name, line) in enumerate(lines):
+            x, colour = line[spec.x], COLOURS[i % len(COLOURS)]
             label = None if spec.series is None else _text(name)
-            ax.plot(middle.index, middle, "o" if sampled else "o-", ms=3.5, color=colour, label=label)
-            if (by_x.size() > 1).any() and not is_boolean(spec.value):
+            ax.plot(x, line["middle"], "o" if sampled else "o-", ms=3.5, color=colour, label=label)
+            if (line["rows"] > 1).any() and not is_boolean(spec.value):
                 band = "; band: least to largest"
-                ax.fill_between(middle.index, by_x.min(), by_x.max(), color=colour, alpha=0.18, linewidth=0)
+                ax.fill_between(x, line["least"], line["largest"], color=colour, alpha=0.18, linewidth=0)
         xs = np.unique(part[spec.x].to_numpy(float))
-        log = _is_log(config, spec.x, xs)
+        log = is_log(config, spec.x, xs)
         if log:
             ax.set_xscale("log")
-        if isinstance(color_norm(shown.to_numpy(float), spec.scale), LogNorm):
+        if isinstance(color_norm(np.concatenate([spread.least, spread.largest]), spec.scale), LogNorm):
             ax.set_yscale("log")
         ax.set(xlim=cell_edges(xs, log)[[0, -1]], title=title)
     if spec.series is not None:
         axes[-1].legend(title=_label(config, spec.series))
-    caption = f"{_value_label(spec.value)} over {spec.x}{_where(config, spec)}{_over(config, frame, spec)}{band}."
+    caption = f"{_value_label(spec.value)} over {spec.x}{_where(config, spec)}{_over(config, groups.varied, spec)}{band}."
     return Drawn(_file_name(spec), figure, caption)
 
 
 @style()
-def _laws(config: Config, frame: pd.DataFrame, spec: FigureTable, laws: list[Law]) -> Drawn:
+def _laws(config: Config, spec: FigureTable, laws: list[Law]) -> Drawn:
     """Points of lines that theory gives a slope for, with the lines fitted."""
     facets = list(dict.fromkeys(None if spec.facet is None else law.where[spec.facet] for law in laws))
     figure, axes = _grid_of_axes(config, spec, len(facets), (4.2, 3.8), _wrap(_value_label(spec.value)), single=(7.2, 4.8))

@@ -4,18 +4,21 @@
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
 
 import json
+import math
+from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from jaxbl.files import write_atomic
 from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law, accuracy_laws
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.points import Points
-from jaxbl.sweeps.store import Store
 from jaxbl.sweeps.sweep import StudyResult
 
+from .aggregates import Distinct, Rows, spread
 from .figures import SIDES
 from .maps import draw
 from .page import PageTable, write_report
@@ -26,52 +29,82 @@ def write_sweep_report(result: StudyResult, folder: Path) -> list[str]:
 
     Returns the lines for the terminal.
     """
-    drawn = draw(result)
     laws = accuracy_laws(result)
+    drawn = draw(result, laws)
+    survey = _Survey(result)
     if laws:
         write_atomic(folder / "laws.json", json.dumps([law.to_dict() for law in laws], indent=2, ensure_ascii=False))
     else:
         (folder / "laws.json").unlink(missing_ok=True)
-    lead = [*headline(result), *_law_lines(laws)]
-    tables = [*([_law_table(laws)] if laws else []), _axes_table(result), _metric_table(result)]
+    lead = [*_headline(result, survey), *_law_lines(laws)]
+    tables = [*([_law_table(laws)] if laws else []), _axes_table(survey), _metric_table(result)]
     config = result.config
     write_report(folder, config.title or "Study", lead, drawn, tables, config.to_toml(), config.notes)
     return lead
 
 
+class _Survey:
+    """What the sentences and the table of axes say of a study, found in one reading.
+
+    Attributes:
+        runs: their number; `even` those on points that are always simulated; `diverged`.
+        converged: how many of the even ones converged, by side.
+        best: the converged run of the least velocity error, by side: that error, and the values of the axes.
+        values: all values of each axis.
+    """
+
+    def __init__(self, result: StudyResult):
+        paths = [axis.path for axis in result.config.axes]
+        self.sides = [side for side in SIDES if f"{side}.converged" in result.columns]
+        figures = [f"{side}.{name}" for side in self.sides for name in ("converged", "velocity_rmse")]
+        # a refined study has most of its runs at the boundary: a share of all runs would depend on the refinement
+        points = Points(result.config) if result.config.sweep.refine is not None else None
+        self.runs = self.even = self.diverged = 0
+        self.converged = dict.fromkeys(self.sides, 0)
+        self.best: dict[str, pd.Series] = {}
+        distinct = {path: Distinct() for path in paths}
+        for frame in result.batches([*paths, "seed", "finite", *figures]):
+            even = frame if points is None else frame[points.always_simulated(frame)]
+            self.runs += len(frame)
+            self.even += len(even)
+            self.diverged += int((~frame["finite"].astype(bool)).sum())
+            for path in paths:
+                distinct[path].add(frame[[path]])
+            for side in self.sides:
+                error = f"{side}.velocity_rmse"
+                self.converged[side] += int(even[f"{side}.converged"].sum())
+                good = frame[frame[f"{side}.converged"].astype(bool)]
+                if len(good) and (side not in self.best or good[error].min() < self.best[side][error]):
+                    self.best[side] = good.loc[good[error].idxmin(), [error, *paths]]
+        self.values = {path: one.frame()[path] for path, one in distinct.items()}
+
+
 def headline(result: StudyResult) -> list[str]:
     """What a study found, in sentences."""
-    sides = [side for side in SIDES if f"{side}.converged" in result.columns]
-    figures = [f"{side}.{name}" for side in sides for name in ("converged", "velocity_rmse")]
-    frame = result.read([*(axis.path for axis in result.config.axes), "seed", "finite", *figures])
-    # a refined study has most of its runs at the boundary: a share of all runs would depend on the refinement
+    return _headline(result, _Survey(result))
+
+
+def _headline(result: StudyResult, found: _Survey) -> list[str]:
     refined = result.config.sweep.refine is not None
-    points = Points(result.config) if refined else None
-    even = frame if points is None else frame[points.always_simulated(frame)]
-    shares = ", ".join(f"{100 * even[f'{side}.converged'].mean():.1f} % ({side})" for side in sides)
-    lines = [f"{len(frame)} runs. The observers converged in {shares} of them."]
-    if points is not None:
-        simulated = len(frame) // result.config.sweep.seeds
-        share = 100 * simulated / len(points)
+    even = found.even or math.nan
+    shares = ", ".join(f"{100 * found.converged[side] / even:.1f} % ({side})" for side in found.sides)
+    lines = [f"{found.runs} runs. The observers converged in {shares} of them."]
+    if refined:
+        points = len(Points(result.config))
+        simulated = found.runs // result.config.sweep.seeds
+        share = 100 * simulated / points
         lines = [
-            f"{simulated} of {len(points)} grid points simulated ({share:.2g} %), {len(frame)} runs. "
+            f"{simulated} of {points} grid points simulated ({share:.2g} %), {found.runs} runs. "
             f"The observers converged in {shares} of those on the coarse grid."
         ]
-    if isinstance(result.source, Store) and not result.is_finished(len(frame)):
+    if not result.is_finished(found.runs):
         more = " so far" if refined else ""
-        lines.append(
-            f"The study is not finished: it has {result.source.manifest['rows']} runs{more}. Go on with 'jaxbl sweep'."
-        )
-    diverged = int((~frame["finite"].astype(bool)).sum())
-    if diverged:
-        lines.append(f"{diverged} runs diverged: finite = false in the table, grey in the figures.")
-    for side in sides:
-        best = frame[frame[f"{side}.converged"].astype(bool)]
-        varied = [
-            a.path for a in result.config.axes if frame[a.path].nunique() > 1 and a.path.startswith(f"observer.{side}")
-        ]
-        if len(best) and varied:
-            row = best.loc[best[f"{side}.velocity_rmse"].idxmin()]
+        lines.append(f"The study is not finished: it has {result.runs} runs{more}. Go on with 'jaxbl sweep'.")
+    if found.diverged:
+        lines.append(f"{found.diverged} runs diverged: finite = false in the table, grey in the figures.")
+    for side, row in found.best.items():
+        varied = [path for path, values in found.values.items() if len(values) > 1 and path.startswith(f"observer.{side}")]
+        if varied:
             where = ", ".join(f"{path} = {row[path]:.3g}" for path in varied)
             lines.append(f"Least {side} velocity error {row[f'{side}.velocity_rmse']:.3g} rad/s rms, at {where}.")
     return lines
@@ -122,22 +155,29 @@ def _law_table(laws: list[Law]) -> PageTable:
     return PageTable("Accuracy laws", columns, rows)
 
 
-def _axes_table(result: StudyResult) -> PageTable:
+def _axes_table(found: _Survey) -> PageTable:
     rows = []
-    for axis in result.config.axes:
-        column = result.read([axis.path])[axis.path]
-        ends = ["–", "–"] if not pd.api.types.is_numeric_dtype(column) else [column.min(), column.max()]
-        rows.append([axis.path, int(column.nunique()), *ends])
+    for path, values in found.values.items():
+        ends = ["–", "–"] if not pd.api.types.is_numeric_dtype(values) else [values.min(), values.max()]
+        rows.append([path, len(values), *ends])
     return PageTable("Axes", ["path", "values", "least", "largest"], rows)
 
 
 def _metric_table(result: StudyResult) -> PageTable:
-    rows = []
-    for side, (name, about) in product(SIDES, SIDE_METRICS.items()):
-        column = f"{side}.{name}"
-        if column in result.columns:
-            values = result.read([column])[column].astype(float)
-            values = values[values.abs() < float("inf")]
-            quantiles = [values.quantile(q) if len(values) else None for q in (0.05, 0.5, 0.95)]
-            rows.append([column, *quantiles, about.unit, about.doc])
-    return PageTable("Metrics over all runs", ["metric", "5 %", "median", "95 %", "unit", "meaning"], rows)
+    about = {f"{side}.{name}": metric for side, (name, metric) in product(SIDES, SIDE_METRICS.items())}
+    shown = [column for column in about if column in result.columns]
+    rows = Rows(result, shown)
+
+    def numbers() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for frame in rows:
+            for i, column in enumerate(shown):
+                values = frame[column].to_numpy(float)
+                values = values[np.isfinite(values)]
+                yield np.full(len(values), i), values
+
+    quantiles = spread(numbers, len(shown), (0.05, 0.5, 0.95)).quantiles.T
+    table = [
+        [column, *(None if np.isnan(q) else q for q in row), about[column].unit, about[column].doc]
+        for column, row in zip(shown, quantiles, strict=True)
+    ]
+    return PageTable("Metrics over all runs", ["metric", "5 %", "median", "95 %", "unit", "meaning"], table)

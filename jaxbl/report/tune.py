@@ -18,7 +18,7 @@ from jaxbl.gains.tune_summary import called_gains
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
-from .figures import COLOURS, MAP, MARKERS, MISSING, SIDES, Drawn, mark, style, subplots, with_unit
+from .figures import COLOURS, MAP, MARKERS, MISSING, SIDES, Drawn, literal, mark, style, subplots, with_unit
 from .maps import cell_edges, color_norm, condition_curves, hatch_failures
 from .page import PageTable, write_report
 
@@ -40,7 +40,7 @@ def _label(tuning: Tuning) -> str:
 def _others(tuning: Tuning, side: str) -> list[tuple[str, str, dict[str, Any]]]:
     """Name, marker and figures on the study's own excitation of the gains that the tuned ones are compared with."""
     rows = [row for row in tuning.summary["named"] if row["side"] == side and row["name"] != "tuned"]
-    return [(row["name"], MARKERS[i % len(MARKERS)], row) for i, row in enumerate(rows)]
+    return [(literal(row["name"]), MARKERS[i % len(MARKERS)], row) for i, row in enumerate(rows)]
 
 
 def _map(tuning: Tuning, side: str) -> Drawn:
@@ -122,7 +122,7 @@ def _comparison(tuning: Tuning, sides: list[str]) -> Drawn:
     for ax, ((key, label), side) in zip(axes, product(compared, sides), strict=True):
         _bars(ax, key, [row for row in rows if row["side"] == side])
         ax.set(xlabel=label, title=side if key == metric else "")
-    axes[0].set_yticks(range(len(names)), names)
+    axes[0].set_yticks(range(len(names)), [literal(name) for name in names])
     axes[0].invert_yaxis()
     first, last = tuning.summary["holdout"]["seeds"]
     seeds = f"seeds {first} to {last}" if last > first else f"seed {first}"

@@ -20,7 +20,7 @@ from jaxbl.gains.error_system import conditions_of
 from jaxbl.gains.verify import Verdict, judged_sides
 from jaxbl.observer.conditions import CONDITIONS
 
-from .figures import COLOURS, MAP, MISSING, Drawn, mark, style, subplots
+from .figures import COLOURS, MAP, MISSING, Drawn, literal, mark, style, subplots
 from .maps import condition_curves
 from .page import PageTable, write_report
 
@@ -41,7 +41,7 @@ def draw_verdict(verdict: Verdict) -> list[Drawn]:
 def _marks(ax: Axes, verdict: Verdict, colour: str = "white") -> list[Line2D]:
     """Mark the usual pair and the study's marks. Returns the legend's handles."""
     marks = [one for one in verdict.summary["marks"] if one["alpha_ratio"] is not None]
-    places = [_USUAL, *((one["name"], one["alpha_ratio"], one["lambda_ratio"]) for one in marks)]
+    places = [_USUAL, *((literal(one["name"]), one["alpha_ratio"], one["lambda_ratio"]) for one in marks)]
     return [
         mark(ax, place, marker, name, 12, colour)
         for (name, *place), marker in zip(places, itertools.cycle(_MARKERS), strict=False)

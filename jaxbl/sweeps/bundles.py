@@ -7,7 +7,7 @@ import functools
 import math
 import socket
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -63,24 +63,26 @@ class ClusterRun(Run):
     def __init__(self, cluster: Cluster, engine: Engine, store: Store, progress: Progress | None):
         super().__init__(engine, store, progress)
         self._cluster = cluster
-        self._looked = time.monotonic()
+        self._next_look = time.monotonic() + _LOOK
 
     def ensure(self, chunks: Iterable[Chunk]) -> None:
-        missing = []
+        missing: list[int | Chunk] = []
         for chunk in chunks:
             if self.is_there(chunk):
                 self.count(chunk)
             else:
-                missing.append(chunk)
+                # the points of all chunks would be 8 GB in a study of 10^9
+                missing.append(chunk.index if self.engine.points.refinement is None else chunk)
         # one chunk a worker says how long one takes
         first, before = self._cluster.workers, self.work.run_seconds
         self._wave(missing[:first], 1)
         rest = missing[first:]
         self._wave(rest, _size((self.work.run_seconds - before) / first, len(rest), self._cluster.workers))
 
-    def _wave(self, chunks: list[Chunk], size: int) -> None:
+    def _wave(self, chunks: Sequence[int | Chunk], size: int) -> None:
         for part, done in self._cluster.done(compute, _bundles(self.engine, self.kept, chunks, size), self._look):
-            for chunk in part:
+            for one in part:
+                chunk = self.engine.chunk(one) if isinstance(one, int) else one
                 _wait_for(self.kept.part(chunk.index), done.host)
                 self.count(chunk)
             self.kept.note(done.checksums)
@@ -88,15 +90,17 @@ class ClusterRun(Run):
 
     def _look(self) -> None:
         """Tell progress by the parts that exist: bundles take long."""
-        if time.monotonic() - self._looked > _LOOK:
-            self._looked = time.monotonic()
+        if time.monotonic() > self._next_look:
+            start = time.monotonic()
             self.tell(len(self.kept.existing()))
+            # a list of 300 000 files takes seconds
+            self._next_look = time.monotonic() + max(_LOOK, 10.0 * (time.monotonic() - start))
 
 
 def hand_over(cluster: Cluster, engine: Engine, store: Store) -> None:
     """Have all chunks of a study computed that are missing, without waiting for more than the first. Raises as
     :class:`ClusterRun`."""
-    missing = [chunk for chunk in map(engine.chunk, engine.order()) if not store.has(chunk.index)]
+    missing = [index for index in engine.order() if not store.has(index)]
     seconds = 0.0
     for _, done in cluster.done(compute, _bundles(engine, store, missing[:1], 1)):
         seconds = done.work.run_seconds
@@ -111,13 +115,15 @@ def _size(seconds: float, chunks: int, workers: int) -> int:
     return max(min(by_time, math.ceil(chunks / (workers * _TURNS))), math.ceil(chunks / _MOST), 1)
 
 
-def _bundles(engine: Engine, store: Store, chunks: Sequence[Chunk], size: int) -> list[tuple[list[Chunk], Bundle]]:
+def _bundles(
+    engine: Engine, store: Store, chunks: Sequence[int | Chunk], size: int
+) -> Iterator[tuple[Sequence[int | Chunk], Bundle]]:
     """Chunks, `size` of them at once, with what a worker needs to know."""
-    refined = engine.points.refinement is not None
     folder = store.folder if is_remote(store.folder) else store.folder.absolute()
     about = str(folder), store.manifest["identity"], store.layout, store.backend, engine.insist
-    parts = [list(chunks[first : first + size]) for first in range(0, len(chunks), size)]
-    return [(part, Bundle(*about, tuple(part if refined else [chunk.index for chunk in part]))) for part in parts]
+    for first in range(0, len(chunks), size):
+        part = chunks[first : first + size]
+        yield part, Bundle(*about, tuple(part))
 
 
 def _wait_for(part: Path, host: str) -> None:

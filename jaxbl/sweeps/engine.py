@@ -7,6 +7,7 @@ that what depends on neither (the excitation, the plant in a gain map) is comput
 import dataclasses
 import functools
 import math
+import statistics
 import time
 from collections import OrderedDict
 from typing import Any, NamedTuple
@@ -17,15 +18,10 @@ import pandas as pd
 
 from jaxbl.config import Config, precision, prepare
 
-from .metrics import metric_columns, with_conditions
+from .costs import Work, costs, faster, lanes_at_once, work_of
+from .metrics import compile_conditions, metric_columns, with_conditions
 from .points import Points
-from .programs import Backend, Layout, Program, backend_of, compile_program, faster
-
-LANES_PER_DEVICE: dict[Backend, int] = {"scan": 4096, "fused": 16384}
-"""Default lanes a device computes at once: the scan's carry then stays in a core's cache, and what lanes of the fused loop
-share counts little (benchmarks/NOTES.md)."""
-_LANES_ON_A_GPU = 2**18
-"""The same there, by either backend: some 2000 lanes for each of its processors, which is what keeps all of it busy."""
+from .programs import BACKENDS, Backend, Layout, Program, backend_of, compile_program, not_put_into_cache
 
 
 class Chunk(NamedTuple):
@@ -39,18 +35,20 @@ class Chunk(NamedTuple):
 
 
 _REFINED_LANES_PER_DEVICE = 1024
-"""The same in a refined study: its batches are small, and fill larger chunks badly (benchmarks/NOTES.md)."""
+"""Lanes that a device computes at once in a refined study: its batches are small, and fill larger chunks badly
+(benchmarks/NOTES.md)."""
 
 
-def layout_for(config: Config, points: Points, devices: list[Any], backend: Backend, chunk: int | None) -> Layout:
-    """Chunk shape: as many lanes as asked for, or as the devices want at once; whole rows of points before several seeds.
+def layout_for(config: Config, points: Points, count: int, capacity: int) -> Layout:
+    """Chunk shape of at most so many lanes for so many devices: whole rows of points before several seeds.
 
     Every device gets two lanes or more: one alone is compiled to other roundings than a row of them.
     """
-    count = len(devices)
     if points.refinement is not None:
-        return _refined_layout(config, count, chunk)
-    capacity = chunk or count * (_LANES_ON_A_GPU if devices[0].platform == "gpu" else LANES_PER_DEVICE[backend])
+        # several seeds before whole rows of points: a batch has few points, and needs all seeds of them; as many seeds as
+        # leave every device 64 points of a chunk
+        seeds = min(config.sweep.seeds, max(capacity // (64 * count), 1))
+        return Layout(seeds, max(math.ceil(capacity / seeds / count), 2) * count)
     # chunks of equal size waste no padding on the last one; a multiple of the devices, along the longer side, suits them
     per_chunk = math.ceil(points.lanes / math.ceil(points.lanes / capacity))
     if points.lanes >= count and points.lanes > 1:
@@ -63,16 +61,12 @@ def layout_for(config: Config, points: Points, devices: list[Any], backend: Back
     return Layout(seeds, per_chunk)
 
 
-def _refined_layout(config: Config, devices: int, chunk: int | None) -> Layout:
-    """Several seeds before whole rows of points: a batch has few points, and needs all seeds of them."""
-    capacity = chunk or _REFINED_LANES_PER_DEVICE * devices
-    # as many seeds as leave every device 64 points of a chunk
-    seeds = min(config.sweep.seeds, max(capacity // (64 * devices), 1))
-    return Layout(seeds, max(math.ceil(capacity / seeds / devices), 2) * devices)
-
-
 _PROGRAMS = 16
 """Compiled programs that are kept, one a group."""
+_TRIED_SAMPLES, _TRIED_SECONDS = 2000, 0.3
+"""Of the short runs that an estimate is made from, at least."""
+_COUNTED_GROUPS = 24
+"""Groups whose steps an estimate counts, at most."""
 
 
 def _coarse_first(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -115,18 +109,35 @@ class Engine:
         self.devices = devices or jax.local_devices()
         self.backend: Backend = backend_of(backend) or self._faster()
         self.insist = insist
-        self.layout = layout or layout_for(config, self.points, self.devices, self.backend, config.sweep.chunk)
+        self.layout = layout or self._layout(self.backend, config.sweep.chunk)
         self.compile_seconds = 0.0
         self.run_seconds = 0.0
         self.scanned: list[str] = []
         self._compiled: OrderedDict[int, tuple[Program, list[str]]] = OrderedDict()
+        self._judging: set[str] = set()
 
     def _faster(self) -> Backend:
         """By the study, however it is cut: roundings differ between backends."""
         if not self.points.columns(np.arange(1)):
             # lanes that differ in nothing but their seed
             return "scan"
-        return faster(layout_for(self.config, self.points, self.devices, "fused", None), self.devices)
+        layouts = {backend: self._layout(backend, None) for backend in BACKENDS}
+        steps = sum(group.config.run.steps for group in self.points.groups)
+        samples = {b: steps * self._chunks(layout, self.points.coarse_lanes) for b, layout in layouts.items()}
+        return faster(self.devices, self._work, layouts, samples, len(self.points.groups))
+
+    def _layout(self, backend: Backend, chunk: int | None) -> Layout:
+        """Chunk shape: as many lanes as asked for, or as the devices want at once."""
+        if chunk is None and self.points.refinement is not None:
+            chunk = _REFINED_LANES_PER_DEVICE * len(self.devices)
+        capacity = chunk or len(self.devices) * lanes_at_once(self.devices, backend, self._work)
+        return layout_for(self.config, self.points, len(self.devices), capacity)
+
+    @functools.cached_property
+    def _work(self) -> Work:
+        """Of a sample, in the group that has most of them."""
+        group = max(self.points.groups, key=lambda group: group.config.run.steps)
+        return work_of(group.config, list(self.points.columns(np.arange(1))))
 
     def __len__(self) -> int:
         """Number of chunks; of a refined study, those of its coarse grid."""
@@ -134,7 +145,10 @@ class Engine:
 
     def chunks_for(self, points: int) -> int:
         """Number of chunks that some points of a group take."""
-        return math.ceil(self.config.sweep.seeds / self.layout.seeds) * math.ceil(points / self.layout.points)
+        return self._chunks(self.layout, points)
+
+    def _chunks(self, layout: Layout, points: int) -> int:
+        return math.ceil(self.config.sweep.seeds / layout.seeds) * math.ceil(points / layout.points)
 
     def chunk(self, index: int) -> Chunk:
         """A chunk by its index; of a refined study, one of its coarse grid."""
@@ -192,7 +206,12 @@ class Engine:
         with precision(group.config):
             given = self._arguments(group.config, self.points.columns(chunk.points), chunk.seeds)
             start = time.perf_counter()
-            figures = jax.block_until_ready(with_conditions(*program.run(*given)))
+            found = jax.block_until_ready(program.run(*given))
+            self.run_seconds += time.perf_counter() - start
+            # only now, as the first lanes need not wait for them
+            self._compile_conditions(group.config.run.precision)
+            start = time.perf_counter()
+            figures = with_conditions(*found)
             self.run_seconds += time.perf_counter() - start
         data = self.labels(chunk)
         for name in names:
@@ -243,38 +262,65 @@ class Engine:
                 self.scanned.append(program.instead)
             return program, metric_columns(experiment)
 
+    def _compile_conditions(self, dtype: str) -> None:
+        if dtype not in self._judging:
+            self._judging.add(dtype)
+            start = time.perf_counter()
+            compile_conditions(dtype)
+            self.compile_seconds += time.perf_counter() - start
+
     def estimate(self) -> "SweepEstimate":
-        """Memory and time of all chunks, from a compilation and a short run at the same chunk shape."""
-        config = self.points.groups[0].config
-        # long enough for what a run costs once not to count
-        short = min(config.run.steps, 2000)
+        """Memory and time of all chunks, from a compilation and short runs of a chunk of the group that has most samples."""
+        groups = self.points.groups
+        group = max(range(len(groups)), key=lambda index: groups[index].config.run.steps)
+        config, chunk = groups[group].config, self.chunk(group * (len(self) // len(groups)))
+        with not_put_into_cache():
+            program, _ = self._compile(config)
+            a_program = self.compile_seconds
+            with precision(config):
+                self._compile_conditions(config.run.precision)
+        compiling = a_program * len(groups) + self.compile_seconds - a_program
+        backend: Backend = "scan" if program.instead is not None else self.backend
+        # long enough for what a call costs not to count
+        expected = self._seconds(backend, config) / config.run.steps
+        steps = min(config.run.steps, max(_TRIED_SAMPLES, int(_TRIED_SECONDS / expected)))
         brief = config.model_copy(
-            update={"run": config.run.model_copy(update={"duration": short * config.run.sample_period})}
+            update={"run": config.run.model_copy(update={"duration": steps * config.run.sample_period})}
         )
+        tried, _ = self._compile(brief)
+        running, judging = [], []
         with precision(config):
-            program, _ = self._compile(brief)
-            compiling = self.compile_seconds
-            given = self._arguments(brief, self.points.columns(np.arange(1)), np.arange(1))
-            seconds = []
+            given = self._arguments(brief, self.points.columns(chunk.points), chunk.seeds)
             for _ in range(3):
-                start = time.perf_counter()
-                jax.block_until_ready(program.run(*given))
-                seconds.append(time.perf_counter() - start)
-        lane_steps = short * math.prod(self.layout)
-        steps = [group.config.run.steps for group in self.points.groups]
-        chunks_a_group = len(self) // len(steps)
+                begun = time.perf_counter()
+                found = jax.block_until_ready(tried.run(*given))
+                ended = time.perf_counter()
+                with_conditions(*found)
+                running.append(ended - begun)
+                judging.append(time.perf_counter() - ended)
+        # other groups take other numbers of plant steps, say; where there are many, some stand for all
+        counted = groups[:: math.ceil(len(groups) / _COUNTED_GROUPS)]
+        all_groups = sum(self._seconds(backend, one.config) for one in counted) * len(groups) / len(counted)
+        a_chunk = statistics.median(running) / steps * config.run.steps * all_groups / self._seconds(backend, config)
+        chunks, lanes = len(self) // len(groups), math.prod(self.layout)
+        run_seconds = chunks * (a_chunk + statistics.median(judging) * len(groups))
         return SweepEstimate(
-            points=len(self.points.groups) * self.points.coarse_lanes,
+            points=len(groups) * self.points.coarse_lanes,
             rows=self.rows,
             most_points=len(self.points),
             chunks=len(self),
-            lanes_a_chunk=math.prod(self.layout),
-            compile_seconds=compiling * len(steps),
-            run_seconds=min(seconds) / short * sum(steps) * chunks_a_group,
-            lane_steps_per_second=lane_steps / min(seconds),
+            lanes_a_chunk=lanes,
+            compile_seconds=compiling,
+            run_seconds=run_seconds,
+            lane_steps_per_second=chunks * lanes * sum(one.config.run.steps for one in groups) / run_seconds,
             megabytes=program.megabytes,
-            backend="scan" if program.instead is not None else self.backend,
+            backend=backend,
         )
+
+    def _seconds(self, backend: Backend, config: Config) -> float:
+        """That a chunk of a group should take."""
+        work = work_of(config, list(self.points.columns(np.arange(1))))
+        return costs(self.devices).sample(backend, work, self.layout) * config.run.steps
 
 
 @dataclasses.dataclass(frozen=True)
@@ -287,7 +333,7 @@ class SweepEstimate:
         most_points: points of the study; of a refined one, those of its fine grid.
         chunks: chunks for `rows`, of `lanes_a_chunk` lanes each.
         compile_seconds: time of all compilations; `run_seconds`, of all chunks.
-        lane_steps_per_second: measured rate, with `backend`.
+        lane_steps_per_second: rate over all chunks, with `backend`.
         megabytes: memory of a chunk, MB.
     """
 

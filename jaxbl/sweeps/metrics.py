@@ -34,6 +34,8 @@ class Metric(abc.ABC):
     label: ClassVar[str]
     """Short name for axes of figures; what it means is in `doc`."""
     doc: ClassVar[str]
+    better: ClassVar[str] = ""
+    """Which is better of two values: `less` or `more`, or neither."""
 
     @classmethod
     def of(cls, name: str, unit: str, label: str, doc: str, **rest: Any) -> type[Self]:
@@ -170,6 +172,8 @@ class Peak(SignalMetric):
 class IdentificationError(RunMetric):
     """Relative error of an identified parameter that the law reports (`AbstractTransmission.errors`)."""
 
+    better = "less"
+
     def applies(self, experiment):
         return experiment.identifier is not None and self.name in getattr(experiment.transmission, "errors", ())
 
@@ -185,6 +189,7 @@ class Converged(RunMetric):
     name = "converged"
     label = "converged"
     doc = "position and velocity errors stay within tolerance over the last quarter"
+    better = "more"
     carry = "last_outside"
 
     def init(self, zero):
@@ -204,6 +209,7 @@ class ConvergenceTime(Converged):
     unit = "s"
     label = "convergence time"
     doc = "time from which both errors stay within tolerance; NaN where not converged"
+    better = "less"
 
     def result(self, carry, end):
         entered = jnp.where(carry < 0.0, 0.0, carry + end.experiment.run.sample_period)
@@ -217,6 +223,7 @@ class Chatter(RunMetric):
     unit = "rad/s"
     label = "chatter of the velocity"
     doc = "rms sample-to-sample change of the velocity error, divided by √2"
+    better = "less"
 
     def init(self, zero):
         return zero, zero
@@ -271,11 +278,14 @@ for _metric in (
         "longest convergence time that a disturbance within f_plus can cause; inf where ρ ≥ 1",
         judge=_time(conditions.convergence_time_worst),
     ),
-    Rms.of("position_rmse", "rad", "position error, rms", "rms position error", signal=lambda _, at: at.position_error),
-    Rms.of("velocity_rmse", "rad/s", "velocity error, rms", "rms velocity error", signal=lambda _, at: at.velocity_error),
+    Rms.of("position_rmse", "rad", "position error, rms", "rms position error", better="less",
+           signal=lambda _, at: at.position_error),
+    Rms.of("velocity_rmse", "rad/s", "velocity error, rms", "rms velocity error", better="less",
+           signal=lambda _, at: at.velocity_error),
     Rms.of(
         "torque_rmse", "N m", "torque error, rms",
         "rms error of the transmitted torque from this side's equivalent control",
+        better="less",
         signal=lambda _, at: at.torque_error,
     ),
     Rms.of(
@@ -422,14 +432,26 @@ def with_conditions(figures: Mapping[str, Any], gains: dict[str, ObserverGains])
     """
     found = {name: np.asarray(value) for name, value in figures.items()}
     f_plus = np.stack([found[f"{side}.f_plus"] for side in gains])
-    columns = [
-        np.stack([np.broadcast_to(np.asarray(x, f_plus.dtype), f_plus.shape[1:]) for x in given])
-        for given in zip(*gains.values(), strict=True)
-    ]
-    judged = in_pieces(_judged, [one.ravel() for one in (*columns, f_plus)])
-    for name, value in judged.items():
-        found |= {f"{side}.{name}": one for side, one in zip(gains, value.reshape(f_plus.shape), strict=True)}
+    columns = [[np.asarray(x, f_plus.dtype) for x in given] for given in zip(*gains.values(), strict=True)]
+    for side, *given in zip(gains, *columns, f_plus, strict=True):
+        # gains and f_plus of all seeds and points, and which of those that differ each is
+        rows = np.stack([np.broadcast_to(one, f_plus.shape[1:]).ravel() for one in given], axis=1)
+        different, which = _different(rows)
+        judged = in_pieces(_judged, list(different.T))
+        found |= {f"{side}.{name}": value[which].reshape(f_plus.shape[1:]) for name, value in judged.items()}
     return found
+
+
+def _different(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows that differ in a bit, and the place among them of each: lanes share what their axes leave alone."""
+    whole = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.shape[1] * rows.itemsize)))[:, 0]
+    _, first, which = np.unique(whole, return_index=True, return_inverse=True)
+    return rows[first], which
+
+
+def compile_conditions(dtype: str) -> None:
+    """Compile what :func:`with_conditions` computes, once for all studies of a precision."""
+    in_pieces(_judged, [np.ones(1, dtype)] * (len(ObserverGains._fields) + 1))
 
 
 @jax.jit
@@ -440,13 +462,18 @@ def _judged(lambda_: Array, alpha: Array, position_error: Array, velocity_error:
     return {name: jnp.where(jnp.isnan(f_plus), jnp.nan, value) for name, value in out.items()}
 
 
-_FINITE = Metric.of("finite", "", "finite", "no number of the lane overflowed")
+_FINITE = Metric.of("finite", "", "finite", "no number of the lane overflowed", better="more")
 """The one column that is not of a side."""
 
 
 def metric_of(column: str) -> type[Metric]:
     """The metric of a column such as `motor.velocity_rmse`."""
     return _FINITE if column == "finite" else SIDE_METRICS[column.partition(".")[2]]
+
+
+def is_magnitude(column: str) -> bool:
+    """Whether a metric counts by its size: a median or mean of signed relative errors must not cancel them."""
+    return column.endswith("_error")
 
 
 def metric_columns(experiment: Experiment) -> list[str]:

@@ -53,7 +53,8 @@ def write(path: Path, frame: pd.DataFrame, mark: Mark) -> None:
     table = pa.Table.from_pandas(frame, preserve_index=False)
     table = table.replace_schema_metadata({**(table.schema.metadata or {}), _KEY: text, _SUM: checksum(text).encode()})
     with written(path) as draft:
-        pq.write_table(table, draft, write_page_checksum=True)
+        # dictionaries of values that hardly repeat would take most of the time
+        pq.write_table(table, draft, write_page_checksum=True, use_dictionary=False)
 
 
 def mark_of(path: Path) -> Mark:

@@ -1,4 +1,4 @@
-"""Elementwise functions of columns of any length by programs of few shapes, as compiling takes longer than computing."""
+"""Elementwise functions of columns of any length by a program of one shape, as compiling takes longer than computing."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -8,20 +8,19 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-_SIZES = 1024, 8192
-"""Of the pieces: one of the first by one device where that is enough, else one of the second by each device at a time."""
+_SIZE = 1024
+"""Of the pieces; each device has one at a time."""
 
 
 def in_pieces(function: Callable[..., Any], columns: Sequence[np.ndarray], devices: Sequence[Any] | None = None) -> Any:
     """Apply an elementwise function to columns `(n,)`, piece by piece, on some devices (all local ones if left out).
 
-    The function takes arrays of one shape and gives any pytree of such; wrap it in `jax.jit`: all pieces have one of two
-    shapes. The result has NumPy arrays `(n,)` in their place.
+    The function takes arrays of one shape and gives any pytree of such; wrap it in `jax.jit`: all pieces have one
+    shape. The result has NumPy arrays `(n,)` in their place.
     """
     count = len(columns[0])
     devices = list(jax.local_devices() if devices is None else devices)
-    size, devices = (_SIZES[0], devices[:1]) if count <= _SIZES[0] else (_SIZES[1], devices)
-    shape = max(-(-count // (size * len(devices))), 1), len(devices), size
+    shape = max(-(-count // (_SIZE * len(devices))), 1), len(devices), _SIZE
     padded = [np.pad(np.asarray(one), (0, math.prod(shape) - count), "edge").reshape(shape) for one in columns]
     # a row for each device: one program for all of them
     rows = NamedSharding(Mesh(np.array(devices), ("devices",)), PartitionSpec("devices"))

@@ -1,6 +1,8 @@
 """Compiled programs for the chunks of a study: the scan by XLA, or the fused loop."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import jax
@@ -46,26 +48,17 @@ class Program(NamedTuple):
     instead: str | None = None
 
 
-_FUSED, _SCAN = (0.5, 0.9e-3), (1.5, 3.1e-3)
-"""Microseconds that a sample costs, and each of its lanes, on one core (benchmarks/NOTES.md)."""
-
-_GPU_SEEDS = 8
-"""Seeds a chunk up to which a GPU gets the fused loop: some 1 us a sample each, where a step of the scan takes 8 (published
-for a scan by XLA; not measured here)."""
-
-
-def faster(layout: Layout, devices: list[Any]) -> Backend:
-    """The backend that takes less time for a chunk.
-
-    The fused loop runs seed after seed, and pays for each what its lanes share; the scan has all lanes side by side. On a
-    GPU the scan starts several kernels a time step, and waits for them.
-    """
-    if devices[0].platform == "gpu" and len(devices) == 1:
-        return "fused" if layout.seeds <= _GPU_SEEDS else "scan"
-    if devices[0].platform != "cpu":
-        return "scan"
-    fused = layout.seeds * (_FUSED[0] + _FUSED[1] * layout.points)
-    return "fused" if fused < _SCAN[0] + _SCAN[1] * layout.seeds * layout.points else "scan"
+@contextmanager
+def not_put_into_cache() -> Iterator[None]:
+    """What is compiled inside is not put into JAX's cache of programs, and taken from it if it is there: compiling takes as
+    long as it would without."""
+    least = "jax_persistent_cache_min_compile_time_secs"
+    before = jax.config.values[least]
+    jax.config.update(least, math.inf)
+    try:
+        yield
+    finally:
+        jax.config.update(least, before)
 
 
 def compile_program(
@@ -108,6 +101,10 @@ def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tu
             passage = DevicePassage(experiment, (METRICS,), paths, layout.points)
     else:
         raise Unsupported(f"{len(devices)} devices of platform {devices[0].platform}")
+
+    with jax.default_device(devices[0]):
+        # what draws the noise is compiled at its first use
+        next(passage.stretches(0))
 
     def run(values: dict[str, np.ndarray], seeds: np.ndarray) -> tuple[dict[str, Any], dict[str, ObserverGains]]:
         with jax.default_device(devices[0]):

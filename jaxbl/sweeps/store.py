@@ -4,14 +4,17 @@ import hashlib
 import json
 import os
 import platform
+import shutil
+import tempfile
 import time
 import tomllib
+import weakref
 from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pandas as pd
@@ -20,6 +23,8 @@ from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import (
     LOG_RESULTS,
+    Busy,
+    begin_file,
     has_file,
     is_empty,
     is_remote,
@@ -27,6 +32,7 @@ from jaxbl.files import (
     listed,
     log_named_in,
     make_folder,
+    move,
     read_json,
     remove,
     remove_drafts,
@@ -36,6 +42,9 @@ from jaxbl.files import (
 from . import parts
 from .parts import Damaged, Mark
 from .programs import Backend, Layout
+
+if TYPE_CHECKING:
+    from pyarrow.dataset import Dataset
 
 FORMAT = 3
 """Of the manifest: raised where older versions could not read it."""
@@ -49,7 +58,8 @@ _COMMANDS = {
 }
 _COMMON = "figures", "report.html"
 _SAVED = 10.0
-"""Seconds from one time that the manifest is written to the next while chunks are computed: parts know what they are."""
+"""Seconds at least from one time that the manifest is written to the next while chunks are computed: parts know what they
+are."""
 
 
 def identity(config: Config, command: str = "sweep") -> str:
@@ -92,12 +102,16 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
         InputError: the folder holds another study or other files, or cannot be written to.
     """
     make_folder(folder)
-    found = {}
+    found, unsure = {}, False
     for other, (marker, _, _) in _COMMANDS.items():
         if (folder / marker).exists():
             try:
                 found[other] = read_json(folder / marker)
             except InputError:
+                if other == command != "sweep" and not overwrite:
+                    # its stages are studies, which say whose they are (:class:`jaxbl.gains.stages.Stages`)
+                    unsure = True
+                    continue
                 mark = _first_mark(folder) if other == "sweep" else None
                 if mark is None and not overwrite:
                     raise
@@ -110,7 +124,7 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
     same = [data.get("single_run") == identity(config, "simulate") for data in found.values()]
     if command != "simulate" and command in found:
         same.append(found[command].get("identity") == identity(config, command))
-    if all(same) and (found or is_empty(folder)):
+    if all(same) and (found or unsure or is_empty(folder)):
         if alone:
             remove_drafts(folder)
         return
@@ -147,6 +161,17 @@ def _first_mark(folder: Path) -> Mark | None:
     return None
 
 
+@contextmanager
+def _refusing(part: Path) -> Iterator[None]:
+    """Around what reads a part: one line where it is damaged."""
+    try:
+        yield
+    except Damaged as why:
+        raise InputError(
+            f"{part}: is damaged ({why}); run 'jaxbl sweep' again, which keeps it aside and computes it anew"
+        ) from None
+
+
 class Store:
     """The folder of one study.
 
@@ -162,15 +187,15 @@ class Store:
         self.keeps_manifest = keeps_manifest
         self.manifest = manifest
         self.damaged: list[str] = []
-        self._copies: TemporaryDirectory[str] | None = None
-        self._saved = 0.0
+        self._copies: Path | None = None
+        self._saved, self._pause = 0.0, _SAVED
 
     @classmethod
     def create(cls, folder: Path, config: Config, layout: Layout, backend: Backend, chunks: int, rows: int) -> "Store":
         """Open a folder that this study may have (:func:`claim`), or take up the one that is there; a manifest that is lost
         or damaged is written anew by what the parts say."""
-        store = None
-        if (folder / "manifest.json").exists():
+        store, there = None, (folder / "manifest.json").exists()
+        if there:
             try:
                 store = cls.open(folder)
             except InputError:
@@ -192,7 +217,10 @@ class Store:
             }
             store = cls(folder, manifest)
         # the manifest first: it is what makes the folder this study's
-        store.update()
+        if there:
+            store.update()
+        elif not begin_file(folder / "manifest.json", json_text(store.manifest)):
+            raise Busy(f"{folder}: another process began a study there just now; run the same command again")
         if not is_remote(folder):
             (folder / "points").mkdir(exist_ok=True)
         write_atomic(folder / "study.toml", config.to_toml())
@@ -232,8 +260,11 @@ class Store:
     def update(self, **values: Any) -> None:
         """Set entries of the manifest."""
         self.manifest |= values
+        begun = time.monotonic()
         write_atomic(self.folder / "manifest.json", json_text(self.manifest))
         self._saved = time.monotonic()
+        # of very many parts it is long
+        self._pause = max(_SAVED, 100.0 * (self._saved - begun))
 
     def part(self, index: int) -> Path:
         return self.folder / "points" / f"part-{index:05d}.parquet"
@@ -248,18 +279,22 @@ class Store:
         if not path.exists():
             return False
         try:
-            known = self.manifest["checksums"].get(str(index))
-            if known is not None:
-                if parts.file_checksum(path) != known:
-                    raise Damaged("does not agree with its checksum in manifest.json")
-                return True
-            mark, _ = parts.read(path)
-            self._check(path, mark, index)
+            self._check_file(path, index)
         except Damaged as why:
             self._put_aside(path, str(why))
             return False
-        self.manifest["checksums"][str(index)] = parts.file_checksum(path)
         return True
+
+    def _check_file(self, path: Path, index: int) -> None:
+        """Whether a part's file is what was written, by the manifest or else by itself. Raises `Damaged`, or `InputError`
+        where it is of another study."""
+        known = self.manifest["checksums"].get(str(index))
+        if known is None:
+            mark, _ = parts.read(path)
+            self._check(path, mark, index)
+            self.manifest["checksums"][str(index)] = parts.file_checksum(path)
+        elif parts.file_checksum(path) != known:
+            raise Damaged("does not agree with its checksum in manifest.json")
 
     def _check(self, path: Path, mark: Mark, index: int) -> None:
         """Whether a whole part is the one that belongs here."""
@@ -278,7 +313,7 @@ class Store:
             folder.mkdir(exist_ok=True)
         names = (path.name if i == 0 else f"{path.name}.{i}" for i in count())
         target = next(folder / name for name in names if not (folder / name).exists())
-        path.replace(target)
+        move(path, target)
         self.damaged.append(f"{path.relative_to(self.folder)} {why}; it is kept as {target.relative_to(self.folder)}")
 
     def write(self, index: int, frame: pd.DataFrame) -> None:
@@ -290,12 +325,13 @@ class Store:
         """Add parts that were written, by their checksums, to the manifest."""
         self.manifest["checksums"] |= {str(index): value for index, value in checksums.items()}
         # not for each part: a large study's manifest is large
-        if self.keeps_manifest and time.monotonic() - self._saved > _SAVED:
+        if self.keeps_manifest and time.monotonic() - self._saved > self._pause:
             self.update()
 
     def existing(self) -> list[Path]:
         """Files of parts, whole or damaged."""
-        return listed(self.folder / "points", "part-*.parquet")
+        # a sixth digit comes after five
+        return sorted(listed(self.folder / "points", "part-*.parquet"), key=lambda path: (len(path.name), path.name))
 
     def read_part(self, index: int, labels: dict[str, np.ndarray], columns: list[str]) -> pd.DataFrame | None:
         """Some columns of a chunk, or None where it holds other rows than those of `labels`."""
@@ -350,33 +386,53 @@ class Store:
     def columns(self) -> list[str]:
         """Names of the columns."""
         mark = _first_mark(self.folder)
-        return list(mark.columns) if mark is not None else list(self.read().columns)
+        return list(mark.columns) if mark is not None else list(next(self.batches()).columns)
 
-    def read(self, columns: list[str] | None = None) -> pd.DataFrame:
-        """Rows of all chunks that are there; all columns, or some.
+    def batches(self, columns: list[str] | None = None) -> Iterator[pd.DataFrame]:
+        """Rows of the chunks that are there, one after the other; all columns, or some.
 
         Raises:
             InputError: a part is damaged, or not of this study.
         """
-        frames = []
         for part in self.parts():
-            try:
+            with _refusing(part):
                 mark, frame = parts.read(self._near(part), columns)
                 self._check(part, mark, int(part.stem.removeprefix("part-")))
-            except Damaged as why:
-                raise InputError(
-                    f"{part}: is damaged ({why}); run 'jaxbl sweep' again, which keeps it aside and computes it anew"
-                ) from None
-            frames.append(frame)
-        return pd.concat(frames, ignore_index=True)
+            yield frame
+
+    def dataset(self, check: bool) -> "Dataset":
+        """Rows of the chunks that are there as a dataset of pyarrow, which reads what is asked of it, and compares each page
+        with its checksum. With `check` each file is first compared with that in the manifest, else each part's mark read.
+
+        Raises:
+            InputError: a part is damaged, or not of this study.
+        """
+        from pyarrow import dataset
+
+        found = self.parts()
+        for part in found:
+            index = int(part.stem.removeprefix("part-"))
+            with _refusing(part):
+                if check:
+                    self._check_file(part, index)
+                else:
+                    self._check(part, parts.mark_of(part), index)
+        form = dataset.ParquetFileFormat(
+            default_fragment_scan_options=dataset.ParquetFragmentScanOptions(page_checksum_verification=True)
+        )
+        remote: Any = found[0]
+        system = remote.fs if is_remote(remote) else None
+        names = [str(part.path if system else part) for part in cast(Any, found)]
+        return cast("Dataset", dataset.dataset(names, format=form, filesystem=system))
 
     def _near(self, part: Path) -> Path:
         """A part where it is read fast: of an object store, a copy for as long as this lives, as a report reads it often."""
         if not is_remote(part):
             return part
         if self._copies is None:
-            self._copies = TemporaryDirectory()
-        copy = Path(self._copies.name) / part.name
+            self._copies = Path(tempfile.mkdtemp())
+            weakref.finalize(self, shutil.rmtree, self._copies, ignore_errors=True)
+        copy = self._copies / part.name
         if not copy.exists():
             copy.write_bytes(part.read_bytes())
         return copy

@@ -3,16 +3,18 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import pandas as pd
+import pyarrow as pa
+from pyarrow.parquet import filters_to_expression
 
 from jaxbl.cluster import Scheduler, connected
 from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
-from jaxbl.files import locked, place, removed_if_empty
+from jaxbl.files import locked, place, remove_drafts, removed_if_empty
 from jaxbl.workers import Progress
 
 from .bundles import ClusterRun, hand_over
@@ -25,6 +27,7 @@ from .store import Store, config_of
 
 if TYPE_CHECKING:
     import xarray
+    from pyarrow.dataset import Dataset
 
 
 _MOST_NUMBERS = 2e8
@@ -67,12 +70,57 @@ class StudyResult:
         # a refined study knows at the end how many it has
         return rows >= manifest["rows"] and (manifest["finished"] or self.config.sweep.refine is None)
 
-    def read(self, columns: Iterable[str] | None = None) -> pd.DataFrame:
-        """Some columns of the frame, read for this call: a large study need not fit into memory whole."""
-        names = None if columns is None else list(dict.fromkeys(columns))
+    @property
+    def runs(self) -> int:
+        """Number of rows that the study has; of an unfinished one, that it will have."""
+        return self.source.manifest["rows"] if isinstance(self.source, Store) else len(self.source)
+
+    def batches(self, columns: Iterable[str] | None = None, filters: Sequence[Any] | None = None) -> Iterator[pd.DataFrame]:
+        """Rows part by part, in the memory of one part; all columns, or some.
+
+        Args:
+            columns: names; left out, all.
+            filters: which rows, as of `pandas.read_parquet`: tuples such as `("encoders.noise", "<", 1e-3)` that all
+                have to hold, or lists of such, of which one has to.
+
+        Raises:
+            InputError: a part is damaged, or not of this study.
+        """
+        names = self.columns if columns is None else list(dict.fromkeys(columns))
+        given: Any = filters or []
+        conditions = [one for group in given for one in (group if isinstance(group, list) else [group])]
+        needed = list(dict.fromkeys([*names, *(condition[0] for condition in conditions)]))
+        source = self.source.batches(needed) if isinstance(self.source, Store) else [self.source]
+        for frame in source:
+            if filters:
+                found = pa.Table.from_pandas(frame.loc[:, needed], preserve_index=False)
+                frame = found.filter(filters_to_expression(given)).to_pandas()
+            yield frame.loc[:, names]
+
+    def read(self, columns: Iterable[str] | None = None, filters: Sequence[Any] | None = None) -> pd.DataFrame:
+        """Some columns or rows of the frame, read for this call: a large study need not fit into memory whole. Arguments and
+        errors are those of :meth:`batches`."""
+        if columns is None and filters is None and not isinstance(self.source, Store):
+            return self.source
+        return pd.concat(self.batches(columns, filters), ignore_index=True)
+
+    def dataset(self, *, check: bool = True) -> "Dataset":
+        """The rows as a dataset of pyarrow, which reads what is asked of it: columns, rows by predicates, batches.
+
+        pyarrow compares each page that it reads with its checksum.
+
+        Args:
+            check: compare each file with its checksum in the manifest first (some seconds a GB); otherwise only what each
+                part says of itself is looked at, and damage to a file's index of its rows may pass.
+
+        Raises:
+            InputError: a part is damaged, or not of this study.
+        """
         if isinstance(self.source, Store):
-            return self.source.read(names)
-        return self.source if names is None else self.source.loc[:, names]
+            return self.source.dataset(check)
+        from pyarrow import dataset
+
+        return cast("Dataset", dataset.dataset(pa.Table.from_pandas(self.source, preserve_index=False)))
 
     def to_xarray(self) -> "xarray.Dataset":
         """The frame as a dataset over the axes and `seed` (zipped axes share one dimension); needs xarray.
@@ -170,6 +218,8 @@ def sweep(
                 run.all()
             # a worker may just let go of it
             with locked(folder, wait=60.0):
+                # of workers that were lost
+                remove_drafts(folder)
                 run.finish()
     return _result(run, store)
 
@@ -241,7 +291,8 @@ def _check_independent(engine: Engine, option: str) -> None:
 
 
 def open_study(folder: str | Path) -> StudyResult:
-    """Read a study's folder, finished or not. Raises `InputError` where there is none."""
+    """A study's folder, finished or not: its config, and its rows as a frame, a dataset of pyarrow or of xarray, each read
+    on first use. Raises `InputError` where there is none."""
     store = Store.open(place(folder))
     return StudyResult(config_of(store.folder), store)
 

@@ -11,9 +11,11 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxbl.drive import set_leaves
 from jaxbl.fused.passage import HostPassage
 from jaxbl.simulate import scan
-from jaxbl.sweeps.engine import LANES_PER_DEVICE
 
 from .workload import FIGURES, RANGES, SEED, Chunked, Workload
+
+LANES = 2**12
+"""That a device scans at once: what they carry then stays in a core's cache (benchmarks/NOTES.md)."""
 
 
 class Scan(Chunked):
@@ -29,7 +31,7 @@ class Scan(Chunked):
         sweep = jax.shard_map(
             jax.vmap(lane, (0, None)), mesh=mesh, in_specs=(lanes, PartitionSpec()), out_specs=lanes, check_vma=False
         )
-        chunk = min(LANES_PER_DEVICE["scan"] * devices, -(-workload.lanes // devices) * devices)
+        chunk = min(LANES * devices, -(-workload.lanes // devices) * devices)
         super().__init__(sweep, workload, chunk, jnp.asarray(SEED))
 
 

@@ -24,7 +24,9 @@ from .ours import Fused, Scan
 from .rivals.compiled import Compiled, forget
 from .rivals.diffrax_euler import Diffrax
 from .rivals.native import Native, NoCompiler, compiler, library
+from .rivals.native_studies import NativeStudy
 from .rivals.plain import Plain
+from .studies import STUDIES, OwnStudy, study
 from .workload import Workload
 
 Runner = Callable[[], dict[str, np.ndarray]]
@@ -109,6 +111,8 @@ class BenchResult:
         rows: of every entry and precision.
         curve: lane-steps per second over the number of lanes: {"name", "precision", "lanes", "lane_steps_per_second"}.
         study: seconds of a whole small study from nothing: {"name", "precision", "lanes", "steps", "seconds"}.
+        studies: lane-steps per second of studies as they stand: {"name", "lanes", "seeds", "steps", "deviation", "jaxbl",
+            "c++"}.
         left_out: entries that this machine cannot run, and what they need.
     """
 
@@ -116,6 +120,7 @@ class BenchResult:
     rows: list[Row]
     curve: list[dict[str, Any]]
     study: list[dict[str, Any]]
+    studies: list[dict[str, Any]]
     left_out: dict[str, str]
 
     def speed(self, name: str, precision: str) -> float | None:
@@ -147,7 +152,8 @@ def _bench(folder: Path, count: int, quick: bool, progress: Progress | None) -> 
     steps, rounds = (1500, 3) if quick else (4000, 7)
     jobs = [(entry, precision) for precision in PRECISIONS for entry in able if _is_run(entry, precision, quick)]
     lanes = [2**k for k in (range(6, 19, 3) if quick else range(6, 21))]
-    parts, done = (1 + rounds) * len(jobs) + len(lanes) + 1, 0
+    compared = list(STUDIES) if any(entry.name == CEILING for entry in able) else []
+    parts, done = (1 + rounds) * len(jobs) + len(lanes) + 1 + len(compared), 0
 
     def tick() -> None:
         nonlocal done
@@ -182,9 +188,13 @@ def _bench(folder: Path, count: int, quick: bool, progress: Progress | None) -> 
     for many in lanes:
         curve += _curve(able, many, 500 if quick else 1000, ("float32",) if quick else PRECISIONS)
         tick()
-    study = _study(count, devices, {entry.name for entry in able}, 1000)
+    small = _small_study(count, devices, {entry.name for entry in able}, 1000)
     tick()
-    return BenchResult(_machine(count), rows, curve, study, left_out)
+    studies = []
+    for name in compared:
+        studies.append(compare(name, folder, count, 6000 if quick else 10_000, rounds))
+        tick()
+    return BenchResult(_machine(count), rows, curve, small, studies, left_out)
 
 
 def _is_run(entry: Entry, precision: str, quick: bool) -> bool:
@@ -258,7 +268,7 @@ def _curve(able: Sequence[Entry], lanes: int, steps: int, precisions: Sequence[s
     return points
 
 
-def _study(count: int, devices: int, able: set[str], lanes: int) -> list[dict[str, Any]]:
+def _small_study(count: int, devices: int, able: set[str], lanes: int) -> list[dict[str, Any]]:
     """A small study from nothing: what was compiled before is forgotten."""
     rows = []
     work = Workload(lanes, 3000, "float32")
@@ -277,6 +287,67 @@ def _study(count: int, devices: int, able: set[str], lanes: int) -> list[dict[st
             row = {"name": entry.name, "precision": work.precision, "lanes": lanes, "steps": work.steps}
             rows.append(row | {"seconds": _seconds(lambda entry=entry: entry.make(work)())})
     return rows
+
+
+def compare(name: str, folder: Path, count: int, steps: int, rounds: int, lanes: int | None = None) -> dict[str, Any]:
+    """A study as it stands by this package and in C++, after a look at whether both give the same figures.
+
+    Args:
+        name: of the study.
+        folder: for the compiled kernel.
+        count: threads.
+        steps: samples of a run.
+        rounds: that are timed, in turns.
+        lanes: left out, all of the study's.
+
+    Raises:
+        NoResult: they do not.
+    """
+    # a noisy observer amplifies rounding: number by number the figures are the same only over a short run
+    short = study(name, _SHORT, lanes, start=0.1)
+    deviation = check_study(name, OwnStudy(short)(), NativeStudy(short, count, folder, own=False)())
+    work = study(name, steps, lanes)
+    runners = [OwnStudy(work), *(NativeStudy(work, count, folder, vectors) for vectors in _VECTORS)]
+    check_medians(name, *(runner() for runner in runners[:2]))
+    least = [float("inf")] * len(runners)
+    for _ in range(rounds):
+        for i, runner in enumerate(runners):
+            least[i] = min(least[i], _seconds(runner))
+    row = {"name": name, "lanes": work.lanes, "seeds": work.seeds, "steps": steps, "deviation": deviation}
+    return row | {"jaxbl": work.lane_steps / least[0], "c++": work.lane_steps / min(least[1:])}
+
+
+_SHORT = 400
+"""Samples of the run by which the figures of a study are compared number by number."""
+_VECTORS = 1, 2, 4
+"""That the kernel of a study takes at a time: the fastest counts."""
+
+
+def check_study(name: str, found: dict[str, Any], reference: dict[str, np.ndarray]) -> float:
+    """Largest median deviation of a figure, relative, NaN being equal to NaN. Raises `NoResult` where one is too large."""
+    worst = 0.0
+    for figure, true in reference.items():
+        values, true = (np.asarray(one, float) for one in (found[figure], true))
+        apart = np.abs(values - true) / np.maximum(np.abs(true), np.finfo(float).tiny)
+        median = float(np.median(np.where(np.isnan(values) & np.isnan(true), 0.0, apart)))
+        # a short run determines the law's parameters badly
+        if not median <= (1e-5 if figure.endswith(("_error", "excitation")) else _TOLERANCE["float64"]["velocity_rmse"]):
+            raise NoResult(f"{name}: {figure} is off by {median:.2g} of it; times of wrong results mean nothing")
+        worst = max(worst, median)
+    return worst
+
+
+def check_medians(name: str, found: dict[str, Any], reference: dict[str, np.ndarray]) -> None:
+    """Raises `NoResult` where the median of a figure over all runs is not that of the reference; errors of identified
+    parameters, which are about zero, do not count."""
+    for figure, true in reference.items():
+        if figure.endswith("_error"):
+            continue
+        one, other = (float(np.nanmedian(np.asarray(values, float))) for values in (found[figure], true))
+        if not abs(one - other) <= 0.05 * abs(other):
+            raise NoResult(
+                f"{name}: {figure} has a median of {one:.3g}, not {other:.3g}; times of wrong results mean nothing"
+            )
 
 
 def _machine(count: int) -> dict[str, Any]:

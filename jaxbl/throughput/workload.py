@@ -33,7 +33,7 @@ RANGES = {
 """What differs from lane to lane, from and to; spread by the logarithm."""
 _PERIOD, _MISS = 1e-3, 0.5
 """Sample period (s), velocity error of the motor's observer at t = 0 (rad/s)."""
-_DRIVE = {"motor_inertia": 0.05, "motor_viscous": 0.15, "load_inertia": 7.0, "load_viscous": 16.0, "gear_ratio": 5.0}
+DRIVE = {"motor_inertia": 0.05, "motor_viscous": 0.15, "load_inertia": 7.0, "load_viscous": 16.0, "gear_ratio": 5.0}
 INPUT = {"amplitude": 0.1, "frequency": 0.16}
 """The sine that is the input, N m and Hz."""
 _STIFFNESS, _SLOPE, _LOW_PASS = 1.0, 20.0, 0.01
@@ -105,7 +105,7 @@ class Workload(NamedTuple):
     def experiment(self) -> Experiment:
         """With array leaves of the precision; lanes set those of `RANGES`."""
         experiment = Experiment(
-            drive=TwoInertia(**_DRIVE),
+            drive=TwoInertia(**DRIVE),
             transmission=SigmoidBacklash(_STIFFNESS, 0.02, _SLOPE),
             effects=(),
             initial=Initial(),
@@ -154,7 +154,7 @@ def constants() -> dict[str, float]:
     """The numbers that all lanes share, for those who write the chain themselves."""
     return {
         "period": _PERIOD,
-        **_DRIVE,
+        **DRIVE,
         "stiffness": _STIFFNESS,
         "slope": _SLOPE,
         "share": -math.expm1(-_PERIOD / _LOW_PASS),

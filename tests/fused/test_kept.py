@@ -90,3 +90,15 @@ def test_a_broken_file_is_no_program(tmp_path, monkeypatch, content):
     assert folder is not None and key is not None
     (folder / key).write_bytes(content)
     assert kept.load(key) is None
+
+
+def test_programs_in_a_folder_that_others_can_write_to_are_not_loaded(tmp_path, monkeypatch):
+    """They are pickled: to load one is to run it."""
+    monkeypatch.setenv(kept.PROGRAMS, str(tmp_path / "programs"))
+    kept._folder.cache_clear()
+    kept.save("key", 3)
+    assert kept.load("key") == 3
+    (tmp_path / "programs").chmod(0o777)
+    kept._folder.cache_clear()
+    assert kept.load("key") is None
+    kept._folder.cache_clear()

@@ -22,7 +22,8 @@ def result():
     ]
     study = [{"name": OURS, "precision": "float32", "lanes": 1000, "steps": 3000, "seconds": 1.25}]
     machine = {"processor": "a processor", "cores": 2, "versions": {"jax": "1.0"}}
-    return BenchResult(machine, rows, curve, study, {"numba, prange": "no numba; pip install 'jaxbl[bench]'"})
+    row = {"name": "gain_map", "lanes": 12288, "seeds": 4, "steps": 8000, "deviation": 1e-12, "jaxbl": 9e7, "c++": 1e8}
+    return BenchResult(machine, rows, curve, study, [row], {"numba, prange": "no numba; pip install 'jaxbl[bench]'"})
 
 
 def test_files_and_figures(result, tmp_path):
@@ -42,3 +43,4 @@ def test_the_table_says_who_where_and_how_far_from_the_ceiling(result):
     assert ours.split()[4:] == ["32", "1000", "1.6e+09", "1.07e+09", "0.8", "1.50", "s", "1e-12"]
     assert lines[-1] == "numba, prange: left out, no numba; pip install 'jaxbl[bench]'"
     assert any("1.25 s" in line for line in lines)
+    assert any("gain_map, 4 seeds of 12288 lanes" in line and line.endswith("C++ 1e+08, 0.9 of it") for line in lines)

@@ -1,5 +1,6 @@
 """The engine: same numbers on any chunking and device count, bounded memory, diverging lanes kept apart."""
 
+import math
 from types import SimpleNamespace
 
 import jax
@@ -11,8 +12,9 @@ from small_study import ALPHA, LAMBDA, NOISE, listed, rigid, small, spaced
 from jaxbl.config import read_config, with_values
 from jaxbl.errors import InputError
 from jaxbl.report.sweep import headline
-from jaxbl.sweeps.engine import Engine, Layout
-from jaxbl.sweeps.programs import faster
+from jaxbl.sweeps import engine
+from jaxbl.sweeps.engine import Engine, Layout, layout_for
+from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult, dry_run, sweep
 from jaxbl.sweeps.trial import run
 
@@ -115,17 +117,13 @@ def test_what_the_fused_loop_cannot_do_is_scanned(excitation, path, why):
 
 def test_the_faster_backend_is_chosen():
     def backend(points, seeds):
-        config = read_config(rigid(axes=[spaced(ALPHA, 1.0, 2.0, points)], sweep={"seeds": seeds}))
-        return Engine(config, devices=jax.devices()[:1]).backend
+        study = rigid({"run.duration": 20.0}, axes=[spaced(ALPHA, 1.0, 2.0, points)], sweep={"seeds": seeds})
+        return Engine(read_config(study), devices=jax.devices()[:1]).backend
 
     assert backend(10_000, 4) == "fused"
     assert backend(3, 1) == "fused"
     # seed after seed would pay for each what lanes share
     assert backend(3, 1000) == "scan"
-    # the scan starts kernels for each time step; several GPUs share lanes by it alone
-    gpu, tpu = SimpleNamespace(platform="gpu"), SimpleNamespace(platform="tpu")
-    assert [faster(Layout(1, 3), devices) for devices in ([gpu], [gpu, gpu], [tpu])] == ["fused", "scan", "scan"]
-    assert faster(Layout(1000, 3), [gpu]) == "scan"
     with pytest.raises(InputError, match="no 'Fused'; one of fused, scan"):
         sweep(rigid(axes=[listed(ALPHA, 1.0, 2.0)]), backend="Fused")
 
@@ -165,24 +163,35 @@ def with_chunk(config, chunk):
 def test_layouts():
     """Whole rows of points first, then seeds; two lanes a device at least; little padding."""
 
-    def layout(points, seeds, devices, chunk=None, backend="scan", platform="cpu"):
-        sweep = {"seeds": seeds} | ({} if chunk is None else {"chunk": chunk})
-        config = read_config(small(axes=[spaced(ALPHA, 1.0, 2.0, points)] if points > 1 else [], sweep=sweep))
-        return tuple(Engine(config, devices=[SimpleNamespace(platform=platform)] * devices, backend=backend).layout)
+    def layout(points, seeds, devices, capacity):
+        config = read_config(small(axes=[spaced(ALPHA, 1.0, 2.0, points)] if points > 1 else [], sweep={"seeds": seeds}))
+        return tuple(layout_for(config, Points(config), devices, capacity))
 
-    assert layout(12288, 1, 2) == (1, 6144)
-    assert layout(4096, 10, 1) == (1, 4096)
-    assert layout(1000, 10, 2) == (8, 1000)
-    assert layout(1, 1000, 2) == (1000, 1)
-    assert layout(1, 1000, 2, chunk=101) == (102, 1)
-    assert layout(100, 1, 2, chunk=30) == (1, 26)
-    assert layout(2, 1, 2) == (1, 4)
-    assert layout(3, 5, 4) == (8, 3)
-    assert layout(1, 1, 1) == (2, 1)
-    # the fused loop takes four times as many lanes at once
-    assert layout(12288, 4, 2, backend="fused") == (2, 12288)
-    # a GPU takes many more
-    assert layout(500_000, 4, 1, backend="fused", platform="gpu") == (1, 250_000)
+    assert layout(12288, 1, 2, 8192) == (1, 6144)
+    assert layout(4096, 10, 1, 4096) == (1, 4096)
+    assert layout(1000, 10, 2, 8192) == (8, 1000)
+    assert layout(1, 1000, 2, 8192) == (1000, 1)
+    assert layout(1, 1000, 2, 101) == (102, 1)
+    assert layout(100, 1, 2, 30) == (1, 26)
+    assert layout(2, 1, 2, 8192) == (1, 4)
+    assert layout(3, 5, 4, 16384) == (8, 3)
+    assert layout(1, 1, 1, 4096) == (2, 1)
+    assert layout(12288, 4, 2, 32768) == (2, 12288)
+
+
+def test_lanes_at_once():
+    def lanes(backend, devices, platform="cpu", chunk=None, points=500_000):
+        sweep = {"seeds": 1} | ({} if chunk is None else {"chunk": chunk})
+        config = read_config(small(axes=[spaced(ALPHA, 1.0, 2.0, points)], sweep=sweep))
+        engine = Engine(config, devices=[SimpleNamespace(platform=platform)] * devices, backend=backend)
+        return math.prod(engine.layout)
+
+    # asked for, as many as a GPU wants, or a power of two for each core
+    assert lanes("scan", 2, chunk=1000) == 1000
+    assert lanes("fused", 1, "gpu") == 250_000
+    for backend in ("scan", "fused"):
+        assert 2**11 <= lanes(backend, 2) <= 2**17
+        assert lanes(backend, 2, points=2**20) in [2**k for k in range(11, 18)]
 
 
 def test_seeds_of_one_point_share_chunks():
@@ -225,8 +234,27 @@ def test_dry_run_counts_without_running_the_study():
     assert (cost.lanes_a_chunk, cost.chunks) == (100, 2 * 4)
     assert cost.megabytes > 0.0
     assert cost.compile_seconds > 0.0
-    # 8 chunks of 1e7 samples at the measured rate
+    # 8 chunks of 1e7 samples
     assert cost.run_seconds == pytest.approx(8 * 100 * 1e7 / cost.lane_steps_per_second)
+
+
+def test_an_estimate_runs_every_seed(monkeypatch):
+    """Seeds of a chunk that only fill it up are copies, which the fused loop does not compute."""
+    used = []
+    compiled = engine.compile_program
+
+    def counted(*arguments, **rest):
+        program = compiled(*arguments, **rest)
+
+        def run(values, seeds):
+            used.append((len(np.unique(seeds)), *(len(np.unique(column)) for column in values.values())))
+            return program.run(values, seeds)
+
+        return program._replace(run=run)
+
+    monkeypatch.setattr(engine, "compile_program", counted)
+    dry_run(rigid(axes=[spaced(ALPHA, 1.0, 2.0, 5)], sweep={"seeds": 3}))
+    assert set(used) == {(3, 5)}
 
 
 # ---------------------------------------------------------------- diverging lanes

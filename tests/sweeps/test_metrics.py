@@ -9,9 +9,11 @@ from paper_drive import paper
 from jaxbl.drive import DeadZone, LinearShaft, Rigid, SigmoidBacklash
 from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, Observers, conditions
 from jaxbl.simulate import scan
+from jaxbl.sweeps import metrics
 from jaxbl.sweeps.metrics import (
     METRICS,
     SIDE_METRICS,
+    ObserverGains,
     metric_columns,
     metric_of,
     observer_gains,
@@ -152,3 +154,30 @@ def test_every_column_has_unit_and_meaning():
     for column in columns:
         assert metric_of(column).doc
     assert metric_of("load.torque_rmse").unit == "N m"
+
+
+def test_conditions_are_computed_once_for_lanes_that_share_them(monkeypatch):
+    counts = []
+    pieces = metrics.in_pieces
+
+    def counted(function, columns):
+        counts.append(len(columns[0]))
+        return pieces(function, columns)
+
+    monkeypatch.setattr(metrics, "in_pieces", counted)
+    # two seeds of three lanes: the load's gains and f_plus are the same for all lanes of a seed
+    f_plus = {
+        "motor.f_plus": np.array([[1.0, 2.0, 3.0], [1.0, 2.5, np.nan]]),
+        "load.f_plus": np.array([[0.1] * 3, [0.2] * 3]),
+    }
+    gains = {
+        "motor": ObserverGains(np.array([4.0, 5.0, 6.0]), np.array([9.0, 9.0, 8.0]), np.array(0.0), np.array(0.5)),
+        "load": ObserverGains(*map(np.array, (0.5, 0.4, 0.0, 0.1))),
+    }
+    found = with_conditions(f_plus, gains)
+    assert counts == [5, 2]
+    for seed, lane in np.ndindex(2, 3):
+        alone = {name: np.asarray(values[seed, lane]) for name, values in f_plus.items()}
+        of_lane = {side: ObserverGains(*(one if one.ndim == 0 else one[lane] for one in g)) for side, g in gains.items()}
+        for name, value in with_conditions(alone, of_lane).items():
+            np.testing.assert_array_equal(found[name][seed, lane], value, err_msg=name)

@@ -9,8 +9,8 @@ from jaxbl.sweeps.pieces import in_pieces
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("count", [1, 3, 4, 7, 24, 25])
-def test_columns_of_any_length_by_two_programs(count, dtype, monkeypatch):
-    monkeypatch.setattr(under_test, "_SIZES", (4, 8))
+def test_columns_of_any_length_by_one_program(count, dtype, monkeypatch):
+    monkeypatch.setattr(under_test, "_SIZE", 4)
     shapes = []
 
     @jax.jit
@@ -22,11 +22,11 @@ def test_columns_of_any_length_by_two_programs(count, dtype, monkeypatch):
     found = in_pieces(both, [x, y])
     np.testing.assert_array_equal(found["sum"], np.full(count, count - 1.0))
     np.testing.assert_array_equal(found["less"], x < y)
-    assert found["sum"].dtype == dtype and set(shapes) == {(1, 4) if count <= 4 else (2, 8)}
+    assert found["sum"].dtype == dtype and set(shapes) == {(2, 4)}
 
 
-def test_devices_share_what_is_large(monkeypatch):
-    monkeypatch.setattr(under_test, "_SIZES", (4, 8))
+def test_devices_share_pieces(monkeypatch):
+    monkeypatch.setattr(under_test, "_SIZE", 4)
     used = []
 
     def where(x):
@@ -35,7 +35,7 @@ def test_devices_share_what_is_large(monkeypatch):
 
     devices = jax.local_devices()
     assert len(devices) == 2
-    assert in_pieces(where, [np.ones(17)], devices).shape == (17,)
+    assert in_pieces(where, [np.ones(9)], devices).shape == (9,)
     assert used == [set(devices)] * 2
     assert in_pieces(where, [np.ones(3)], devices[1:]).shape == (3,)
     assert used[2:] == [{devices[1]}]

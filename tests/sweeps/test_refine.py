@@ -506,14 +506,6 @@ def finished(tmp_path_factory):
     return folder, sweep(study(), folder)
 
 
-@pytest.fixture
-def computed(monkeypatch):
-    """Indices of the chunks that are computed."""
-    indices, compute = [], Engine.run
-    monkeypatch.setattr(Engine, "run", lambda engine, chunk: indices.append(chunk.index) or compute(engine, chunk))
-    return indices
-
-
 def files(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 

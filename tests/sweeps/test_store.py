@@ -9,6 +9,7 @@ from pathlib import Path
 from random import Random
 
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 from small_study import ALPHA, listed, rigid
 
@@ -18,7 +19,7 @@ from jaxbl.files import json_text, make_folder, read_json
 from jaxbl.sweeps.engine import Engine
 from jaxbl.sweeps.parts import file_checksum
 from jaxbl.sweeps.store import Store, claim, identity
-from jaxbl.sweeps.sweep import open_study, repair, sweep
+from jaxbl.sweeps.sweep import StudyResult, open_study, repair, sweep
 
 FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
 
@@ -26,14 +27,6 @@ FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
 def study(changes=None, **tables):
     """Nine runs in three chunks: 3 seeds of 3 points, padded to 4."""
     return rigid(changes, **{"axes": [listed(ALPHA, 5.0, 9.0, 20.0)], "sweep": {"seeds": 3, "chunk": 2}} | tables)
-
-
-@pytest.fixture
-def computed(monkeypatch):
-    """Indices of the chunks that are computed."""
-    indices, compute = [], Engine.run
-    monkeypatch.setattr(Engine, "run", lambda engine, chunk: indices.append(chunk.index) or compute(engine, chunk))
-    return indices
 
 
 def files(folder):
@@ -406,3 +399,80 @@ def test_files_of_others_are_never_removed(tmp_path):
     with pytest.raises(InputError, match="not of a study"):
         claim(tmp_path, read_config(rigid()), overwrite=True)
     assert (tmp_path / "figures" / "mine.png").exists()
+
+
+def test_rows_are_read_as_they_are_asked_for(finished):
+    folder, result = finished
+    opened, whole = open_study(folder), result.frame
+    assert len(list(opened.batches(["seed"]))) == 3
+    columns = ["motor.f_plus", ALPHA]
+    pd.testing.assert_frame_equal(opened.read(columns), whole[columns])
+    kept = whole[(whole["seed"] > 0) & (whole[ALPHA] < 20.0)]
+    some = opened.read(columns, [("seed", ">", 0), (ALPHA, "<", 20.0)])
+    pd.testing.assert_frame_equal(some, kept[columns].reset_index(drop=True))
+    either = opened.read(["seed"], [[("seed", "==", 0)], [(ALPHA, "in", [5.0, 9.0])]])
+    assert len(either) == ((whole["seed"] == 0) | whole[ALPHA].isin([5.0, 9.0])).sum()
+    # the same of a result in memory
+    memory = StudyResult(opened.config, whole)
+    pd.testing.assert_frame_equal(memory.read(columns, [("seed", ">", 0), (ALPHA, "<", 20.0)]), some)
+
+
+@pytest.mark.parametrize("check", [True, False])
+def test_a_dataset_of_the_rows(finished, check):
+    import pyarrow.compute as pc
+
+    folder, result = finished
+    dataset = open_study(folder).dataset(check=check)
+    assert dataset.count_rows() == 9
+    found = dataset.to_table(columns=["seed", "motor.f_plus"], filter=pc.field(ALPHA) == 9.0).to_pandas()
+    expected = result.frame.loc[result.frame[ALPHA] == 9.0, ["seed", "motor.f_plus"]]
+    pd.testing.assert_frame_equal(
+        found.sort_values("seed", ignore_index=True), expected.sort_values("seed", ignore_index=True)
+    )
+    memory = StudyResult(result.config, result.frame).dataset()
+    assert memory.to_table().to_pandas().equals(result.frame)
+
+
+def test_a_dataset_of_damaged_or_foreign_parts_is_refused(copy, tmp_path):
+    part = copy / "points" / "part-00001.parquet"
+    content = bytearray(part.read_bytes())
+    column = pq.read_metadata(part).row_group(0).column(4)
+    # the last byte of the column's values
+    content[column.data_page_offset + column.total_compressed_size - 1] ^= 1
+    part.write_bytes(content)
+    with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged \(does not agree with its checksum"):
+        open_study(copy).dataset()
+    # what is not looked at first is found where it is read
+    dataset = open_study(copy).dataset(check=False)
+    with pytest.raises(OSError, match=r"CRC|checksum|corrupt"):
+        dataset.to_table()
+    sweep(study({"drive.motor_inertia": 0.06}), tmp_path / "other")
+    shutil.copy(tmp_path / "other" / "points" / part.name, part)
+    for check in (True, False):
+        with pytest.raises(InputError, match=r"is of another study|is damaged"):
+            open_study(copy).dataset(check=check)
+
+
+def test_parts_are_in_order_beyond_five_digits(tmp_path, finished):
+    engine = Engine(read_config(study()), backend="scan")
+    store = Store.create(tmp_path, engine.config, engine.layout, engine.backend, 100_001, 9)
+    rows = next(finished[1].source.batches())
+    for index in (99_999, 100_000, 2):
+        store.write(index, rows.assign(seed=index))
+    store.update()
+    opened = open_study(tmp_path)
+    assert opened.frame["seed"].drop_duplicates().tolist() == [2, 99_999, 100_000]
+    assert opened.dataset().to_table(columns=["seed"]).to_pandas()["seed"].tolist() == opened.frame["seed"].tolist()
+    assert open_study(tmp_path).source.has(100_000)
+
+
+def test_a_study_in_an_object_store_is_read_alike(finished):
+    upath = pytest.importorskip("upath")
+    place = upath.UPath("memory://reading/study")
+    for name, content in files(finished[0]).items():
+        (place / name).write_bytes(content)
+    opened = open_study("memory://reading/study")
+    pd.testing.assert_frame_equal(opened.frame, finished[1].frame)
+    for check in (True, False):
+        found = opened.dataset(check=check).to_table(columns=[ALPHA, "seed"]).to_pandas()
+        pd.testing.assert_frame_equal(found, finished[1].frame[[ALPHA, "seed"]])

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 
 from jaxbl.drive import set_leaves
 from jaxbl.simulate import advance, begin, figures
-from jaxbl.sweeps.engine import LANES_PER_DEVICE
 
+from ..ours import LANES
 from ..workload import FIGURES, Chunked, Workload
 
 
@@ -53,4 +53,4 @@ class Diffrax(Chunked):
             last: Any = solution.ys
             return figures(own, (FIGURES,), tree.unflatten([x[0] for x in last]))
 
-        super().__init__(jax.vmap(lane), workload, LANES_PER_DEVICE["scan"])
+        super().__init__(jax.vmap(lane), workload, LANES)

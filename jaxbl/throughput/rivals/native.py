@@ -15,7 +15,6 @@ from ..workload import INPUT, SEED, Workload, constants, identified_figures
 
 _FLAGS = ("-std=c++20", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fopenmp", "-shared", "-fPIC")
 """Fused multiply-add as the compiler likes (GCC's default), but no reordering: sums are compensated."""
-_SOURCE = Path(__file__).with_name("chain.cpp")
 SUMS = 9
 """Results of a lane, as chain.cpp numbers them."""
 
@@ -34,24 +33,24 @@ class NoCompiler(Exception):
 
 
 @cache
-def library(folder: Path) -> ctypes.CDLL:
-    """The kernel for this machine, compiled into a folder. Raises `NoCompiler`."""
+def library(folder: Path, name: str = "chain") -> ctypes.CDLL:
+    """A kernel for this machine, compiled into a folder. Raises `NoCompiler`."""
     command = compiler()
     if command is None:
         raise NoCompiler("no C++ compiler; install g++, or name one in CXX")
-    target = folder.resolve() / "chain.so"
+    source, target = Path(__file__).with_name(f"{name}.cpp"), folder.resolve() / f"{name}.so"
     folder.mkdir(parents=True, exist_ok=True)
     # anew each time: what lies there may be another machine's
     draft = target.with_suffix(f".{os.getpid()}")
-    done = subprocess.run([command, *_FLAGS, "-o", str(draft), str(_SOURCE)], capture_output=True, text=True)
+    done = subprocess.run([command, *_FLAGS, "-o", str(draft), str(source)], capture_output=True, text=True)
     if done.returncode:
         said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
-        raise NoCompiler(f"{command} cannot compile {_SOURCE.name}: {said[-1]}")
+        raise NoCompiler(f"{command} cannot compile {source.name}: {said[-1]}")
     draft.replace(target)
     return ctypes.CDLL(str(target))
 
 
-_WHOLE = 64
+WHOLE = 64
 """Lanes, or samples: whole vectors of the widest registers there are, two of them."""
 
 
@@ -62,17 +61,17 @@ class Native:
     def __init__(self, workload: Workload, threads: int, folder: Path, *, own: bool = False):
         self.workload, self.threads, self._own, self._seeds = workload, threads, own, count(SEED)
         self._function = getattr(library(folder), f"chain_{workload.precision}")
-        self._padded = -(-workload.lanes // _WHOLE) * _WHOLE
+        self._padded = -(-workload.lanes // WHOLE) * WHOLE
         values = [np.resize(column, self._padded) for column in workload.values().values()]
         self._given = [np.ascontiguousarray(column) for column in values]
         self._out = [np.zeros(self._padded, workload.dtype) for _ in range(SUMS)]
         if own:
-            samples = -(-workload.steps // _WHOLE) * _WHOLE
+            samples = -(-workload.steps // WHOLE) * WHOLE
             self._torque, self._noise = np.empty(samples, workload.dtype), np.empty((samples, 2), workload.dtype)
         else:
             self._torque, self._noise = map(np.ascontiguousarray, workload.inputs())
         self._constants = _Constants(**constants(), **INPUT)
-        self._table = [_pointers(arrays) for arrays in (self._given, self._out)]
+        self._table = [pointers(arrays) for arrays in (self._given, self._out)]
 
     def __call__(self) -> dict[str, np.ndarray]:
         w = self.workload
@@ -83,5 +82,6 @@ class Native:
         return identified_figures(w, [sums[: w.lanes] for sums in self._out])
 
 
-def _pointers(arrays: list[np.ndarray]) -> Any:
+def pointers(arrays: list[np.ndarray]) -> Any:
+    """Where arrays lie, for a kernel."""
     return (ctypes.c_void_p * len(arrays))(*[array.ctypes.data for array in arrays])

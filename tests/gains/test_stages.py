@@ -1,0 +1,59 @@
+"""Folders of commands that run several studies: damage to their manifests and tables, and folders of others."""
+
+import pandas as pd
+import pytest
+from small_study import parts, thirty
+
+from jaxbl.config import read_config
+from jaxbl.errors import InputError
+from jaxbl.gains.stages import stages_in
+
+
+def stage(folder, changes=None, **given):
+    """One stage, with a pilot's number and a table; returns the lanes that were computed, what was found, and the table."""
+    study = read_config(thirty(**(changes or {})))
+    with stages_in(study, "tune", folder, None, **given) as stages:
+        found = dict(stages.found)
+        stages.keep(pilot=1.5)
+        table = stages.table("table.parquet", lambda: pd.DataFrame({"x": [1.0, 2.0]}))
+        stages.run(study, "coarse")
+        return stages.cost["lanes"], found, table
+
+
+def test_a_damaged_manifest_is_written_anew(tmp_path):
+    assert stage(tmp_path)[0] == 30
+    path = tmp_path / "tune" / "manifest.json"
+    before = path.read_bytes()
+    path.write_bytes(before[: len(before) // 2])
+    # what it said is found again; the stage's parts are there
+    lanes, found, _ = stage(tmp_path)
+    assert (lanes, found) == (0, {})
+    assert path.read_bytes() == before
+    lanes, found, _ = stage(tmp_path)
+    assert lanes == 0 and found["pilot"] == 1.5
+
+
+def test_a_damaged_manifest_does_not_make_the_folder_anothers(tmp_path):
+    stage(tmp_path)
+    path = tmp_path / "tune" / "manifest.json"
+    path.write_text(path.read_text().replace("1.5", "1.6"))
+    before = path.read_bytes(), parts(tmp_path / "tune" / "coarse")
+    with pytest.raises(InputError, match=r"is of another study|holds another study"):
+        stage(tmp_path, {"encoders": {"noise": 1e-3}})
+    (tmp_path / "tune" / "table.parquet").unlink()
+    with pytest.raises(InputError, match="holds another study"):
+        stage(tmp_path, {"encoders": {"noise": 1e-3}})
+    assert (path.read_bytes(), parts(tmp_path / "tune" / "coarse")) == before
+    assert sorted(one.name for one in (tmp_path / "tune").iterdir()) == ["coarse", "manifest.json"]
+    # of a command that is not there nobody can say whose it is
+    with pytest.raises(InputError, match="is damaged"), stages_in(read_config(thirty()), "verify", tmp_path, None):
+        pass
+
+
+def test_a_damaged_table_is_computed_anew(tmp_path):
+    stage(tmp_path)
+    path = tmp_path / "tune" / "table.parquet"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 3] ^= 1
+    path.write_bytes(content)
+    assert list(stage(tmp_path)[2]["x"]) == [1.0, 2.0]

@@ -1,0 +1,122 @@
+"""Medians and extremes of many runs: the same by few passes over kept rows as by many over parts."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from small_study import ALPHA, LAMBDA, NOISE, listed, made, rigid, spaced
+
+from jaxbl.report import aggregates
+from jaxbl.report.aggregates import Column, Groups, spread
+from jaxbl.report.maps import draw
+from jaxbl.report.sweep import write_sweep_report
+from jaxbl.sweeps.engine import Engine
+from jaxbl.sweeps.run import begun
+from jaxbl.sweeps.sweep import open_study
+
+NUMBERS = {
+    "normal": lambda rng, n: rng.normal(size=n),
+    "ties and zeros of both signs": lambda rng, n: rng.choice([0.0, -0.0, 1.0, 2.0], n),
+    "over many decades": lambda rng, n: np.exp(50.0 * rng.normal(size=n)),
+    "far apart": lambda rng, n: np.where(rng.random(n) < 0.5, -1e300, 1e-300) * rng.random(n),
+}
+
+
+@pytest.mark.parametrize("kind", NUMBERS)
+@pytest.mark.parametrize("most", [10, 150, 10**9])
+def test_spread_is_that_of_pandas(monkeypatch, kind, most):
+    rng = np.random.default_rng(3)
+    of, values = rng.integers(0, 20, 3000), NUMBERS[kind](rng, 3000)
+    values[(rng.random(3000) < 0.1) | (of == 7)] = np.nan
+    monkeypatch.setattr(aggregates, "MOST_VALUES", most)
+    found = spread(lambda: ((of[i : i + 257], values[i : i + 257]) for i in range(0, 3000, 257)), 21, (0.05, 0.5, 0.95))
+    groups = pd.Series(values).groupby(of)
+    for name, expected in (("count", groups.count()), ("least", groups.min()), ("largest", groups.max())):
+        np.testing.assert_array_equal(
+            getattr(found, name), expected.reindex(range(21), fill_value=[np.nan, 0][name == "count"])
+        )
+    np.testing.assert_array_equal(found.quantiles[1], groups.median().reindex(range(21)))
+    for share, row in zip((0.05, 0.95), found.quantiles[[0, 2]], strict=True):
+        np.testing.assert_allclose(row, groups.quantile(share).reindex(range(21)), rtol=1e-14)
+
+
+def test_groups_are_those_of_pandas():
+    rng = np.random.default_rng(0)
+    frame = pd.DataFrame(
+        {"a": rng.choice(["x", "y"], 500), "b": rng.choice([3.0, 1.0, 2.0], 500), "v": rng.normal(size=500)}
+    )
+    frame.loc[rng.random(500) < 0.1, "v"] = np.nan
+    frame["c"] = 1.0
+    parts = [frame.iloc[i : i + 90] for i in range(0, 500, 90)]
+    groups = Groups(parts, ["a", "b"], ["a", "c"])
+    expected = frame.groupby(["a", "b"], sort=True)["v"]
+    column = Column(["v"], lambda part: part["v"])
+    means = groups.means({"v": column})
+    assert (groups.rows, groups.varied) == (500, {"a"})
+    pd.testing.assert_series_equal(means["v"], expected.mean())
+    pd.testing.assert_series_equal(means["rows"], expected.size(), check_names=False)
+    pd.testing.assert_series_equal(groups.medians(column), expected.median(), check_names=False)
+
+
+def stored(folder, data, **columns):
+    """A made-up study in parts."""
+    result = made(data, **columns)
+    engine, store = begun(folder, Engine(result.config, backend="scan"), insist=False)
+    keys = [axis.path for axis in result.config.axes] + ["seed"]
+    for index in range(len(engine)):
+        labels = pd.DataFrame(engine.labels(engine.chunk(index)))
+        store.write(index, labels.merge(result.frame, on=keys, how="left", validate="1:1"))
+    store.update(finished=True)
+    return open_study(folder)
+
+
+MAP = {"kind": "heatmap", "x": ALPHA, "y": LAMBDA, "value": "motor.velocity_rmse"}
+LINE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
+FIGURES = [
+    MAP | {"facet": NOISE, "overlays": ["exact"]},
+    MAP | {"value": "motor.converged"},
+    LINE | {"series": NOISE},
+    LINE | {"where": {LAMBDA: "least"}},
+    LINE | {"where": {LAMBDA: "least", NOISE: 1e-4}, "theory": 0.5},
+]
+GRID = [listed(NOISE, 1e-4, 1e-3), spaced(ALPHA, 1.0, 100.0, 7), spaced(LAMBDA, 1.0, 20.0, 5)]
+STUDIES = {
+    "grid": {"axes": GRID, "sweep": {"seeds": 6, "chunk": 50}},
+    "design": {"axes": [GRID[0], *({k: v for k, v in axis.items() if k != "num"} for axis in GRID[1:])],
+               "sweep": {"design": "sobol", "points": 64, "seeds": 2, "chunk": 50}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", STUDIES)
+def test_reports_are_the_same_part_by_part(tmp_path, monkeypatch, kind):
+    rng = np.random.default_rng(0)
+    figures = FIGURES if kind == "grid" else FIGURES[:3]
+    result = stored(
+        tmp_path / "study",
+        rigid(figures=figures, **STUDIES[kind]),
+        motor__velocity_rmse=lambda frame: np.sqrt(frame[ALPHA]) * np.exp(rng.normal(size=len(frame))),
+        motor__converged=lambda frame: frame[LAMBDA] > rng.uniform(0.0, 20.0, len(frame)),
+        motor__f_plus=lambda frame: rng.uniform(1.0, 30.0, len(frame)),
+        finite=lambda frame: rng.random(len(frame)) < 0.99,
+    )
+    assert result.source.manifest["parts"] > 4
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    lines = []
+    for folder in (whole, parts):
+        folder.mkdir()
+        lines.append(write_sweep_report(result, folder))
+        monkeypatch.setattr(aggregates, "MOST_VALUES", 20)
+        monkeypatch.setattr(aggregates, "_MOST_KEPT", 0)
+    assert lines[0] == lines[1]
+    # figures are in the page
+    assert (whole / "report.html").read_bytes() == (parts / "report.html").read_bytes()
+    assert len(list((parts / "figures").iterdir())) == len(figures)
+
+
+def test_only_some_points_of_a_large_design_have_dots(monkeypatch):
+    from jaxbl.report import maps
+
+    monkeypatch.setattr(maps, "_MOST_DOTS", 64)
+    result = made(rigid(figures=FIGURES[:2], **STUDIES["design"]))
+    for drawing in draw(result):
+        # of 256 runs at 64 points
+        assert drawing.caption.endswith("The first 16 points of the design are shown.")

@@ -1,0 +1,87 @@
+"""What `jaxbl compare` leaves."""
+
+import json
+import shutil
+
+import pytest
+from small_study import ALPHA, LAMBDA, listed, rigid, spaced
+
+from jaxbl import cli
+from jaxbl.config import read_config
+from jaxbl.files import json_text, read_json
+from jaxbl.sweeps.sweep import sweep
+
+
+@pytest.fixture
+def called(monkeypatch, capsys):
+    """Exit code and output of a command."""
+
+    monkeypatch.setattr(cli, "start_jax", lambda: None)
+
+    def run(*words):
+        monkeypatch.setattr("sys.argv", ["jaxbl", *map(str, words)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        return end.value.code or 0, "".join(capsys.readouterr())
+
+    return run
+
+
+AXES = [spaced(ALPHA, 5.0, 20.0, 3), listed(LAMBDA, 4.0, 8.0)]
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """Two studies, of which the second moves further at more points."""
+    place = tmp_path_factory.mktemp("studies")
+    more = [spaced(ALPHA, 5.0, 80.0, 5), AXES[1]]
+    for name, axes, amplitude in (("before", AXES, 0.1), ("after", more, 0.4)):
+        study = rigid({"excitation.amplitude": amplitude, "title": name}, axes=axes, sweep={"seeds": 4})
+        sweep(read_config(study), place / name, backend="scan")
+    return place
+
+
+def test_command_writes_text_json_and_figure(folders, called):
+    words = ["compare", str(folders / "before"), str(folders / "after"), "--out", str(folders / "both")]
+    code, output = called(*words)
+    assert code == 0, output
+    assert "excitation.amplitude: 0.1 -> 0.4" in output
+    assert "Points: 6 in both; 0 in the first alone, 4 in the second alone." in output
+    assert "Noise: by differences seed by seed, 4 seeds" in output
+    data = json.loads((folders / "both" / "comparison.json").read_text())
+    assert data["config"]["excitation.amplitude"] == [0.1, 0.4]
+    assert data["points"] == {"both": 6, "first_only": 0, "second_only": 4}
+    sizes = next(one for one in data["metrics"] if one["metric"] == "motor.f_plus_acceleration")
+    # the acceleration of a linear drive is in proportion to its input
+    assert (sizes["points"], sizes["differs"], sizes["up"]) == (6, 6, 6)
+    assert sizes["moved"]["value"] == pytest.approx(4.0, rel=1e-6)
+    assert (folders / "both" / "figures" / "comparison.png").stat().st_size > 5000
+    # again into the same folder, without a difference now: no figure is left
+    code, output = called("compare", str(folders / "before"), str(folders / "before"), "--out", str(folders / "both"))
+    assert code == 0, output
+    assert "Config: no difference that decides a number." in output
+    assert "metric  " not in output
+    assert not (folders / "both" / "figures" / "comparison.png").exists()
+
+
+def test_unfinished_studies_are_compared_as_far_as_they_are(folders, tmp_path, called):
+    shutil.copytree(folders / "before", tmp_path / "part")
+    manifest = tmp_path / "part" / "manifest.json"
+    manifest.write_text(json_text(read_json(manifest) | {"rows": 48, "parts": 2, "finished": False}))
+    code, output = called("compare", str(folders / "before"), str(tmp_path / "part"), "--out", str(tmp_path / "out"))
+    assert code == 0, output
+    assert "is not finished: 24 of 48 runs are compared." in " ".join(output.split())
+
+
+@pytest.mark.parametrize(
+    ("second", "out", "message"),
+    [
+        ("nothing", "new", "nothing: holds no study (no manifest.json); run 'jaxbl sweep' first"),
+        ("after", "before", "before: is not empty and holds no comparison; choose another folder with --out"),
+    ],
+)
+def test_bad_input(folders, called, second, out, message):
+    code, output = called("compare", str(folders / "before"), str(folders / second), "--out", str(folders / out))
+    assert code == 2
+    assert message in output
+    assert not (folders / "new").exists()

@@ -1,0 +1,153 @@
+"""Studies on a cluster: the table that one process gives, parts that are there left out, and what goes wrong in one line."""
+
+import time
+
+import jax
+import pandas as pd
+import pytest
+from distributed import Client, LocalCluster
+from small_study import ALPHA, LAMBDA, parts, spaced, thirty
+
+from jaxbl import cluster
+from jaxbl.cluster import Cluster, connected
+from jaxbl.config import read_config
+from jaxbl.errors import InputError, NoResult
+from jaxbl.gains.stages import stages_in
+from jaxbl.sweeps.bundles import Bundle, _size, compute
+from jaxbl.sweeps.programs import Layout
+from jaxbl.sweeps.status import status
+from jaxbl.sweeps.sweep import submit, sweep
+
+_submit = Cluster._submit
+
+
+def test_the_same_table_by_workers_of_which_each_chunk_is_computed_once(tmp_path, client, computed):
+    alone = sweep(thirty(), tmp_path / "alone")
+    count = len(computed)
+    computed.clear()
+    seen = []
+    result = sweep(thirty(), tmp_path / "cluster", scheduler=client, progress=lambda *done: seen.append(done))
+    assert sorted(computed) == list(range(count)) and count == 8
+    assert parts(tmp_path / "cluster") == parts(tmp_path / "alone")
+    pd.testing.assert_frame_equal(result.frame, alone.frame, check_exact=True)
+    assert result.cost["lanes"] == 30 and result.cost["run_seconds"] > 0.0
+    assert seen[-1] == (30, 30) and seen == sorted(seen)
+    # what is there is left out
+    lost = tmp_path / "cluster" / "points" / "part-00003.parquet"
+    lost.unlink()
+    computed.clear()
+    # the last points of the first seed
+    assert sweep(thirty(), tmp_path / "cluster", scheduler=client).cost["lanes"] == 3
+    assert computed == [3]
+    assert parts(tmp_path / "cluster") == parts(tmp_path / "alone")
+    # what is damaged is told by whom it was found
+    lost.write_bytes(lost.read_bytes()[:-100])
+    assert len(sweep(thirty(), tmp_path / "cluster", scheduler=client).damaged) == 1
+    assert parts(tmp_path / "cluster") == parts(tmp_path / "alone")
+    assert not list(tmp_path.rglob(".*"))
+
+
+@pytest.mark.slow
+def test_processes_of_this_machine_give_the_same_table(tmp_path):
+    sweep(thirty(), tmp_path / "alone")
+    other = thirty(sweep={"seeds": 2, "chunk": 256})
+    whole = sweep(other, tmp_path / "whole", devices=jax.devices()[:1]).frame
+    found = sweep(thirty(), tmp_path / "study", scheduler="local:2")
+    assert parts(tmp_path / "study") == parts(tmp_path / "alone")
+    # in other chunks, on one device
+    points = [ALPHA, LAMBDA, "seed"]
+    frames = [frame.sort_values(points, ignore_index=True) for frame in (found.frame, whole)]
+    pd.testing.assert_frame_equal(*frames, check_exact=True)
+
+
+def test_a_refined_study_on_a_cluster(tmp_path, client):
+    axes = [spaced(ALPHA, 5.0, 20.0, 9), spaced(LAMBDA, 0.3, 5.0, 9)]
+    changed = thirty(axes=axes, sweep={"seeds": 2, "chunk": 16, "refine": 2})
+    alone = sweep(changed, tmp_path / "alone")
+    sweep(changed, tmp_path / "cluster", scheduler=client)
+    assert parts(tmp_path / "cluster") == parts(tmp_path / "alone")
+    # grids of 9 x 9 and 33 x 33
+    assert 2 * 9**2 < len(alone.frame) < 2 * 33**2
+
+
+def test_stages_of_verify_and_tune_on_a_cluster(tmp_path, client, computed, monkeypatch):
+    submitted = []
+    monkeypatch.setattr(Cluster, "_submit", lambda self, *given: submitted.append(given) or _submit(self, *given))
+    with stages_in(read_config(thirty()), "verify", tmp_path, client) as stages:
+        stages.keep()
+        assert len(stages.run(thirty(), "drive").frame) == 30
+        assert stages.cost["lanes"] == 30 and len(computed) == 8
+    # the first chunk a worker, then the rest
+    assert sum(len(jobs) for _, jobs in submitted) == 8
+    assert len(list((tmp_path / "verify" / "drive" / "points").iterdir())) == 8
+
+
+def test_a_study_that_is_handed_over_goes_on_without_who_did_it(tmp_path, client, computed):
+    folder = tmp_path / "study"
+    first = submit(thirty(), folder, client)
+    assert first.parts_in_all == 8 and not first.finished
+    latest = time.monotonic() + 60.0
+    while not status(folder).complete and time.monotonic() < latest:
+        time.sleep(0.1)
+    assert sorted(computed) == list(range(8))
+    assert not status(folder).finished
+    assert sweep(thirty(), folder).cost["lanes"] == 0
+    assert status(folder).finished
+    # nothing is left to be done
+    assert submit(thirty(), folder, client).complete
+    assert sorted(computed) == list(range(8))
+
+
+def test_bundles_take_workers_long_enough_and_are_not_too_many():
+    # chunks of 0.1 s, many of them; few of them, four bundles a worker; so many that a scheduler would suffer; unknown time
+    assert _size(0.1, 100_000, 10) == 200
+    assert _size(0.1, 400, 10) == 10
+    assert _size(30.0, 1_000_000, 10) == 20
+    assert _size(0.0, 3, 10) == 1
+
+
+def test_bad_input(tmp_path, client, monkeypatch):
+    with pytest.raises(InputError, match="--scheduler local:none: local:N needs the number of processes"):
+        sweep(thirty(), tmp_path / "a", scheduler="local:none")
+    monkeypatch.setattr(cluster, "_ANSWER", 0.3)
+    with pytest.raises(InputError, match=r"--scheduler tcp://127.0.0.1:1: no Dask scheduler answers there"):
+        sweep(thirty(), tmp_path / "a", scheduler="tcp://127.0.0.1:1")
+    with pytest.raises(InputError, match="its workers write into a folder; name it with --out"):
+        sweep(thirty(), scheduler=client)
+    with pytest.raises(InputError, match="--detach: needs the --scheduler of a cluster that stays"):
+        submit(thirty(), tmp_path / "a", None)
+    refined = thirty(axes=[spaced(ALPHA, 5.0, 20.0, 9), spaced(LAMBDA, 0.3, 5.0, 9)], sweep={"refine": 2})
+    with pytest.raises(InputError, match=r"--detach: sweep.refine makes points depend on one another"):
+        submit(refined, tmp_path / "a", client)
+    assert not (tmp_path / "a").exists()
+    with pytest.raises(InputError, match=r"nowhere: is not seen by worker .*; --out should name a folder that all machines"):
+        compute(Bundle(str(tmp_path / "nowhere"), "", Layout(1, 1), "scan", False, (0,)))
+
+
+def _fails(job):
+    raise {"input": InputError("the job's line"), "module": ModuleNotFoundError("No module named 'x'")}[job]
+
+
+def test_errors_of_workers_reach_who_asked(client, monkeypatch):
+    with connected(client) as workers:
+        assert isinstance(workers, Cluster) and workers.workers == 2 and not workers.local
+        assert list(workers.each(abs, [-3, -2, -1])) == [3, 2, 1]
+        with pytest.raises(InputError, match="the job's line"):
+            list(workers.each(_fails, ["input"]))
+        with pytest.raises(InputError, match="its workers lack a module"):
+            list(workers.each(_fails, ["module"]))
+        asking = [cluster.version("jaxbl")]
+        monkeypatch.setattr(cluster, "version", lambda name: asking.pop() if asking else "0.0.1")
+        with pytest.raises(InputError, match=r"worker .* has jaxbl 0\.0\.1; install .* there"):
+            list(workers.each(abs, [1]))
+
+
+def test_a_scheduler_that_is_lost_is_said(client):
+    with LocalCluster(n_workers=1, processes=False, dashboard_address="127.0.0.1:0") as own:
+        connection = Client(own, set_as_default=False)
+        with connected(connection) as workers:
+            results = workers.each(time.sleep, [0.0, 3.0])
+            assert next(results) is None
+            connection.close()
+            with pytest.raises(NoResult, match="the connection to the scheduler is lost"):
+                next(results)

@@ -1,0 +1,86 @@
+"""What a study will take: counted in its traced step, times what the machine takes, which is measured once."""
+
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+from small_study import ALPHA, LAMBDA, NOISE, small
+
+import jaxbl.sweeps.costs as under_test
+from jaxbl.config import read_config
+from jaxbl.fused import kept
+from jaxbl.sweeps.costs import Cost, Costs, Work, faster, measured, work_of
+from jaxbl.sweeps.programs import Layout
+
+KNOWN = Costs(Cost(4e-7, 3e-9, 2e-11, 3e-4), Cost(0.0, 5e-9, 7e-11, 2e-3), 1e6)
+
+
+def test_counted_work():
+    one, ten = (read_config(small({"run.substeps": n})) for n in (1, 10))
+    gains, plants = [LAMBDA, ALPHA], ["transmission.dead_zone"]
+    shared, own = work_of(ten, gains), work_of(ten, plants)
+    # one and the same step, by all lanes or by each
+    assert shared.shared + shared.lane == pytest.approx(own.shared + own.lane, rel=0.1)
+    assert shared.shared > 3.0 * shared.lane
+    assert own.lane > own.shared
+    # nine plant steps more, each of them a tanh at least
+    for paths, of in ((gains, "shared"), (plants, "lane")):
+        more = getattr(work_of(ten, paths), of) - getattr(work_of(one, paths), of)
+        assert 9 * 30 < more < 9 * 100
+    # position and velocity of both sides are among what a lane of its own carries
+    assert own.carried - shared.carried >= 4 * 8
+    single = read_config(small({"run.precision": "float32"}))
+    assert work_of(single, gains).carried == pytest.approx(work_of(one, gains).carried / 2, rel=0.01)
+    # a run that is twice as long does not more a sample
+    longer = read_config(small({"run.duration": 2.0 * one.run.duration, "run.substeps": 1}))
+    assert work_of(longer, [NOISE]).lane == pytest.approx(work_of(one, [NOISE]).lane, rel=0.02)
+
+
+def test_measured_costs_are_those_of_the_machine(monkeypatch):
+    """Of a made-up one, whose times follow from its costs."""
+
+    def times(config, devices, wanted):
+        took = {}
+        for backend, path, lanes in wanted:
+            work = work_of(config, [path])
+            took[backend, path, lanes] = KNOWN.sample(backend, work, Layout(1, lanes))
+            if backend == "scan" and lanes > 10_000:
+                # the cache is too small
+                took[backend, path, lanes] *= 2.0
+        equations = work_of(config, [wanted[0][1]]).equations
+        return took, {"fused": KNOWN.fused.equation * equations, "scan": KNOWN.scan.equation * equations}
+
+    monkeypatch.setattr(under_test, "_times", times)
+    found = measured(jax.devices()[:1])
+    for backend in ("fused", "scan"):
+        np.testing.assert_allclose(found.of(backend), KNOWN.of(backend), rtol=1e-6)
+    assert found.cache == 4096 * work_of(read_config(under_test._STUDY), ["observer.motor.lambda"]).carried
+
+
+def test_measured_once_where_programs_are_kept(monkeypatch, tmp_path):
+    calls = []
+    monkeypatch.setattr(under_test, "measured", lambda devices: calls.append(devices) or KNOWN)
+    devices = jax.devices()
+    assert under_test.costs(devices) == under_test._CPU
+    assert not calls
+    monkeypatch.setenv(kept.PROGRAMS, str(tmp_path))
+    assert [under_test.costs(devices) for _ in range(2)] == [KNOWN, KNOWN]
+    assert calls == [devices]
+
+
+def test_the_backend_that_takes_less_time():
+    def chosen(platform, layout, samples=10**7, devices=1, programs=1):
+        backends = dict.fromkeys(("fused", "scan"), Layout(*layout)), dict.fromkeys(("fused", "scan"), samples)
+        work = Work(300.0, 100.0, 200.0, 800)
+        return faster([SimpleNamespace(platform=platform)] * devices, work, *backends, programs)
+
+    assert chosen("cpu", (1, 3)) == "fused"
+    # seed after seed would pay for each what lanes share
+    assert chosen("cpu", (1000, 3)) == "scan"
+    # but XLA takes longer to compile
+    assert chosen("cpu", (1000, 3), 1000) == "fused"
+    assert chosen("cpu", (1000, 3), programs=100_000) == "fused"
+    # the scan starts kernels for each time step; several GPUs share lanes by it alone
+    assert [chosen("gpu", (1, 3)), chosen("gpu", (1, 3), devices=2), chosen("tpu", (1, 3))] == ["fused", "scan", "scan"]
+    assert chosen("gpu", (1000, 3)) == "scan"

@@ -1,0 +1,186 @@
+"""Studies whose processes are killed at any moment: gone on with, they end in the bytes of one that was left alone, no chunk
+is computed twice once its part was whole, and nothing else is left in the folder."""
+
+import multiprocessing
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+import pytest
+from small_study import parts, spaced, thirty
+
+from small_study import ALPHA, LAMBDA  # isort: skip
+
+from jaxbl.errors import NoResult
+from jaxbl.sweeps.sweep import share, sweep
+
+pytestmark = pytest.mark.slow
+
+# a process that has loaded everything and started nothing: its children begin at once
+CONTEXT = multiprocessing.get_context("forkserver")
+CONTEXT.set_forkserver_preload(["jaxbl.sweeps.sweep", "distributed"])
+
+
+def study(points=120):
+    """Runs in as many chunks, of some ten milliseconds each."""
+    axes = [spaced(ALPHA, 5.0, 20.0, points // 10), spaced(LAMBDA, 0.3, 5.0, 10)]
+    return thirty(axes=axes, sweep={"seeds": 4, "chunk": 4}, run={"duration": 4.0, "substeps": 1})
+
+
+def _sweep(folder, scheduler=None):
+    try:
+        sweep(study(), folder, scheduler=scheduler)
+    except NoResult:
+        sys.exit(1)
+
+
+def _share(folder, which):
+    share(study(), folder, which)
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """Parts of the study that was left alone, and the seconds that it took."""
+    folder = tmp_path_factory.mktemp("alone") / "study"
+    times = []
+    for _ in range(2):
+        # the second time all is compiled
+        start = time.monotonic()
+        run = begun(_sweep, folder)
+        run.join()
+        assert run.exitcode == 0
+        times.append(time.monotonic() - start)
+        found = parts(folder)
+        for path in (folder / "points").iterdir():
+            path.unlink()
+    return found, times[1]
+
+
+def begun(function, *given):
+    process = CONTEXT.Process(target=function, args=given)
+    process.start()
+    return process
+
+
+def whole(folder, expected):
+    """Parts that are whole, with what changes when one is written again."""
+    found = {path.name: path for path in (folder / "points").glob("part-*")} if (folder / "points").is_dir() else {}
+    return {
+        name: (path.stat().st_ino, path.stat().st_mtime_ns)
+        for name, path in found.items()
+        if path.read_bytes() == expected[name]
+    }
+
+
+def check(folder, expected):
+    """The study goes on to its end, and is what it would have been."""
+    sweep(study(), folder)
+    assert parts(folder) == expected
+    assert not list(folder.rglob(".*")) and not (folder / "damaged").exists()
+
+
+def test_killed_at_twenty_random_moments(tmp_path, alone):
+    expected, seconds = alone
+    rng = random.Random(0)
+    kills = rounds = 0
+    while kills < 20:
+        folder, rounds, before = tmp_path / f"{rounds}", rounds + 1, {}
+        while True:
+            process = begun(_sweep, folder)
+            process.join(rng.uniform(0.1, 1.0) * seconds)
+            if process.exitcode is None:
+                process.kill()
+                process.join()
+                kills += 1
+            after = whole(folder, expected)
+            assert before.items() <= after.items(), "a chunk was computed twice"
+            before = after
+            if process.exitcode == 0:
+                break
+        check(folder, expected)
+    assert rounds > 1
+
+
+def test_shares_of_which_one_is_killed(tmp_path, alone):
+    expected, seconds = alone
+    processes = [begun(_share, tmp_path / "study", (number, 3)) for number in (1, 2, 3)]
+    time.sleep(0.7 * seconds)
+    processes[1].kill()
+    for process in processes:
+        process.join()
+    assert [process.exitcode for process in processes] == [0, -signal.SIGKILL, 0]
+    before = whole(tmp_path / "study", expected)
+    assert 2 * len(expected) // 3 <= len(before) < len(expected)
+    check(tmp_path / "study", expected)
+    assert before.items() <= whole(tmp_path / "study", expected).items()
+
+
+@contextmanager
+def dask(*words):
+    """A process of a cluster."""
+    # none is restarted by another one
+    environment = os.environ | {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "10"}
+    process = subprocess.Popen([sys.executable, "-m", *words], env=environment, stderr=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def worker(address, folder):
+    words = ("--no-nanny", "--nthreads", "1", "--no-dashboard", "--local-directory", str(folder), "--death-timeout", "60")
+    return dask("distributed.cli.dask_worker", address, *words)
+
+
+def scheduler(port):
+    return dask("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard")
+
+
+def until(true, seconds=120.0):
+    latest = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < latest
+        time.sleep(0.02)
+
+
+def count(folder):
+    return len(list((folder / "points").glob("part-*"))) if (folder / "points").is_dir() else 0
+
+
+def test_a_worker_the_client_and_the_scheduler_are_killed(tmp_path, alone):
+    expected, _ = alone
+    folder = tmp_path / "study"
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    address = f"tcp://127.0.0.1:{port}"
+    with worker(address, tmp_path / "a") as first, worker(address, tmp_path / "b"):
+        with scheduler(port):
+            client = begun(_sweep, folder, address)
+            until(lambda: count(folder) >= 8)
+            # a worker, wherever it is, and a late one is welcome
+            first.kill()
+            with worker(address, tmp_path / "c"):
+                until(lambda: count(folder) >= 30)
+                client.kill()
+                client.join()
+                before = whole(folder, expected)
+                client = begun(_sweep, folder, address)
+                until(lambda: count(folder) >= 60)
+        # the scheduler is gone
+        client.join(60.0)
+        assert client.exitcode == 1
+        after = whole(folder, expected)
+        assert before.items() <= after.items() and len(after) < len(expected)
+    with scheduler(port), worker(address, tmp_path / "d"):
+        client = begun(_sweep, folder, address)
+        client.join(120.0)
+        assert client.exitcode == 0
+    assert after.items() <= whole(folder, expected).items()
+    check(folder, expected)

@@ -1,0 +1,113 @@
+"""A study whose folder is in an object store: the same parts as on a disk, restart, damage, stores that do not answer."""
+
+import boto3
+import pandas as pd
+import pytest
+from moto.server import ThreadedMotoServer
+from small_study import ALPHA, listed, parts, thirty
+
+from jaxbl.errors import InputError
+from jaxbl.files import begin_file, place
+from jaxbl.report.sweep import write_sweep_report
+from jaxbl.sweeps.status import status
+from jaxbl.sweeps.sweep import open_study, repair, share, sweep
+
+
+@pytest.fixture(scope="module")
+def bucket():
+    """Address of an empty one, in a store of this process."""
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    names = {
+        "ACCESS_KEY_ID": "a",
+        "SECRET_ACCESS_KEY": "b",
+        "ENDPOINT_URL": f"http://{host}:{port}",
+        "DEFAULT_REGION": "us-east-1",
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in names.items():
+            patch.setenv(f"AWS_{name}", value)
+        boto3.client("s3").create_bucket(Bucket="bucket")
+        yield "s3://bucket"
+    server.stop()
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("alone") / "study"
+    return folder, sweep(thirty(), folder)
+
+
+def keys(address):
+    """Names below an address, with their content."""
+    bucket, _, prefix = address.removeprefix("s3://").partition("/")
+    client = boto3.client("s3")
+    names = [one["Key"] for one in client.list_objects_v2(Bucket=bucket, Prefix=prefix).get("Contents", [])]
+    return {name.removeprefix(f"{prefix}/"): client.get_object(Bucket=bucket, Key=name)["Body"].read() for name in names}
+
+
+def test_a_study_in_a_store_is_that_of_a_disk(bucket, alone, computed):
+    folder, result = alone
+    address = f"{bucket}/a/study"
+    first = share(thirty(), address, (1, 2))
+    assert (first.parts, first.finished) == (4, False)
+    found = sweep(thirty(), address)
+    assert sorted(computed) == list(range(8))
+    pd.testing.assert_frame_equal(found.frame, result.frame, check_exact=True)
+    stored = keys(address)
+    assert {name for name in stored if not name.startswith("points/")} == {"manifest.json", "study.toml"}
+    assert {name.removeprefix("points/"): stored[name] for name in stored if name.startswith("points/")} == parts(folder)
+    # again: only read
+    assert sweep(thirty(), address).cost["lanes"] == 0
+    assert keys(address) == stored
+    assert status(address).finished
+    pd.testing.assert_frame_equal(open_study(address).frame, result.frame, check_exact=True)
+    with pytest.raises(InputError, match="holds another study"):
+        sweep(thirty(sweep={"seeds": 3, "chunk": 4}), address)
+    sweep(thirty(axes=[listed(ALPHA, 5.0, 9.0)]), address, overwrite=True)
+    assert set(keys(address)) == {"manifest.json", "study.toml", *(f"points/part-0000{seed}.parquet" for seed in (0, 1))}
+
+
+def test_damage_in_a_store_is_noticed_and_healed(bucket, alone, computed):
+    address = f"{bucket}/b"
+    sweep(thirty(), address)
+    computed.clear()
+    one, other = (place(address) / "points" / f"part-0000{index}.parquet" for index in (2, 5))
+    one.write_bytes(one.read_bytes()[:-1000])
+    other.unlink()
+    with pytest.raises(InputError, match=r"part-00002\.parquet: is damaged"):
+        _ = open_study(address).frame
+    assert len(sweep(thirty(), address).damaged) == 1
+    assert sorted(computed) == [2, 5]
+    assert "damaged/part-00002.parquet" in keys(address)
+    (place(address) / "manifest.json").unlink()
+    with pytest.raises(InputError, match="has lost its manifest"):
+        open_study(address)
+    assert repair(address)[0] == 8
+    pd.testing.assert_frame_equal(open_study(address).frame, alone[1].frame, check_exact=True)
+
+
+def test_a_report_in_a_store(bucket):
+    address = f"{bucket}/c"
+    figure = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
+    write_sweep_report(sweep(thirty(figures=[figure]), address), place(address))
+    stored = keys(address)
+    (name,) = [name for name in stored if name.startswith("figures/")]
+    assert stored[name].startswith(b"\x89PNG") and b"Metrics over all runs" in stored["report.html"]
+
+
+def test_who_comes_second_does_not_begin(bucket):
+    path = place(f"{bucket}/d/manifest.json")
+    assert begin_file(path, "first")
+    assert not begin_file(path, "second")
+    assert path.read_bytes() == b"first"
+
+
+def test_bad_addresses(bucket, monkeypatch):
+    with pytest.raises(InputError, match=r"s3://none/x: cannot be written to \(.*bucket.*\); name another folder"):
+        sweep(thirty(), "s3://none/x")
+    with pytest.raises(InputError, match=r"s3://none/x: holds no study"):
+        open_study("s3://none/x")
+    with pytest.raises(InputError, match=r"foo://a: is no place for results"):
+        sweep(thirty(), "foo://a")

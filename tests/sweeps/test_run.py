@@ -1,0 +1,85 @@
+"""A study in shares, by processes that know nothing of one another, in any order, into one folder."""
+
+import pandas as pd
+import pytest
+from small_study import ALPHA, LAMBDA, parts, spaced, thirty
+
+from jaxbl.config import read_config
+from jaxbl.errors import InputError
+from jaxbl.files import locked
+from jaxbl.sweeps import run
+from jaxbl.sweeps.engine import Engine
+from jaxbl.sweeps.status import status, statuses
+from jaxbl.sweeps.sweep import share, sweep
+
+
+def test_shares_are_the_whole_study(tmp_path, computed):
+    alone = sweep(thirty(), tmp_path / "alone")
+    computed.clear()
+    folder, seen = tmp_path / "shares", []
+    last = share(thirty(), folder, (3, 3), progress=lambda *done: seen.append(done))
+    assert len(computed) == 2 and not last.complete
+    # progress of a share is of its own lanes
+    assert seen[-1][0] == seen[-1][1] == sum(Engine(alone.config).lanes(index) for index in computed)
+    assert (status(folder).parts, status(folder).parts_in_all, status(folder).finished) == (2, 8, False)
+    with locked(folder, shared=True):
+        # another one is at work
+        share(thirty(), folder, (1, 3))
+        assert status(folder).held_by.startswith("process")
+    done = share(thirty(), folder, (2, 3))
+    assert sorted(computed) == list(range(8))
+    assert done.complete and done.remaining == 0.0 and not done.finished
+    # a share that is there, and who collects them, compute nothing
+    share(thirty(), folder, (2, 3))
+    result = sweep(thirty(), folder)
+    assert sorted(computed) == list(range(8))
+    assert parts(folder) == parts(tmp_path / "alone")
+    pd.testing.assert_frame_equal(result.frame, alone.frame, check_exact=True)
+    assert status(folder).finished
+    assert not list(folder.rglob(".*"))
+    # more shares than chunks
+    assert share(thirty(), folder, (99, 100)).complete
+
+
+def test_a_share_leaves_the_folder_of_others_alone(tmp_path, computed, monkeypatch):
+    share(thirty(), tmp_path / "study", (1, 2))
+    before = parts(tmp_path / "study")
+    with pytest.raises(InputError, match="holds another study"):
+        share(thirty(sweep={"seeds": 3, "chunk": 4}), tmp_path / "study", (2, 2))
+    monkeypatch.setattr(run, "_PREPARED", 0.2)
+    with (
+        locked(tmp_path / "study"),
+        pytest.raises(InputError, match="is writing into it; wait until it has ended"),
+    ):
+        share(thirty(), tmp_path / "study", (2, 2))
+    assert parts(tmp_path / "study") == before
+    refined = thirty(axes=[spaced(ALPHA, 5.0, 20.0, 9), spaced(LAMBDA, 0.3, 5.0, 9)], sweep={"refine": 2})
+    with pytest.raises(InputError, match=r"--share: sweep\.refine makes points depend on one another"):
+        share(refined, tmp_path / "other", (1, 2))
+    assert not (tmp_path / "other").exists()
+
+
+def test_status_of_folders(tmp_path):
+    with pytest.raises(InputError, match="holds no study"):
+        statuses(tmp_path)
+    for name in ("verify/drive", "verify/sampled"):
+        sweep(thirty(), tmp_path / name)
+    assert [one.folder.name for one in statuses(tmp_path)] == ["drive", "sampled"]
+
+
+def test_chunks_cover_the_grid_coarsely_first():
+    """Whenever it is stopped, a study has points all over its map."""
+    axes = [spaced(ALPHA, 5.0, 20.0, 32), spaced(LAMBDA, 0.3, 5.0, 32)]
+    engine = Engine(read_config(thirty(axes=axes, sweep={"seeds": 2, "chunk": 8})))
+    order = engine.order()
+    assert sorted(order) == list(range(len(engine))) and len(engine) == 256
+    # the first seed of all points before the second
+    assert {engine.chunk(index).seeds[0] for index in order[:128]} == {0}
+    for count in (8, 16, 32, 64):
+        points = [point for index in order[:count] for point in engine.chunk(index).points]
+        # of the rows of the map, each as wide as there are blocks in it
+        rows = {point // 32 for point in points}
+        assert len(rows) >= 0.5 * min(32, count)
+        gaps = [b - a for a, b in zip(sorted(rows), sorted(rows)[1:], strict=False)]
+        assert max(gaps) <= 2 * 32 / min(32, count) + 1
+    assert {point // 32 for index in order[:64] for point in engine.chunk(index).points} == set(range(32))

@@ -1,0 +1,175 @@
+"""Bad input of any kind gets one line, in seconds and in little memory."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import tomli_w
+from measured import made
+from small_study import ALPHA, listed, rigid
+
+HERE = Path(__file__).parent
+
+# said of the inputs that :mod:`bad_inputs` lists; "" where there is nothing to say
+SAID = {
+    "study inertia": "drive.motor_inertia: should be at least 1e-30, not 4.94066e-324",
+    "study substeps of 1e30": "run.substeps: should be a number of 64 bits, not 0xc9f2c9cd04674edea40000000",
+    "study substeps of 1e9": "run.substeps: should be less than or equal to 100000, not 1000000000",
+    "study nested": "tables or arrays are nested too deep",
+    "study nested tables": "a.b.b.b.b.b.b.b.b.b.b.b.b.b.b.b: tables or arrays within one another; at most 16 are possible",
+    "study dotted": "line 1: a key of more than 50 parts; none has as many",
+    "study nested far": "tables or arrays are nested too deep",
+    "study long kind": "effects[0].kind: unknown kind 'xxx",
+    "study long key": "a key should have at most 200 characters, not 5000",
+    "study long title": "title: String should have at most 500 characters, not 'xxx",
+    "study long path": "axes[0]: unknown path 'ooo",
+    "study chained": "include: more than 100 files, with those that they include; fewer are needed",
+    "study doubled": "include: more than 100 files, with those that they include; fewer are needed",
+    "study pipe included": "pipe.csv: is a pipe or a device; a file is needed",
+    "study device included": "/dev/zero: is a pipe or a device; a file is needed",
+    "study pipe recorded": "pipe.csv: is a pipe or a device; a file is needed",
+    "study device recorded": "/dev/zero: is a pipe or a device; a file is needed",
+    "study harmonics": "excitation.count: should be less than or equal to 10000, not 1000000000",
+    "study values": "has 12 MB; it should have at most 8 MB",
+    "study fewer values": "holds more than 300000 values; give axes by start, stop and num, inputs as a recorded file",
+    "study sine at the rate": "excitation: frequency 1000 Hz has to be below half the sampling rate, 500 Hz",
+    "study short steps": "excitation: hold 1e-12 s has to be at least run.sample_period, 0.001 s",
+    "study short record": "short.csv ends after 0.05 s, the run after 0.2 s; its last value is held for the rest.",
+    "study gear ratio": "drive.gear_ratio: should be greater than or equal to 0.0000001, not 1e-12",
+    "study escape": r"title: should have no control characters such as '\x1b'",
+    "log number": "should hold an array of objects, one a row, or of rows of equally many numbers",
+    "log deep array": "is nested too deep; a log holds rows, or arrays by name",
+    "log deep object": "is nested too deep; a log holds rows, or arrays by name",
+    "log one line": "line 1 has more than 1 MB; a log has a line for each row",
+    "log one line of text": "line 1 has more than 1 MB; a log has a line for each row",
+    "log one cell": "line 1 has more than 1 MB; a log has a line for each row",
+    "log a long row": "line 2 has more than 1 MB; a log has a line for each row",
+    "log late stamps": "column 't', data row 2 is 1e+297; a reading should be below 1e+30",
+    "log early stamps": "the period of the time stamps is 1e-303 s, as no drive is sampled; see [log] t.unit",
+    "log far positions": "column 'theta_e', data row 1 is -2.78976e+300; a reading should be below 1e+30",
+    "log no motion": "theta_e moves by only 6.4e-299 rad; see its unit and factor in [log]",
+    "log no torque": "u is at most 1.65e-299; see its unit and factor in [log]",
+    "log resampled": "a period of 1e-12 s makes 3999000000001 samples of 4000",
+    "log drifting": "log.theta_s.drift: should be greater than or equal to -0.1, not -1000000000.0",
+    "log unpacks": "",
+    "log unpacks twice": "",
+    "log unpacks in use": "column 'u' has 2000000000 values; at most 100000000 can be read",
+    "log unpacks less": "column 'u' has 90000000 values and the time 400; they should be equally many",
+    "log unpacks cells": "",
+    "log external": "Not read, as the data are in other files: theta_s.",
+    "log external link": "Not read, as the data are in other files: theta_s.",
+    "log loop": "",
+    "log complex": "column 'theta_s' holds complex numbers; it should hold real numbers",
+    "log dates": "Time is counted from 2025-12-31T23:00:00.000000000.",
+    "log frozen": "theta_s stands still from 1 to 2.999 s while theta_e moves by 59.6 rad: readings that are frozen",
+    "log clipped": "theta_s stands still at the end of its range from 0.827 to 1.647 s while theta_e moves by 30.9 rad",
+    "log escape": r"no column 'theta_e' or 'theta_s'; columns: t, u, \x1b[31mred, b",
+    "log pipe": "pipe.csv: is a pipe or a device; a file is needed",
+    "log device": "/dev/zero: is a pipe or a device; a file is needed",
+}
+
+
+def read(what: str, folder: Path) -> dict[str, str]:
+    """What was said of inputs of a kind, by a process that ends where one takes too much."""
+    script = [sys.executable, str(HERE / "bad_inputs.py"), what, str(folder)]
+    paths = os.pathsep.join([str(HERE.parent), str(HERE), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        script, env=os.environ | {"PYTHONPATH": paths}, capture_output=True, text=True, timeout=1500, check=False
+    )
+    assert done.returncode == 0, done.stderr[-5000:]
+    return json.loads((folder / "said.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def said(tmp_path_factory):
+    return read("listed", tmp_path_factory.mktemp("listed"))
+
+
+def test_every_listed_input_was_tried(said):
+    assert said.keys() == SAID.keys()
+
+
+@pytest.mark.parametrize("case", SAID)
+def test_what_is_said_of_it(said, case):
+    assert SAID[case] in said[case]
+    assert bool(SAID[case]) == bool(said[case])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["toml", "logs"])
+def test_five_hundred_generated_ones(what, tmp_path):
+    """Read, or refused in one line; the process itself ends at an exception, at ten seconds, and at two gigabytes."""
+    found = read(what, tmp_path).values()
+    assert len(found) >= 500
+    # neither all refused nor all read
+    named = sum(str(tmp_path) in one for one in found)
+    assert 50 < named < len(found) - 20
+
+
+def command(*arguments: str, cwd: Path, before: tuple[str, ...] = (), **environment: str) -> subprocess.CompletedProcess:
+    call = [*before, sys.executable, "-m", "jaxbl", *arguments]
+    return subprocess.run(
+        call, cwd=cwd, env=os.environ | environment, capture_output=True, text=True, timeout=300, check=False
+    )
+
+
+def test_a_command_ends_with_two_and_one_line(tmp_path):
+    os.mkfifo(tmp_path / "log.csv")
+    done = command("inspect", "log.csv", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "jaxbl: log.csv: is a pipe or a device; a file is needed\n"
+
+
+def test_letters_of_a_file_s_name_do_not_reach_the_terminal(tmp_path):
+    made().to_csv(tmp_path / "a\x1b[31mb.csv", index=False)
+    done = command("inspect", "a\x1b[31mb.csv", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith(r"a\x1b[31mb.csv: 4000 samples")
+    assert "\x1b" not in done.stdout
+
+
+@pytest.mark.slow
+def test_a_name_is_no_mathematics_and_a_folder_may_be_read_only(tmp_path):
+    """The figures come after all computing: a name must not make them fail."""
+    axes = [listed(ALPHA, 5.0, 9.0)]
+    figures = [{"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}]
+    (tmp_path / "study.toml").write_text(tomli_w.dumps(rigid(title=r"$\frac{$ 漢", axes=axes, figures=figures)))
+    done = command("sweep", "study.toml", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    # and where the results may only be read, that is said before the figures are drawn
+    folder = tmp_path / "results" / "study"
+    folder.chmod(0o555)
+    # the superuser may write anywhere, unless that right is given up
+    before = () if os.geteuid() else ("setpriv", "--bounding-set=-dac_override")
+    if before and shutil.which("setpriv") is None:
+        return
+    done = command("plot", str(folder), cwd=tmp_path, before=before)
+    folder.chmod(0o755)
+    said = f"{folder}: cannot be written to (Permission denied); copy it to where you may write, and plot that"
+    assert (done.returncode, done.stderr) == (2, f"jaxbl: {said}\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wait", [0.0, 0.3, 1.0, 2.0])
+def test_an_interrupt_before_work_begins(tmp_path, wait):
+    """While modules are loaded; some of them swallow a KeyboardInterrupt."""
+    made().to_csv(tmp_path / "log.csv", index=False)
+    (tmp_path / "study.toml").write_text(tomli_w.dumps(rigid()))
+    call = [sys.executable, "-X", "importtime", "-m", "jaxbl", "identify", "log.csv", "--model", "study.toml"]
+    with subprocess.Popen(call, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        # Python itself is up once it has loaded a module that only jaxbl asks for
+        lines = iter(process.stderr.readline, "")
+        next(line for line in lines if line.endswith(" typer\n") or " click" in line)
+        time.sleep(wait)
+        process.send_signal(signal.SIGINT)
+        rest = process.stderr.read()
+        process.wait(300)
+    said = [line for line in rest.splitlines() if not line.startswith("import time:")]
+    assert process.returncode == 130
+    assert len(said) == 1 and said[0].startswith("interrupted")

@@ -1,0 +1,38 @@
+"""The studies of the benchmark are those of the repository, and C++ gives the same figures."""
+
+import numpy as np
+import pytest
+
+from jaxbl.config import read_config
+from jaxbl.errors import NoResult
+from jaxbl.throughput.rivals.native import compiler
+from jaxbl.throughput.run import check_medians, check_study, compare
+from jaxbl.throughput.studies import STUDIES
+
+
+@pytest.mark.parametrize("name", list(STUDIES))
+def test_those_of_the_repository(name):
+    drawn = {"title": "", "notes": [], "figures": []}
+    repository = read_config(f"sweeps/{name}.toml").model_copy(update=drawn)
+    assert read_config(STUDIES[name]).model_copy(update=drawn).resolved() == repository.resolved()
+
+
+@pytest.mark.skipif(compiler() is None, reason="no C++ compiler")
+@pytest.mark.parametrize("name", list(STUDIES))
+def test_the_same_figures_in_cpp(name, tmp_path_factory):
+    # beyond 5 s, where the identifiers begin
+    row = compare(name, tmp_path_factory.getbasetemp(), 2, 6000, 1, lanes=64)
+    assert row["deviation"] < 1e-5
+    assert row["lanes"] == 64
+    assert min(row["jaxbl"], row["c++"]) > 0.0
+
+
+def test_other_figures_are_not_timed():
+    true = {"motor.velocity_rmse": np.array([1.0, 2.0, np.nan])}
+    assert check_study("study", true, true) == 0.0
+    for wrong in ([1.001, 2.002, np.nan], [np.nan, np.nan, np.nan]):
+        with pytest.raises(NoResult, match=r"study: motor.velocity_rmse is off"):
+            check_study("study", {"motor.velocity_rmse": np.array(wrong)}, true)
+    check_medians("study", {"motor.velocity_rmse": np.array([1.01, 2.01, 7.0])[:2]}, true)
+    with pytest.raises(NoResult, match=r"motor.velocity_rmse has a median of 3, not 1.5"):
+        check_medians("study", {"motor.velocity_rmse": np.array([3.0, 3.0, np.nan])}, true)
