@@ -23,8 +23,8 @@ _KEPT = 2**24
 """Bytes of what lanes share, of some seeds, that a program keeps for the next lanes."""
 _WORTH = 0.875
 """Share of lanes down to which those that are done stay: to move the others costs as much as some samples."""
-_SHARE = 2**16
-"""Samples of lanes, some 0.1 ms, that are worth a thread."""
+_SHARE = 2**18
+"""Samples of lanes times their bytes, some 0.1 ms, that are worth a thread."""
 _CALL = 2**20
 """Samples of lanes that a call of the loop takes, some 1 ms: after it, lanes that are done leave."""
 
@@ -176,7 +176,7 @@ class HostPassage(Passage):
             for name in ("input at the end", "mark of a block", "result")
         }
         # a thread a share: its stretches come one after the other, whatever the others do
-        shares = min(threads, self._filled // self._together, max(self._filled * self._steps // _SHARE, 1))
+        shares = min(threads, self._filled // self._together, max(self._filled * self._steps * dtype.itemsize // _SHARE, 1))
         self._threads = [ThreadPoolExecutor(1) for _ in range(shares)]
 
     def _march(self, given, stretches):
