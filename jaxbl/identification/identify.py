@@ -129,7 +129,9 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
             return _from_motor(task, nominal, free, segments, done)
         found = ParameterSearch(nominal, segments, settings, rest=rest, name=str(record.path)).run(free)
         done()
-        values = {one.path: float(one.value(found.fit.theta[i])) for i, one in enumerate(found.free)}
+        # by NumPy, as in the summary: JAX's exponential function may differ in the last digit
+        theta = np.asarray(found.fit.theta)
+        values = {one.path: float(one.value(theta[i])) for i, one in enumerate(found.free)}
         fitted = set_leaves(nominal, arrays(values))
         profiles = {}
         if settings.profile:

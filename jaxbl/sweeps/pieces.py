@@ -1,5 +1,6 @@
 """Elementwise functions of columns of any length by a program of one shape, as compiling takes longer than computing."""
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -7,6 +8,16 @@ from typing import Any
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+
+@functools.lru_cache(maxsize=64)
+def _program(function: Callable[..., Any], devices: tuple[Any, ...]) -> tuple[Callable[..., Any], NamedSharding]:
+    """A function for all devices at once, and where rows of arguments lie. Each device does its own row, without a word to
+    the others: two such programs at the same time would wait for each other otherwise."""
+    mesh, rows = Mesh(np.array(devices), ("devices",)), PartitionSpec("devices")
+    own = jax.shard_map(function, mesh=mesh, in_specs=rows, out_specs=rows, check_vma=False)
+    return jax.jit(own), NamedSharding(mesh, rows)
+
 
 _SIZE = 1024
 """Of the pieces; each device has one at a time."""
@@ -22,7 +33,6 @@ def in_pieces(function: Callable[..., Any], columns: Sequence[np.ndarray], devic
     devices = list(jax.local_devices() if devices is None else devices)
     shape = max(-(-count // (_SIZE * len(devices))), 1), len(devices), _SIZE
     padded = [np.pad(np.asarray(one), (0, math.prod(shape) - count), "edge").reshape(shape) for one in columns]
-    # a row for each device: one program for all of them
-    rows = NamedSharding(Mesh(np.array(devices), ("devices",)), PartitionSpec("devices"))
-    found = [function(*(jax.device_put(piece, rows) for piece in pieces)) for pieces in zip(*padded, strict=True)]
+    program, rows = _program(function, tuple(devices))
+    found = [program(*(jax.device_put(piece, rows) for piece in pieces)) for pieces in zip(*padded, strict=True)]
     return jax.tree.map(lambda *some: np.concatenate([np.asarray(one).ravel() for one in some])[:count], *found)
