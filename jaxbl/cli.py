@@ -6,6 +6,7 @@ import math
 import os
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -135,8 +136,7 @@ def sweep(
     from jaxbl.sweeps.points import Points
     from jaxbl.sweeps.sweep import sweep as run_sweep
 
-    from .report.maps import check_figures
-    from .report.sweep import write_sweep_report
+    from .report.checks import check_figures
 
     if not study.axes and study.sweep.seeds == 1:
         raise InputError(f"{config}: axes: the study has none; add [[axes]], or use 'jaxbl simulate'")
@@ -147,7 +147,7 @@ def sweep(
             _print_cost(study, chosen)
             return
     run = functools.partial(run_sweep, verify_store=verify_store, scheduler=scheduler)
-    collect = functools.partial(_compute, context, config, study, out, overwrite, chosen, run, write_sweep_report)
+    collect = functools.partial(_compute, context, config, study, out, overwrite, chosen, run, "sweep")
     if detach or which is not None:
         from jaxbl.sweeps.sweep import share as run_share
         from jaxbl.sweeps.sweep import submit
@@ -240,10 +240,8 @@ def tune(
     study, chosen = _study(config, backend)
     from jaxbl.gains.tune import tune as run_tune
 
-    from .report.tune import write_tune_report
-
     run = functools.partial(run_tune, scheduler=scheduler)
-    _compute(context, config, study, out, overwrite, chosen, run, write_tune_report)
+    _compute(context, config, study, out, overwrite, chosen, run, "tune")
 
 
 @app.command()
@@ -259,10 +257,8 @@ def verify(
     study, chosen = _study(config, backend)
     from jaxbl.gains.verify import verify as run_verify
 
-    from .report.verify import write_verify_report
-
     run = functools.partial(run_verify, scheduler=scheduler)
-    _compute(context, config, study, out, overwrite, chosen, run, write_verify_report)
+    _compute(context, config, study, out, overwrite, chosen, run, "verify")
 
 
 def _study(config: Path, backend: str | None) -> tuple["Config", "Backend | None"]:
@@ -292,7 +288,7 @@ def _compute(
     overwrite: bool,
     backend: "Backend | None",
     run: Callable[..., Any],
-    write_report: Callable[[Any, Path], list[str]],
+    command: str,
 ) -> None:
     """Run a command on a study that continues where an interrupted call stopped, write its report, and say what it took."""
     folder = _folder(config, out)
@@ -300,7 +296,9 @@ def _compute(
         result = run(study, folder, progress=progress, overwrite=overwrite, backend=backend)
     from .fused import SCANNED
 
-    lines = write_report(result, folder)
+    # what draws is loaded when there is something to be drawn
+    report = import_module(f".report.{command}", __package__)
+    lines = getattr(report, f"write_{command}_report")(result, folder)
     cost = getattr(result, "cost", None)
     if cost and cost["lanes"]:
         compiling, computing = duration(cost["compile_seconds"]), duration(cost["run_seconds"])

@@ -27,7 +27,7 @@ from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
 from jaxbl.config import read_config, read_log_config
 from jaxbl.errors import InputError
 from jaxbl.records import read_record
-from jaxbl.report.maps import check_figures
+from jaxbl.report.checks import check_figures
 from jaxbl.sweeps.metrics import metric_columns
 from jaxbl.sweeps.points import Points
 

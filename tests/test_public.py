@@ -12,7 +12,7 @@ import pytest
 
 import jaxbl
 from jaxbl.config import read_config
-from jaxbl.report.maps import check_figures
+from jaxbl.report.checks import check_figures
 from jaxbl.sweeps.metrics import metric_columns
 from jaxbl.sweeps.points import Points
 

@@ -22,15 +22,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jaxbl.config import Config, FigureTable, is_boolean, numeric_paths
-from jaxbl.errors import InputError
-from jaxbl.gains.accuracy_laws import Law, accuracy_laws, check_selection, fixed_values, selected
+from jaxbl.gains.accuracy_laws import Law, accuracy_laws, fixed_values, selected
 from jaxbl.observer.conditions import CONDITIONS, Condition
 from jaxbl.sweeps.metrics import is_magnitude, metric_of
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
-from jaxbl.validation import nearest
 
 from .aggregates import Column, Groups, Rows
+from .checks import check_figures
 from .figures import COLOURS, MAP, MARKERS, MISSING, SIDES, Drawn, style, subplots, with_unit
 from .refined_maps import Filling, on_coarse_values
 
@@ -129,25 +128,6 @@ def _dots(result: StudyResult, figure: FigureTable) -> pd.Series | None:
     values = Points(config).values(sampled[0])
     # the first points of a design cover its ranges evenly, too
     return pd.Series(values[: max(len(values) * _MOST_DOTS // result.runs, 1)], name=sampled[0])
-
-
-def check_figures(config: Config, figures: list[FigureTable], columns: list[str]) -> None:
-    """Raise `InputError` where a figure names an axis or metric that does not exist."""
-    axes = [axis.path for axis in config.axes]
-    words = [axis.path for axis in config.axes if any(isinstance(value, str) for value in axis.values or ())]
-    for i, figure in enumerate(figures):
-        for key in ("x", "y", "facet", "series"):
-            path = getattr(figure, key)
-            if path is not None and path not in axes:
-                hint = nearest(path, axes) if axes else "the study has no axes"
-                raise InputError(f"figures[{i}].{key}: '{path}' is not an axis of this study; {hint}")
-            if path in words and key in ("x", "y"):
-                other = "facet" if figure.kind == "heatmap" else "facet or series"
-                raise InputError(f"figures[{i}].{key}: '{path}' has no numeric values; use it as {other}")
-        metrics = [column for column in columns if column not in (*axes, "seed")]
-        if figure.value not in metrics:
-            raise InputError(f"figures[{i}].value: '{figure.value}' is no metric; {nearest(figure.value, metrics)}")
-        check_selection(config, figure, i)
 
 
 def _label(config: Config, path: str) -> str:

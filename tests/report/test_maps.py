@@ -10,8 +10,9 @@ from small_study import ALPHA, LAMBDA, NOISE, listed, made, rigid, small, spaced
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
 from jaxbl.observer.conditions import least_lambda_seeber_horn
+from jaxbl.report.checks import check_figures
 from jaxbl.report.figures import save
-from jaxbl.report.maps import check_figures, draw
+from jaxbl.report.maps import draw
 
 RMSE = "motor.velocity_rmse"
 GAINS = [spaced(ALPHA, 1.0, 50.0, 5), spaced(LAMBDA, 1.0, 20.0, 4)]

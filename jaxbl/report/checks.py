@@ -1,0 +1,25 @@
+"""What is wrong with the figures that a study asks for, said before anything is computed, and without loading what draws."""
+
+from jaxbl.config import Config, FigureTable
+from jaxbl.errors import InputError
+from jaxbl.gains.accuracy_laws import check_selection
+from jaxbl.validation import nearest
+
+
+def check_figures(config: Config, figures: list[FigureTable], columns: list[str]) -> None:
+    """Raise `InputError` where a figure names an axis or metric that does not exist."""
+    axes = [axis.path for axis in config.axes]
+    words = [axis.path for axis in config.axes if any(isinstance(value, str) for value in axis.values or ())]
+    for i, figure in enumerate(figures):
+        for key in ("x", "y", "facet", "series"):
+            path = getattr(figure, key)
+            if path is not None and path not in axes:
+                hint = nearest(path, axes) if axes else "the study has no axes"
+                raise InputError(f"figures[{i}].{key}: '{path}' is not an axis of this study; {hint}")
+            if path in words and key in ("x", "y"):
+                other = "facet" if figure.kind == "heatmap" else "facet or series"
+                raise InputError(f"figures[{i}].{key}: '{path}' has no numeric values; use it as {other}")
+        metrics = [column for column in columns if column not in (*axes, "seed")]
+        if figure.value not in metrics:
+            raise InputError(f"figures[{i}].value: '{figure.value}' is no metric; {nearest(figure.value, metrics)}")
+        check_selection(config, figure, i)
