@@ -131,6 +131,8 @@ def sweep(
     which = _share(share, {"--overwrite": overwrite, "--verify-store": verify_store, "--scheduler": scheduler is not None})
     if detach and scheduler is None:
         raise InputError("--detach: needs the --scheduler of a cluster that stays when this command has ended")
+    if detach and (overwrite or verify_store):
+        raise InputError("--detach: does not go with --overwrite or --verify-store; choose another folder with --out")
     study, chosen = _study(config, backend)
     from jaxbl.sweeps.metrics import metric_columns
     from jaxbl.sweeps.points import Points

@@ -219,6 +219,10 @@ BAD = {
         ["sweep", "study.toml", "--detach"],
         "--detach: needs the --scheduler of a cluster that stays when this command has ended",
     ),
+    "leaving, and removing what is there": (
+        ["sweep", "study.toml", "--detach", "--scheduler", "tcp://127.0.0.1:1", "--overwrite"],
+        "--detach: does not go with --overwrite or --verify-store; choose another folder with --out",
+    ),
     "a cluster for one log": (
         ["diagnose", "log.csv", "--scheduler", "local:2"],
         "--scheduler goes with --batch: one log is one process's work",
