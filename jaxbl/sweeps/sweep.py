@@ -110,7 +110,7 @@ class StudyResult:
         pyarrow compares each page that it reads with its checksum.
 
         Args:
-            check: compare each file with its checksum in the manifest first (some seconds a GB); otherwise only what each
+            check: compare each file with its checksum in the manifest first (about a second a GB); otherwise only what each
                 part says of itself is looked at, and damage to a file's index of its rows may pass.
 
         Raises:

@@ -12,6 +12,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 from small_study import ALPHA, listed, rigid
+from upath import UPath
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError, NoResult
@@ -467,8 +468,7 @@ def test_parts_are_in_order_beyond_five_digits(tmp_path, finished):
 
 
 def test_a_study_in_an_object_store_is_read_alike(finished):
-    upath = pytest.importorskip("upath")
-    place = upath.UPath("memory://reading/study")
+    place = UPath("memory://reading/study")
     for name, content in files(finished[0]).items():
         (place / name).write_bytes(content)
     opened = open_study("memory://reading/study")
