@@ -2,6 +2,7 @@
 
 import itertools
 import time
+from threading import Event
 
 import jax
 import pandas as pd
@@ -153,12 +154,20 @@ def test_jobs_are_taken_as_they_are_needed(client):
         results.close()
 
 
-def test_a_scheduler_that_is_lost_is_said(client):
-    with LocalCluster(n_workers=1, processes=False, dashboard_address="127.0.0.1:0") as own:
-        connection = Client(own, set_as_default=False)
-        with connected(connection) as workers:
-            results = workers.each(time.sleep, [0.0, 3.0])
-            assert next(results) is None
-            connection.close()
-            with pytest.raises(NoResult, match="the connection to the scheduler is lost"):
-                next(results)
+_GO_ON = Event()
+
+
+def _waits(job):
+    return job and _GO_ON.wait(60.0)
+
+
+def test_a_scheduler_that_is_lost_is_said():
+    # one thread, so that the job that waits begins after the other
+    own = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
+    with LocalCluster(**own) as there, Client(there, set_as_default=False) as connection, connected(connection) as workers:
+        results = workers.each(_waits, [False, True])
+        assert next(results) is False
+        connection.close()
+        with pytest.raises(NoResult, match="the connection to the scheduler is lost"):
+            next(results)
+        _GO_ON.set()
