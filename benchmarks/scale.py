@@ -72,23 +72,45 @@ def measure(data: dict[str, Any], folder: Path) -> Cost:
     return Cost(config.run.steps, *(what / engine.rows for what in (between - start, end - between, size)))
 
 
-def started(folder: Path) -> tuple[float, float]:
-    """Seconds, and processor seconds, of the command until its first part is there."""
+_COMMAND = """
+import sys, time
+import psutil
+from jaxbl.__main__ import program
+from jaxbl.sweeps import programs
+
+run = programs.Program.run
+
+
+def clocked(*given):
+    now = time.time() - psutil.Process().create_time(), sum(psutil.Process().cpu_times()[:2])
+    print(*now, file=sys.stderr, flush=True)
+    programs.Program.run = run
+    return run(*given)
+
+
+programs.Program.run = clocked
+sys.argv[0] = "jaxbl"
+program()
+"""
+
+
+def started(folder: Path) -> list[float]:
+    """Seconds, and processor seconds, of the command until its first lanes begin, and until its first part is there."""
     small = (
         f'include = "{ROOT}/sweeps/gain_map.toml"\n[sweep]\nchunk = 64\n[run]\nduration = 0.1\n[identifier]\nstart = 0.05\n'
     )
     (folder / "study.toml").write_text(small)
     for out in ("first", "second"):
         start = time.perf_counter()
-        words = [sys.executable, "-m", "jaxbl", "sweep", "study.toml", "--out", out]
-        process = psutil.Popen(words, cwd=folder, stdout=subprocess.DEVNULL)
+        words = [sys.executable, "-c", _COMMAND, "sweep", "study.toml", "--out", out]
+        process = psutil.Popen(words, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         while not list((folder / out).glob("points/part-*")):
             time.sleep(0.01)
         times = process.cpu_times()
         wall = time.perf_counter() - start
         process.kill()
-        process.wait()
-    return wall, times.user + times.system
+        _, said = process.communicate()
+    return [*map(float, said.split()[:2]), wall, times.user + times.system]
 
 
 def main() -> None:
@@ -111,8 +133,11 @@ def main() -> None:
             f"{1e3 * cost.computing:.3f} ms a run; storing {1e6 * cost.storing:.1f} us, {cost.size:.0f} bytes a run"
         )
     with tempfile.TemporaryDirectory() as folder:
-        wall, used = started(Path(folder))
-    print(f"start to first part, programs kept: {wall:.1f} s, {used:.1f} s of processor time")
+        begun, used, there, used_there = started(Path(folder))
+    print(
+        f"programs kept: start to first lane-step {begun:.1f} s, {used:.1f} s of processor time; "
+        f"to first part {there:.1f} s, {used_there:.1f} s"
+    )
     print(
         f"\n{'runs':>8} {'study':16} {'core-hours':>11} {'dollars':>10}"
         + "".join(f"{n:>9} cores" for n in given.cores)

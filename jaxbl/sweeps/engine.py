@@ -211,7 +211,7 @@ class Engine:
             found = jax.block_until_ready(program.run(*given))
             self.run_seconds += time.perf_counter() - start
             # only now, as the first lanes need not wait for them
-            self._compile_conditions(group.config.run.precision)
+            self._compile_conditions(group.config.run.precision, chunk)
             start = time.perf_counter()
             figures = with_conditions(*found)
             self.run_seconds += time.perf_counter() - start
@@ -264,11 +264,11 @@ class Engine:
                 self.scanned.append(program.instead)
             return program, metric_columns(experiment)
 
-    def _compile_conditions(self, dtype: str) -> None:
+    def _compile_conditions(self, dtype: str, chunk: Chunk) -> None:
         if dtype not in self._judging:
             self._judging.add(dtype)
             start = time.perf_counter()
-            compile_conditions(dtype)
+            compile_conditions(dtype, len(chunk.seeds) * len(chunk.points))
             self.compile_seconds += time.perf_counter() - start
 
     def estimate(self) -> "SweepEstimate":
@@ -280,7 +280,7 @@ class Engine:
             program, _ = self._compile(config)
             a_program = self.compile_seconds
             with precision(config):
-                self._compile_conditions(config.run.precision)
+                self._compile_conditions(config.run.precision, chunk)
         compiling = a_program * len(groups) + self.compile_seconds - a_program
         backend: Backend = "scan" if program.instead is not None else self.backend
         # long enough for what a call costs not to count

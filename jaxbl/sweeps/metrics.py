@@ -449,9 +449,9 @@ def _different(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return rows[first], which
 
 
-def compile_conditions(dtype: str) -> None:
-    """Compile what :func:`with_conditions` computes, once for all studies of a precision."""
-    in_pieces(_judged, [np.ones(1, dtype)] * (len(ObserverGains._fields) + 1))
+def compile_conditions(dtype: str, lanes: int) -> None:
+    """Compile what :func:`with_conditions` computes of so many lanes, for all studies of a precision."""
+    in_pieces(_judged, [np.ones(lanes, dtype)] * (len(ObserverGains._fields) + 1))
 
 
 @jax.jit

@@ -27,12 +27,14 @@ CONTEXT.set_forkserver_preload(["jaxbl.sweeps.sweep", "distributed"])
 
 
 def study(points=120):
-    """Runs in as many chunks, of some ten milliseconds each."""
+    """Runs in as many chunks, of some milliseconds each."""
     axes = [spaced(ALPHA, 5.0, 20.0, points // 10), spaced(LAMBDA, 0.3, 5.0, 10)]
-    return thirty(axes=axes, sweep={"seeds": 4, "chunk": 4}, run={"duration": 4.0, "substeps": 1})
+    return thirty(axes=axes, sweep={"seeds": 4, "chunk": 4}, run={"duration": 1.0, "substeps": 1})
 
 
 def _sweep(folder, scheduler=None):
+    # compiled programs are kept, as on the command line, in one folder for all tests
+    os.environ["JAXBL_PROGRAMS"] = str(folder.parents[1] / "programs")
     try:
         sweep(study(), folder, scheduler=scheduler)
     except NoResult:

@@ -9,8 +9,8 @@ from jaxbl.sweeps.pieces import in_pieces
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("count", [1, 3, 4, 7, 24, 25])
-def test_columns_of_any_length_by_one_program(count, dtype, monkeypatch):
-    monkeypatch.setattr(under_test, "_SIZE", 4)
+def test_columns_of_any_length_by_programs_of_two_shapes(count, dtype, monkeypatch):
+    monkeypatch.setattr(under_test, "_SIZES", (2, 4))
     shapes = []
 
     @jax.jit
@@ -22,11 +22,11 @@ def test_columns_of_any_length_by_one_program(count, dtype, monkeypatch):
     found = in_pieces(both, [x, y])
     np.testing.assert_array_equal(found["sum"], np.full(count, count - 1.0))
     np.testing.assert_array_equal(found["less"], x < y)
-    assert found["sum"].dtype == dtype and set(shapes) == {(1, 4)}
+    assert found["sum"].dtype == dtype and set(shapes) == {(1, 2 if count <= 4 else 4)}
 
 
 def test_devices_share_pieces(monkeypatch):
-    monkeypatch.setattr(under_test, "_SIZE", 4)
+    monkeypatch.setattr(under_test, "_SIZES", (2, 4))
     used, made = [], under_test._program
 
     def program_for(function, devices):
