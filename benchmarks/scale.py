@@ -74,21 +74,25 @@ def measure(data: dict[str, Any], folder: Path) -> Cost:
 
 _COMMAND = """
 import sys, time
-import psutil
+
+begun = float(sys.argv.pop(1))
 from jaxbl.__main__ import program
-from jaxbl.sweeps import programs
+from jaxbl.sweeps import engine
 
-run = programs.Program.run
-
-
-def clocked(*given):
-    now = time.time() - psutil.Process().create_time(), sum(psutil.Process().cpu_times()[:2])
-    print(*now, file=sys.stderr, flush=True)
-    programs.Program.run = run
-    return run(*given)
+compile_program = engine.compile_program
 
 
-programs.Program.run = clocked
+def clocked(*given, **named):
+    program = compile_program(*given, **named)
+
+    def run(*given):
+        print(time.time() - begun, time.process_time(), file=sys.stderr, flush=True)
+        return program.run(*given)
+
+    return program._replace(run=run)
+
+
+engine.compile_program = clocked
 sys.argv[0] = "jaxbl"
 program()
 """
@@ -101,13 +105,13 @@ def started(folder: Path) -> list[float]:
     )
     (folder / "study.toml").write_text(small)
     for out in ("first", "second"):
-        start = time.perf_counter()
-        words = [sys.executable, "-c", _COMMAND, "sweep", "study.toml", "--out", out]
+        start = time.time()
+        words = [sys.executable, "-c", _COMMAND, str(start), "sweep", "study.toml", "--out", out]
         process = psutil.Popen(words, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-        while not list((folder / out).glob("points/part-*")):
+        while process.poll() is None and not list((folder / out).glob("points/part-*")):
             time.sleep(0.01)
         times = process.cpu_times()
-        wall = time.perf_counter() - start
+        wall = time.time() - start
         process.kill()
         _, said = process.communicate()
     return [*map(float, said.split()[:2]), wall, times.user + times.system]
