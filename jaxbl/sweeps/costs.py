@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.interpreters.partial_eval import dce_jaxpr
 
 from jaxbl.config import Config, precision, prepare, read_config
 from jaxbl.drive.parameters import get_leaf, set_leaves
@@ -21,7 +22,7 @@ from jaxbl.fused import kept
 from jaxbl.simulate import Experiment, scan
 from jaxbl.workers import doing
 
-from .metrics import METRICS
+from .metrics import Names, metrics
 from .programs import BACKENDS, Backend, Layout, compile_program, not_put_into_cache
 
 
@@ -136,10 +137,10 @@ def work_of(config: Config, paths: Sequence[str]) -> Work:
     """Count what a sample takes where these paths differ from lane to lane."""
     with precision(config):
         experiment = prepare(config)
-        key = kept.key_of("work", experiment, tuple(paths))
+        key = kept.key_of("work", experiment, tuple(paths), config.sweep.asked)
         found = kept.load(key)
         if found is None:
-            found = _counted(experiment, paths)
+            found = _counted(experiment, paths, config.sweep.asked)
             kept.save(key, found)
     return found
 
@@ -156,9 +157,9 @@ _WEIGHTS = {
 """What an operation takes of a processor, about, where that is not as much as a sum."""
 
 
-def _counted(experiment: Experiment, paths: Sequence[str]) -> Work:
+def _counted(experiment: Experiment, paths: Sequence[str], names: Names) -> Work:
     def lane(values: dict[str, Any], seed: Any) -> dict[str, Any]:
-        return scan(set_leaves(experiment, values), seed, (METRICS,))[0]
+        return scan(set_leaves(experiment, values), seed, (metrics(names),))[0]
 
     one = jax.ShapeDtypeStruct((_COUNTED,), jnp.result_type(experiment.run.sample_period))
     traced = jax.make_jaxpr(jax.vmap(lane, (0, None), axis_size=_COUNTED))(
@@ -166,7 +167,9 @@ def _counted(experiment: Experiment, paths: Sequence[str]) -> Work:
     )
     shared = own = carried = 0.0
     equations = 0
-    for times, eqn in _equations(traced.jaxpr, 1.0):
+    # neither backend computes what no metric needs
+    used, _ = dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars))
+    for times, eqn in _equations(used, 1.0):
         by_lane = [v.aval for v in eqn.outvars if _COUNTED in v.aval.shape]
         if times == 0.0:
             carried = max(carried, sum(aval.size * aval.dtype.itemsize for aval in by_lane) / _COUNTED)

@@ -10,6 +10,7 @@ import math
 import statistics
 import time
 from collections import OrderedDict
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -19,7 +20,7 @@ import pandas as pd
 from jaxbl.config import Config, precision, prepare
 
 from .costs import Work, costs, faster, lanes_at_once, work_of
-from .metrics import compile_conditions, metric_columns, with_conditions
+from .metrics import ObserverGains, compile_conditions, metric_columns, needs_conditions, with_conditions
 from .points import Points
 from .programs import BACKENDS, Backend, Layout, Program, backend_of, compile_program, not_put_into_cache
 
@@ -213,7 +214,7 @@ class Engine:
             # only now, as the first lanes need not wait for them
             self._compile_conditions(group.config.run.precision)
             start = time.perf_counter()
-            figures = with_conditions(*found)
+            figures = self._judged(*found)
             self.run_seconds += time.perf_counter() - start
         data = self.labels(chunk)
         for name in names:
@@ -258,14 +259,20 @@ class Engine:
             experiment = prepare(config)
             columns, _ = self._arguments(config, self.points.columns(np.arange(1)), np.arange(1))
             start = time.perf_counter()
-            program = compile_program(experiment, self.layout, self.devices, self.backend, columns, insist=self.insist)
+            program = compile_program(
+                experiment, self.layout, self.devices, self.backend, columns, names=config.sweep.asked, insist=self.insist
+            )
             self.compile_seconds += time.perf_counter() - start
             if program.instead is not None and program.instead not in self.scanned:
                 self.scanned.append(program.instead)
-            return program, metric_columns(experiment)
+            return program, metric_columns(experiment, config.sweep.metrics)
+
+    def _judged(self, figures: dict[str, Any], gains: dict[str, ObserverGains]) -> Mapping[str, Any]:
+        """Figures of a chunk with those that follow from them, if any of these is asked for."""
+        return with_conditions(figures, gains) if needs_conditions(self.config.sweep.asked) else figures
 
     def _compile_conditions(self, dtype: str) -> None:
-        if dtype not in self._judging:
+        if dtype not in self._judging and needs_conditions(self.config.sweep.asked):
             self._judging.add(dtype)
             start = time.perf_counter()
             compile_conditions(dtype)
@@ -297,7 +304,7 @@ class Engine:
                 begun = time.perf_counter()
                 found = jax.block_until_ready(tried.run(*given))
                 ended = time.perf_counter()
-                with_conditions(*found)
+                self._judged(*found)
                 running.append(ended - begun)
                 judging.append(time.perf_counter() - ended)
         # other groups take other numbers of plant steps, say; where there are many, some stand for all

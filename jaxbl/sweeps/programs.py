@@ -15,7 +15,7 @@ from jaxbl.errors import InputError
 from jaxbl.fused import Unsupported, attempted
 from jaxbl.simulate import Experiment, scan
 
-from .metrics import METRICS, ObserverGains, metric_columns, observer_gains
+from .metrics import Names, ObserverGains, metric_columns, metrics, observer_gains
 
 if TYPE_CHECKING:
     from jaxbl.fused.passage import Passage
@@ -68,9 +68,11 @@ def compile_program(
     backend: Backend,
     columns: dict[str, np.ndarray],
     *,
+    names: Names = None,
     insist: bool = False,
 ) -> Program:
-    """Compile one, inside :func:`jaxbl.config.precision`; `columns` is an example of the values, `(points,)` by path.
+    """Compile one, inside :func:`jaxbl.config.precision`; `columns` is an example of the values, `(points,)` by path;
+    `names` are the metrics asked for.
 
     Where the fused loop cannot run the step, or no lane differs from another, the scan takes its place; with `insist` that
     is refused.
@@ -81,24 +83,24 @@ def compile_program(
     if backend == "fused":
         try:
             with attempted():
-                return _fused(experiment, layout, devices, tuple(columns))
+                return _fused(experiment, layout, devices, tuple(columns), names)
         except Unsupported as why:
             if insist:
                 raise InputError(f"--backend fused: the fused loop does not know {why}; use --backend scan") from None
-            return _scanned(experiment, layout, devices, columns)._replace(instead=str(why))
-    return _scanned(experiment, layout, devices, columns)
+            return _scanned(experiment, layout, devices, columns, names)._replace(instead=str(why))
+    return _scanned(experiment, layout, devices, columns, names)
 
 
-def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tuple[str, ...]) -> Program:
+def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tuple[str, ...], names: Names) -> Program:
     if not paths:
         raise Unsupported("lanes that differ in nothing but their seed")
     from jaxbl.fused.passage import DevicePassage, HostPassage
 
     if devices[0].platform == "cpu":
-        passage: Passage = HostPassage(experiment, (METRICS,), paths, layout.points, len(devices))
+        passage: Passage = HostPassage(experiment, (metrics(names),), paths, layout.points, len(devices))
     elif devices[0].platform == "gpu" and len(devices) == 1:
         with jax.default_device(devices[0]):
-            passage = DevicePassage(experiment, (METRICS,), paths, layout.points)
+            passage = DevicePassage(experiment, (metrics(names),), paths, layout.points)
     else:
         raise Unsupported(f"{len(devices)} devices of platform {devices[0].platform}")
 
@@ -116,14 +118,16 @@ def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tu
         return stacked, observer_gains(set_leaves(experiment, values))
 
     size = jnp.result_type(experiment.run.sample_period).itemsize
-    figures = len(metric_columns(experiment)) * layout.seeds
+    figures = len(metric_columns(experiment, names)) * layout.seeds
     return Program(run, (passage.carried + len(paths) + figures) * layout.points * size / 1e6)
 
 
-def _scanned(experiment: Experiment, layout: Layout, devices: list[Any], columns: dict[str, np.ndarray]) -> Program:
+def _scanned(
+    experiment: Experiment, layout: Layout, devices: list[Any], columns: dict[str, np.ndarray], names: Names
+) -> Program:
     def lane(values: dict[str, Any], seed: Any) -> tuple[dict[str, Any], Any]:
         experiment_of_lane = set_leaves(experiment, values)
-        figures, _ = scan(experiment_of_lane, seed, (METRICS,))
+        figures, _ = scan(experiment_of_lane, seed, (metrics(names),))
         return figures, observer_gains(experiment_of_lane)
 
     # shards along the longer side that divides evenly; one device does the rest
