@@ -33,7 +33,7 @@ class SweepTable(Table):
     metrics: list[str] | None = Field(
         default=None,
         description="metrics to compute and store, by their names without side, e.g. ['converged', 'convergence_time']; "
-        "left out: all",
+        "left out: all; `finite` then counts what overflowed before all of these were known",
     )
     chunk: int | None = Field(default=None, ge=1, description="lanes computed at once; left out: chosen for the machine")
     refine: int | None = Field(

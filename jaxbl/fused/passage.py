@@ -17,7 +17,7 @@ from jaxbl.simulate import Experiment, Reducer, advance, begin, block_length, do
 from .ahead import Shared, ahead_of_lanes
 from .llvm import Arrays, Loop, Placed, Rows, vector_lanes
 from .noise import host
-from .split import Around, Kind, carry_kinds, carry_needed, split
+from .split import Around, Kind, carry_kinds, split
 
 _KEPT = 2**24
 """Bytes of what lanes share, of some seeds, that a program keeps for the next lanes."""
@@ -69,35 +69,21 @@ class Passage(abc.ABC):
         def own(values: list[Any]) -> Experiment:
             return set_leaves(experiment, dict(zip(paths, values, strict=True)))
 
-        values = [jax.ShapeDtypeStruct((), dtype)] * len(paths)
-        given = jax.ShapeDtypeStruct((), jnp.int32), dict.fromkeys(experiment.sides, jax.ShapeDtypeStruct((), jnp.float32))
-        whole = jax.eval_shape(lambda values: begin(own(values), reducers), values)
-        spare, tree = jax.tree.leaves(whole), jax.tree.structure(whole)
-        needed = [True] * len(spare)
-
-        def kept(carry: Any) -> list[Any]:
-            return [leaf for leaf, one in zip(jax.tree.leaves(carry), needed, strict=True) if one]
-
-        def filled(leaves: list[Any]) -> Any:
-            some = iter(leaves)
-            return tree.unflatten(
-                [next(some) if one else jnp.zeros(leaf.shape, leaf.dtype) for leaf, one in zip(spare, needed, strict=True)]
-            )
-
         def start(values: list[Any], *_: Any) -> Any:
-            return kept(begin(own(values), reducers))
+            return begin(own(values), reducers)
 
         def sample(values: list[Any], carry: Any, given: Any) -> Any:
-            return kept(advance(own(values), reducers, filled(carry), *given)[0])
+            return advance(own(values), reducers, carry, *given)[0]
 
         def settle(values: list[Any], carry: Any, given: Any) -> Any:
-            after = end_of_block(own(values), filled(carry))
-            return kept(after), done(own(values), reducers, after)
+            carry = end_of_block(own(values), carry)
+            return carry, done(own(values), reducers, carry)
 
         def result(values: list[Any], carry: Any, given: Any) -> dict[str, Any]:
-            return figures(own(values), reducers, filled(carry))
+            return figures(own(values), reducers, carry)
 
-        needed = carry_needed(((sample, given), (settle, ())), result, values, spare)
+        values = [jax.ShapeDtypeStruct((), dtype)] * len(paths)
+        given = jax.ShapeDtypeStruct((), jnp.int32), dict.fromkeys(experiment.sides, jax.ShapeDtypeStruct((), jnp.float32))
         carry = jax.eval_shape(start, values)
         kinds = carry_kinds(start, ((sample, given), (settle, ())), values)
         one = [leaf for leaf, kind in zip(jax.tree.leaves(carry), kinds, strict=True) if kind != Kind.LANE]

@@ -71,30 +71,6 @@ def carry_kinds(start: Callable[..., Any], functions: Iterable[tuple[Callable[..
             return [Kind.LANE if kind & Kind.LANE else Kind.SHARED for kind in found]
 
 
-def carry_needed(
-    functions: Iterable[tuple[Callable[..., Any], Any]], result: Callable[..., Any], values: Any, carry: list[Any]
-) -> list[bool]:
-    """Which leaves of a carry decide a result, or what functions give beyond the carry; arguments as of :func:`carry_kinds`
-    and :func:`split`."""
-    first, last = len(jax.tree.leaves(values)), len(jax.tree.leaves(values)) + len(carry)
-
-    def read(jaxpr: Any, outputs: Iterable[Any]) -> list[bool]:
-        needed = _needed(jaxpr, outputs)[1]
-        return [v in needed for v in jaxpr.invars[first:last]]
-
-    ending = flat(result, values, carry, ()).jaxpr
-    found = read(ending, ending.outvars)
-    traced = [flat(function, values, carry, given).jaxpr for function, given in functions]
-    while True:
-        before = found
-        for jaxpr in traced:
-            moved = [out for out, one in zip(jaxpr.outvars, found, strict=False) if one]
-            also = read(jaxpr, [*moved, *jaxpr.outvars[len(carry) :]])
-            found = [old or new for old, new in zip(found, also, strict=True)]
-        if found == before:
-            return found
-
-
 def split(
     function: Callable[..., Any],
     values: Any,
@@ -209,15 +185,10 @@ def _kinds(jaxpr: Any, given: Sequence[Kind]) -> dict[Var, Kind]:
 
 def _live(jaxpr: Any) -> list[JaxprEqn]:
     """Equations that an output needs."""
-    return _needed(jaxpr, jaxpr.outvars)[0]
-
-
-def _needed(jaxpr: Any, outputs: Iterable[Any]) -> tuple[list[JaxprEqn], set[Var]]:
-    """Equations that some outputs need, and all that they read."""
-    needed = {v for v in outputs if isinstance(v, Var)}
+    needed = {v for v in jaxpr.outvars if isinstance(v, Var)}
     kept = []
     for eqn in reversed(jaxpr.eqns):
         if any(out in needed for out in eqn.outvars):
             kept.append(eqn)
             needed |= {v for v in eqn.invars if isinstance(v, Var)}
-    return kept[::-1], needed
+    return kept[::-1]

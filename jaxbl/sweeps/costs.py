@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.interpreters.partial_eval import dce_jaxpr
 
 from jaxbl.config import Config, precision, prepare, read_config
 from jaxbl.drive.parameters import get_leaf, set_leaves
@@ -117,7 +116,11 @@ def lanes_at_once(devices: Sequence[Any], backend: Backend, work: Work) -> int:
 
 
 def faster(
-    devices: Sequence[Any], work: Work, layouts: Mapping[Backend, Layout], samples: Mapping[Backend, int], programs: int
+    devices: Sequence[Any],
+    works: Mapping[Backend, Work],
+    layouts: Mapping[Backend, Layout],
+    samples: Mapping[Backend, int],
+    programs: int,
 ) -> Backend:
     """The backend that takes less time to compile so many programs, and to take chunks of these shapes through so many
     samples in all."""
@@ -127,20 +130,20 @@ def faster(
     known = costs(devices)
 
     def total(backend: Backend) -> float:
-        running = samples[backend] * known.sample(backend, work, layouts[backend])
-        return programs * known.compiling(backend, work) + running
+        running = samples[backend] * known.sample(backend, works[backend], layouts[backend])
+        return programs * known.compiling(backend, works[backend]) + running
 
     return min(BACKENDS, key=total)
 
 
-def work_of(config: Config, paths: Sequence[str]) -> Work:
-    """Count what a sample takes where these paths differ from lane to lane."""
+def work_of(config: Config, paths: Sequence[str], names: Names = None) -> Work:
+    """Count what a sample takes where these paths differ from lane to lane, and some metrics are computed, or all."""
     with precision(config):
         experiment = prepare(config)
-        key = kept.key_of("work", experiment, tuple(paths), config.sweep.asked)
+        key = kept.key_of("work", experiment, tuple(paths), names)
         found = kept.load(key)
         if found is None:
-            found = _counted(experiment, paths, config.sweep.asked)
+            found = _counted(experiment, paths, names)
             kept.save(key, found)
     return found
 
@@ -167,9 +170,7 @@ def _counted(experiment: Experiment, paths: Sequence[str], names: Names) -> Work
     )
     shared = own = carried = 0.0
     equations = 0
-    # neither backend computes what no metric needs
-    used, _ = dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars))
-    for times, eqn in _equations(used, 1.0):
+    for times, eqn in _equations(traced.jaxpr, 1.0):
         by_lane = [v.aval for v in eqn.outvars if _COUNTED in v.aval.shape]
         if times == 0.0:
             carried = max(carried, sum(aval.size * aval.dtype.itemsize for aval in by_lane) / _COUNTED)

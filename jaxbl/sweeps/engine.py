@@ -20,9 +20,9 @@ import pandas as pd
 from jaxbl.config import Config, precision, prepare
 
 from .costs import Work, costs, faster, lanes_at_once, work_of
-from .metrics import ObserverGains, compile_conditions, metric_columns, needs_conditions, with_conditions
+from .metrics import Names, ObserverGains, compile_conditions, metric_columns, needs_conditions, with_conditions
 from .points import Points
-from .programs import BACKENDS, Backend, Layout, Program, backend_of, compile_program, not_put_into_cache
+from .programs import BACKENDS, Backend, Layout, Program, backend_of, compile_program, computed, not_put_into_cache
 
 
 class Chunk(NamedTuple):
@@ -119,7 +119,7 @@ class Engine:
 
     def _faster(self) -> Backend:
         """By the study, however it is cut: roundings differ between backends."""
-        if not self.points.columns(np.arange(1)):
+        if not self._varied:
             # lanes that differ in nothing but their seed
             return "scan"
         layouts: dict[Backend, Layout] = {backend: self._layout(backend, None) for backend in BACKENDS}
@@ -127,20 +127,27 @@ class Engine:
         samples: dict[Backend, int] = {
             b: steps * self._chunks(layout, self.points.coarse_lanes) for b, layout in layouts.items()
         }
-        return faster(self.devices, self._work, layouts, samples, len(self.points.groups))
+        return faster(self.devices, self._works, layouts, samples, len(self.points.groups))
 
     def _layout(self, backend: Backend, chunk: int | None) -> Layout:
         """Chunk shape: as many lanes as asked for, or as the devices want at once."""
         if chunk is None and self.points.refinement is not None:
             chunk = _REFINED_LANES_PER_DEVICE * len(self.devices)
-        capacity = chunk or len(self.devices) * lanes_at_once(self.devices, backend, self._work)
+        capacity = chunk or len(self.devices) * lanes_at_once(self.devices, backend, self._works[backend])
         return layout_for(self.config, self.points, len(self.devices), capacity)
 
     @functools.cached_property
-    def _work(self) -> Work:
-        """Of a sample, in the group that has most of them."""
-        group = max(self.points.groups, key=lambda group: group.config.run.steps)
-        return work_of(group.config, list(self.points.columns(np.arange(1))))
+    def _works(self) -> dict[Backend, Work]:
+        """Of a sample by either backend, in the group that has most of them."""
+        config = max(self.points.groups, key=lambda group: group.config.run.steps).config
+        asked: dict[Backend, Names] = {backend: computed(backend, config.sweep.asked) for backend in BACKENDS}
+        found = {names: work_of(config, self._varied, names) for names in set(asked.values())}
+        return {backend: found[names] for backend, names in asked.items()}
+
+    @property
+    def _varied(self) -> list[str]:
+        """Paths that differ from lane to lane."""
+        return list(self.points.columns(np.arange(1)))
 
     def __len__(self) -> int:
         """Number of chunks; of a refined study, those of its coarse grid."""
@@ -328,7 +335,7 @@ class Engine:
 
     def _seconds(self, backend: Backend, config: Config) -> float:
         """That a chunk of a group should take."""
-        work = work_of(config, list(self.points.columns(np.arange(1))))
+        work = work_of(config, self._varied, computed(backend, config.sweep.asked))
         return costs(self.devices).sample(backend, work, self.layout) * config.run.steps
 
 

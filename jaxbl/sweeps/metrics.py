@@ -526,7 +526,7 @@ def _judged(lambda_: Array, alpha: Array, position_error: Array, velocity_error:
 
 
 _FINITE = Metric.of(
-    "finite", "", "finite", "no number of the lane overflowed before all that is asked for was known", better="more"
+    "finite", "", "finite", "no number of the lane overflowed, as far as metrics were not known yet", better="more"
 )
 """The one column that is not of a side."""
 

@@ -15,7 +15,7 @@ from jaxbl.errors import InputError
 from jaxbl.fused import Unsupported, attempted
 from jaxbl.simulate import Experiment, scan
 
-from .metrics import Names, ObserverGains, metric_columns, metrics, observer_gains
+from .metrics import METRICS, Names, ObserverGains, metric_columns, metrics, observer_gains
 
 if TYPE_CHECKING:
     from jaxbl.fused.passage import Passage
@@ -29,6 +29,12 @@ def backend_of(name: str | None, given: str = "backend") -> Backend | None:
     if name is not None and name not in BACKENDS:
         raise InputError(f"{given}: there is no {name!r}; one of {', '.join(BACKENDS)}")
     return name
+
+
+def computed(backend: Backend, names: Names) -> Names:
+    """The metrics that a backend computes where some are asked for. XLA rounds otherwise where it computes less: the scan
+    computes all, so that those asked for are to the bit what they are beside the others."""
+    return names if backend == "fused" else None
 
 
 class Layout(NamedTuple):
@@ -72,7 +78,7 @@ def compile_program(
     insist: bool = False,
 ) -> Program:
     """Compile one, inside :func:`jaxbl.config.precision`; `columns` is an example of the values, `(points,)` by path;
-    `names` are the metrics asked for.
+    `names` are the metrics asked for: its figures have these, and perhaps others.
 
     Where the fused loop cannot run the step, or no lane differs from another, the scan takes its place; with `insist` that
     is refused.
@@ -87,8 +93,8 @@ def compile_program(
         except Unsupported as why:
             if insist:
                 raise InputError(f"--backend fused: the fused loop does not know {why}; use --backend scan") from None
-            return _scanned(experiment, layout, devices, columns, names)._replace(instead=str(why))
-    return _scanned(experiment, layout, devices, columns, names)
+            return _scanned(experiment, layout, devices, columns)._replace(instead=str(why))
+    return _scanned(experiment, layout, devices, columns)
 
 
 def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tuple[str, ...], names: Names) -> Program:
@@ -122,12 +128,10 @@ def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tu
     return Program(run, (passage.carried + len(paths) + figures) * layout.points * size / 1e6)
 
 
-def _scanned(
-    experiment: Experiment, layout: Layout, devices: list[Any], columns: dict[str, np.ndarray], names: Names
-) -> Program:
+def _scanned(experiment: Experiment, layout: Layout, devices: list[Any], columns: dict[str, np.ndarray]) -> Program:
     def lane(values: dict[str, Any], seed: Any) -> tuple[dict[str, Any], Any]:
         experiment_of_lane = set_leaves(experiment, values)
-        figures, _ = scan(experiment_of_lane, seed, (metrics(names),))
+        figures, _ = scan(experiment_of_lane, seed, (METRICS,))
         return figures, observer_gains(experiment_of_lane)
 
     # shards along the longer side that divides evenly; one device does the rest
