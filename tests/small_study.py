@@ -105,7 +105,7 @@ def made(data: dict[str, Any], **columns: Any) -> StudyResult:
         values = {path: lanes.get(path, np.full(points.lanes, group.structural.get(path))) for path in points.paths}
         rows += [pd.DataFrame(values | {"seed": np.full(points.lanes, seed)}) for seed in range(seeds)]
     frame = pd.concat(rows, ignore_index=True)
-    for name in metric_columns(config.build()):
+    for name in metric_columns(config.build(), config.sweep.metrics):
         frame[name] = True if name.endswith(("finite", "converged")) else 1.0
     for name, column in columns.items():
         frame[name.replace("__", ".")] = column(frame)

@@ -30,6 +30,11 @@ class SweepTable(Table):
     )
     points: int | None = Field(default=None, ge=1, le=100_000_000, description="number of quasi-random points")
     design_seed: int = Field(default=0, ge=0, description="seed of the quasi-random design")
+    metrics: list[str] | None = Field(
+        default=None,
+        description="metrics to compute and store, by their names without side, e.g. ['converged', 'convergence_time']; "
+        "left out: all; `finite` then counts what overflowed before all of these were known",
+    )
     chunk: int | None = Field(default=None, ge=1, description="lanes computed at once; left out: chosen for the machine")
     refine: int | None = Field(
         default=None,
@@ -56,9 +61,19 @@ class SweepTable(Table):
                 raise wrong(f"{key} needs refine, the number of times that the grid is halved")
         if self.refine_tolerance is not None and (self.refine_metric is None or is_boolean(self.refine_metric)):
             raise wrong("refine_tolerance needs a numeric refine_metric, e.g. 'motor.velocity_rmse'")
+        if self.metrics is not None and not self.metrics:
+            raise wrong("metrics should name at least one, e.g. 'converged'; leave it out for all")
+        for name in self.metrics or ():
+            if self.metrics is not None and self.metrics.count(name) > 1:
+                raise wrong(f"metrics names '{name}' twice")
         if self.refine is not None and self.design != "grid":
             raise wrong(f"refine needs design = 'grid'; points of a {self.design} design have no neighbours")
         return self
+
+    @property
+    def asked(self) -> tuple[str, ...] | None:
+        """The metrics asked for, whatever their order in the file; None for all."""
+        return None if self.metrics is None else tuple(sorted(self.metrics))
 
 
 class AxisTable(Table):

@@ -44,7 +44,14 @@ _SIGNAL = 3.0  # the signal is less than so many errors: no estimate any more
 _NEAR = 10.0  # beyond a law's end, a cause of this strength is named: a tenth of the error, or an error of a tenth
 _PERIOD_EXPONENT = 0.1  # of the error in the period, under noise; white noise alone gives 1/2
 
+_SIGNALS = {"position_rmse": "position", "velocity_rmse": "velocity", "chatter": "velocity"}
 _SIZES = ("position_size", "velocity_size", "velocity_rmse")
+
+
+def sizes_for(value: str) -> list[str]:
+    """The columns besides its own that a law of a metric is judged by."""
+    side, _, name = value.rpartition(".")
+    return [f"{side}.{size}" for size in _SIZES] if name in _SIGNALS else []
 
 
 class PowerLawFit(NamedTuple):
@@ -208,8 +215,7 @@ def accuracy_laws(result: "StudyResult", figures: list[FigureTable] | None = Non
         if figure.theory is None:
             continue
         check_selection(config, figure, index)
-        side = figure.value.partition(".")[0]
-        sizes = [f"{side}.{name}" for name in _SIZES if f"{side}.{name}" in result.columns]
+        sizes = [name for name in sizes_for(figure.value) if name in result.columns]
         # a line is judged beside those without noise and at other periods
         fixed = {path: value for path, value in fixed_values(config, figure).items() if path not in (NOISE, PERIOD)}
         parts = result.batches([*(axis.path for axis in config.axes), "finite", figure.value, *sizes])
@@ -345,13 +351,13 @@ class _Line:
 
         A reading is rounded to eps times the position, and a change of it divided by the period is a velocity.
         """
-        side, _, name = self._figure.value.rpartition(".")
+        name = self._figure.value.rpartition(".")[2]
         unknown = np.full(len(self.x), np.nan)
         eps = float(np.finfo(config.run.precision).eps)
-        kind = {"position_rmse": "position", "velocity_rmse": "velocity", "chatter": "velocity"}.get(name)
-        if kind is None or not {f"{side}.{name}" for name in _SIZES} <= set(self._frame.columns):
+        kind = _SIGNALS.get(name)
+        if kind is None or not set(sizes_for(self._figure.value)) <= set(self._frame.columns):
             return unknown, unknown, unknown
-        position, velocity, error = (self._means(f"{side}.{name}")[1] for name in _SIZES)
+        position, velocity, error = (self._means(size)[1] for size in sizes_for(self._figure.value))
         if kind == "position":
             return position, eps * position, error / velocity
         return velocity, eps * (position / period + velocity), error / velocity

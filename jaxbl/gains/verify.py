@@ -167,7 +167,10 @@ def _only(config: Config, **updates: Any) -> Config:
     data = config.resolved()
     for key in ("figures", "verify"):
         data.pop(key, None)
-    return read_config(data | updates)
+    data |= updates
+    # what is judged needs metrics of its own
+    data["sweep"].pop("metrics", None)
+    return read_config(data)
 
 
 def _ideal(config: Config) -> Config:

@@ -2,12 +2,13 @@
 
 from jaxbl.config import Config, FigureTable
 from jaxbl.errors import InputError
-from jaxbl.gains.accuracy_laws import check_selection
+from jaxbl.gains.accuracy_laws import check_selection, sizes_for
+from jaxbl.sweeps.metrics import no_metric
 from jaxbl.validation import nearest
 
 
 def check_figures(config: Config, figures: list[FigureTable], columns: list[str]) -> None:
-    """Raise `InputError` where a figure names an axis or metric that does not exist."""
+    """Raise `InputError` where a figure names an axis that does not exist, or needs a metric that is not there."""
     axes = [axis.path for axis in config.axes]
     words = [axis.path for axis in config.axes if any(isinstance(value, str) for value in axis.values or ())]
     for i, figure in enumerate(figures):
@@ -20,6 +21,14 @@ def check_figures(config: Config, figures: list[FigureTable], columns: list[str]
                 other = "facet" if figure.kind == "heatmap" else "facet or series"
                 raise InputError(f"figures[{i}].{key}: '{path}' has no numeric values; use it as {other}")
         metrics = [column for column in columns if column not in (*axes, "seed")]
-        if figure.value not in metrics:
-            raise InputError(f"figures[{i}].value: '{figure.value}' is no metric; {nearest(figure.value, metrics)}")
+        of_curves = ("converged", "f_plus") if figure.overlays else ()
+        needed = {
+            "value": [figure.value],
+            "overlays": [f"{figure.x.split('.')[1]}.{name}" for name in of_curves],
+            "theory": [] if figure.theory is None else sizes_for(figure.value),
+        }
+        for key, names in needed.items():
+            for name in names:
+                if name not in metrics:
+                    raise InputError(f"figures[{i}].{key}: {no_metric(name, config.build(), metrics)}")
         check_selection(config, figure, i)

@@ -48,8 +48,9 @@ _CURVES = {
 """Dashes and colour of each gain condition's curve."""
 
 
-def default_figures(config: Config) -> list[FigureTable]:
-    """Figures for a study that asks for none: a heatmap over its last two axes, or lines over its one."""
+def default_figures(config: Config, columns: list[str]) -> list[FigureTable]:
+    """Figures for a study that asks for none: a heatmap over its last two axes, or lines over its one, of the motor's
+    velocity error, or else of the first metric among its columns."""
     varying = [
         axis.path
         for axis in config.axes
@@ -58,6 +59,8 @@ def default_figures(config: Config) -> list[FigureTable]:
     if not varying:
         return []
     value = "motor.velocity_rmse"
+    if value not in columns:
+        value = next(name for name in columns if name.startswith("motor."))
     if len(varying) == 1:
         return [FigureTable(kind="line", x=varying[0], value=value)]
     return [FigureTable(kind="heatmap", x=varying[-1], y=varying[-2], value=value, facet=(None, None, *varying)[-3])]
@@ -74,7 +77,7 @@ def draw(result: StudyResult, laws: list[Law] | None = None) -> list[Drawn]:
         InputError: a figure names an axis or a metric that the study does not have.
     """
     config = result.config
-    figures = config.figures or default_figures(config)
+    figures = config.figures or default_figures(config, result.columns)
     check_figures(config, figures, result.columns)
     points = Points(config) if config.sweep.refine is not None else None
     drawn: list[Drawn] = []
@@ -447,9 +450,8 @@ def _shown_column(value: str) -> Column:
 
 def _best(panel: _Panel, spec: FigureTable) -> tuple[float, float, float] | None:
     """Place and value of the smallest figure, for errors and times, among the points that converged if any did."""
-    if not re.search(r"rmse|chatter|convergence_time$", spec.value):
+    if panel.converged is None or not re.search(r"rmse|chatter|convergence_time$", spec.value):
         return None
-    assert panel.converged is not None
     kept = panel.table[panel.converged >= 0.5].dropna()
     kept = kept if len(kept) else panel.table.dropna()
     if not len(kept):

@@ -48,15 +48,17 @@ class _Survey:
 
     Attributes:
         runs: their number; `even` those on points that are always simulated; `diverged`.
-        converged: how many of the even ones converged, by side.
-        best: the converged run of the least velocity error, by side: that error, and the values of the axes.
+        converged: how many of the even ones converged, by side; none where the study does not say.
+        best: the converged run of the least velocity error, by side: that error, and the values of the axes; none where the
+            study does not say.
         values: all values of each axis.
     """
 
     def __init__(self, result: StudyResult):
         paths = [axis.path for axis in result.config.axes]
-        self.sides = [side for side in SIDES if f"{side}.converged" in result.columns]
-        figures = [f"{side}.{name}" for side in self.sides for name in ("converged", "velocity_rmse")]
+        wanted = {side: [f"{side}.{name}" for name in ("converged", "velocity_rmse")] for side in SIDES}
+        figures = [name for names in wanted.values() for name in names if name in result.columns]
+        self.sides = [side for side in SIDES if f"{side}.converged" in figures]
         # a refined study has most of its runs at the boundary: a share of all runs would depend on the refinement
         points = Points(result.config) if result.config.sweep.refine is not None else None
         self.runs = self.even = self.diverged = 0
@@ -73,6 +75,8 @@ class _Survey:
             for side in self.sides:
                 error = f"{side}.velocity_rmse"
                 self.converged[side] += int(even[f"{side}.converged"].sum())
+                if error not in figures:
+                    continue
                 good = frame[frame[f"{side}.converged"].astype(bool)]
                 if len(good) and (side not in self.best or good[error].min() < self.best[side][error]):
                     self.best[side] = good.loc[good[error].idxmin(), [error, *paths]]
@@ -88,15 +92,14 @@ def _headline(result: StudyResult, found: _Survey) -> list[str]:
     refined = result.config.sweep.refine is not None
     even = found.even or math.nan
     shares = ", ".join(f"{100 * found.converged[side] / even:.1f} % ({side})" for side in found.sides)
-    lines = [f"{found.runs} runs. The observers converged in {shares} of them."]
+    counted, of = f"{found.runs} runs.", "them"
     if refined:
         points = len(Points(result.config))
         simulated = found.runs // result.config.sweep.seeds
         share = 100 * simulated / points
-        lines = [
-            f"{simulated} of {points} grid points simulated ({share:.2g} %), {found.runs} runs. "
-            f"The observers converged in {shares} of those on the coarse grid."
-        ]
+        counted = f"{simulated} of {points} grid points simulated ({share:.2g} %), {found.runs} runs."
+        of = "those on the coarse grid"
+    lines = [f"{counted} The observers converged in {shares} of {of}." if found.sides else counted]
     if not result.is_finished(found.runs):
         more = " so far" if refined else ""
         lines.append(f"The study is not finished: it has {result.runs} runs{more}. Go on with 'jaxbl sweep'.")

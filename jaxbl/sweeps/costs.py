@@ -21,7 +21,7 @@ from jaxbl.fused import kept
 from jaxbl.simulate import Experiment, scan
 from jaxbl.workers import doing
 
-from .metrics import METRICS
+from .metrics import Names, metrics
 from .programs import BACKENDS, Backend, Layout, compile_program, not_put_into_cache
 
 
@@ -116,7 +116,11 @@ def lanes_at_once(devices: Sequence[Any], backend: Backend, work: Work) -> int:
 
 
 def faster(
-    devices: Sequence[Any], work: Work, layouts: Mapping[Backend, Layout], samples: Mapping[Backend, int], programs: int
+    devices: Sequence[Any],
+    works: Mapping[Backend, Work],
+    layouts: Mapping[Backend, Layout],
+    samples: Mapping[Backend, int],
+    programs: int,
 ) -> Backend:
     """The backend that takes less time to compile so many programs, and to take chunks of these shapes through so many
     samples in all."""
@@ -126,20 +130,20 @@ def faster(
     known = costs(devices)
 
     def total(backend: Backend) -> float:
-        running = samples[backend] * known.sample(backend, work, layouts[backend])
-        return programs * known.compiling(backend, work) + running
+        running = samples[backend] * known.sample(backend, works[backend], layouts[backend])
+        return programs * known.compiling(backend, works[backend]) + running
 
     return min(BACKENDS, key=total)
 
 
-def work_of(config: Config, paths: Sequence[str]) -> Work:
-    """Count what a sample takes where these paths differ from lane to lane."""
+def work_of(config: Config, paths: Sequence[str], names: Names = None) -> Work:
+    """Count what a sample takes where these paths differ from lane to lane, and some metrics are computed, or all."""
     with precision(config):
         experiment = prepare(config)
-        key = kept.key_of("work", experiment, tuple(paths))
+        key = kept.key_of("work", experiment, tuple(paths), names)
         found = kept.load(key)
         if found is None:
-            found = _counted(experiment, paths)
+            found = _counted(experiment, paths, names)
             kept.save(key, found)
     return found
 
@@ -156,9 +160,9 @@ _WEIGHTS = {
 """What an operation takes of a processor, about, where that is not as much as a sum."""
 
 
-def _counted(experiment: Experiment, paths: Sequence[str]) -> Work:
+def _counted(experiment: Experiment, paths: Sequence[str], names: Names) -> Work:
     def lane(values: dict[str, Any], seed: Any) -> dict[str, Any]:
-        return scan(set_leaves(experiment, values), seed, (METRICS,))[0]
+        return scan(set_leaves(experiment, values), seed, (metrics(names),))[0]
 
     one = jax.ShapeDtypeStruct((_COUNTED,), jnp.result_type(experiment.run.sample_period))
     traced = jax.make_jaxpr(jax.vmap(lane, (0, None), axis_size=_COUNTED))(

@@ -10,6 +10,7 @@ import math
 import statistics
 import time
 from collections import OrderedDict
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -19,9 +20,9 @@ import pandas as pd
 from jaxbl.config import Config, precision, prepare
 
 from .costs import Work, costs, faster, lanes_at_once, work_of
-from .metrics import compile_conditions, metric_columns, with_conditions
+from .metrics import Names, ObserverGains, compile_conditions, metric_columns, needs_conditions, with_conditions
 from .points import Points
-from .programs import BACKENDS, Backend, Layout, Program, backend_of, compile_program, not_put_into_cache
+from .programs import BACKENDS, Backend, Layout, Program, backend_of, compile_program, computed, not_put_into_cache
 
 
 class Chunk(NamedTuple):
@@ -118,7 +119,7 @@ class Engine:
 
     def _faster(self) -> Backend:
         """By the study, however it is cut: roundings differ between backends."""
-        if not self.points.columns(np.arange(1)):
+        if not self._varied:
             # lanes that differ in nothing but their seed
             return "scan"
         layouts: dict[Backend, Layout] = {backend: self._layout(backend, None) for backend in BACKENDS}
@@ -126,20 +127,27 @@ class Engine:
         samples: dict[Backend, int] = {
             b: steps * self._chunks(layout, self.points.coarse_lanes) for b, layout in layouts.items()
         }
-        return faster(self.devices, self._work, layouts, samples, len(self.points.groups))
+        return faster(self.devices, self._works, layouts, samples, len(self.points.groups))
 
     def _layout(self, backend: Backend, chunk: int | None) -> Layout:
         """Chunk shape: as many lanes as asked for, or as the devices want at once."""
         if chunk is None and self.points.refinement is not None:
             chunk = _REFINED_LANES_PER_DEVICE * len(self.devices)
-        capacity = chunk or len(self.devices) * lanes_at_once(self.devices, backend, self._work)
+        capacity = chunk or len(self.devices) * lanes_at_once(self.devices, backend, self._works[backend])
         return layout_for(self.config, self.points, len(self.devices), capacity)
 
     @functools.cached_property
-    def _work(self) -> Work:
-        """Of a sample, in the group that has most of them."""
-        group = max(self.points.groups, key=lambda group: group.config.run.steps)
-        return work_of(group.config, list(self.points.columns(np.arange(1))))
+    def _works(self) -> dict[Backend, Work]:
+        """Of a sample by either backend, in the group that has most of them."""
+        config = max(self.points.groups, key=lambda group: group.config.run.steps).config
+        asked: dict[Backend, Names] = {backend: computed(backend, config.sweep.asked) for backend in BACKENDS}
+        found = {names: work_of(config, self._varied, names) for names in set(asked.values())}
+        return {backend: found[names] for backend, names in asked.items()}
+
+    @property
+    def _varied(self) -> list[str]:
+        """Paths that differ from lane to lane."""
+        return list(self.points.columns(np.arange(1)))
 
     def __len__(self) -> int:
         """Number of chunks; of a refined study, those of its coarse grid."""
@@ -213,7 +221,7 @@ class Engine:
             # only now, as the first lanes need not wait for them
             self._compile_conditions(group.config.run.precision, chunk)
             start = time.perf_counter()
-            figures = with_conditions(*found)
+            figures = self._judged(*found)
             self.run_seconds += time.perf_counter() - start
         data = self.labels(chunk)
         for name in names:
@@ -258,14 +266,20 @@ class Engine:
             experiment = prepare(config)
             columns, _ = self._arguments(config, self.points.columns(np.arange(1)), np.arange(1))
             start = time.perf_counter()
-            program = compile_program(experiment, self.layout, self.devices, self.backend, columns, insist=self.insist)
+            program = compile_program(
+                experiment, self.layout, self.devices, self.backend, columns, names=config.sweep.asked, insist=self.insist
+            )
             self.compile_seconds += time.perf_counter() - start
             if program.instead is not None and program.instead not in self.scanned:
                 self.scanned.append(program.instead)
-            return program, metric_columns(experiment)
+            return program, metric_columns(experiment, config.sweep.metrics)
+
+    def _judged(self, figures: dict[str, Any], gains: dict[str, ObserverGains]) -> Mapping[str, Any]:
+        """Figures of a chunk with those that follow from them, if any of these is asked for."""
+        return with_conditions(figures, gains) if needs_conditions(self.config.sweep.asked) else figures
 
     def _compile_conditions(self, dtype: str, chunk: Chunk) -> None:
-        if dtype not in self._judging:
+        if dtype not in self._judging and needs_conditions(self.config.sweep.asked):
             self._judging.add(dtype)
             start = time.perf_counter()
             compile_conditions(dtype, len(chunk.seeds) * len(chunk.points))
@@ -297,7 +311,7 @@ class Engine:
                 begun = time.perf_counter()
                 found = jax.block_until_ready(tried.run(*given))
                 ended = time.perf_counter()
-                with_conditions(*found)
+                self._judged(*found)
                 running.append(ended - begun)
                 judging.append(time.perf_counter() - ended)
         # other groups take other numbers of plant steps, say; where there are many, some stand for all
@@ -321,7 +335,7 @@ class Engine:
 
     def _seconds(self, backend: Backend, config: Config) -> float:
         """That a chunk of a group should take."""
-        work = work_of(config, list(self.points.columns(np.arange(1))))
+        work = work_of(config, self._varied, computed(backend, config.sweep.asked))
         return costs(self.devices).sample(backend, work, self.layout) * config.run.steps
 
 

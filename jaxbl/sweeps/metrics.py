@@ -22,6 +22,7 @@ from jaxbl.drive.transmission import TRANSMISSIONS
 from jaxbl.errors import InputError
 from jaxbl.observer import conditions
 from jaxbl.simulate import Experiment, Number, Reducer, Signals, State, TrueSide
+from jaxbl.validation import nearest
 
 from .pieces import in_pieces
 
@@ -114,6 +115,13 @@ class RunMetric(Metric):
         """State after a sample."""
         return carry
 
+    def known(self, carry: Any, experiment: Experiment, start: Number) -> Array | None:
+        """Whether no further sample can change the result, from the state so far; None if that is never known.
+
+        `start` is the time of the first sample of the last quarter, s. A lane whose metrics are all known need not go on.
+        """
+        return None
+
     @abc.abstractmethod
     def result(self, carry: Any, end: SideEnd) -> Array:
         """The metric, from the state after the last sample."""
@@ -197,6 +205,9 @@ class Converged(RunMetric):
 
     def update(self, carry, sample):
         return jnp.where(sample.within, carry, sample.time)
+
+    def known(self, carry, experiment, start):
+        return carry >= start - 0.5 * experiment.run.sample_period
 
     def result(self, carry, end):
         return carry < end.start - 0.5 * end.experiment.run.sample_period
@@ -322,18 +333,32 @@ for _metric in (
     SIDE_METRICS.add(_metric)
 
 
+Names = tuple[str, ...] | None
+"""The metrics that a study asks for; None asks for all."""
+
+_OVERFLOW = ("position_rmse", "velocity_rmse", "torque_rmse", "f_plus", "f_plus_acceleration")
+"""Metrics that overflow with the lane: they show whether it stayed finite."""
+
+
 @functools.cache
-def _metrics(kind: type[Metric]) -> dict[str, Any]:
-    """The metrics of a kind, by name."""
-    return {name: cls() for name, cls in SIDE_METRICS.items() if issubclass(cls, kind)}
+def _metrics(kind: type[Metric], names: Names = None) -> dict[str, Any]:
+    """The metrics of a kind that are asked for, by name."""
+    return {name: cls() for name, cls in SIDE_METRICS.items() if issubclass(cls, kind) and (names is None or name in names)}
 
 
-def _carries(experiment: Experiment) -> dict[str, RunMetric]:
+def _given(experiment: Experiment, names: Names) -> dict[str, RunMetric]:
+    """The metrics of a side that the loop gives: those asked for, and f_plus where others follow from it."""
+    if names is not None and needs_conditions(names):
+        names = (*names, "f_plus")
+    return {name: metric for name, metric in _metrics(RunMetric, names).items() if metric.applies(experiment)}
+
+
+def _carries(experiment: Experiment, names: Names) -> dict[str, RunMetric]:
     """The states of a side: by name, the metric that moves each on."""
     found: dict[str, RunMetric] = {}
-    for metric in _metrics(RunMetric).values():
-        if metric.applies(experiment):
-            found.setdefault(metric.carry or metric.name, metric)
+    for name, metric in _metrics(RunMetric).items():
+        if name in _OVERFLOW or name in _given(experiment, names):
+            found.setdefault(metric.carry or name, metric)
     return found
 
 
@@ -342,9 +367,28 @@ def window_start(steps: int) -> int:
     return steps - max(steps // 4, 1)
 
 
-def _init(experiment: Experiment) -> dict[str, tuple]:
+def _start(experiment: Experiment) -> Number:
+    """Time of the first sample of the last quarter."""
+    return window_start(experiment.run.steps) * experiment.run.sample_period
+
+
+def _init(names: Names, experiment: Experiment) -> dict[str, tuple]:
     zero = jnp.zeros_like(experiment.run.sample_period)
-    return {side: tuple(metric.init(zero) for metric in _carries(experiment).values()) for side in experiment.sides}
+    carries = _carries(experiment, names).values()
+    return {side: tuple(metric.init(zero) for metric in carries) for side in experiment.sides}
+
+
+def _known(names: Names, experiment: Experiment, totals: tuple) -> Array | None:
+    """Whether all that is asked for of a side is known from its states so far; None if that is never known."""
+    if names is None or needs_conditions(names):
+        return None
+    carries = dict(zip(_carries(experiment, names), totals, strict=True))
+    start = _start(experiment)
+    each = [
+        metric.known(carries[metric.carry or name], experiment, start) for name, metric in _given(experiment, names).items()
+    ]
+    found = [one for one in each if one is not None]
+    return functools.reduce(jnp.logical_and, found) if found and len(found) == len(each) else None
 
 
 def identified(experiment: Experiment, state: State) -> Mapping[str, Mapping[str, Number]]:
@@ -355,7 +399,9 @@ def identified(experiment: Experiment, state: State) -> Mapping[str, Mapping[str
     return experiment.identifier.estimate(state.identifier, experiment.transmission)
 
 
-def _update(experiment: Experiment, totals: dict[str, tuple], index: Int[Array, ""], signals: Signals) -> dict[str, tuple]:
+def _update(
+    names: Names, experiment: Experiment, totals: dict[str, tuple], index: Int[Array, ""], signals: Signals
+) -> dict[str, tuple]:
     run = experiment.run
     inside = (index >= window_start(run.steps)).astype(signals.time.dtype)
     new = {}
@@ -371,52 +417,69 @@ def _update(experiment: Experiment, totals: dict[str, tuple], index: Int[Array, 
             jnp.abs(velocity) * ratio <= run.velocity_tolerance
         )
         sample = SideSample(signals.time, inside, within, true, position, velocity, torque)
-        metrics = _carries(experiment).values()
-        new[side] = tuple(metric.update(carry, sample) for metric, carry in zip(metrics, old, strict=True))
+        metrics = _carries(experiment, names).values()
+        moved = tuple(metric.update(carry, sample) for metric, carry in zip(metrics, old, strict=True))
+        known = _known(names, experiment, old)
+        if known is not None:
+            # whether it stays finite is not asked any more, be the lane taken further or not
+            moved = jax.tree.map(functools.partial(jnp.where, known), old, moved)
+        new[side] = moved
     return new
 
 
-_OVERFLOW = ("position_rmse", "velocity_rmse", "torque_rmse", "f_plus", "f_plus_acceleration")
-"""Metrics that overflow with the lane: they show whether it stayed finite."""
-
-
 def _found(
-    experiment: Experiment, totals: dict[str, tuple], state: State, side: str, names: Iterable[str]
+    names: Names, experiment: Experiment, totals: dict[str, tuple], state: State, side: str, wanted: Iterable[str]
 ) -> dict[str, Any]:
-    """Some metrics of a side, from its states so far, and whether it stayed finite."""
-    first, run = window_start(experiment.run.steps), experiment.run
+    """Some metrics of a side, from its states so far."""
+    run = experiment.run
     parameters = identified(experiment, state).get(side, {})
-    end = SideEnd(experiment, state, first * run.sample_period, run.steps - first, parameters)
-    carries = dict(zip(_carries(experiment), totals[side], strict=True))
+    end = SideEnd(experiment, state, _start(experiment), run.steps - window_start(run.steps), parameters)
+    carries = dict(zip(_carries(experiment, names), totals[side], strict=True))
     metrics = _metrics(RunMetric)
-    return {name: metrics[name].result(carries[metrics[name].carry or name], end) for name in names}
+    return {name: metrics[name].result(carries[metrics[name].carry or name], end) for name in wanted}
 
 
 def _finite(found: dict[str, Any]) -> Array:
     return jnp.isfinite(sum(found[name] for name in _OVERFLOW))
 
 
-def _done(experiment: Experiment, totals: dict[str, tuple], state: State) -> Array:
-    """Whether no side stayed finite: none of the metrics that show it becomes finite again, and all others are NaN then."""
-    sides = [_finite(_found(experiment, totals, state, side, _OVERFLOW)) for side in totals]
-    return ~functools.reduce(jnp.logical_or, sides)
+def _done(names: Names, experiment: Experiment, totals: dict[str, tuple], state: State) -> Array:
+    """Whether of each side all that is asked for is known, or it did not stay finite: none of the metrics that show that
+    becomes finite again, and all others are NaN then."""
+    goes_on = []
+    for side, own in totals.items():
+        finite, known = _finite(_found(names, experiment, totals, state, side, _OVERFLOW)), _known(names, experiment, own)
+        goes_on.append(finite if known is None else finite & ~known)
+    return ~functools.reduce(jnp.logical_or, goes_on)
 
 
-def _result(experiment: Experiment, totals: dict[str, tuple], state: State) -> dict[str, Array]:
+def _result(names: Names, experiment: Experiment, totals: dict[str, tuple], state: State) -> dict[str, Array]:
     figures: dict[str, Array] = {}
     finite = jnp.asarray(True)
-    applying = [name for name, metric in _metrics(RunMetric).items() if metric.applies(experiment)]
+    given = _given(experiment, names)
     for side in totals:
-        out = _found(experiment, totals, state, side, applying)
+        out = _found(names, experiment, totals, state, side, dict.fromkeys([*given, *_OVERFLOW]))
         ok = _finite(out)
-        out = {name: jnp.where(ok, value, False if name == "converged" else jnp.nan) for name, value in out.items()}
+        out = {name: jnp.where(ok, out[name], False if name == "converged" else jnp.nan) for name in given}
         finite = finite & ok
         figures |= {f"{side}.{name}": value for name, value in out.items()}
     return {"finite": finite, **figures}
 
 
-METRICS = Reducer(_init, _update, _result, _done)
-"""The metrics of every sweep."""
+@functools.cache
+def metrics(names: Names = None) -> Reducer:
+    """What computes `finite` and the metrics asked for in the loop over time; the same object for the same names."""
+    own = functools.partial
+    return Reducer(own(_init, names), own(_update, names), own(_result, names), own(_done, names))
+
+
+METRICS = metrics()
+"""All metrics."""
+
+
+def needs_conditions(names: Names) -> bool:
+    """Whether some of the metrics asked for are left to :func:`with_conditions`."""
+    return bool(_metrics(GainMetric, names))
 
 
 def observer_gains(experiment: Experiment) -> dict[str, ObserverGains]:
@@ -462,7 +525,9 @@ def _judged(lambda_: Array, alpha: Array, position_error: Array, velocity_error:
     return {name: jnp.where(jnp.isnan(f_plus), jnp.nan, value) for name, value in out.items()}
 
 
-_FINITE = Metric.of("finite", "", "finite", "no number of the lane overflowed", better="more")
+_FINITE = Metric.of(
+    "finite", "", "finite", "no number of the lane overflowed, as far as metrics were not known yet", better="more"
+)
 """The one column that is not of a side."""
 
 
@@ -476,10 +541,27 @@ def is_magnitude(column: str) -> bool:
     return column.endswith("_error")
 
 
-def metric_columns(experiment: Experiment) -> list[str]:
-    """The columns that :data:`METRICS` and :func:`with_conditions` give for this experiment."""
-    names = [name for name, metric in _metrics(Metric).items() if metric.applies(experiment)]
-    return ["finite", *(f"{side}.{name}" for side in experiment.sides for name in names)]
+def metric_columns(experiment: Experiment, names: Iterable[str] | None = None) -> list[str]:
+    """The columns of this experiment, of the metrics asked for or of all: what :func:`metrics` and :func:`with_conditions`
+    give.
+
+    Raises:
+        InputError: there is no such metric, or this experiment does not have it.
+    """
+    own = [name for name, metric in _metrics(Metric).items() if metric.applies(experiment)]
+    wanted = own if names is None else list(names)
+    for i, name in enumerate(wanted):
+        if name not in own:
+            what = "does not apply to this drive" if name in SIDE_METRICS else "is no metric"
+            raise InputError(f"sweep.metrics[{i}]: '{name}' {what}; {nearest(name, own)}")
+    return ["finite", *(f"{side}.{name}" for side in experiment.sides for name in own if name in wanted)]
+
+
+def no_metric(column: str, experiment: Experiment, columns: Iterable[str]) -> str:
+    """What to say of a metric that is not among a study's columns."""
+    if column in metric_columns(experiment):
+        return f"'{column}' is not computed; add '{column.rpartition('.')[2]}' to sweep.metrics"
+    return f"'{column}' is no metric; {nearest(column, columns)}"
 
 
 NOTHING = {"float64": 1e-9, "float32": 1e-4}

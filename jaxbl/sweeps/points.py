@@ -16,9 +16,8 @@ from jaxbl.config import TOLERANCE, AxisTable, Config, with_values
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.errors import InputError
 from jaxbl.files import plain
-from jaxbl.validation import nearest
 
-from .metrics import metric_columns
+from .metrics import metric_columns, no_metric
 from .refine import CellGrid, Criterion
 
 AxisColumns = dict[str, np.ndarray]
@@ -58,6 +57,7 @@ class Points:
             if path in self.paths[:i]:
                 raise InputError(f"axes[{i}]: path '{path}' has an axis already; each path may have one")
         base, self.leaves = self._check(config)
+        metrics = metric_columns(base.build(), config.sweep.metrics)
         refined = self._refined(config)
         depth = config.sweep.refine or 0
         blocks = self._blocks(config, dict.fromkeys(refined, depth))
@@ -71,7 +71,7 @@ class Points:
             fine = [_length(b) for b in self._blocks_of_leaves]
             sizes = [(n - 1 >> depth) + 1 if h else n for n, h in zip(fine, halved, strict=True)]
             self.coarse_lanes = math.prod(sizes)
-            self.refinement = Refinement(refined, CellGrid(sizes, halved, depth), _criterion(config, base, refined))
+            self.refinement = Refinement(refined, CellGrid(sizes, halved, depth), _criterion(config, base, metrics, refined))
         outside = _points_of(structural) * config.sweep.seeds
         if (runs := outside * self.coarse_lanes) > _MOST_RUNS:
             raise InputError(f"axes: {runs:.2g} runs are more than {_MOST_RUNS:.0e}; fewer values, or a quasi-random design")
@@ -220,18 +220,21 @@ def _take(blocks: list[AxisColumns], indices: np.ndarray) -> AxisColumns:
     return out
 
 
-def _criterion(config: Config, base: Config, refined: list[str]) -> Criterion:
-    """When neighbours disagree: in the metric that the study names, or in what converges."""
-    metrics = metric_columns(base.build())
+def _criterion(config: Config, base: Config, metrics: list[str], refined: list[str]) -> Criterion:
+    """When neighbours disagree: in the metric that the study names, or in what converges; `metrics` are its columns."""
     metric, tolerance = config.sweep.refine_metric, config.sweep.refine_tolerance
     if metric is None:
         converged = [name for name in metrics if name.endswith(".converged")]
+        if not converged:
+            raise InputError(
+                "sweep.refine_metric is missing: neighbours are compared in 'converged', which sweep.metrics lacks"
+            )
         of_gains = [
             name for name in converged if any(path.startswith(f"observer.{name.partition('.')[0]}.") for path in refined)
         ]
         return Criterion.of(of_gains or converged, TOLERANCE)
     if metric not in metrics:
-        raise InputError(f"sweep.refine_metric: '{metric}' is no metric; {nearest(metric, metrics)}")
+        raise InputError(f"sweep.refine_metric: {no_metric(metric, base.build(), metrics)}")
     return Criterion.of([metric], TOLERANCE if tolerance is None else tolerance)
 
 

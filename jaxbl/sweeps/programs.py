@@ -15,7 +15,7 @@ from jaxbl.errors import InputError
 from jaxbl.fused import Unsupported, attempted
 from jaxbl.simulate import Experiment, scan
 
-from .metrics import METRICS, ObserverGains, metric_columns, observer_gains
+from .metrics import METRICS, Names, ObserverGains, metric_columns, metrics, observer_gains
 
 if TYPE_CHECKING:
     from jaxbl.fused.passage import Passage
@@ -29,6 +29,12 @@ def backend_of(name: str | None, given: str = "backend") -> Backend | None:
     if name is not None and name not in BACKENDS:
         raise InputError(f"{given}: there is no {name!r}; one of {', '.join(BACKENDS)}")
     return name
+
+
+def computed(backend: Backend, names: Names) -> Names:
+    """The metrics that a backend computes where some are asked for. XLA rounds otherwise where it computes less: the scan
+    computes all, so that those asked for are to the bit what they are beside the others."""
+    return names if backend == "fused" else None
 
 
 class Layout(NamedTuple):
@@ -68,9 +74,11 @@ def compile_program(
     backend: Backend,
     columns: dict[str, np.ndarray],
     *,
+    names: Names = None,
     insist: bool = False,
 ) -> Program:
-    """Compile one, inside :func:`jaxbl.config.precision`; `columns` is an example of the values, `(points,)` by path.
+    """Compile one, inside :func:`jaxbl.config.precision`; `columns` is an example of the values, `(points,)` by path;
+    `names` are the metrics asked for: its figures have these, and perhaps others.
 
     Where the fused loop cannot run the step, or no lane differs from another, the scan takes its place; with `insist` that
     is refused.
@@ -81,7 +89,7 @@ def compile_program(
     if backend == "fused":
         try:
             with attempted():
-                return _fused(experiment, layout, devices, tuple(columns))
+                return _fused(experiment, layout, devices, tuple(columns), names)
         except Unsupported as why:
             if insist:
                 raise InputError(f"--backend fused: the fused loop does not know {why}; use --backend scan") from None
@@ -89,16 +97,16 @@ def compile_program(
     return _scanned(experiment, layout, devices, columns)
 
 
-def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tuple[str, ...]) -> Program:
+def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tuple[str, ...], names: Names) -> Program:
     if not paths:
         raise Unsupported("lanes that differ in nothing but their seed")
     from jaxbl.fused.passage import DevicePassage, HostPassage
 
     if devices[0].platform == "cpu":
-        passage: Passage = HostPassage(experiment, (METRICS,), paths, layout.points, len(devices))
+        passage: Passage = HostPassage(experiment, (metrics(names),), paths, layout.points, len(devices))
     elif devices[0].platform == "gpu" and len(devices) == 1:
         with jax.default_device(devices[0]):
-            passage = DevicePassage(experiment, (METRICS,), paths, layout.points)
+            passage = DevicePassage(experiment, (metrics(names),), paths, layout.points)
     else:
         raise Unsupported(f"{len(devices)} devices of platform {devices[0].platform}")
 
@@ -116,7 +124,7 @@ def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tu
         return stacked, observer_gains(set_leaves(experiment, values))
 
     size = jnp.result_type(experiment.run.sample_period).itemsize
-    figures = len(metric_columns(experiment)) * layout.seeds
+    figures = len(metric_columns(experiment, names)) * layout.seeds
     return Program(run, (passage.carried + len(paths) + figures) * layout.points * size / 1e6)
 
 

@@ -65,10 +65,12 @@ are."""
 def identity(config: Config, command: str = "sweep") -> str:
     """Hash of everything that decides the numbers that a command finds for a study.
 
-    Title, notes, figures, chunk size and tables that only other commands read decide nothing.
+    Title, notes, figures, chunk size, and tables and keys that only other commands read decide nothing.
     """
     data = config.resolved()
     data["sweep"].pop("chunk", None)
+    if data["sweep"].pop("metrics", None) is not None and command == "sweep":
+        data["sweep"]["metrics"] = config.sweep.asked
     for key in ("title", "notes", "figures", "identify", *_COMMANDS[command][2]):
         data.pop(key, None)
     for key in ("q", "marks"):

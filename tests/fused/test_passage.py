@@ -21,7 +21,7 @@ from jaxbl.fused.pallas import LANES, Kernel
 from jaxbl.fused.passage import DevicePassage, HostPassage
 from jaxbl.observer import OBSERVERS, EquivalentControl, Identifier, Observers
 from jaxbl.simulate import Experiment, Reducer, Run, scan
-from jaxbl.sweeps.metrics import METRICS
+from jaxbl.sweeps.metrics import METRICS, metrics
 from jaxbl.throughput.workload import FIGURES, RANGES, SEED, Workload
 
 HALF = ["motor.coulomb_friction", "load.stribeck_friction", "load.gravity", "motor.cogging", "load.periodic_disturbance",
@@ -77,6 +77,15 @@ def test_figures_are_those_of_the_scan(names, law, options):
     assert set(fused) == set(scanned)
     for name, figure in fused.items():
         np.testing.assert_allclose(figure, scanned[name], rtol=1e-7, err_msg=name)
+    # what is computed alone is to the bit what it is beside the others
+    values = {path: np.asarray(get_leaf(whole, path)) * np.linspace(0.6, 1.4, 37) for path in effects}
+    every, some = (
+        HostPassage(whole, (metrics(n),), tuple(values), 37, 2) for n in (None, ("chatter", "f_plus", "torque_rmse"))
+    )
+    every, some = every(values, 3), some(values, 3)
+    assert len(some) < len(every)
+    for name, figure in some.items():
+        np.testing.assert_array_equal(figure, every[name], err_msg=name)
 
 
 @pytest.mark.slow
@@ -249,6 +258,53 @@ def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precisi
                 np.testing.assert_array_equal(figure, expected[name], err_msg=name)
             # some two thirds of the lanes leave
             assert sum(samples) < 0.6 * lanes * whole.run.steps
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_lanes_whose_answer_is_known_leave(monkeypatch, precision):
+    """Some keep the tolerance, some never do, and of both some overflow, early or in the last quarter."""
+    monkeypatch.setattr(module, "_CALL", 1)
+    monkeypatch.setattr(module, "_SHARE", 1)
+    lanes, samples = 256, []
+    # about the stiffness from which float32 and float64 overflow within the run
+    late = np.linspace(1.6965e5, 1.698e5, 64), np.linspace(1.703e5, 1.713e5, 64)
+    stiffness = np.concatenate([np.full(64, 60.0), *late, np.full(64, 1e6)])
+    tolerance = np.where(np.arange(lanes) % 4 == 0, 1e3, 1e-12)
+    with jax.enable_x64(precision == "float64"):
+        whole = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41, precision=precision)
+        values = {"transmission.stiffness": stiffness, "run.velocity_tolerance": tolerance}
+        values["run.position_tolerance"] = np.where(tolerance > 1.0, 1e3, 1e-12)
+        asked = metrics(("converged", "convergence_time"))
+        every, staying = (
+            HostPassage(whole, (one,), tuple(values), lanes, 1) for one in (METRICS, asked._replace(done=None))
+        )
+        assert staying.carried < every.carried
+        expected, stayed = every(values, 3), staying(values, 3)
+        assert 0 < np.count_nonzero(expected["motor.converged"]) < lanes
+        assert set(stayed) < set(expected)
+        # a side is not followed once its answer is known: what overflows later is not seen
+        assert (stayed["finite"] >= expected["finite"]).all()
+        assert np.count_nonzero(stayed["finite"]) > np.count_nonzero(expected["finite"])
+        for threads in (1, 2):
+            passage = HostPassage(whole, (asked,), tuple(values), lanes, threads)
+            loop = passage._loop
+
+            def counted(arrays, upto, first, last, loop=loop, **options):
+                if upto > options.get("start", 0):
+                    samples.append(last)
+                loop(arrays, upto, first, last, **options)
+
+            counted.signature, counted.lanes = loop.signature, loop.lanes
+            monkeypatch.setattr(passage, "_loop", counted)
+            samples.clear()
+            found = passage(values, 3)
+            # in the last block, those are left that keep the tolerance
+            assert samples[-1] < lanes // 4
+            assert set(found) == set(stayed)
+            for name, figure in found.items():
+                np.testing.assert_array_equal(figure, stayed[name], err_msg=name)
+                if name != "finite":
+                    np.testing.assert_array_equal(figure, expected[name], err_msg=name)
 
 
 def test_all_lanes_may_leave(monkeypatch):

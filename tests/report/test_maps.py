@@ -13,6 +13,7 @@ from jaxbl.observer.conditions import least_lambda_seeber_horn
 from jaxbl.report.checks import check_figures
 from jaxbl.report.figures import save
 from jaxbl.report.maps import draw
+from jaxbl.report.sweep import write_sweep_report
 
 RMSE = "motor.velocity_rmse"
 GAINS = [spaced(ALPHA, 1.0, 50.0, 5), spaced(LAMBDA, 1.0, 20.0, 4)]
@@ -269,6 +270,35 @@ def test_figure_of_what_is_not_there(case):
     with pytest.raises(InputError) as error:
         draw(result)
     assert message in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("figure", "message"),
+    [
+        (line(), f"figures[0].value: '{RMSE}' is not computed; add 'velocity_rmse' to sweep.metrics"),
+        (
+            line(value="motor.chatter", theory=1.0, where={LAMBDA: "least"}),
+            "figures[0].theory: 'motor.position_size' is not",
+        ),
+        (
+            heatmap(value="motor.chatter", overlays=["exact"]),
+            "figures[0].overlays: 'motor.converged' is not computed; add 'converged' to sweep.metrics",
+        ),
+    ],
+)
+def test_figure_of_what_the_study_does_not_compute(figure, message):
+    with pytest.raises(InputError) as error:
+        draw(made(rigid(axes=GAINS, figures=[figure], sweep={"metrics": ["chatter"]})))
+    assert message in str(error.value)
+
+
+@pytest.mark.parametrize("metrics", [["chatter"], ["converged"], ["convergence_time", "margin_exact"]])
+def test_default_figure_and_report_of_some_metrics(tmp_path, metrics):
+    result = made(rigid(axes=GAINS, sweep={"metrics": metrics}))
+    (drawing,) = draw(result)
+    assert drawing.name == f"heatmap_motor_{metrics[0]}"
+    (line,) = write_sweep_report(result, tmp_path)
+    assert ("converged in 100.0 % (motor)" in line) == ("converged" in metrics)
 
 
 def test_figures_of_a_study_without_axes():

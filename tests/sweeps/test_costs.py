@@ -72,8 +72,8 @@ def test_measured_once_where_programs_are_kept(monkeypatch, tmp_path):
 def test_the_backend_that_takes_less_time():
     def chosen(platform, layout, samples=10**7, devices=1, programs=1):
         backends = dict.fromkeys(("fused", "scan"), Layout(*layout)), dict.fromkeys(("fused", "scan"), samples)
-        work = Work(300.0, 100.0, 200.0, 800)
-        return faster([SimpleNamespace(platform=platform)] * devices, work, *backends, programs)
+        works = dict.fromkeys(("fused", "scan"), Work(300.0, 100.0, 200.0, 800))
+        return faster([SimpleNamespace(platform=platform)] * devices, works, *backends, programs)
 
     assert chosen("cpu", (1, 3)) == "fused"
     # seed after seed would pay for each what lanes share

@@ -324,3 +324,25 @@ def with_precision(config, precision):
     data = config.resolved()
     data["run"]["precision"] = precision
     return read_config(data)
+
+
+@pytest.mark.parametrize("backend", ["scan", "fused"])
+def test_some_metrics_are_to_the_bit_those_of_a_study_of_all(backend):
+    data = small({"run.substeps": 2}, axes=AXES, sweep={"seeds": 3})
+
+    def run(**keys):
+        engine = Engine(read_config(data | {"sweep": {"seeds": 3, **keys}}), Layout(3, 12), jax.devices()[:1], backend)
+        return engine, engine.run(engine.chunk(0))
+
+    _, full = run()
+    _, found = run(metrics=["margin_alpha", "converged", "velocity_rmse"])
+    columns = [f"{side}.{name}" for side in ("motor", "load") for name in ("converged", "velocity_rmse", "margin_alpha")]
+    assert list(found) == [NOISE, ALPHA, LAMBDA, "seed", "finite", *columns]
+    assert_equal(found, full[list(found)])
+    # none of these follows from gains
+    engine, alone = run(metrics=["converged"])
+    assert list(alone)[4:] == ["finite", "motor.converged", "load.converged"]
+    assert_equal(alone, full[list(alone)])
+    assert engine._judging == set()
+    # the scan computes the others all the same
+    assert engine._works["fused"].carried < engine._works["scan"].carried

@@ -1,21 +1,24 @@
 """The streaming metrics against NumPy on a full trace."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from paper_drive import paper
 
 from jaxbl.drive import DeadZone, LinearShaft, Rigid, SigmoidBacklash
+from jaxbl.errors import InputError
 from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, Observers, conditions
 from jaxbl.simulate import scan
-from jaxbl.sweeps import metrics
+from jaxbl.sweeps import metrics as under_test
 from jaxbl.sweeps.metrics import (
     METRICS,
     SIDE_METRICS,
     ObserverGains,
     metric_columns,
     metric_of,
+    needs_conditions,
     observer_gains,
     window_start,
     with_conditions,
@@ -156,15 +159,47 @@ def test_every_column_has_unit_and_meaning():
     assert metric_of("load.torque_rmse").unit == "N m"
 
 
+def test_some_metrics_alone():
+    experiment = paper()
+    assert metric_columns(experiment, ["f_plus", "converged"]) == [
+        "finite", "motor.converged", "motor.f_plus", "load.converged", "load.f_plus",
+    ]  # fmt: skip
+    asked = under_test.metrics(("converged", "convergence_time"))
+    assert asked is under_test.metrics(("converged", "convergence_time"))
+    assert asked != under_test.metrics(("converged",))
+    # one state for both, besides those that show whether the lane stays finite
+    assert {side: len(carry) for side, carry in asked.init(experiment).items()} == {"motor": 6, "load": 6}
+    assert [needs_conditions(names) for names in (None, ("converged",), ("margin_alpha",))] == [True, False, True]
+    given = jax.eval_shape(lambda: scan(experiment, jnp.asarray(2), (under_test.metrics(("margin_alpha",)),))[0])
+    assert set(given) == {"finite", "motor.f_plus", "load.f_plus"}
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (
+            ["converged", "velocity_rms"],
+            r"^sweep.metrics\[1\]: 'velocity_rms' is no metric; did you mean 'velocity_rmse'\?$",
+        ),
+        (["motor.converged"], r"did you mean 'converged'\?$"),
+        (["stiffness_error"], r"^sweep.metrics\[0\]: 'stiffness_error' does not apply to this drive; "),
+    ],
+)
+def test_metrics_that_cannot_be_had(names, message):
+    rigid = paper(**CASES["rigid"])
+    with pytest.raises(InputError, match=message):
+        metric_columns(rigid, names)
+
+
 def test_conditions_are_computed_once_for_lanes_that_share_them(monkeypatch):
     counts = []
-    pieces = metrics.in_pieces
+    pieces = under_test.in_pieces
 
     def counted(function, columns):
         counts.append(len(columns[0]))
         return pieces(function, columns)
 
-    monkeypatch.setattr(metrics, "in_pieces", counted)
+    monkeypatch.setattr(under_test, "in_pieces", counted)
     # two seeds of three lanes: the load's gains and f_plus are the same for all lanes of a seed
     f_plus = {
         "motor.f_plus": np.array([[1.0, 2.0, 3.0], [1.0, 2.5, np.nan]]),

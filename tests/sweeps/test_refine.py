@@ -325,6 +325,14 @@ BAD = {
         GAINS,
         "sweep.refine_metric: 'motor.velocity_rms' is no metric; did you mean 'motor.velocity_rmse'?",
     ),
+    "metric that is not computed": (
+        {"refine": 1, "refine_metric": "motor.chatter", "metrics": ["converged"]},
+        GAINS,
+        "sweep.refine_metric: 'motor.chatter' is not computed; add 'chatter' to sweep.metrics",
+    ),
+    "nothing to compare": ({"refine": 1, "metrics": ["chatter"]}, GAINS, "sweep.refine_metric is missing: neighbours are"),
+    "no metrics": ({"metrics": []}, GAINS, "sweep: metrics should name at least one"),
+    "a metric twice": ({"metrics": ["chatter", "chatter"]}, GAINS, "sweep: metrics names 'chatter' twice"),
     "design": (
         {"refine": 1, "design": "sobol", "points": 4},
         [spaced(ALPHA, 1.0, 2.0)],

@@ -124,6 +124,7 @@ OTHER = {
     "other axis": {"axes": [listed(ALPHA, 5.0, 9.0, 21.0)]},
     "more seeds": {"sweep": {"seeds": 4, "chunk": 2}},
     "other precision": {"changes": {"run.precision": "float32"}},
+    "some metrics": {"sweep": {"metrics": ["converged"]}},
 }
 
 
@@ -476,3 +477,14 @@ def test_a_study_in_an_object_store_is_read_alike(finished):
     for check in (True, False):
         found = opened.dataset(check=check).to_table(columns=[ALPHA, "seed"]).to_pandas()
         pd.testing.assert_frame_equal(found, finished[1].frame[[ALPHA, "seed"]])
+
+
+def test_the_metrics_asked_for_are_a_sweeps_own():
+    def of(command, *names):
+        return identity(read_config(rigid(sweep={"metrics": list(names)} if names else {})), command)
+
+    assert of("sweep", "converged", "chatter") == of("sweep", "chatter", "converged") != of("sweep", "converged")
+    for command in ("simulate", "verify", "tune"):
+        assert of(command, "converged") == of(command)
+    # folders that are there stay what they are
+    assert "metrics" not in read_config(rigid()).resolved()["sweep"]
