@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -178,10 +179,30 @@ class Run:
         refine(grid, evaluate, criterion.differ)
 
     def ensure(self, chunks: Iterable[Chunk]) -> None:
-        """Have chunks computed that are not there."""
-        for chunk in chunks:
-            if not self.is_there(chunk):
-                self._compute(chunk)
+        """Have chunks computed that are not there; one is written while the next one is computed. What was computed is written
+        also where an interrupt ends this."""
+        written: tuple[Chunk, Future[str]] | None = None
+        with ThreadPoolExecutor(1) as writer:
+            for chunk in chunks:
+                if self.is_there(chunk):
+                    self.count(chunk)
+                    continue
+                frame = self.engine.run(chunk)
+                self._lanes += len(frame)
+                if self._store is None:
+                    self._frames[chunk.index] = frame
+                    self.count(chunk)
+                    continue
+                before, written = written, (chunk, writer.submit(self._store.write, chunk.index, frame))
+                # frames are large: one waits at most
+                self._keep(before)
+            self._keep(written)
+
+    def _keep(self, written: tuple[Chunk, Future[str]] | None) -> None:
+        """Count a part that is being written, once it is."""
+        if written is not None:
+            chunk, checksum = written
+            self.kept.note({chunk.index: checksum.result()})
             self.count(chunk)
 
     def is_there(self, chunk: Chunk) -> bool:
@@ -201,14 +222,6 @@ class Run:
         if frame is None:
             raise InputError(f"{self._store.part(chunk.index)}: was changed by another process; run the same command again")
         return frame
-
-    def _compute(self, chunk: Chunk) -> None:
-        frame = self.engine.run(chunk)
-        self._lanes += len(frame)
-        if self._store is None:
-            self._frames[chunk.index] = frame
-        else:
-            self._store.write(chunk.index, frame)
 
     def count(self, chunk: Chunk) -> None:
         """Say that a chunk is there."""

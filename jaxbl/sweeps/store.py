@@ -318,10 +318,11 @@ class Store:
         move(path, target)
         self.damaged.append(f"{path.relative_to(self.folder)} {why}; it is kept as {target.relative_to(self.folder)}")
 
-    def write(self, index: int, frame: pd.DataFrame) -> None:
+    def write(self, index: int, frame: pd.DataFrame) -> str:
+        """Write a part; its checksum is to be noted (:meth:`note`). Changes nothing here: it may run in another thread."""
         head = self._head | {"title": self.manifest["title"]}
         parts.write(self.part(index), frame, Mark(head, self.manifest["layout"], self.backend, index, 0, {}))
-        self.note({index: parts.file_checksum(self.part(index))})
+        return parts.file_checksum(self.part(index))
 
     def note(self, checksums: dict[int, str]) -> None:
         """Add parts that were written, by their checksums, to the manifest."""

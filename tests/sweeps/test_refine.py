@@ -555,7 +555,8 @@ def test_an_interrupted_study_replays_its_decisions_and_computes_nothing_twice(t
 
     with pytest.raises(KeyboardInterrupt):
         sweep(study(), tmp_path / "study", progress=interrupt)
-    assert computed == list(range(stop + 1))
+    # the next one may have been computed while that was written
+    assert computed in (list(range(stop + 1)), list(range(stop + 2)))
     assert not manifest(tmp_path / "study")["finished"]
     assert "The study is not finished" in headline(open_study(tmp_path / "study"))[1]
     seen.clear()
