@@ -179,8 +179,8 @@ class Run:
         refine(grid, evaluate, criterion.differ)
 
     def ensure(self, chunks: Iterable[Chunk]) -> None:
-        """Have chunks computed that are not there; one is written while the next one is computed. What was computed is written
-        also where an interrupt ends this."""
+        """Have chunks computed that are not there; one is written while the next one is computed. What was computed is
+        written also where an interrupt ends this."""
         written: tuple[Chunk, Future[str]] | None = None
         with ThreadPoolExecutor(1) as writer:
             for chunk in chunks:
