@@ -82,7 +82,7 @@ def page() -> str:
             parts.append(f"{lead}| `{field.name}`: {known.doc} | {known.unit} | {default} |")
     parts.append(
         "\n## Metrics\n\nColumns of `points/part-*.parquet`: one for each `side` in motor, load. Besides them: the axis "
-        "paths, `seed`, and `finite` (no number of the lane overflowed)..\n\n| column | unit | meaning |\n|---|---|---|"
+        "paths, `seed`, and `finite` (no number of the lane overflowed).\n\n| column | unit | meaning |\n|---|---|---|"
     )
     parts += [
         f"| `side.{name}` | {about.unit} | {about.doc.replace('|', chr(92) + '|')} |" for name, about in SIDE_METRICS.items()

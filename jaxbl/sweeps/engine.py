@@ -219,7 +219,7 @@ class Engine:
             found = jax.block_until_ready(program.run(*given))
             self.run_seconds += time.perf_counter() - start
             # only now, as the first lanes need not wait for them
-            self._compile_conditions(group.config.run.precision, chunk)
+            self._compile_conditions(group.config.run.precision)
             start = time.perf_counter()
             figures = self._judged(*found)
             self.run_seconds += time.perf_counter() - start
@@ -278,11 +278,11 @@ class Engine:
         """Figures of a chunk with those that follow from them, if any of these is asked for."""
         return with_conditions(figures, gains) if needs_conditions(self.config.sweep.asked) else figures
 
-    def _compile_conditions(self, dtype: str, chunk: Chunk) -> None:
+    def _compile_conditions(self, dtype: str) -> None:
         if dtype not in self._judging and needs_conditions(self.config.sweep.asked):
             self._judging.add(dtype)
             start = time.perf_counter()
-            compile_conditions(dtype, len(chunk.seeds) * len(chunk.points))
+            compile_conditions(dtype, self.layout.seeds * self.layout.points)
             self.compile_seconds += time.perf_counter() - start
 
     def estimate(self) -> "SweepEstimate":
@@ -294,7 +294,7 @@ class Engine:
             program, _ = self._compile(config)
             a_program = self.compile_seconds
             with precision(config):
-                self._compile_conditions(config.run.precision, chunk)
+                self._compile_conditions(config.run.precision)
         compiling = a_program * len(groups) + self.compile_seconds - a_program
         backend: Backend = "scan" if program.instead is not None else self.backend
         # long enough for what a call costs not to count

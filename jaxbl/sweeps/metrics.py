@@ -500,7 +500,8 @@ def with_conditions(figures: Mapping[str, Any], gains: dict[str, ObserverGains])
         # gains and f_plus of all seeds and points, and which of those that differ each is
         rows = np.stack([np.broadcast_to(one, f_plus.shape[1:]).ravel() for one in given], axis=1)
         different, which = _different(rows)
-        judged = in_pieces(_judged, list(different.T))
+        # the program that the study's chunks have compiled, however few of the lanes differ
+        judged = in_pieces(_judged, list(different.T), most=f_plus[0].size)
         found |= {f"{side}.{name}": value[which].reshape(f_plus.shape[1:]) for name, value in judged.items()}
     return found
 

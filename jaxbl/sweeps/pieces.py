@@ -20,18 +20,22 @@ def _program(function: Callable[..., Any], devices: tuple[Any, ...]) -> tuple[Ca
 
 
 _SIZES = 64, 1024
-"""Of the pieces; each device has one at a time. Of few values the smaller ones: conditions of 1024 lanes take 6 ms."""
+"""Of the pieces; each device has one at a time. For few values the small ones: a chunk of 4 lanes takes 6.5 ms with them, 17.8
+ms with the large ones (benchmarks/NOTES.md)."""
 
 
-def in_pieces(function: Callable[..., Any], columns: Sequence[np.ndarray], devices: Sequence[Any] | None = None) -> Any:
+def in_pieces(
+    function: Callable[..., Any], columns: Sequence[np.ndarray], devices: Sequence[Any] | None = None, most: int = 0
+) -> Any:
     """Apply an elementwise function to columns `(n,)`, piece by piece, on some devices (all local ones if left out).
 
     The function takes arrays of one shape and gives any pytree of such; wrap it in `jax.jit`: all pieces of a call have
-    one shape. The result has NumPy arrays `(n,)` in their place.
+    one shape, that of `most` values where calls with fewer should take the same program. The result has NumPy arrays
+    `(n,)` in their place.
     """
     count = len(columns[0])
     devices = list(jax.local_devices() if devices is None else devices)
-    size = next((size for size in _SIZES if count <= size * len(devices)), _SIZES[-1])
+    size = next((size for size in _SIZES if max(count, most) <= size * len(devices)), _SIZES[-1])
     shape = max(-(-count // (size * len(devices))), 1), len(devices), size
     padded = [np.pad(np.asarray(one), (0, math.prod(shape) - count), "edge").reshape(shape) for one in columns]
     program, rows = _program(function, tuple(devices))

@@ -168,6 +168,8 @@ def test_a_scheduler_that_is_lost_is_said():
         results = workers.each(_waits, [False, True])
         assert next(results) is False
         connection.close()
-        with pytest.raises(NoResult, match="the connection to the scheduler is lost"):
-            next(results)
-        _GO_ON.set()
+        try:
+            with pytest.raises(NoResult, match="the connection to the scheduler is lost"):
+                next(results)
+        finally:
+            _GO_ON.set()

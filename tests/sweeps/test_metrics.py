@@ -195,9 +195,9 @@ def test_conditions_are_computed_once_for_lanes_that_share_them(monkeypatch):
     counts = []
     pieces = under_test.in_pieces
 
-    def counted(function, columns):
-        counts.append(len(columns[0]))
-        return pieces(function, columns)
+    def counted(function, columns, **keys):
+        counts.append((len(columns[0]), keys))
+        return pieces(function, columns, **keys)
 
     monkeypatch.setattr(under_test, "in_pieces", counted)
     # two seeds of three lanes: the load's gains and f_plus are the same for all lanes of a seed
@@ -210,7 +210,8 @@ def test_conditions_are_computed_once_for_lanes_that_share_them(monkeypatch):
         "load": ObserverGains(*map(np.array, (0.5, 0.4, 0.0, 0.1))),
     }
     found = with_conditions(f_plus, gains)
-    assert counts == [5, 2]
+    # both sides by the program of six lanes
+    assert counts == [(5, {"most": 6}), (2, {"most": 6})]
     for seed, lane in np.ndindex(2, 3):
         alone = {name: np.asarray(values[seed, lane]) for name, values in f_plus.items()}
         of_lane = {side: ObserverGains(*(one if one.ndim == 0 else one[lane] for one in g)) for side, g in gains.items()}

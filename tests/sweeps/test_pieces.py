@@ -23,6 +23,10 @@ def test_columns_of_any_length_by_programs_of_two_shapes(count, dtype, monkeypat
     np.testing.assert_array_equal(found["sum"], np.full(count, count - 1.0))
     np.testing.assert_array_equal(found["less"], x < y)
     assert found["sum"].dtype == dtype and set(shapes) == {(1, 2 if count <= 4 else 4)}
+    shapes.clear()
+    np.testing.assert_array_equal(in_pieces(both, [x, y], most=5)["sum"], found["sum"])
+    # traced already, where there are more than four
+    assert set(shapes) == ({(1, 4)} if count <= 4 else set())
 
 
 def test_devices_share_pieces(monkeypatch):
