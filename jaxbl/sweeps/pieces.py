@@ -20,8 +20,8 @@ def _program(function: Callable[..., Any], devices: tuple[Any, ...]) -> tuple[Ca
 
 
 _SIZES = 64, 1024
-"""Of the pieces; each device has one at a time. For few values the small ones: a chunk of 4 lanes takes 6.5 ms with them, 17.8
-ms with the large ones (benchmarks/NOTES.md)."""
+"""Of the pieces; each device has one at a time. For few values the small ones: a chunk of 4 lanes takes 6.5 ms with them,
+17.8 ms with the large ones (benchmarks/NOTES.md)."""
 
 
 def in_pieces(
