@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from pyarrow.dataset import Dataset
 
 
+_LET_GO = 60.0
+"""Seconds in which workers end what they have begun, and let go of the folder: also those of a client that was lost."""
 _MOST_NUMBERS = 2e8
 """Of a dataset that is mostly empty: 1.6 GB."""
 
@@ -204,7 +206,7 @@ def sweep(
         # refused, if it is, before anything is written
         engine.check()
     with removed_if_empty(folder), connected(scheduler) as cluster:
-        with locked(folder):
+        with locked(folder, wait=0.0 if cluster is None else _LET_GO):
             engine, store = begun(folder, engine, insist=backend is not None, overwrite=overwrite)
             store.refuse_others()
             if verify_store:
@@ -216,8 +218,7 @@ def sweep(
         if cluster is not None:
             with locked(folder, shared=True):
                 run.all()
-            # a worker may just let go of it
-            with locked(folder, wait=60.0):
+            with locked(folder, wait=_LET_GO):
                 # of workers that were lost
                 remove_drafts(folder)
                 run.finish()

@@ -2,7 +2,8 @@
 
 import itertools
 import time
-from threading import Event
+from contextlib import ExitStack
+from threading import Event, Timer
 
 import jax
 import pandas as pd
@@ -14,6 +15,7 @@ from jaxbl import cluster
 from jaxbl.cluster import Cluster, connected
 from jaxbl.config import read_config
 from jaxbl.errors import InputError, NoResult
+from jaxbl.files import Busy, locked
 from jaxbl.gains.stages import stages_in
 from jaxbl.sweeps.bundles import Bundle, _size, compute
 from jaxbl.sweeps.programs import Layout
@@ -60,6 +62,15 @@ def test_processes_of_this_machine_give_the_same_table(tmp_path):
     points = [ALPHA, LAMBDA, "seed"]
     frames = [frame.sort_values(points, ignore_index=True) for frame in (found.frame, whole)]
     pd.testing.assert_frame_equal(*frames, check_exact=True)
+
+
+def test_workers_of_a_client_that_was_lost_are_waited_for(tmp_path, client):
+    with ExitStack() as held:
+        held.enter_context(locked(tmp_path / "study", shared=True))
+        with pytest.raises(Busy):
+            sweep(thirty(), tmp_path / "study")
+        Timer(1.0, held.pop_all().close).start()
+        assert sweep(thirty(), tmp_path / "study", scheduler=client).cost["lanes"] == 30
 
 
 def test_a_refined_study_on_a_cluster(tmp_path, client):
