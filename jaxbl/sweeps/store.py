@@ -46,7 +46,7 @@ from .programs import Backend, Layout
 if TYPE_CHECKING:
     from pyarrow.dataset import Dataset
 
-FORMAT = 3
+FORMAT = 4
 """Of the manifest: raised where older versions could not read it."""
 
 _COMMANDS = {

@@ -195,7 +195,7 @@ def test_a_damaged_manifest_without_parts(copy):
 
 def test_manifest_of_another_version(copy):
     (copy / "manifest.json").write_text(json_text(read_json(copy / "manifest.json") | {"format": 99}))
-    with pytest.raises(InputError, match="has format 99; this version reads 3"):
+    with pytest.raises(InputError, match="has format 99; this version reads 4"):
         open_study(copy)
 
 
