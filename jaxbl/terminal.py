@@ -1,8 +1,12 @@
 """What a command does around its work: progress bar, interrupts, and names in front of messages of bad input."""
 
+import math
 import shlex
 import signal
 import sys
+import threading
+import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,9 +16,15 @@ from typing import TYPE_CHECKING
 import typer
 
 from .errors import InputError, printable
+from .workers import listening
 
 if TYPE_CHECKING:
     from .workers import Progress
+
+INTERRUPTED = 130
+"""Exit code of an interrupted command: 128 and the signal's number."""
+_EVERY, _LOOK, _WINDOW = 10.0, 1.0, 60.0
+"""Seconds between lines of progress in a pipe, between looks at what is done, and back to the look that gives the speed."""
 
 
 @contextmanager
@@ -51,7 +61,7 @@ def running(
 
     before = signal.signal(signal.SIGINT, interrupt)
     try:
-        with naming(config, folder), progress_bar(unit) as shown:
+        with naming(config, folder), progress_bar(unit, quiet=is_quiet(context)) as shown:
 
             def progress(done: int, total: int) -> None:
                 if interrupted:
@@ -65,7 +75,7 @@ def running(
             raise
         state = "what is finished is kept. Go on with" if kept else "nothing was written. Start again with"
         typer.echo(printable(f"interrupted; {state}: {_call_again(context, folder, kept=kept)}"), err=True)
-        raise typer.Exit(130) from None
+        raise typer.Exit(INTERRUPTED) from None
     finally:
         signal.signal(signal.SIGINT, before)
 
@@ -85,19 +95,40 @@ def _call_again(context: typer.Context, folder: Path, *, kept: bool) -> str:
 
 
 @contextmanager
-def progress_bar(unit: str) -> "Iterator[Progress | None]":
-    """A bar with the remaining time on a terminal, nothing in a pipe."""
-    if not sys.stderr.isatty():
+def progress_bar(unit: str, *, quiet: bool = False, first: str = "compiling") -> "Iterator[Progress | None]":
+    """What is being done, how much of it in `unit`, and the remaining time: a bar on a terminal, in a pipe a line now and
+    then. Without a unit nothing is counted."""
+    if quiet:
         yield None
-        return
+    elif sys.stderr.isatty():
+        with _bar(unit, first) as update:
+            yield update
+    else:
+        with _lines(unit, first) as update:
+            yield update
+
+
+@contextmanager
+def working(context: typer.Context, what: str) -> Iterator[None]:
+    """Around work of which no part can be counted: it is said what is being done."""
+    with progress_bar("", quiet=is_quiet(context), first=what):
+        yield
+
+
+def is_quiet(context: typer.Context) -> bool:
+    """Whether a command was asked for errors alone."""
+    return bool(context.params.get("quiet"))
+
+
+@contextmanager
+def _bar(unit: str, first: str) -> "Iterator[Progress]":
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    from .workers import listening
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn(unit), TimeRemainingColumn())
+    counted = (MofNCompleteColumn(), TextColumn(unit), TimeRemainingColumn()) if unit else (TimeElapsedColumn(),)
+    columns = (TextColumn("{task.description}"), BarColumn(), *counted)
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("compiling", total=None)
+        task = bar.add_task(first, total=None)
         heard = False
 
         def update(done: int, total: int) -> None:
@@ -110,6 +141,66 @@ def progress_bar(unit: str) -> "Iterator[Progress | None]":
 
         with listening(hear):
             yield update
+
+
+class Lines:
+    """Progress as lines of text, from what is heard of it: what is being done, the share, the remaining time.
+
+    Args:
+        unit: of what is counted.
+        what: is being done at first.
+        now: time of the beginning, s.
+    """
+
+    def __init__(self, unit: str, what: str, now: float):
+        self._unit, self._what, self._began, self._said = unit, what, now, now
+        self._heard, self._done, self._total = False, 0, 0
+        self._seen = deque([(now, 0)], maxlen=round(_WINDOW / _LOOK))
+
+    def update(self, done: int, total: int) -> None:
+        """Hear how much is done."""
+        self._done, self._total = done, total
+        if not self._heard:
+            self._what = "running"
+
+    def hear(self, what: str) -> None:
+        """Hear what is being done."""
+        self._heard, self._what = True, what
+
+    def look(self, now: float) -> str | None:
+        """A line, if it is time for one."""
+        self._seen.append((now, self._done))
+        if now - self._said < _EVERY:
+            return None
+        self._said = now
+        if not self._total:
+            return f"jaxbl: {self._what}, for {duration(now - self._began)} so far"
+        share = f"{self._done} of {self._total} {self._unit} ({math.floor(100 * self._done / self._total)} %)"
+        since, before = self._seen[0]
+        left = ""
+        # parts of an earlier call are counted within a moment: what happened lately says how fast it goes
+        if before < self._done < self._total:
+            left = f", about {duration((self._total - self._done) * (now - since) / (self._done - before))} left"
+        return f"jaxbl: {self._what}, {share}{left}"
+
+
+@contextmanager
+def _lines(unit: str, first: str) -> "Iterator[Progress]":
+    lines, ended = Lines(unit, first, time.monotonic()), threading.Event()
+
+    def speak() -> None:
+        while not ended.wait(_LOOK):
+            if line := lines.look(time.monotonic()):
+                typer.echo(printable(line), err=True)
+
+    speaker = threading.Thread(target=speak, name="jaxbl-progress", daemon=True)
+    speaker.start()
+    try:
+        with listening(lines.hear):
+            yield lines.update
+    finally:
+        ended.set()
+        speaker.join()
 
 
 def duration(seconds: float) -> str:

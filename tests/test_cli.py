@@ -19,10 +19,12 @@ import pytest
 import tomli_w
 from measured import EMPS, made, real
 from passed import PASSED
+from progress_lines import without_progress
 from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
 from typer.testing import CliRunner
 
 from jaxbl import cli, terminal
+from jaxbl.cli.options import folder_of
 from jaxbl.errors import InputError
 from jaxbl.files import locked
 from jaxbl.sweeps.engine import Engine
@@ -46,8 +48,8 @@ def jaxbl(*arguments, cwd, **environment):
 
 @pytest.fixture
 def call(monkeypatch, tmp_path):
-    """The command in this process: exit code, lines on stdout, lines on stderr."""
-    monkeypatch.setattr(cli, "start_jax", lambda: None)
+    """The command in this process: exit code, lines on stdout, lines on stderr but for progress."""
+    monkeypatch.setattr("jaxbl.workers.start_jax", lambda: None)
     monkeypatch.chdir(tmp_path)
 
     def run(*arguments):
@@ -56,7 +58,7 @@ def call(monkeypatch, tmp_path):
         if result.exception is not None and ended is None:
             raise result.exception
         code = ended.code if ended else (result.return_value or 0)
-        return code, result.stdout.splitlines(), result.stderr.splitlines()
+        return code, result.stdout.splitlines(), without_progress(result.stderr).splitlines()
 
     return run
 
@@ -94,7 +96,7 @@ def test_a_sweep_and_its_second_call(tmp_path):
     write(tmp_path, rigid(axes=AXES, sweep={"seeds": 2}))
     cache = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
     first = jaxbl("sweep", "study.toml", cwd=tmp_path, **cache)
-    assert (first.returncode, first.stderr) == (0, "")
+    assert (first.returncode, without_progress(first.stderr)) == (0, "")
     folder = tmp_path / "results" / "study"
     assert left(folder) == [
         "figures/line_motor_velocity_rmse.png", "manifest.json", "points/part-00000.parquet", "report.html", "study.toml",
@@ -121,7 +123,10 @@ def test_interrupted_sweep_says_how_to_go_on(tmp_path):
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=180)
     assert process.returncode == 130
-    assert errors == "interrupted; what is finished is kept. Go on with: jaxbl sweep 'a study.toml' --out out\n"
+    assert (
+        without_progress(errors)
+        == "interrupted; what is finished is kept. Go on with: jaxbl sweep 'a study.toml' --out out\n"
+    )
     assert 1 <= len(list(folder.glob("points/part-*.parquet"))) < 30
     assert not json.loads((folder / "manifest.json").read_text())["finished"]
 
@@ -263,7 +268,7 @@ def test_bad_input_is_one_line_and_exit_2(case, tmp_path, monkeypatch, capsys):
     (tmp_path / "full" / "thesis.tex").write_text("mine")
     before = left(tmp_path)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli, "start_jax", lambda: None)
+    monkeypatch.setattr("jaxbl.workers.start_jax", lambda: None)
     monkeypatch.setattr(sys, "argv", ["jaxbl", *arguments])
     with pytest.raises(SystemExit) as end:
         cli.main()
@@ -411,12 +416,13 @@ def test_tune_leaves_gains_numbers_figures_and_report(call, tmp_path, monkeypatc
 def test_a_search_that_finds_nothing_leaves_no_gains_and_exits_1(tmp_path, monkeypatch, capsys):
     write(tmp_path, tunable(margin_exact=1e4))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli, "start_jax", lambda: None)
+    monkeypatch.setattr("jaxbl.workers.start_jax", lambda: None)
     monkeypatch.setattr(sys, "argv", ["jaxbl", "tune", "study.toml"])
     with pytest.raises(SystemExit) as end:
         cli.main()
     assert end.value.code == 1
     out, errors = capsys.readouterr()
+    errors = without_progress(errors)
     assert out == ""
     assert errors.startswith("jaxbl: motor: none of the 9 gains ") and errors.count("\n") == 1
     assert "margin_exact = 10000: 0 (largest" in errors
@@ -450,13 +456,40 @@ def test_results_of_another_study_stay_until_overwriting_is_asked_for(call, tmp_
     assert json.loads((tmp_path / "out" / "manifest.json").read_text())["title"] == "second"
 
 
-def test_progress_bar_on_a_terminal_only(monkeypatch, capsys):
-    with terminal.progress_bar("runs") as progress:
-        assert progress is None
+def test_progress_on_a_terminal_is_a_bar(monkeypatch, capsys):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    with terminal.progress_bar("runs") as progress:
-        progress(2, 3)
+    for unit in ("runs", ""):
+        with terminal.progress_bar(unit) as progress:
+            progress(2, 3)
     assert capsys.readouterr().out == ""
+
+
+def test_progress_in_a_pipe_is_a_line_now_and_then(monkeypatch, capsys):
+    with terminal.progress_bar("runs") as progress:
+        progress(1, 3)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(terminal, "_EVERY", 0.05)
+    monkeypatch.setattr(terminal, "_LOOK", 0.01)
+    for quiet, said in ((True, False), (False, True)):
+        with terminal.progress_bar("runs", quiet=quiet):
+            time.sleep(0.2)
+        out, errors = capsys.readouterr()
+        assert out == without_progress(errors) == "" and bool(errors) == said
+
+
+def test_lines_of_progress_say_what_is_done_the_share_and_the_remaining_time():
+    lines = terminal.Lines("runs", "compiling", 0.0)
+    assert [lines.look(t) for t in (1.0, 9.0, 10.0, 11.0)] == [None, None, "jaxbl: compiling, for 10.0 s so far", None]
+    # what an earlier call has left is counted at once, and says nothing of the speed
+    lines.update(500, 1000)
+    assert lines.look(12.0) is None
+    for t in range(13, 90):
+        lines.update(500 + 2 * (t - 12), 1000)
+        said = lines.look(float(t))
+    lines.hear("drawing")
+    assert lines.look(90.0) == "jaxbl: drawing, 654 of 1000 runs (65 %), about 3 min left"
+    assert without_progress("jaxbl: drawing, 654 of 1000 runs (65 %), about 2 min left\nx\n") == "x\n"
+    assert said is None
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0.04, "0.0 s"), (99.0, "99.0 s"), (600.0, "10 min"), (7200.0, "2.0 h")])
@@ -465,7 +498,7 @@ def test_durations(seconds, text):
 
 
 def test_default_folder():
-    assert cli._folder(Path("a/b.toml"), None) == Path("results/b")
+    assert folder_of(Path("a/b.toml"), None) == Path("results/b")
 
 
 @pytest.mark.slow
@@ -493,7 +526,7 @@ def test_shipped_studies_run_without_a_word_on_stderr(name, command, tmp_path):
         if "num" in axis:
             axis["num"] = 2
     done = jaxbl(command, write(tmp_path, study), cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (done.returncode, without_progress(done.stderr)) == (0, "")
 
 
 def test_inspect_writes_a_first_model(call, tmp_path):
@@ -583,7 +616,7 @@ def test_a_transmission_on_a_test_rig_is_identified_and_no_drive(call, tmp_path)
 def test_inspect_runs_without_a_word_on_stderr(tmp_path):
     (tmp_path / "log.toml").write_text(tomli_w.dumps({"log": EMPS}))
     done = jaxbl("inspect", str(real("emps/DATA_EMPS.mat")), "--model", "log.toml", "--out", "out", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (done.returncode, without_progress(done.stderr)) == (0, "")
     assert "motion up to" in done.stdout
 
 
@@ -694,7 +727,7 @@ def test_an_interrupt_while_numbers_are_sought(axis, tmp_path):
         _, errors = process.communicate(timeout=180)
     assert process.returncode == 130
     again = "jaxbl identify 'an axis.csv' --model axis.toml --out 'results/an axis'"
-    assert errors == f"interrupted; nothing was written. Start again with: {again}\n"
+    assert without_progress(errors) == f"interrupted; nothing was written. Start again with: {again}\n"
     assert not folder.exists()
 
 

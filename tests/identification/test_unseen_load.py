@@ -87,7 +87,7 @@ def test_a_drive_without_a_gap_is_refused_and_the_move_written(tmp_path, monkeyp
     law = {"law": "sigmoid_backlash", "stiffness": 50.0, "dead_zone": 0.005, "slope": 200.0}
     study = STUDY | {"transmission": law, "uncertainty": {"exact": ["drive.gear_ratio", "transmission.slope"]}}
     (tmp_path / "axis.toml").write_text(tomli_w.dumps(study))
-    monkeypatch.setattr(cli, "start_jax", lambda: None)
+    monkeypatch.setattr("jaxbl.workers.start_jax", lambda: None)
     monkeypatch.chdir(tmp_path)
     called = CliRunner().invoke(
         cli.app, ["identify", str(path), "--model", "axis.toml", "--out", "out", "--next-experiment", "next.csv"]

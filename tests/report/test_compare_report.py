@@ -16,7 +16,7 @@ from jaxbl.sweeps.sweep import sweep
 def called(monkeypatch, capsys):
     """Exit code and output of a command."""
 
-    monkeypatch.setattr(cli, "start_jax", lambda: None)
+    monkeypatch.setattr("jaxbl.workers.start_jax", lambda: None)
 
     def run(*words):
         monkeypatch.setattr("sys.argv", ["jaxbl", *map(str, words)])

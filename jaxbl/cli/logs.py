@@ -1,0 +1,235 @@
+"""Commands on measured logs: inspect, identify, diagnose."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jaxbl import workers
+from jaxbl.errors import InputError
+from jaxbl.terminal import running
+
+from .options import (
+    FORMATS,
+    LogArgument,
+    LogOutOption,
+    LogOverwriteOption,
+    MaxTorqueOption,
+    MaxTravelOption,
+    SchedulerOption,
+    check_new,
+    folder_of,
+)
+from .outcome import Outcome
+
+if TYPE_CHECKING:
+    from jaxbl.records import LogTable
+
+
+def inspect(
+    log: LogArgument,
+    model: Annotated[
+        Path | None, typer.Option(metavar="TOML", help="study, or a file with [log] alone: how to read the log")
+    ] = None,
+    write: Annotated[
+        Path | None, typer.Option(metavar="NEW.toml", help="propose [log] and a nominal model for identify and diagnose")
+    ] = None,
+    out: LogOutOption = None,
+    overwrite: LogOverwriteOption = False,
+) -> Outcome:
+    """Examine a measured log: channels, sampling, noise, and which parameters it can identify."""
+    if write is not None:
+        check_new(write, "--write")
+    from jaxbl.files import claim_log_folder
+    from jaxbl.records import inspect as inspect_log
+    from jaxbl.report.inspect import write_inspection_report
+
+    table = gear_ratio = nominal = None
+    if model is not None:
+        from jaxbl.config import read_log_config
+
+        table, gear_ratio, nominal = read_log_config(model)
+    guesses: list[str] = []
+    if write is None:
+        found = inspect_log(log, table, gear_ratio=gear_ratio, nominal=nominal)
+    else:
+        from jaxbl.records.proposal import propose
+
+        given = None if table is None else table.model_dump(exclude_unset=True)
+        study, guesses, found = propose(log, given, gear_ratio=gear_ratio, nominal=nominal)
+    folder = folder_of(log, out)
+    claim_log_folder(folder, log, overwrite=overwrite)
+    lines = write_inspection_report(found, folder)
+    if write is not None:
+        import tomli_w
+
+        from jaxbl.files import write_atomic
+
+        remarks = [
+            f"Proposed by jaxbl inspect --write from {log.name}. Look it through: names, units, and the drive.",
+            *guesses,
+        ]
+        write_atomic(write, "".join(f"# {remark}\n" for remark in remarks) + tomli_w.dumps(study))
+        lines += ["", f"{write}: a first model. Run: jaxbl identify {log} --model {write}", *guesses]
+    return Outcome(lines, folder, summary="inspection.json")
+
+
+def identify(
+    context: typer.Context,
+    log: Annotated[list[Path], typer.Argument(metavar="LOG...", help=f"{FORMATS}s of one machine", show_default=False)],
+    model: Annotated[
+        Path, typer.Option(metavar="TOML", help="study with nominal parameters, and [log]", show_default=False)
+    ],
+    holdout: Annotated[Path | None, typer.Option(metavar="LOG2", help="log of the same machine to test the fit on")] = None,
+    profile: Annotated[
+        bool | None, typer.Option("--profile", help="add profile-likelihood intervals", show_default=False)
+    ] = None,
+    next_experiment: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.csv", help="write an input that shows a gap which the motor's encoder alone does not"),
+    ] = None,
+    max_torque: MaxTorqueOption = None,
+    max_travel: MaxTravelOption = None,
+    out: LogOutOption = None,
+    overwrite: LogOverwriteOption = False,
+) -> Outcome:
+    """Fit a machine's parameters to its logs, with intervals: stiffness, gap, inertias, frictions."""
+    _check_limits(next_experiment, max_torque, max_travel)
+    workers.start_jax()
+    from jaxbl.config import read_log_config
+
+    table, gear_ratio, _ = read_log_config(model)
+    if table.kind == "element":
+        if len(log) > 1:
+            raise InputError("identify: several logs; of a transmission on a test rig one log is fitted at a time")
+        if profile:
+            raise InputError(
+                "identify: --profile is for drives; intervals of a transmission on a test rig are by a jackknife"
+            )
+        if next_experiment is not None:
+            raise InputError("identify: --next-experiment is for drives; a transmission on a test rig is loaded to and fro")
+        return _identify_element(log[0], table, gear_ratio, holdout, folder_of(log[0], out), overwrite)
+    from jaxbl.files import results_of
+    from jaxbl.identification.identify import read_identification_task, run_identification
+    from jaxbl.report.identify import identification_lines, write_identification_report
+
+    task = read_identification_task(log, model, holdout=holdout, profile=profile)
+    if next_experiment is not None:
+        from jaxbl.diagnosis.next_experiment import check_gap_sought
+
+        check_gap_sought(task)
+    folder = folder_of(log[0], out)
+    with running(context, model, folder, unit="steps", kept=False) as progress:
+        file = folder / "identification.json"
+        summary = results_of(
+            task, file, lambda task: run_identification(task, progress), write_identification_report, overwrite=overwrite
+        )
+    lines = identification_lines(summary)
+    if next_experiment is not None:
+        from jaxbl.diagnosis.next_experiment import write_gap_experiment
+
+        lines += write_gap_experiment(folder, summary, task.record, next_experiment, max_torque, max_travel)
+    return Outcome(lines, folder, summary=summary)
+
+
+def _identify_element(
+    log: Path, table: "LogTable", gear_ratio: float | None, holdout: Path | None, folder: Path, overwrite: bool
+) -> Outcome:
+    from jaxbl.files import results_of
+    from jaxbl.identification.element import read_element_task, run_element
+    from jaxbl.report.element import element_lines, write_element_report
+
+    task = read_element_task(log, table, gear_ratio, holdout=holdout)
+    file = folder / "identification.json"
+    summary = results_of(task, file, run_element, write_element_report, overwrite=overwrite)
+    return Outcome(element_lines(summary), folder, summary=summary)
+
+
+def diagnose(
+    context: typer.Context,
+    log: Annotated[
+        list[Path] | None, typer.Argument(metavar="[LOG...]", help=f"{FORMATS}s of one machine", show_default=False)
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option(metavar="TOML", help="study with nominal parameters, [uncertainty] and [log]")
+    ] = None,
+    holdout: Annotated[
+        Path | None,
+        typer.Option(metavar="LOG2", help="log of the same machine for the test [default: the last quarter of the log]"),
+    ] = None,
+    batch: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="diagnose every log of a folder; NAME.toml beside NAME.csv is its model"),
+    ] = None,
+    jobs: Annotated[int | None, typer.Option(metavar="N", min=1, help="processes for --batch [default: one a core]")] = None,
+    scheduler: SchedulerOption = None,
+    next_experiment: Annotated[
+        Path | None, typer.Option(metavar="FILE.csv", help="write an input that separates the effects this log cannot")
+    ] = None,
+    max_torque: MaxTorqueOption = None,
+    max_travel: MaxTravelOption = None,
+    out: LogOutOption = None,
+    overwrite: LogOverwriteOption = False,
+) -> Outcome:
+    """Find effects that a model lacks, add them, and test on held-out data that its errors shrink."""
+    _check_limits(next_experiment, max_torque, max_travel)
+    if batch is not None:
+        if log or holdout is not None or next_experiment is not None:
+            raise InputError("--batch FOLDER takes no logs, --holdout or --next-experiment; give these one by one")
+        workers.start_jax()
+        folder = out if out is not None else Path("results") / batch.name
+        return _diagnose_batch(context, batch, model, folder, jobs, overwrite, scheduler)
+    if jobs is not None or scheduler is not None:
+        raise InputError(f"{'--scheduler' if jobs is None else '--jobs'} goes with --batch: one log is one process's work")
+    if not log:
+        raise InputError("diagnose: no log; give one or several of one machine, or a folder with --batch")
+    if model is None:
+        raise InputError("diagnose: no model; give a study with nominal parameters: --model TOML")
+    workers.start_jax()
+    from jaxbl.diagnosis.diagnose import read_diagnosis_task, run_diagnosis
+    from jaxbl.files import results_of
+    from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
+
+    task = read_diagnosis_task(log, model, holdout=holdout)
+    folder = folder_of(log[0], out)
+    with running(context, model, folder, unit="steps", kept=False) as progress:
+        file = folder / "diagnosis.json"
+        summary = results_of(
+            task, file, lambda task: run_diagnosis(task, progress), write_diagnosis_report, overwrite=overwrite
+        )
+    lines = diagnosis_lines(summary)
+    if next_experiment is not None:
+        from jaxbl.diagnosis.next_experiment import write_gap_experiment, write_next_experiment
+
+        write = write_gap_experiment if "backlash" in summary else write_next_experiment
+        lines += write(folder, summary, task.record, next_experiment, max_torque, max_travel)
+    return Outcome(lines, folder, summary=summary)
+
+
+def _check_limits(next_experiment: Path | None, torque: float | None, travel: float | None) -> None:
+    """Limits of an experiment need one, and have to be positive."""
+    for name, limit in (("--max-torque", torque), ("--max-travel", travel)):
+        if limit is not None and next_experiment is None:
+            raise InputError(f"{name} limits what --next-experiment FILE.csv asks for; give both")
+        if limit is not None and not 0.0 < limit < math.inf:
+            raise InputError(f"{name} is {limit:g}; it has to be positive")
+
+
+def _diagnose_batch(
+    context: typer.Context,
+    source: Path,
+    model: Path | None,
+    out: Path,
+    jobs: int | None,
+    overwrite: bool,
+    scheduler: str | None,
+) -> Outcome:
+    from jaxbl.batch import batch_lines, read_batch, run_batch
+
+    work, skipped = read_batch(source, model, out, overwrite=overwrite)
+    with running(context, model or source, out, unit="logs") as progress:
+        rows = run_batch(work, out, jobs, progress, scheduler)
+    lines = [f"Skipped, by their names no logs: {', '.join(skipped)}"] if skipped else []
+    code = 2 if all(row["refused"] for row in rows) else 0
+    return Outcome([*lines, *batch_lines(rows)], out, "batch.csv", {"logs": rows, "skipped": skipped}, code)

@@ -1,0 +1,54 @@
+"""Arguments and options that several commands have."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jaxbl.errors import InputError
+from jaxbl.files import place
+
+ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML study", show_default=False)]
+OutOption = Annotated[
+    str | None,
+    typer.Option(metavar="DIR", help="folder for the results, or s3://BUCKET/FOLDER [default: results/<config name>]"),
+]
+FolderArgument = Annotated[str, typer.Argument(metavar="DIR", help="folder of a sweep, verify or tune", show_default=False)]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="remove the results of another study from the folder")]
+BackendOption = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="fused: one compiled loop; scan: XLA's own loop [default: the faster here]"),
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS", help="Dask cluster that computes: tcp://HOST:PORT, its scheduler's .json file, or local:N"
+    ),
+]
+FORMATS = "CSV, Parquet, MATLAB or JSON file"
+LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help=FORMATS, show_default=False)]
+LogOutOption = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="folder for the results [default: results/<log name>]")
+]
+MaxTorqueOption = Annotated[
+    float | None, typer.Option(metavar="N·m", help="limit of the next experiment's input [default: the log's]")
+]
+MaxTravelOption = Annotated[
+    float | None, typer.Option(metavar="RAD", help="limit of its motor travel (m on a linear axis) [default: the log's]")
+]
+LogOverwriteOption = Annotated[
+    bool, typer.Option("--overwrite", help="write into a folder that holds results of another log")
+]
+
+
+def folder_of(config: Path, out: str | Path | None) -> Path:
+    """The folder for the results of a study or a log."""
+    return place(out) if out is not None else Path("results") / config.stem
+
+
+def check_new(file: Path, option: str) -> None:
+    """Refuse to write where there is something, or no folder for it."""
+    if file.exists():
+        raise InputError(f"{file}: is there already; {option} needs a new name")
+    if not file.parent.is_dir():
+        raise InputError(f"{file}: there is no folder {file.parent}")

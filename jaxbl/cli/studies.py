@@ -1,0 +1,332 @@
+"""Commands on studies: simulate, sweep, status, tune, verify, plot, compare, repair."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from jaxbl import workers
+from jaxbl.errors import InputError, printable
+from jaxbl.files import Busy, place
+from jaxbl.terminal import duration, naming, running, working
+
+from .options import (
+    BackendOption,
+    ConfigArgument,
+    FolderArgument,
+    OutOption,
+    OverwriteOption,
+    SchedulerOption,
+    folder_of,
+)
+from .outcome import Outcome
+
+if TYPE_CHECKING:
+    from jaxbl.config import Config
+    from jaxbl.sweeps.programs import Backend
+    from jaxbl.sweeps.status import Status
+    from jaxbl.sweeps.sweep import StudyResult
+
+
+def simulate(
+    context: typer.Context,
+    config: ConfigArgument,
+    out: OutOption = None,
+    seed: Annotated[int, typer.Option(help="seed of the encoder noise", min=0, max=2**31 - 1)] = 0,
+    every: Annotated[int, typer.Option(help="keep every N-th sample of the trace", min=1, metavar="N")] = 1,
+    overwrite: OverwriteOption = False,
+) -> Outcome:
+    """Simulate a study once: trace, figures, summary."""
+    workers.start_jax()
+    from jaxbl.files import locked, removed_if_empty
+    from jaxbl.report.simulate import write_trial_report
+    from jaxbl.sweeps.store import claim
+    from jaxbl.sweeps.trial import run
+
+    study = _read(config)
+    folder = folder_of(config, out)
+    with removed_if_empty(folder), locked(folder), working(context, "simulating"):
+        claim(folder, study, "simulate", overwrite=overwrite)
+        trial = run(study, seed=seed, every=every)
+        lines = write_trial_report(trial, folder)
+    return Outcome(lines, folder, summary="summary.json", code=0 if trial.summary["metrics"]["finite"] else 1)
+
+
+def sweep(
+    context: typer.Context,
+    config: ConfigArgument,
+    out: OutOption = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="print the expected cost, and stop")] = False,
+    overwrite: OverwriteOption = False,
+    backend: BackendOption = None,
+    verify_store: Annotated[
+        bool, typer.Option("--verify-store", help="read every stored part first, and compute damaged ones anew")
+    ] = False,
+    scheduler: SchedulerOption = None,
+    detach: Annotated[bool, typer.Option("--detach", help="leave the cluster at work; see 'jaxbl status DIR'")] = False,
+    share: Annotated[
+        str | None,
+        typer.Option(metavar="I/N", help="compute the I-th of N shares into a folder that other processes write into, too"),
+    ] = None,
+) -> Outcome:
+    """Simulate all points of a study: metrics, maps, report. Continues an interrupted sweep."""
+    which = _share(share, {"--overwrite": overwrite, "--verify-store": verify_store, "--scheduler": scheduler is not None})
+    if detach and scheduler is None:
+        raise InputError("--detach: needs the --scheduler of a cluster that stays when this command has ended")
+    if detach and (overwrite or verify_store):
+        raise InputError("--detach: does not go with --overwrite or --verify-store; choose another folder with --out")
+    study, chosen = _study(config, backend)
+    from jaxbl.report.checks import check_figures
+    from jaxbl.sweeps.metrics import metric_columns
+    from jaxbl.sweeps.points import Points
+    from jaxbl.sweeps.sweep import sweep as run_sweep
+
+    if not study.axes and study.sweep.seeds == 1:
+        raise InputError(f"{config}: axes: the study has none; add [[axes]], or use 'jaxbl simulate'")
+    with naming(config):
+        Points(study)
+        check_figures(study, study.figures, metric_columns(study.build()))
+        if dry_run:
+            return _expected_cost(study, chosen)
+    run = functools.partial(run_sweep, verify_store=verify_store, scheduler=scheduler)
+    collect = functools.partial(_compute, context, config, study, out, overwrite, chosen, run, "sweep")
+    if detach or which is not None:
+        from jaxbl.sweeps.sweep import share as run_share
+        from jaxbl.sweeps.sweep import submit
+
+        folder = folder_of(config, out)
+        with running(context, config, folder) as progress:
+            if which is None:
+                found = submit(study, folder, scheduler, backend=chosen)
+            else:
+                found = run_share(study, folder, which, progress=progress, backend=chosen)
+        if not found.complete:
+            left = f"When all parts are there, 'jaxbl sweep {config} --out {folder}' writes the report."
+            return _state([found], left)
+        # who is last collects them
+        try:
+            return collect()
+        except Busy:
+            return _state([found])
+    return collect()
+
+
+def _share(text: str | None, others: dict[str, bool]) -> tuple[int, int] | None:
+    """Number of a share, and of all; `others` are options that do not go with it."""
+    if text is None:
+        return None
+    for name, given in others.items():
+        if given:
+            raise InputError(f"--share: does not go with {name}: other processes may be at work in the folder")
+    number, _, count = text.partition("/")
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise InputError(f"--share {text}: should be I/N, such as 2/8: the second of eight")
+    return int(number), int(count)
+
+
+def status(folder: FolderArgument) -> Outcome:
+    """Say how far a study is, by the parts that exist."""
+    from jaxbl.sweeps.status import statuses
+
+    return _state(statuses(folder))
+
+
+def _state(found: "list[Status]", *more: str) -> Outcome:
+    """How far studies are."""
+    data = {"studies": [vars(one) | {"folder": str(one.folder)} for one in found]}
+    return Outcome([*(line for one in found for line in _state_lines(one)), *more], summary=data)
+
+
+def _state_lines(found: "Status") -> list[str]:
+    share = f"{found.parts} of {found.parts_in_all} parts ({math.floor(1000 * found.parts / found.parts_in_all) / 10:g} %)"
+    lines = [f"{found.folder}: '{printable(found.title)}', {share} of {found.runs} runs"]
+    if found.damaged:
+        lines.append(f"  {found.damaged} damaged files are kept in {found.folder / 'damaged'}")
+    if found.finished and found.complete:
+        return [*lines, "  finished"]
+    rate, left = found.parts_per_second, found.remaining
+    speed = f", {60.0 * rate:.3g} parts a minute" if rate else ""
+    if found.complete:
+        lines.append("  all parts are there; 'jaxbl sweep' on it reads them and writes the report")
+    elif found.held_by:
+        lines.append(f"  {found.held_by} is at work{speed}{'' if left is None else f', {duration(left)} left'}")
+    else:
+        lines.append(f"  no process is at work in it{speed and f' (it went at{speed[1:]})'}; 'jaxbl sweep' goes on")
+    return lines
+
+
+def _expected_cost(study: "Config", backend: "Backend | None") -> Outcome:
+    """What a sweep will take."""
+    from jaxbl.sweeps.sweep import dry_run
+
+    cost = dry_run(study, backend=backend)
+    refined = study.sweep.refine is not None
+    lines = [f"points       {cost.points}{' on the coarse grid' if refined else ''} ({cost.rows} runs with all seeds)"]
+    if refined:
+        lines.append(f"refinement   at most {cost.most_points} points; as many as the boundaries need, not counted below")
+    rate = f"{cost.lane_steps_per_second:.2g} lane-steps/s measured, backend {cost.backend}"
+    lines += [
+        f"chunks       {cost.chunks} of {cost.lanes_a_chunk} lanes",
+        f"memory       {cost.megabytes:.1f} MB a chunk",
+        f"compilation  about {duration(cost.compile_seconds)}",
+        f"run          about {duration(cost.run_seconds)} ({rate})",
+    ]
+    return Outcome(lines, summary=vars(cost))
+
+
+def tune(
+    context: typer.Context,
+    config: ConfigArgument,
+    out: OutOption = None,
+    overwrite: OverwriteOption = False,
+    backend: BackendOption = None,
+    scheduler: SchedulerOption = None,
+) -> Outcome:
+    """Choose lambda and alpha of both observers: gains.toml, comparison, report. Continues an interrupted search."""
+    study, chosen = _study(config, backend)
+    from jaxbl.gains.tune import tune as run_tune
+
+    run = functools.partial(run_tune, scheduler=scheduler)
+    return _compute(context, config, study, out, overwrite, chosen, run, "tune")
+
+
+def verify(
+    context: typer.Context,
+    config: ConfigArgument,
+    out: OutOption = None,
+    overwrite: OverwriteOption = False,
+    backend: BackendOption = None,
+    scheduler: SchedulerOption = None,
+) -> Outcome:
+    """Test the gain conditions by simulation: counterexamples, maps, report. Continues an interrupted verification."""
+    study, chosen = _study(config, backend)
+    from jaxbl.gains.verify import verify as run_verify
+
+    run = functools.partial(run_verify, scheduler=scheduler)
+    return _compute(context, config, study, out, overwrite, chosen, run, "verify")
+
+
+def _study(config: Path, backend: str | None) -> tuple["Config", "Backend | None"]:
+    """A study, and the backend that is asked for."""
+    workers.start_jax()
+    from jaxbl.sweeps.programs import backend_of
+
+    chosen = backend_of(backend, "--backend")
+    return _read(config), chosen
+
+
+def _read(config: Path) -> "Config":
+    """A study; what is valid in it and perhaps not meant is said first."""
+    from jaxbl.config import read_config
+
+    study = read_config(config)
+    for remark in study.remarks():
+        typer.echo(printable(f"jaxbl: {config}: {remark}"), err=True)
+    return study
+
+
+_SUMMARIES = {"tune": "tuning.json", "verify": "verdict.json"}
+"""Files that say what a command found."""
+
+
+def _extent(result: "StudyResult") -> dict[str, Any]:
+    """How large a study is, as data."""
+    return {"title": result.config.title, "runs": result.runs, "finished": result.is_finished(result.runs)}
+
+
+def _compute(
+    context: typer.Context,
+    config: Path,
+    study: "Config",
+    out: str | None,
+    overwrite: bool,
+    backend: "Backend | None",
+    run: Callable[..., Any],
+    command: str,
+) -> Outcome:
+    """Run a command on a study that continues where an interrupted call stopped, write its report, and say what it took."""
+    folder = folder_of(config, out)
+    with running(context, config, folder) as progress:
+        result = run(study, folder, progress=progress, overwrite=overwrite, backend=backend)
+    from jaxbl.fused import SCANNED
+
+    with working(context, "drawing"):
+        # what draws is loaded when there is something to be drawn
+        report = import_module(f"jaxbl.report.{command}")
+        lines = getattr(report, f"write_{command}_report")(result, folder)
+    cost = getattr(result, "cost", None)
+    if cost and cost["lanes"]:
+        compiling, computing = duration(cost["compile_seconds"]), duration(cost["run_seconds"])
+        lines.append(f"Compiled in {compiling}, ran {cost['lanes']:.0f} lanes in {computing}.")
+    lines += (SCANNED % what for what in result.scanned)
+    lines += (f"Damaged, and computed anew: {what}" for what in getattr(result, "damaged", ()))
+    return Outcome(lines, folder, summary=_SUMMARIES.get(command) or _extent(result))
+
+
+def plot(
+    context: typer.Context,
+    folder: FolderArgument,
+    config: Annotated[
+        Path | None, typer.Option(metavar="CONFIG", help="take title, notes and figures from this study")
+    ] = None,
+) -> Outcome:
+    """Draw figures and report of a sweep again from its stored points, without simulating."""
+    workers.start_jax()
+    from jaxbl.config import read_config
+    from jaxbl.files import make_folder
+    from jaxbl.report.sweep import write_sweep_report
+    from jaxbl.sweeps.store import Store, identity
+    from jaxbl.sweeps.sweep import open_study
+
+    where, result = place(folder), open_study(folder)
+    make_folder(where, "copy it to where you may write, and plot that")
+    if config is not None:
+        study = read_config(config)
+        if identity(study) != Store.open(where).manifest["identity"]:
+            raise InputError(f"{config}: is not the study in {folder}; only title, notes and figures may differ")
+        result = dataclasses.replace(result, config=study)
+    with working(context, "drawing"):
+        return Outcome(write_sweep_report(result, where), where, summary=_extent(result))
+
+
+def compare(
+    context: typer.Context,
+    first: Annotated[Path, typer.Argument(metavar="DIR1", parser=place, help="folder of a sweep", show_default=False)],
+    second: Annotated[Path, typer.Argument(metavar="DIR2", parser=place, help="of another one", show_default=False)],
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="folder for the results [default: results/compare-DIR1-DIR2]")
+    ] = None,
+) -> Outcome:
+    """Compare two sweeps: what changed in the config, and where metrics differ by more than noise."""
+    workers.start_jax()
+    from jaxbl.files import is_empty, make_folder, removed_if_empty
+    from jaxbl.report.compare import write_comparison
+    from jaxbl.sweeps.compare import compare as run_compare
+    from jaxbl.sweeps.sweep import open_study
+
+    studies = open_study(first), open_study(second)
+    folder = out if out is not None else Path("results") / f"compare-{first.name}-{second.name}"
+    make_folder(folder)
+    if not is_empty(folder) and not (folder / "comparison.json").exists():
+        raise InputError(f"{folder}: is not empty and holds no comparison; choose another folder with --out")
+    with removed_if_empty(folder), working(context, "comparing"):
+        lines = write_comparison(run_compare(*studies), studies[0].config, folder)
+    return Outcome(lines, folder, "comparison.json", "comparison.json")
+
+
+def repair(folder: FolderArgument) -> Outcome:
+    """Check a sweep's folder: keep damaged parts aside, and write a manifest that is lost or damaged anew."""
+    workers.start_jax()
+    from jaxbl.sweeps.sweep import repair as run_repair
+
+    whole, store = run_repair(folder)
+    parts = store.manifest["parts"]
+    lines = [*(f"Damaged: {what}" for what in store.damaged), f"{whole} of {parts} parts are whole."]
+    if whole < parts:
+        lines.append(f"'jaxbl sweep STUDY.toml --out {folder}' with the same study computes the others.")
+    return Outcome(lines, place(folder), "", {"parts": parts, "whole": whole, "damaged": store.damaged})
