@@ -203,6 +203,11 @@ def _lines(unit: str, first: str) -> "Iterator[Progress]":
         speaker.join()
 
 
+def answers() -> bool:
+    """Whether somebody can be asked."""
+    return sys.stdin is not None and sys.stdin.isatty()
+
+
 def duration(seconds: float) -> str:
     """A time for the reader, in s, min or h."""
     if seconds < 100.0:

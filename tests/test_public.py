@@ -32,7 +32,7 @@ FLOORS = [
     {"gains", "diagnosis"},
     {"throughput"},
     {"report"},
-    {"batch", "terminal"},
+    {"batch", "datasheet", "terminal"},
     {"cli"},
 ]
 BELOW = {part: set().union(*FLOORS[:i]) for i, floor in enumerate(FLOORS) for part in floor}

@@ -39,6 +39,7 @@ def _main(
 
 
 for _command in (
+    setup.init,
     *(studies.simulate, studies.sweep, studies.status, studies.tune, studies.verify),
     *(logs.inspect, logs.identify, logs.diagnose),
     *(studies.plot, studies.compare, studies.repair, setup.bench),

@@ -84,12 +84,19 @@ def told(command: Callable[..., Outcome]) -> Callable[..., None]:
         if outcome.code:
             raise typer.Exit(outcome.code)
 
-    options = {"quiet": QuietOption, "json": JsonOption}
+    return with_options(run, command, {"quiet": QuietOption, "json": JsonOption}, False)
+
+
+def with_options(
+    run: Callable[..., Any], command: Callable[..., Any], options: Mapping[str, Any], default: Any
+) -> Callable[..., Any]:
+    """A function with the arguments of a command, and with further options of one default."""
     own = inspect.signature(command)
     added = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
         for name, kind in options.items()
     ]
-    run.__signature__ = own.replace(parameters=[*own.parameters.values(), *added])  # type: ignore[attr-defined]
-    run.__annotations__ = command.__annotations__ | options
+    own_ones = [one for one in own.parameters.values() if one.kind is not inspect.Parameter.VAR_KEYWORD]
+    run.__signature__ = own.replace(parameters=[*own_ones, *added])  # type: ignore[attr-defined]
+    run.__annotations__ = {**command.__annotations__, **options}
     return run

@@ -1,4 +1,4 @@
-"""Commands around the work: bench."""
+"""Commands before the work: init, schema, doctor, demo, bench."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,10 +6,73 @@ from typing import Annotated
 import typer
 
 from jaxbl import workers
+from jaxbl.datasheet import ITEMS, Given, Item, first_study, remark
 from jaxbl.errors import InputError
-from jaxbl.terminal import running
+from jaxbl.files import write_atomic
+from jaxbl.terminal import answers, running, working
 
-from .outcome import Outcome
+from .options import check_new
+from .outcome import Outcome, with_options
+
+NewArgument = Annotated[Path, typer.Argument(metavar="[NEW.toml]", help="file to be written", show_default="drive.toml")]
+
+
+def init(
+    context: typer.Context,
+    file: NewArgument = Path("drive.toml"),
+    title: Annotated[str, typer.Option(metavar="TEXT", help="headline of its report")] = "",
+    **given: str | None,
+) -> Outcome:
+    """Write a first study from a drive's data sheet: what no option says is asked for."""
+    check_new(file, "init")
+    values = {one.name: one.read(text) for one in ITEMS if (text := given[one.name]) is not None}
+    if answers():
+        if len(values) < len(ITEMS):
+            typer.echo("Numbers of the data sheet with their units; Enter takes what is in brackets.", err=True)
+        values = {one.name: values.get(one.name) or _asked(one) for one in ITEMS}
+    elif missing := [one for one in ITEMS if one.name not in values and not one.default]:
+        wanted = ", ".join(f"{one.option} '{one.example}'" for one in missing)
+        raise InputError(f"init: these numbers are missing, here with examples: {wanted}; on a terminal they are asked for")
+    values = {one.name: values.get(one.name) or one.left_out() for one in ITEMS}
+    workers.start_jax()
+    with working(context, "running a pilot for the gains"):
+        text, found = first_study(values, title or file.stem)
+    check_new(file, "init")
+    write_atomic(file, text)
+    bounds = {side: one["f_plus"] for side, one in found.items()}
+    said = ", ".join(f"{bound:.3g} rad/s² ({side})" for side, bound in bounds.items())
+    lines = [
+        f"{file}: a study with comments. Gains by the usual rule, for unknown accelerations up to {said}.",
+        *([said] if (said := remark(values, found)) else []),
+        "Next:",
+        f"  jaxbl simulate {file}   one run, with figures",
+        f"  jaxbl sweep {file} --out results/{file.stem}_map   which gains work",
+        f"  jaxbl tune {file} --out results/{file.stem}_gains   the best ones",
+    ]
+    data = {"file": str(file), "given": {name: one._asdict() for name, one in values.items()}, "f_plus": bounds}
+    return Outcome(lines, summary=data)
+
+
+def _asked(item: Item) -> Given:
+    """What the user answers; asked again where that is no such number."""
+    while True:
+        known = ", ".join(unit for unit in item.units if unit)
+        question = f"{item.asked}, such as {item.example}{f' (units: {known})' if known else ''}"
+        text = typer.prompt(question, default=item.default or None, err=True)
+        try:
+            return item.left_out() if text == item.default else item.read(text)
+        except InputError as error:
+            typer.echo(f"  {error}", err=True)
+
+
+def _option(item: Item) -> object:
+    known = ", ".join(unit for unit in item.units if unit)
+    default = f" [default: {item.default}]" if item.default else ""
+    about = f"{item.asked}, such as '{item.example}'{f'; units: {known}' if known else ''}{default}"
+    return Annotated[str | None, typer.Option(item.option, metavar="VALUE", help=about, show_default=False)]
+
+
+with_options(init, init, {item.name: _option(item) for item in ITEMS}, None)
 
 
 def bench(

@@ -34,10 +34,13 @@ Gains = dict[str, tuple[float, float]]
 Window = dict[str, tuple[float, float]]
 """Ends of the ratios searched on one side: alpha / f⁺ under `alpha`, lambda / √f⁺ under `lambda`."""
 
-USUAL_LAMBDA, USUAL_ALPHA = 1.5, 1.1
-"""The usual rule (Levant 1998): lambda = 1.5 sqrt(f_plus), alpha = 1.1 f_plus."""
 
 _FINEST = 1e-6  # relative steps below this are no longer worth a run
+
+
+def usual_rule(f_plus: float) -> tuple[float, float]:
+    """The usual rule (Levant 1998): lambda = 1.5 sqrt(f_plus) (rad^0.5/s) and alpha = 1.1 f_plus (rad/s^2)."""
+    return 1.5 * math.sqrt(f_plus), 1.1 * f_plus
 
 
 @dataclasses.dataclass(frozen=True)
@@ -212,7 +215,7 @@ class Search:
 
     def gains_to_compare(self, tuned: Gains) -> dict[str, Gains]:
         """Gains of both sides by name."""
-        usual = {side: (USUAL_LAMBDA * math.sqrt(bound), USUAL_ALPHA * bound) for side, bound in self.f_plus.items()}
+        usual = {side: usual_rule(bound) for side, bound in self.f_plus.items()}
         observers = {side: getattr(self.scenarios.config.observer, side) for side in self.sides}
         own = {side: (float(observer.lambda_), float(observer.alpha)) for side, observer in observers.items()}
         others = {

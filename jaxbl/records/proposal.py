@@ -290,20 +290,24 @@ def _study(found: Inspection, nominal: NominalDrive, table: dict[str, Any]) -> d
         "title": record.path.stem,
         "drive": {"kind": "two_inertia" if two else "rigid"} | {name: getattr(nominal, name) for name in names},
     }
-    fastest = 0.0
     if two:
         law = {"law": "dead_zone", "stiffness": nominal.stiffness, "half_gap": nominal.half_gap}
         study["transmission"] = law if nominal.half_gap else {"law": "linear_shaft", "stiffness": law["stiffness"]}
-        fastest = math.sqrt(nominal.stiffness / nominal.motor_inertia)
-    # ten plant steps for each radian of the shaft's own motion
-    substeps = max(math.ceil(10.0 * fastest * record.sample_period / (2.0 * math.pi)), 1)
     noise = record.findings.channels["theta_e" if "motor" in record.positions else "theta_s"].noise
     return study | {
         "encoders": {"noise": _rounded(noise)},
-        "run": {"sample_period": record.sample_period, "substeps": substeps},
+        "run": {"sample_period": record.sample_period, "substeps": plant_steps(nominal, record.sample_period)},
         "uncertainty": {"relative": _VAGUE, "exact": ["drive.gear_ratio"] if two else []},
         "log": table,
     }
+
+
+def plant_steps(drive: NominalDrive, period: float) -> int:
+    """Plant steps in a sample of `period` s: ten in a period of the oscillation of both inertias about the shaft."""
+    rate = 0.0
+    if math.isfinite(drive.stiffness):
+        rate = drive.stiffness * (1.0 / drive.motor_inertia + drive.gear_ratio**2 / drive.load_inertia)
+    return max(math.ceil(10.0 * math.sqrt(rate) * period / (2.0 * math.pi)), 1)
 
 
 def _rounded(value: float) -> float:
