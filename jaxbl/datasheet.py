@@ -252,8 +252,9 @@ def _amplitude(given: Mapping[str, Given], waves: int) -> float:
 def _accepted(given: Mapping[str, Given], found: Mapping[str, Any]) -> tuple[float, float]:
     """Velocity and position error (rad/s, rad) that the motor's observer may have.
 
-    A part of the largest speed; twice what the largest unknown acceleration makes of the speed in a sample; and what readings off
-    by e cost a differentiator of such signals, in proportion to sqrt(f+ e). Reference: A. Levant, Automatica 34 (1998).
+    A part of the largest speed; twice what the largest unknown acceleration makes of the speed in a sample; and what
+    readings off by e cost a differentiator of such signals, in proportion to sqrt(f+ e).
+    Reference: A. Levant, Automatica 34 (1998).
     """
     period, ratio = given["sample_period"].value, given["gear_ratio"].value
     off = given["motor_encoder"].value + 4.0 * given["encoder_noise"].value
@@ -290,7 +291,7 @@ def _observers(given: Mapping[str, Given], found: Mapping[str, Any], gains: Mapp
         f"position_tolerance = {_number(position, 2)} # rad",
         "",
         "# Gains by the usual rule, lambda = 1.5 sqrt(f+) and alpha = 1.1 f+; f+ is the largest acceleration in a run of",
-        f"# this study that observers do not know: {bound['motor']:.3g} rad/s² at the motor, {bound['load']:.3g} at the load.",
+        f"# this study that observers do not know: {bound['motor']:.3g} rad/s² (motor), {bound['load']:.3g} rad/s² (load).",
         "# 'jaxbl tune' looks for better ones.",
         "[observer]",
     ]

@@ -17,7 +17,10 @@ os.environ |= {
 import jax
 import pytest
 from hypothesis import settings
+from progress_lines import without_progress
+from typer.testing import CliRunner
 
+from jaxbl import cli
 from jaxbl.workers import collect_rarely, forget_programs
 
 collect_rarely()
@@ -55,3 +58,20 @@ def client():
         Client(workers, set_as_default=False) as connection,
     ):
         yield connection
+
+
+@pytest.fixture
+def call(monkeypatch, tmp_path):
+    """The command in this process: exit code, lines on stdout, lines on stderr but for progress."""
+    monkeypatch.setattr("jaxbl.workers.start_jax", lambda: None)
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        result = CliRunner().invoke(cli.app, list(map(str, arguments)), standalone_mode=False)
+        ended = result.exception if isinstance(result.exception, SystemExit) else None
+        if result.exception is not None and ended is None:
+            raise result.exception
+        code = ended.code if ended else (result.return_value or 0)
+        return code, result.stdout.splitlines(), without_progress(result.stderr).splitlines()
+
+    return run

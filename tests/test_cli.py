@@ -21,7 +21,6 @@ from measured import EMPS, made, real
 from passed import PASSED
 from progress_lines import without_progress
 from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
-from typer.testing import CliRunner
 
 from jaxbl import cli, terminal
 from jaxbl.cli.options import folder_of
@@ -44,23 +43,6 @@ def jaxbl(*arguments, cwd, **environment):
         [sys.executable, "-m", "jaxbl", *arguments], cwd=cwd, capture_output=True, text=True, timeout=120, check=False,
         env=os.environ | environment,
     )  # fmt: skip
-
-
-@pytest.fixture
-def call(monkeypatch, tmp_path):
-    """The command in this process: exit code, lines on stdout, lines on stderr but for progress."""
-    monkeypatch.setattr("jaxbl.workers.start_jax", lambda: None)
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        result = CliRunner().invoke(cli.app, list(map(str, arguments)), standalone_mode=False)
-        ended = result.exception if isinstance(result.exception, SystemExit) else None
-        if result.exception is not None and ended is None:
-            raise result.exception
-        code = ended.code if ended else (result.return_value or 0)
-        return code, result.stdout.splitlines(), without_progress(result.stderr).splitlines()
-
-    return run
 
 
 def write(folder, data=None, name="study.toml"):

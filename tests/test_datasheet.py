@@ -4,7 +4,6 @@ import math
 import tomllib
 
 import pytest
-from test_cli import call as call  # the command in this process
 
 from jaxbl import read_config
 from jaxbl.cli import setup

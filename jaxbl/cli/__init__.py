@@ -45,6 +45,8 @@ for _command in (
     *(studies.plot, studies.compare, studies.repair, setup.bench),
 ):
     app.command()(told(_command))
+# what it prints is JSON in any case
+app.command()(setup.schema)
 
 
 def main(run: Callable[[], object] = app) -> None:

@@ -75,6 +75,23 @@ def _option(item: Item) -> object:
 with_options(init, init, {item.name: _option(item) for item in ITEMS}, None)
 
 
+def schema(
+    out: Annotated[Path | None, typer.Option(metavar="NEW.json", help="file to be written [default: stdout]")] = None,
+) -> None:
+    """Print the JSON schema of a study, by which editors complete and check its keys."""
+    import json
+
+    from jaxbl.config.schema import schema as schema_of
+
+    if out is not None:
+        check_new(out, "--out")
+    text = json.dumps(schema_of(), indent=1, ensure_ascii=False)
+    if out is None:
+        typer.echo(text)
+    else:
+        write_atomic(out, f"{text}\n")
+
+
 def bench(
     context: typer.Context,
     quick: Annotated[

@@ -53,6 +53,10 @@ class _ColumnTable(StrictTable):
             return {"column": data}
         return data
 
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: Any, handler: Any) -> dict[str, Any]:
+        return {"anyOf": [{"type": ["string", "integer"]}, handler(schema)], "description": (cls.__doc__ or "").strip()}
+
     def column_or(self, name: str) -> str | int:
         """The column that is given, else the one with a channel's own name."""
         return name if self.column is None else self.column

@@ -1,0 +1,76 @@
+"""The JSON schema of a study: takes every study that there is, refuses what is wrong, and says units and meanings."""
+
+import json
+import tomllib
+from pathlib import Path
+
+import jsonschema
+import pytest
+from small_study import ALPHA, listed, rigid, small
+
+from jaxbl.config import Config
+from jaxbl.config.schema import schema
+from jaxbl.drive.effects import EFFECTS
+
+STUDIES = sorted((Path(__file__).parents[1] / "sweeps").glob("*.toml"))
+
+
+@pytest.fixture(scope="module")
+def errors():
+    """What is wrong with a study, by the schema."""
+    jsonschema.Draft7Validator.check_schema(schema())
+    validator = jsonschema.Draft7Validator(schema())
+    return lambda data: [error.message for error in validator.iter_errors(data)]
+
+
+@pytest.mark.parametrize("file", STUDIES, ids=lambda file: file.stem)
+def test_it_takes_every_study(file, errors):
+    assert errors(tomllib.loads(file.read_text(encoding="utf-8"))) == []
+
+
+def test_it_takes_what_a_part_may_have(errors):
+    """What is included has the other keys; a column's name alone stands for a table."""
+    for part in ({}, {"include": "a.toml", "drive": {"motor_inertia": 0.1}}, {"log": {"theta_e": "x", "u": 3}}):
+        assert errors(part) == []
+    assert errors(Config.model_validate(small(axes=[listed(ALPHA, 1.0)])).resolved()) == []
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"runs": {}},
+        rigid({"run.durations": 1.0}),
+        rigid({"drive.motor_inertia": 0.0}),
+        rigid({"drive.motor_inertia": "0.1"}),
+        rigid({"excitation.kind": "sinus"}),
+        rigid({"encoders.load_noise": -1.0}),
+        rigid(effects=[{"kind": "motor.coulomb_friction"}]),
+        rigid(effects=[{"kind": "motor.coulomb_friction", "torque": 1.0, "level": 2.0}]),
+        rigid(axes=[{"values": [1.0]}]),
+        {"log": {"theta_e": {"unit": "kg"}}},
+        {"tune": {"compare": [{"name": "a", "motor": {"lambda": 1.0}}]}},
+    ],
+    ids=str,
+)
+def test_it_refuses_what_is_wrong(wrong, errors):
+    assert len(errors(wrong)) >= 1
+
+
+def test_it_says_units_and_meanings_and_knows_every_effect():
+    found = schema()
+    text = json.dumps(found)
+    assert all(f'"const": "{kind}"' in text for kind in EFFECTS)
+    assert '"null"' not in text
+    assert found["$defs"]["TwoInertia"]["properties"]["motor_inertia"]["description"] == "motor inertia J_e (kg m²)"
+    for name, table in found["$defs"].items():
+        for key, about in table.get("properties", {}).items():
+            assert "const" in about or "description" in about or "$ref" in about, f"{name}.{key}"
+
+
+def test_the_command_prints_or_writes_it_and_overwrites_nothing(call, tmp_path):
+    code, lines, _ = call("schema")
+    assert code == 0 and json.loads("\n".join(lines)) == schema()
+    assert call("schema", "--out", "jaxbl.json")[:2] == (0, [])
+    assert json.loads((tmp_path / "jaxbl.json").read_text(encoding="utf-8")) == schema()
+    with pytest.raises(ValueError, match=r"^jaxbl\.json: is there already; --out needs a new name$"):
+        call("schema", "--out", "jaxbl.json")
