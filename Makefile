@@ -5,7 +5,7 @@ BIN := .venv/bin
 .PHONY: demo test lint versions clean
 
 demo: .venv/installed
-	$(BIN)/jaxbl sweep sweeps/gain_map.toml
+	$(BIN)/jaxbl demo
 
 # one worker a core: more threads of linear algebra would only wait for one another
 test: .venv/installed-dev

@@ -4,10 +4,11 @@ import math
 import shlex
 import signal
 import sys
+import textwrap
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 """Exit code of an interrupted command: 128 and the signal's number."""
+_COLUMNS = 80
+"""Of a terminal."""
 _EVERY, _LOOK, _WINDOW = 10.0, 1.0, 60.0
 """Seconds between lines of progress in a pipe, between looks at what is done, and back to the look that gives the speed."""
 
@@ -201,6 +204,19 @@ def _lines(unit: str, first: str) -> "Iterator[Progress]":
     finally:
         ended.set()
         speaker.join()
+
+
+def two_columns(rows: Iterable[tuple[str, str]]) -> list[str]:
+    """Names and what is said of them, in lines of at most 80 columns but for what is longer in itself."""
+    rows = list(rows)
+    width = max(len(name) for name, _ in rows) + 2
+    lines = []
+    for name, text in rows:
+        lines += textwrap.wrap(
+            text, _COLUMNS, initial_indent=name.ljust(width), subsequent_indent=" " * width, break_long_words=False,
+            break_on_hyphens=False,
+        )  # fmt: skip
+    return lines
 
 
 def answers() -> bool:

@@ -24,6 +24,7 @@ from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
 
 from jaxbl import cli, terminal
 from jaxbl.cli.options import folder_of
+from jaxbl.cli.outcome import Outcome
 from jaxbl.errors import InputError
 from jaxbl.files import locked
 from jaxbl.sweeps.engine import Engine
@@ -854,3 +855,46 @@ def test_a_folder_of_logs_is_diagnosed_and_goes_on_where_it_stopped(axis, quick,
     (tmp_path / "logs" / "broken.csv").rename(tmp_path / "logs" / "a2.csv")
     (tmp_path / "logs" / "a.csv").write_text("t,u\n0,1\n")
     assert call(*again, "again")[0] == 2
+
+
+def test_one_json_object_has_what_was_found_or_what_is_wrong(call, tmp_path, monkeypatch, capsys):
+    write(tmp_path)
+    code, lines, _ = call("sweep", "study.toml", "--json", "--out", "out")
+    found = json.loads("\n".join(lines))
+    assert (code, found["command"], found["exit"]) == (0, "sweep", 0)
+    assert found["summary"] == {"title": "small", "runs": 3, "finished": True}
+    assert found["found"][0].startswith("3 runs.") and found["open"] == "out/report.html"
+    assert set(found["files"]) == {f"out/{name}" for name in left(tmp_path / "out") if not name.startswith("points/")}
+    assert call("sweep", "study.toml", "--quiet", "--out", "out") == (0, [], [])
+    monkeypatch.setattr(sys, "argv", ["jaxbl", "sweep", "none.toml", "--json"])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    out, errors = capsys.readouterr()
+    said = "none.toml: no such file"
+    assert (end.value.code, errors) == (2, f"jaxbl: {said}\n")
+    assert json.loads(out) == {"command": "sweep", "exit": 2, "error": said}
+
+
+def test_completion_knows_the_commands(tmp_path):
+    asked = {"_JAXBL_COMPLETE": "complete_bash", "COMP_WORDS": "jaxbl swee", "COMP_CWORD": "1"}
+    code = "import sys; sys.argv = ['jaxbl']; from jaxbl.__main__ import program; program()"
+    shown = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=os.environ | asked, capture_output=True, text=True, check=False
+    )
+    assert shown.stdout.split() == ["sweep"]
+
+
+def test_the_demo_is_the_study_of_the_tree_or_of_the_wheel(call, tmp_path, monkeypatch):
+    given = {}
+
+    def sweep(context, config, out, backend):
+        given.update(config=config, out=out)
+        return Outcome(["2 runs."], tmp_path / "results" / "gain_map")
+
+    monkeypatch.setattr("jaxbl.cli.setup.sweep", sweep)
+    code, lines, _ = call("demo")
+    assert code == 0 and lines[0] == "2 runs." and lines[-1].endswith("results/gain_map/report.html")
+    assert given["config"].is_file() and given["config"].name == "gain_map.toml" and given["out"] is None
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
+    included = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
+    assert included == {"sweeps/gain_map.toml": "jaxbl/studies/gain_map.toml"}

@@ -133,7 +133,7 @@ def test_architecture_shows_the_floors():
 
 # what a block cannot do in a test, and what stands in for it
 INSTEAD = {
-    "make demo": "jaxbl sweep sweeps/gain_map.toml",  # test_demo_is_this_command; the environment is imitated below
+    "make demo": "jaxbl demo",  # test_demo_is_this_command; the environment is imitated below
     "make test": "",  # this is it
     # benchmarks/slurm.sh runs these files by a SLURM
     "sbatch --array=1-20 --cpus-per-task=8 docs/cluster/array.sbatch": (

@@ -32,7 +32,7 @@ FLOORS = [
     {"gains", "diagnosis"},
     {"throughput"},
     {"report"},
-    {"batch", "datasheet", "terminal"},
+    {"batch", "datasheet", "doctor", "terminal"},
     {"cli"},
 ]
 BELOW = {part: set().union(*FLOORS[:i]) for i, floor in enumerate(FLOORS) for part in floor}

@@ -39,10 +39,10 @@ def _main(
 
 
 for _command in (
-    setup.init,
+    *(setup.demo, setup.init),
     *(studies.simulate, studies.sweep, studies.status, studies.tune, studies.verify),
     *(logs.inspect, logs.identify, logs.diagnose),
-    *(studies.plot, studies.compare, studies.repair, setup.bench),
+    *(studies.plot, studies.compare, studies.repair, setup.bench, setup.doctor),
 ):
     app.command()(told(_command))
 # what it prints is JSON in any case

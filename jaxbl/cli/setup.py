@@ -9,10 +9,11 @@ from jaxbl import workers
 from jaxbl.datasheet import ITEMS, Given, Item, first_study, remark
 from jaxbl.errors import InputError
 from jaxbl.files import write_atomic
-from jaxbl.terminal import answers, running, working
+from jaxbl.terminal import answers, running, two_columns, working
 
-from .options import check_new
+from .options import BackendOption, OutOption, check_new
 from .outcome import Outcome, with_options
+from .studies import sweep
 
 NewArgument = Annotated[Path, typer.Argument(metavar="[NEW.toml]", help="file to be written", show_default="drive.toml")]
 
@@ -90,6 +91,47 @@ def schema(
         typer.echo(text)
     else:
         write_atomic(out, f"{text}\n")
+
+
+def doctor(context: typer.Context) -> Outcome:
+    """Say what is installed here and where it keeps things, and test that it computes, in some seconds."""
+    workers.start_jax()
+    with working(context, "looking at versions and devices"):
+        from jaxbl.doctor import examine
+
+        findings = examine()
+    bad = [one.name for one in findings if not one.good]
+    lines = two_columns((one.name, one.found if one.good else f"FAILED: {one.found}") for one in findings)
+    lines.append(f"Not in order: {', '.join(bad)}." if bad else "All in order.")
+    return Outcome(lines, summary={"findings": [one._asdict() for one in findings]}, code=1 if bad else 0)
+
+
+def demo(
+    context: typer.Context,
+    out: OutOption = None,
+    backend: BackendOption = None,
+) -> Outcome:
+    """Run the gain map of the README: 49 152 runs of a geared drive, some seconds to a minute."""
+    config = _shipped("gain_map.toml")
+    found = sweep(context, config, out, backend=backend)
+    folder = found.folder
+    lines = [
+        *found.lines,
+        f"Open the page below in a browser. The study is {folder}/study.toml. To go on:",
+        f"  jaxbl simulate {folder}/study.toml --out results/one_run   one of its runs",
+        "  jaxbl init drive.toml   a study of your own drive, from its data sheet",
+    ]
+    return found._replace(lines=lines)
+
+
+def _shipped(name: str) -> Path:
+    """A study that comes with the package; in a clone it is beside it."""
+    package = Path(__file__).parents[1]
+    places = package / "studies" / name, package.parent / "sweeps" / name
+    for file in places:
+        if file.is_file():
+            return file
+    raise InputError(f"{places[0]}: no such file; install jaxbl anew, it comes with it")
 
 
 def bench(

@@ -107,6 +107,7 @@ def costs(devices: Sequence[Any]) -> Costs:
         doing("measuring this machine")
         found = measured(list(devices))
         kept.save(key, found)
+        doing("running")
     return found
 
 
