@@ -32,7 +32,8 @@ FLOORS = [
     {"gains", "diagnosis"},
     {"throughput"},
     {"report"},
-    {"batch", "datasheet", "doctor", "terminal"},
+    {"datasheet", "doctor"},
+    {"batch", "terminal"},
     {"cli"},
 ]
 BELOW = {part: set().union(*FLOORS[:i]) for i, floor in enumerate(FLOORS) for part in floor}
