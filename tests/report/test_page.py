@@ -7,6 +7,7 @@ import pandas as pd
 from small_study import ALPHA, LAMBDA, listed, made, rigid, small, spaced
 
 from jaxbl.report.page import PageTable, html
+from jaxbl.report.picture import Picture
 from jaxbl.report.simulate import write_trial_report
 from jaxbl.report.sweep import write_sweep_report
 from jaxbl.sweeps.trial import run
@@ -40,16 +41,20 @@ class Page(HTMLParser):
 HOSTILE = "<script>alert('a')</script> & \"b\" <b>"
 
 
-def test_everything_is_escaped_and_in_its_place(tmp_path):
-    (tmp_path / "a.png").write_bytes(b"png")
+def test_everything_is_escaped_and_in_its_place():
+    shown = Picture(b"<svg>", (96, 48), HOSTILE, HOSTILE, [{"title": HOSTILE}])
     table = PageTable(HOSTILE, [HOSTILE, "n"], [[HOSTILE, 1.23456789], [None, True], ["x", float("nan")], ["y", 3]])
-    text = html(HOSTILE, [HOSTILE], [HOSTILE], [(tmp_path / "a.png", HOSTILE)], [table], f'title = "{HOSTILE}"')
+    text = html(HOSTILE, [HOSTILE], [HOSTILE], [(HOSTILE, shown)], [table], f'title = "{HOSTILE}"')
     page = Page(text)
-    assert "script" not in page.tags
+    # values of the figure, and the page's own
+    assert page.tags.count("script") == 2
     assert "b" not in page.tags
-    assert page.images == [{"src": "data:image/png;base64,cG5n", "alt": HOSTILE}]
+    image = {"src": "data:image/svg+xml;base64,PHN2Zz4=", "alt": HOSTILE, "width": "96", "height": "48"}
+    assert page.images == [image]
     # title twice, lead, remark, caption, table's heading, head and cell, config
     assert page.text.count(HOSTILE) == 9
+    values = text.partition('<script type="application/json">')[2].partition("</script>")[0]
+    assert json.loads(values) == [{"title": HOSTILE}]
     for cell in ("1.235", "–", "yes", "nan", ">3<"):
         assert cell in text
 
