@@ -41,7 +41,7 @@ const before = (values, x) => {
   return low;
 };
 
-/** What a panel has at a place: lines of text, and where the nearest point is (shares of the panel). */
+/** What a panel has at a place: lines of text (of a map, those of the cell), and where the nearest point is (shares of the panel). */
 const found = (panel, at, size) => {
   const { x, y } = panel, here = [x.value(at[0]), y.value(1 - at[1])];
   const place = [`${x.name}: ${x.text(here[0])}`, `${y.name}: ${y.text(here[1])}`];
@@ -58,7 +58,10 @@ const found = (panel, at, size) => {
     });
     if (Math.min(...index) >= 0) {
       const value = values[index[1] * (edges[0].length - 1) + index[0]];
-      return { text: [`${name}: ${Number.isNaN(value) ? "none" : number(value)}`, ...place] };
+      // the point that the cell is drawn around
+      const centre = [x, y].map((axis, i) =>
+        `${axis.name}: ${number(axis.value((axis.share(edges[i][index[i]]) + axis.share(edges[i][index[i] + 1])) / 2))}`);
+      return { text: [`${name}: ${Number.isNaN(value) ? "none" : number(value)}`, ...centre] };
     }
   }
   let best = null, least = 30 * 30;
