@@ -24,11 +24,15 @@ class Axis {
     return this.log ? Math.exp(mapped) : mapped;
   }
   text(value) {
-    if (!this.names) return number(value);
+    if (!this.names?.length) return number(value);
     const near = this.names.reduce((a, b) => (Math.abs(b[0] - value) < Math.abs(a[0] - value) ? b : a));
     return Math.abs(near[0] - value) <= 0.5 ? near[1] : "";
   }
-  get name() { return this.label || "value"; }
+  /** A line of text for a value; none where it has neither a name nor a label. */
+  line(value) {
+    const text = this.text(value);
+    return this.label && text ? [`${this.label}: ${text}`] : this.names?.length && text ? [text] : [];
+  }
 }
 
 /** The largest index whose value is not beyond x. */
@@ -44,11 +48,13 @@ const before = (values, x) => {
 /** What a panel has at a place: lines of text (of a map, those of the cell), and where the nearest point is (shares of the panel). */
 const found = (panel, at, size) => {
   const { x, y } = panel, here = [x.value(at[0]), y.value(1 - at[1])];
-  const place = [`${x.name}: ${x.text(here[0])}`, `${y.name}: ${y.text(here[1])}`];
+  const place = [...x.line(here[0]), ...y.line(here[1])];
   const bar = panel.bars.find(([left, bottom, width, height]) =>
     (here[1] - bottom) * (here[1] - bottom - height) <= 0 && (here[0] - left) * (here[0] - left - width) <= 0);
-  if (bar) return { text: y.names ? [y.text(bar[1] + bar[3] / 2), `${x.name}: ${number(bar[0] + bar[2])}`]
-    : [`${x.name}: ${x.text(bar[0] + bar[2] / 2)}`, `${y.name}: ${number(bar[1] + bar[3])}`] };
+  if (bar) {
+    const lies = y.names, ends = [bar[0] + (lies ? bar[2] : bar[2] / 2), bar[1] + (lies ? bar[3] / 2 : bar[3])];
+    return { text: lies ? [...y.line(ends[1]), ...x.line(ends[0])] : [...x.line(ends[0]), ...y.line(ends[1])] };
+  }
   if (panel.cells) {
     const { edges, values, name } = panel.cells;
     const index = edges.map((one, i) => {
@@ -59,8 +65,8 @@ const found = (panel, at, size) => {
     if (Math.min(...index) >= 0) {
       const value = values[index[1] * (edges[0].length - 1) + index[0]];
       // the point that the cell is drawn around
-      const centre = [x, y].map((axis, i) =>
-        `${axis.name}: ${number(axis.value((axis.share(edges[i][index[i]]) + axis.share(edges[i][index[i] + 1])) / 2))}`);
+      const centre = [x, y].flatMap((axis, i) =>
+        axis.line(axis.value((axis.share(edges[i][index[i]]) + axis.share(edges[i][index[i] + 1])) / 2)));
       return { text: [`${name}: ${Number.isNaN(value) ? "none" : number(value)}`, ...centre] };
     }
   }
@@ -80,7 +86,7 @@ const found = (panel, at, size) => {
   }
   if (!best) return { text: place };
   const head = best.line.name ? [best.line.name] : [];
-  const text = [...head, `${x.name}: ${x.text(best.line.x[best.i])}`, `${y.name}: ${y.text(best.line.y[best.i])}`];
+  const text = [...head, ...x.line(best.line.x[best.i]), ...y.line(best.line.y[best.i])];
   return { text, at: best.shares, colour: best.line.colour };
 };
 
@@ -125,6 +131,7 @@ const figure = (element) => {
     if (!panel) return hide();
     const [left, top, wide, high] = panel.place, size = [wide * width, high * height];
     const here = found(panel, [(share[0] - left) / wide, (share[1] - top) / high], size);
+    if (!here.text.length) return hide();
     values.textContent = here.text.join("\n");
     values.hidden = false;
     marker.hidden = !here.at;

@@ -16,7 +16,7 @@ from matplotlib.container import BarContainer
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import FixedFormatter
+from matplotlib.ticker import FixedFormatter, FuncFormatter
 
 from .figures import Drawn, style
 
@@ -146,9 +146,9 @@ def _axis(axis: Any, ends: tuple[float, float]) -> dict[str, Any]:
         "ends": [float(f"{end:.8g}") for end in ends],
         "log": axis.get_scale() == "log",
     }
-    formatter = axis.get_major_formatter()
-    if isinstance(formatter, FixedFormatter) and (names := [_plain(text) for text in formatter.seq]):
-        found["names"] = [[float(at), name] for at, name in zip(axis.get_majorticklocs(), names, strict=False)]
+    if isinstance(axis.get_major_formatter(), FixedFormatter | FuncFormatter):
+        texts = [_plain(label.get_text()).replace("\n", ", ") for label in axis.get_majorticklabels()]
+        found["names"] = [[float(at), text] for at, text in zip(axis.get_majorticklocs(), texts, strict=False) if text]
     return found
 
 
@@ -170,7 +170,7 @@ def _packed(values: np.ndarray) -> str:
 
 
 def _plain(text: str) -> str:
-    """A label without what matplotlib reads as mathematics."""
+    """A label as a reader without mathematical type has it."""
     return text.replace(r"\$", "$")
 
 
@@ -181,7 +181,7 @@ def _described(panel: dict[str, Any]) -> str:
         f"{name} {axis['label'] or 'without a name'} from {axis['ends'][0]:.3g} to {axis['ends'][1]:.3g}"
         f"{' (logarithmic)' if axis['log'] else ''}"
         for name in ("x", "y")
-        if "names" not in (axis := panel[name])
+        if not (axis := panel[name]).get("names")
     ]
     names = [line["name"] for line in panel["lines"] if line["name"]]
     drawn = f" Lines: {', '.join(dict.fromkeys(names))}." if names else ""
