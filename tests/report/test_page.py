@@ -88,7 +88,7 @@ def test_page_of_a_run_and_its_files(tmp_path):
     assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8")) == trial.summary
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "trace.parquet"), trial.trace)
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
-    assert len(page.images) == 9
+    assert len(page.images) == 11
     assert (tmp_path / "report.html").stat().st_size < 5e6
     for text in (*lines, "one run", "half_gap", "rms velocity error"):
         assert text in page.text
