@@ -132,7 +132,7 @@ def draw_worst_planes(marks: Sequence[dict[str, Any]]) -> Drawn | None:
     known = [one for one in marks if (one["alpha_ratio"] or 0.0) > 1.0 and one["lambda_ratio"] > 0.0][:_MOST_PLANES]
     if not known:
         return None
-    columns = min(len(known), 3)
+    columns = 2 if len(known) == 4 else min(len(known), 3)
     rows = -(-len(known) // columns)
     figure, axes = subplots(3.2 * columns + 0.4, 3.6 * rows, rows, columns)
     for ax in axes[len(known) :]:
