@@ -164,9 +164,13 @@ def _line(line: Line2D, every: int) -> dict[str, Any]:
     }
 
 
+_LARGEST = float(np.finfo(np.float32).max)
+
+
 def _packed(values: np.ndarray) -> str:
     """Numbers as float32, little-endian, in base 64."""
-    return base64.b64encode(np.ascontiguousarray(values, "<f4").tobytes()).decode()
+    held = np.clip(np.asarray(values, float), -_LARGEST, _LARGEST)
+    return base64.b64encode(held.astype("<f4").tobytes()).decode()
 
 
 def _plain(text: str) -> str:
