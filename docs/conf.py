@@ -7,13 +7,14 @@ from pathlib import Path
 
 from sphinx.util import logging
 
-sys.path.insert(0, str(Path(__file__).parent))
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
 
 project = "jaxbl"
 author = "the jaxbl authors"
 release = version_of("jaxbl")
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "study_directive"]
-root_doc = "docs/index"
+root_doc = f"{HERE.name}/index"
 include_patterns = ["README.md", "CHANGELOG.md", "CONTRIBUTING.md", "benchmarks/NOTES.md", "docs/*.md"]
 exclude_patterns = ["**/.*", "results", "build", "dist", "docs/_build"]
 
