@@ -26,6 +26,8 @@ napoleon_use_ivar = True
 
 html_theme = "furo"
 html_title = f"jaxbl {release}"
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 html_extra_path = ["site"]  # the way from the site's root to its first page
 html_copy_source = False
 html_show_copyright = False
