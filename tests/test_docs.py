@@ -146,6 +146,11 @@ def test_readme_lists_every_command_and_study():
     assert [file.name for file in ROOT.glob("sweeps/*.toml") if f"`{file.name}`" not in text] == []
 
 
+def test_which_command_has_every_command():
+    text = (ROOT / "docs" / "which_command.md").read_text(encoding="utf-8")
+    assert [one for one in get_command(app).commands if not re.search(rf"`jaxbl {one}\b", text)] == []
+
+
 def test_architecture_shows_the_floors():
     """The diagram names the parts of each floor, top floor first."""
     diagram = re.search(r"```text\n(cli.*?)```", (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"), re.S)[1]
