@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from browser import check, needs_chromium, opened
 from small_study import ALPHA, LAMBDA, listed, rigid, spaced
 
 from jaxbl.gains.verify import verify
@@ -69,3 +70,9 @@ def test_page_and_lines(checked):
     (marked,) = [line for line in lines if line.startswith("good gains")]
     assert "any disturbance within f⁺ dies out" in marked
     assert len(list((folder / "figures").glob("*.png"))) == 5
+
+
+@needs_chromium
+def test_the_page_in_a_browser(checked):
+    with opened(checked[1] / "report.html") as (page,):
+        check(page, 5)
