@@ -57,6 +57,7 @@ class Study(SphinxDirective):
 
     def run(self):
         """The figures, and the study below them."""
+        self.env.note_reread()  # figures follow from the package, too
         name, command, text = self.arguments[0], self.options["command"], "\n".join(self.content) + "\n"
         try:
             files = drawn(name, command, text)
