@@ -71,13 +71,16 @@ def error_plane(trace: pd.DataFrame, side: str, found: dict[str, Any]) -> Drawn:
             if one:
                 label = f"{label}: ratio {one:.3g}"
                 right.plot(np.abs(peaks[0]) * one**count, dashes, color=COLOURS[6], lw=1.0, label=label, scaley=False)
-    if len(peaks):
+    if not len(peaks):
+        right.text(0.5, 0.5, "no peak stands out\nfrom the chatter", ha="center", va="center", transform=right.transAxes)
+        right.set(xticks=[], yticks=[])
+    else:
         right.set(yscale="log", ylim=(0.5 * np.abs(peaks).min(), 3.0 * np.abs(peaks).max()))
     _set_limits(left, (error[shown], slope[shown]), curve)
     left.set(xlabel="position error e (rad)", ylabel="its slope ė (rad/s)")
     right.set(xlabel="half cycle", ylabel="peak of |ė| (rad/s)")
     left.locator_params(axis="x", nbins=5)
-    for ax in (left, right):
+    for ax in (left, right) if len(peaks) else (left,):
         legend(ax)
     why = "" if ratio is not None else f" There is no majorant: {'α is not above f⁺' if least is None else 'λ is zero'}."
     caption = (
