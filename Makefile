@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test lint versions clean
+.PHONY: demo test lint docs versions clean
 
 demo: .venv/installed
 	$(BIN)/jaxbl demo
@@ -15,6 +15,10 @@ lint: .venv/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+
+# the site, from the pages, docstrings, and the studies of the gallery
+docs: .venv/installed-dev
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet --builder html --conf-dir docs . docs/_build/html
 
 versions: .venv/installed-dev
 	.ci/versions
@@ -31,4 +35,4 @@ versions: .venv/installed-dev
 	@touch $@ .venv/installed
 
 clean:
-	rm -rf .venv results
+	rm -rf .venv results docs/_build

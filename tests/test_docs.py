@@ -17,13 +17,14 @@ from progress_lines import without_progress
 from test_public import FLOORS
 from typer.main import get_command
 
+import jaxbl
 from jaxbl.cli import app
 from jaxbl.config import read_config
 from jaxbl.records import read_log_table
 
 ROOT = Path(__file__).parents[1]
 TEXTS = [*sorted(ROOT.glob("*.md")), *sorted(ROOT.glob("docs/*.md")), ROOT / "benchmarks" / "NOTES.md"]
-SCRIPTS = [ROOT / "docs" / "generate.py", *sorted(ROOT.glob("benchmarks/**/*.py"))]
+SCRIPTS = [*sorted(ROOT.glob("docs/*.py")), *sorted(ROOT.glob("benchmarks/**/*.py"))]
 
 
 def name(path):
@@ -42,6 +43,31 @@ def test_tutorial_configs_are_valid():
     assert len(blocks) == 3
     config = read_config(tomllib.loads("".join(blocks)))
     assert [axis.num for axis in config.axes] == [32, 32]
+
+
+def test_gallery_studies_are_valid():
+    text = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    found = re.findall(r"^```\{study\} \w+\n((?::[^\n]*\n)+)(.*?)^```", text, re.S | re.M)
+    assert len(found) == text.count("```{study}") >= 5
+    for options, study in found:
+        config = read_config(tomllib.loads(study))
+        assert bool(config.axes) == (":command: sweep\n" in options)
+
+
+def test_api_has_every_public_name():
+    entries = re.findall(r"^\.\. auto\w+:: (\w+)$", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"), re.M)
+    assert sorted(entries) == dir(jaxbl)
+
+
+def test_every_page_is_in_the_site():
+    index = ROOT / "docs" / "index.md"
+    listed = re.findall(r"^(?:\w+ <)?([\w./]+)>?$", index.read_text(encoding="utf-8"), re.M)
+    assert {(index.parent / f"{page}.md").resolve() for page in listed} == {page.resolve() for page in TEXTS} - {index}
+
+
+def test_citation_has_this_version():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
 
 
 def test_log_examples_are_valid():
@@ -94,7 +120,7 @@ GROUPS = {
 @pytest.mark.parametrize("page", TEXTS + SCRIPTS, ids=name)
 def test_names_of_modules_and_files_exist(page):
     text = page.read_text(encoding="utf-8")
-    paths = re.findall(r"(?<![\w./-])(?:jaxbl|benchmarks|docs|sweeps|tests)/[\w./-]*\w/?", text)
+    paths = re.findall(r"(?<![\w./-])(?:jaxbl|benchmarks|docs(?!/_build)|sweeps|tests)/[\w./-]*\w/?", text)
     paths += re.findall(r"(?<![\w./-])(?!my_package|results)\w[\w-]*/[\w./-]+\.(?:py|cu|md|toml)\b", text)
     for path in paths:
         assert (ROOT / path).exists() or (page.parent / path).exists(), path
@@ -121,6 +147,11 @@ def test_readme_lists_every_command_and_study():
     assert [file.name for file in ROOT.glob("sweeps/*.toml") if f"`{file.name}`" not in text] == []
 
 
+def test_which_command_has_every_command():
+    text = (ROOT / "docs" / "which_command.md").read_text(encoding="utf-8")
+    assert [one for one in get_command(app).commands if not re.search(rf"`jaxbl {one}\b", text)] == []
+
+
 def test_architecture_shows_the_floors():
     """The diagram names the parts of each floor, top floor first."""
     diagram = re.search(r"```text\n(cli.*?)```", (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"), re.S)[1]
@@ -135,6 +166,7 @@ def test_architecture_shows_the_floors():
 INSTEAD = {
     "make demo": "jaxbl demo",  # test_demo_is_this_command; the environment is imitated below
     "make test": "",  # this is it
+    r"\. \.venv/bin/activate": "",
     # benchmarks/slurm.sh runs these files by a SLURM
     "sbatch --array=1-20 --cpus-per-task=8 docs/cluster/array.sbatch": (
         "SLURM_ARRAY_TASK_ID=2 SLURM_ARRAY_TASK_MAX=2 sh docs/cluster/array.sbatch"
@@ -179,15 +211,18 @@ def environment(folder, extra=None):
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     optional = project["optional-dependencies"]
     shown = {"jaxbl", *map(imports_of, optional[extra] if extra else [])}
-    hidden = sorted(set(map(imports_of, chain.from_iterable(optional.values()))) - shown)
+    # pages install packages of their own
+    hidden = sorted(set(map(imports_of, chain.from_iterable(optional.values()))) - shown - {"hatchling"})
     site = folder / "site"
     site.mkdir()
     (site / "sitecustomize.py").write_text(f"import sys\nsys.modules.update(dict.fromkeys({hidden!r}))\n")
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     # as on the command line, compiled programs are kept; here nothing changes the package while it runs
     programs = str(ROOT / ".cache" / "programs")
+    pip = {"TARGET": str(site), "NO_DEPS": "1", "NO_BUILD_ISOLATION": "0", "NO_INDEX": "1", "DISABLE_PIP_VERSION_CHECK": "1"}
     return os.environ | {
-        "PATH": path, "PYTHONPATH": os.pathsep.join([str(site), str(ROOT)]), "JAXBL_PROGRAMS": programs
+        "PATH": path, "PYTHONPATH": os.pathsep.join([str(site), str(ROOT)]), "JAXBL_PROGRAMS": programs,
+        **{f"PIP_{key}": value for key, value in pip.items()},
     }  # fmt: skip
 
 
@@ -199,24 +234,37 @@ def test_demo_is_this_command():
 @pytest.mark.slow
 @pytest.mark.parametrize("page", sorted(PAGES, key=lambda page: -len(blocks_of(page))), ids=name)
 def test_page_runs_as_written(page, tmp_path):
-    """Blocks of one page in order, in a folder with the studies of a clone; TOML blocks of the tutorial make `axis.toml`."""
+    """Blocks of one page in order, in a folder with the studies of a clone. A block that begins with a file's name is that
+    file; others of TOML in the tutorial make `axis.toml`."""
     env = environment(tmp_path, EXTRAS.get(page.name))
     clone = tmp_path / "clone"
     clone.mkdir()
     shutil.copytree(ROOT / "sweeps", clone / "sweeps")
     shutil.copytree(ROOT / "docs" / "cluster", clone / "docs" / "cluster")
+    said = ""
     for language, text in blocks_of(page):
-        if language == "toml" and page.name == "tutorial.md":
-            with (clone / "axis.toml").open("a", encoding="utf-8") as file:
-                file.write(text)
+        file = re.match(r"# (\w+\.(?:toml|py))\n", text)
+        if file is None and language == "toml" and page.name == "tutorial.md":
+            with (clone / "axis.toml").open("a", encoding="utf-8") as axis:
+                axis.write(text)
+        elif file is not None:
+            (clone / file[1]).write_text(text, encoding="utf-8")
         elif language == "python":
             run([sys.executable, "-c", text], clone, env)
         elif language == "sh":
             for command, other in INSTEAD.items():
                 text = re.sub(rf"^{command}", other, text, flags=re.M)
-            run(["sh", "-e", "-c", text], clone, env)
+            said = run(["sh", "-e", "-c", text], clone, env)
+        elif language == "output":
+            assert set(without_numbers(text)) <= set(without_numbers(said)), said
+
+
+def without_numbers(text):
+    """Lines of what a command prints; last digits differ from machine to machine."""
+    return re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?", "0", text).splitlines()
 
 
 def run(words, folder, env):
     done = subprocess.run(words, cwd=folder, env=env, capture_output=True, text=True, check=False)
     assert (done.returncode, without_progress(done.stderr)) == (0, ""), f"{words[-1]}\n{done.stdout}\n{done.stderr}"
+    return done.stdout

@@ -458,7 +458,7 @@ def _over_time(found: Diagnosis) -> Drawn:
         unit = unit_on(found.record, f"{side}.torque", "N m")
         bandwidth = found.located[side].bandwidth
         for before, after, held in pieces:
-            plot_torque(ax, before, bandwidth, noise=False, color=_BEFORE, lw=0.9, label="before")
+            plot_torque(ax, before, bandwidth, noise=False, color=_BEFORE, lw=2.6, alpha=0.6, label="before")
             plot_torque(ax, after, bandwidth, color=_AFTER, lw=0.9, label="after")
             if held and not all(other for _, _, other in pieces):
                 ax.axvspan(before.time[0], before.time[-1], color=_HELD, alpha=0.18, lw=0.0, zorder=0, label="held out")

@@ -73,7 +73,7 @@ def _intervals(found: Identification) -> Drawn:
     names = [*fitted, *held]
     figure, (ax,) = subplots(9.0, 1.1 + 0.4 * len(names))
     beside: Any = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": 9}
-    shown = [0.0]
+    shown, drawn = [0.0], []
     for i, one in enumerate(fitted.values()):
         size = abs(one["nominal"]) or abs(one["value"]) or 1.0
         ends = one["interval"][0], one["value"], one["interval"][1]
@@ -81,6 +81,7 @@ def _intervals(found: Identification) -> Drawn:
         ax.plot([low, high], [i, i], color=COLOURS[0], lw=5.0, alpha=0.45, solid_capstyle="butt")
         ax.plot([low, middle, high], [i] * 3, "|", color=COLOURS[0], ms=11, mew=1.6)
         ax.plot(middle, i, "o", color=COLOURS[0], ms=5)
+        drawn.append((low, high))
         shown += [max(low, middle - 100.0), min(high, middle + 100.0)]
         half = 0.5 * abs(one["interval"][1] - one["interval"][0])
         ax.annotate(_with_error(one["value"], half, one.get("unit", "")), (1.01, i), **beside)
@@ -89,15 +90,17 @@ def _intervals(found: Identification) -> Drawn:
         ax.annotate("held at nominal: not seen in this log", (1.01, i), color="#555555", **beside)
     ax.axvline(0.0, color="black", lw=0.8, zorder=0)
     room = 0.06 * (max(shown) - min(shown)) or 1.0
+    left, right = min(shown) - room, max(shown) + room
+    for i, (low, high) in enumerate(drawn):
+        for beyond, end, arrow in ((low < left, left, "<"), (high > right, right, ">")):
+            if beyond:
+                ax.plot(end, i, arrow, color=COLOURS[0], ms=8, clip_on=False, zorder=5)
     ax.set_yticks(range(len(names)), names)
-    ax.set(
-        xlabel="difference from the nominal value (% of it)",
-        xlim=(min(shown) - room, max(shown) + room),
-        ylim=(len(names) - 0.5, -0.5),
-    )
+    ax.set(xlabel="difference from the nominal value (% of it)", xlim=(left, right), ylim=(len(names) - 0.5, -0.5))
     caption = (
         "Fitted parameters as differences from their nominal values (the line at 0), with 95 % intervals that allow for "
-        "correlated residuals. On the right: value, half width of the interval, and its share of the value."
+        "correlated residuals; an arrow: the interval goes on. On the right: value, half width of the interval, and its "
+        "share of the value."
     )
     return Drawn("intervals", figure, caption)
 
@@ -232,6 +235,15 @@ def _mean_over(twist: Array, torque: Array, rows: Array, span: tuple[float, floa
     return 0.5 * (edges[1:] + edges[:-1]), mean
 
 
+def _means(ax: Axes, log: LogSignals, x: Array, torque: Array, rate: Array, name: str, span: tuple[float, float]) -> None:
+    """The mean torque over x of settled samples, for both signs of its rate."""
+    rows = np.arange(len(rate))[log.settled]
+    rows = rows[np.isfinite(torque[rows])]
+    for word, shade, chosen in (("growing", _GROWING, rate[rows] > 0.0), ("falling", _FALLING, ~(rate[rows] > 0.0))):
+        mean = _mean_over(x, torque, rows[chosen], span)
+        ax.plot(*mean, color=shade, lw=2.4, alpha=0.9, zorder=3, label=f"mean, {name} {word}")
+
+
 def _hysteresis(log: LogSignals) -> Drawn:
     panels = [(f"by the {side} side", log.torques[side], SIDE_COLOURS[side]) for side in log.sides]
     if log.measured is not None:
@@ -244,11 +256,7 @@ def _hysteresis(log: LogSignals) -> Drawn:
         if across and up:
             _cloud(ax, log, log.twist, torque, (across, up))
             ax.set(xlim=across, ylim=up)
-            rows = np.arange(len(rate))[log.settled]
-            rows = rows[np.isfinite(torque[rows])]
-            for word, shade, chosen in (("growing", _GROWING, rate[rows] > 0.0), ("falling", _FALLING, ~(rate[rows] > 0.0))):
-                mean = _mean_over(log.twist, torque, rows[chosen], across)
-                ax.plot(*mean, color=shade, lw=2.4, alpha=0.9, zorder=3, label=f"mean, twist {word}")
+            _means(ax, log, log.twist, torque, rate, "twist", across)
             twist = np.linspace(*across, 400)
             ax.plot(twist, log.law_at(twist), color=_MODEL, lw=1.2, ls="--", zorder=4, label="fitted law")
         ax.set_title(name, color=colour, loc="left")
@@ -317,15 +325,17 @@ def _friction(log: LogSignals) -> Drawn:
     if across and up:
         _cloud(ax, log, velocity, estimate, (across, up))
         ax.set(xlim=across, ylim=up)
+        # a line of the observer's own torque, which chatters, would fill the panel
+        _means(ax, log, velocity, estimate, np.gradient(velocity), "velocity", across)
     shown = log.line
-    ax.plot(velocity[shown], estimate[shown], color=SIDE_COLOURS["motor"], lw=0.8, alpha=0.8, zorder=3, label="observer")
     if effects is not None:
         ax.plot(velocity[shown], effects[shown], color=_MODEL, lw=1.2, zorder=4, label="fitted effects")
     ax.set(xlabel=f"velocity by the smoother ({log.unit['motor']}/s)", ylabel=f"resisting {what} ({unit})")
-    legend(ax, 2)
+    legend(ax, 3)
     caption = (
         f"The {what} beyond inertia and viscous friction over velocity, behind the same low-pass: friction as the log "
-        f"shows it, and as fitted. The low-pass slants the reversals. {_plane_note(log)}"
+        "shows it (grey: samples by the observer, without the first tenth; lines: their means for either direction of the "
+        "acceleration), and as fitted. The low-pass slants the reversals."
     )
     return Drawn("friction", figure, caption)
 

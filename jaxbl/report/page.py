@@ -1,8 +1,18 @@
-"""The files of a report: a plain HTML page that holds everything, figures, and the results of a log, whole or not at all."""
+"""The files of a report: one HTML page that holds everything, figures, and the results of a log, whole or not at all.
+
+The page needs nothing from elsewhere, and runs no script but its own (`page.js`): a policy in its head forbids both.
+"""
 
 import base64
+import hashlib
+import json
+import platform
+import shlex
+import sys
 from collections.abc import Sequence
 from html import escape
+from importlib.metadata import version
+from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -12,23 +22,13 @@ import tomli_w
 from jaxbl.files import json_text, write_atomic, writing
 
 from .figures import Drawn, save
+from .picture import Picture, picture
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from jaxbl.diagnosis.diagnose import Diagnosis
     from jaxbl.identification.identify import Identification
-
-_STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 2rem auto; max-width: 72rem; padding: 0 1rem; }
-h1 { font-size: 1.6rem; margin-bottom: 0.2rem; } h2 { font-size: 1.2rem; margin-top: 2rem; }
-.lead { font-size: 1.1rem; } figure { margin: 1rem 0 1.5rem; } figcaption { color: #555; font-size: 0.95rem; }
-img { max-width: 100%; height: auto; }
-table { border-collapse: collapse; font-size: 0.95rem; display: block; overflow-x: auto; }
-th, td { padding: 0.25rem 0.8rem; border-bottom: 1px solid #ddd; text-align: left; }
-td.number { text-align: right; font-variant-numeric: tabular-nums; }
-pre { background: #f5f5f5; padding: 1rem; overflow-x: auto; font-size: 0.85rem; }
-"""
 
 
 class PageTable(NamedTuple):
@@ -52,7 +52,8 @@ def write_report(
 
     Returns lead and remarks, the lines for the terminal.
     """
-    page = html(title, lead, remarks, save_all(drawn, folder), tables, config)
+    save_all(drawn, folder)
+    page = html(title, lead, remarks, [(one.name, picture(one)) for one in drawn], tables, config)
     write_atomic(folder / "report.html", page)
     return [*lead, *remarks]
 
@@ -123,33 +124,68 @@ def html(
     title: str,
     lead: Sequence[str],
     remarks: Sequence[str],
-    pictures: Sequence[tuple[Path, str]],
+    pictures: Sequence[tuple[str, Picture]],
     tables: Sequence[PageTable],
     config: str,
 ) -> str:
-    """The whole page; figures (files and captions) are embedded, so that the page is one file."""
-    parts = [f"<h1>{escape(title)}</h1>", *(f'<p class="lead">{escape(line)}</p>' for line in lead)]
+    """The whole page. Figures have names; the first line of the lead is the answer."""
+    style, script = (files("jaxbl.report").joinpath(name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
+    allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{allowed}'"
+    ranks = ["lead answer", *("lead" for _ in lead[1:])]
+    parts = [f'<p class="{rank}">{escape(line)}</p>' for rank, line in zip(ranks, lead, strict=False)]
     if remarks:
         parts += ["<h2>Remarks</h2><ul>", *(f"<li>{escape(line)}</li>" for line in remarks), "</ul>"]
     if pictures:
-        parts.append("<h2>Figures</h2>")
-        for path, caption in pictures:
-            data = base64.b64encode(path.read_bytes()).decode()
-            caption = escape(caption)
-            image = f'<img src="data:image/png;base64,{data}" alt="{caption}">'
-            parts.append(f"<figure>{image}<figcaption>{caption}</figcaption></figure>")
-    for table in tables:
-        head = "".join(f"<th>{escape(column)}</th>" for column in table.columns)
-        body = "".join(f"<tr>{''.join(_cell(value) for value in row)}</tr>" for row in table.rows)
-        parts.append(f"<h2>{escape(table.heading)}</h2><table><tr>{head}</tr>{body}</table>")
+        parts += ["<h2>Figures</h2>", *(_figure(name, one) for name, one in pictures)]
+    parts += map(_table, tables)
     parts.append(f"<h2>Config</h2><details><summary>study.toml</summary><pre>{escape(config)}</pre></details>")
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy" content="{policy}">
+<title>{escape(title)}</title><style>{style}</style></head>
+<body><main><h1>{escape(title)}</h1>
+{chr(10).join(parts)}
+</main><footer>{escape(_origin())}</footer><script>{script}</script></body></html>
+"""
+
+
+def _figure(name: str, shown: Picture) -> str:
+    width, height = shown.size
+    data = base64.b64encode(shown.svg).decode()
+    # a script of data ends where the next tag of that name begins, whatever it holds
+    panels = json.dumps(shown.panels, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
+    image = f'<img src="data:image/svg+xml;base64,{data}" alt="{escape(shown.described)}" width="{width}" height="{height}">'
+    label = "figure: arrow keys read values, plus and minus zoom, 0 shows the whole"
     return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
-        f"<style>{_STYLE}</style></head><body>\n" + "\n".join(parts) + "\n</body></html>\n"
+        f'<figure data-name="{escape(name)}"><div class="view" tabindex="0" role="group" aria-label="{label}" '
+        f'style="width:{width}px">{image}</div><figcaption>{escape(shown.caption)}</figcaption>'
+        f'<script type="application/json">{panels}</script></figure>'
+    )
+
+
+def _table(table: PageTable) -> str:
+    heading = escape(table.heading)
+    head = "".join(f'<th scope="col">{escape(column)}</th>' if column else "<td></td>" for column in table.columns)
+    body = "".join(f"<tr>{''.join(_cell(value) for value in row)}</tr>" for row in table.rows)
+    return (
+        f'<h2>{heading}</h2><div class="scroll" tabindex="0" role="region" aria-label="{heading}">'
+        f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
     )
 
 
 def _cell(value: object) -> str:
     if isinstance(value, bool) or value is None:
         value = {True: "yes", False: "no", None: "–"}[value]
-    return f"<td>{escape(value)}</td>" if isinstance(value, str) else f'<td class="number">{value:.4g}</td>'
+    if isinstance(value, str):
+        return f"<td>{escape(value)}</td>"
+    return f'<td class="number" data-value="{value}">{value:.4g}</td>'
+
+
+def _origin() -> str:
+    """What made the page: versions, and the command, if it was one."""
+    versions = ", ".join(f"{name} {version(name)}" for name in ("jaxbl", "jax", "numpy"))
+    made = f"Made by {versions}, Python {platform.python_version()}"
+    if Path(sys.argv[0]).name in ("jaxbl", "__main__.py") and sys.argv[1:]:
+        return f"{made}, with: {shlex.join(['jaxbl', *sys.argv[1:]])}"
+    return f"{made}."

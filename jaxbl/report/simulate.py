@@ -1,4 +1,4 @@
-"""What `jaxbl simulate` leaves to be read. The figures are the analogues of Figs. 7 to 17 and 28 of the paper."""
+"""What `jaxbl simulate` leaves to be read. The figures are the analogues of Figs. 7 to 17, 28 and 29 of the paper."""
 
 import json
 from pathlib import Path
@@ -11,6 +11,7 @@ from jaxbl.files import write_atomic, write_table
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.trial import Trial
 
+from .error_plane import error_plane
 from .figures import COLOURS, FAINT, SIDE_COLOURS, SIDES, Drawn, legend, stacked, style, subplots, with_unit
 from .page import PageTable, write_report
 
@@ -53,6 +54,7 @@ def draw_trial(trial: Trial) -> list[Drawn]:
     for side in sides:
         drawn += [_observed(trace, side, quantity, unit) for quantity, unit in (("velocity", "rad/s"), ("position", "rad"))]
     drawn.append(_torque(trace, sides))
+    drawn += [error_plane(trial.trace, side, found) for side, found in trial.summary["conditions"].items()]
     if len(sides) == 2:
         last = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]]
         drawn += [_identified(trial, trace, last, sides), _hysteresis(last), _limit_cycle(last)]

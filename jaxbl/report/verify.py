@@ -20,6 +20,7 @@ from jaxbl.gains.error_system import conditions_of
 from jaxbl.gains.verify import Verdict, judged_sides
 from jaxbl.observer.conditions import CONDITIONS
 
+from .error_plane import draw_worst_planes
 from .figures import COLOURS, MAP, MISSING, Drawn, literal, mark, style, subplots
 from .maps import condition_curves
 from .page import PageTable, write_report
@@ -35,7 +36,15 @@ def draw_verdict(verdict: Verdict) -> list[Drawn]:
     """All figures of a verification."""
     damping = [_damping(verdict)] if verdict.normalised.damped else []
     levels = [_levels(verdict, side) for side in judged_sides(verdict.config)]
-    return [_atlas(verdict), *damping, *levels, _conservatism(verdict), _claimed(verdict)]
+    planes = draw_worst_planes(verdict.summary["marks"])
+    return [
+        _atlas(verdict),
+        *([] if planes is None else [planes]),
+        *damping,
+        *levels,
+        _conservatism(verdict),
+        _claimed(verdict),
+    ]
 
 
 def _marks(ax: Axes, verdict: Verdict, colour: str = "white") -> list[Line2D]:

@@ -112,7 +112,7 @@ def _checksum(values: np.ndarray) -> str:
     """CRC-32 of type and values. It guards against damage, not against forgery, and costs a fifth of a cryptographic one."""
     if values.dtype == object:
         return _crc(json.dumps([str(one) for one in values]).encode())
-    return _crc(np.ascontiguousarray(values).view(np.uint8), zlib.crc32(str(values.dtype).encode()))
+    return _crc(np.ascontiguousarray(values).view(np.uint8).data, zlib.crc32(str(values.dtype).encode()))
 
 
 def file_checksum(path: Path) -> str:
@@ -120,7 +120,7 @@ def file_checksum(path: Path) -> str:
     return _crc(path.read_bytes())
 
 
-def _crc(content: bytes | np.ndarray, begun: int = 0) -> str:
+def _crc(content: bytes | memoryview, begun: int = 0) -> str:
     return f"{zlib.crc32(content, begun):08x}"
 
 

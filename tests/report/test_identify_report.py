@@ -155,6 +155,15 @@ def labels(figure: Figure) -> list[str]:
     return figure.axes[0].get_legend_handles_labels()[1]
 
 
+def test_an_interval_that_leaves_the_panel_ends_in_an_arrow(tmp_path):
+    found = made(CASES["rigid"][0], tmp_path)
+    one = found.summary["parameters"]["drive.motor_inertia"]
+    one["interval"] = [one["value"] - 5e-3, 10.0 * one["value"]]
+    ax = draw_identification(found)[0].figure.axes[0]
+    arrows = [(line.get_marker(), *line.get_xydata()[0]) for line in ax.lines if line.get_marker() in ("<", ">")]
+    assert arrows == [(">", ax.get_xlim()[1], 0.0)]
+
+
 def test_a_linear_axis_has_newtons_and_metres(tmp_path):
     found = made(CASES["linear"][0], tmp_path, unit="m")
     words = "\n".join(write_identification_report(found, tmp_path))

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from browser import check, needs_chromium, opened
 from measured import GEAR_RATIO, SERVO, made, real
 from test_page import Page
 
@@ -79,6 +80,14 @@ def test_the_report_holds_table_figures_and_how_the_log_was_read(tmp_path):
         assert text in page
     data = json.loads((tmp_path / "out" / "inspection.json").read_text())
     assert data["identifiable"][0]["quantity"] == "inertia"
+
+
+@needs_chromium
+def test_the_page_in_a_browser(tmp_path):
+    made(gap=0.1).to_parquet(tmp_path / "log.parquet")
+    write_inspection_report(inspect(tmp_path / "log.parquet", gear_ratio=GEAR_RATIO), tmp_path)
+    with opened(tmp_path / "report.html") as (page,):
+        check(page, 4)
 
 
 def test_a_real_log_with_two_encoders(tmp_path):

@@ -4,9 +4,12 @@ import json
 from html.parser import HTMLParser
 
 import pandas as pd
+import pytest
+from browser import check, needs_chromium, opened
 from small_study import ALPHA, LAMBDA, listed, made, rigid, small, spaced
 
 from jaxbl.report.page import PageTable, html
+from jaxbl.report.picture import Picture
 from jaxbl.report.simulate import write_trial_report
 from jaxbl.report.sweep import write_sweep_report
 from jaxbl.sweeps.trial import run
@@ -40,16 +43,20 @@ class Page(HTMLParser):
 HOSTILE = "<script>alert('a')</script> & \"b\" <b>"
 
 
-def test_everything_is_escaped_and_in_its_place(tmp_path):
-    (tmp_path / "a.png").write_bytes(b"png")
+def test_everything_is_escaped_and_in_its_place():
+    shown = Picture(b"<svg>", (96, 48), HOSTILE, HOSTILE, [{"title": HOSTILE}])
     table = PageTable(HOSTILE, [HOSTILE, "n"], [[HOSTILE, 1.23456789], [None, True], ["x", float("nan")], ["y", 3]])
-    text = html(HOSTILE, [HOSTILE], [HOSTILE], [(tmp_path / "a.png", HOSTILE)], [table], f'title = "{HOSTILE}"')
+    text = html(HOSTILE, [HOSTILE], [HOSTILE], [(HOSTILE, shown)], [table], f'title = "{HOSTILE}"')
     page = Page(text)
-    assert "script" not in page.tags
+    # values of the figure, and the page's own
+    assert page.tags.count("script") == 2
     assert "b" not in page.tags
-    assert page.images == [{"src": "data:image/png;base64,cG5n", "alt": HOSTILE}]
+    image = {"src": "data:image/svg+xml;base64,PHN2Zz4=", "alt": HOSTILE, "width": "96", "height": "48"}
+    assert page.images == [image]
     # title twice, lead, remark, caption, table's heading, head and cell, config
     assert page.text.count(HOSTILE) == 9
+    values = text.partition('<script type="application/json">')[2].partition("</script>")[0]
+    assert json.loads(values) == [{"title": HOSTILE}]
     for cell in ("1.235", "–", "yes", "nan", ">3<"):
         assert cell in text
 
@@ -81,6 +88,74 @@ def test_page_of_a_run_and_its_files(tmp_path):
     assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8")) == trial.summary
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "trace.parquet"), trial.trace)
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
-    assert len(page.images) == 9
+    assert len(page.images) == 11
+    assert (tmp_path / "report.html").stat().st_size < 5e6
     for text in (*lines, "one run", "half_gap", "rms velocity error"):
         assert text in page.text
+
+
+@needs_chromium
+def test_figures_say_their_values_and_zoom_and_tables_sort(tmp_path):
+    axes = [spaced(ALPHA, 1.0, 50.0, 5), spaced(LAMBDA, 1.0, 20.0, 4)]
+    result = made(rigid(axes=axes), motor__velocity_rmse=lambda frame: frame[ALPHA] * frame[LAMBDA])
+    write_sweep_report(result, tmp_path)
+    with opened(tmp_path / "report.html", color_scheme="dark") as (page,):
+        check(page, 1)
+        view, values = page.locator(".view"), page.locator(".values")
+        panel = json.loads(page.locator("figure script").text_content())[0]
+        left, top, width, height = panel["place"]
+        # of the map's first column, the middle row
+        view.hover(position=place(view, left + 0.05 * width, top + 0.5 * height))
+        shown = dict(line.rsplit(": ", 1) for line in values.inner_text().split("\n"))
+        alpha = 50.0**0.5
+        assert [float(text) for text in shown.values()] == pytest.approx([alpha, 1.0, alpha], rel=1e-3)
+        assert list(shown) == ["motor: velocity error, rms (rad/s)", f"{LAMBDA} (√rad/s)", f"{ALPHA} (rad/s²)"]
+        # the same place, zoomed: the pointer stays on its cell
+        view.dblclick(position=place(view, left + 0.05 * width, top + 0.5 * height))
+        assert "scale(3)" in page.locator("figure img").get_attribute("style")
+        view.hover(position=place(view, left + 0.05 * width, top + 0.5 * height))
+        assert dict(line.rsplit(": ", 1) for line in values.inner_text().split("\n")) == shown
+        page.get_by_label("whole figure").click()
+        assert not page.locator("figure img").get_attribute("style")
+        # by keyboard, and said to a screen reader
+        view.focus()
+        for key in ("ArrowLeft", "ArrowUp"):
+            page.keyboard.press(key)
+        assert page.locator(".spoken").text_content() == values.text_content() != ""
+        # words after numbers, and backwards
+        table = page.locator("table").last
+        first = table.locator("tbody tr td:first-child")
+        before = first.all_inner_texts()
+        table.get_by_role("button", name="metric").click()
+        assert first.all_inner_texts() == sorted(before)
+        table.get_by_role("button", name="median").click()
+        table.get_by_role("button", name="median").click()
+        numbers = [float(text.replace("–", "-inf")) for text in table.locator("td:nth-child(3)").all_inner_texts()]
+        known = [number for number in numbers if number > -float("inf")]
+        assert known == sorted(known, reverse=True) == numbers[: len(known)]
+
+
+def place(view, x, y):
+    """Shares of a figure as pixels."""
+    box = view.bounding_box()
+    return {"x": x * box["width"], "y": y * box["height"]}
+
+
+@needs_chromium
+def test_nothing_of_the_users_runs_in_a_page(tmp_path):
+    names = [
+        HOSTILE,
+        "<img src=x onerror=alert(1)>",
+        "</script><script>alert(2)</script>",
+        "a\x1b]0;b\x07\x00\u202e",
+        "x" * 5000,
+    ]
+    shown = Picture(b'<svg xmlns="http://www.w3.org/2000/svg" width="9" height="9"/>', (9, 9), names[1], names[2] * 2, [])
+    table = PageTable(names[1], names, [names, names])
+    text = html(names[2], names, names, [(names[0], shown)] * 2, [table, PageTable("none", ["a"], [])], "\n".join(names))
+    (tmp_path / "page.html").write_text(text, encoding="utf-8")
+    with opened(tmp_path / "page.html") as (page,):
+        check(page, 2)
+        page.locator(".view").first.hover()
+        for name in names[:3]:
+            assert page.get_by_text(name, exact=True).count() >= 3

@@ -7,13 +7,13 @@ from jaxbl.report.figures import save
 from jaxbl.report.simulate import draw_trial
 from jaxbl.sweeps.trial import run
 
-BOTH = ["input", "motor_velocity", "motor_position", "load_velocity", "load_position", "torque", "dead_zone", "hysteresis",
-        "limit_cycle"]  # fmt: skip
+BOTH = ["input", "motor_velocity", "motor_position", "load_velocity", "load_position", "torque", "error_plane_motor",
+        "error_plane_load", "dead_zone", "hysteresis", "limit_cycle"]  # fmt: skip
 CASES = {
     "sigmoid": (small({"run.duration": 1.0}), BOTH),
     "dead zone": (small(transmission={"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.01}), BOTH),
     "shaft": (small(transmission={"law": "linear_shaft", "stiffness": 1.0}), BOTH),
-    "rigid": (rigid(), ["input", "motor_velocity", "motor_position", "torque"]),
+    "rigid": (rigid(), ["input", "motor_velocity", "motor_position", "torque", "error_plane_motor"]),
     # nothing moves, nothing is identified
     "at rest": (small({"excitation.amplitude": 0.0, "encoders.noise": 0.0, "observer.motor.velocity_error": 0.0}), BOTH),
     "not identified": (small({"identifier.start": 10.0}), BOTH),
@@ -32,7 +32,7 @@ def test_all_figures_are_drawn_with_units(tmp_path, case):
         assert save(d.figure, tmp_path / f"{d.name}.png").stat().st_size > 5000
         for ax in d.figure.axes:
             assert "(" in ax.get_ylabel(), d.name
-        assert "(" in d.figure.axes[-1].get_xlabel() or d.name == "dead_zone"
+        assert "(" in d.figure.axes[-1].get_xlabel() or d.name == "dead_zone" or d.name.startswith("error_plane")
     if case == "sigmoid":
         zone = next(d for d in drawn if d.name == "dead_zone").figure.axes
         assert [ax.get_ylabel() for ax in zone] == ["stiffness (N m/rad)", "dead zone (rad)", "half gap (rad)"]

@@ -6,10 +6,11 @@ import tomllib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from browser import check, needs_chromium, opened
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import LogNorm
 from small_study import small
-from test_page import Page
+from test_page import Page, place
 
 from jaxbl.config import read_config
 from jaxbl.gains.tune import tune
@@ -103,3 +104,19 @@ def test_comparison_draws_what_the_numbers_say(tuned):
     np.testing.assert_allclose(bars, [row["velocity_rmse"]["worst"] for row in rows])
     texts = [text.get_text() for text in drawing.figure.axes[2].texts]
     assert "converged in 0 %" in texts
+
+
+@needs_chromium
+def test_bars_have_the_names_beside_them(folder, tuned):
+    with opened(folder / "report.html") as (page,):
+        check(page, 5)
+        figure = page.locator("figure[data-name=tuning_holdout]")
+        panel = json.loads(figure.locator("script").text_content())[0]
+        left, bottom, width, height = panel["bars"][0]
+        low, high = panel["x"]["ends"], panel["y"]["ends"]
+        at = (left + 0.5 * width - low[0]) / (low[1] - low[0]), 1.0 - (bottom + 0.5 * height - high[0]) / (high[1] - high[0])
+        x, y, wide, tall = panel["place"]
+        figure.locator(".view").hover(position=place(figure.locator(".view"), x + at[0] * wide, y + at[1] * tall))
+        name, value = figure.locator(".values").inner_text().split("\n")
+        assert name in [one for _, one in panel["y"]["names"]]
+        assert float(value.rpartition(": ")[2]) == pytest.approx(left + width, rel=1e-3)

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from browser import check, needs_chromium, opened
 from small_study import ALPHA, LAMBDA, listed, rigid, spaced
 
 from jaxbl.gains.verify import verify
@@ -34,7 +35,7 @@ def checked(tmp_path_factory):
 def test_figures(checked):
     verdict, _, _ = checked
     drawn = {drawing.name: drawing for drawing in draw_verdict(verdict)}
-    assert list(drawn) == ["atlas", "friction", "levels_motor", "conservatism", "claimed_bound"]
+    assert list(drawn) == ["atlas", "error_planes", "friction", "levels_motor", "conservatism", "claimed_bound"]
     assert all(drawing.caption for drawing in drawn.values())
     atlas = drawn["atlas"].figure
     legend = [text.get_text() for text in atlas.legends[0].get_texts()]
@@ -68,4 +69,10 @@ def test_page_and_lines(checked):
     assert "no condition can hold" in marked or "worst disturbance enlarges the velocity error" in marked
     (marked,) = [line for line in lines if line.startswith("good gains")]
     assert "any disturbance within f⁺ dies out" in marked
-    assert len(list((folder / "figures").glob("*.png"))) == 5
+    assert len(list((folder / "figures").glob("*.png"))) == 6
+
+
+@needs_chromium
+def test_the_page_in_a_browser(checked):
+    with opened(checked[1] / "report.html") as (page,):
+        check(page, 6)

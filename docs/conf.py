@@ -1,0 +1,55 @@
+"""How Sphinx makes the site (`make docs`): from the tree's root, of the pages as they are read there."""
+
+import re
+import sys
+from importlib.metadata import version as version_of
+from pathlib import Path
+
+from sphinx.util import logging
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+
+project = "jaxbl"
+author = "the jaxbl authors"
+release = version_of("jaxbl")
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "study_directive"]
+root_doc = f"{HERE.name}/index"
+include_patterns = ["README.md", "CHANGELOG.md", "CONTRIBUTING.md", "benchmarks/NOTES.md", "docs/*.md"]
+exclude_patterns = ["**/.*", "results", "build", "dist", "docs/_build"]
+
+myst_heading_anchors = 4  # as GitHub makes them
+default_role = "code"
+autodoc_typehints = "none"  # units and shapes are in the text
+autodoc_member_order = "bysource"
+napoleon_use_ivar = True
+
+html_theme = "furo"
+html_title = f"jaxbl {release}"
+html_static_path = ["static"]
+html_css_files = ["site.css"]
+html_extra_path = ["site"]  # the way from the site's root to its first page
+html_copy_source = False
+html_show_copyright = False
+
+
+def bars(app, what, name, it, options, lines):
+    """Docstrings write sizes as |x|, which reStructuredText takes for a name, but in `code`."""
+    for i, line in enumerate(lines):
+        lines[i] = re.sub(r"(`[^`]*`)|\|", lambda found: found[1] or r"\|", line)
+
+
+def own_files(app, error):
+    """Warn of pages that load something from another host."""
+    loads = re.compile(
+        r"""<(?:script|img|iframe|link)\b[^>]*?(?:src|href)=["']?(?:https?:)?//[^>]*>|@import|url\(["']?https?:"""
+    )
+    for file in [] if error else (one for kind in ("html", "css") for one in Path(app.outdir).rglob(f"*.{kind}")):
+        if found := loads.search(file.read_text(encoding="utf-8")):
+            logging.getLogger(__name__).warning(f"{file}: loads from another host: {found[0]}")
+
+
+def setup(app):
+    """Called by Sphinx."""
+    app.connect("autodoc-process-docstring", bars)
+    app.connect("build-finished", own_files)

@@ -1,0 +1,48 @@
+"""Pages in a real browser: Chromium without a screen, found on this machine; tests are skipped where it has none."""
+
+import functools
+import shutil
+from contextlib import contextmanager
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import sync_playwright
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+
+
+@contextmanager
+def opened(*paths, **options):
+    """A page of each file, without an error, and without a request for anything elsewhere. One browser at a time."""
+    wrong = []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        context = browser.new_context(viewport={"width": 1100, "height": 900}, **options)
+        context.on("console", lambda message: wrong.append(message.text) if message.type in ("error", "warning") else None)
+        context.on("weberror", lambda error: wrong.append(str(error.error)))
+        context.on("dialog", lambda dialog: wrong.append(dialog.message))
+        pages = []
+        for path in paths:
+            page = context.new_page()
+            page.on("request", functools.partial(_elsewhere, wrong))
+            page.goto(path.resolve().as_uri())
+            pages.append(page)
+        yield pages
+        assert wrong == []
+        browser.close()
+
+
+def _elsewhere(wrong, request):
+    if not request.url.startswith(("file:", "data:", "blob:")):
+        wrong.append(request.url)
+
+
+def check(page, figures):
+    """So many figures have loaded and have a text; nothing serious is in the way of a screen reader or keyboard."""
+    images = page.evaluate("[...document.images].map((one) => [one.complete && one.naturalWidth > 0, one.alt])")
+    assert len(images) == figures
+    assert all(loaded and len(text) > 20 for loaded, text in images)
+    found = Axe().run(page).response["violations"]
+    assert [(one["id"], one["nodes"][0]["html"]) for one in found if one["impact"] in ("serious", "critical")] == []
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")

@@ -1,0 +1,56 @@
+"""Figures as a page holds them: the text in their place, and values that can be read back."""
+
+import base64
+
+import numpy as np
+import pytest
+
+from jaxbl.report.figures import Drawn, save, subplots
+from jaxbl.report.picture import picture
+
+
+def unpacked(text):
+    return np.frombuffer(base64.b64decode(text), "<f4")
+
+
+def made(tmp_path, draw):
+    figure, (left, right) = subplots(6.0, 3.0, columns=2)
+    draw(left)
+    right.barh([0, 1], [3.0, 4.0])
+    right.set_yticks([0, 1], ["first", "second"])
+    drawn = Drawn("one", figure, "What it shows.")
+    save(figure, tmp_path / "one.png")
+    return picture(drawn)
+
+
+def test_lines_bars_names_and_a_description(tmp_path):
+    x = np.array([0.0, 1.0, 2.0])
+
+    def draw(ax):
+        ax.plot(x, [1.0, np.nan, 1e50], label=r"price in \$")
+        ax.axhline(0.5)
+        ax.set(xlabel="time (s)", yscale="log")
+
+    shown = made(tmp_path, draw)
+    left, right = shown.panels
+    # the line that only marks a place is none of values
+    (line,) = left["lines"]
+    assert line["name"] == "price in $" and line["sorted"]
+    np.testing.assert_array_equal(unpacked(line["x"]), x)
+    y = unpacked(line["y"])
+    assert y[0] == 1.0 and np.isnan(y[1]) and y[2] == np.finfo(np.float32).max
+    assert left["y"]["log"] and not left["x"]["log"]
+    assert right["bars"] == [[0.0, -0.4, 3.0, 0.8], [0.0, 0.6, 4.0, 0.8]]
+    assert right["y"]["names"] == [[0.0, "first"], [1.0, "second"]]
+    assert shown.described.startswith("What it shows. x time (s) from ") and "Lines: price in $." in shown.described
+    assert shown.size == (576, 288) and shown.svg.startswith(b"<?xml")
+
+
+@pytest.mark.parametrize("count", [100, 50_000])
+def test_clouds_and_long_lines_stay_small(tmp_path, count):
+    values = np.random.default_rng(0).standard_normal((2, count))
+    shown = made(tmp_path, lambda ax: ax.plot(*values, "."))
+    assert len(shown.svg) < 200_000
+    (line,) = shown.panels[0]["lines"]
+    assert 1 < len(unpacked(line["x"])) <= 30_000
+    assert made(tmp_path, lambda ax: ax.plot(*values, ".")) == shown
