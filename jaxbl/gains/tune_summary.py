@@ -161,7 +161,7 @@ class Summary:
             # gains that miss this constraint alone
             missed = found[~kept[key] & np.logical_and.reduce([values for name, values in kept.items() if name != key])]
             if key != "converged" and len(missed) and missed["error"].min() < (1.0 - _WORTH) * row["error"]:
-                least = missed.loc[missed["error"].idxmin()]
+                least = missed.nsmallest(1, "error").iloc[0]
                 lines.append(
                     f"{side}: {key} = {getattr(self.table, key):g} holds the optimum back: of the gains tried, lambda = "
                     f"{least['lambda']:.3g}, alpha = {least['alpha']:.3g} miss it alone, with an error of "

@@ -222,7 +222,7 @@ def _judge(config: Config, level: str, side: str, frame: pd.DataFrame) -> tuple[
                 counterexamples.append(frame[failed].assign(row=np.flatnonzero(failed), **extra))
     worked = frame[converged]
     too_small = worked[bounds["true"]] > worked[bounds["claimed"]]
-    ratio = (worked[bounds["true"]] / worked[bounds["claimed"]]).replace([np.inf, -np.inf], np.nan).dropna()
+    ratio = pd.Series(worked[bounds["true"]] / worked[bounds["claimed"]]).replace([np.inf, -np.inf], np.nan).dropna()
     claimed = {
         "definition": "twice the largest acceleration",
         "converged_runs": len(worked),
