@@ -1,0 +1,1 @@
+"""Studies in a browser: a folder that needs no Python, or a page served from this machine."""
