@@ -42,7 +42,7 @@ for _command in (
     *(setup.demo, setup.init),
     *(studies.simulate, studies.sweep, studies.status, studies.tune, studies.verify),
     *(logs.inspect, logs.identify, logs.diagnose),
-    *(studies.plot, studies.compare, studies.repair, setup.bench, setup.doctor),
+    *(studies.plot, studies.explore, studies.compare, studies.repair, setup.bench, setup.doctor),
 ):
     app.command()(told(_command))
 # what it prints is JSON in any case

@@ -1,4 +1,4 @@
-"""Commands on studies: simulate, sweep, status, tune, verify, plot, compare, repair."""
+"""Commands on studies: simulate, sweep, status, tune, verify, plot, explore, compare, repair."""
 
 import dataclasses
 import functools
@@ -292,6 +292,26 @@ def plot(
         result = dataclasses.replace(result, config=study)
     with working(context, "drawing"):
         return Outcome(write_sweep_report(result, where), where, summary=_extent(result))
+
+
+def explore(
+    context: typer.Context,
+    folder: FolderArgument,
+    static: Annotated[
+        Path, typer.Option("--static", metavar="OUT", help="folder for the page, new or ours", show_default=False)
+    ],
+) -> Outcome:
+    """Write a page that draws a sweep's maps by mouse, with its data beside it: it needs no Python, nor a server."""
+    workers.start_jax()
+    from jaxbl.report.explore import write_static
+    from jaxbl.report.sweep import headline
+    from jaxbl.sweeps.sweep import open_study
+
+    result = open_study(folder)
+    with working(context, "writing the page"):
+        lead = headline(result)
+        page = write_static(result, static, lead)
+    return Outcome(lead, static, page.name, summary=_extent(result))
 
 
 def compare(

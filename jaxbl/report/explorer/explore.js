@@ -44,12 +44,15 @@ const bytesOf = (about) => {
     });
     return out.buffer;
   };
+  let whole = null;
   const byRange = async (start, end) => {
+    if (whole) return (await whole).slice(start, end);
     const answer = await fetch("points.parquet", { headers: { Range: `bytes=${start}-${end - 1}` } });
     if (!answer.ok) throw new Error(`points.parquet: ${answer.status} ${answer.statusText}`);
-    const content = await answer.arrayBuffer();
-    // some servers send the whole file
-    return answer.status === 206 ? content : content.slice(start, end);
+    if (answer.status === 206) return answer.arrayBuffer();
+    // some servers send the whole file, which is enough once
+    whole ??= answer.arrayBuffer();
+    return (await whole).slice(start, end);
   };
   const slice = location.protocol === "file:" ? fromScripts : byRange;
   return { byteLength: about.bytes, slice: (start, end = about.bytes) => slice(start, end) };
@@ -80,11 +83,19 @@ class Study {
   }
   async read(name) {
     this.metadata ??= hyparquet.parquetMetadataAsync(this.file);
-    const out = new Float32Array(this.rows);
-    await hyparquet.parquetRead({
-      file: this.file, metadata: await this.metadata, columns: [name],
-      onChunk: ({ columnData, rowStart }) => out.set(columnData, rowStart),
-    });
+    const metadata = await this.metadata, out = new Float32Array(this.rows);
+    let rowStart = 0;
+    for (const group of metadata.row_groups) {
+      const rowEnd = rowStart + Number(group.num_rows);
+      // the page stays alive
+      await new Promise((resolve) => setTimeout(resolve));
+      $("state").textContent = `reading ${name}: ${Math.floor((100 * rowStart) / this.rows)} %`;
+      await hyparquet.parquetRead({
+        file: this.file, metadata, columns: [name], rowStart, rowEnd,
+        onChunk: ({ columnData, rowStart: first }) => out.set(columnData, first),
+      });
+      rowStart = rowEnd;
+    }
     return out;
   }
 }
@@ -145,8 +156,7 @@ class Picture {
     this.study = study;
     this.canvas = $("map");
     this.over = $("over");
-    const first = study.varied.filter((dim) => dim.paths[0].path !== "seed");
-    const [y, x] = study.overview ? [study.dims[study.overview.y], study.dims[study.overview.x]] : first.slice(-2);
+    const [y, x] = [study.dims[study.overview.y], study.dims[study.overview.x]];
     this.view = { x, y, metric: study.first, how: "median", log: true, at: study.dims.map((dim) => (dim.paths[0].path === "seed" ? "all" : 0)) };
     this.whole();
     this.cursor = null;
@@ -177,15 +187,16 @@ class Picture {
     if (asked !== this.asked) return;
     this.column = column;
     this.shown = mapped(this.study, column, this.view);
+    await this.curves();
     this.draw();
     $("state").textContent = this.study.found < this.study.rows ? `${this.study.found} of ${this.study.rows} runs so far; white where none is` : "";
+    if (this.curved.length) $("state").textContent += ` f⁺ = ${text(this.bound)} rad/s²: the view's median`;
     document.body.dataset.drawn = `${this.view.metric} ${this.view.x.name} ${this.view.y.name}`;
   }
   /** From what the export computed, before any column is read. */
   first() {
     const { overview } = this.study;
     this.fit();
-    if (!overview) return;
     const bytes = Uint8Array.from(atob(overview.values), (one) => one.charCodeAt(0));
     const step = overview.shape.map((one, i) => Math.ceil([this.view.y.size, this.view.x.size][i] / one));
     this.shown = { values: new Float32Array(bytes.buffer), cells: [...overview.shape].reverse(), step: step.reverse() };
@@ -232,6 +243,35 @@ class Picture {
     this.bar(context, colours, style.color);
     this.canvas.setAttribute("aria-label", `${this.label()} over ${this.view.x.name} and ${this.view.y.name}, from ${text(scale.low)} to ${text(scale.high)}`);
     this.mark();
+  }
+  /** Least lambda over alpha of the conditions asked for, at the view's median f_plus. */
+  async curves() {
+    this.curved = [];
+    const { x, y, condition } = this.view, side = this.gains();
+    if (!side || !condition || condition === "none") return;
+    const bounds = mapped(this.study, await this.study.column(`${side}.f_plus`), { ...this.view, how: "median" }).values.filter(Number.isFinite);
+    const bound = reduced.median(bounds);
+    if (!(bound > 0)) return;
+    const { alpha, lambda } = this.study.conditions.find((one) => one.name === condition);
+    const points = alpha.map((one, i) => [one * bound, lambda[i] * Math.sqrt(bound)]);
+    this.curved = [x.name.endsWith(".alpha") ? points : points.map(([a, b]) => [b, a])];
+    this.bound = bound;
+  }
+  /** The side whose gains the axes are, if they are. */
+  gains() {
+    const [a, b] = [this.view.x.name, this.view.y.name].sort(), side = a.split(".")[1];
+    const both = a === `observer.${side}.alpha` && b === `observer.${side}.lambda`;
+    return both && this.study.metric(`${side}.f_plus`) ? side : null;
+  }
+  /** Where a value lies along an axis, as a share of the map; between two values in the axis's own scale. */
+  share(i, value) {
+    const { values } = [this.view.x, this.view.y][i], log = values[0] > 0 && values[values.length - 1] / values[0] > 20;
+    const map = log ? Math.log : (one) => one, count = values.length;
+    let k = values.findIndex((one) => one >= value);
+    if (k < 0) k = count - 1;
+    k = Math.max(1, k);
+    const at = k - 1 + (map(value) - map(values[k - 1])) / (map(values[k]) - map(values[k - 1]));
+    return (at + 0.5 - this.view.from[i]) / this.size()[i];
   }
   size() { return [0, 1].map((i) => this.view.to[i] - this.view.from[i]); }
   label() {
@@ -289,6 +329,20 @@ class Picture {
   mark() {
     const context = this.over.getContext("2d"), { box } = this;
     context.clearRect(0, 0, this.width, this.height);
+    context.save();
+    context.beginPath();
+    context.rect(box.left, box.top, box.width, box.height);
+    context.clip();
+    for (const points of this.curved ?? []) {
+      for (const [colour, width] of [["#000000", 4], ["#FFD400", 2]]) {
+        context.strokeStyle = colour;
+        context.lineWidth = width;
+        context.beginPath();
+        for (const [a, b] of points) context.lineTo(box.left + box.width * this.share(0, a), box.top + box.height * (1 - this.share(1, b)));
+        context.stroke();
+      }
+    }
+    context.restore();
     if (this.brush) {
       const [[ax, ay], [bx, by]] = this.brush;
       context.strokeStyle = "#ffffff";
@@ -376,10 +430,6 @@ globalThis.jaxblStudy = async (about) => {
   document.title = $("title").textContent = about.title;
   $("lead").replaceChildren(...about.lead.map((line) => made("p", { textContent: line })));
   $("config").textContent = about.config;
-  if (!about.grid || study.varied.filter((dim) => dim.paths[0].path !== "seed").length < 2) {
-    $("state").textContent = "This page draws maps over two axes of a grid; this study has none.";
-    return;
-  }
   const picture = new Picture(study), { view } = picture, plot = $("plot");
   const choose = (label, id, options, chosen, act) => {
     const select = made("select", { id }, ...options.map(([value, name]) => made("option", { value, textContent: name, selected: String(value) === String(chosen) })));
@@ -404,6 +454,8 @@ globalThis.jaxblStudy = async (about) => {
         choose(dim.name, `at${dim.i}`, [["all", "all"], ...dim.values.map((value, i) => [i, `${text(value)} ${dim.unit}`.trim()]).slice(0, 1000)], view.at[dim.i],
           (value) => { view.at[dim.i] = value === "all" ? value : Number(value); })),
       choose("of several", "how", Object.keys(reduced).map((one) => [one, one]), view.how, (value) => { view.how = value; }),
+      ...(picture.gains() ? [choose("gain condition", "condition", [["none", "none"], ...study.conditions.map((one) => [one.name, one.title])], view.condition ?? "none",
+        (value) => { view.condition = value; })] : []),
       choose("colours", "log", [["true", "logarithmic where it fits"], ["false", "linear"]], view.log, (value) => { view.log = value === "true"; }),
     );
   };

@@ -1,1 +1,0 @@
-"""Studies in a browser: a folder that needs no Python, or a page served from this machine."""

@@ -1,0 +1,130 @@
+"""A study as a folder for the browser: its data, and the page by mouse and keyboard."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from browser import needs_chromium, opened
+from small_study import ALPHA, LAMBDA, NOISE, listed, made, rigid, spaced
+
+from jaxbl.config import read_config
+from jaxbl.errors import InputError
+from jaxbl.report.explore import write_static
+
+HOSTILE = "</script><script>alert(1)</script> <b>a</b> \u202e"
+AXES = [listed(NOISE, 1e-5, 1e-4), spaced(ALPHA, 2.0, 50.0, 6), spaced(LAMBDA, 1.0, 20.0, 5)]
+
+
+def product(frame):
+    return frame[ALPHA] * frame[LAMBDA] * (1.0 + 1e3 * frame[NOISE]) + 0.1 * frame["seed"]
+
+
+def study(**columns):
+    data = rigid({"title": HOSTILE}, axes=AXES, sweep={"seeds": 3})
+    return made(data, motor__velocity_rmse=product, motor__f_plus=lambda frame: 1.0, **columns)
+
+
+def about(folder):
+    return json.loads((folder / "study.js").read_text().removeprefix("jaxblStudy(").rstrip().removesuffix(");"))
+
+
+def test_rows_are_in_the_order_of_the_axes_whatever_that_of_the_parts(tmp_path):
+    result = study(motor__convergence_time=lambda frame: np.where(frame["seed"] > 0, np.inf, 1.0))
+    shuffled = result.frame.sample(frac=1.0, random_state=0).iloc[5:]
+    write_static(result.__class__(result.config, shuffled), tmp_path / "out", ["found"])
+    told, table = about(tmp_path / "out"), pq.read_table(tmp_path / "out" / "points.parquet").to_pandas()
+    assert (told["rows"], told["found"], told["title"]) == (180, 175, HOSTILE)
+    paths = [one["path"] for axis in told["axes"] for one in axis["paths"]]
+    grid = pd.MultiIndex.from_product([axis["paths"][0]["values"] for axis in told["axes"]], names=paths)
+    expected = shuffled.set_index(paths)["motor.velocity_rmse"].reindex(grid).to_numpy()
+    np.testing.assert_allclose(table["motor.velocity_rmse"], expected, rtol=1e-6)
+    # what is infinite is not there
+    assert table["motor.convergence_time"].isna().sum() > 100
+    # the same bytes in scripts, for pages from disk
+    scripts = "".join(file.read_text() for file in sorted((tmp_path / "out").glob("points.*.js")))
+    assert scripts.startswith("jaxblBytes(0, ") and len(scripts) > 4 * told["bytes"] / 3
+
+
+def test_zipped_axes_are_one(tmp_path):
+    axes = [spaced(ALPHA, 2.0, 50.0, 3), {"path": LAMBDA, "values": [1.0, 1.0, 3.0], "zip": "pair"},
+            {"path": NOISE, "values": [1e-5, 1e-4, 1e-4], "zip": "pair"}]  # fmt: skip
+    result = made(rigid(axes=axes), motor__velocity_rmse=product)
+    write_static(result, tmp_path, [])
+    table = pq.read_table(tmp_path / "points.parquet").to_pandas()
+    assert len(table) == 9 and [len(axis["paths"]) for axis in about(tmp_path)["axes"]] == [1, 2, 1]
+    np.testing.assert_allclose(table["motor.velocity_rmse"], result.frame["motor.velocity_rmse"], rtol=1e-6)
+
+
+def test_what_cannot_be_drawn_and_folders_of_others_are_refused(tmp_path):
+    line = made(rigid(axes=[spaced(ALPHA, 2.0, 50.0, 6)]), motor__velocity_rmse=lambda frame: frame[ALPHA])
+    with pytest.raises(InputError, match="explore: draws maps over two axes of a grid; this study varies fewer"):
+        write_static(line, tmp_path / "a", [])
+    assert not (tmp_path / "a").exists()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "index.html").write_text("mine")
+    with pytest.raises(InputError, match="mine: is not empty, and was not written by jaxbl explore"):
+        write_static(study(), tmp_path / "mine", [])
+    assert (tmp_path / "mine" / "index.html").read_text() == "mine"
+    for _ in range(2):
+        write_static(study(), tmp_path / "again", [])
+
+
+def read(values):
+    """The numbers beside the pointer: of the cell, of x, of y."""
+    return [float(line.split(": ")[-1].split()[0]) for line in values.inner_text().split("\n")]
+
+
+@needs_chromium
+def test_values_regions_cuts_and_a_point_as_config(tmp_path):
+    result = study()
+    page_file = write_static(result, tmp_path / "out", [HOSTILE])
+    with opened(page_file, color_scheme="dark") as (page,):
+        page.wait_for_function(f"document.body.dataset.drawn === 'motor.velocity_rmse {LAMBDA} {ALPHA}'")
+        assert page.locator("#title").text_content() == page.locator("#lead").text_content() == HOSTILE
+        plot, values = page.locator("#plot"), page.locator("#values")
+        box = page.evaluate("[document.querySelector('#plot').clientWidth, document.querySelector('#plot').clientHeight]")
+
+        def place(x, y):
+            return {"x": 78 + x * (box[0] - 78 - 96), "y": 12 + (1 - y) * (box[1] - 12 - 52)}
+
+        # a cell: the median over seeds, at the first noise
+        plot.hover(position=place(0.5, 0.25))
+        alphas, lambdas = np.geomspace(2.0, 50.0, 6), np.geomspace(1.0, 20.0, 5)
+        assert read(values) == pytest.approx([alphas[1] * lambdas[2] * 1.01 + 0.1, lambdas[2], alphas[1]], rel=1e-3)
+        # other noise, the largest seed
+        page.select_option("#at0", "1")
+        page.select_option("#how", "largest")
+        plot.hover(position=place(0.5, 0.26))
+        assert float(values.inner_text().split("\n")[0].split(": ")[-1]) == pytest.approx(
+            alphas[1] * lambdas[2] * 1.1 + 0.2, rel=1e-3
+        )
+        # axes change places, and conditions can be drawn over gains
+        page.select_option("#x", "1")
+        page.wait_for_function(f"document.body.dataset.drawn === 'motor.velocity_rmse {ALPHA} {LAMBDA}'")
+        page.select_option("#condition", "exact")
+        page.wait_for_function("document.querySelector('#state').textContent.includes('f⁺ = 1 rad/s²')")
+        # a region by mouse, a cell by keyboard
+        at = plot.bounding_box()
+        start, end = place(0.05, 0.9), place(0.6, 0.3)
+        page.mouse.move(at["x"] + start["x"], at["y"] + start["y"])
+        page.mouse.down()
+        page.mouse.move(at["x"] + end["x"], at["y"] + end["y"], steps=3)
+        page.mouse.up()
+        plot.hover(position=place(0.01, 0.01))
+        assert read(values)[1:] == pytest.approx([alphas[0], lambdas[1]], rel=1e-3)
+        plot.focus()
+        for key in ("ArrowRight", "Enter"):
+            page.keyboard.press(key)
+        assert page.locator("#cuts").is_visible()
+        with page.expect_download() as download:
+            page.click("#point")
+        (tmp_path / "out" / "point.toml").write_bytes(Path(download.value.path()).read_bytes())
+        with page.expect_download() as picture:
+            page.click("#picture")
+        assert Path(picture.value.path()).read_bytes().startswith(b"\x89PNG")
+    config = read_config(tmp_path / "out" / "point.toml")
+    assert config.encoders.noise == 1e-4 and config.axes == []
+    assert any(config.observer.motor.alpha == pytest.approx(one) for one in alphas)
