@@ -297,6 +297,18 @@ def test_shares_and_how_far_they_are(call, tmp_path):
     assert len(left(tmp_path / "a" / "points")) == 4 and (tmp_path / "a" / "report.html").is_file()
 
 
+def test_a_sweep_is_explored(call, tmp_path):
+    write(tmp_path, rigid(axes=GAINS))
+    call("sweep", "study.toml", "--out", "out")
+    code, lines, _ = call("explore", "out", "--static", "page")
+    assert code == 0 and lines[0].startswith("4 runs.") and lines[-1] == "page/index.html"
+    assert {"index.html", "explore.js", "hyparquet.js", "study.js", "study.toml", "points.parquet"} <= set(
+        left(Path("page"))
+    )
+    with pytest.raises(InputError, match="out: is not empty, and was not written by jaxbl explore"):
+        call("explore", "out", "--static", "out")
+
+
 def test_plot_draws_other_figures_from_the_stored_points(call, tmp_path, monkeypatch):
     study = write(tmp_path)
     call("sweep", study, "--out", "out")
