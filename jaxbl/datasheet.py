@@ -178,6 +178,7 @@ def _drive(given: Mapping[str, Given], title: str) -> str:
     """The tables of the drive, its input and its sensors."""
     import tomli_w
 
+    from .drive.effects import CoulombFriction
     from .records import NominalDrive
     from .records.proposal import plant_steps
 
@@ -216,7 +217,7 @@ def _drive(given: Mapping[str, Given], title: str) -> str:
         how = f" at the output, end to end; half of it times {ratio:g}"
         lines.append(line("half_gap", "backlash", 0.5 * ratio, f"rad {at_motor}", how))
     if value["motor_friction"]:
-        lines += ["", "[[effects]]", 'kind = "motor.coulomb_friction"', line("torque", "motor_friction", unit="N m")]
+        lines += ["", "[[effects]]", f'kind = "motor.{CoulombFriction.kind}"', line("torque", "motor_friction", unit="N m")]
     noise = " (the load's is this divided by the gear ratio; load_noise says otherwise)"
     lines += [
         "",
