@@ -18,9 +18,7 @@ import jax
 import pytest
 from hypothesis import settings
 from progress_lines import without_progress
-from typer.testing import CliRunner
 
-from jaxbl import cli
 from jaxbl.workers import collect_rarely, forget_programs
 
 collect_rarely()
@@ -64,6 +62,11 @@ def client():
 def call(monkeypatch, tmp_path):
     """The command in this process: exit code, lines on stdout, lines on stderr but for progress."""
     monkeypatch.setattr("jaxbl.workers.start_jax", lambda: None)
+    # the oldest typer warns when it is imported beside the newest click
+    from typer.testing import CliRunner
+
+    from jaxbl import cli
+
     monkeypatch.chdir(tmp_path)
 
     def run(*arguments):
