@@ -68,7 +68,7 @@ def least_lambda_moreno_osorio(alpha: Values, f_plus: Values) -> Values:
     return _above(alpha, f_plus, 2.0 * jnp.sqrt(f_plus * ratio / (1.0 + jnp.sqrt((1.0 - ratio) * (1.0 + ratio)))))
 
 
-def _arc(h: Values, y: Values, discriminant: Values) -> Values:
+def arc_of(h: Values, y: Values, discriminant: Values) -> Values:
     """int dq / (q^2 + lambda q + c) from p = v / y to infinity, with h = v + lambda y / 2 and discriminant c - lambda^2 / 4.
 
     `inf` where a real root lies on the way. Complex, real, and nearly double roots.
@@ -110,7 +110,7 @@ def _log_peak_ratio(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
     below = jnp.where(c2 > half**2, c2 - half**2, 1.0)
     # log(c2 / c1) without cancellation where alpha is far above f_plus
     gain = 0.5 * jnp.log1p(2.0 * f_plus / _margin(alpha, f_plus))
-    return gain - half * (_arc(half, one, c1 - half**2) + _arc(-half, one, below))
+    return gain - half * (arc_of(half, one, c1 - half**2) + arc_of(-half, one, below))
 
 
 def bisect(holds: Callable[[Values], Values], high: Values, halvings: int) -> tuple[Values, Values]:
@@ -192,13 +192,13 @@ def _passage(lambda_: Values, alpha: Values, f_plus: Values, y: Values, x2: Valu
     start_y, one, d1 = jnp.where(turns, y, 0.0), jnp.ones_like(end), jnp.where(turns, c1 - half**2, 1.0)
     # q^2 + lambda q + c = (q + lambda / 2)^2 + c - lambda^2 / 4
     norms = jnp.sqrt((start**2 + d1 * start_y**2) / jnp.maximum(end**2 + d1, eps * end**2))
-    y_ray = norms * jnp.exp(-half * (_arc(end, one, d1) - _arc(start, start_y, d1)))
+    y_ray = norms * jnp.exp(-half * (arc_of(end, one, d1) - arc_of(start, start_y, d1)))
     y_turn = jnp.where(turns, y_ray, jnp.where(ends, 0.0, y))
     x2_turn = jnp.where(turns, (ray + lambda_) * y_ray, jnp.where(ends, 0.0, x2))
     # home
     away, d2 = y_turn > 0.0, c2 - half**2
     h = jnp.where(away, half * y_turn - x2_turn, 1.0)
-    arc = _arc(h, jnp.where(away, y_turn, 0.0), d2)
+    arc = arc_of(h, jnp.where(away, y_turn, 0.0), d2)
     homes = away & jnp.isfinite(arc)
     level = jnp.where(homes, h**2 + d2 * y_turn**2, 1.0)
     speed = jnp.where(homes, jnp.sqrt(level) * jnp.exp(-half * jnp.where(homes, arc, 0.0)), 0.0)

@@ -176,7 +176,7 @@ def _remarks(experiment: Experiment, last: dict[str, Any], metrics: dict[str, An
             if values is None or values["least_lambda"]["exact"] is None:
                 continue
             missed = [
-                f"{CONDITIONS[name].title} by a factor of {least / found['lambda']:.4g} (more than {least:.4g})"
+                f"{CONDITIONS[name].title}{_factor(least, found['lambda'])} (more than {least:.4g})"
                 for name, least in values["least_lambda"].items()
                 if found["lambda"] <= least
             ]
@@ -196,3 +196,8 @@ def _remarks(experiment: Experiment, last: dict[str, Any], metrics: dict[str, An
                 "(run.position_tolerance, run.velocity_tolerance; on the load divided by the gear ratio)."
             )
     return remarks
+
+
+def _factor(least: float, lambda_: float) -> str:
+    """By what factor lambda is too small; of zero there is none."""
+    return f" by a factor of {least / lambda_:.4g}" if lambda_ > 0.0 else ""

@@ -1,0 +1,78 @@
+"""The error (33)-(34) of an observer in its phase plane: slope, peaks, worst path, majorant of the proof (Fig. 29)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .conditions import arc_of, least_lambda_davila_fridman
+
+
+def error_slope(error: np.ndarray, rate: np.ndarray, lambda_: float) -> np.ndarray:
+    """Slope of the position error (rad/s): the velocity error less the square-root term of (7)-(8).
+
+    Args:
+        error: position error (rad).
+        rate: velocity error (rad/s), of the same shape.
+        lambda_: gain.
+    """
+    return rate - lambda_ * np.sqrt(np.abs(error)) * np.sign(error)
+
+
+def error_peaks(error: np.ndarray, rate: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Peaks of an observer's velocity error: its values where the position error changes sign.
+
+    Args:
+        error: position error (rad) at each sample.
+        rate: velocity error without the square-root term (rad/s), which is the slope of `error` where that is zero.
+        most: peaks that are wanted.
+
+    Returns:
+        Indices of the samples before, and peaks (rad/s); those that stand out from the chatter of the last quarter (three
+        times its rms), the first `most` only.
+    """
+    at = np.flatnonzero((error[:-1] * error[1:] < 0.0) | ((error[:-1] == 0.0) & (error[1:] != 0.0)))
+    share = error[at] / (error[at] - error[at + 1])
+    peaks = rate[at] + share * (rate[at + 1] - rate[at])
+    chatter = 3.0 * np.sqrt(np.mean(rate[-max(len(rate) // 4, 1) :] ** 2))
+    low = np.flatnonzero(~(np.abs(peaks) > chatter))
+    count = min(low[0] if len(low) else len(peaks), most)
+    return at[:count], peaks[:count]
+
+
+def majorant(peak: float, lambda_: float, alpha: float, f_plus: float) -> tuple[np.ndarray, np.ndarray]:
+    """The majorant curve (36) of a half cycle and of the next one, from a peak (rad/s): e (rad) and its slope (rad/s).
+
+    Each half cycle drops from its largest e to the next peak, which is (37) times the one before. Needs alpha > f and
+    lambda > 0.
+    """
+    with jax.enable_x64(True):
+        ratio = float(least_lambda_davila_fridman(jnp.asarray(alpha), jnp.asarray(f_plus))) / lambda_
+    along = np.linspace(0.0, 1.0, 100)
+    # (36), as e over its largest, and slope over the peak
+    e, slope = np.r_[along * (2.0 - along), 1.0, 0.0], np.r_[1.0 - along, -ratio, -ratio]
+    largest = peak**2 / (2.0 * (alpha - f_plus)) * np.sign(peak)
+    return largest * np.r_[e, -(ratio**2) * e], peak * np.r_[slope, -ratio * slope]
+
+
+def worst_half_cycle(lambda_: float, alpha: float, f_plus: float, points: int = 1001) -> tuple[np.ndarray, np.ndarray]:
+    """The outermost path of (34) from e = 0 with slope 1 rad/s to e = 0 again: e (rad) and its slope (rad/s).
+
+    With y = sqrt(e) and a slope of p y, y sqrt(p^2 + lambda p + c) falls by exp(-(lambda / 2) arc) (docs/theory.md); c is
+    2 (alpha - f) on the way out and 2 (alpha + f) on the way back. It ends with the ratio of
+    :func:`jaxbl.observer.conditions.peak_ratio`. Needs alpha > f.
+    """
+    half, size, es, slopes = 0.5 * lambda_, 1.0, [], []
+    c1, c2 = 2.0 * (alpha - f_plus), 2.0 * (alpha + f_plus)
+    # out and back, by the angle of p
+    for c, first, last in ((c1, 0.5 * np.pi, 0.0), (c2, 0.0, -0.5 * np.pi)):
+        angle = np.linspace(first, last, points)
+        sine, cosine = np.sin(angle), np.cos(angle)
+        with jax.enable_x64(True):
+            arc = np.asarray(arc_of(jnp.asarray(sine + half * cosine), jnp.asarray(cosine), jnp.asarray(c - half**2)))
+        # the first point out has an arc of zero; where the arc is endless, the path has ended at the origin
+        level = size * np.exp(-half * (arc - arc[0]))
+        form = np.where(level > 0.0, sine**2 + lambda_ * sine * cosine + c * cosine**2, 1.0)
+        es.append((level * cosine) ** 2 / form)
+        slopes.append(level * sine / np.sqrt(form))
+        size = level[-1] * np.sqrt(c2 / c1)
+    return np.concatenate(es), np.concatenate(slopes)
