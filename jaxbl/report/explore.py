@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,12 +25,13 @@ from matplotlib.colors import to_hex
 
 from jaxbl.config import Config, is_boolean, numeric_paths
 from jaxbl.errors import InputError
-from jaxbl.files import is_empty, json_text, make_folder, plain
+from jaxbl.files import is_empty, json_text, make_folder, plain, writing
 from jaxbl.observer.conditions import CONDITIONS
-from jaxbl.sweeps.metrics import metric_of
+from jaxbl.sweeps.points import AxisColumns, Points
 from jaxbl.sweeps.sweep import StudyResult
 
 from .figures import MAP
+from .maps import drawn_values, value_label
 
 _GROUP = 1 << 17
 """Rows of a row group."""
@@ -42,35 +43,25 @@ _OVERVIEW = 512
 """Cells of the overview along each axis, at most."""
 
 
-class Dimension(NamedTuple):
-    """Axes of a grid that advance together, and their values."""
-
-    values: dict[str, np.ndarray]
-
-    @property
-    def size(self) -> int:
-        return len(next(iter(self.values.values())))
-
-    def index(self, frame: pd.DataFrame) -> np.ndarray:
-        """Where rows of a frame lie along it."""
-        names = list(self.values)
-        if len(names) == 1:
-            return pd.Index(self.values[names[0]]).get_indexer(pd.Index(frame[names[0]]))
-        known = pd.MultiIndex.from_arrays(list(self.values.values()))
-        return known.get_indexer(pd.MultiIndex.from_arrays([frame[name] for name in names]))
-
-
-def dimensions(config: Config) -> list[Dimension]:
-    """Those of a grid, the seed's last. Raises `InputError` where a study is none."""
+def _dimensions(config: Config) -> list[AxisColumns]:
+    """Axes of a grid, those that advance together as one, the seed last. Raises `InputError` where a study is none."""
     if config.sweep.refine is not None or config.sweep.design != "grid":
         kind = "refined" if config.sweep.refine is not None else "a quasi-random design"
         raise InputError(f"explore: draws maps over two axes of a grid; this study is {kind}, which 'jaxbl plot' draws")
-    found: dict[str, dict[str, np.ndarray]] = {}
-    for axis in config.axes:
-        found.setdefault(axis.zip or axis.path, {})[axis.path] = np.asarray(axis.grid())
     first = config.sweep.first_seed
-    seeds = np.arange(first, first + config.sweep.seeds)
-    return [Dimension(values) for values in (*found.values(), {"seed": seeds})]
+    return [*Points(config).blocks, {"seed": np.arange(first, first + config.sweep.seeds)}]
+
+
+def _length(dim: AxisColumns) -> int:
+    return len(next(iter(dim.values())))
+
+
+def _places(dim: AxisColumns, frame: pd.DataFrame) -> np.ndarray:
+    """Where rows of a frame lie along a dimension."""
+    if len(dim) == 1:
+        ((path, values),) = dim.items()
+        return pd.Index(values).get_indexer(pd.Index(frame[path]))
+    return pd.MultiIndex.from_arrays([*dim.values()]).get_indexer(pd.MultiIndex.from_arrays([frame[path] for path in dim]))
 
 
 def write_static(result: StudyResult, out: Path, lead: list[str]) -> Path:
@@ -88,28 +79,30 @@ def write_static(result: StudyResult, out: Path, lead: list[str]) -> Path:
         InputError: the study is no grid of at least two axes, or the folder holds something else.
     """
     config = result.config
-    dims = dimensions(config)
-    if sum(one.size > 1 for one in dims[:-1]) < 2:
+    dims = _dimensions(config)
+    if sum(_length(one) > 1 for one in dims[:-1]) < 2:
         raise InputError("explore: draws maps over two axes of a grid; this study varies fewer")
     make_folder(out)
     if not is_empty(out) and not (out / _MARKER).exists():
         raise InputError(f"{out}: is not empty, and was not written by jaxbl explore; choose another folder")
-    (out / _MARKER).write_text(json_text({"made_by": "jaxbl explore"}), encoding="utf-8")
-    for old in out.glob("points.*"):
-        old.unlink()
-    about = _about(config, dims, result.columns) | {"lead": lead} | _write_points(result, out, dims)
-    (out / "study.toml").write_text(config.to_toml(), encoding="utf-8")
-    (out / "study.js").write_text(f"jaxblStudy({json.dumps(about)});\n", encoding="utf-8")
-    with (out / "points.parquet").open("rb") as file:
-        for number, content in enumerate(iter(lambda: file.read(_SCRIPT), b"")):
-            text = f'jaxblBytes({number}, "{base64.b64encode(content).decode()}");\n'
-            (out / f"points.{number:04d}.js").write_text(text, encoding="ascii")
-    for one in files("jaxbl.report").joinpath("explorer").iterdir():
-        (out / one.name).write_bytes(one.read_bytes())
+    with writing(out):
+        (out / _MARKER).write_text(json_text({"made_by": "jaxbl explore"}), encoding="utf-8")
+        for old in out.glob("points.*"):
+            old.unlink()
+        about = _about(config, dims, result.columns) | {"lead": lead} | _write_points(result, out, dims)
+        (out / "study.toml").write_text(config.to_toml(), encoding="utf-8")
+        (out / "study.js").write_text(f"jaxblStudy({json.dumps(about)});\n", encoding="utf-8")
+        with (out / "points.parquet").open("rb") as file:
+            for number, content in enumerate(iter(lambda: file.read(_SCRIPT), b"")):
+                text = f'jaxblBytes({number}, "{base64.b64encode(content).decode()}");\n'
+                (out / f"points.{number:04d}.js").write_text(text, encoding="ascii")
+        package = files("jaxbl.report")
+        for one in (package.joinpath("page.css"), *package.joinpath("explorer").iterdir()):
+            (out / one.name).write_bytes(one.read_bytes())
     return out / "index.html"
 
 
-def _about(config: Config, dims: list[Dimension], columns: list[str]) -> dict[str, Any]:
+def _about(config: Config, dims: list[AxisColumns], columns: list[str]) -> dict[str, Any]:
     """What the page says of a study and its columns."""
     units = numeric_paths(config)
 
@@ -118,8 +111,10 @@ def _about(config: Config, dims: list[Dimension], columns: list[str]) -> dict[st
 
     return {
         "title": config.title or "Study",
-        "axes": [{"paths": [axis(path, values) for path, values in one.values.items()]} for one in dims],
-        "metrics": [_metric(name) for name in _metrics(config, columns)],
+        "axes": [{"paths": [axis(path, values) for path, values in one.items()]} for one in dims],
+        "metrics": [
+            {"name": name, "label": value_label(name), "yes": is_boolean(name)} for name in _metrics(config, columns)
+        ],
         "config": config.to_toml(),
         "colours": [to_hex(one) for one in colormaps[MAP](np.linspace(0.0, 1.0, 256))],
         "conditions": _conditions(),
@@ -132,33 +127,23 @@ def _metrics(config: Config, columns: list[str]) -> list[str]:
     return [name for name in columns if name not in known]
 
 
-def _metric(name: str) -> dict[str, Any]:
-    about = metric_of(name)
-    side, _, _ = name.rpartition(".")
-    return {
-        "name": name,
-        "label": f"{side}: {about.label}" if side else about.label,
-        "unit": about.unit,
-        "yes": is_boolean(name),
-    }
-
-
-def _write_points(result: StudyResult, out: Path, dims: list[Dimension]) -> dict[str, Any]:
+def _write_points(result: StudyResult, out: Path, dims: list[AxisColumns]) -> dict[str, Any]:
     """Write `points.parquet`: metrics as float32, rows in the order of the axes, nan where none is; in the memory of a part.
     Returns what the page needs to read it, and its first picture."""
     metrics = _metrics(result.config, result.columns)
-    shape = [one.size for one in dims]
+    shape = [_length(one) for one in dims]
     rows, found = math.prod(shape), 0
     with TemporaryDirectory(dir=out, prefix=".draft.") as place:
         kept = {name: np.memmap(Path(place) / str(i), np.float32, "w+", shape=(rows,)) for i, name in enumerate(metrics)}
         for values in kept.values():
             values[:] = np.nan
         for frame in result.batches():
-            at = np.ravel_multi_index([one.index(frame) for one in dims], shape)
+            at = np.ravel_multi_index([_places(one, frame) for one in dims], shape)
             found += len(frame)
             for name, values in kept.items():
-                numbers = frame[name].to_numpy(float)
-                values[at] = np.where(np.abs(numbers) < np.finfo(np.float32).max, numbers, np.nan)
+                # what no float32 holds is as good as diverged
+                shown = drawn_values(frame, name)
+                values[at] = shown.where(shown.abs() < np.finfo(np.float32).max)
         _write_table(out, kept, rows)
         first = next((name for name in metrics if name.endswith(".velocity_rmse")), metrics[0])
         overview = _overview(kept[first], shape)
@@ -175,12 +160,14 @@ def _write_table(out: Path, columns: Mapping[str, np.ndarray], rows: int) -> Non
 
 
 def _overview(values: np.ndarray, shape: list[int]) -> dict[str, Any]:
-    """The map over the last two axes that vary, at the first value of the others: the first picture."""
+    """The first picture: the map over the last two axes that vary, at the first value of the others, median over seeds."""
     y, x = [i for i, size in enumerate(shape[:-1]) if size > 1][-2:]
     index: list[Any] = [0] * len(shape)
     for i in (y, x):
         index[i] = slice(None, None, -(-shape[i] // _OVERVIEW))
-    cells = np.asarray(values.reshape(shape)[tuple(index)], "<f4")
+    index[-1] = slice(None)
+    seeds = values.reshape(shape)[tuple(index)]
+    cells = pd.DataFrame(seeds.reshape(-1, shape[-1])).median(axis=1).to_numpy("<f4").reshape(seeds.shape[:-1])
     return {"x": x, "y": y, "shape": list(cells.shape), "values": base64.b64encode(cells.tobytes()).decode()}
 
 

@@ -145,7 +145,8 @@ def _text(value: Any) -> str:
     return value if isinstance(value, str) else f"{value:g}"
 
 
-def _value_label(value: str) -> str:
+def value_label(value: str) -> str:
+    """What an axis or a colour bar says of a metric: side, label, unit."""
     side, _, _ = value.rpartition(".")
     about = metric_of(value)
     label = f"|{about.label}|" if is_magnitude(value) else about.label
@@ -353,12 +354,12 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points | Non
         handles.append(Patch(facecolor=MISSING, label=label) if gridded else cross)
     # a logarithmic scale begins at the smallest positive value
     extend = "min" if np.nanmin(values, initial=np.inf) < norm.vmin else "neither"  # type: ignore[operator]
-    label = _wrap(_value_label(spec.value))
+    label = _wrap(value_label(spec.value))
     figure.colorbar(ScalarMappable(norm, MAP), ax=axes, pad=0.02, aspect=28, extend=extend, label=label)
     if handles:
         most = max(int(figure.get_figwidth() / 2.4), 1)
         figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), most))
-    caption = f"{_value_label(spec.value)} over {spec.x} and {spec.y}{_over(config, varied, spec)}."
+    caption = f"{value_label(spec.value)} over {spec.x} and {spec.y}{_over(config, varied, spec)}."
     return Drawn(_file_name(spec), figure, caption)
 
 
@@ -394,7 +395,7 @@ def _map_panel(
             *_, share = _dense(panel.converged, filling)
             handles = hatch_failures(ax, (xs, ys), edges, share, f"{side} not converged")
     else:
-        shown = _shown(dots, spec.value)
+        shown = drawn_values(dots, spec.value)
         there, gone = dots[shown.notna()], dots[shown.isna()]
         ax.scatter(there[spec.x], there[spec.y], c=shown[shown.notna()], cmap=MAP, norm=norm, s=16, linewidths=0)
         ax.plot(gone[spec.x], gone[spec.y], "x", ms=4, color=MISSING)
@@ -435,8 +436,8 @@ def hatch_failures(
     return [Patch(facecolor="#808080", edgecolor="white", hatch="///", label=label)]
 
 
-def _shown(part: pd.DataFrame, value: str) -> pd.Series:
-    """The values to draw: those of diverged lanes are left out."""
+def drawn_values(part: pd.DataFrame, value: str) -> pd.Series:
+    """The values to draw, of a frame that has `finite`: sizes of what has a sign, and nan where a lane diverged."""
     values = part[value].astype(float)
     if value == "finite":
         return values
@@ -445,7 +446,7 @@ def _shown(part: pd.DataFrame, value: str) -> pd.Series:
 
 
 def _shown_column(value: str) -> Column:
-    return Column([value, "finite"], lambda frame: _shown(frame, value))
+    return Column([value, "finite"], lambda frame: drawn_values(frame, value))
 
 
 def _best(panel: _Panel, spec: FigureTable) -> tuple[float, float, float] | None:
@@ -490,7 +491,7 @@ def _lines(config: Config, rows: Rows, spec: FigureTable) -> Drawn:
     panels = [("", found)]
     if spec.facet is not None:
         panels = [(_with_value(config, spec.facet, value), part) for value, part in found.groupby(spec.facet, sort=True)]
-    figure, axes = _grid_of_axes(config, spec, len(panels), (4.2, 3.4), _wrap(_value_label(spec.value)), single=(6.4, 4.2))
+    figure, axes = _grid_of_axes(config, spec, len(panels), (4.2, 3.4), _wrap(value_label(spec.value)), single=(6.4, 4.2))
     sampled, band = spec.x in _sampled(config), ""
     for ax, (title, part) in zip(axes, panels, strict=True):
         lines = [("", part)] if spec.series is None else list(part.groupby(spec.series, sort=True))
@@ -510,7 +511,7 @@ def _lines(config: Config, rows: Rows, spec: FigureTable) -> Drawn:
         ax.set(xlim=cell_edges(xs, log)[[0, -1]], title=title)
     if spec.series is not None:
         axes[-1].legend(title=_label(config, spec.series))
-    caption = f"{_value_label(spec.value)} over {spec.x}{_where(config, spec)}{_over(config, groups.varied, spec)}{band}."
+    caption = f"{value_label(spec.value)} over {spec.x}{_where(config, spec)}{_over(config, groups.varied, spec)}{band}."
     return Drawn(_file_name(spec), figure, caption)
 
 
@@ -518,7 +519,7 @@ def _lines(config: Config, rows: Rows, spec: FigureTable) -> Drawn:
 def _laws(config: Config, spec: FigureTable, laws: list[Law]) -> Drawn:
     """Points of lines that theory gives a slope for, with the lines fitted."""
     facets = list(dict.fromkeys(None if spec.facet is None else law.where[spec.facet] for law in laws))
-    figure, axes = _grid_of_axes(config, spec, len(facets), (4.2, 3.8), _wrap(_value_label(spec.value)), single=(7.2, 4.8))
+    figure, axes = _grid_of_axes(config, spec, len(facets), (4.2, 3.8), _wrap(value_label(spec.value)), single=(7.2, 4.8))
     for ax, facet in zip(axes, facets, strict=True):
         there = [law for law in laws if spec.facet is None or law.where[spec.facet] == facet]
         ax.set(xscale="log", yscale="log", title="" if spec.facet is None else _with_value(config, spec.facet, facet))
@@ -533,7 +534,7 @@ def _laws(config: Config, spec: FigureTable, laws: list[Law]) -> Drawn:
             ax.text(0.5, 0.5, "nothing above zero to draw", ha="center", transform=ax.transAxes)
         ax.legend(loc="best", handlelength=1.6, title=f"slope (theory {spec.theory:g}, dashed)")
     caption = (
-        f"{_value_label(spec.value)} over {spec.x}{_where(config, spec)}; geometric mean over {config.sweep.seeds} "
+        f"{value_label(spec.value)} over {spec.x}{_where(config, spec)}; geometric mean over {config.sweep.seeds} "
         f"{'seed' if config.sweep.seeds == 1 else 'seeds'}. Lines: least squares over the filled points; hollow points lie "
         "outside the law's range; dashed: theory's slope. The table says why each law ends."
     )

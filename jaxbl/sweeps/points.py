@@ -48,7 +48,8 @@ class Points:
     """All points of a study, first axis slowest, structural axes outermost.
 
     Each group, one for each combination of structural values, has `lanes` points. `coarse_lanes` of them are always
-    simulated: all, or the coarse grid of a refined study.
+    simulated: all, or the coarse grid of a refined study. `blocks` has the values of each axis in the order of the config,
+    those that advance together as one.
     """
 
     def __init__(self, config: Config):
@@ -60,7 +61,7 @@ class Points:
         metrics = metric_columns(base.build(), config.sweep.metrics)
         refined = self._refined(config)
         depth = config.sweep.refine or 0
-        blocks = self._blocks(config, dict.fromkeys(refined, depth))
+        self.blocks = blocks = self._blocks(config, dict.fromkeys(refined, depth))
         structural = [b for b in blocks if not all(path in self.leaves for path in b)]
         self._blocks_of_leaves = [b for b in blocks if all(path in self.leaves for path in b)]
         self.lanes = _points_of(self._blocks_of_leaves)

@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from browser import needs_chromium, opened
-from small_study import ALPHA, LAMBDA, NOISE, listed, made, rigid, spaced
+from browser import check, needs_chromium, opened
+from small_study import ALPHA, LAMBDA, NOISE, listed, made, rigid, small, spaced
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
@@ -48,6 +48,18 @@ def test_rows_are_in_the_order_of_the_axes_whatever_that_of_the_parts(tmp_path):
     assert scripts.startswith("jaxblBytes(0, ") and len(scripts) > 4 * told["bytes"] / 3
 
 
+def test_sizes_are_drawn_and_lanes_that_diverged_are_not_there(tmp_path):
+    columns = {"motor__stiffness_error": lambda frame: -2.0, "finite": lambda frame: frame["seed"] != 1}
+    result = made(small(axes=AXES, sweep={"seeds": 3}), **columns)
+    write_static(result, tmp_path, [])
+    table = pq.read_table(tmp_path / "points.parquet").to_pandas()
+    found = table["motor.stiffness_error"]
+    assert found.isna().mean() == pytest.approx(1.0 / 3.0) and set(found.dropna()) == {2.0}
+    assert set(table["finite"]) == {0.0, 1.0}
+    (told,) = [one for one in about(tmp_path)["metrics"] if one["name"] == "motor.stiffness_error"]
+    assert told["label"].startswith("motor: |")
+
+
 def test_zipped_axes_are_one(tmp_path):
     axes = [spaced(ALPHA, 2.0, 50.0, 3), {"path": LAMBDA, "values": [1.0, 1.0, 3.0], "zip": "pair"},
             {"path": NOISE, "values": [1e-5, 1e-4, 1e-4], "zip": "pair"}]  # fmt: skip
@@ -79,7 +91,7 @@ def read(values):
 
 @needs_chromium
 def test_values_regions_cuts_and_a_point_as_config(tmp_path):
-    result = study()
+    result = study(motor__converged=lambda frame: frame["seed"] > 0)
     page_file = write_static(result, tmp_path / "out", [HOSTILE])
     with opened(page_file, color_scheme="dark") as (page,):
         page.wait_for_function(f"document.body.dataset.drawn === 'motor.velocity_rmse {LAMBDA} {ALPHA}'")
@@ -94,6 +106,14 @@ def test_values_regions_cuts_and_a_point_as_config(tmp_path):
         plot.hover(position=place(0.5, 0.25))
         alphas, lambdas = np.geomspace(2.0, 50.0, 6), np.geomspace(1.0, 20.0, 5)
         assert read(values) == pytest.approx([alphas[1] * lambdas[2] * 1.01 + 0.1, lambdas[2], alphas[1]], rel=1e-3)
+        check(page, 0)
+        # of what is true or false, the share
+        page.select_option("#metric", "motor.converged")
+        page.wait_for_function("document.body.dataset.drawn.startsWith('motor.converged ')")
+        plot.hover(position=place(0.5, 0.26))
+        assert read(values)[0] == pytest.approx(2.0 / 3.0, rel=1e-3)
+        page.select_option("#metric", "motor.velocity_rmse")
+        page.wait_for_function("document.body.dataset.drawn.startsWith('motor.velocity_rmse ')")
         # other noise, the largest seed
         page.select_option("#at0", "1")
         page.select_option("#how", "largest")

@@ -128,7 +128,8 @@ const mapped = (study, column, view) => {
   }
   const out = new Float32Array(cells[0] * cells[1]);
   const gathered = new Float32Array(offsets.length * step[0] * step[1]);
-  const how = reduced[view.how];
+  // of what is true or false, the share
+  const how = study.metric(view.metric).yes ? reduced.mean : reduced[view.how];
   for (let j = 0; j < cells[1]; j++) {
     for (let i = 0; i < cells[0]; i++) {
       let count = 0;
@@ -249,7 +250,7 @@ class Picture {
     this.curved = [];
     const { x, y, condition } = this.view, side = this.gains();
     if (!side || !condition || condition === "none") return;
-    const bounds = mapped(this.study, await this.study.column(`${side}.f_plus`), { ...this.view, how: "median" }).values.filter(Number.isFinite);
+    const bounds = mapped(this.study, await this.study.column(`${side}.f_plus`), { ...this.view, metric: `${side}.f_plus`, how: "median" }).values.filter(Number.isFinite);
     const bound = reduced.median(bounds);
     if (!(bound > 0)) return;
     const { alpha, lambda } = this.study.conditions.find((one) => one.name === condition);
@@ -275,8 +276,7 @@ class Picture {
   }
   size() { return [0, 1].map((i) => this.view.to[i] - this.view.from[i]); }
   label() {
-    const { label, unit } = this.study.metric(this.view.metric);
-    return unit ? `${label} (${unit})` : label;
+    return this.study.metric(this.view.metric).label;
   }
   axes(context, colour) {
     const { box, view } = this;
@@ -447,11 +447,11 @@ globalThis.jaxblStudy = async (about) => {
       picture.whole();
     };
     $("choice").replaceChildren(
-      choose("metric", "metric", study.metrics.map((one) => [one.name, one.unit ? `${one.label} (${one.unit})` : one.label]), view.metric, (value) => { view.metric = value; }),
+      choose("metric", "metric", study.metrics.map((one) => [one.name, one.label]), view.metric, (value) => { view.metric = value; }),
       choose("x", "x", dims, view.x.i, swap("x", "y")),
       choose("y", "y", dims, view.y.i, swap("y", "x")),
       ...study.varied.filter((dim) => dim !== view.x && dim !== view.y).map((dim) =>
-        choose(dim.name, `at${dim.i}`, [["all", "all"], ...dim.values.map((value, i) => [i, `${text(value)} ${dim.unit}`.trim()]).slice(0, 1000)], view.at[dim.i],
+        choose(dim.name, `at${dim.i}`, [["all", "all"], ...dim.values.map((value, i) => [i, `${text(value)} ${dim.unit}`.trim()])], view.at[dim.i],
           (value) => { view.at[dim.i] = value === "all" ? value : Number(value); })),
       choose("of several", "how", Object.keys(reduced).map((one) => [one, one]), view.how, (value) => { view.how = value; }),
       ...(picture.gains() ? [choose("gain condition", "condition", [["none", "none"], ...study.conditions.map((one) => [one.name, one.title])], view.condition ?? "none",
@@ -481,12 +481,14 @@ globalThis.jaxblStudy = async (about) => {
     $("where").textContent = picture.lines(cell).slice(1).join(", ");
     cut($("cutx"), picture, 0);
     cut($("cuty"), picture, 1);
-    $("command").textContent = "Save the point, and simulate it anew: jaxbl simulate point.toml";
-    dispatchEvent(new CustomEvent("jaxbl-cell", { detail: { picture, cell } }));
+    const averaged = study.varied.filter((dim) => dim !== view.x && dim !== view.y && dim.paths[0].path !== "seed" && view.at[dim.i] === "all");
+    const first = averaged.length ? ` Of ${averaged.map((dim) => dim.name).join(", ")} it has the first value.` : "";
+    $("command").textContent = `Save the point beside study.toml, and simulate it: jaxbl simulate point.toml.${first}`;
   };
   plot.addEventListener("pointerdown", (event) => { if (picture.column) { picture.brush = [at(event), at(event)]; plot.setPointerCapture(event.pointerId); } });
   plot.addEventListener("pointermove", (event) => {
-    if (!picture.shown) return;
+    // the first picture has not all points
+    if (!picture.column) return;
     if (picture.brush) { picture.brush[1] = at(event); picture.mark(); }
     show(picture.cell(at(event)), at(event));
   });
