@@ -17,7 +17,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import tomli_w
-from browser import CHROMIUM, check, opened
 from measured import EMPS, made, real
 from passed import PASSED
 from progress_lines import without_progress
@@ -654,9 +653,6 @@ def test_a_log_is_identified(call, tmp_path):
     assert code == 0
     assert lines[0].startswith("drive.motor_inertia = 0.0")
     assert lines[-1] == "results/axis/report.html"
-    if CHROMIUM is not None:
-        with opened(tmp_path / "results/axis/report.html") as (page,):
-            check(page, 5)
     found = json.loads((tmp_path / "results/axis/identification.json").read_text())
     names = ["drive.motor_inertia", "drive.motor_viscous", "effects.motor.coulomb_friction.torque"]
     assert list(found["parameters"]) == names

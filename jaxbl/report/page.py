@@ -186,6 +186,8 @@ def _origin() -> str:
     """What made the page: versions, and the command, if it was one."""
     versions = ", ".join(f"{name} {version(name)}" for name in ("jaxbl", "jax", "numpy"))
     made = f"Made by {versions}, Python {platform.python_version()}"
-    if Path(sys.argv[0]).name in ("jaxbl", "__main__.py") and sys.argv[1:]:
+    program = Path(sys.argv[0]).parts
+    # `jaxbl`, or `python -m jaxbl`
+    if sys.argv[1:] and (program[-1:] == ("jaxbl",) or program[-2:] == ("jaxbl", "__main__.py")):
         return f"{made}, with: {shlex.join(['jaxbl', *sys.argv[1:]])}"
     return f"{made}."

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from browser import check, needs_chromium, opened
 from hidden_log import FRICTION, driven, logged, model
 
 import jaxbl.diagnosis.diagnosis_summary as summary_module
@@ -145,6 +146,14 @@ def test_the_extended_model_runs_and_the_report_says_what_was_found(found, tmp_p
     summary = read_json(tmp_path / "diagnosis.json")
     assert summary == found.summary and diagnosis_lines(summary) == lines
     assert again.effects[0].torque == summary["findings"][0]["parameters"]["torque"]["value"]
+
+
+@needs_chromium
+def test_the_page_in_a_browser(found, tmp_path):
+    write_diagnosis_report(found, tmp_path)
+    with opened(tmp_path / "report.html") as (page,):
+        check(page, len(list((tmp_path / "figures").iterdir())))
+        assert page.locator(".answer").inner_text().startswith("Explained: the model lacks motor.coulomb_friction;")
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from browser import check, needs_chromium, opened
 from matplotlib.figure import Figure
 from small_study import rigid, small
 
@@ -162,6 +163,13 @@ def test_an_interval_that_leaves_the_panel_ends_in_an_arrow(tmp_path):
     ax = draw_identification(found)[0].figure.axes[0]
     arrows = [(line.get_marker(), *line.get_xydata()[0]) for line in ax.lines if line.get_marker() in ("<", ">")]
     assert arrows == [(">", ax.get_xlim()[1], 0.0)]
+
+
+@needs_chromium
+def test_the_page_in_a_browser(tmp_path):
+    write_identification_report(made(CASES["dead zone"][0], tmp_path), tmp_path)
+    with opened(tmp_path / "report.html") as (page,):
+        check(page, len(GEARED))
 
 
 def test_a_linear_axis_has_newtons_and_metres(tmp_path):

@@ -1,6 +1,7 @@
 """The HTML page: well-formed, complete, and nothing of the user's text taken for markup."""
 
 import json
+from html import unescape
 from html.parser import HTMLParser
 
 import pandas as pd
@@ -59,6 +60,22 @@ def test_everything_is_escaped_and_in_its_place():
     assert json.loads(values) == [{"title": HOSTILE}]
     for cell in ("1.235", "–", "yes", "nan", ">3<"):
         assert cell in text
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["/bin/jaxbl", "plot", "a b"], ", with: jaxbl plot 'a b'<"),
+        (["/lib/jaxbl/__main__.py", "plot", "c"], ", with: jaxbl plot c<"),
+        (["/lib/pytest/__main__.py", "tests"], None),
+        (["notebook.py"], None),
+        ([""], None),
+    ],
+)
+def test_the_command_is_said_where_it_was_one(words, said, monkeypatch):
+    monkeypatch.setattr("sys.argv", words)
+    text = unescape(html("title", [], [], [], [], ""))
+    assert "Made by jaxbl" in text and (said in text if said else ", with: " not in text)
 
 
 def test_page_of_a_sweep(tmp_path):

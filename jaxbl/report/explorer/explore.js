@@ -190,7 +190,7 @@ class Picture {
     this.shown = mapped(this.study, column, this.view);
     await this.curves();
     this.draw();
-    $("state").textContent = this.study.found < this.study.rows ? `${this.study.found} of ${this.study.rows} runs so far; white where none is` : "";
+    $("state").textContent = this.study.found < this.study.rows ? `${this.study.found} of ${this.study.rows} runs so far` : "";
     if (this.curved.length) $("state").textContent += ` f⁺ = ${text(this.bound)} rad/s²: the view's median`;
     document.body.dataset.drawn = `${this.view.metric} ${this.view.x.name} ${this.view.y.name}`;
   }
