@@ -62,7 +62,7 @@ def picture(drawn: Drawn) -> Picture:
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
         figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
     width, height = (round(96 * inches) for inches in figure.get_size_inches())
-    value = next((_plain(bar.get_ylabel() or bar.get_xlabel()) for bar in bars), "value")
+    value = next((_plain(bar.get_ylabel() or bar.get_xlabel()) for bar in bars), None)
     share = _share(axes)
     panels = [_panel(figure, ax, value, share) for ax in axes]
     described = " ".join([drawn.caption, *(_described(panel) for panel in panels[:6])])
@@ -92,7 +92,7 @@ def _lines(ax: Axes) -> list[Line2D]:
     return [line for line in ax.get_lines() if line.get_transform() == ax.transData and len(_xy(line))]
 
 
-def _panel(figure: Figure, ax: Axes, value: str, every: int) -> dict[str, Any]:
+def _panel(figure: Figure, ax: Axes, value: str | None, every: int) -> dict[str, Any]:
     """What a page needs to read values off axes.
 
     Place (left, top, width, height) as shares of the figure; label, ends, scale and named ticks of both axes; lines (names,
@@ -111,7 +111,8 @@ def _panel(figure: Figure, ax: Axes, value: str, every: int) -> dict[str, Any]:
             # shared axes are named once, on the outer panels
             shared = (getattr(one, f"get_{label}label")() for one in figure.axes if one in _siblings(ax, label))
             panel[label]["label"] = next((_plain(text) for text in shared if text), "")
-    for mesh in ax.collections:
+    # without a colour bar cells are a cloud behind lines
+    for mesh in ax.collections if value is not None else ():
         if isinstance(mesh, QuadMesh):
             corners = np.asarray(mesh.get_coordinates())
             cells = np.ma.filled(np.ma.masked_invalid(np.ma.asarray(mesh.get_array(), float)), np.nan)

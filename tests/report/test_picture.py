@@ -46,6 +46,22 @@ def test_lines_bars_names_and_a_description(tmp_path):
     assert shown.size == (576, 288) and shown.svg.startswith(b"<?xml")
 
 
+@pytest.mark.parametrize("bar", [True, False])
+def test_cells_have_values_where_a_colour_bar_says_of_what(tmp_path, bar):
+    figure, (ax,) = subplots(6.0, 3.0, beside=True)
+    mesh = ax.pcolormesh([0.0, 1.0, 2.0, 3.0], [0.0, 1.0, 2.0], np.ma.masked_equal([[1.0, 2.0, 3.0], [4.0, 5.0, 0.0]], 0.0))
+    if bar:
+        figure.colorbar(mesh, ax=ax, label="error (rad)")
+    drawn = Drawn("map", figure, "A map.")
+    save(figure, tmp_path / "map.png")
+    (panel,) = picture(drawn).panels
+    assert ("cells" in panel) == bar
+    if bar:
+        assert panel["cells"]["name"] == "error (rad)"
+        np.testing.assert_array_equal(unpacked(panel["cells"]["x"]), [0.0, 1.0, 2.0, 3.0])
+        np.testing.assert_array_equal(unpacked(panel["cells"]["values"]), [1.0, 2.0, 3.0, 4.0, 5.0, np.nan])
+
+
 @pytest.mark.parametrize("count", [100, 50_000])
 def test_clouds_and_long_lines_stay_small(tmp_path, count):
     values = np.random.default_rng(0).standard_normal((2, count))
