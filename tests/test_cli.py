@@ -301,7 +301,7 @@ def test_a_sweep_is_explored(call, tmp_path):
     call("sweep", "study.toml", "--out", "out")
     code, lines, _ = call("explore", "out", "--static", "page")
     assert code == 0 and lines[0].startswith("4 runs.") and lines[-1] == "page/index.html"
-    assert {"index.html", "explore.js", "hyparquet.js", "study.js", "study.toml", "points.parquet"} <= set(
+    assert {"index.html", "map.js", "plot.js", "hyparquet.js", "data.js", "study.toml", "points.parquet"} <= set(
         left(Path("page"))
     )
     with pytest.raises(InputError, match="out: is not empty, and was not written by jaxbl explore"):

@@ -19,6 +19,7 @@ from jaxbl.records import POSITION_CHANNELS
 from jaxbl.simulate import Experiment, Reducer, Signals, State, scan
 
 from .metrics import METRICS, identified, observer_gains, with_conditions
+from .programs import Backend
 from .store import identity
 
 
@@ -37,13 +38,17 @@ class Trial(NamedTuple):
     summary: dict[str, Any]
 
 
-def run(study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every: int = 1) -> Trial:
+def run(
+    study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every: int = 1, backend: Backend | None = None
+) -> Trial:
     """Run the experiment of a study once, without its axes.
 
     Args:
         study: TOML file, mapping or config.
         seed: seed of the encoder noise.
         every: keep every N-th sample of the trace.
+        backend: `scan` compiles for all values of the study's numbers, which is faster where many runs follow one another;
+            left out, the faster for one run.
 
     Raises:
         InputError: wrong config.
@@ -53,20 +58,29 @@ def run(study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every:
         raise InputError(f"every: should be between 1 and the number of samples {config.run.steps}, not {every}")
     with precision(config):
         experiment = prepare(config)
-        what = (METRICS, _LAST), partial(_row, experiment), every
-        try:
-            with attempted():
-                from jaxbl.fused.single_run import recorded
-
-                figures, kept = recorded(experiment, seed, *what)
-        except Unsupported as why:
-            say_scanned(str(why))
-            figures, kept = jax.jit(lambda seed: scan(experiment, seed, *what))(jnp.asarray(seed))
+        figures, kept = _scanned(experiment, seed, every) if backend == "scan" else _recorded(experiment, seed, every)
         figures = with_conditions(figures, observer_gains(experiment))
         trace = pd.DataFrame({name: np.asarray(column, float) for name, column in kept.items()})
     last = {name: plain(figures.pop(name)) for name in list(figures) if name.startswith("last.")}
     metrics = {name: plain(value) for name, value in figures.items()}
     return Trial(config, trace, _summary(config, last, metrics, seed))
+
+
+def _recorded(experiment: Experiment, seed: int, every: int) -> tuple[dict[str, Any], Any]:
+    """By the fused loop if it can."""
+    try:
+        with attempted():
+            from jaxbl.fused.single_run import recorded
+
+            return recorded(experiment, seed, _REDUCERS, partial(_row, experiment), every)
+    except Unsupported as why:
+        say_scanned(str(why))
+        return _scanned(experiment, seed, every)
+
+
+@partial(jax.jit, static_argnums=2)
+def _scanned(experiment: Experiment, seed: Any, every: int) -> tuple[dict[str, Any], Any]:
+    return scan(experiment, seed, _REDUCERS, partial(_row, experiment), every)
 
 
 def _last(experiment: Experiment, largest: Any, state: State) -> dict[str, Any]:
@@ -82,6 +96,7 @@ _LAST = Reducer(
     lambda experiment, largest, index, signals: jnp.maximum(largest, jnp.abs(signals.torque)),
     _last,
 )
+_REDUCERS = METRICS, _LAST
 
 
 def _row(experiment: Experiment, state: State, signals: Signals) -> dict[str, Any]:

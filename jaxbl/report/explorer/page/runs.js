@@ -1,0 +1,134 @@
+"use strict";
+/* Runs that the server simulates anew: traces, hysteresis, error in the phase plane; some pinned beside the newest. */
+
+const SIDES = ["motor", "load"];
+/** What is drawn of a run: title, axes, and lines [name, column of x, column of y, dashed]; of the last half where the first is transient. */
+const tracePlots = (columns) => {
+  const sides = SIDES.filter((side) => `${side}.velocity` in columns), time = { label: "time", unit: "s" }, plots = [];
+  const over = (caption, label, unit, lines) => plots.push({ caption, time: true, x: time, y: { label, unit }, lines: lines.map(([name, y, dash]) => [name, "t", y, dash]) });
+  for (const side of sides) {
+    const symbol = side === "motor" ? "θe" : "θs";
+    over(`${side}: position`, `position ${symbol}`, "rad", [["observed", `${side}.position_estimate`, false], ["true", `${side}.position`, true]]);
+    over(`${side}: velocity`, "velocity", "rad/s", [["observed", `${side}.velocity_estimate`, false], ["true", `${side}.velocity`, true]]);
+    over(`${side}: error of the velocity, true less observed`, "velocity error", "rad/s", [["error", `${side}.velocity_error`, false]]);
+  }
+  const what = "z" in columns ? "transmitted torque" : "disturbance torque";
+  over(`${what}, true and observed`, what, "N m", [...sides.map((side) => [`by the ${side} observer`, `${side}.torque_estimate`, false]), ["true", "torque", true]]);
+  if ("z" in columns) {
+    plots.push({ caption: "hysteresis: torque over twist, second half of the run", half: true, x: { label: "twist z", unit: "rad" }, y: { label: what, unit: "N m" },
+      lines: [["by the motor observer", "z", "motor.torque_estimate", false], ["true", "z", "torque", true]] });
+  }
+  return plots;
+};
+
+class Runs {
+  constructor(study, picture) {
+    Object.assign(this, { study, picture, all: [], plots: [] });
+  }
+  /** Has the run of a point simulated; it takes the place of the newest, unless that is pinned. */
+  async simulate(indices) {
+    const asked = (this.asked = Symbol("asked"));
+    $("runs").hidden = false;
+    $("told").textContent = "simulating …";
+    $("point").disabled = true;
+    const began = performance.now();
+    let found;
+    try {
+      const answer = await fetch("run", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ at: indices }) });
+      found = await answer.json();
+      if (!answer.ok) throw new Error(found.error);
+    } catch (error) {
+      if (asked === this.asked) $("told").textContent = `Not simulated: ${error.message}`;
+      return;
+    }
+    if (asked !== this.asked) return;
+    this.all = this.all.filter((one) => one.pinned);
+    if (this.all.length === COLOURS.length) this.all.shift();
+    const free = COLOURS.filter((colour) => !this.all.some((one) => one.colour === colour));
+    const columns = Object.fromEntries(Object.entries(found.columns).map(([name, bytes]) => [name, unpacked(bytes)]));
+    for (const side of SIDES.filter((one) => `${one}.velocity` in columns)) {
+      columns[`${side}.velocity_error`] = columns[`${side}.velocity`].map((one, i) => one - columns[`${side}.velocity_estimate`][i]);
+    }
+    this.newest = { ...found, indices, columns, colour: free[0], pinned: false };
+    this.all.push(this.newest);
+    this.draw();
+    $("told").textContent = this.said(found, indices);
+    $("point").disabled = false;
+    document.body.dataset.simulated = `${indices} ${Math.round(performance.now() - began)}`;
+  }
+  /** The metric of the map, stored and of this run: they differ where the run is not the one of the sweep. */
+  said(found, indices) {
+    const { metric } = this.picture.view, stored = this.picture.column[this.study.dims.reduce((sum, dim) => sum + indices[dim.i] * dim.stride, 0)];
+    const raw = found.metrics[metric], { label, yes } = this.study.metric(metric);
+    const now = yes ? Number(raw) : raw === null ? NaN : this.study.metric(metric).size ? Math.abs(raw) : raw;
+    const same = Object.is(Math.fround(now), stored) || Math.abs(now - stored) <= 1e-3 * Math.abs(stored) || (Number.isNaN(stored) && !Number.isFinite(now));
+    const every = found.every > 1 ? ` Every ${found.every}th sample is drawn.` : "";
+    return same ? `${label}: ${text(now)}, as stored in the sweep.${every}` : `This run differs from the sweep's: ${label} is ${text(now)}, stored ${text(stored)}.${every}`;
+  }
+  config() { return this.newest.config; }
+  draw() {
+    const { columns } = this.newest, specs = tracePlots(columns), several = this.all.length > 1;
+    const range = this.plots.find((one) => one.spec.time)?.range;
+    $("pinned").replaceChildren(...this.all.map((one) => this.entry(one)));
+    $("key").replaceChildren(legend([["solid: observed, or error", "currentColor", false], ["dashed: true", "currentColor", true], ["dots: majorant of the proof", "#8a8d93", true]]));
+    const whole = $("traces");
+    whole.replaceChildren();
+    this.plots = [];
+    const add = (spec, lines) => {
+      const figure = made("figure");
+      whole.append(figure);
+      const plot = new Plot(figure, { ...spec, zoomed: spec.time && ((to) => this.follow(plot, to)) });
+      plot.spec = spec;
+      if (spec.time && range) plot.range = [range[0], null];
+      plot.set(lines);
+      this.plots.push(plot);
+    };
+    const named = (run, name) => (several ? `${run.name}: ${name}` : name);
+    for (const spec of specs) {
+      const sides = spec.lines.length > 2;
+      add({ ...spec, named: sides && !several }, this.all.flatMap((run) => spec.lines.filter(([, , y]) => y in run.columns).map(([name, x, y, dashed], i) => {
+        const part = (column) => (spec.half ? column.subarray(column.length >> 1) : column);
+        // two observers of one quantity
+        const colour = !several && sides && !dashed ? COLOURS[i] : several || !dashed ? run.colour : undefined;
+        return { name: named(run, name), x: part(run.columns[x]), y: part(run.columns[y]), colour, alpha: dashed ? 1 : 0.8, dash: dashed ? [6, 4] : [], width: dashed ? 1.3 : 1.8, sorted: x === "t" };
+      })));
+    }
+    for (const side of SIDES.filter((one) => this.newest.planes[one])) {
+      const bounded = this.all.some((run) => run.planes[side]?.majorant);
+      const spec = { caption: `${side}: error of the observer in the phase plane${bounded ? ", with the majorant of the proof (36)-(37)" : "; no peak stands out from the chatter"}`, height: 300,
+        x: { label: "position error e", unit: "rad" }, y: { label: "its slope ė", unit: "rad/s" } };
+      add(spec, this.all.filter((run) => run.planes[side]).flatMap((run) => {
+        const { error, slope, majorant } = run.planes[side];
+        const lines = [{ name: named(run, "error"), x: unpacked(error), y: unpacked(slope), colour: run.colour }];
+        return majorant ? [...lines, { name: named(run, "majorant"), x: unpacked(majorant[0]), y: unpacked(majorant[1]), colour: several ? run.colour : "#8a8d93", dash: [2, 3] }] : lines;
+      }));
+    }
+    this.table();
+  }
+  entry(one) {
+    const mark = made("span", { className: "mark" });
+    mark.style.borderTopColor = one.colour;
+    const pin = made("button", { type: "button", textContent: one.pinned ? "unpin" : "pin" });
+    pin.addEventListener("click", () => {
+      one.pinned = !one.pinned;
+      if (!one.pinned && one !== this.newest) this.all = this.all.filter((other) => other !== one);
+      this.draw();
+    });
+    return made("li", {}, mark, one.name, pin);
+  }
+  /** All plots over time show what one of them does. */
+  follow(from, range) {
+    for (const plot of this.plots) {
+      if (plot === from || !plot.spec.time) continue;
+      plot.range = range && [range[0], null];
+      plot.draw();
+    }
+  }
+  table() {
+    const { metrics } = this.newest, cell = (value) => made("td", { className: "number", textContent: typeof value === "boolean" ? (value ? "yes" : "no") : text(value) });
+    $("metrics").replaceChildren(
+      made("thead", {}, made("tr", {}, ...["metric", ...this.all.map((one) => one.name)].map((name) => made("th", { textContent: name, scope: "col" })))),
+      made("tbody", {}, ...Object.keys(metrics).map((name) => made("tr", {}, made("th", { textContent: this.study.metric(name)?.label ?? name, scope: "row" }), ...this.all.map((one) => cell(one.metrics[name]))))),
+    );
+  }
+}
