@@ -230,8 +230,10 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept, tmp_
             figures = page.locator("#traces figure")
             assert figures.count() == 5 and "error of the observer in the phase plane" in figures.last.inner_text()
             # drawn, and read by keyboard
-            dark = "getImageData(90, 20, 200, 150).data.some((byte, i) => i % 4 < 3 && byte < 128)"
-            drawn = f"[...document.querySelectorAll('#traces canvas')].map((one) => one.getContext('2d').{dark})"
+            coloured = (
+                "getImageData(85, 15, 300, 150).data.some((byte, i, all) => i % 4 === 0 && Math.abs(byte - all[i + 2]) > 60)"
+            )
+            drawn = f"[...document.querySelectorAll('#traces canvas')].map((one) => one.getContext('2d').{coloured})"
             assert all(page.evaluate(drawn))
             figures.first.locator(".plane").focus()
             page.keyboard.press("ArrowRight")
@@ -243,9 +245,13 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept, tmp_
 def test_a_study_at_work_is_written_anew_when_its_page_is_loaded_again(tmp_path):
     share(SWEPT, tmp_path / "out", (1, 2))
     with served(study_source(tmp_path / "out")) as server:
-        first, again = server.newest(), server.newest()
-        places = [server.file(one, "data.js").parent for one in (first, again)]
-        assert [about(one)["found"] for one in places] == [8, 8] and about(places[0])["served"]
+
+        def told(version):
+            assert (file := server.file(version, "data.js")) is not None
+            return about(file.parent)
+
+        versions = server.newest(), server.newest()
+        assert [told(one)["found"] for one in versions] == [8, 8] and told(versions[0])["served"]
         sweep(SWEPT, tmp_path / "out")
         last = server.newest()
-        assert about(server.file(last, "data.js").parent)["found"] == 12 and server.newest() == last
+        assert told(last)["found"] == 12 and server.newest() == last
