@@ -247,7 +247,8 @@ def test_a_study_at_work_is_written_anew_when_its_page_is_loaded_again(tmp_path)
     with served(study_source(tmp_path / "out")) as server:
 
         def told(version):
-            assert (file := server.file(version, "data.js")) is not None
+            file = server.file(version, "data.js")
+            assert file is not None
             return about(file.parent)
 
         versions = server.newest(), server.newest()
