@@ -310,14 +310,15 @@ def explore(
         typer.Option("--browser/--no-browser", help="open the page [default: on a terminal]", show_default=False),
     ] = None,
 ) -> Outcome:
-    """Explore a sweep's maps by mouse in the browser, simulate single runs; --static: a page that needs no Python."""
+    """Explore a sweep, an identification or a diagnosis in the browser; --static: a page that needs no Python."""
     if static is not None and (port or browser is not None):
         raise InputError("--static: writes a page and serves none; --port and --browser do not go with it")
     workers.start_jax()
     from jaxbl.report.explorer.folder import write_static
+    from jaxbl.report.explorer.log import is_log_folder, log_source
     from jaxbl.report.explorer.study import study_source
 
-    source = study_source(folder)
+    source = log_source(folder) if is_log_folder(folder) else study_source(folder)
     if static is not None:
         with working(context, "writing the page"):
             page = write_static(source, static)

@@ -139,11 +139,13 @@ const logTicks = (low, high, count) => {
  * Lines over axes in a canvas: values under the pointer and by arrow keys, drag to enlarge, double click or 0 for the whole.
  *
  * `x` and `y` are { label, unit, names, log, limits }: names stand for the numbers 0, 1, ...; limits leave out what lies beyond.
+ * Cells, behind the lines, are { x, y, size, values, colours, limit, label, unit }: ends along both axes, numbers of cells, values in
+ * rows of y, and the value of the last colour (less it, of the first). `cursor`, [x, y] or null, is marked by a ring.
  * A line is { name, x, y, colour, alpha, dash, width, dots, sorted, marks }; `named` says the lines' names above.
  */
 class Plot {
   constructor(element, { x, y, height = 240, caption = "", zoomed = null, named = false }) {
-    Object.assign(this, { element, x, y, height, lines: [], range: null, bands: [], zoomed, named });
+    Object.assign(this, { element, x, y, height, lines: [], range: null, bands: [], zoomed, named, cells: null, cursor: null });
     this.canvas = made("canvas");
     this.canvas.setAttribute("role", "img");
     this.values = made("div", { className: "values", hidden: true });
@@ -154,12 +156,12 @@ class Plot {
     element.replaceChildren(this.key, this.view, made("figcaption", { textContent: caption }));
     this.listen();
   }
-  get box() { return { left: 82, top: 10, width: Math.max(this.width - 96, 10), height: this.height - 58 }; }
+  get box() { return { left: 82, top: 10, width: Math.max(this.width - (this.cells ? 166 : 96), 10), height: this.height - 58 }; }
   /** Lines, and { from, to, name } along x that are shaded. */
   set(lines, bands = []) {
     this.lines = lines.filter((one) => one.x.length);
     this.bands = bands;
-    this.key.replaceChildren(...(this.named ? [legend([...this.lines.map((one) => [one.name, one.colour ?? "currentColor", one.dash?.length]), ...bands.slice(0, 1).map((one) => [one.name, "#009E73"])])] : []));
+    this.key.replaceChildren(...(this.named ? [legend([...this.lines.map((one) => [one.name, one.colour ?? "currentColor", one.dash?.length]), ...bands.slice(0, 1).map((one) => [one.name, "#8a8d93"])])] : []));
     this.draw();
   }
   /** Ends of both axes of what is shown. */
@@ -197,20 +199,61 @@ class Plot {
     context.setTransform(density, 0, 0, density, 0, 0);
     context.fillStyle = style.backgroundColor;
     context.fillRect(0, 0, this.width, this.height);
+    if (this.cells) this.image(context, style, x, y);
     this.axes(context, style);
     context.save();
     context.beginPath();
     context.rect(box.left, box.top, box.width, box.height);
     context.clip();
     for (const { from, to } of this.bands) {
-      context.fillStyle = "#009E7333";
+      context.fillStyle = "#8a8d9340";
       context.fillRect(x.place(from), box.top, x.place(to) - x.place(from), box.height);
     }
     for (const line of this.lines) this.line(context, line, x, y, style.color);
+    if (this.cursor) {
+      for (const [colour, width] of [["#ffffff", 5], ["#000000", 2]]) {
+        context.strokeStyle = colour;
+        context.lineWidth = width;
+        context.beginPath();
+        context.arc(x.place(this.cursor[0]), y.place(this.cursor[1]), 6, 0, 2 * Math.PI);
+        context.stroke();
+      }
+    }
     context.restore();
     const told = this.lines.map((one) => one.name).filter(Boolean).join(", ");
-    canvas.setAttribute("aria-label", `${withUnit(this.y.label, this.y.unit)} over ${withUnit(this.x.label, this.x.unit)}, from ${text(y.ends[0])} to ${text(y.ends[1])}: ${told}`);
+    canvas.setAttribute("aria-label", `${withUnit(this.y.label, this.y.unit)} over ${withUnit(this.x.label, this.x.unit)}, from ${text(y.ends[0])} to ${text(y.ends[1])}: ${this.cells ? this.spoken : told}`);
     this.view.setAttribute("aria-label", `${this.y.label} over ${this.x.label}: arrow keys read values, 0 shows the whole`);
+  }
+  image(context, style, x, y) {
+    const { size, values, colours, limit, label, unit } = this.cells, image = new ImageData(size[0], size[1]);
+    for (let j = 0; j < size[1]; j++) {
+      for (let i = 0; i < size[0]; i++) {
+        const value = values[j * size[0] + i], share = 0.5 + (0.5 * value) / limit;
+        if (Number.isFinite(value)) image.data.set([...colours[Math.round(255 * Math.min(1, Math.max(0, share)))], 255], 4 * ((size[1] - 1 - j) * size[0] + i));
+      }
+    }
+    const sheet = Object.assign(document.createElement("canvas"), { width: size[0], height: size[1] });
+    sheet.getContext("2d").putImageData(image, 0, 0);
+    context.imageSmoothingEnabled = false;
+    const { box } = this, [left, right] = this.cells.x.map(x.place), [bottom, top] = this.cells.y.map(y.place);
+    context.save();
+    context.beginPath();
+    context.rect(box.left, box.top, box.width, box.height);
+    context.clip();
+    context.drawImage(sheet, left, top, right - left, bottom - top);
+    context.restore();
+    const at = box.left + box.width + 14;
+    for (let k = 0; k < box.height; k++) {
+      context.fillStyle = `rgb(${colours[Math.round(255 * (1 - k / box.height))].join(",")})`;
+      context.fillRect(at, box.top + k, 12, 1.5);
+    }
+    context.fillStyle = style.color;
+    context.font = "13px system-ui, sans-serif";
+    context.textAlign = "left";
+    context.textBaseline = "middle";
+    for (const [share, value] of [[0, limit], [0.5, 0], [1, -limit]]) context.fillText(text(value), at + 16, box.top + 6 + share * (box.height - 12));
+    context.fillText(unit, at + 16, box.top + 0.25 * box.height);
+    this.spoken = `colours: ${withUnit(label, unit)}, from ${text(-limit)} to ${text(limit)}`;
   }
   line(context, line, x, y, colour) {
     context.strokeStyle = context.fillStyle = line.colour ?? colour;
@@ -295,6 +338,7 @@ class Plot {
   /** The sample nearest to a place in pixels: the line, its index; none is farther than 40 pixels. */
   nearest([px, py]) {
     const [x, y] = this.scaled;
+    if (this.cells) return this.cell([x.value(px), y.value(py)]);
     let best = null, least = 40 * 40;
     for (const line of this.lines) {
       let first = 0, last = line.x.length;
@@ -306,13 +350,22 @@ class Plot {
     }
     return best;
   }
+  /** The cell at a point: its middle and its value; null where there is none. */
+  cell(point) {
+    const { size, values } = this.cells, ends = [this.cells.x, this.cells.y];
+    const at = point.map((one, i) => Math.floor((size[i] * (one - ends[i][0])) / (ends[i][1] - ends[i][0])));
+    if (at.some((one, i) => !(one >= 0 && one < size[i]))) return null;
+    const value = values[at[1] * size[0] + at[0]];
+    return Number.isFinite(value) ? { value, cell: at.map((one, i) => ends[i][0] + ((one + 0.5) * (ends[i][1] - ends[i][0])) / size[i]) } : null;
+  }
   show(found) {
+    const [x, y] = this.scaled ?? [];
     this.values.hidden = !found;
     if (!found) return;
-    const { line, i } = found, [x, y] = this.scaled;
-    const say = (axis, value) => `${axis.label}: ${axis.names ? axis.names[Math.round(value)] : text(value)} ${axis.unit ?? ""}`.trim();
-    this.values.textContent = [line.name, say(this.x, line.x[i]), say(this.y, line.y[i])].filter(Boolean).join("\n");
-    const at = [x.place(line.x[i]), y.place(line.y[i])], right = at[0] + 14 + this.values.offsetWidth > this.width;
+    const { line, i, cell } = found, say = (axis, value) => `${axis.label}: ${axis.names ? axis.names[Math.round(value)] : text(value)} ${axis.unit ?? ""}`.trim();
+    const place = cell ?? [line.x[i], line.y[i]], name = cell ? say(this.cells, found.value) : line.name;
+    this.values.textContent = [name, say(this.x, place[0]), say(this.y, place[1])].filter(Boolean).join("\n");
+    const at = [x.place(place[0]), y.place(place[1])], right = at[0] + 14 + this.values.offsetWidth > this.width;
     this.values.style.left = `${Math.max(0, right ? at[0] - 14 - this.values.offsetWidth : at[0] + 14)}px`;
     this.values.style.top = `${Math.max(0, Math.min(at[1] + 14, this.height - this.values.offsetHeight))}px`;
   }
@@ -331,7 +384,7 @@ class Plot {
     let from = null, chosen = null;
     view.addEventListener("pointerdown", (event) => { from = at(event); view.setPointerCapture(event.pointerId); });
     view.addEventListener("pointermove", (event) => {
-      if (!this.lines.length) return;
+      if (!this.scaled) return;
       if (!from) return this.show(this.nearest(at(event)));
       this.draw();
       const context = this.canvas.getContext("2d"), to = at(event);
@@ -341,7 +394,7 @@ class Plot {
     view.addEventListener("pointerup", (event) => {
       const start = from, to = at(event);
       from = null;
-      if (!start || Math.abs(to[0] - start[0]) < 8) return this.lines.length && this.draw();
+      if (!start || Math.abs(to[0] - start[0]) < 8) return this.draw();
       const range = this.scaled.map(({ value }, i) => [value(start[i]), value(to[i])].sort((a, b) => a - b));
       // a drag along x alone keeps the other axis
       this.zoom([range[0], Math.abs(to[1] - start[1]) < 8 ? null : range[1]]);
