@@ -152,7 +152,7 @@ globalThis.jaxblData = async (about) => {
       made("tbody", {}, ...view.shown.map((column) => made("tr", {}, made("th", { textContent: label(column), scope: "row" }),
         ...parts.map(([, which]) => made("td", { className: "number", textContent: text(rms(data[column], which)) }))))),
     );
-    $("state").textContent = view.part ? `From ${text(view.part[0])} to ${text(view.part[1])} s.` : "";
+    $("state").textContent = view.part ? `From ${textBetween(view.part[0], view.part)} to ${textBetween(view.part[1], view.part)} s.` : "";
   };
 
   /** Marks a sample in all plots, and says what is known of it. */
@@ -165,7 +165,7 @@ globalThis.jaxblData = async (about) => {
     }
     $("moment").value = String(Math.round((1000 * (i - from)) / Math.max(to - 1 - from, 1)));
     const say = (name, value, unit) => `${name} ${text(value)} ${unit}`.trim();
-    $("now").textContent = [say("t", time[i], "s"), ...about.coordinates.filter((one) => one.column !== "t").map((one) => say(one.label, data[one.column][i], one.unit)),
+    $("now").textContent = [`t ${textBetween(time[i], [time[0], time[time.length - 1]])} s`, ...about.coordinates.filter((one) => one.column !== "t").map((one) => say(one.label, data[one.column][i], one.unit)),
       ...view.shown.map((column) => say(view.group.lines.find((one) => one.column === column).label, data[column][i], view.group.unit))].join(", ");
   };
   const stop = () => {

@@ -13,6 +13,9 @@ const text = (value) => {
   const size = Math.abs(value);
   return size !== 0 && (size < 1e-3 || size >= 1e5) ? value.toExponential(3).replace(/\.?0+e/, "e") : String(Number(value.toPrecision(4)));
 };
+/** The same with as many digits as tell values between these ends apart. */
+const textBetween = (value, [low, high]) =>
+  Number.isFinite(value) && high - low < 0.05 * Math.abs(value) ? String(Number(value.toPrecision(9))) : text(value);
 const unpacked = (bytes) => new Float32Array(Uint8Array.from(atob(bytes), (one) => one.charCodeAt(0)).buffer);
 const withUnit = (name, unit) => (unit ? `${name} (${unit})` : name);
 const save = (name, url) => made("a", { href: url, download: name }).click();
@@ -312,7 +315,7 @@ class Plot {
         for (let k = low; k <= high; k += every) at.push(k);
       }
       for (const value of at) {
-        const along = place(value), name = axis.names ? axis.names[value] : text(value);
+        const along = place(value), name = axis.names ? axis.names[value] : textBetween(value, ends);
         context.strokeStyle = style.color;
         context.globalAlpha = 0.15;
         context.lineWidth = 1;
@@ -362,9 +365,9 @@ class Plot {
     const [x, y] = this.scaled ?? [];
     this.values.hidden = !found;
     if (!found) return;
-    const { line, i, cell } = found, say = (axis, value) => `${axis.label}: ${axis.names ? axis.names[Math.round(value)] : text(value)} ${axis.unit ?? ""}`.trim();
-    const place = cell ?? [line.x[i], line.y[i]], name = cell ? say(this.cells, found.value) : line.name;
-    this.values.textContent = [name, say(this.x, place[0]), say(this.y, place[1])].filter(Boolean).join("\n");
+    const { line, i, cell } = found, say = (axis, value, ends) => `${axis.label}: ${axis.names ? axis.names[Math.round(value)] : textBetween(value, ends)} ${axis.unit ?? ""}`.trim();
+    const place = cell ?? [line.x[i], line.y[i]], name = cell ? say(this.cells, found.value, [-Infinity, Infinity]) : line.name;
+    this.values.textContent = [name, say(this.x, place[0], x.ends), say(this.y, place[1], y.ends)].filter(Boolean).join("\n");
     const at = [x.place(place[0]), y.place(place[1])], right = at[0] + 14 + this.values.offsetWidth > this.width;
     this.values.style.left = `${Math.max(0, right ? at[0] - 14 - this.values.offsetWidth : at[0] + 14)}px`;
     this.values.style.top = `${Math.max(0, Math.min(at[1] + 14, this.height - this.values.offsetHeight))}px`;
