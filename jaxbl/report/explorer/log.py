@@ -93,15 +93,9 @@ def write_log(summary: Mapping[str, Any], trace: pd.DataFrame, model: Mapping[st
             "explore: trace.parquet has no column that the page could draw; run the command that wrote it again"
         )
     kept = {one["column"] for one in (*coordinates, *(line for group in groups for line in group["lines"]))} | {"held_out"}
-    frame = frame[[name for name in frame if name in kept]].astype(
-        {name: np.float32 for name in frame if name in kept - {"t"}}
-    )
-    pq.write_table(
-        pa.Table.from_pandas(frame, preserve_index=False),
-        out / "points.parquet",
-        row_group_size=_GROUP,
-        use_dictionary=False,
-    )
+    # float32 would round times; what is not there stays nan, which a page reads as a number
+    shown = {str(name): np.asarray(frame[name], np.float64 if name == "t" else np.float32) for name in frame if name in kept}
+    pq.write_table(pa.table(shown), out / "points.parquet", row_group_size=_GROUP, use_dictionary=False)
     return {
         "rows": len(frame),
         "period": summary["sample_period"],
