@@ -16,6 +16,8 @@ import numpy as np
 from jaxbl.errors import InputError
 from jaxbl.files import is_empty, json_text, make_folder, writing
 
+ROW_GROUP = 1 << 17
+"""Rows of a row group of the Parquet file."""
 _SCRIPT = 4 << 20
 """Bytes of the Parquet file in a script."""
 _MARKER = "jaxbl-explorer.json"

@@ -19,10 +19,8 @@ from jaxbl.report.element import element_lines
 from jaxbl.report.identify import identification_lines
 from jaxbl.report.residuals import missing_quantity
 
-from .folder import Source, write_page
+from .folder import ROW_GROUP, Source, write_page
 
-_GROUP = 1 << 17
-"""Rows of a row group."""
 _POSITIONS = {"motor": "theta_e", "load": "theta_s"}
 _LABELS = {"t": "time", "u": "input u", "theta_e": "motor position θe", "theta_s": "load position θs", "twist": "twist z",
            "displacement": "displacement"}  # fmt: skip
@@ -95,7 +93,7 @@ def write_log(summary: Mapping[str, Any], trace: pd.DataFrame, model: Mapping[st
     kept = {one["column"] for one in (*coordinates, *(line for group in groups for line in group["lines"]))} | {"held_out"}
     # float32 would round times; what is not there stays nan, which a page reads as a number
     shown = {str(name): np.asarray(frame[name], np.float64 if name == "t" else np.float32) for name in frame if name in kept}
-    pq.write_table(pa.table(shown), out / "points.parquet", row_group_size=_GROUP, use_dictionary=False)
+    pq.write_table(pa.table(shown), out / "points.parquet", row_group_size=ROW_GROUP, use_dictionary=False)
     return {
         "rows": len(frame),
         "period": summary["sample_period"],
@@ -181,7 +179,7 @@ def _groups(summary: Mapping[str, Any], frame: pd.DataFrame, units: Mapping[str,
             _, without, name = str(column).partition(f"{side}.missing_without.")
             _, other, rival = str(column).partition(f"{side}.missing_with.")
             if without:
-                lines[str(column)] = f"with the missing effects but {name}"
+                lines[str(column)] = f"with the missing effects, without {name}"
             elif other:
                 lines[str(column)] = f"with {rival} in place of {last}"
         lines[f"{side}.observed_before"] = "model as given, by the observer"

@@ -53,7 +53,7 @@ def test_columns_and_what_is_said_of_them(tmp_path):
     assert {one["column"]: one["label"] for one in group["lines"]} == {
         "motor.missing_before": "model as given",
         "motor.missing_after": "with the missing effects",
-        f"motor.missing_without.{HOSTILE}": f"with the missing effects but {HOSTILE}",
+        f"motor.missing_without.{HOSTILE}": f"with the missing effects, without {HOSTILE}",
         "motor.missing_with.motor.stiction": f"with motor.stiction in place of {HOSTILE}",
     }
 
@@ -128,7 +128,7 @@ def test_lines_coordinates_and_moments(tmp_path):
         # with one effect less: another line, another map
         page.locator("#lines input").nth(2).check()
         page.wait_for_selector("#over2 figure:nth-child(3)")
-        assert sizes()[f"with the missing effects but {HOSTILE}"][0] == pytest.approx(
+        assert sizes()[f"with the missing effects, without {HOSTILE}"][0] == pytest.approx(
             np.sqrt(np.mean((RIPPLE[100:3000] + 0.02) ** 2)), rel=1e-3
         )
         # the mean in a cell of position and speed is the ripple at that position

@@ -17,7 +17,7 @@ from jaxbl.config import read_config
 from jaxbl.errors import InputError
 from jaxbl.report.explorer.folder import Source, write_static
 from jaxbl.report.explorer.server import served
-from jaxbl.report.explorer.study import check_grid, study_source, write_study
+from jaxbl.report.explorer.study import study_source, write_study
 from jaxbl.sweeps.sweep import open_study, share, sweep
 from jaxbl.sweeps.trial import run
 
@@ -81,10 +81,7 @@ def test_zipped_axes_are_one(tmp_path):
     np.testing.assert_allclose(table["motor.velocity_rmse"], result.frame["motor.velocity_rmse"], rtol=1e-6)
 
 
-def test_what_cannot_be_drawn_and_folders_of_others_are_refused(tmp_path):
-    line = made(rigid(axes=[spaced(ALPHA, 2.0, 50.0, 6)]), motor__velocity_rmse=lambda frame: frame[ALPHA])
-    with pytest.raises(InputError, match="explore: draws maps over two axes of a grid; this study varies fewer"):
-        check_grid(line.config)
+def test_folders_of_others_are_refused(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "index.html").write_text("mine")
     with pytest.raises(InputError, match="mine: is not empty, and was not written by jaxbl explore"):
@@ -185,10 +182,10 @@ def swept(tmp_path_factory):
 
 
 def test_a_run_simulated_anew_is_that_of_its_config(swept):
-    found = study_source(swept).answers["run"]({"at": [1, 2, 0, 0]})
+    found = study_source(swept).answers["run"]({"values": {NOISE: 1e-4, ALPHA: 50.0, LAMBDA: 1.0}, "seed": 0})
     trial = run(tomllib.loads(found["config"]))
     assert trial.config.encoders.noise == 1e-4 and trial.config.observer.motor.alpha == pytest.approx(50.0)
-    assert set(found["metrics"]) == set(trial.summary["metrics"]) and found["seed"] == 0
+    assert set(found["metrics"]) == set(trial.summary["metrics"])
     for name, value in trial.summary["metrics"].items():
         assert found["metrics"][name] == (value if value is None else pytest.approx(value, rel=1e-9)), name
     velocity = np.frombuffer(base64.b64decode(found["columns"]["motor.velocity"]), "<f4")
@@ -199,11 +196,23 @@ def test_a_run_simulated_anew_is_that_of_its_config(swept):
     assert row["motor.velocity_rmse"].item() == pytest.approx(found["metrics"]["motor.velocity_rmse"], rel=1e-6)
 
 
+VALUES = {NOISE: 1e-4, ALPHA: 50.0, LAMBDA: 1.0}
+
+
 @pytest.mark.parametrize(
-    "asked", [{"at": [2, 0, 0, 0]}, {"at": [0, 0, 0]}, {"at": [0, 0, -1, 0]}, {"at": ["0"] * 4}, {"at": 3}, {}, 7]
+    ("asked", "why"),
+    [
+        (7, f"values: should have a value of each axis: {NOISE}, {ALPHA}, {LAMBDA}"),
+        ({"seed": 0}, "values: should have a value of each axis"),
+        ({"values": VALUES | {"run.duration": 1e9}, "seed": 0}, "values: should have a value of each axis"),
+        ({"values": VALUES | {NOISE: -1.0}, "seed": 0}, "encoders.noise"),
+        ({"values": VALUES | {ALPHA: "<b>"}, "seed": 0}, "observer.motor.alpha"),
+        ({"values": VALUES, "seed": -1}, r"seed: should be a whole number from 0 and below 2\^31"),
+        ({"values": VALUES}, "seed: should be a whole number"),
+    ],
 )
-def test_points_that_there_are_none_of_are_refused(swept, asked):
-    with pytest.raises(InputError, match=r"at: should be 4 whole numbers, each from 0 and below \[2, 3, 2, 1\]"):
+def test_points_that_the_study_may_not_have_are_refused(swept, asked, why):
+    with pytest.raises(InputError, match=why):
         study_source(swept).answers["run"](asked)
 
 
@@ -215,7 +224,7 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept, tmp_
             page.wait_for_selector("body[data-drawn^='motor.velocity_rmse ']")
             plot = page.locator("#plot")
             plot.click(position={"x": 200, "y": 100})
-            page.wait_for_selector("body[data-simulated^='0,2,0,0 ']")
+            page.wait_for_selector("body[data-simulated*='motor.alpha 50, motor.lambda 1, seed 0, ']")
             told = page.locator("#told").inner_text()
             assert told.endswith("as stored in the sweep.")
             with page.expect_download() as download:
@@ -225,7 +234,7 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept, tmp_
             assert float(told.split(": ")[-1].split(",")[0]) == pytest.approx(error, rel=1e-3)
             page.click("#pinned button")
             plot.click(position={"x": 700, "y": 500})
-            page.wait_for_selector("body[data-simulated^='0,0,1,0 ']")
+            page.wait_for_selector("body[data-simulated*='motor.alpha 5, motor.lambda 20, seed 0, ']")
             assert page.locator("#pinned li").count() == 2
             figures = page.locator("#traces figure")
             assert figures.count() == 5 and "error of the observer in the phase plane" in figures.last.inner_text()

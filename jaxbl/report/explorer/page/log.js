@@ -50,10 +50,8 @@ const means = (values, over, limits, size, from, to, least) => {
 
 globalThis.jaxblData = async (about) => {
   const columns = new Columns(about, 64, (name, share) => { $("state").textContent = `reading ${name}: ${Math.floor(100 * share)} %`; });
-  document.title = $("title").textContent = about.title;
-  $("lead").replaceChildren(...about.lead.map((line) => made("p", { textContent: line })));
-  $("config").textContent = about.config;
-  const colours = about.colours.map((one) => [1, 3, 5].map((i) => parseInt(one.slice(i, i + 2), 16)));
+  head(about);
+  const colours = coloursOf(about);
   const named = Object.fromEntries(about.coordinates.map((one) => [one.column, one]));
   const view = { group: about.groups[0], x: about.over[0], y: about.over[1] ?? about.over[0], part: null, at: 0 };
   const begin = (group) => Object.assign(view, { group, shown: group.lines.slice(0, 2).map((one) => one.column), cutoff: group.bandwidth });
@@ -131,7 +129,8 @@ globalThis.jaxblData = async (about) => {
       const figure = made("figure");
       $("over2").append(figure);
       const plot = new Plot(figure, { x: { ...axis(view.x), limits: limits[0] }, y: { ...axis(view.y), limits: limits[1] }, height: 300, caption: `${group.name}, ${label(shown[k])}: mean in each cell; empty cells have fewer than 3 samples` });
-      plot.cells = { x: limits[0], y: limits[1], size: CELLS, values, colours, limit, label: group.quantity, unit: group.unit };
+      plot.cells = { x: limits[0], y: limits[1], size: CELLS, values };
+      plot.scale = new Scale({ colours, low: -limit, high: limit, log: false, label: group.quantity, unit: group.unit });
       plot.set([]);
       plots.push([plot, (_, i) => [xs[i], ys[i]], shown[k]]);
     });

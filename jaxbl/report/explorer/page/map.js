@@ -11,10 +11,13 @@ class Study {
       i, size: axis.paths[0].values.length, paths: axis.paths, name: axis.paths.map((one) => one.path).join(", "),
       unit: axis.paths[0].unit, values: axis.paths[0].values, seed: axis.paths[0].path === "seed",
     }));
+    this.colours = coloursOf(about);
     let stride = 1;
     for (const dim of [...this.dims].reverse()) { dim.stride = stride; stride *= dim.size; }
     this.varied = this.dims.filter((dim) => dim.size > 1);
   }
+  /** Paths of what varies, but for the seed. */
+  get named() { return this.varied.filter((dim) => !dim.seed).flatMap((dim) => dim.paths.map((one) => one.path)); }
   metric(name) { return this.metrics.find((one) => one.name === name); }
   column(name) { return this.columns.get(name); }
 }
@@ -148,43 +151,32 @@ class Picture {
   }
   /** Colours of values, one scale for all panels. */
   scale() {
-    let low = Infinity, high = -Infinity;
-    for (const { shown } of this.panels) {
-      for (const one of shown.values) {
-        if (!Number.isFinite(one) || (this.view.log && !(one > 0))) continue;
-        low = Math.min(low, one);
-        high = Math.max(high, one);
-      }
-    }
-    if (this.study.metric(this.view.metric).yes) [low, high] = [0, 1];
-    if (low > high) [low, high] = [0, 1];
-    if (low === high) [low, high] = [low - 0.5 * Math.abs(low) - 1e-12, high + 0.5 * Math.abs(high) + 1e-12];
-    this.log = this.view.log && low > 0 && high / low > 30;
-    const map = this.log ? Math.log : (one) => one;
-    return { low, high, share: (one) => (map(one) - map(low)) / (map(high) - map(low)), value: (share) => (this.log ? low * (high / low) ** share : low + share * (high - low)) };
+    const { log, metric } = this.view, { label, yes } = this.study.metric(metric);
+    let values = this.panels.flatMap(({ shown }) => [...shown.values]);
+    // a scale of logarithms has no place for zeros
+    const positive = log && !yes ? values.filter((one) => one > 0) : [];
+    if (positive.length) values = positive;
+    return Scale.of(values, { colours: this.study.colours, label, ...(yes ? { low: 0, high: 1 } : {}), ...(log && !yes ? {} : { log: false }) });
   }
   draw() {
     const context = this.canvas.getContext("2d"), style = getComputedStyle(document.body);
     context.fillStyle = style.backgroundColor;
     context.fillRect(0, 0, this.width, this.height);
-    const scale = (this.scaled = this.scale());
-    const colours = this.study.colours.map((one) => [1, 3, 5].map((i) => parseInt(one.slice(i, i + 2), 16)));
+    const scale = (this.scaled = this.scale()), { top, height } = this.panels[0].box;
     for (const panel of this.panels) {
-      this.cells(context, panel, scale, colours);
+      this.cells(context, panel, scale);
       this.axes(context, panel, style.color);
     }
-    this.bar(context, colours, style.color);
+    scale.draw(context, style.color, this.width - BAR + 10, top, height);
     const over = `${this.view.x.name} and ${this.view.y.name}${this.view.facet ? `, for values of ${this.view.facet.name}` : ""}`;
     this.canvas.setAttribute("aria-label", `${this.label()} over ${over}, from ${text(scale.low)} to ${text(scale.high)}`);
     this.mark();
   }
-  cells(context, { box, shown: { cells, values, step } }, scale, colours) {
+  cells(context, { box, shown: { cells, values, step } }, scale) {
     const image = new ImageData(cells[0], cells[1]);
     for (let j = 0; j < cells[1]; j++) {
       for (let i = 0; i < cells[0]; i++) {
-        const value = values[j * cells[0] + i], at = 4 * ((cells[1] - 1 - j) * cells[0] + i);
-        const share = Number.isFinite(value) ? Math.min(1, Math.max(0, scale.share(value))) : NaN;
-        image.data.set([...(share === share ? colours[Math.round(255 * share)] : [189, 189, 189]), 255], at);
+        image.data.set([...scale.colour(values[j * cells[0] + i]), 255], 4 * ((cells[1] - 1 - j) * cells[0] + i));
       }
     }
     const sheet = Object.assign(document.createElement("canvas"), { width: cells[0], height: cells[1] });
@@ -258,17 +250,6 @@ class Picture {
     context.textBaseline = "alphabetic";
     context.fillText(title, box.left, box.top - 8, box.width);
   }
-  bar(context, colours, colour) {
-    const { top, height } = this.panels[0].box, left = this.width - BAR + 10;
-    for (let k = 0; k < height; k++) {
-      context.fillStyle = `rgb(${colours[Math.round(255 * (1 - k / height))].join(",")})`;
-      context.fillRect(left, top + k, 14, 1.5);
-    }
-    context.fillStyle = colour;
-    context.textAlign = "left";
-    context.textBaseline = "middle";
-    for (let k = 0; k <= 4; k++) context.fillText(text(this.scaled.value(k / 4)), left + 18, top + height * (1 - k / 4));
-  }
   /** What lies at a place in pixels: the panel's number, and the cell's indices along both axes; null outside. */
   at([px, py]) {
     for (const [panel, { box }] of this.panels.entries()) {
@@ -318,10 +299,13 @@ class Picture {
       context.stroke();
     }
   }
-  /** Index of the chosen cell along each dimension: of what is taken together, the first. */
-  indices() {
-    const { x, y, at } = this.viewed(this.panels[this.cursor.panel].index);
-    return this.study.dims.map((dim) => (dim === x ? this.cursor.cell[0] : dim === y ? this.cursor.cell[1] : at[dim.i] === "all" ? 0 : at[dim.i]));
+  /** The point of the chosen cell: values by path, the seed, and what is stored of the metric; of what is taken together, the first. */
+  point() {
+    const { x, y, at } = this.viewed(this.panels[this.cursor.panel].index), values = {};
+    const indices = this.study.dims.map((dim) => (dim === x ? this.cursor.cell[0] : dim === y ? this.cursor.cell[1] : at[dim.i] === "all" ? 0 : at[dim.i]));
+    for (const dim of this.study.dims) for (const one of dim.paths) values[one.path] = one.values[indices[dim.i]];
+    const { seed, ...others } = values, row = this.study.dims.reduce((sum, dim) => sum + indices[dim.i] * dim.stride, 0);
+    return { values: others, seed, stored: { metric: this.study.metric(this.view.metric), value: this.column[row] } };
   }
 }
 
@@ -332,45 +316,19 @@ const cut = (element, picture, i) => {
   along.from[i] = 0;
   along.to[i] = dim.size;
   const { values } = mapped(study, picture.column, along), finite = values.filter(Number.isFinite);
-  const log = picture.log && Math.max(...finite) > 10 * Math.min(...finite);
+  const log = picture.scaled.log && Math.max(...finite) > 10 * Math.min(...finite);
   const plot = new Plot(element, { x: { label: dim.name, unit: dim.unit, names: dim.values.map(text) }, y: { label: picture.label(), log }, height: 270 });
   plot.set([{ name: "", x: values.map((_, k) => k), y: values, colour: COLOURS[1], width: 2, marks: [cell[i]], sorted: true }]);
   return plot;
-};
-
-const exact = (value) => (typeof value === "string" ? JSON.stringify(value) : Number.isInteger(value) ? value.toFixed(1) : String(value));
-
-/** The chosen point as a study that includes this one. */
-const pointText = (study, indices) => {
-  const lines = ['include = "study.toml"', "axes = []", "figures = []"];
-  for (const dim of study.dims) {
-    if (!dim.seed) lines.push(...dim.paths.map((one) => `${one.path} = ${exact(one.values[indices[dim.i]])}`));
-  }
-  return `${lines.join("\n")}\n`;
-};
-
-/** Gains of the chosen point, for a study to include. */
-const gainsText = (study, indices) => {
-  const found = structuredClone(study.gains);
-  for (const dim of study.dims) {
-    for (const one of dim.paths) {
-      const [table, side, name] = one.path.split(".");
-      if (table === "observer" && found[side] && name in found[side]) found[side][name] = one.values[indices[dim.i]];
-    }
-  }
-  const tables = Object.entries(found).map(([side, { lambda, alpha }]) => `[observer.${side}]\nlambda = ${exact(lambda)}\nalpha = ${exact(alpha)}\n`);
-  return `# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.\n\n${tables.join("\n")}`;
 };
 
 /* ------------------------------------------------------------------------------------------------------------ page */
 
 globalThis.jaxblData = async (about) => {
   const study = new Study(about);
-  document.title = $("title").textContent = about.title;
-  $("lead").replaceChildren(...about.lead.map((line) => made("p", { textContent: line })));
-  $("config").textContent = about.config;
+  head(about);
   const picture = new Picture(study), { view } = picture, plot = $("plot");
-  const runs = about.served ? new Runs(study, picture) : null;
+  const runs = about.served ? new Runs(study) : null;
   $("hint").textContent = `Move over the map to read values. Drag to enlarge a region. Click a cell to cut through it${runs ? " and to simulate its run" : ""}. Grey: no value, as the run diverged or is not there yet.`;
   const form = () => {
     const dims = study.varied.filter((dim) => !dim.seed), drawn = () => [view.x, view.y, view.facet];
@@ -425,7 +383,8 @@ globalThis.jaxblData = async (about) => {
     const several = study.varied.filter((dim) => ![view.x, view.y, view.facet].includes(dim) && view.at[dim.i] === "all" && !(dim.seed && !runs));
     const first = several.length ? ` It is the run of the first value of ${several.map((dim) => dim.name).join(", ")}.` : "";
     $("command").textContent = (runs ? "" : "Save the point beside study.toml, and simulate it: jaxbl simulate point.toml.") + first;
-    runs?.simulate(picture.indices());
+    const { values, seed, stored } = picture.point();
+    runs?.simulate(values, seed, stored);
   };
   plot.addEventListener("pointerdown", (event) => { if (picture.column) { picture.brush = [at(event), at(event)]; plot.setPointerCapture(event.pointerId); } });
   plot.addEventListener("pointermove", (event) => {
@@ -461,8 +420,8 @@ globalThis.jaxblData = async (about) => {
   });
   $("whole").addEventListener("click", () => { picture.whole(); picture.update(); });
   $("picture").addEventListener("click", () => save("map.png", picture.canvas.toDataURL("image/png")));
-  $("point").addEventListener("click", () => saveText("point.toml", runs ? runs.config() : pointText(study, picture.indices())));
-  $("gains").addEventListener("click", () => saveText("gains.toml", gainsText(study, picture.indices())));
+  $("point").addEventListener("click", () => saveText("point.toml", runs ? runs.config() : pointText(picture.point().values)));
+  $("gains").addEventListener("click", () => saveText("gains.toml", gainsText(study.gains, picture.point().values)));
   addEventListener("resize", () => { picture.update(); for (const one of [...(picture.cuts ?? []), ...(runs?.plots ?? [])]) one.draw(); });
   picture.first();
   try {

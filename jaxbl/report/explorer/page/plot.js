@@ -26,6 +26,14 @@ const choose = (label, id, options, chosen, act) => {
   return made("label", {}, label, select);
 };
 
+/** Title, what was found, and the config. */
+const head = ({ title, lead, config }) => {
+  const lines = lead.map((line) => made("p", { textContent: line })), more = lines.splice(3);
+  document.title = $("title").textContent = title;
+  $("lead").replaceChildren(...lines, ...(more.length ? [made("details", {}, made("summary", { textContent: "more of what was found" }), ...more)] : []));
+  $("config").textContent = config;
+};
+
 /* ------------------------------------------------------------------------------------------------------------- data */
 
 const waiting = new Map();
@@ -138,17 +146,46 @@ const logTicks = (low, high, count) => {
   return out;
 };
 
+/** Colours of values from low to high: { colours, low, high, log, label, unit }, colours as [red, green, blue]. */
+class Scale {
+  constructor(of) { Object.assign(this, of); }
+  /** Of finite values; logarithmic where they are positive and span more than a factor of 30. */
+  static of(values, about) {
+    let [low, high] = [Infinity, -Infinity];
+    for (const one of values) if (Number.isFinite(one)) { low = Math.min(low, one); high = Math.max(high, one); }
+    if (low > high) [low, high] = [0, 1];
+    if (low === high) [low, high] = [low - 0.5 * Math.abs(low) - 1e-12, high + 0.5 * Math.abs(high) + 1e-12];
+    return new Scale({ low, high, log: low > 0 && high / low > 30, ...about });
+  }
+  share(value) { return this.log ? Math.log(value / this.low) / Math.log(this.high / this.low) : (value - this.low) / (this.high - this.low); }
+  value(share) { return this.log ? this.low * (this.high / this.low) ** share : this.low + share * (this.high - this.low); }
+  colour(value) { return Number.isFinite(value) ? this.colours[Math.round(255 * Math.min(1, Math.max(0, this.share(value))))] : MISSING; }
+  /** A bar with values beside it. */
+  draw(context, colour, left, top, height) {
+    for (let k = 0; k < height; k++) {
+      context.fillStyle = `rgb(${this.colours[Math.round(255 * (1 - k / height))].join(",")})`;
+      context.fillRect(left, top + k, 14, 1.5);
+    }
+    Object.assign(context, { fillStyle: colour, font: "13px system-ui, sans-serif", textAlign: "left", textBaseline: "middle" });
+    for (let k = 0; k <= 4; k++) context.fillText(text(this.value(k / 4)), left + 18, top + height * (1 - k / 4));
+  }
+}
+const coloursOf = (about) => about.colours.map((one) => [1, 3, 5].map((i) => parseInt(one.slice(i, i + 2), 16)));
+/** The colour of no value. */
+const MISSING = [189, 189, 189];
+
 /**
  * Lines over axes in a canvas: values under the pointer and by arrow keys, drag to enlarge, double click or 0 for the whole.
  *
  * `x` and `y` are { label, unit, names, log, limits }: names stand for the numbers 0, 1, ...; limits leave out what lies beyond.
- * Cells, behind the lines, are { x, y, size, values, colours, limit, label, unit }: ends along both axes, numbers of cells, values in
- * rows of y, and the value of the last colour (less it, of the first). `cursor`, [x, y] or null, is marked by a ring.
- * A line is { name, x, y, colour, alpha, dash, width, dots, sorted, marks }; `named` says the lines' names above.
+ * Cells, behind the lines, are { x, y, size, values }: ends along both axes, numbers of cells, values in rows of y. `scale` gives their
+ * colours, and those of dots with `shade`, a value each. `cursor`, [x, y] or null, is marked by a ring.
+ * `picked` hears which sample is clicked.
+ * A line is { name, x, y, colour, alpha, dash, width, dots, sorted, marks, said }; `named` says the lines' names above.
  */
 class Plot {
-  constructor(element, { x, y, height = 240, caption = "", zoomed = null, named = false }) {
-    Object.assign(this, { element, x, y, height, lines: [], range: null, bands: [], zoomed, named, cells: null, cursor: null });
+  constructor(element, { x, y, height = 240, caption = "", zoomed = null, picked = null, named = false }) {
+    Object.assign(this, { element, x, y, height, lines: [], range: null, bands: [], zoomed, picked, named, cells: null, scale: null, cursor: null });
     this.canvas = made("canvas");
     this.canvas.setAttribute("role", "img");
     this.values = made("div", { className: "values", hidden: true });
@@ -159,7 +196,7 @@ class Plot {
     element.replaceChildren(this.key, this.view, made("figcaption", { textContent: caption }));
     this.listen();
   }
-  get box() { return { left: 82, top: 10, width: Math.max(this.width - (this.cells ? 166 : 96), 10), height: this.height - 58 }; }
+  get box() { return { left: 82, top: 10, width: Math.max(this.width - (this.scale ? 176 : 96), 10), height: this.height - 58 }; }
   /** Lines, and { from, to, name } along x that are shaded. */
   set(lines, bands = []) {
     this.lines = lines.filter((one) => one.x.length);
@@ -202,7 +239,8 @@ class Plot {
     context.setTransform(density, 0, 0, density, 0, 0);
     context.fillStyle = style.backgroundColor;
     context.fillRect(0, 0, this.width, this.height);
-    if (this.cells) this.image(context, style, x, y);
+    if (this.cells) this.image(context, x, y);
+    this.scale?.draw(context, style.color, box.left + box.width + 14, box.top, box.height);
     this.axes(context, style);
     context.save();
     context.beginPath();
@@ -223,16 +261,17 @@ class Plot {
       }
     }
     context.restore();
-    const told = this.lines.map((one) => one.name).filter(Boolean).join(", ");
-    canvas.setAttribute("aria-label", `${withUnit(this.y.label, this.y.unit)} over ${withUnit(this.x.label, this.x.unit)}, from ${text(y.ends[0])} to ${text(y.ends[1])}: ${this.cells ? this.spoken : told}`);
+    const { scale } = this, names = this.lines.map((one) => one.name).filter(Boolean).join(", ");
+    const told = scale ? `colours: ${withUnit(scale.label, scale.unit)}, from ${text(scale.low)} to ${text(scale.high)}` : names;
+    canvas.setAttribute("aria-label", `${withUnit(this.y.label, this.y.unit)} over ${withUnit(this.x.label, this.x.unit)}, from ${text(y.ends[0])} to ${text(y.ends[1])}: ${told}`);
     this.view.setAttribute("aria-label", `${this.y.label} over ${this.x.label}: arrow keys read values, 0 shows the whole`);
   }
-  image(context, style, x, y) {
-    const { size, values, colours, limit, label, unit } = this.cells, image = new ImageData(size[0], size[1]);
+  image(context, x, y) {
+    const { size, values } = this.cells, image = new ImageData(size[0], size[1]);
     for (let j = 0; j < size[1]; j++) {
       for (let i = 0; i < size[0]; i++) {
-        const value = values[j * size[0] + i], share = 0.5 + (0.5 * value) / limit;
-        if (Number.isFinite(value)) image.data.set([...colours[Math.round(255 * Math.min(1, Math.max(0, share)))], 255], 4 * ((size[1] - 1 - j) * size[0] + i));
+        const value = values[j * size[0] + i];
+        if (Number.isFinite(value)) image.data.set([...this.scale.colour(value), 255], 4 * ((size[1] - 1 - j) * size[0] + i));
       }
     }
     const sheet = Object.assign(document.createElement("canvas"), { width: size[0], height: size[1] });
@@ -245,18 +284,6 @@ class Plot {
     context.clip();
     context.drawImage(sheet, left, top, right - left, bottom - top);
     context.restore();
-    const at = box.left + box.width + 14;
-    for (let k = 0; k < box.height; k++) {
-      context.fillStyle = `rgb(${colours[Math.round(255 * (1 - k / box.height))].join(",")})`;
-      context.fillRect(at, box.top + k, 12, 1.5);
-    }
-    context.fillStyle = style.color;
-    context.font = "13px system-ui, sans-serif";
-    context.textAlign = "left";
-    context.textBaseline = "middle";
-    for (const [share, value] of [[0, limit], [0.5, 0], [1, -limit]]) context.fillText(text(value), at + 16, box.top + 6 + share * (box.height - 12));
-    context.fillText(unit, at + 16, box.top + 0.25 * box.height);
-    this.spoken = `colours: ${withUnit(label, unit)}, from ${text(-limit)} to ${text(limit)}`;
   }
   line(context, line, x, y, colour) {
     context.strokeStyle = context.fillStyle = line.colour ?? colour;
@@ -265,7 +292,10 @@ class Plot {
     context.setLineDash(line.dash ?? []);
     if (line.dots) {
       const size = line.dots;
-      for (let i = 0; i < line.x.length; i++) context.fillRect(x.place(line.x[i]) - size / 2, y.place(line.y[i]) - size / 2, size, size);
+      for (let i = 0; i < line.x.length; i++) {
+        if (line.shade) context.fillStyle = `rgb(${this.scale.colour(line.shade[i]).join(",")})`;
+        context.fillRect(x.place(line.x[i]) - size / 2, y.place(line.y[i]) - size / 2, size, size);
+      }
       context.globalAlpha = 1;
       return;
     }
@@ -366,8 +396,8 @@ class Plot {
     this.values.hidden = !found;
     if (!found) return;
     const { line, i, cell } = found, say = (axis, value, ends) => `${axis.label}: ${axis.names ? axis.names[Math.round(value)] : textBetween(value, ends)} ${axis.unit ?? ""}`.trim();
-    const place = cell ?? [line.x[i], line.y[i]], name = cell ? say(this.cells, found.value, [-Infinity, Infinity]) : line.name;
-    this.values.textContent = [name, say(this.x, place[0], x.ends), say(this.y, place[1], y.ends)].filter(Boolean).join("\n");
+    const place = cell ?? [line.x[i], line.y[i]], name = cell ? say(this.scale, found.value, [-Infinity, Infinity]) : line.name;
+    this.values.textContent = [name, ...(line?.said?.(i) ?? []), say(this.x, place[0], x.ends), say(this.y, place[1], y.ends)].filter(Boolean).join("\n");
     const at = [x.place(place[0]), y.place(place[1])], right = at[0] + 14 + this.values.offsetWidth > this.width;
     this.values.style.left = `${Math.max(0, right ? at[0] - 14 - this.values.offsetWidth : at[0] + 14)}px`;
     this.values.style.top = `${Math.max(0, Math.min(at[1] + 14, this.height - this.values.offsetHeight))}px`;
@@ -397,7 +427,12 @@ class Plot {
     view.addEventListener("pointerup", (event) => {
       const start = from, to = at(event);
       from = null;
-      if (!start || Math.abs(to[0] - start[0]) < 8) return this.draw();
+      if (!start || Math.abs(to[0] - start[0]) < 8) {
+        this.draw();
+        const found = start && this.nearest(to);
+        if (found) this.picked?.(found);
+        return;
+      }
       const range = this.scaled.map(({ value }, i) => [value(start[i]), value(to[i])].sort((a, b) => a - b));
       // a drag along x alone keeps the other axis
       this.zoom([range[0], Math.abs(to[1] - start[1]) < 8 ? null : range[1]]);
@@ -415,7 +450,8 @@ class Plot {
         const i = (chosen?.i ?? 0) + (chosen ? step ?? 0 : 0) * Math.max(1, Math.floor(length / 100));
         chosen = { line, i: Math.min(length - 1, Math.max(0, i)) };
         this.show({ line: this.lines[line], i: chosen.i });
-      } else return;
+      } else if (event.key === "Enter" && chosen && this.picked) this.picked({ line: this.lines[chosen.line], i: chosen.i });
+      else return;
       event.preventDefault();
     });
   }

@@ -21,12 +21,27 @@ const tracePlots = (columns) => {
   return plots;
 };
 
+const exact = (value) => (typeof value === "string" ? JSON.stringify(value) : Number.isInteger(value) ? value.toFixed(1) : String(value));
+
+/** A point, its values by path, as a study that includes this one. */
+const pointText = (values) => `${['include = "study.toml"', "axes = []", "figures = []", ...Object.entries(values).map(([path, value]) => `${path} = ${exact(value)}`)].join("\n")}\n`;
+
+/** Gains of a point, for a study to include. */
+const gainsText = (gains, values) => {
+  const tables = Object.entries(gains).map(([side, own]) => {
+    const [lambda, alpha] = ["lambda", "alpha"].map((name) => exact(values[`observer.${side}.${name}`] ?? own[name]));
+    return `[observer.${side}]\nlambda = ${lambda}\nalpha = ${alpha}\n`;
+  });
+  return `# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.\n\n${tables.join("\n")}`;
+};
+
 class Runs {
-  constructor(study, picture) {
-    Object.assign(this, { study, picture, all: [], plots: [] });
+  constructor(study) {
+    Object.assign(this, { study, all: [], plots: [] });
   }
-  /** Has the run of a point simulated; it takes the place of the newest, unless that is pinned. */
-  async simulate(indices) {
+  /** Has the run of a point simulated, `values` by path; it takes the place of the newest, unless that is pinned. `stored` is
+   * what the sweep has of a metric: { metric, value }. */
+  async simulate(values, seed, stored) {
     const asked = (this.asked = Symbol("asked"));
     $("runs").hidden = false;
     $("told").textContent = "simulating …";
@@ -34,7 +49,7 @@ class Runs {
     const began = performance.now();
     let found;
     try {
-      const answer = await fetch("run", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ at: indices }) });
+      const answer = await fetch("run", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ values, seed }) });
       found = await answer.json();
       if (!answer.ok) throw new Error(found.error);
     } catch (error) {
@@ -49,21 +64,20 @@ class Runs {
     for (const side of SIDES.filter((one) => `${one}.velocity` in columns)) {
       columns[`${side}.velocity_error`] = columns[`${side}.velocity`].map((one, i) => one - columns[`${side}.velocity_estimate`][i]);
     }
-    this.newest = { ...found, indices, columns, colour: free[0], pinned: false };
+    const name = [...this.study.named.map((path) => `${path.replace(/^observer\./, "")} ${text(values[path])}`), `seed ${seed}`].join(", ");
+    this.newest = { ...found, name, columns, colour: free[0], pinned: false };
     this.all.push(this.newest);
     this.draw();
-    $("told").textContent = this.said(found, indices);
+    $("told").textContent = this.said(found, stored);
     $("point").disabled = false;
-    document.body.dataset.simulated = `${indices} ${Math.round(performance.now() - began)}`;
+    document.body.dataset.simulated = `${name}, ${Math.round(performance.now() - began)} ms`;
   }
-  /** The metric of the map, stored and of this run: they differ where the run is not the one of the sweep. */
-  said(found, indices) {
-    const { metric } = this.picture.view, stored = this.picture.column[this.study.dims.reduce((sum, dim) => sum + indices[dim.i] * dim.stride, 0)];
-    const raw = found.metrics[metric], { label, yes } = this.study.metric(metric);
-    const now = yes ? Number(raw) : raw === null ? NaN : this.study.metric(metric).size ? Math.abs(raw) : raw;
-    const same = Object.is(Math.fround(now), stored) || Math.abs(now - stored) <= 1e-3 * Math.abs(stored) || (Number.isNaN(stored) && !Number.isFinite(now));
-    const every = found.every > 1 ? ` Every ${found.every}th sample is drawn.` : "";
-    return same ? `${label}: ${text(now)}, as stored in the sweep.${every}` : `This run differs from the sweep's: ${label} is ${text(now)}, stored ${text(stored)}.${every}`;
+  /** A metric as stored and of this run: they differ where the run is not the one of the sweep. */
+  said({ metrics, every }, { metric: { name, label, yes, size }, value }) {
+    const raw = metrics[name], now = yes ? Number(raw) : raw === null ? NaN : size ? Math.abs(raw) : raw;
+    const same = Math.abs(now - value) <= 1e-3 * Math.abs(value) || (Number.isNaN(value) && !Number.isFinite(now));
+    const drawn = every > 1 ? ` Every ${every}th sample is drawn.` : "";
+    return (same ? `${label}: ${text(now)}, as stored in the sweep.` : `This run differs from the sweep's: ${label} is ${text(now)}, stored ${text(value)}.`) + drawn;
   }
   config() { return this.newest.config; }
   draw() {
