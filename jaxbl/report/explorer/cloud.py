@@ -44,6 +44,10 @@ def write_cloud(result: StudyResult, metrics: list[str], out: Path) -> dict[str,
             }
             writer.write_table(pa.table(arrays, schema=schema), row_group_size=ROW_GROUP)
             found += len(frame)
-    told = [{"path": path, "unit": units[path].unit if path in units else "", "words": words.get(path)} for path in axes]
+    told = [
+        {"path": one.path, "unit": units[one.path].unit if one.path in units else "", "words": words.get(one.path),
+         "log": one.scale == "log"}
+        for one in config.axes
+    ]  # fmt: skip
     sampled = config.sweep.design != "grid"
     return {"axes": told, "rows": found, "found": found, "total": result.runs, "sampled": sampled}

@@ -265,3 +265,49 @@ def test_a_study_at_work_is_written_anew_when_its_page_is_loaded_again(tmp_path)
         sweep(SWEPT, tmp_path / "out")
         last = server.newest()
         assert told(last)["found"] == 12 and server.newest() == last
+
+
+WORDS = {"path": "observer.discretisation", "values": ["implicit", "explicit"]}
+
+
+def product_of_gains(frame):
+    return frame[ALPHA] * frame[LAMBDA]
+
+
+def test_points_of_a_design_keep_their_axes_words_among_them(tmp_path):
+    axes = [{"path": ALPHA, "start": 2.0, "stop": 50.0, "scale": "log"}, {"path": LAMBDA, "start": 1.0, "stop": 20.0}, WORDS]
+    data = rigid(axes=axes, sweep={"design": "sobol", "points": 8, "seeds": 2})
+    result = made(data, motor__velocity_rmse=product_of_gains, finite=lambda frame: frame["seed"] == 0)
+    write_study(result, tmp_path, ["found"])
+    told, table = about(tmp_path), pq.read_table(tmp_path / "points.parquet").to_pandas()
+    assert (told["rows"], told["found"], told["total"], told["sampled"]) == (32, 32, 32, True)
+    assert [(one["path"], one["words"], one["log"]) for one in told["axes"]] == [
+        (ALPHA, None, True), (LAMBDA, None, False), (WORDS["path"], WORDS["values"], False)
+    ]  # fmt: skip
+    np.testing.assert_array_equal(table[ALPHA], result.frame[ALPHA])
+    words = [WORDS["values"][int(one)] for one in table[WORDS["path"]]]
+    assert words == [*result.frame[WORDS["path"]]] and set(words) == set(WORDS["values"])
+    assert table["motor.velocity_rmse"].isna().equals(table["seed"] == 1.0)
+
+
+@needs_chromium
+def test_a_study_of_one_axis_is_drawn_over_it_and_its_points_kept(tmp_path):
+    result = made(rigid(axes=[spaced(ALPHA, 2.0, 50.0, 6)]), motor__velocity_rmse=lambda frame: 2.0 * frame[ALPHA])
+    page_file = write_static(source(result), tmp_path / "out")
+    with opened(page_file) as (page,):
+        page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {ALPHA} motor.velocity_rmse']")
+        page.select_option("#log", "false")
+        plane, values = page.locator("#plot .plane"), page.locator("#plot .values")
+        plane.focus()
+        for key in ("ArrowRight", "ArrowRight", "ArrowRight", "Enter"):
+            page.keyboard.press(key)
+        alpha = np.geomspace(2.0, 50.0, 6)[2]
+        assert [float(line.split(": ")[-1].split()[0]) for line in values.inner_text().split("\n")] == pytest.approx(
+            [2.0 * alpha, alpha, 2.0 * alpha], rel=1e-3
+        )
+        page.locator("#chosen").wait_for()
+        with page.expect_download() as download:
+            page.click("#point")
+        (tmp_path / "out" / "point.toml").write_bytes(Path(download.value.path()).read_bytes())
+        check(page, 0)
+    assert read_config(tmp_path / "out" / "point.toml").observer.motor.alpha == pytest.approx(alpha, rel=1e-12)

@@ -9,7 +9,7 @@ globalThis.jaxblData = async (about) => {
   const axes = [...about.axes, { path: "seed", unit: "", words: null }];
   // words are kept as their numbers
   const known = Object.fromEntries([
-    ...axes.map(({ path, unit, words }) => [path, { label: path, unit, names: words, Kind: Float64Array }]),
+    ...axes.map(({ path, unit, words, log }) => [path, { label: path, unit, names: words, spread: log, Kind: Float64Array }]),
     ...about.metrics.map((one) => [one.name, { label: one.label, unit: "", Kind: Float32Array }]),
   ]);
   const metric = (name) => about.metrics.find((one) => one.name === name);
@@ -18,7 +18,7 @@ globalThis.jaxblData = async (about) => {
   const [y, x] = about.axes.length > 1 ? about.axes.slice(-2).map((one) => one.path) : [about.first, about.axes[0].path];
   const view = { x, y, shade: about.first, log: true };
   const value = (path, number) => known[path].names?.[number] ?? number;
-  let plot = null, chosen = null, data = {};
+  let plot = null, chosen = null, data = {}, said = "";
 
   const form = () => {
     const all = Object.entries(known).map(([name, { label, unit }]) => [name, withUnit(label, unit)]);
@@ -43,7 +43,7 @@ globalThis.jaxblData = async (about) => {
     const axis = (name) => {
       const values = rows.map((i) => data[name][i]), { low, high } = Scale.of(values, {});
       const positive = values.every((one) => !(one <= 0));
-      return { ...known[name], log: view.log && positive && high / low > 30 && !known[name].names };
+      return { ...known[name], log: view.log && positive && (known[name].spread || high / low > 30) && !known[name].names };
     };
     const shade = rows.map((i) => data[view.shade][i]), { label, unit } = known[view.shade];
     const shaded = (i) => `${withUnit(label, unit)}: ${text(value(view.shade, shade[i]))}`;
@@ -53,7 +53,7 @@ globalThis.jaxblData = async (about) => {
     plot.scale = Scale.of(shade, { colours: coloursOf(about), label, unit, ...(metric(view.shade)?.yes ? { low: 0, high: 1 } : {}), ...(view.log ? {} : { log: false }) });
     plot.set([{ name: "", x: rows.map((i) => data[view.x][i]), y: rows.map((i) => data[view.y][i]), shade, dots: rows.length > 5000 ? 3 : 6, said: (i) => [shaded(i)] }]);
     const some = rows.length < about.rows ? `${rows.length} of ${about.rows} points are drawn. ` : "";
-    $("state").textContent = some + (about.found < about.total ? `${about.found} of ${about.total} runs so far.${about.served ? " Load the page again for more." : ""}` : "");
+    said = $("state").textContent = some + (about.found < about.total ? `${about.found} of ${about.total} runs so far.${about.served ? " Load the page again for more." : ""}` : "");
     document.body.dataset.drawn = `${view.shade} ${view.x} ${view.y}`;
   };
 
@@ -68,6 +68,7 @@ globalThis.jaxblData = async (about) => {
     plot.cursor = [data[view.x][row], data[view.y][row]];
     plot.draw();
     const name = metric(view.shade) ? view.shade : about.first;
+    $("state").textContent = said;
     runs?.simulate(values, seed, { metric: metric(name), value: (await columns.get(name))[row] });
   };
 

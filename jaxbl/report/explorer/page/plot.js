@@ -216,7 +216,7 @@ class Plot {
       if (axis.limits) [low, high] = axis.limits;
       if (!(low <= high)) [low, high] = axis.log ? [1, 10] : [0, 1];
       if (low === high) { const more = Math.abs(low) || 1; [low, high] = axis.log ? [low / 2, 2 * high] : [low - 0.5 * more, high + 0.5 * more]; }
-      const room = axis.limits ? 0 : axis.names ? 0.5 : i ? 0.04 * (axis.log ? Math.log(high / low) : high - low) : 0;
+      const dots = this.lines.some((one) => one.dots), room = axis.limits ? 0 : axis.names ? 0.5 : i || dots ? 0.04 * (axis.log ? Math.log(high / low) : high - low) : 0;
       return axis.log ? [low * Math.exp(-room), high * Math.exp(room)] : [low - room, high + room];
     });
     return whole.map((one, i) => this.range?.[i] ?? one);
