@@ -13,12 +13,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from jaxbl.files import write_atomic
+from jaxbl.gains.limits import PLACES
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.tune_summary import called_gains
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
 from .figures import COLOURS, MAP, MARKERS, MISSING, SIDES, Drawn, literal, mark, style, subplots, with_unit
+from .gain_plane import conditions_line, name_gains, name_ratio
 from .maps import cell_edges, color_norm, condition_curves, hatch_failures
 from .page import PageTable, write_report
 
@@ -29,7 +31,8 @@ _CONDITIONS = {name: CONDITIONS[name] for name in ("davila_fridman", "seeber_hor
 def draw_tuning(tuning: Tuning) -> list[Drawn]:
     """All figures of a tuning."""
     sides = [side for side in SIDES if side in tuning.candidates]
-    return [*(_map(tuning, side) for side in sides), *(_front(tuning, side) for side in sides), _comparison(tuning, sides)]
+    maps = [draw(tuning, side) for side in sides for draw in (_map, _limits)]
+    return [*maps, *(_front(tuning, side) for side in sides), _comparison(tuning, sides)]
 
 
 def _label(tuning: Tuning) -> str:
@@ -46,29 +49,35 @@ def _others(tuning: Tuning, side: str) -> list[tuple[str, str, dict[str, Any]]]:
 def _map(tuning: Tuning, side: str) -> Drawn:
     summary, bound = tuning.summary, tuning.summary["f_plus"][side]
     coarse = tuning.candidates[side].query("stage == 0")
-    tables = coarse.astype({"feasible": float}).pivot_table(
-        index="lambda_ratio", columns="alpha_ratio", values=["error", "feasible"], dropna=False
+    constraints, binding = (summary["limits"][side][key] for key in ("constraints", "binding"))
+    tables = coarse.astype({"feasible": float, "converged": float}).pivot_table(
+        index="lambda", columns="alpha", values=["error", "feasible", *(PLACES[name] for name in binding)], dropna=False
     )
     grid, feasible = tables["error"].to_numpy(float), tables["feasible"].to_numpy(float)
     xs, ys = tables["error"].columns.to_numpy(float), tables.index.to_numpy(float)
     norm = color_norm(grid, "log")
     edges = cell_edges(xs, True), cell_edges(ys, True)
-    figure, (ax,) = subplots(6.6, 5.4, beside=True)
+    figure, (ax,) = subplots(7.2, 6.0, beside=True)
     ax.grid(False)
     ax.set_facecolor(MISSING)
-    ax.set(xscale="log", yscale="log", xlabel="α / f⁺", ylabel="λ / √f⁺ (λ in √rad/s)")
+    ax.set(xscale="log", yscale="log", xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
     ax.pcolormesh(*edges, grid, cmap=MAP, norm=norm, rasterized=True)
     handles: list[Any] = [*hatch_failures(ax, (xs, ys), edges, feasible, "constraints not met")]
-    handles += condition_curves(ax, _CONDITIONS, 1.0, (edges[0][0], edges[0][-1]))
+    lines = {name: _binding_line(ax, edges, tables, name, constraints[name]) for name in binding}
+    handles += [handle for line in lines.values() for handle in line]
+    handles += condition_curves(ax, _CONDITIONS, bound, (edges[0][0], edges[0][-1]))
     for window in summary["stages"][1:2]:
-        (left, right), (low, high) = window[side]["alpha_ratio"], window[side]["lambda_ratio"]
+        (left, right), (low, high) = (
+            np.array(window[side][f"{gain}_ratio"]) * unit for gain, unit in (("alpha", bound), ("lambda", np.sqrt(bound)))
+        )
         ax.add_patch(Rectangle((left, low), right - left, high - low, fill=False, ec="white", ls="--", lw=1.2))
         handles.append(Patch(fill=False, ec="#777777", ls="--", label="first zoom"))
     gains = summary["gains"][side]
     ax.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
     for name, marker, row in _others(tuning, side):
-        handles.append(mark(ax, (row["alpha"] / bound, row["lambda"] / np.sqrt(bound)), marker, name, 8))
-    handles.append(mark(ax, (gains["alpha_ratio"], gains["lambda_ratio"]), "*", "tuned", 15))
+        handles.append(mark(ax, (row["alpha"], row["lambda"]), marker, name, 8))
+    handles.append(mark(ax, (gains["alpha"], gains["lambda"]), "*", "tuned", 15))
+    name_gains(ax, bound)
     ax.set_title(
         f"{side}: tuned ★ λ = {gains['lambda']:.3g} √rad/s, α = {gains['alpha']:.3g} rad/s²,  f⁺ = {bound:.3g} rad/s²"
     )
@@ -76,11 +85,152 @@ def _map(tuning: Tuning, side: str) -> Drawn:
     if np.isnan(grid).any():
         handles.append(Patch(facecolor=MISSING, label=f"diverged ({int(np.isnan(grid).sum())} points)"))
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    drawn = [name for name, line in lines.items() if line]
+    red = f" Red: {' and '.join(drawn)}, which bind{'s' * (len(drawn) == 1)}." if drawn else ""
     caption = (
-        f"{side}: {_label(tuning)} over all runs, on the coarse map of normalised gains. Hatched: not converged, or a "
-        "margin not met. Curves: least λ of the gain conditions. The other gains are compared below."
+        f"{side}: {_label(tuning)} over all runs, on the coarse map; above and on the right the axes of the atlas "
+        f"(jaxbl verify). Hatched: not converged, or a margin not met.{red} Curves: least λ of the gain conditions at the f⁺ "
+        "of the pilot run. The other gains are compared below."
     )
     return Drawn(f"tuning_{side}", figure, caption)
+
+
+def _binding_line(ax: Axes, edges: Any, tables: pd.DataFrame, name: str, found: dict[str, Any]) -> list[Line2D]:
+    """The line on the coarse map along which a constraint that binds is just met. Returns the legend's handles."""
+    values = tables[PLACES[name]]
+    xs, ys, level = values.columns.to_numpy(float), values.index.to_numpy(float), found.get("limit", 0.5)
+    shown = values.to_numpy(float)
+    if not np.nanmin(shown) < level < np.nanmax(shown):
+        return []
+    # out to the edges of the outer cells
+    xs, ys = (np.concatenate([e[:1], c, e[-1:]]) for c, e in zip((xs, ys), edges, strict=True))
+    ax.contour(xs, ys, np.pad(shown, 1, mode="edge"), levels=[level], colors=_BINDS, linewidths=3.2, zorder=3)
+    return [Line2D([], [], color=_BINDS, lw=3.2, label=_called(name, found))]
+
+
+_BINDS = "#E8000B"
+"""Colour of a constraint that binds."""
+
+
+def _called(name: str, found: dict[str, Any]) -> str:
+    """A constraint with its limit, and whether it binds."""
+    limit = f" = {found['limit']:g}" if "limit" in found else ""
+    return f"{name}{limit}{' (binds)' if found['binds'] else ''}"
+
+
+def _missing(names: list[str]) -> str:
+    """What gains do that miss constraints."""
+    margins = [name for name in names if name != "converged"]
+    parts = [f"misses {' and '.join(margins)}"] if margins else []
+    return " and ".join([*parts, "does not converge"] if "converged" in names else parts)
+
+
+def _limits(tuning: Tuning, side: str) -> Drawn:
+    """The error along each gain through the optimum, and what ends the way to each side."""
+    summary, bound = tuning.summary, tuning.summary["f_plus"][side]
+    found, gains, error = summary["limits"][side], summary["gains"][side], summary["achieved"][side]
+    figure, axes = subplots(9.6, 4.6, columns=2, beside=True, sharey=True)
+    handles: dict[str, Any] = {}
+    for ax, (gain, symbol, unit, label, ratio) in zip(axes, _PLANES, strict=True):
+        line = pd.DataFrame(found["profiles"][gain])
+        x, y = line[gain].to_numpy(float), line["error"].to_numpy(float)
+        edges = cell_edges(x, True)
+        ax.set(xscale="log", yscale="log", xlim=edges[[0, -1]])
+        for name, one in found["constraints"].items():
+            colour, shade = (_BINDS, 0.3) if one["binds"] else (MISSING, 0.6)
+            missed = line["missed"].map(lambda names, name=name: name in names).to_numpy(bool)
+            for first, last in _stretches(missed):
+                ax.axvspan(edges[first], edges[last], color=colour, alpha=shade, lw=0.0)
+                handles[name] = Patch(facecolor=colour, alpha=shade, label=f"not met: {_called(name, one)}")
+        (handles["error"],) = ax.plot(x, y, color=COLOURS[0], lw=2.0, label=_label(tuning))
+        if summary["objective"] == "velocity":
+            chatter = line["chatter"].to_numpy(float)
+            with np.errstate(invalid="ignore"):
+                slow = np.sqrt(y**2 - chatter**2)
+            (handles["chatter"],) = ax.plot(x, chatter, color=COLOURS[4], lw=1.2, label="its chatter, sample to sample")
+            (handles["slow"],) = ax.plot(x, slow, color=COLOURS[2], lw=1.2, label="its slow part, the rest")
+        ax.axvline(gains[gain], color="black", lw=0.8)
+        handles["tuned"] = mark(ax, (gains[gain], error[f"{summary['objective']}_rmse"]), "*", "tuned", 15, held=False)
+        smaller, larger = (f"{way} {symbol}: {_short(one)}" for way, one in found["towards"][gain].items())
+        ax.set_title(f"← {smaller}", loc="left", fontsize=9)
+        ax.set_title(f"{larger} →", loc="right", fontsize=9)
+        ax.set_xlabel(f"{symbol} ({unit})")
+        name_ratio(ax, "x", ratio(bound), label)
+    parts = (
+        ""
+        if "slow" not in handles
+        else (
+            " Chatter is the rms change from sample to sample over √2; the slow part is the rest of the mean square, where "
+            "chatter is not above the error."
+        )
+    )
+    axes[0].set_ylabel(_label(tuning))
+    figure.suptitle(f"{side}: what limits the gains", fontsize=10)
+    figure.legend(handles=list(handles.values()), loc="outside lower center", ncols=3)
+    caption = (
+        f"{side}: the error along each gain, with the other one as tuned, from the runs of all maps (between two rows of a "
+        f"map, interpolated).{parts} {_limits_line(side, summary).partition(': ')[2]}"
+    )
+    return Drawn(f"limits_{side}", figure, caption)
+
+
+_PLANES = (
+    ("lambda", "λ", "√rad/s", "λ / √f⁺", np.sqrt),
+    ("alpha", "α", "rad/s²", "α / f⁺", float),
+)
+
+
+def _stretches(there: np.ndarray) -> list[tuple[int, int]]:
+    """First, and one after the last, index of each stretch that is true."""
+    steps = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
+    return list(zip(steps[::2], steps[1::2], strict=True))
+
+
+def _short(way: dict[str, Any]) -> str:
+    """What limits a gain towards one side, in few words."""
+    if way["limit"] == "constraint":
+        return " and ".join(way["missed"])
+    if way["limit"] == "range":
+        return "end of the range"
+    if way["change"] is None:
+        return "diverges"
+    return f"error {100.0 * way['change']:+.2g} %"
+
+
+def _limits_line(side: str, summary: dict[str, Any]) -> str:
+    """What limits the gains of a side towards smaller and larger values, in sentences."""
+    found = summary["limits"][side]
+    binding = [f"{_called(name, one | {'binds': False})} (here {one['value']:.4g})" if "limit" in one else name
+               for name, one in found["constraints"].items() if one["binds"]]  # fmt: skip
+    if binding:
+        lines = [f"{side}: {' and '.join(binding)} bind{'s' * (len(binding) == 1)}."]
+    elif found["range_ends"]:
+        lines = [f"{side}: no constraint binds, but the range searched ends at the optimum."]
+    else:
+        lines = [f"{side}: no constraint binds, and the optimum lies inside of the range searched."]
+    for gain, symbol, unit, *_ in _PLANES:
+        ways = found["towards"][gain]
+        text = "; ".join(_way(way, symbol, unit, one) for way, one in ways.items())
+        lines.append(f"{text[0].upper()}{text[1:]}.")
+        if [one["by"] for one in ways.values()] == ["slow", "chatter"]:
+            lines.append(f"So for {symbol} the slow part of the error balances its chatter.")
+    return " ".join(lines)
+
+
+def _way(way: str, symbol: str, unit: str, found: dict[str, Any]) -> str:
+    """What limits a gain towards one side, as part of a sentence."""
+    if found["limit"] == "range":
+        return f"{way} {symbol}: outside of the range searched (tune.{'lambda' if symbol == 'λ' else 'alpha'}_ratio)"
+    if found["at"] is None:
+        return f"{way} {symbol}: {_missing(found['missed'])}"
+    at = f"{symbol} = {found['at']:.3g} {unit}"
+    if found["change"] is None:
+        return f"{way} {symbol}: runs diverge (at {at})"
+    size = f"{abs(100.0 * found['change']):.2g} % {'more' if found['change'] > 0.0 else 'less'} error at {at}"
+    by = {"chatter": ", as chatter grows", "slow": ", as the slow part grows", None: ""}[found["by"]]
+    joint = ", but that" if found["limit"] == "constraint" else ", which also"
+    missed = f"{joint} {_missing(found['missed'])}" if found["missed"] else ""
+    return f"{way} {symbol}: {size}{by}{missed}"
 
 
 def _front(tuning: Tuning, side: str) -> Drawn:
@@ -221,6 +371,8 @@ def _tune_headline(summary: dict[str, Any]) -> list[str]:
             f"{found[metric]:.3g} {unit} rms, converged after "
             f"{found['convergence_time']:.3g} s, the worst of {_runs_behind(summary)}."
         )
+    lines += [_limits_line(side, summary) for side in summary["gains"]]
+    lines += [conditions_line(side, one, "the largest of all runs") for side, one in summary["conditions"].items()]
     where = _where(summary)
     rows = {(row["name"], row["side"]): row for row in summary["holdout"]["rows"]}
     for side, others in summary["holdout"]["factors"].items():
