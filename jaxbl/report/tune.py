@@ -86,11 +86,11 @@ def _map(tuning: Tuning, side: str) -> Drawn:
         handles.append(Patch(facecolor=MISSING, label=f"diverged ({int(np.isnan(grid).sum())} points)"))
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     drawn = [name for name, line in lines.items() if line]
-    red = f" Red: {' and '.join(drawn)}, which bind{'s' * (len(drawn) == 1)}." if drawn else ""
+    bold = f" Bold line: {' and '.join(drawn)}, which bind{'s' * (len(drawn) == 1)}." if drawn else ""
     caption = (
         f"{side}: {_label(tuning)} over all runs, on the coarse map; above and on the right the axes of the atlas "
-        f"(jaxbl verify). Hatched: not converged, or a margin not met.{red} Curves: least λ of the gain conditions at the f⁺ "
-        "of the pilot run. The other gains are compared below."
+        f"(jaxbl verify). Hatched: not converged, or a margin not met.{bold} Curves: least λ of the gain conditions at the "
+        "f⁺ of the pilot run. The other gains are compared below."
     )
     return Drawn(f"tuning_{side}", figure, caption)
 
@@ -104,12 +104,12 @@ def _binding_line(ax: Axes, edges: Any, tables: pd.DataFrame, name: str, found: 
         return []
     # out to the edges of the outer cells
     xs, ys = (np.concatenate([e[:1], c, e[-1:]]) for c, e in zip((xs, ys), edges, strict=True))
-    ax.contour(xs, ys, np.pad(shown, 1, mode="edge"), levels=[level], colors=_BINDS, linewidths=3.2, zorder=3)
-    return [Line2D([], [], color=_BINDS, lw=3.2, label=_called(name, found))]
+    ax.contour(xs, ys, np.pad(shown, 1, mode="edge"), levels=[level], colors=_LIMITS[name], linewidths=3.2, zorder=3)
+    return [Line2D([], [], color=_LIMITS[name], lw=3.2, label=_called(name, found))]
 
 
-_BINDS = "#E8000B"
-"""Colour of a constraint that binds."""
+_LIMITS = {"converged": "#7F7F7F", "margin_alpha": "#56B4E9", "margin_exact": "#E8000B", "longest_convergence": "#F0E442"}
+"""Colours of constraints."""
 
 
 def _called(name: str, found: dict[str, Any]) -> str:
@@ -129,6 +129,7 @@ def _limits(tuning: Tuning, side: str) -> Drawn:
     """The error along each gain through the optimum, and what ends the way to each side."""
     summary, bound = tuning.summary, tuning.summary["f_plus"][side]
     found, gains, error = summary["limits"][side], summary["gains"][side], summary["achieved"][side]
+    velocity = summary["objective"] == "velocity"
     figure, axes = subplots(9.6, 4.6, columns=2, beside=True, sharey=True)
     handles: dict[str, Any] = {}
     for ax, (gain, symbol, unit, label, ratio) in zip(axes, _PLANES, strict=True):
@@ -137,13 +138,14 @@ def _limits(tuning: Tuning, side: str) -> Drawn:
         edges = cell_edges(x, True)
         ax.set(xscale="log", yscale="log", xlim=edges[[0, -1]])
         for name, one in found["constraints"].items():
-            colour, shade = (_BINDS, 0.3) if one["binds"] else (MISSING, 0.6)
+            look: dict[str, Any] = {"facecolor": _LIMITS[name], "alpha": 0.25, "lw": 0.0, "ec": _LIMITS[name]}
+            look |= {"hatch": "///"} if one["binds"] else {}
             missed = line["missed"].map(lambda names, name=name: name in names).to_numpy(bool)
             for first, last in _stretches(missed):
-                ax.axvspan(edges[first], edges[last], color=colour, alpha=shade, lw=0.0)
-                handles[name] = Patch(facecolor=colour, alpha=shade, label=f"not met: {_called(name, one)}")
+                ax.axvspan(edges[first], edges[last], **look)
+                handles[name] = Patch(**look, label=f"not met: {_called(name, one)}")
         (handles["error"],) = ax.plot(x, y, color=COLOURS[0], lw=2.0, label=_label(tuning))
-        if summary["objective"] == "velocity":
+        if velocity:
             chatter = line["chatter"].to_numpy(float)
             with np.errstate(invalid="ignore"):
                 slow = np.sqrt(y**2 - chatter**2)
@@ -156,21 +158,19 @@ def _limits(tuning: Tuning, side: str) -> Drawn:
         ax.set_title(f"{larger} →", loc="right", fontsize=9)
         ax.set_xlabel(f"{symbol} ({unit})")
         name_ratio(ax, "x", ratio(bound), label)
-    parts = (
-        ""
-        if "slow" not in handles
-        else (
-            " Chatter is the rms change from sample to sample over √2; the slow part is the rest of the mean square, where "
-            "chatter is not above the error."
-        )
-    )
     axes[0].set_ylabel(_label(tuning))
     figure.suptitle(f"{side}: what limits the gains", fontsize=10)
     figure.legend(handles=list(handles.values()), loc="outside lower center", ncols=3)
     caption = (
         f"{side}: the error along each gain, with the other one as tuned, from the runs of all maps (between two rows of a "
-        f"map, interpolated).{parts} {_limits_line(side, summary).partition(': ')[2]}"
+        "map, interpolated). "
     )
+    if velocity:
+        caption += (
+            "Chatter is the rms change from sample to sample over √2; the slow part is the rest of the mean square, where "
+            "chatter is not above the error. "
+        )
+    caption += f"What limits the gains: {_limits_text(found)}"
     return Drawn(f"limits_{side}", figure, caption)
 
 
@@ -194,20 +194,24 @@ def _short(way: dict[str, Any]) -> str:
         return "end of the range"
     if way["change"] is None:
         return "diverges"
-    return f"error {100.0 * way['change']:+.2g} %"
+    return f"error {_size(way['change'])}"
 
 
-def _limits_line(side: str, summary: dict[str, Any]) -> str:
-    """What limits the gains of a side towards smaller and larger values, in sentences."""
-    found = summary["limits"][side]
+def _size(change: float) -> str:
+    """A relative change in few characters."""
+    return f"× {1.0 + change:.2g}" if change >= 1.0 else f"{100.0 * change:+.2g} %"
+
+
+def _limits_text(found: dict[str, Any]) -> str:
+    """What limits gains towards smaller and larger values (`limits` of a side), in sentences."""
     binding = [f"{_called(name, one | {'binds': False})} (here {one['value']:.4g})" if "limit" in one else name
                for name, one in found["constraints"].items() if one["binds"]]  # fmt: skip
     if binding:
-        lines = [f"{side}: {' and '.join(binding)} bind{'s' * (len(binding) == 1)}."]
+        lines = [f"{' and '.join(binding)} bind{'s' * (len(binding) == 1)}."]
     elif found["range_ends"]:
-        lines = [f"{side}: no constraint binds, but the range searched ends at the optimum."]
+        lines = ["no constraint binds, but the range searched ends at the optimum."]
     else:
-        lines = [f"{side}: no constraint binds, and the optimum lies inside of the range searched."]
+        lines = ["no constraint binds, and the optimum lies inside of the range searched."]
     for gain, symbol, unit, *_ in _PLANES:
         ways = found["towards"][gain]
         text = "; ".join(_way(way, symbol, unit, one) for way, one in ways.items())
@@ -226,9 +230,9 @@ def _way(way: str, symbol: str, unit: str, found: dict[str, Any]) -> str:
     at = f"{symbol} = {found['at']:.3g} {unit}"
     if found["change"] is None:
         return f"{way} {symbol}: runs diverge (at {at})"
-    size = f"{abs(100.0 * found['change']):.2g} % {'more' if found['change'] > 0.0 else 'less'} error at {at}"
+    size = f"error {_size(found['change'])} at {at}"
     by = {"chatter": ", as chatter grows", "slow": ", as the slow part grows", None: ""}[found["by"]]
-    joint = ", but that" if found["limit"] == "constraint" else ", which also"
+    joint = ", but it" if found["limit"] == "constraint" else ", and it"
     missed = f"{joint} {_missing(found['missed'])}" if found["missed"] else ""
     return f"{way} {symbol}: {size}{by}{missed}"
 
@@ -308,7 +312,7 @@ def _bars(ax: Axes, key: str, rows: list[dict[str, Any]]) -> None:
 def write_tune_report(tuning: Tuning, folder: Path) -> list[str]:
     """Write `gains.toml`, `tuning.json`, figures and report into a folder that exists. Returns lines for the terminal."""
     summary = tuning.summary
-    lead = _tune_headline(summary)
+    lead = tune_headline(summary)
     write_atomic(folder / "gains.toml", gains_toml(summary))
     write_atomic(folder / "tuning.json", json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False))
     tables = [
@@ -359,7 +363,7 @@ def _where(summary: dict[str, Any]) -> str:
     return "on the study's excitation with other noise" if held["same_excitation"] else other
 
 
-def _tune_headline(summary: dict[str, Any]) -> list[str]:
+def tune_headline(summary: dict[str, Any]) -> list[str]:
     """The chosen gains and their errors on the held-out runs, in sentences."""
     lines, metric = [], f"{summary['objective']}_rmse"
     unit = SIDE_METRICS[metric].unit
@@ -371,7 +375,7 @@ def _tune_headline(summary: dict[str, Any]) -> list[str]:
             f"{found[metric]:.3g} {unit} rms, converged after "
             f"{found['convergence_time']:.3g} s, the worst of {_runs_behind(summary)}."
         )
-    lines += [_limits_line(side, summary) for side in summary["gains"]]
+    lines += [f"{side}, what limits the gains: {_limits_text(found)}" for side, found in summary["limits"].items()]
     lines += [conditions_line(side, one, "the largest of all runs") for side, one in summary["conditions"].items()]
     where = _where(summary)
     rows = {(row["name"], row["side"]): row for row in summary["holdout"]["rows"]}
