@@ -58,8 +58,8 @@ def conditions_line(side: str, found: dict[str, Any], which: str) -> str:
         less = "" if largest == 0.0 else f", or f⁺ below {largest:.3g} rad/s² ({bound / largest:.3g} times smaller)"
         return f"{at} no gain condition holds. The exact one asks for λ above {least:.3g} √rad/s{more}{less}."
     missed = [_SHORT[name] for name in found["holds"] if name not in holds]
-    what = f"gain conditions that hold: {', '.join(_SHORT[name] for name in holds)}"
-    what += f"; that do not: {', '.join(missed)}" if missed else " (all)"
+    what = f"gain conditions met: {', '.join(_SHORT[name] for name in holds)}"
+    what += f"; not met: {', '.join(missed)}" if missed else " (all)"
     return (
         f"{at} {what}. λ may fall by a factor of {lambda_ / least:.4g} (to {least:.3g} √rad/s), or f⁺ grow by one of "
         f"{largest / bound:.4g} (to {largest:.3g} rad/s²), until the exact one fails."
@@ -92,8 +92,8 @@ def draw_gain_plane(side: str, found: dict[str, Any]) -> Drawn:
         condition_curves(ax, {"exact": CONDITIONS["exact"]}, largest, alphas)
         edge = ax.lines[-1]
         x, y = np.asarray(edge.get_xydata()).T
-        edge.set(data=([x[0], *x], [lambdas[1], *y]), color="black", ls="--", lw=1.2, path_effects=[])
         label = f"where it would fail at f⁺ = {largest:.3g} rad/s²"
+        edge.set(data=([x[0], *x], [lambdas[1], *y]), color="black", ls="--", lw=1.2, path_effects=[], label=label)
         handles.append(Line2D([], [], color="black", ls="--", lw=1.2, label=label))
     if least is not None:
         ends = [least, max(lambda_, lambdas[0])]

@@ -5,6 +5,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import matplotlib.patheffects as path_effects
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -104,11 +105,13 @@ def _binding_line(ax: Axes, edges: Any, tables: pd.DataFrame, name: str, found: 
         return []
     # out to the edges of the outer cells
     xs, ys = (np.concatenate([e[:1], c, e[-1:]]) for c, e in zip((xs, ys), edges, strict=True))
-    ax.contour(xs, ys, np.pad(shown, 1, mode="edge"), levels=[level], colors=_LIMITS[name], linewidths=3.2, zorder=3)
-    return [Line2D([], [], color=_LIMITS[name], lw=3.2, label=_called(name, found))]
+    lines = ax.contour(xs, ys, np.pad(shown, 1, mode="edge"), levels=[level], colors=_LIMITS[name], linewidths=3.0, zorder=3)
+    outlined = [path_effects.Stroke(linewidth=5.0, foreground="white"), path_effects.Normal()]
+    lines.set_path_effects(outlined)
+    return [Line2D([], [], color=_LIMITS[name], lw=3.0, path_effects=outlined, label=_called(name, found))]
 
 
-_LIMITS = {"converged": "#7F7F7F", "margin_alpha": "#56B4E9", "margin_exact": "#E8000B", "longest_convergence": "#F0E442"}
+_LIMITS = {"converged": "#7F7F7F", "margin_alpha": "#3F51B5", "margin_exact": "#E8000B", "longest_convergence": "#8B4513"}
 """Colours of constraints."""
 
 
@@ -131,6 +134,7 @@ def _limits(tuning: Tuning, side: str) -> Drawn:
     found, gains, error = summary["limits"][side], summary["gains"][side], summary["achieved"][side]
     velocity = summary["objective"] == "velocity"
     figure, axes = subplots(9.6, 4.6, columns=2, beside=True, sharey=True)
+    shaded: dict[str, Any] = {}
     handles: dict[str, Any] = {}
     for ax, (gain, symbol, unit, label, ratio) in zip(axes, _PLANES, strict=True):
         line = pd.DataFrame(found["profiles"][gain])
@@ -138,12 +142,11 @@ def _limits(tuning: Tuning, side: str) -> Drawn:
         edges = cell_edges(x, True)
         ax.set(xscale="log", yscale="log", xlim=edges[[0, -1]])
         for name, one in found["constraints"].items():
-            look: dict[str, Any] = {"facecolor": _LIMITS[name], "alpha": 0.25, "lw": 0.0, "ec": _LIMITS[name]}
-            look |= {"hatch": "///"} if one["binds"] else {}
+            look: dict[str, Any] = {"facecolor": _LIMITS[name], "alpha": 0.4 if one["binds"] else 0.15, "lw": 0.0}
             missed = line["missed"].map(lambda names, name=name: name in names).to_numpy(bool)
             for first, last in _stretches(missed):
                 ax.axvspan(edges[first], edges[last], **look)
-                handles[name] = Patch(**look, label=f"not met: {_called(name, one)}")
+                shaded[name] = Patch(**look, label=f"not met: {_called(name, one)}")
         (handles["error"],) = ax.plot(x, y, color=COLOURS[0], lw=2.0, label=_label(tuning))
         if velocity:
             chatter = line["chatter"].to_numpy(float)
@@ -160,7 +163,7 @@ def _limits(tuning: Tuning, side: str) -> Drawn:
         name_ratio(ax, "x", ratio(bound), label)
     axes[0].set_ylabel(_label(tuning))
     figure.suptitle(f"{side}: what limits the gains", fontsize=10)
-    figure.legend(handles=list(handles.values()), loc="outside lower center", ncols=3)
+    figure.legend(handles=[*shaded.values(), *handles.values()], loc="outside lower center", ncols=3)
     caption = (
         f"{side}: the error along each gain, with the other one as tuned, from the runs of all maps (between two rows of a "
         "map, interpolated). "
@@ -231,7 +234,7 @@ def _way(way: str, symbol: str, unit: str, found: dict[str, Any]) -> str:
     if found["change"] is None:
         return f"{way} {symbol}: runs diverge (at {at})"
     size = f"error {_size(found['change'])} at {at}"
-    by = {"chatter": ", as chatter grows", "slow": ", as the slow part grows", None: ""}[found["by"]]
+    by = {"chatter": ", as its chatter grows", "slow": ", as its slow part grows", None: ""}[found["by"]]
     joint = ", but it" if found["limit"] == "constraint" else ", and it"
     missed = f"{joint} {_missing(found['missed'])}" if found["missed"] else ""
     return f"{way} {symbol}: {size}{by}{missed}"
@@ -376,6 +379,8 @@ def tune_headline(summary: dict[str, Any]) -> list[str]:
             f"{found['convergence_time']:.3g} s, the worst of {_runs_behind(summary)}."
         )
     lines += [f"{side}, what limits the gains: {_limits_text(found)}" for side, found in summary["limits"].items()]
+    if any(way["by"] for found in summary["limits"].values() for ways in found["towards"].values() for way in ways.values()):
+        lines[-1] += " (Chatter is what changes from sample to sample, the slow part is the rest.)"
     lines += [conditions_line(side, one, "the largest of all runs") for side, one in summary["conditions"].items()]
     where = _where(summary)
     rows = {(row["name"], row["side"]): row for row in summary["holdout"]["rows"]}

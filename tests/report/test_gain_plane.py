@@ -8,7 +8,7 @@ from jaxbl.report.figures import save
 from jaxbl.report.gain_plane import conditions_line, draw_gain_plane
 
 GAINS = {
-    "exact holds": (1.24, 2.84, 1.97, "gain conditions that hold: exact; that do not: Davila-Fridman (32), Levant 1998, "),
+    "exact holds": (1.24, 2.84, 1.97, "gain conditions met: exact; not met: Davila-Fridman (32), Levant 1998, "),
     "all hold": (12.0, 3.1, 1.5, "Lyapunov, exact (all). λ may fall by a factor of "),
     "none holds": (0.005, 1.8, 1.59, "no gain condition holds. The exact one asks for λ above 1.21 √rad/s (243 "),
     "no lambda": (0.0, 1.8, 1.59, "no gain condition holds. The exact one asks for λ above 1.21 √rad/s."),
@@ -38,6 +38,7 @@ def test_plane_and_sentence_agree_with_the_numbers(case, tmp_path):
     np.testing.assert_allclose(right.get_ylim(), np.array(ax.get_ylim()) / np.sqrt(bound))
     # the curves of the conditions, the exact one last
     for curve, (name, condition) in zip(ax.lines, CONDITIONS.items(), strict=False):
+        assert curve.get_label() == condition.title
         alphas, least = np.asarray(curve.get_xydata())[200]
         assert least == pytest.approx(judge_gains(1.0, alphas, bound)["least_lambda"][name], rel=1e-6), condition.title
 
