@@ -35,7 +35,7 @@ def limits_of(search: "Search", side: str) -> dict[str, Any]:
 
     `profiles`: for each gain, the error along it with the other gain held at the optimum, and which constraints are missed
     there. `towards`: what that says of smaller and larger gains, within about a cell of the coarse map (:func:`_towards`).
-    `constraints`: their values at the optimum, their limits, and the factor between them, 1 at the limit. `binding`: the
+    `constraints`: their values at the optimum, their limits, and the factor between them, 1 at the limit, None without end. `binding`: the
     constraints that forbid a smaller error beside the optimum. `range_ends`: where the range searched ends at the optimum.
     """
     best = search.best(side)
@@ -50,7 +50,9 @@ def limits_of(search: "Search", side: str) -> dict[str, Any]:
     for name, column in _NUMBERS.items():
         limit = getattr(search.table, name)
         if limit is not None:
-            room = best[column] / limit if name != "longest_convergence" else limit / max(best[column], 1e-300)
+            ratio = best[column] / limit
+            # a time of zero has any room
+            room = ratio if name != "longest_convergence" else 1.0 / ratio if ratio else np.inf
             constraints[name] = {"value": best[column], "limit": limit, "room": room, "binds": name in binding}
     ends = [f"{way} {gain}" for gain, ways in towards.items() for way, found in ways.items() if found["limit"] == "range"]
     shown = {

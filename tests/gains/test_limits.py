@@ -97,6 +97,11 @@ def test_a_constraint_whose_gains_are_no_better_does_not_bind():
     assert (smaller["limit"], smaller["missed"]) == ("error", ["margin_exact"])
 
 
+def test_a_time_of_zero_has_room_without_end():
+    found = limits_of(searched(bowl, longest_convergence=1.0), "motor")
+    assert found["constraints"]["longest_convergence"] == {"value": 0.0, "limit": 1.0, "room": None, "binds": False}
+
+
 def test_ends_of_the_range_and_runs_that_diverge():
     found = limits_of(searched(lambda x, a: np.where(x > 1.2, np.nan, 1.0 + np.log(a))), "motor")
     assert found["towards"]["lambda"]["smaller"]["limit"] == "range"
