@@ -35,8 +35,9 @@ def limits_of(search: "Search", side: str) -> dict[str, Any]:
 
     `profiles`: for each gain, the error along it with the other gain held at the optimum, and which constraints are missed
     there. `towards`: what that says of smaller and larger gains, within about a cell of the coarse map (:func:`_towards`).
-    `constraints`: their values at the optimum, their limits, and the factor between them, 1 at the limit, None without end. `binding`: the
-    constraints that forbid a smaller error beside the optimum. `range_ends`: where the range searched ends at the optimum.
+    `constraints`: their values at the optimum, their limits, and the factor between them, 1 at the limit, None without end.
+    `binding`: the constraints that forbid a smaller error beside the optimum. `range_ends`: where the range searched ends at
+    the optimum.
     """
     best = search.best(side)
     profiles = {gain: _profile(search, side, gain, best) for gain in GAINS}
