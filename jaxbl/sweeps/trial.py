@@ -14,7 +14,7 @@ from jaxbl.config import Config, precision, prepare, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import plain
 from jaxbl.fused import Unsupported, attempted, say_scanned
-from jaxbl.observer.conditions import CONDITIONS, peak_ratio
+from jaxbl.observer.conditions import CONDITIONS, judge_gains
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.simulate import Experiment, Reducer, Signals, State, scan
 
@@ -128,7 +128,8 @@ def _summary(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed
     for side in experiment.sides:
         f_plus = metrics[f"{side}.f_plus"]
         if f_plus is not None:
-            conditions[side] = _conditions(getattr(experiment.observer, side), f_plus)
+            observer = getattr(experiment.observer, side)
+            conditions[side] = judge_gains(observer.lambda_, observer.alpha, f_plus)
     return {
         "title": config.title,
         "single_run": identity(config, "simulate"),
@@ -137,30 +138,6 @@ def _summary(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed
         "identified": parameters,
         "conditions": conditions,
         "remarks": [*config.notes, *_remarks(experiment, last, metrics, conditions)],
-    }
-
-
-@jax.jit
-def _asked(lambda_: jax.Array, alpha: jax.Array, f_plus: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
-    """What each condition asks of lambda, and the ratio of peaks."""
-    least = {name: condition.least_lambda(alpha, f_plus) for name, condition in CONDITIONS.items()}
-    return least, peak_ratio(lambda_, alpha, f_plus)
-
-
-def _conditions(observer: Any, f_plus: float) -> dict[str, Any]:
-    """Gains of an observer against what each condition asks at a bound f_plus (rad/s^2)."""
-    with jax.enable_x64(True):
-        lambda_, alpha, bound = (jnp.asarray(x) for x in (float(observer.lambda_), float(observer.alpha), f_plus))
-        found, rho = _asked(lambda_, alpha, bound)
-    least = {name: plain(found[name]) for name in CONDITIONS}
-    return {
-        "lambda": float(observer.lambda_),
-        "alpha": float(observer.alpha),
-        "f_plus": f_plus,
-        "alpha_exceeds_f_plus": float(observer.alpha) > f_plus,
-        "least_lambda": least,
-        "holds": {name: value is not None and float(observer.lambda_) > value for name, value in least.items()},
-        "peak_ratio": plain(rho),
     }
 
 
@@ -186,7 +163,7 @@ def _remarks(experiment: Experiment, last: dict[str, Any], metrics: dict[str, An
             # what lambda would have to be where alpha does cover the torque
             torque_bound = largest * abs(float(experiment.drive.torque_gain(side))) / inertia
             if found["alpha"] > torque_bound:
-                found["torque_bound"] = _conditions(getattr(experiment.observer, side), torque_bound)
+                found["torque_bound"] = judge_gains(found["lambda"], found["alpha"], torque_bound)
         for label, values in (("the true f⁺", found), ("f⁺ = max |C| / J", found.get("torque_bound"))):
             if values is None or values["least_lambda"]["exact"] is None:
                 continue
