@@ -8,8 +8,8 @@ import textwrap
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -81,6 +81,20 @@ def running(
         raise typer.Exit(INTERRUPTED) from None
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def until_interrupted(run: Callable[[], object]) -> None:
+    """Run until Ctrl+C or a request to end; a second one ends the process as it is."""
+
+    def end(number: int, frame: FrameType | None) -> None:
+        for one in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(one, signal.SIG_DFL)
+        raise KeyboardInterrupt
+
+    for one in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(one, end)
+    with suppress(KeyboardInterrupt):
+        run()
 
 
 def _call_again(context: typer.Context, folder: Path, *, kept: bool) -> str:

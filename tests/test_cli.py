@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import tomllib
+import urllib.request
 from importlib.metadata import version
 from pathlib import Path
 
@@ -306,6 +307,29 @@ def test_a_sweep_is_explored(call, tmp_path):
     )
     with pytest.raises(InputError, match="out: is not empty, and was not written by jaxbl explore"):
         call("explore", "out", "--static", "out")
+
+
+def test_explore_serves_until_it_is_interrupted(call, tmp_path):
+    write(tmp_path, rigid(axes=GAINS))
+    call("sweep", "study.toml", "--out", "out")
+    command = [sys.executable, "-m", "jaxbl", "explore", "out", "--json"]
+    with subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"TMPDIR": str(tmp_path)},
+    ) as process:
+        assert process.stderr is not None
+        (url,) = (line.split()[1] for line in iter(process.stderr.readline, "Ctrl+C ends it.\n") if line.startswith("Open "))
+        with urllib.request.urlopen(url) as answer:
+            assert b"jaxbl explore" in answer.read()
+        assert any(one.startswith("jaxbl-explore-") for one in left(tmp_path))
+        process.send_signal(signal.SIGINT)
+        output, errors = process.communicate(timeout=60)
+    assert process.returncode == 0 and errors == "" and json.loads(output)["exit"] == 0
+    assert not any(one.startswith("jaxbl-explore-") for one in left(tmp_path))
 
 
 def test_plot_draws_other_figures_from_the_stored_points(call, tmp_path, monkeypatch):

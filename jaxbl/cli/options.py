@@ -26,6 +26,9 @@ SchedulerOption = Annotated[
     ),
 ]
 FORMATS = "CSV, Parquet, MATLAB or JSON file"
+ResultsArgument = Annotated[
+    str, typer.Argument(metavar="DIR", help="folder of a sweep, identify or diagnose", show_default=False)
+]
 LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help=FORMATS, show_default=False)]
 LogOutOption = Annotated[
     Path | None, typer.Option(metavar="DIR", help="folder for the results [default: results/<log name>]")

@@ -1,6 +1,5 @@
 """Commands on studies: simulate, sweep, status, tune, verify, plot, explore, compare, repair."""
 
-import contextlib
 import dataclasses
 import functools
 import math
@@ -16,7 +15,7 @@ import typer
 from jaxbl import workers
 from jaxbl.errors import InputError, printable
 from jaxbl.files import Busy, place
-from jaxbl.terminal import duration, is_quiet, naming, running, working
+from jaxbl.terminal import duration, is_quiet, naming, running, until_interrupted, working
 
 from .options import (
     BackendOption,
@@ -24,6 +23,7 @@ from .options import (
     FolderArgument,
     OutOption,
     OverwriteOption,
+    ResultsArgument,
     SchedulerOption,
     folder_of,
 )
@@ -299,12 +299,12 @@ def plot(
 
 def explore(
     context: typer.Context,
-    folder: FolderArgument,
+    folder: ResultsArgument,
     static: Annotated[
         Path | None,
         typer.Option("--static", metavar="OUT", help="write the page into this folder, new or ours, and do not serve it"),
     ] = None,
-    port: Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="to serve on [default: one that is free]")] = 0,
+    port: Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="port to serve on; 0: one that is free")] = 0,
     browser: Annotated[
         bool | None,
         typer.Option("--browser/--no-browser", help="open the page [default: on a terminal]", show_default=False),
@@ -331,8 +331,7 @@ def explore(
                 typer.echo(printable(line), err=True)
         if browser if browser is not None else sys.stdout.isatty():
             webbrowser.open(server.url)
-        with contextlib.suppress(KeyboardInterrupt):
-            server.serve_forever()
+        until_interrupted(server.serve_forever)
     return Outcome([])
 
 

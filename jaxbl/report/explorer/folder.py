@@ -33,12 +33,14 @@ class Source(NamedTuple):
         write: writes page and data into an empty folder, to be served or not; says whether there is more to come.
         answers: to questions of a page that is served, by name.
         prepare: takes what time it can off the first answer.
+        finish: waits for the answer that is being computed; none is computed after it.
     """
 
     lead: Sequence[str]
     write: Callable[[Path, bool], bool]
     answers: Mapping[str, Callable[[Any], Mapping[str, Any]]]
     prepare: Callable[[], Any]
+    finish: Callable[[], Any]
 
 
 def write_static(source: Source, out: Path) -> Path:

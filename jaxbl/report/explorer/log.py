@@ -60,7 +60,7 @@ def log_source(folder: str | Path) -> Source:
         write_page(out, "log.html", about | {"title": title, "lead": lead, "config": model}, ("log.js",), scripts=not served)
         return False
 
-    return Source(lead, write, {}, lambda: None)
+    return Source(lead, write, {}, lambda: None, lambda: None)
 
 
 def _read(file: Path) -> Any:

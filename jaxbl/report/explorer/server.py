@@ -42,6 +42,8 @@ def served(source: Source, port: int = 0) -> "Iterator[ExplorerServer]":
         with server:
             threading.Thread(target=source.prepare, name="jaxbl-prepare", daemon=True).start()
             yield server
+            # threads of XLA that still compute would take the interpreter down
+            source.finish()
 
 
 class ExplorerServer(ThreadingHTTPServer):
@@ -67,13 +69,18 @@ class ExplorerServer(ThreadingHTTPServer):
         place: Path,
         port: int = 0,
     ):
-        super().__init__(("127.0.0.1", port), _Handler)
         self.answers = answers
         self._write, self._place = write, place
         self._token = secrets.token_urlsafe(24)
         self._lock, self._versions, self._stale = threading.Lock(), 0, True
+        super().__init__(("127.0.0.1", port), _Handler)
         self.names = {f"{name}:{self.server_port}" for name in ("127.0.0.1", "localhost")}
         self.url = f"http://127.0.0.1:{self.server_port}/{self._token}/"
+
+    def server_close(self) -> None:
+        super().server_close()
+        # a page that is being written is written to the end, and no other one
+        self._lock.acquire()
 
     def is_known(self, token: str) -> bool:
         """Whether a request comes from who was given the address."""

@@ -1,5 +1,6 @@
 """A study in a browser: what its page needs, and single runs of it."""
 
+import functools
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,7 +40,9 @@ def study_source(folder: str | Path) -> Source:
             return simulated(result.config, asked)
 
     first = {axis.path: axis.start if axis.values is None else axis.values[0] for axis in result.config.axes}
-    return Source(headline(result), write, {"run": answer}, lambda: answer({"values": first, "seed": 0}))
+    return Source(
+        headline(result), write, {"run": answer}, lambda: answer({"values": first, "seed": 0}), one_at_a_time.acquire
+    )
 
 
 def write_study(result: StudyResult, out: Path, lead: Sequence[str], *, served: bool = False) -> bool:

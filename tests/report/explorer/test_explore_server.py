@@ -26,7 +26,7 @@ def ask(asked):
 
 @pytest.fixture
 def server():
-    with served(Source([], write, {"run": ask}, lambda: None)) as one:
+    with served(Source([], write, {"run": ask}, lambda: None, lambda: None)) as one:
         threading.Thread(target=one.serve_forever, daemon=True).start()
         yield one
         one.shutdown()
@@ -92,7 +92,7 @@ def test_questions(server):
 
 
 def test_a_port_of_another_program(server):
-    source = Source([], write, {}, lambda: None)
+    source = Source([], write, {}, lambda: None, lambda: None)
     with (
         pytest.raises(InputError, match=f"--port {server.server_port}: .*; choose another one"),
         served(source, server.server_port),

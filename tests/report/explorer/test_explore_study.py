@@ -35,7 +35,7 @@ def study(**columns):
 
 
 def source(result, lead=()):
-    return Source(lead, lambda out, served: write_study(result, out, lead, served=served), {}, lambda: None)
+    return Source(lead, lambda out, served: write_study(result, out, lead, served=served), {}, lambda: None, lambda: None)
 
 
 def about(folder):
