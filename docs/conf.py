@@ -28,15 +28,19 @@ html_theme = "furo"
 html_title = f"jaxbl {release}"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
+html_js_files = ["site.js"]
 html_extra_path = ["site"]  # the way from the site's root to its first page
 html_copy_source = False
 html_show_copyright = False
 
 
-def bars(app, what, name, it, options, lines):
+def read_docstring(app, what, name, it, options, lines):
     """Docstrings write sizes as |x|, which reStructuredText takes for a name, but in `code`."""
     for i, line in enumerate(lines):
         lines[i] = re.sub(r"(`[^`]*`)|\|", lambda found: found[1] or r"\|", line)
+    if what in ("attribute", "data", "property"):
+        # what stands before a colon in the first line is no type here
+        lines.insert(0, "")
 
 
 def own_files(app, error):
@@ -51,5 +55,5 @@ def own_files(app, error):
 
 def setup(app):
     """Called by Sphinx."""
-    app.connect("autodoc-process-docstring", bars)
+    app.connect("autodoc-process-docstring", read_docstring, priority=400)  # before napoleon
     app.connect("build-finished", own_files)
