@@ -23,6 +23,7 @@ default_role = "code"
 autodoc_typehints = "none"  # units and shapes are in the text
 autodoc_member_order = "bysource"
 napoleon_use_ivar = True
+napoleon_numpy_docstring = False
 
 html_theme = "furo"
 html_title = f"jaxbl {release}"
@@ -39,8 +40,8 @@ def read_docstring(app, what, name, it, options, lines):
     for i, line in enumerate(lines):
         lines[i] = re.sub(r"(`[^`]*`)|\|", lambda found: found[1] or r"\|", line)
     if what in ("attribute", "data", "property"):
-        # what stands before a colon in the first line is no type here
-        lines.insert(0, "")
+        # napoleon takes what stands before a colon in the first line for a type: here, an empty comment
+        lines[:0] = ["..", ""]
 
 
 def own_files(app, error):
