@@ -13,11 +13,23 @@ sys.path.insert(0, str(HERE))
 project = "jaxbl"
 author = "the jaxbl authors"
 release = version_of("jaxbl")
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "study_directive"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "study_directive"]
 root_doc = f"{HERE.name}/index"
-include_patterns = ["README.md", "CHANGELOG.md", "CONTRIBUTING.md", "benchmarks/NOTES.md", "docs/*.md"]
+include_patterns = [
+    "README.md",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "benchmarks/NOTES.md",
+    "docs/*.md",
+    "docs/notebooks/*.ipynb",
+]
 exclude_patterns = ["**/.*", "results", "build", "dist", "docs/_build"]
 
+# notebooks are kept without outputs, and run where their page is read
+nb_execution_mode = "force"
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
+nb_execution_timeout = 600
 myst_heading_anchors = 4  # as GitHub makes them
 default_role = "code"
 autodoc_typehints = "none"  # units and shapes are in the text
