@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from jaxbl.drive.registry import Registry, check_subclass
 from jaxbl.drive.transmission import TRANSMISSIONS
 from jaxbl.errors import InputError
 from jaxbl.observer import conditions
+from jaxbl.registry import Registry, check_subclass
 from jaxbl.simulate import Experiment, Number, Reducer, Signals, State, TrueSide
 from jaxbl.validation import nearest
 

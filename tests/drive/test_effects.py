@@ -13,7 +13,7 @@ from drive_reference import START, block, plant, reference, trajectory
 from effect_values import ENCODERS, VALUES
 from scipy.integrate import solve_ivp
 
-from jaxbl.drive import EFFECTS, LinearShaft, Plant, TwoInertia, as_arrays, make_effect, parameters, registry
+from jaxbl.drive import EFFECTS, LinearShaft, Plant, TwoInertia, as_arrays, make_effect, parameters
 from jaxbl.drive.effects import CoulombFriction, Motion, SideEffect, StribeckFriction, angle, base, size
 from jaxbl.drive.parameters import parameter
 
@@ -238,7 +238,7 @@ def installed(monkeypatch):
             assert group == "jaxbl.effects"
             return [types.SimpleNamespace(name=name, value="a:b", load=lambda v=value: v) for name, value in found.items()]
 
-        monkeypatch.setattr(registry, "entry_points", entry_points)
+        monkeypatch.setattr("jaxbl.registry.entry_points", entry_points)
         monkeypatch.setattr(EFFECTS, "_found", dict(BUILT_IN))
         monkeypatch.setattr(EFFECTS, "_loaded", False)
 

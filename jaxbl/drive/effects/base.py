@@ -15,8 +15,9 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import equinox as eqx
 import numpy as np
 
+from jaxbl.registry import Registry
+
 from ..parameters import Parameter, parameter, parameters
-from ..registry import Registry
 
 Value = Any  # a number or an array of one: hooks are duck-typed, neutral ones answer the Python number 0.0
 Numbers = dict[str, float]

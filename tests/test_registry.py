@@ -6,7 +6,7 @@ import sys
 import pytest
 from plugin import install_package
 
-from jaxbl.drive.registry import Registry, check_subclass
+from jaxbl.registry import Registry, check_subclass
 
 SOURCE = """
 import test_registry

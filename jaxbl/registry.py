@@ -1,4 +1,4 @@
-"""Classes by name: those of this package, and those that installed packages add through entry points."""
+"""Classes and functions by name: those of this package, and those that installed packages add through entry points."""
 
 import dataclasses
 import logging
@@ -11,7 +11,7 @@ Added = TypeVar("Added", bound=type)
 
 
 class Registry(Mapping[str, Any]):
-    """Name -> class. Entry points are loaded once, when names are first listed or one is not of this package.
+    """Name -> class or function. Entry points are loaded once, when names are first listed or one is not of this package.
 
     An entry that cannot be imported, or that the check refuses, is left out with one warning line (logger `jaxbl`): a
     broken add-on never ends a command.
