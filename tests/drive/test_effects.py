@@ -300,6 +300,11 @@ class TwoAngles(SideEffect):
     b: float = angle("another")
 
 
+class Costly(SideEffect):
+    kind = "costly"
+    torque: float = size("$", "torque")
+
+
 @pytest.mark.parametrize(
     ("name", "found", "wrong"),
     [
@@ -311,6 +316,7 @@ class TwoAngles(SideEffect):
         ("motor.as_before", AsBefore, r"dry_friction should take \(self, state, motion\), not \(self, state, velocity\)"),
         ("motor.not_neutral", NotNeutral, "not neutral: resist adds 1"),
         ("motor.two_angles", TwoAngles, "an angle should stand beside one size"),
+        ("motor.costly", Costly, r"torque: unit should be one line without control characters and without \$, not '\$'"),
     ],
 )
 def test_what_is_wrong_with_an_effect_is_one_line_and_it_is_left_out(name, found, wrong, installed, caplog):
