@@ -97,6 +97,9 @@ class LogFile:
         """The name of a column that is given by name or number; InputError names the nearest where there is none."""
         if column in self.columns:
             return column
+        # a hard space or the like, which names have here as messages spell it
+        if isinstance(column, str) and printable(column) in self.columns:
+            return printable(column)
         names = list(self.columns)
         if isinstance(column, int):
             if column < len(names):

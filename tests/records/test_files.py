@@ -367,6 +367,14 @@ def test_a_period_in_place_of_stamps_counts_the_channels_that_are_read(tmp_path)
         read_record(tmp_path / "other.mat", {"t": {"period": 1e-3}})
 
 
+@pytest.mark.parametrize("name", ["torque\xa0(Nm)", "\u202eu", "u\x1b[0m"])
+def test_columns_are_found_by_the_name_that_the_file_has_and_by_the_one_that_messages_spell(name, tmp_path):
+    pd.DataFrame({"t": T, name: U}).to_csv(tmp_path / "log.csv", index=False)
+    file = read_log_file(tmp_path / "log.csv", ("t", name))
+    for column in (name, repr(name)[1:-1]):
+        np.testing.assert_array_equal(file.numbers(column), U)
+
+
 def read_blocks(path):
     words = np.fromfile(path).reshape(-1, 2)
     return {"t": words[:, 0], "u": words[:, 1]}
