@@ -13,30 +13,47 @@ sys.path.insert(0, str(HERE))
 project = "jaxbl"
 author = "the jaxbl authors"
 release = version_of("jaxbl")
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "study_directive"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "study_directive"]
 root_doc = f"{HERE.name}/index"
-include_patterns = ["README.md", "CHANGELOG.md", "CONTRIBUTING.md", "benchmarks/NOTES.md", "docs/*.md"]
+include_patterns = [
+    "README.md",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "benchmarks/NOTES.md",
+    "docs/*.md",
+    "docs/notebooks/*.ipynb",
+]
 exclude_patterns = ["**/.*", "results", "build", "dist", "docs/_build"]
 
+# notebooks are kept without outputs, and run where their page is read
+nb_execution_mode = "force"
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
+nb_execution_timeout = 600
 myst_heading_anchors = 4  # as GitHub makes them
 default_role = "code"
 autodoc_typehints = "none"  # units and shapes are in the text
 autodoc_member_order = "bysource"
 napoleon_use_ivar = True
+napoleon_numpy_docstring = False
 
 html_theme = "furo"
 html_title = f"jaxbl {release}"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
+html_js_files = ["site.js"]
 html_extra_path = ["site"]  # the way from the site's root to its first page
 html_copy_source = False
 html_show_copyright = False
 
 
-def bars(app, what, name, it, options, lines):
+def read_docstring(app, what, name, it, options, lines):
     """Docstrings write sizes as |x|, which reStructuredText takes for a name, but in `code`."""
     for i, line in enumerate(lines):
         lines[i] = re.sub(r"(`[^`]*`)|\|", lambda found: found[1] or r"\|", line)
+    if what in ("attribute", "data", "property"):
+        # napoleon takes what stands before a colon in the first line for a type: here, an empty comment
+        lines[:0] = ["..", ""]
 
 
 def own_files(app, error):
@@ -51,5 +68,5 @@ def own_files(app, error):
 
 def setup(app):
     """Called by Sphinx."""
-    app.connect("autodoc-process-docstring", bars)
+    app.connect("autodoc-process-docstring", read_docstring, priority=400)  # before napoleon
     app.connect("build-finished", own_files)

@@ -28,14 +28,8 @@ if TYPE_CHECKING:
     from .records import Record as Record
     from .records import inspect as inspect
     from .records import read_record as read_record
-    from .report.diagnose import write_diagnosis_report as write_diagnosis_report
-    from .report.element import write_element_report as write_element_report
-    from .report.identify import write_identification_report as write_identification_report
-    from .report.inspect import write_inspection_report as write_inspection_report
-    from .report.simulate import write_trial_report as write_trial_report
-    from .report.sweep import write_sweep_report as write_sweep_report
-    from .report.tune import write_tune_report as write_tune_report
-    from .report.verify import write_verify_report as write_verify_report
+    from .report.results import draw as draw
+    from .report.results import write_report as write_report
     from .sweeps.compare import Comparison as Comparison
     from .sweeps.compare import compare as compare
     from .sweeps.status import Status as Status
@@ -62,14 +56,7 @@ _NAMES = {
     "identification.element": ("ElementIdentification", "identify_element"),
     "identification.identify": ("Identification", "identify"),
     "records": ("Inspection", "LogTable", "Record", "inspect", "read_record"),
-    "report.diagnose": ("write_diagnosis_report",),
-    "report.element": ("write_element_report",),
-    "report.identify": ("write_identification_report",),
-    "report.inspect": ("write_inspection_report",),
-    "report.simulate": ("write_trial_report",),
-    "report.sweep": ("write_sweep_report",),
-    "report.tune": ("write_tune_report",),
-    "report.verify": ("write_verify_report",),
+    "report.results": ("draw", "write_report"),
     "sweeps.compare": ("Comparison", "compare"),
     "sweeps.status": ("Status", "status"),
     "sweeps.sweep": ("StudyResult", "dry_run", "open_study", "repair", "share", "submit", "sweep"),

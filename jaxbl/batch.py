@@ -9,7 +9,7 @@ import pandas as pd
 from .cluster import Scheduler, connected
 from .errors import InputError
 from .files import make_folder, results_of
-from .records.files import LOG_ENDINGS, is_log
+from .records.files import is_log, log_endings
 from .report.diagnose import probability, rms_text
 from .workers import Progress, each, forget_programs, worth
 
@@ -44,7 +44,7 @@ def read_batch(source: Path, model: Path | None, out: Path, *, overwrite: bool) 
     others = (file.name for file in source.iterdir() if file.suffix != ".toml" and not file.name.startswith("."))
     skipped = sorted({*others} - known)
     if not logs:
-        raise InputError(f"{source}: holds no log ({', '.join(LOG_ENDINGS)}, or a folder of a ROS 2 bag)")
+        raise InputError(f"{source}: holds no log ({', '.join(log_endings())}, or a folder of a ROS 2 bag)")
     stems = [file.stem for file in logs]
     for name in stems:
         if stems.count(name) > 1:

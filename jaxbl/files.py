@@ -102,7 +102,8 @@ def _checksum_of(data: Mapping[str, Any]) -> str:
 def write_atomic(path: Path, content: str | bytes) -> None:
     """Write a file so that it is either there whole or not at all. Raises as :func:`written`."""
     with written(path) as draft:
-        draft.write_bytes(content.encode() if isinstance(content, str) else content)
+        # names of files may hold bytes that are no UTF-8: JSON's own way of writing them
+        draft.write_bytes(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
 
 
 def begin_file(path: Path, content: str) -> bool:

@@ -62,7 +62,8 @@ def test_api_has_every_public_name():
 def test_every_page_is_in_the_site():
     index = ROOT / "docs" / "index.md"
     listed = re.findall(r"^(?:\w+ <)?([\w./]+)>?$", index.read_text(encoding="utf-8"), re.M)
-    assert {(index.parent / f"{page}.md").resolve() for page in listed} == {page.resolve() for page in TEXTS} - {index}
+    pages = {page.resolve().with_suffix("") for page in [*TEXTS, *ROOT.glob("docs/notebooks/*.ipynb")]}
+    assert {(index.parent / page).resolve() for page in listed} == pages - {index.with_suffix("")}
 
 
 def test_citation_has_this_version():

@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxbl.registry import Registry, check_module
+
 from .parameters import Scalar, option, parameter
-from .registry import Registry, check_module
 
 
 class AbstractExcitation(eqx.Module):

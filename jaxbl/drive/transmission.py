@@ -15,8 +15,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxbl.registry import Registry, check_module
+
 from .parameters import Scalar, parameter
-from .registry import Registry, check_module
 
 
 class AbstractTransmission(eqx.Module):

@@ -22,6 +22,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.errors import InputError, printable
+from jaxbl.registry import Registry
 from jaxbl.validation import LARGEST, check_file, nearest
 
 from .libraries import Column, Columns, read_bag, read_mcap, read_mdf, read_tdms
@@ -34,10 +35,24 @@ _MARKS: tuple[tuple[bytes, str, Callable[..., dict[str | int, Any]]], ...] = (
     (b"#ROSBAG", "a ROS bag", read_bag),
 )
 """First bytes, name and reader of kinds that need a library."""
-LOG_ENDINGS = (
+_ENDINGS = (
     ".csv", ".txt", ".tsv", ".dat", ".parquet", ".mat", ".h5", ".hdf5", ".json", ".mf4", ".mdf", ".tdms", ".mcap", ".bag"
 )  # fmt: skip
-"""Of the files that are logs by their name."""
+"""Of the files that are logs by their name, without those of installed packages."""
+
+
+def _check_reader(name: str, found: Any) -> None:
+    if f".{name}" in _ENDINGS:
+        raise ValueError(f"files that end in .{name} are read by jaxbl itself")
+    if not re.fullmatch(r"[a-z0-9_-]+", name):
+        raise ValueError("its name should be the ending of its files, in small letters and without the dot")
+    if not callable(found):
+        raise TypeError("should be a function of a file's path")
+
+
+READERS = Registry("jaxbl.readers", _check_reader)
+"""Functions of a path that give the columns of a file by name, by the ending of their files without its dot."""
+
 _HEAD = 1 << 18
 """Bytes from which the kind of a file and the form of its rows are seen: hundreds of rows."""
 _BAG = "metadata.yaml"
@@ -82,6 +97,9 @@ class LogFile:
         """The name of a column that is given by name or number; InputError names the nearest where there is none."""
         if column in self.columns:
             return column
+        # a hard space or the like, which names have here as messages spell it
+        if isinstance(column, str) and printable(column) in self.columns:
+            return printable(column)
         names = list(self.columns)
         if isinstance(column, int):
             if column < len(names):
@@ -160,7 +178,12 @@ class LogFile:
 
 def is_log(path: Path) -> bool:
     """Whether a file, or the folder of a ROS 2 bag, is a log by its name; :func:`read_log_file` reads others, too."""
-    return (path / _BAG).is_file() or (path.is_file() and path.suffix.lower() in LOG_ENDINGS)
+    return (path / _BAG).is_file() or (path.is_file() and path.suffix.lower() in log_endings())
+
+
+def log_endings() -> tuple[str, ...]:
+    """Of the files that are logs by their name, with those of installed packages."""
+    return (*_ENDINGS, *(f".{name}" for name in READERS))
 
 
 def read_log_file(path: Path, wanted: Collection[str | int] = ()) -> LogFile:
@@ -197,6 +220,8 @@ def _columns(path: Path, wanted: Collection[str | int]) -> dict[str | int, Any]:
     if (path / _BAG).is_file():
         with _reading("a ROS bag"):
             return read_bag(path, wanted)
+    if suffix not in _ENDINGS and suffix[1:] in READERS:
+        return _added(path, suffix[1:])
     with path.open("rb") as file:
         head = file.read(_HEAD)
         whole = not file.read(1)
@@ -225,6 +250,22 @@ def _columns(path: Path, wanted: Collection[str | int]) -> dict[str | int, Any]:
     except UnicodeDecodeError:
         # a degree sign in a header of an old program
         return _of_text(path, head.decode("latin-1"), "latin-1", whole, wanted)
+
+
+def _added(path: Path, ending: str) -> Columns:
+    """Columns by the reader of an installed package."""
+    with _reading(f"a log by the reader of .{ending} files"):
+        found = READERS[ending](path)
+    try:
+        columns = found if isinstance(found, Columns) else Columns(found)
+        fits = all(isinstance(name, str) for name in columns) and all(
+            isinstance(values, Column) or np.ndim(values) == 1 for values in columns.values()
+        )
+    except (TypeError, ValueError):
+        fits = False
+    if not fits:
+        raise InputError(f"the reader of .{ending} files should give columns of one dimension by name")
+    return columns
 
 
 def _of_text(path: Path, head: str, encoding: str, whole: bool, wanted: Collection[str | int]) -> dict[str | int, Any]:

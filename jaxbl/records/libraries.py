@@ -16,7 +16,12 @@ from jaxbl.errors import InputError
 
 
 class Columns(dict[str | int, Any]):
-    """Columns of a file by name, with the units that the file says, and remarks on how it was read."""
+    """Columns of a file by name: arrays or :class:`Column`.
+
+    Attributes:
+        units: those that the file itself says, by column; `jaxbl inspect --write` puts them into `[log]`.
+        notes: remarks on how it was read, in sentences.
+    """
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
@@ -28,7 +33,7 @@ class Column:
     """Values of a column that are loaded as they are asked for.
 
     Attributes:
-        load: gives them, shape (rows,).
+        load: called without arguments, gives them, shape (rows,).
         rows: how many there are.
     """
 

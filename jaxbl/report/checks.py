@@ -1,15 +1,29 @@
 """What is wrong with the figures that a study asks for, said before anything is computed, and without loading what draws."""
 
-from jaxbl.config import Config, FigureTable
+from jaxbl.config import AxisTable, Config, FigureTable
 from jaxbl.errors import InputError
 from jaxbl.gains.accuracy_laws import check_selection, sizes_for
 from jaxbl.sweeps.metrics import no_metric
 from jaxbl.validation import nearest
 
+MOST_PARTS = 60
+"""Panels or lines of a figure: twenty rows of three panels, more than anyone compares."""
+
+
+def values_of(config: Config, axis: AxisTable) -> int:
+    """How many values an axis has."""
+    if axis.values is not None:
+        return len(set(axis.values))
+    if axis.num is None:
+        return config.sweep.points or 0
+    return (axis.num - 1 << (config.sweep.refine or 0)) + 1
+
 
 def check_figures(config: Config, figures: list[FigureTable], columns: list[str]) -> None:
     """Raise `InputError` where a figure names an axis that does not exist, or needs a metric that is not there."""
     axes = [axis.path for axis in config.axes]
+    counts = {axis.path: values_of(config, axis) for axis in config.axes}
+    parts = {"facet": "panel", "series": "line"}
     words = [axis.path for axis in config.axes if any(isinstance(value, str) for value in axis.values or ())]
     for i, figure in enumerate(figures):
         for key in ("x", "y", "facet", "series"):
@@ -20,6 +34,11 @@ def check_figures(config: Config, figures: list[FigureTable], columns: list[str]
             if path in words and key in ("x", "y"):
                 other = "facet" if figure.kind == "heatmap" else "facet or series"
                 raise InputError(f"figures[{i}].{key}: '{path}' has no numeric values; use it as {other}")
+            if path is not None and key in parts and (count := counts[path]) > MOST_PARTS:
+                raise InputError(
+                    f"figures[{i}].{key}: '{path}' has {count} values, each of which would be a {parts[key]}; at most "
+                    f"{MOST_PARTS} can be drawn"
+                )
         metrics = [column for column in columns if column not in (*axes, "seed")]
         of_curves = ("converged", "f_plus") if figure.overlays else ()
         needed = {

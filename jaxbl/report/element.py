@@ -34,7 +34,7 @@ def write_element_report(found: ElementIdentification, folder: Path) -> list[str
         found.trace,
         model,
         lead,
-        _draw(found),
+        draw_element(found),
         tables,
         remarks,
     )
@@ -75,7 +75,8 @@ def _remarks(summary: dict[str, Any]) -> list[str]:
 
 
 @style()
-def _draw(found: ElementIdentification) -> list[Drawn]:
+def draw_element(found: ElementIdentification) -> list[Drawn]:
+    """All figures of a transmission on a test rig."""
     trace, record = found.trace, found.task.record
     channels = record.findings.channels
     unit, torque_unit = channels["theta_e"].unit, channels["u"].unit

@@ -87,14 +87,17 @@ def save(figure: Figure, path: Path) -> Path:
     # a name may have letters that the font lacks, drawn as boxes
     with warnings.catch_warnings(), written(path) as draft:
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
-        if figure.get_layout_engine() is None:
-            _lay_out(figure)
+        lay_out(figure)
         figure.savefig(draft, format="png")
     return path
 
 
-def _lay_out(figure: Figure) -> None:
-    """Find room for texts once: an engine of matplotlib's own does so twice, and before each drawing."""
+@style()
+def lay_out(figure: Figure) -> None:
+    """Find room for texts once: an engine of matplotlib's own, where a figure has one, does so twice, and before each
+    drawing."""
+    if figure.get_layout_engine() is not None:
+        return
     width, height = figure.get_size_inches()
     figure.subplots_adjust(_MARGIN / width, _MARGIN / height, 1.0 - 0.2 * _MARGIN / width, 1.0 - 0.5 * _MARGIN / height)
     begins: dict[Axes, float] = {ax: ax.bbox.x0 for ax in figure.axes}

@@ -29,7 +29,7 @@ from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 
 from .aggregates import Column, Groups, Rows
-from .checks import check_figures
+from .checks import MOST_PARTS, check_figures, values_of
 from .figures import COLOURS, MAP, MARKERS, MISSING, SIDES, Drawn, style, subplots, with_unit
 from .refined_maps import Filling, on_coarse_values
 
@@ -63,7 +63,9 @@ def default_figures(config: Config, columns: list[str]) -> list[FigureTable]:
         value = next(name for name in columns if name.startswith("motor."))
     if len(varying) == 1:
         return [FigureTable(kind="line", x=varying[0], value=value)]
-    return [FigureTable(kind="heatmap", x=varying[-1], y=varying[-2], value=value, facet=(None, None, *varying)[-3])]
+    few = [axis.path for axis in config.axes if values_of(config, axis) <= MOST_PARTS]
+    facet = varying[-3] if varying[-3:-2] and varying[-3] in few else None
+    return [FigureTable(kind="heatmap", x=varying[-1], y=varying[-2], value=value, facet=facet)]
 
 
 def draw(result: StudyResult, laws: list[Law] | None = None) -> list[Drawn]:

@@ -17,6 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import tomli_w
 
 from jaxbl.files import json_text, write_atomic, writing
@@ -103,7 +104,7 @@ def write_results(
         trace.to_parquet(draft / "trace.parquet", index=False)
         (draft / "model.toml").write_text(model, encoding="utf-8")
         lines = write_report(draft, title, lead, drawn, tables, model, remarks)
-        (draft / f"{name}.json").write_text(json_text(summary), encoding="utf-8")
+        write_atomic(draft / f"{name}.json", json_text(summary))
         for file in sorted(draft.rglob("*"), key=lambda one: one.name == f"{name}.json"):
             if file.is_file():
                 target = folder / file.relative_to(draft)
@@ -179,7 +180,9 @@ def _cell(value: object) -> str:
         value = {True: "yes", False: "no", None: "–"}[value]
     if isinstance(value, str):
         return f"<td>{escape(value)}</td>"
-    return f'<td class="number" data-value="{value}">{value:.4g}</td>'
+    # counts in full
+    text = str(value) if isinstance(value, int | np.integer) else f"{value:.4g}"
+    return f'<td class="number" data-value="{value}">{text}</td>'
 
 
 def _origin() -> str:

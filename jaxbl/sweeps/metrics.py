@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from jaxbl.drive.registry import Registry, check_subclass
 from jaxbl.drive.transmission import TRANSMISSIONS
 from jaxbl.errors import InputError
 from jaxbl.observer import conditions
+from jaxbl.registry import Registry, check_subclass, check_text
 from jaxbl.simulate import Experiment, Number, Reducer, Signals, State, TrueSide
 from jaxbl.validation import nearest
 
@@ -53,8 +53,8 @@ class Metric(abc.ABC):
 def _check(name: str, found: Any) -> None:
     base = GainMetric if isinstance(found, type) and issubclass(found, GainMetric) else RunMetric
     check_subclass(name, found, base)
-    if not all(isinstance(getattr(found, about, None), str) for about in ("unit", "label", "doc")):
-        raise TypeError("unit, label and doc should be text")
+    for about in ("unit", "label", "doc"):
+        check_text(about, getattr(found, about, None))
 
 
 class _Metrics(Registry):

@@ -13,7 +13,7 @@ from drive_reference import START, block, plant, reference, trajectory
 from effect_values import ENCODERS, VALUES
 from scipy.integrate import solve_ivp
 
-from jaxbl.drive import EFFECTS, LinearShaft, Plant, TwoInertia, as_arrays, make_effect, parameters, registry
+from jaxbl.drive import EFFECTS, LinearShaft, Plant, TwoInertia, as_arrays, make_effect, parameters
 from jaxbl.drive.effects import CoulombFriction, Motion, SideEffect, StribeckFriction, angle, base, size
 from jaxbl.drive.parameters import parameter
 
@@ -238,7 +238,7 @@ def installed(monkeypatch):
             assert group == "jaxbl.effects"
             return [types.SimpleNamespace(name=name, value="a:b", load=lambda v=value: v) for name, value in found.items()]
 
-        monkeypatch.setattr(registry, "entry_points", entry_points)
+        monkeypatch.setattr("jaxbl.registry.entry_points", entry_points)
         monkeypatch.setattr(EFFECTS, "_found", dict(BUILT_IN))
         monkeypatch.setattr(EFFECTS, "_loaded", False)
 
@@ -300,6 +300,11 @@ class TwoAngles(SideEffect):
     b: float = angle("another")
 
 
+class Costly(SideEffect):
+    kind = "costly"
+    torque: float = size("$", "torque")
+
+
 @pytest.mark.parametrize(
     ("name", "found", "wrong"),
     [
@@ -311,6 +316,7 @@ class TwoAngles(SideEffect):
         ("motor.as_before", AsBefore, r"dry_friction should take \(self, state, motion\), not \(self, state, velocity\)"),
         ("motor.not_neutral", NotNeutral, "not neutral: resist adds 1"),
         ("motor.two_angles", TwoAngles, "an angle should stand beside one size"),
+        ("motor.costly", Costly, r"torque: unit should be one line without control characters and without \$, not '\$'"),
     ],
 )
 def test_what_is_wrong_with_an_effect_is_one_line_and_it_is_left_out(name, found, wrong, installed, caplog):

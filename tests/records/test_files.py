@@ -2,6 +2,7 @@
 
 import json
 import sys
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.io import savemat
 from jaxbl.errors import InputError
 from jaxbl.records import files, read_record
 from jaxbl.records.files import read_log_file
-from jaxbl.records.libraries import Column
+from jaxbl.records.libraries import Column, Columns
 
 T, U = np.arange(5) * 0.1, np.array([1.5, -2.0, 3e-7, 4e12, 0.0])
 
@@ -364,3 +365,77 @@ def test_a_period_in_place_of_stamps_counts_the_channels_that_are_read(tmp_path)
     savemat(tmp_path / "other.mat", {"torque": values[0], "theta": values[1]})
     with pytest.raises(InputError, match=r"no column 'theta_e' or 'theta_s'; columns: torque, theta"):
         read_record(tmp_path / "other.mat", {"t": {"period": 1e-3}})
+
+
+@pytest.mark.parametrize("name", ["torque\xa0(Nm)", "\u202eu", "u\x1b[0m"])
+def test_columns_are_found_by_the_name_that_the_file_has_and_by_the_one_that_messages_spell(name, tmp_path):
+    pd.DataFrame({"t": T, name: U}).to_csv(tmp_path / "log.csv", index=False)
+    file = read_log_file(tmp_path / "log.csv", ("t", name))
+    for column in (name, repr(name)[1:-1]):
+        np.testing.assert_array_equal(file.numbers(column), U)
+
+
+def read_blocks(path):
+    words = np.fromfile(path).reshape(-1, 2)
+    return {"t": words[:, 0], "u": words[:, 1]}
+
+
+def lazy_blocks(path):
+    found = Columns(
+        {name: Column(lambda i=i: np.fromfile(path).reshape(-1, 2)[:, i], len(T)) for i, name in enumerate("tu")}
+    )
+    found.notes.append("Read block by block.")
+    return found
+
+
+@pytest.fixture
+def installed(monkeypatch):
+    """Readers as of installed packages, by ending."""
+
+    def install(**found):
+        monkeypatch.setattr(files.READERS, "_found", {})
+        monkeypatch.setattr(files.READERS, "_loaded", False)
+        entries = [SimpleNamespace(name=name, value="a:b", load=lambda read=read: read) for name, read in found.items()]
+        monkeypatch.setattr("jaxbl.registry.entry_points", lambda group: entries if group == "jaxbl.readers" else [])
+
+    return install
+
+
+@pytest.mark.parametrize("read", [read_blocks, lazy_blocks, lambda path: pd.DataFrame(read_blocks(path))])
+def test_readers_of_installed_packages_read_the_files_of_their_ending(read, installed, tmp_path):
+    np.stack([T, U], axis=1).tofile(tmp_path / "log.REC")
+    assert not files.is_log(tmp_path / "log.REC")
+    installed(rec=read)
+    assert files.is_log(tmp_path / "log.REC") and files.log_endings()[-1] == ".rec"
+    columns = read_log_file(tmp_path / "log.REC", ("t", "u"))
+    for name, values in {"t": T, "u": U}.items():
+        np.testing.assert_array_equal(columns.numbers(name), values)
+    assert columns.notes == (["Read block by block."] if read is lazy_blocks else [])
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (lambda path: [1.0, 2.0], "the reader of .rec files should give columns of one dimension by name"),
+        (lambda path: None, "the reader of .rec files should give columns of one dimension by name"),
+        (lambda path: {"t": np.zeros((2, 2))}, "the reader of .rec files should give columns of one dimension by name"),
+        (lambda path: {0: T}, "the reader of .rec files should give columns of one dimension by name"),
+        (lambda path: {}["t"], "cannot be read as a log by the reader of .rec files: 't'"),
+    ],
+)
+def test_what_a_reader_of_a_package_does_wrong_is_one_line(found, said, installed, tmp_path):
+    (tmp_path / "log.rec").write_bytes(b"x")
+    installed(rec=found)
+    with pytest.raises(InputError) as error:
+        read_log_file(tmp_path / "log.rec")
+    assert str(error.value) == f"{tmp_path / 'log.rec'}: {said}"
+
+
+def test_readers_cannot_take_the_endings_of_others(installed, caplog):
+    installed(csv=read_blocks, **{".Rec": read_blocks, "rec": 3})
+    assert list(files.READERS) == []
+    assert [message.partition("left out: ")[2] for message in caplog.messages] == [
+        "ValueError: files that end in .csv are read by jaxbl itself",
+        "ValueError: its name should be the ending of its files, in small letters and without the dot",
+        "TypeError: should be a function of a file's path",
+    ]

@@ -273,6 +273,20 @@ def test_figure_of_what_is_not_there(case):
 
 
 @pytest.mark.parametrize(
+    ("figure", "key", "part"), [(heatmap, "facet", "panel"), (line, "facet", "panel"), (line, "series", "line")]
+)
+def test_more_parts_than_a_figure_can_have(figure, key, part):
+    axes = [*GAINS, spaced(NOISE, 1e-6, 1e-3, 61)]
+    with pytest.raises(InputError) as error:
+        draw(made(rigid(axes=axes, figures=[figure(**{key: NOISE})])))
+    said = f"figures[0].{key}: '{NOISE}' has 61 values, each of which would be a {part}; at most 60 can be drawn"
+    assert str(error.value) == said
+    # a study that asks for no figures gets one all the same
+    (drawing,) = draw(made(rigid(axes=axes[::-1])))
+    assert drawing.caption.endswith(f"median over {NOISE}.")
+
+
+@pytest.mark.parametrize(
     ("figure", "message"),
     [
         (line(), f"figures[0].value: '{RMSE}' is not computed; add 'velocity_rmse' to sweep.metrics"),

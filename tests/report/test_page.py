@@ -1,14 +1,17 @@
 """The HTML page: well-formed, complete, and nothing of the user's text taken for markup."""
 
 import json
+import os
 from html import unescape
 from html.parser import HTMLParser
 
+import numpy as np
 import pandas as pd
 import pytest
 from browser import check, needs_chromium, opened
 from small_study import ALPHA, LAMBDA, listed, made, rigid, small, spaced
 
+from jaxbl.files import write_atomic
 from jaxbl.report.page import PageTable, html
 from jaxbl.report.picture import Picture
 from jaxbl.report.simulate import write_trial_report
@@ -98,7 +101,7 @@ def test_page_of_a_sweep(tmp_path):
 
 
 def test_page_of_a_run_and_its_files(tmp_path):
-    trial = run(small({"title": "one run", "identifier.start": 10.0}))
+    trial = run(small({"title": HOSTILE, "notes": [HOSTILE], "identifier.start": 10.0}))
     lines = write_trial_report(trial, tmp_path)
     assert "stiffness: undetermined (motor), undetermined (load); true 1" in lines
     assert sorted(path.name for path in tmp_path.iterdir()) == ["figures", "report.html", "summary.json", "trace.parquet"]
@@ -107,7 +110,8 @@ def test_page_of_a_run_and_its_files(tmp_path):
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert len(page.images) == 11
     assert (tmp_path / "report.html").stat().st_size < 5e6
-    for text in (*lines, "one run", "half_gap", "rms velocity error"):
+    assert "b" not in page.tags and HOSTILE in lines
+    for text in (*lines, "half_gap", "rms velocity error"):
         assert text in page.text
 
 
@@ -176,3 +180,45 @@ def test_nothing_of_the_users_runs_in_a_page(tmp_path):
         page.locator(".view").first.hover()
         for name in names[:3]:
             assert page.get_by_text(name, exact=True).count() >= 3
+
+
+GONE = {
+    "finite": lambda frame: False,
+    "motor__converged": lambda frame: False,
+    **{f"motor__{name}": lambda frame: np.nan for name in ("velocity_rmse", "position_rmse", "f_plus")},
+}
+
+
+@needs_chromium
+def test_pages_of_studies_that_nobody_expects(tmp_path):
+    """Markup and letters from right to left in texts, ten thousand values of an axis, nothing but runs that diverged."""
+    title = f"{HOSTILE} $\\frac{{$ {{0}} %s \u202e"
+    lambdas = spaced(LAMBDA, 1.0, 20.0, 2)
+    many = spaced(ALPHA, 1.0, 50.0, 10_000)
+    figure = {"kind": "heatmap", "x": ALPHA, "y": LAMBDA, "value": "motor.velocity_rmse", "overlays": ["exact"]}
+    few = {"axes": [spaced(ALPHA, 1.0, 50.0, 5), lambdas], "figures": [figure]}
+    rising = {"motor__velocity_rmse": lambda frame: frame[ALPHA]}
+    studies = {
+        "texts": (few | {"title": title, "notes": [title] * 2}, rising),
+        "map": ({"axes": [lambdas, many]}, rising),
+        "gone": (few, GONE),
+    }
+    for name, (data, columns) in studies.items():
+        (tmp_path / name).mkdir()
+        write_sweep_report(made(rigid(**data), **columns), tmp_path / name)
+    with opened(*(tmp_path / name / "report.html" for name in studies), color_scheme="dark") as pages:
+        for page in pages:
+            check(page, 1)
+        shown = dict(zip(studies, pages, strict=True))
+        assert shown["texts"].locator("h1").text_content() == title
+        assert shown["texts"].get_by_text(title, exact=True).count() == 3
+        assert shown["map"].locator("table").first.locator("td", has_text="10000").count() == 1
+        assert shown["gone"].get_by_text("10 runs diverged").count() == 1
+
+
+def test_names_that_are_no_utf8_can_be_written_and_read(tmp_path):
+    name = os.fsdecode(b"a\xff.csv")
+    write_atomic(tmp_path / "page.html", html(name, [name], [], [], [], ""))
+    assert "<h1>a\\udcff.csv</h1>" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    write_atomic(tmp_path / "file.json", json.dumps({"file": name}, ensure_ascii=False))
+    assert json.loads((tmp_path / "file.json").read_text(encoding="utf-8")) == {"file": name}

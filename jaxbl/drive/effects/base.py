@@ -15,8 +15,9 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import equinox as eqx
 import numpy as np
 
+from jaxbl.registry import Registry, check_text
+
 from ..parameters import Parameter, parameter, parameters
-from ..registry import Registry
 
 Value = Any  # a number or an array of one: hooks are duck-typed, neutral ones answer the Python number 0.0
 Numbers = dict[str, float]
@@ -370,6 +371,8 @@ def _check_numbers(cls: type[AbstractEffect]) -> None:
     for field, about in parameters(cls):
         if not isinstance(about, Parameter) or not isinstance(about.unit, str):
             raise TypeError(f"{field.name} should be declared with a unit")
+        check_text(f"{field.name}: unit", about.unit)
+        check_text(f"{field.name}: description", about.doc)
     roles = [about.role for _, about in parameters(cls)]
     kinds = [role.kind for role in roles if role is not None]
     if kinds and len(kinds) < len(roles):

@@ -1,6 +1,5 @@
 """A study in a browser: what its page needs, and single runs of it."""
 
-import functools
 import threading
 from collections.abc import Sequence
 from pathlib import Path

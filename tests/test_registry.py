@@ -6,7 +6,7 @@ import sys
 import pytest
 from plugin import install_package
 
-from jaxbl.drive.registry import Registry, check_subclass
+from jaxbl.registry import Registry, check_subclass, check_text
 
 SOURCE = """
 import test_registry
@@ -20,6 +20,9 @@ class Renamed(Good):
 
 class Half(test_registry.Base):
     name = "half"
+
+class Markup(Good):
+    name = "<b>"
 
 number = 3
 """
@@ -69,6 +72,7 @@ def test_built_in_classes_come_first_and_entry_points_after_them(install, caplog
         ("half", "Half", "TypeError: should define answer"),
         ("gone", "Renamed", "TypeError: its name should be 'gone' as in the entry point, not 'other'"),
         ("built_in", "Good", "ValueError: the name is taken"),
+        ("<b>", "Markup", "ValueError: its name should be a lower-case word of letters, digits and _"),
     ],
 )
 def test_a_wrong_entry_is_left_out_with_one_line(install, caplog, name, member, said):
@@ -86,3 +90,19 @@ def test_an_entry_that_cannot_be_imported_is_left_out(tmp_path, monkeypatch, cap
     known, _ = registry()
     assert "one" not in known
     assert len(caplog.messages) == 1 and "\n" not in caplog.messages[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "unit should be text"),
+        ("N$m", "unit should be one line without control characters and without $, not 'N$m'"),
+        ("a\nb", "unit should be one line without control characters and without $, not 'a\\nb'"),
+        ("\u202e", "unit should be one line without control characters and without $, not '\\u202e'"),
+    ],
+)
+def test_texts_that_figures_cannot_show_are_refused(text, said):
+    with pytest.raises((TypeError, ValueError)) as error:
+        check_text("unit", text)
+    assert str(error.value) == said
+    check_text("unit", "√rad/s <b> {0} %s")

@@ -1,8 +1,9 @@
-"""Classes by name: those of this package, and those that installed packages add through entry points."""
+"""Classes and functions by name: those of this package, and those that installed packages add through entry points."""
 
 import dataclasses
 import logging
 import multiprocessing
+import re
 from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import entry_points
 from typing import Any, TypeVar
@@ -11,7 +12,7 @@ Added = TypeVar("Added", bound=type)
 
 
 class Registry(Mapping[str, Any]):
-    """Name -> class. Entry points are loaded once, when names are first listed or one is not of this package.
+    """Name -> class or function. Entry points are loaded once, when names are first listed or one is not of this package.
 
     An entry that cannot be imported, or that the check refuses, is left out with one warning line (logger `jaxbl`): a
     broken add-on never ends a command.
@@ -61,11 +62,25 @@ class Registry(Mapping[str, Any]):
         return self._found
 
 
+def check_text(what: str, text: Any) -> None:
+    """Check a text that figures and pages show: one line, and nothing that figures take for mathematics.
+
+    Raises:
+        TypeError: it is no text.
+        ValueError: it has a control character, or a dollar sign.
+    """
+    if not isinstance(text, str):
+        raise TypeError(f"{what} should be text")
+    if not text.isprintable() or "$" in text:
+        raise ValueError(f"{what} should be one line without control characters and without $, not {text!r}")
+
+
 def check_subclass(name: str, found: Any, base: type) -> None:
     """Check that an entry is a class that can be used in place of `base`, under the name that it was entered with.
 
     Raises:
         TypeError: it is no class, not derived from `base`, lacks a method or number, or has another name.
+        ValueError: the name is no lower-case word.
     """
     if not (isinstance(found, type) and issubclass(found, base)):
         raise TypeError(f"should be a class derived from {base.__name__}")
@@ -73,6 +88,8 @@ def check_subclass(name: str, found: Any, base: type) -> None:
         raise TypeError(f"should define {', '.join(sorted(missing))}")
     if (own := getattr(found, "name", None)) != name:
         raise TypeError(f"its name should be '{name}' as in the entry point, not {own!r}")
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        raise ValueError("its name should be a lower-case word of letters, digits and _")
 
 
 def check_module(name: str, found: Any, base: type) -> None:
@@ -81,3 +98,5 @@ def check_module(name: str, found: Any, base: type) -> None:
     for field in dataclasses.fields(found):
         if "parameter" not in field.metadata:
             raise TypeError(f"{field.name} should be declared by parameter(...) or option(...)")
+        check_text(f"{field.name}: unit", field.metadata["parameter"].unit)
+        check_text(f"{field.name}: description", field.metadata["parameter"].doc)

@@ -1,0 +1,48 @@
+"""Figures and reports of any result, by two functions."""
+
+import inspect
+
+import pytest
+from small_study import ALPHA, LAMBDA, made, rigid, spaced
+
+import jaxbl
+from jaxbl.report import results
+
+
+@pytest.fixture(scope="module")
+def study():
+    axes = [spaced(ALPHA, 1.0, 50.0, 5), spaced(LAMBDA, 1.0, 20.0, 4)]
+    figures = [
+        {"kind": "heatmap", "x": ALPHA, "y": LAMBDA, "value": f"motor.{name}"} for name in ("chatter", "velocity_rmse")
+    ]
+    return made(rigid(axes=axes, figures=figures))
+
+
+def test_a_notebook_shows_figures_with_captions_and_texts(study):
+    both, one = jaxbl.draw(study), jaxbl.draw(study, "heatmap_motor_chatter")
+    assert len(both) == 2 and [drawn.name for drawn in one] == ["heatmap_motor_chatter"]
+    shown = one._repr_html_()
+    assert shown.count("<figure>") == 1 and f"<figcaption>{one[0].caption}</figcaption>" in shown
+    assert f"x {ALPHA} (rad/s²) from " in shown.partition('alt="')[2].partition('"')[0]
+
+
+def test_a_report_makes_its_folder_and_says_its_lines(study, tmp_path):
+    lines = jaxbl.write_report(study, str(tmp_path / "a" / "b"))
+    assert lines[0].startswith("20 runs.")
+    assert sorted(file.name for file in (tmp_path / "a" / "b").iterdir()) == ["figures", "report.html"]
+
+
+def test_each_kind_of_result_goes_to_its_own_functions():
+    for kind, functions in results._KINDS.items():
+        first = [next(iter(inspect.signature(one).parameters.values())).annotation for one in functions]
+        assert first == [kind, kind]
+
+
+def test_what_is_no_result_or_no_figure_is_said(study, tmp_path):
+    with pytest.raises(jaxbl.InputError, match="no figure 'heatmap_motor_chater'; did you mean 'heatmap_motor_chatter'"):
+        jaxbl.draw(study, "heatmap_motor_chater")
+    with pytest.raises(jaxbl.InputError, match="no report of dict; a result should be one of Trial, StudyResult"):
+        jaxbl.draw({})
+    (tmp_path / "file").write_text("")
+    with pytest.raises(jaxbl.NoResult, match="file: cannot be written"):
+        jaxbl.write_report(study, tmp_path / "file")

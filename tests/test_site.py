@@ -1,0 +1,66 @@
+"""The documentation's site: every page in a browser, and where its links lead."""
+
+import os
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urldefrag, urlsplit
+
+import pytest
+from browser import accessible, needs_chromium, opened
+
+ROOT = Path(__file__).parents[1]
+SITE = ROOT / "docs" / "_build" / "html"
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def pages():
+    """Its pages, as `make docs` builds them: only those that have changed since it last did."""
+    words = "-m sphinx --fail-on-warning --keep-going --quiet --builder html --conf-dir docs . docs/_build/html"
+    assert words in (ROOT / "Makefile").read_text(encoding="utf-8")
+    subprocess.run(
+        [sys.executable, *words.split()], cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True, timeout=900
+    )
+    return sorted(SITE.rglob("*.html"))
+
+
+class Links(HTMLParser):
+    """Places that a page has, and where it leads."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.places, self.targets = {""}, set()
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        for key, value in attrs:
+            if key in ("id", "name") and value:
+                self.places.add(value)
+            elif key in ("href", "src") and not urlsplit(value).scheme:
+                self.targets.add(value)
+
+
+def test_every_link_leads_somewhere(pages):
+    known = {page: Links(page.read_text(encoding="utf-8")) for page in pages}
+    assert sum(len(page.targets) for page in known.values()) > 1000
+    for page, links in known.items():
+        for target in links.targets:
+            place, anchor = map(unquote, urldefrag(target.partition("?")[0]))
+            file = (page.parent / place).resolve() if place else page
+            assert file.is_file(), (page, target)
+            assert not anchor or anchor in known[file].places, (page, target)
+
+
+# both colour schemes and both widths, each once
+@needs_chromium
+@pytest.mark.parametrize(("scheme", "width"), [("light", 1100), ("dark", 400)])
+def test_every_page_can_be_read_by_everyone(pages, scheme, width):
+    shown = [page for page in pages if page != SITE / "index.html"]  # it only leads to the first
+    with opened(*shown, color_scheme=scheme, viewport={"width": width, "height": 900}) as open_pages:
+        for page in open_pages:
+            images = page.evaluate("[...document.images].map((one) => [one.currentSrc, one.naturalWidth, one.alt])")
+            assert [one for one in images if not all(one)] == [], page.url
+            accessible(page)
