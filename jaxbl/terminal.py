@@ -1,7 +1,6 @@
 """What a command does around its work: progress bar, interrupts, and names in front of messages of bad input."""
 
 import math
-import shlex
 import signal
 import sys
 import textwrap
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from .commands import command_line
 from .errors import InputError, printable
 from .workers import listening
 
@@ -77,15 +77,16 @@ def running(
         if not (interrupted or isinstance(error, KeyboardInterrupt)):
             raise
         state = "what is finished is kept. Go on with" if kept else "nothing was written. Start again with"
-        typer.echo(printable(f"interrupted; {state}: {_call_again(context, folder, kept=kept)}"), err=True)
+        again = command_line(*call_again(context, folder, kept=kept))
+        typer.echo(printable(f"interrupted; {state}: {again}"), err=True)
         raise typer.Exit(INTERRUPTED) from None
     finally:
         signal.signal(signal.SIGINT, before)
 
 
-def _call_again(context: typer.Context, folder: Path, *, kept: bool) -> str:
-    """The command line of this call, with the folder of its results; what is `kept` there is not to be overwritten."""
-    words = ["jaxbl", str(context.info_name)]
+def call_again(context: typer.Context, folder: Path, *, kept: bool = True) -> list[str]:
+    """The words of this call, with the folder of its results; what is `kept` there is not to be overwritten."""
+    words = [str(context.info_name)]
     for one in context.command.params:
         source, value = context.get_parameter_source(str(one.name)), context.params.get(str(one.name))
         if one.name in ("out", "overwrite" if kept else "out") or source is None or source.name != "COMMANDLINE":
@@ -94,7 +95,7 @@ def _call_again(context: typer.Context, folder: Path, *, kept: bool) -> str:
             words.append(one.opts[0])
         if value is not True:
             words += map(str, value if isinstance(value, list | tuple) else [value])
-    return shlex.join([*words, "--out", str(folder)])
+    return [*words, "--out", str(folder)]
 
 
 @contextmanager

@@ -10,7 +10,9 @@ import subprocess
 import sys
 import time
 import tomllib
+from html import unescape
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +25,9 @@ from progress_lines import without_progress
 from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
 
 from jaxbl import cli, terminal
+from jaxbl.cli import setup
 from jaxbl.cli.options import folder_of
-from jaxbl.cli.outcome import Outcome
+from jaxbl.commands import program
 from jaxbl.errors import InputError
 from jaxbl.files import locked
 from jaxbl.sweeps.engine import Engine
@@ -86,7 +89,7 @@ def test_a_sweep_and_its_second_call(tmp_path):
     ]  # fmt: skip
     lines = first.stdout.splitlines()
     assert lines[0].startswith("6 runs. The observers converged in ")
-    assert re.fullmatch(r"Compiled in [\d.]+ s, ran 6 lanes in [\d.]+ s\.", lines[-2])
+    assert re.fullmatch(r"Compiled in [\d.]+ s, ran 6 lanes in [\d.]+ s\.", lines[lines.index("Next:") - 1])
     assert lines[-1] == "results/study/report.html"
     second = jaxbl("sweep", "study.toml", cwd=tmp_path, **cache)
     assert second.stdout.splitlines() == [line for line in lines if not line.startswith("Compiled")]
@@ -527,7 +530,8 @@ def test_shipped_studies_run_without_a_word_on_stderr(name, command, tmp_path):
 def test_inspect_writes_a_first_model(call, tmp_path):
     made(count=6000, gap=0.1, noise=1e-4).to_csv("axis.csv", index=False)
     code, lines, _ = call("inspect", "axis.csv", "--write", "axis.toml")
-    assert code == 0 and "axis.toml: a first model. Run: jaxbl identify axis.csv --model axis.toml" in lines
+    assert code == 0 and "axis.toml: a first model." in lines
+    assert [command for command, _ in steps_in(lines)] == ["jaxbl identify axis.csv --model axis.toml"]
     text = (tmp_path / "axis.toml").read_text()
     assert text.startswith("# Proposed by jaxbl inspect --write from axis.csv.") and "gear_ratio = 20.0" in text
     assert call("inspect", "axis.csv", "--model", "axis.toml", "--out", "again")[0] == 0
@@ -773,7 +777,7 @@ def quick(monkeypatch):
         tasks.append(task)
         return _Found(task)
 
-    def report(found, folder):
+    def report(found, folder, steps):
         from jaxbl.report.diagnose import diagnosis_lines
 
         (folder / "report.html").write_text("its page")
@@ -800,9 +804,12 @@ def test_a_log_is_diagnosed_once(axis, quick, call, tmp_path):
         "On the last part of the log (0.4 to 0.6 s), held out, over windows of 0.1 s, rms (noise; most that a complete "
         "model leaves): theta_e 0.1 -> 0.001 rad (0.001; 0.0012), "
     )
-    assert lines[-2].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
+    at = lines.index("Next:")
+    assert lines[at - 1].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
+    run = "jaxbl simulate 'results/an axis/model.toml' --out 'results/an axis_run'"
+    assert [command for command, _ in steps_in(lines)] == [run]
     assert lines[-1] == "results/an axis/report.html"
-    assert call(*DIAGNOSE) == (0, [*lines[:-2], lines[-1]], [])
+    assert call(*DIAGNOSE) == (0, [*lines[: at - 1], *lines[at:]], [])
     assert len(quick) == 1
     shutil.copy("an axis.csv", "other.csv")
     with pytest.raises(InputError, match="results of another log"):
@@ -876,6 +883,7 @@ def test_one_json_object_has_what_was_found_or_what_is_wrong(call, tmp_path, mon
     assert (code, found["command"], found["exit"]) == (0, "sweep", 0)
     assert found["summary"] == {"title": "small", "runs": 3, "finished": True}
     assert found["found"][0].startswith("3 runs.") and found["open"] == "out/report.html"
+    assert [one["command"].split()[1] for one in found["next"]] == ["tune", "simulate"]
     assert set(found["files"]) == {f"out/{name}" for name in left(tmp_path / "out") if not name.startswith("points/")}
     assert call("sweep", "study.toml", "--quiet", "--out", "out") == (0, [], [])
     monkeypatch.setattr(sys, "argv", ["jaxbl", "sweep", "none.toml", "--json"])
@@ -896,17 +904,61 @@ def test_completion_knows_the_commands(tmp_path):
     assert shown.stdout.split() == ["sweep"]
 
 
-def test_the_demo_is_the_study_of_the_tree_or_of_the_wheel(call, tmp_path, monkeypatch):
-    given = {}
-
-    def sweep(context, config, out, backend):
-        given.update(config=config, out=out)
-        return Outcome(["2 runs."], tmp_path / "results" / "gain_map")
-
-    monkeypatch.setattr("jaxbl.cli.setup.sweep", sweep)
-    code, lines, _ = call("demo")
-    assert code == 0 and lines[0] == "2 runs." and lines[-1].endswith("results/gain_map/report.html")
-    assert given["config"].is_file() and given["config"].name == "gain_map.toml" and given["out"] is None
+def test_the_demo_is_the_study_of_the_tree_or_of_the_wheel():
+    shown = setup._shipped("gain_map.toml")
+    assert shown.is_file() and shown.name == "gain_map.toml"
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
     included = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
     assert included == {"sweeps/gain_map.toml": "jaxbl/studies/gain_map.toml"}
+
+
+def steps_in(lines):
+    """Command lines under "Next:", each with its question."""
+    at = lines.index("Next:") + 1
+    rows = lines[at : at + 2 * sum(line.startswith("  jaxbl ") for line in lines[at:])]
+    assert all(line.startswith("  jaxbl ") for line in rows[::2]) and all(len(line) <= 80 for line in rows[1::2])
+    return [(command.strip(), question.strip()) for command, question in zip(rows[::2], rows[1::2], strict=True)]
+
+
+@pytest.mark.slow
+def test_what_the_demo_says_to_try_next_works_as_it_stands(call, tmp_path, monkeypatch):
+    study = write(tmp_path, tunable() | {"axes": GAINS, "notes": ["The question: which gains?"]}, "a map.toml")
+    monkeypatch.setattr(setup, "_shipped", lambda name: study)
+    code, lines, _ = call("demo", "--out", "results/a map")
+    assert code == 0 and lines[-1] == "results/a map/report.html"
+    steps = steps_in(lines)
+    assert [shlex.split(command)[1] for command, _ in steps] == ["explore", "tune", "simulate", "init"]
+    page = unescape(Path("results/a map/report.html").read_text(encoding="utf-8"))
+    studied = (
+        "Studied: a rigid drive in runs of 0.2 s, sampled every 1 ms, over observer.motor.alpha (2 values, 5 to 9 rad/s²)"
+    )
+    assert all(
+        text in page for text in (lines[0], studied, "The question: which gains?", "What to try next", *chain(*steps))
+    )
+    # another page of the same study says the same
+    assert steps_in(call("plot", "results/a map")[1]) == steps[:-1]
+    for command, _ in steps[:-1]:
+        code, lines, _ = call(*shlex.split(command)[1:])
+        assert code == 0 and Path(lines[-1]).is_file()
+    # the last one asks; who has such a file is not told to write it
+    with pytest.raises(InputError, match="these numbers are missing"):
+        call(*shlex.split(steps[-1][0])[1:])
+    write(tmp_path, name="drive.toml")
+    assert len(steps_in(call("demo", "--out", "results/a map")[1])) == 3
+
+
+def test_commands_are_named_as_a_shell_finds_them(tmp_path, monkeypatch):
+    folder = tmp_path / "my venv" / "bin"
+    folder.mkdir(parents=True)
+    for name in ("jaxbl", "python"):
+        (folder / name).touch(0o755)
+    monkeypatch.setattr(sys, "executable", str(folder / "python"))
+    monkeypatch.setenv("PATH", str(folder))
+    assert program() == "jaxbl"
+    # `make demo` runs what is in a folder that the shell does not search
+    monkeypatch.setenv("PATH", "/nowhere")
+    assert program() == shlex.quote(str(folder / "jaxbl"))
+    monkeypatch.chdir(tmp_path)
+    assert program() == "'my venv/bin/jaxbl'"
+    (folder / "jaxbl").unlink()
+    assert program() == f"{shlex.quote(str(folder / 'python'))} -m jaxbl"

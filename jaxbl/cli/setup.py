@@ -11,9 +11,10 @@ from jaxbl.errors import InputError
 from jaxbl.files import write_atomic
 from jaxbl.terminal import answers, running, two_columns, working
 
+from .next_steps import after_demo, after_init
 from .options import BackendOption, OutOption, check_new
 from .outcome import Outcome, with_options
-from .studies import sweep
+from .studies import compute, read_study
 
 NewArgument = Annotated[Path, typer.Argument(metavar="[NEW.toml]", help="file to be written", show_default="drive.toml")]
 
@@ -45,13 +46,9 @@ def init(
     lines = [
         f"{file}: a study with comments. Gains by the usual rule, for unknown accelerations up to {said}.",
         *([said] if (said := remark(values, found)) else []),
-        "Next:",
-        f"  jaxbl simulate {file}   one run, with figures",
-        f"  jaxbl sweep {file} --out results/{file.stem}_map   which gains work",
-        f"  jaxbl tune {file} --out results/{file.stem}_gains   the best ones",
     ]
     data = {"file": str(file), "given": {name: one._asdict() for name, one in values.items()}, "f_plus": bounds}
-    return Outcome(lines, summary=data)
+    return Outcome(lines, summary=data, steps=after_init(file))
 
 
 def _asked(item: Item) -> Given:
@@ -113,15 +110,10 @@ def demo(
 ) -> Outcome:
     """Run the gain map of the README: 49 152 runs of a geared drive, some seconds to a minute."""
     config = _shipped("gain_map.toml")
-    found = sweep(context, config, out, backend=backend)
-    folder = found.folder
-    lines = [
-        *found.lines,
-        f"Open the page below in a browser. The study is {folder}/study.toml. To go on:",
-        f"  jaxbl simulate {folder}/study.toml --out results/one_run   one of its runs",
-        "  jaxbl init drive.toml   a study of your own drive, from its data sheet",
-    ]
-    return found._replace(lines=lines)
+    study, chosen = read_study(config, backend)
+    from jaxbl.sweeps.sweep import sweep
+
+    return compute(context, config, study, out, False, chosen, sweep, "sweep", after_demo)
 
 
 def _shipped(name: str) -> Path:
