@@ -3,21 +3,28 @@
 import shlex
 import shutil
 import sys
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+COLUMNS = 80
+"""Of a terminal."""
+
 
 class Step(NamedTuple):
-    """A command line, and the question that it answers, in a sentence of at most 76 characters."""
+    """A command line, and the question that it answers, in a sentence."""
 
     command: str
     answers: str
 
 
 def lines_of(steps: Sequence[Step]) -> list[str]:
-    """Steps as lines for the terminal; none where there are no steps."""
-    return ["Next:", *(line for one in steps for line in (f"  {one.command}", f"    {one.answers}"))] if steps else []
+    """Steps as lines for the terminal; none where there are no steps. Command lines are never broken."""
+    lines = ["Next:"] if steps else []
+    for one in steps:
+        lines += [f"  {one.command}", *textwrap.wrap(f"    {one.answers}", COLUMNS, subsequent_indent="    ")]
+    return lines
 
 
 def program() -> str:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from .commands import command_line
+from .commands import COLUMNS, command_line
 from .errors import InputError, printable
 from .workers import listening
 
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 """Exit code of an interrupted command: 128 and the signal's number."""
-_COLUMNS = 80
-"""Of a terminal."""
 _EVERY, _LOOK, _WINDOW = 10.0, 1.0, 60.0
 """Seconds between lines of progress in a pipe, between looks at what is done, and back to the look that gives the speed."""
 
@@ -214,7 +212,7 @@ def two_columns(rows: Iterable[tuple[str, str]]) -> list[str]:
     lines = []
     for name, text in rows:
         lines += textwrap.wrap(
-            text, _COLUMNS, initial_indent=name.ljust(width), subsequent_indent=" " * width, break_long_words=False,
+            text, COLUMNS, initial_indent=name.ljust(width), subsequent_indent=" " * width, break_long_words=False,
             break_on_hyphens=False,
         )  # fmt: skip
     return lines

@@ -14,6 +14,7 @@ from html import unescape
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -26,8 +27,9 @@ from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
 
 from jaxbl import cli, terminal
 from jaxbl.cli import setup
+from jaxbl.cli.next_steps import Given, after_diagnosis, after_identification
 from jaxbl.cli.options import folder_of
-from jaxbl.commands import program
+from jaxbl.commands import lines_of, program
 from jaxbl.errors import InputError
 from jaxbl.files import locked
 from jaxbl.sweeps.engine import Engine
@@ -945,6 +947,51 @@ def test_what_the_demo_says_to_try_next_works_as_it_stands(call, tmp_path, monke
         call(*shlex.split(steps[-1][0])[1:])
     write(tmp_path, name="drive.toml")
     assert len(steps_in(call("demo", "--out", "results/a map")[1])) == 3
+
+
+def test_after_logs_what_is_open_by_what_was_found():
+    logs, model, folder = [Path("a b.csv")], Path("m.toml"), Path("out")
+    again = ["diagnose", "a b.csv", "--model", "m.toml", "--out", "out"]
+
+    def task(samples, parts=1, missing=("excitation",)):
+        cut = tuple(slice(i * samples // parts, (i + 1) * samples // parts) for i in range(parts))
+        return SimpleNamespace(record=SimpleNamespace(segments=cut), missing=frozenset(missing))
+
+    def commands(steps):
+        assert all(len(line) <= 80 for line in lines_of(steps) if line.startswith("    "))
+        return [one.command for one in steps]
+
+    def identified(rms, done=None, holdout=None, wanted=None, **more):
+        summary = {"residual": {"motor": {"rms": rms, "noise": 1.0}}} | more
+        return commands(
+            after_identification(done or task(1000), summary, again, folder, Given(logs, model, holdout, wanted))
+        )
+
+    diagnose = "jaxbl diagnose 'a b.csv' --model m.toml"
+    simulate = "jaxbl simulate out/model.toml --out out_run"
+    assert identified(3.0) == [f"{diagnose} --out out_diagnosed"]
+    # too short to hold a quarter out, but for another log
+    assert identified(3.0, task(300)) == []
+    assert identified(3.0, task(300), Path("b.csv")) == [f"{diagnose} --holdout b.csv --out out_diagnosed"]
+    assert identified(1.0) == [simulate]
+    # the input of a log with gaps cannot be played back; that of the study can
+    assert identified(1.0, task(1000, 2)) == [] and identified(1.0, task(1000, 2, ())) == [simulate]
+    unseen = {"backlash": {"shown": False}}
+    assert identified(1.0, **unseen) == [simulate, f"{diagnose} --out out --next-experiment out_next.csv"]
+    assert identified(1.0, wanted=Path("n.csv"), **unseen) == identified(1.0, backlash={"shown": True}) == [simulate]
+
+    def diagnosed(wanted=None, **more):
+        return commands(after_diagnosis(task(1000), DIAGNOSED | more, again, folder, Given(logs, model, None, wanted)))
+
+    assert diagnosed() == [simulate]
+    long = {"effect": "transmission.rotational_friction_of_somebody_elses_package", "confidence": 0.5}
+    tied = [DIAGNOSED["findings"][0] | {"alternatives": [long]}]
+    experiment = f"{diagnose} --out out --next-experiment out_next.csv"
+    assert diagnosed(findings=tied, rival=long) == [experiment, simulate]
+    assert diagnosed(Path("n.csv"), findings=tied, rival=long) == [simulate]
+    nothing = {"findings": [], "verdict": "no_discrepancy"}
+    assert diagnosed(**nothing) == ["jaxbl identify 'a b.csv' --model m.toml --out out_identified"]
+    assert diagnosed(findings=[], verdict="unknown_effect") == []
 
 
 def test_commands_are_named_as_a_shell_finds_them(tmp_path, monkeypatch):

@@ -54,7 +54,7 @@ def inspect(
 
         table, gear_ratio, nominal = read_log_config(model)
     guesses: list[str] = []
-    steps: list[Step] = []
+    steps = [] if write is None else after_proposal(log, write)
     if write is None:
         found = inspect_log(log, table, gear_ratio=gear_ratio, nominal=nominal)
     else:
@@ -64,7 +64,7 @@ def inspect(
         study, guesses, found = propose(log, given, gear_ratio=gear_ratio, nominal=nominal)
     folder = folder_of(log, out)
     claim_log_folder(folder, log, overwrite=overwrite)
-    lines = write_inspection_report(found, folder)
+    lines = write_inspection_report(found, folder, steps)
     if write is not None:
         import tomli_w
 
@@ -76,7 +76,6 @@ def inspect(
         ]
         write_atomic(write, "".join(f"# {remark}\n" for remark in remarks) + tomli_w.dumps(study))
         lines += ["", f"{write}: a first model.", *guesses]
-        steps = after_proposal(log, write)
     return Outcome(lines, folder, summary="inspection.json", steps=steps)
 
 

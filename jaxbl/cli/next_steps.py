@@ -64,7 +64,7 @@ def _all_converge_somewhere(result: "StudyResult") -> bool:
 
 def after_proposal(log: Path, model: Path) -> list[Step]:
     """What a proposed model is for."""
-    answers = "Which inertia, friction, stiffness and gap does the machine have?"
+    answers = "Which numbers does the machine have, and how sure are they?"
     return [Step(command_line("identify", log, "--model", model), answers)]
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import tomli_w
 
+from jaxbl.commands import Step
 from jaxbl.files import plain, write_atomic
 from jaxbl.records import POSITION_CHANNELS, Inspection, Record
 from jaxbl.records.inspection import main_side, velocity
@@ -27,8 +28,11 @@ _CHANNELS = {
 """Label and colour of each channel."""
 
 
-def write_inspection_report(inspection: Inspection, folder: Path) -> list[str]:
-    """Write `inspection.json`, figures and report into a folder that exists. Returns the lines for the terminal."""
+def write_inspection_report(inspection: Inspection, folder: Path, steps: Sequence[Step] = ()) -> list[str]:
+    """Write `inspection.json`, figures and report into a folder that exists; the page says what to try next (`steps`).
+
+    Returns the lines for the terminal.
+    """
     record = inspection.record
     text = json.dumps(plain(inspection.to_dict()), indent=2, ensure_ascii=False)
     write_atomic(folder / "inspection.json", text)
@@ -39,7 +43,7 @@ def write_inspection_report(inspection: Inspection, folder: Path) -> list[str]:
     ]
     table = tomli_w.dumps({"log": inspection.log.model_dump(exclude_none=True)})
     lead = [*record.warnings, _headline(record), inspection.as_read()]
-    write_report(folder, record.path.name, lead, draw_inspection(inspection), tables, table, record.notes)
+    write_report(folder, record.path.name, lead, draw_inspection(inspection), tables, table, record.notes, steps)
     return summary(inspection)
 
 
