@@ -18,7 +18,7 @@ def after_init(file: Path) -> list[Step]:
     return [
         Step(command_line("simulate", file), "How do the drive and the estimates of its observers move? One run."),
         Step(command_line("sweep", file, "--out", f"{name}_map"), "Which gains of the motor observer work? A map."),
-        Step(command_line("tune", file, "--out", f"{name}_gains"), "Which gains have the least error, and of how much?"),
+        Step(command_line("tune", file, "--out", f"{name}_gains"), "Which gains have the least error, and how large is it?"),
     ]
 
 
