@@ -19,7 +19,7 @@ _RPM = math.pi / 30.0
 _ANGLE: dict[str, Unit] = {
     "rad": 1.0, "mrad": 1e-3, "deg": _DEGREE, "arcmin": _DEGREE / 60.0, "arcsec": _DEGREE / 3600.0,
 }  # fmt: skip
-_TORQUE: dict[str, Unit] = {"N m": 1.0, "mN m": 1e-3, "N cm": 1e-2}
+_TORQUE: dict[str, Unit] = {"N m": 1.0, "mN m": 1e-3, "N cm": 1e-2, "N mm": 1e-3}
 _INERTIA: dict[str, Unit] = {"kg m²": 1.0, "kg cm²": 1e-4, "kg mm²": 1e-6, "g cm²": 1e-7}
 _VISCOUS: dict[str, Unit] = {
     "N m s/rad": 1.0, "mN m s/rad": 1e-3, "N m/rpm": 1.0 / _RPM, "mN m/rpm": 1e-3 / _RPM, "mN m/krpm": 1e-6 / _RPM,
@@ -61,7 +61,7 @@ class Item(NamedTuple):
     Attributes:
         name: as an option, with _ for -.
         asked: what it is, in words.
-        units: that it may be given in; the first is SI, and what a number alone is in.
+        units: that it may be given in; the first is SI.
         example: as a data sheet may say it.
         default: what is taken if it is left out; "" where it has to be given.
         least: smallest possible SI value; `above`: whether it has to be larger than that.
@@ -86,14 +86,20 @@ class Item(NamedTuple):
             InputError: no number, a unit that is not known here, or out of range.
         """
         known = {_spelt(unit): (unit, factor) for unit, factor in self.units.items()}
+        likely = f"'{self.example}'" + (f", or '{NONE}'" if self.absent else "")
         if self.absent and text.strip().lower() == NONE:
             return Given(0.0, f"given: {NONE}")
         found = re.fullmatch(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
         units = ", ".join(unit for unit in self.units if unit) or "none"
-        if not found:
-            other = f", or '{NONE}'" if self.absent else ""
-            raise InputError(f"{self.option} '{text}': should be a number and its unit, such as '{self.example}'{other}")
-        number, unit = float(found[1]), _spelt(found[2]) or next(iter(known))
+        if not found or found[2].startswith(","):
+            point = ", with a decimal point" if "," in text else ""
+            raise InputError(f"{self.option} '{text}': should be a number and its unit{point}, such as {likely}")
+        number, unit = float(found[1]), _spelt(found[2])
+        if not unit and not number:
+            # zero of anything
+            unit = next(iter(known))
+        if not unit and "" not in known:
+            raise InputError(f"{self.option} '{text}': has no unit; such as {likely}; units: {units}")
         if unit not in known:
             raise InputError(f"{self.option} '{text}': the unit '{found[2]}' is not known here; known: {units}")
         name, factor = known[unit]

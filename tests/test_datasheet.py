@@ -22,7 +22,8 @@ BY_NAME = ITEMS["geared"]
     [
         ("motor_inertia", "0.48 kg cm2", 4.8e-5),
         ("motor_inertia", "480gcm²", 4.8e-5),
-        ("motor_inertia", "4.8e-5", 4.8e-5),
+        ("motor_inertia", "4.8e-5 kg m^2", 4.8e-5),
+        ("backlash", "0", 0.0),
         ("motor_viscous", "2 mN·m/krpm", 2e-3 / (1000.0 * 2.0 * math.pi / 60.0)),
         ("torque", "1.3Nm", 1.3),
         ("speed", "3000 1/min", 100.0 * math.pi),
@@ -70,6 +71,12 @@ def test_examples_and_defaults_can_be_read():
     ("name", "text", "message"),
     [
         ("motor_inertia", "heavy", "--motor-inertia 'heavy': should be a number and its unit, such as '0.48 kg cm²'"),
+        ("speed", "3000", "--speed '3000': has no unit; such as '3000 rpm'; units: rad/s, rpm, deg/s"),
+        (
+            "torque",
+            "1,3 N m",
+            "--torque '1,3 N m': should be a number and its unit, with a decimal point, such as '1.3 N m'",
+        ),
         ("speed", "3000 km/h", "--speed '3000 km/h': the unit 'km/h' is not known here; known: rad/s, rpm, deg/s"),
         ("torque", "-1 N m", "--torque '-1 N m': should be more than 0 N m, such as '1.3 N m'"),
         ("backlash", "-1 arcmin", "--backlash '-1 arcmin': should be at least 0 rad, such as '3 arcmin'"),
@@ -127,8 +134,8 @@ def test_on_a_terminal_numbers_are_asked_for_again_until_they_are_some(monkeypat
         return next(answers) or default
 
     monkeypatch.setattr("typer.prompt", prompt)
-    assert setup._asked(BY_NAME["motor_inertia"]).value == pytest.approx(5e-5)
-    assert setup._asked(BY_NAME["sample_period"]).text == "not given"
+    assert setup._asked_number(BY_NAME["motor_inertia"]).value == pytest.approx(5e-5)
+    assert setup._asked_number(BY_NAME["sample_period"]).text == "not given"
     assert asked[0] == asked[1] and asked[2][1] == "1 ms"
     assert "should be a number and its unit" in capsys.readouterr().err
 
@@ -234,7 +241,7 @@ def test_the_usual_rule_in_a_study_is_that_of_tune():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--kind", "belt"], "--kind 'belt': should be one of geared: a motor, a gear, and a load that turns; screw: "),
+        (["--kind", "belt"], "--kind 'belt': should be one of geared, screw, direct, linear; jaxbl init"),
         (
             [*words("direct", DIRECT), "--gear-ratio", "5", "--mass", "1 kg"],
             "--gear-ratio, --mass: not asked of --kind direct, which has: --motor-inertia, --motor-viscous, ",
@@ -264,21 +271,23 @@ def test_what_no_such_drive_has_is_said_and_nothing_written(arguments, message, 
 
 def test_on_a_terminal_the_kind_is_asked_for_first(call, tmp_path, monkeypatch):
     monkeypatch.setattr(setup, "answers", lambda: True)
+    examples = {item.asked: item.example for item in KINDS["linear"].items}
     asked = []
-    said = iter(["gearless", "linear", "8 kg"])
+    said = iter(["gearless", "Linear", "8 kg"])
 
     def prompt(text, default, err):
         asked.append(text)
-        return next(said, default or "7")
+        return next(said, default or examples.get(text.partition(", such as")[0]))
 
     monkeypatch.setattr("typer.prompt", prompt)
     code, lines, errors = call("init", "axis.toml", "--frequency", "20 Hz")
     assert code == 0 and lines[0].startswith("axis.toml: a study")
-    assert asked[0] == asked[1] and asked[0].startswith("Kind of drive: geared: ")
+    assert asked[0] == asked[1] and asked[0] == "kind of this drive"
     assert [text.partition(",")[0] for text in asked[2:]] == [
         item.asked.partition(",")[0] for item in KINDS["linear"].items[:-1]
     ]
-    assert errors[0].startswith("  --kind 'gearless': should be one of geared")
+    assert errors[0] == "Kinds of drives:" and all(len(line) <= 80 for line in (*errors[:5], *asked))
+    assert errors[5].startswith("  --kind 'gearless': should be one of geared")
     assert read_config(tmp_path / "axis.toml").drive.motor_inertia == 8.0
 
 

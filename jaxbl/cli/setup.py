@@ -1,7 +1,8 @@
 """Commands before the work: init, schema, doctor, demo, bench."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
 
@@ -16,9 +17,10 @@ from .options import BackendOption, OutOption, check_new
 from .outcome import Outcome, with_options
 from .studies import compute, read_study
 
+T = TypeVar("T")
 NewArgument = Annotated[Path, typer.Argument(metavar="[NEW.toml]", help="file to be written", show_default="drive.toml")]
 
-_KINDS_SAID = "; ".join(f"{name}: {kind.about}" for name, kind in KINDS.items())
+_KINDS_SAID = "; ".join(f"{name}: {kind.about}" for name, kind in KINDS.items()) + " [default: asked for, or geared]"
 
 
 def init(
@@ -37,13 +39,13 @@ def init(
     name = (_asked_kind() if asking else next(iter(KINDS))) if kind is None else _kind(kind)
     items = KINDS[name].items
     if others := [option_of(one) for one in said if one not in {item.name for item in items}]:
-        has = ", ".join(item.option for item in items)
-        raise InputError(f"{', '.join(others)}: not asked of --kind {name}, which has: {has}; {_KINDS_SAID}")
+        has, rest = ", ".join(item.option for item in items), ", ".join(kind for kind in KINDS if kind != name)
+        raise InputError(f"{', '.join(others)}: not asked of --kind {name}, which has: {has}; other kinds: {rest}")
     values = {one.name: one.read(said[one.name]) for one in items if one.name in said}
     if asking:
         if len(values) < len(items):
             typer.echo("Numbers of the data sheet with their units; Enter takes what is in brackets.", err=True)
-        values = {one.name: values.get(one.name) or _asked(one) for one in items}
+        values = {one.name: values.get(one.name) or _asked_number(one) for one in items}
     elif missing := [one for one in items if one.name not in values and not one.default]:
         wanted = ", ".join(f"{one.option} '{one.example}'" for one in missing)
         other = "" if kind else f"; another kind of drive: --kind {', '.join(list(KINDS)[1:])}"
@@ -73,35 +75,34 @@ def init(
 
 def _kind(text: str) -> str:
     """The name of a kind of drive."""
-    if text.strip() not in KINDS:
-        raise InputError(f"--kind '{text}': should be one of {_KINDS_SAID}")
-    return text.strip()
+    name = text.strip().lower()
+    if name not in KINDS:
+        raise InputError(f"--kind '{text}': should be one of {', '.join(KINDS)}; jaxbl init --help says what they are")
+    return name
 
 
 def _asked_kind() -> str:
     """The kind of drive that the user names; asked again where there is no such kind."""
+    typer.echo("Kinds of drives:", err=True)
+    for line in two_columns((f"  {name}", kind.about) for name, kind in KINDS.items()):
+        typer.echo(line, err=True)
+    return _asked("kind of this drive", next(iter(KINDS)), _kind)
+
+
+def _asked_number(item: Item) -> Given:
+    """The number that the user says."""
+    other = f", or {NONE}" * item.absent
+    question = f"{item.asked}, such as {item.example}{other}"
+    return _asked(question, item.default, lambda text: item.left_out() if text == item.default else item.read(text))
+
+
+def _asked(question: str, default: str, read: Callable[[str], T]) -> T:
+    """What the user answers; asked again where it cannot be read."""
     while True:
         try:
-            return _kind(typer.prompt(f"Kind of drive: {_KINDS_SAID}", default=next(iter(KINDS)), err=True))
+            return read(typer.prompt(question, default=default or None, err=True))
         except InputError as error:
             typer.echo(f"  {error}", err=True)
-
-
-def _asked(item: Item) -> Given:
-    """What the user answers; asked again where that is no such number."""
-    while True:
-        question = f"{item.asked}, such as {item.example}{f' ({units})' if (units := _units(item)) else ''}"
-        text = typer.prompt(question, default=item.default or None, err=True)
-        try:
-            return item.left_out() if text == item.default else item.read(text)
-        except InputError as error:
-            typer.echo(f"  {error}", err=True)
-
-
-def _units(item: Item) -> str:
-    """Units that an item may be given in, and what else may be said, in words."""
-    known = ", ".join(unit for unit in item.units if unit)
-    return "; ".join(filter(None, (known and f"units: {known}", f"or '{NONE}'" * item.absent)))
 
 
 def _option(items: list[tuple[str, Item]]) -> object:
