@@ -3,11 +3,10 @@
 import math
 import signal
 import sys
-import textwrap
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -15,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from .commands import COLUMNS, command_line
 from .errors import InputError, printable
+from .lines import command_line
 from .workers import listening
 
 if TYPE_CHECKING:
@@ -203,19 +202,6 @@ def _lines(unit: str, first: str) -> "Iterator[Progress]":
     finally:
         ended.set()
         speaker.join()
-
-
-def two_columns(rows: Iterable[tuple[str, str]]) -> list[str]:
-    """Names and what is said of them, in lines of at most 80 columns but for what is longer in itself."""
-    rows = list(rows)
-    width = max(len(name) for name, _ in rows) + 2
-    lines = []
-    for name, text in rows:
-        lines += textwrap.wrap(
-            text, COLUMNS, initial_indent=name.ljust(width), subsequent_indent=" " * width, break_long_words=False,
-            break_on_hyphens=False,
-        )  # fmt: skip
-    return lines
 
 
 def answers() -> bool:

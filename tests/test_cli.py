@@ -29,9 +29,9 @@ from jaxbl import cli, terminal
 from jaxbl.cli import setup
 from jaxbl.cli.next_steps import Given, after_diagnosis, after_identification
 from jaxbl.cli.options import folder_of
-from jaxbl.commands import lines_of, program
 from jaxbl.errors import InputError
 from jaxbl.files import locked
+from jaxbl.lines import lines_of, program
 from jaxbl.sweeps.engine import Engine
 
 FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
@@ -630,9 +630,10 @@ def test_a_refined_sweep_from_the_command_line(call, tmp_path):
     assert code == 0
     assert lines[:3] == [
         "points       9 on the coarse grid (9 runs with all seeds)",
-        "refinement   at most 289 points; as many as the boundaries need, not counted below",
+        "refinement   at most 289 points; as many as the borders need, not counted below",
         "chunks       1 of 32 lanes",
     ]
+    assert all(len(line) <= 80 for line in lines)
     code, first, _ = call("sweep", "study.toml")
     assert code == 0
     assert re.match(r"\d+ of 289 grid points simulated \([\d.]+ %\), \d+ runs\. ", first[0])
@@ -779,7 +780,7 @@ def quick(monkeypatch):
         tasks.append(task)
         return _Found(task)
 
-    def report(found, folder, steps):
+    def report(found, folder, steps=()):
         from jaxbl.report.diagnose import diagnosis_lines
 
         (folder / "report.html").write_text("its page")

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from jaxbl import workers
-from jaxbl.commands import Step
 from jaxbl.errors import InputError
+from jaxbl.lines import Step
 from jaxbl.terminal import call_again, running
 
 from .next_steps import Given, after_diagnosis, after_identification, after_proposal

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jaxbl.commands import Step, command_line
 from jaxbl.files import is_remote
+from jaxbl.lines import Step, command_line
 
 if TYPE_CHECKING:
     from jaxbl.identification.logs import LogTask

@@ -9,9 +9,9 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from jaxbl.commands import Step, lines_of
 from jaxbl.errors import InputError, NoResult, printable
 from jaxbl.files import listed, read_json
+from jaxbl.lines import Step, lines_of
 from jaxbl.terminal import INTERRUPTED
 
 QuietOption = Annotated[bool, typer.Option("--quiet", help="print neither progress nor what was found, errors alone")]

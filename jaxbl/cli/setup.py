@@ -10,7 +10,8 @@ from jaxbl import workers
 from jaxbl.datasheet import KINDS, NONE, Given, Item, first_study, named_items, option_of, remark
 from jaxbl.errors import InputError
 from jaxbl.files import write_atomic
-from jaxbl.terminal import answers, running, two_columns, working
+from jaxbl.lines import described
+from jaxbl.terminal import answers, running, working
 
 from .next_steps import after_demo, after_init
 from .options import BackendOption, OutOption, check_new
@@ -84,7 +85,7 @@ def _kind(text: str) -> str:
 def _asked_kind() -> str:
     """The kind of drive that the user names; asked again where there is no such kind."""
     typer.echo("Kinds of drives:", err=True)
-    for line in two_columns((f"  {name}", kind.about) for name, kind in KINDS.items()):
+    for line in described((f"  {name}", kind.about) for name, kind in KINDS.items()):
         typer.echo(line, err=True)
     return _asked("kind of this drive", next(iter(KINDS)), _kind)
 
@@ -145,7 +146,7 @@ def doctor(context: typer.Context) -> Outcome:
 
         findings = examine()
     bad = [one.name for one in findings if not one.good]
-    lines = two_columns((one.name, one.found if one.good else f"FAILED: {one.found}") for one in findings)
+    lines = described((one.name, one.found if one.good else f"FAILED: {one.found}") for one in findings)
     lines.append(f"Not in order: {', '.join(bad)}." if bad else "All in order.")
     return Outcome(lines, summary={"findings": [one._asdict() for one in findings]}, code=1 if bad else 0)
 

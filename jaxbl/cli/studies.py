@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from jaxbl import workers
-from jaxbl.commands import Step
 from jaxbl.errors import InputError, printable
 from jaxbl.files import Busy, place
+from jaxbl.lines import Step, described
 from jaxbl.terminal import duration, naming, running, working
 
 from .next_steps import after_sweep
@@ -168,16 +168,18 @@ def _expected_cost(study: "Config", backend: "Backend | None") -> Outcome:
 
     cost = dry_run(study, backend=backend)
     refined = study.sweep.refine is not None
-    lines = [f"points       {cost.points}{' on the coarse grid' if refined else ''} ({cost.rows} runs with all seeds)"]
+    rows = [("points", f"{cost.points}{' on the coarse grid' if refined else ''} ({cost.rows} runs with all seeds)")]
     if refined:
-        lines.append(f"refinement   at most {cost.most_points} points; as many as the boundaries need, not counted below")
+        most = f"at most {cost.most_points} points; as many as the borders need, not counted below"
+        rows.append(("refinement", most))
     rate = f"{cost.lane_steps_per_second:.2g} lane-steps/s measured, backend {cost.backend}"
-    lines += [
-        f"chunks       {cost.chunks} of {cost.lanes_a_chunk} lanes",
-        f"memory       {cost.megabytes:.1f} MB a chunk",
-        f"compilation  about {duration(cost.compile_seconds)}",
-        f"run          about {duration(cost.run_seconds)} ({rate})",
+    rows += [
+        ("chunks", f"{cost.chunks} of {cost.lanes_a_chunk} lanes"),
+        ("memory", f"{cost.megabytes:.1f} MB a chunk"),
+        ("compilation", f"about {duration(cost.compile_seconds)}"),
+        ("run", f"about {duration(cost.run_seconds)} ({rate})"),
     ]
+    lines = described(rows)
     return Outcome(lines, summary=vars(cost))
 
 

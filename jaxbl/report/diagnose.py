@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from jaxbl.commands import Step
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.identification.logs import unit_on
+from jaxbl.lines import Step
 
 from .figures import COLOURS, FAINT, MISSING, Drawn, decades, legend, stacked, style, subplots, with_unit
 from .motor_alone_figures import draw_motor_alone

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxbl.commands import Step
 from jaxbl.identification.identify import Identification
 from jaxbl.identification.search import NOISE_ALONE
+from jaxbl.lines import Step
 
 from .figures import SIDES
 from .identify_figures import draw_identification

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import tomli_w
 
-from jaxbl.commands import Step
 from jaxbl.files import json_text, write_atomic, writing
+from jaxbl.lines import Step
 
 from .figures import Drawn, save
 from .picture import Picture, picture

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from jaxbl.commands import Step
 from jaxbl.config import Config, numeric_paths
 from jaxbl.files import write_atomic
 from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law, accuracy_laws
+from jaxbl.lines import Step
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
