@@ -125,8 +125,14 @@ def test_interrupt_anywhere_else():
     assert end.value.code == 130
 
 
+NONE = "no such file; here are axis.toml, below.toml, figure.toml, gains.toml, part.toml, ..."
 BAD = {
-    "no such file": (["sweep", "none.toml"], "none.toml: no such file"),
+    "no such file": (
+        ["sweep", "none.toml"],
+        f"none.toml: {NONE}",
+    ),
+    "a name that is near": (["sweep", "studi.toml"], "studi.toml: no such file; did you mean study.toml?"),
+    "no such folder": (["sweep", "studies/a.toml"], "studies/a.toml: no such file: there is no folder studies"),
     "a folder": (["simulate", "."], ".: is a folder; a TOML file is needed"),
     "no axes": (["sweep", "plain.toml"], "plain.toml: axes: the study has none; add [[axes]], or use 'jaxbl simulate'"),
     "wrong key": (["simulate", "wrong.toml"], "wrong.toml: run: unknown key 'durations'; did you mean 'duration'?"),
@@ -199,14 +205,17 @@ BAD = {
         ["verify", "gains.toml", "--out", "full"],
         "full: is not empty and holds no study; choose another folder with --out",
     ),
-    "nothing to include": (["tune", "part.toml"], "part.toml: include: none.toml: no such file"),
+    "nothing to include": (
+        ["tune", "part.toml"],
+        f"part.toml: include: none.toml: {NONE}",
+    ),
     "no such share": (
         ["sweep", "study.toml", "--share", "3/2"],
         "--share 3/2: should be I/N, such as 2/8: the second of eight",
     ),
     "a share of a cluster": (
         ["sweep", "study.toml", "--share", "1/2", "--scheduler", "local:2"],
-        "--share: does not go with --scheduler: other processes may be at work in the folder",
+        "--share: does not go with --scheduler: other processes may be at work in the folder; leave one of them out",
     ),
     "leaving no cluster": (
         ["sweep", "study.toml", "--detach"],
@@ -218,7 +227,7 @@ BAD = {
     ),
     "a cluster for one log": (
         ["diagnose", "log.csv", "--scheduler", "local:2"],
-        "--scheduler goes with --batch: one log is one process's work",
+        "--scheduler goes with --batch: one log is one process's work; leave it out, or give a folder",
     ),
     "no such cluster": (
         ["sweep", "study.toml", "--scheduler", "local:0"],
@@ -226,7 +235,7 @@ BAD = {
     ),
     "no such store": (
         ["sweep", "study.toml", "--out", "foo://bucket/a"],
-        "foo://bucket/a: is no place for results (Unsupported filesystem: 'foo')",
+        "foo://bucket/a: is no place for results (Unsupported filesystem: 'foo'); it should be a folder, or s3://BUCKET/FOLDER",
     ),
     "nothing of which to say the status": (
         ["status", "full"],
@@ -859,7 +868,8 @@ def test_a_folder_of_logs_is_diagnosed_and_goes_on_where_it_stopped(axis, quick,
     again = "diagnose", "--batch", "logs", "--model", "axis.toml", "--jobs", "1", "--out"
     code, lines, _ = call(*again, "out")
     assert code == 0
-    assert [line.split()[:2] for line in lines[:3]] == [
+    # what is found may go on below
+    assert [line.split()[:2] for line in lines if not line.startswith(" ")][:3] == [
         ["a.csv", "explained"],
         ["b.csv", "explained"],
         ["broken.csv", "refused"],
@@ -893,7 +903,7 @@ def test_one_json_object_has_what_was_found_or_what_is_wrong(call, tmp_path, mon
     with pytest.raises(SystemExit) as end:
         cli.main()
     out, errors = capsys.readouterr()
-    said = "none.toml: no such file"
+    said = "none.toml: no such file; here are study.toml"
     assert (end.value.code, errors) == (2, f"jaxbl: {said}\n")
     assert json.loads(out) == {"command": "sweep", "exit": 2, "error": said}
 

@@ -109,10 +109,10 @@ def identify(
             raise InputError("identify: several logs; of a transmission on a test rig one log is fitted at a time")
         if profile:
             raise InputError(
-                "identify: --profile is for drives; intervals of a transmission on a test rig are by a jackknife"
+                "identify: --profile is for drives; a transmission on a test rig has intervals without it; leave it out"
             )
         if next_experiment is not None:
-            raise InputError("identify: --next-experiment is for drives; a transmission on a test rig is loaded to and fro")
+            raise InputError("identify: --next-experiment is for drives, not for a transmission on a test rig; leave it out")
         return _identify_element(log[0], table, gear_ratio, holdout, folder_of(log[0], out), overwrite)
     from jaxbl.files import results_of
     from jaxbl.identification.identify import read_identification_task, run_identification
@@ -193,7 +193,8 @@ def diagnose(
         folder = out if out is not None else Path("results") / batch.name
         return _diagnose_batch(context, batch, model, folder, jobs, overwrite, scheduler)
     if jobs is not None or scheduler is not None:
-        raise InputError(f"{'--scheduler' if jobs is None else '--jobs'} goes with --batch: one log is one process's work")
+        option = "--scheduler" if jobs is None else "--jobs"
+        raise InputError(f"{option} goes with --batch: one log is one process's work; leave it out, or give a folder")
     if not log:
         raise InputError("diagnose: no log; give one or several of one machine, or a folder with --batch")
     if model is None:

@@ -124,7 +124,9 @@ def _share(text: str | None, others: dict[str, bool]) -> tuple[int, int] | None:
         return None
     for name, given in others.items():
         if given:
-            raise InputError(f"--share: does not go with {name}: other processes may be at work in the folder")
+            raise InputError(
+                f"--share: does not go with {name}: other processes may be at work in the folder; leave one of them out"
+            )
     number, _, count = text.partition("/")
     if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
         raise InputError(f"--share {text}: should be I/N, such as 2/8: the second of eight")

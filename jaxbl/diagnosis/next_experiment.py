@@ -161,7 +161,7 @@ def _written(found: Input, record: Record, path: Path) -> str:
         path.parent.mkdir(parents=True, exist_ok=True)
         pd.DataFrame({"t": time, "u": found.torque}).to_csv(path, index=False, float_format="%.9g")
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+        raise InputError(f"{path}: cannot be written: {error.strerror}; name another file") from None
     clear = "" if found.apart > _DECISIVE else ": too little; --max-torque and --max-travel allow for more"
     unit = unit_on(record, "motor.torque", "N m")
     mean = f" about a mean of {found.mean:.3g} {unit}" if found.mean else ""
