@@ -98,7 +98,7 @@ def after_diagnosis(
     task: "LogTask", summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: "Given"
 ) -> list[Step]:
     """What is open after a diagnosis; arguments as of :func:`after_identification`."""
-    from jaxbl.diagnosis.next_experiment import tied
+    from jaxbl.diagnosis.diagnosis_summary import tied
 
     steps, model = _gap_experiment(summary, again, folder, given), folder / "model.toml"
     pair = None if "backlash" in summary or given.next_experiment else tied(summary)
