@@ -286,12 +286,29 @@ def first_study(kind: Kind, given: Mapping[str, Given], title: str) -> tuple[str
 
     given = by_key(kind, given)
     text = _drive(kind, given, title)
-    model, _ = read_model(_data(text))
-    found = pilot(Scenarios(model, ["nominal"], {}), TuneTable())
-    gains = {side: usual_rule(one["f_plus"]) for side, one in found.items()}
-    text += _observers(kind, given, found, gains, usual_rule(1.0))
-    read_config(_data(text))
+    try:
+        model, _ = read_model(_data(text))
+        found = pilot(Scenarios(model, ["nominal"], {}), TuneTable())
+        _check_motion(kind, found)
+        gains = {side: usual_rule(one["f_plus"]) for side, one in found.items()}
+        text += _observers(kind, given, found, gains, usual_rule(1.0))
+        read_config(_data(text))
+    except InputError as error:
+        raise InputError(
+            f"these numbers make no study; look at their units: {str(error).removeprefix('config: ')}"
+        ) from None
     return text, found
+
+
+def _check_motion(kind: Kind, found: Mapping[str, Any]) -> None:
+    """Refuse a drive that its rated torque does not move."""
+    options = {item.key or item.name: item.option for item in kind.items}
+    if not found["motor"]["largest_velocity"] > 0.0:
+        raise InputError(
+            f"the motor does not move: {options['torque']} should be larger, or {options['motor_friction']} smaller"
+        )
+    if "load" in found and not found["load"]["f_plus"] > 0.0:
+        raise InputError(f"the load does not move: {options['backlash']} should be smaller, or {options['frequency']} lower")
 
 
 def by_key(kind: Kind, given: Mapping[str, Given]) -> dict[str, Given]:

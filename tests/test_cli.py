@@ -27,7 +27,7 @@ from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
 
 from jaxbl import cli, terminal
 from jaxbl.cli import setup
-from jaxbl.cli.next_steps import Given, after_diagnosis, after_identification
+from jaxbl.cli.next_steps import LogCall, after_diagnosis, after_identification
 from jaxbl.cli.options import folder_of
 from jaxbl.errors import InputError
 from jaxbl.files import locked
@@ -975,7 +975,7 @@ def test_after_logs_what_is_open_by_what_was_found():
     def identified(rms, done=None, holdout=None, wanted=None, **more):
         summary = {"residual": {"motor": {"rms": rms, "noise": 1.0}}} | more
         return commands(
-            after_identification(done or task(1000), summary, again, folder, Given(logs, model, holdout, wanted))
+            after_identification(done or task(1000), summary, again, folder, LogCall(logs, model, holdout, wanted))
         )
 
     diagnose = "jaxbl diagnose 'a b.csv' --model m.toml"
@@ -992,7 +992,7 @@ def test_after_logs_what_is_open_by_what_was_found():
     assert identified(1.0, wanted=Path("n.csv"), **unseen) == identified(1.0, backlash={"shown": True}) == [simulate]
 
     def diagnosed(wanted=None, **more):
-        return commands(after_diagnosis(task(1000), DIAGNOSED | more, again, folder, Given(logs, model, None, wanted)))
+        return commands(after_diagnosis(task(1000), DIAGNOSED | more, again, folder, LogCall(logs, model, None, wanted)))
 
     assert diagnosed() == [simulate]
     long = {"effect": "transmission.rotational_friction_of_somebody_elses_package", "confidence": 0.5}

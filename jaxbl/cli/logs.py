@@ -12,7 +12,7 @@ from jaxbl.errors import InputError
 from jaxbl.lines import Step
 from jaxbl.terminal import call_again, running
 
-from .next_steps import Given, after_diagnosis, after_identification, after_proposal
+from .next_steps import LogCall, after_diagnosis, after_identification, after_proposal
 from .options import (
     FORMATS,
     LogArgument,
@@ -124,7 +124,7 @@ def identify(
 
         check_gap_sought(task)
     folder = folder_of(log[0], out)
-    given = Given(log, model, holdout, next_experiment)
+    given = LogCall(log, model, holdout, next_experiment)
 
     def steps(summary: Mapping[str, Any]) -> list[Step]:
         return after_identification(task, summary, call_again(context, folder), folder, given)
@@ -206,7 +206,7 @@ def diagnose(
 
     task = read_diagnosis_task(log, model, holdout=holdout)
     folder = folder_of(log[0], out)
-    given = Given(log, model, holdout, next_experiment)
+    given = LogCall(log, model, holdout, next_experiment)
 
     def steps(summary: Mapping[str, Any]) -> list[Step]:
         return after_diagnosis(task, summary, call_again(context, folder), folder, given)

@@ -69,7 +69,7 @@ def after_proposal(log: Path, model: Path) -> list[Step]:
 
 
 def after_identification(
-    task: "LogTask", summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: "Given"
+    task: "LogTask", summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: "LogCall"
 ) -> list[Step]:
     """What is open after an identification.
 
@@ -95,7 +95,7 @@ def after_identification(
 
 
 def after_diagnosis(
-    task: "LogTask", summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: "Given"
+    task: "LogTask", summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: "LogCall"
 ) -> list[Step]:
     """What is open after a diagnosis; arguments as of :func:`after_identification`."""
     from jaxbl.diagnosis.diagnosis_summary import tied
@@ -114,7 +114,7 @@ def after_diagnosis(
     return steps
 
 
-class Given(NamedTuple):
+class LogCall(NamedTuple):
     """What a command on logs was about: logs, model, log held out, and a file for the next experiment."""
 
     logs: Sequence[Path]
@@ -127,7 +127,7 @@ class Given(NamedTuple):
         return [*self.logs, "--model", self.model, *(["--holdout", self.holdout] if self.holdout else [])]
 
 
-def _gap_experiment(summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: Given) -> list[Step]:
+def _gap_experiment(summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: LogCall) -> list[Step]:
     """The move that would show a gap to the motor's encoder alone, where the log does not."""
     said = summary.get("backlash")
     if said is None or said["shown"] or given.next_experiment is not None:
