@@ -155,6 +155,7 @@ DIRECT = {
     "motor_encoder": "20 bit",
 }  # fmt: skip
 LINEAR = {"mass": "8 kg", "motor_friction": "6 N", "force": "200 N", "speed": "2 m/s", "motor_encoder": "100 nm"}
+NO_STUDY = "these numbers make no study; look at their units"
 # so that a run is short
 SHORT = {"frequency": "20 Hz"}
 
@@ -246,6 +247,10 @@ def test_the_usual_rule_in_a_study_is_that_of_tune():
             [*words("direct", DIRECT), "--gear-ratio", "5", "--mass", "1 kg"],
             "--gear-ratio, --mass: not asked of --kind direct, which has: --motor-inertia, --motor-viscous, ",
         ),
+        (words("direct", DIRECT | SHORT | {"motor_friction": "20 N m"}), f"{NO_STUDY}: the motor does not move: --torque "),
+        (words("linear", LINEAR | SHORT | {"motor_friction": "400 N"}), f"{NO_STUDY}: the motor does not move: --force "),
+        (words("screw", SCREW | SHORT | {"backlash": "1 m"}), f"{NO_STUDY}: the load does not move: --backlash should be"),
+        (words("screw", SCREW | {"lead": "1e-7 mm"}), f"{NO_STUDY}: drive.gear_ratio: should be less than or equal to 1"),
         (["--lead", "10 mm"], "--lead: not asked of --kind geared, which has: --motor-inertia, "),
         (
             words("linear", LINEAR | {"motor_friction": "0 N"}),
