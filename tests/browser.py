@@ -16,7 +16,7 @@ needs_chromium = pytest.mark.skipif(
 
 @contextmanager
 def opened(*paths, **options):
-    """A page of each file, without an error, and without a request for anything elsewhere. One browser at a time."""
+    """A page of each file or address, without an error, or a request for anything elsewhere. One browser at a time."""
     wrong = []
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
@@ -26,17 +26,17 @@ def opened(*paths, **options):
         context.on("dialog", lambda dialog: wrong.append(dialog.message))
         pages = []
         for path in paths:
-            page = context.new_page()
-            page.on("request", functools.partial(_elsewhere, wrong))
-            page.goto(path.resolve().as_uri())
+            page, where = context.new_page(), path if isinstance(path, str) else path.resolve().as_uri()
+            page.on("request", functools.partial(_elsewhere, wrong, where if isinstance(path, str) else "file:"))
+            page.goto(where)
             pages.append(page)
         yield pages
         assert wrong == [], wrong
         browser.close()
 
 
-def _elsewhere(wrong, request):
-    if not request.url.startswith(("file:", "data:", "blob:")):
+def _elsewhere(wrong, here, request):
+    if not request.url.startswith((here, "data:", "blob:")):
         wrong.append(request.url)
 
 

@@ -315,7 +315,7 @@ def test_a_sweep_is_explored(call, tmp_path):
     call("sweep", "study.toml", "--out", "out")
     code, lines, _ = call("explore", "out", "--static", "page")
     assert code == 0 and lines[0].startswith("4 runs.") and lines[-1] == "page/index.html"
-    assert {"index.html", "explore.js", "hyparquet.js", "study.js", "study.toml", "points.parquet"} <= set(
+    assert {"index.html", "map.js", "plot.js", "hyparquet.js", "data.js", "study.toml", "points.parquet"} <= set(
         left(Path("page"))
     )
     with pytest.raises(InputError, match="out: is not empty, and was not written by jaxbl explore"):
@@ -819,7 +819,7 @@ def test_a_log_is_diagnosed_once(axis, quick, call, tmp_path):
     at = lines.index("Next:")
     assert lines[at - 1].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
     run = "jaxbl simulate 'results/an axis/model.toml' --out 'results/an axis_run'"
-    assert [command for command, _ in steps_in(lines)] == [run]
+    assert [command for command, _ in steps_in(lines)] == [run, "jaxbl explore 'results/an axis'"]
     assert lines[-1] == "results/an axis/report.html"
     assert call(*DIAGNOSE) == (0, [*lines[: at - 1], *lines[at:]], [])
     assert len(quick) == 1
@@ -896,7 +896,7 @@ def test_one_json_object_has_what_was_found_or_what_is_wrong(call, tmp_path, mon
     assert (code, found["command"], found["exit"]) == (0, "sweep", 0)
     assert found["summary"] == {"title": "small", "runs": 3, "finished": True}
     assert found["found"][0].startswith("3 runs.") and found["open"] == "out/report.html"
-    assert [one["command"].split()[1] for one in found["next"]] == ["tune", "simulate"]
+    assert [one["command"].split()[1] for one in found["next"]] == ["explore", "tune", "simulate"]
     assert set(found["files"]) == {f"out/{name}" for name in left(tmp_path / "out") if not name.startswith("points/")}
     assert call("sweep", "study.toml", "--quiet", "--out", "out") == (0, [], [])
     monkeypatch.setattr(sys, "argv", ["jaxbl", "sweep", "none.toml", "--json"])
@@ -951,7 +951,9 @@ def test_what_the_demo_says_to_try_next_works_as_it_stands(call, tmp_path, monke
     # another page of the same study says the same
     assert steps_in(call("plot", "results/a map")[1]) == steps[:-1]
     for command, _ in steps[:-1]:
-        code, lines, _ = call(*shlex.split(command)[1:])
+        words = shlex.split(command)[1:]
+        # else it serves the page until it is ended
+        code, lines, _ = call(*words, *(["--static", "page"] if words[0] == "explore" else []))
         assert code == 0 and Path(lines[-1]).is_file()
     # the last one asks; who has such a file is not told to write it
     with pytest.raises(InputError, match="these numbers are missing"):
@@ -970,7 +972,8 @@ def test_after_logs_what_is_open_by_what_was_found():
 
     def commands(steps):
         assert all(len(line) <= 80 for line in lines_of(steps) if line.startswith("    "))
-        return [one.command for one in steps]
+        assert steps[-1].command == "jaxbl explore out"
+        return [one.command for one in steps[:-1]]
 
     def identified(rms, done=None, holdout=None, wanted=None, **more):
         summary = {"residual": {"motor": {"rms": rms, "noise": 1.0}}} | more

@@ -32,18 +32,12 @@ def after_demo(result: "StudyResult", folder: Path) -> list[Step]:
 
 def after_sweep(result: "StudyResult", folder: Path) -> list[Step]:
     """What can be asked of a sweep, and of its study, which its folder has, too."""
-    from jaxbl.sweeps.points import Points
-
-    config, steps, study = result.config, [], folder / "study.toml"
-    if config.sweep.refine is None and config.sweep.design == "grid":
-        varied = [len(next(iter(block.values()))) > 1 for block in Points(config).blocks]
-        if sum(varied) >= 2:
-            page = command_line("explore", folder, "--static", f"{folder}_page")
-            steps.append(Step(page, "How do other metrics look, over other axes? A page of maps to explore."))
+    study = folder / "study.toml"
+    steps = [Step(command_line("explore", folder), "How do other metrics look, over other axes? Maps in the browser.")]
     if is_remote(study):
         return steps
     gains = {f"observer.{side}.{gain}" for side in ("motor", "load") for gain in ("lambda", "alpha")}
-    if gains & {axis.path for axis in config.axes} and _all_converge_somewhere(result):
+    if gains & {axis.path for axis in result.config.axes} and _all_converge_somewhere(result):
         answers = "Which gains have the least error, and are they better than the usual rule?"
         steps.append(Step(command_line("tune", study, "--out", f"{folder}_gains"), answers))
     answers = "What happens over time? One run, with the numbers that the study itself has."
@@ -91,7 +85,7 @@ def after_identification(
     elif _runs(task):
         words = ("simulate", folder / "model.toml", "--out", f"{folder}_run")
         steps.append(Step(command_line(*words), "How does the drive move with these numbers, and what do observers see?"))
-    return [*steps, *_gap_experiment(summary, again, folder, given)]
+    return [*steps, *_gap_experiment(summary, again, folder, given), _along_the_log(folder)]
 
 
 def after_diagnosis(
@@ -111,7 +105,7 @@ def after_diagnosis(
     if summary["findings"] and _runs(task):
         words = ("simulate", model, "--out", f"{folder}_run")
         steps.append(Step(command_line(*words), "How does the drive move with what was found? The extended study, run."))
-    return steps
+    return [*steps, _along_the_log(folder)]
 
 
 class LogCall(NamedTuple):
@@ -125,6 +119,10 @@ class LogCall(NamedTuple):
     def words(self) -> list[object]:
         """Logs and model on a command line."""
         return [*self.logs, "--model", self.model, *(["--holdout", self.holdout] if self.holdout else [])]
+
+
+def _along_the_log(folder: Path) -> Step:
+    return Step(command_line("explore", folder), "Where along the log do model and machine differ? In the browser.")
 
 
 def _gap_experiment(summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: LogCall) -> list[Step]:

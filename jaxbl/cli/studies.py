@@ -1,8 +1,11 @@
 """Commands on studies: simulate, sweep, status, tune, verify, plot, explore, compare, repair."""
 
+import contextlib
 import dataclasses
 import functools
 import math
+import sys
+import webbrowser
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
@@ -14,7 +17,7 @@ from jaxbl import workers
 from jaxbl.errors import InputError, printable
 from jaxbl.files import Busy, place
 from jaxbl.lines import Step, described
-from jaxbl.terminal import duration, naming, running, working
+from jaxbl.terminal import duration, is_quiet, naming, running, working
 
 from .next_steps import after_sweep
 from .options import (
@@ -310,20 +313,39 @@ def explore(
     context: typer.Context,
     folder: FolderArgument,
     static: Annotated[
-        Path, typer.Option("--static", metavar="OUT", help="folder for the page, new or ours", show_default=False)
-    ],
+        Path | None,
+        typer.Option("--static", metavar="OUT", help="write the page into this folder, new or ours, and do not serve it"),
+    ] = None,
+    port: Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="to serve on [default: one that is free]")] = 0,
+    browser: Annotated[
+        bool | None,
+        typer.Option("--browser/--no-browser", help="open the page [default: on a terminal]", show_default=False),
+    ] = None,
 ) -> Outcome:
-    """Write a page that draws a sweep's maps by mouse, with its data beside it: it needs no Python, nor a server."""
+    """Explore a sweep, an identification or a diagnosis in the browser; --static: a page that needs no Python."""
+    if static is not None and (port or browser is not None):
+        raise InputError("--static: writes a page and serves none; --port and --browser do not go with it")
     workers.start_jax()
-    from jaxbl.report.explore import write_static
-    from jaxbl.report.sweep import headline
-    from jaxbl.sweeps.sweep import open_study
+    from jaxbl.report.explorer.folder import write_static
+    from jaxbl.report.explorer.log import is_log_folder, log_source
+    from jaxbl.report.explorer.study import study_source
 
-    result = open_study(folder)
-    with working(context, "writing the page"):
-        lead = headline(result)
-        page = write_static(result, static, lead)
-    return Outcome(lead, static, page.name, summary=_extent(result))
+    source = log_source(folder) if is_log_folder(folder) else study_source(folder)
+    if static is not None:
+        with working(context, "writing the page"):
+            page = write_static(source, static)
+        return Outcome([*source.lead], static, page.name)
+    from jaxbl.report.explorer.server import served
+
+    with served(source, port) as server:
+        if not is_quiet(context):
+            for line in (*source.lead, f"Open {server.url}", "Ctrl+C ends it."):
+                typer.echo(printable(line), err=True)
+        if browser if browser is not None else sys.stdout.isatty():
+            webbrowser.open(server.url)
+        with contextlib.suppress(KeyboardInterrupt):
+            server.serve_forever()
+    return Outcome([])
 
 
 def compare(

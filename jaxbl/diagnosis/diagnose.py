@@ -5,7 +5,7 @@ the fit has seen.
 """
 
 import dataclasses
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,6 +39,7 @@ from .expected_errors import Expected, expected_errors, failed
 from .judgement import exchanged, explained_share, is_little, judged
 from .localise import SIGNIFICANT, Localised, localise
 from .motor_alone import diagnose_alone
+from .neutral_effects import without
 from .numbers_by_log import contradictions
 from .observer_residual import Observed, observed_torques
 from .proof import SEEN, SURE, Accepted, Control, Proof, beaten, free_values
@@ -66,9 +67,10 @@ class Diagnosis:
         holdout: what was held out: the rest of the log, or another one.
         summary: as in `diagnosis.json`.
         trace: one row a sample of the log: `t`, `u`, positions, `held_out`, and on each side the torque that the model lacks
-            as given (`motor.missing_before`) and with the effects (`motor.missing_after`) with its `motor.noise`, N m; and
-            what the model as given lacks by the observers (`motor.observed_before`, `motor.observed_noise`), N m, empty
-            while they converge.
+            as given (`motor.missing_before`, its noise is `motor.noise`), with the effects (`motor.missing_after`), without
+            one of these (`motor.missing_without.NAME`), and with another one in place of the last
+            (`motor.missing_with.NAME`), N m; what the model as given lacks by the observers (`motor.observed_before`,
+            `motor.observed_noise`), N m, empty while they converge; and the smoothed `motor.velocity`, rad/s.
         residuals: torques that the model as given lacks, by side, of each segment that was fitted.
         observed: the same by the observers' equivalent control.
         coordinates: along them, by side, of each segment.
@@ -150,12 +152,13 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         found = judgement.found
         done()
         doing("running the observers")
-        lacking_after = residual_torques(fitted.experiment, setup.fitted.segments)
+        missing = _missing(setup, proof, accepted, controls)
+        lacking_after, _ = missing["missing_after"]
         on_log, on_holdout = _paired(setup.lacking, lacking_after), _paired(proof.before.torques, after.torques)
         _, gain_values = gains_for(task.missing, fitted.experiment, setup.recorded)
         observing = set_leaves(setup.bare, arrays(gain_values))
         observed = _observed(setup, observing)
-        trace = trace_of(setup, on_log, on_holdout, observed)
+        trace = trace_of(setup, missing, observed)
         done()
         summary = summary_of(setup, accepted, found)
         about, notes = observers_say(observing, observed[0], setup)
@@ -188,6 +191,22 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         task.config, model, task.record, task.holdout, plain(summary), trace, setup.lacking, observed[0], setup.coordinates,
         setup.located, pairs, replays="excitation" in task.missing,
     )  # fmt: skip
+
+
+def _missing(
+    setup: Setup, proof: Proof, accepted: Accepted, controls: Sequence[Control]
+) -> dict[str, tuple[dict[str, list[Residual]], dict[str, list[Residual]]]]:
+    """Torques that models lack on the log and on what was held out, by names of columns: the model as given, the one with
+    the effects, that without each of them, and the one with another effect in place of the last."""
+    fitted = accepted.fitted
+    others = {f"missing_without.{name}": without(fitted.experiment, name) for name in fitted.names}
+    others |= {f"missing_with.{one.effect}": one.experiment for one in controls if one.experiment is not None}
+    after = residual_torques(fitted.experiment, setup.fitted.segments), accepted.after.torques
+    found = {"missing_before": (setup.lacking, proof.before.torques), "missing_after": after}
+    for name, experiment in others.items():
+        held = residual_torques(at_period(experiment, setup.holdout.period), setup.holdout.segments)
+        found[name] = residual_torques(experiment, setup.fitted.segments), held
+    return found
 
 
 def _paired(

@@ -5,7 +5,7 @@ missing."""
 # pyright: reportArgumentType=false
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -219,29 +219,42 @@ def rival_tables(config: Config, own: Sequence[Free], rival: Model) -> dict[str,
     return {"effect": rival.names[-1]} | {key: data[key] for key in ("drive", "transmission", "effects") if key in data}
 
 
-Pairs = Mapping[str, Sequence[tuple[Residual, Residual]]]
+Torques = Mapping[str, Sequence[Residual]]
 """Torques that a model lacks as given and with the effects, by side, segment by segment."""
 
 
 def trace_of(
-    setup: Setup, fitted: Pairs, held: Pairs, observed: tuple[Mapping[str, list[Observed]], Mapping[str, list[Observed]]]
+    setup: Setup,
+    missing: Mapping[str, tuple[Torques, Torques]],
+    observed: tuple[Mapping[str, list[Observed]], Mapping[str, list[Observed]]],
 ) -> pd.DataFrame:
     """One row a sample of the log, its held-out part included; of another log that was held out there is nothing.
 
-    `observed` is what the model as given lacks by the observers, on both parts.
+    `missing` is what models lack on both parts, by the names of their columns; `observed` what the model as given lacks by
+    the observers.
     """
     task = setup.task
     whole = task.record if task.separate else task.holdout
     columns: dict[str, Any] = {"t": whole.time, "u": whole.torque}
     columns |= {POSITION_CHANNELS[side]: whole.positions[side] for side in POSITION_CHANNELS if side in whole.positions}
     columns["held_out"] = np.arange(len(whole.time)) >= len(task.record.time)
-    sources = [(task.record, fitted)] + ([] if task.separate else [(task.holdout, held)])
-    for side in fitted:
-        before, after, noise = np.full((3, len(whole.time)), np.nan)
-        for record, pairs in sources:
-            for rows, (one, left) in zip(record.segments, pairs[side], strict=True):
-                before[rows], after[rows], noise[rows] = one.torque, left.torque, one.deviation
-        columns |= {f"{side}.missing_before": before, f"{side}.missing_after": after, f"{side}.noise": noise}
+    logs = [(task.record, setup.fitted.segments)] + ([] if task.separate else [(task.holdout, setup.holdout.segments)])
+    parts = [rows for record, _ in logs for rows in record.segments]
+
+    def along(values: Iterable[Any]) -> np.ndarray:
+        column = np.full(len(whole.time), np.nan)
+        for rows, one in zip(parts, values, strict=True):
+            column[rows] = one
+        return column
+
+    before, _ = missing["missing_before"]
+    for side in before:
+        columns[f"{side}.velocity"] = along(one.smoothed[side].state[:, 1] for _, segments in logs for one in segments)
+        for name, torques in missing.items():
+            pieces = [one for torque in torques[: len(logs)] for one in torque[side]]
+            columns[f"{side}.{name}"] = along(one.torque for one in pieces)
+            if name == "missing_before":
+                columns[f"{side}.noise"] = along(one.deviation for one in pieces)
     for side in observed[0]:
         torque, noise = np.full((2, len(whole.time)), np.nan)
         for record, pieces in zip((task.record, task.holdout), observed, strict=True):

@@ -74,6 +74,11 @@ def complete(experiment: Experiment, acting: Collection[str] = ()) -> Experiment
     return with_effects(experiment, tuple(effects))
 
 
+def without(experiment: Experiment, name: str) -> Experiment:
+    """A model with one of its effects at neutral numbers."""
+    return with_effects(experiment, tuple(_neutral(name) if one.name == name else one for one in experiment.effects))
+
+
 def lean(experiment: Experiment, state: PlantState, free: Collection[str] = ()) -> tuple[Experiment, PlantState]:
     """A model and its state without the effects that do nothing, and may not by their `free` numbers.
 

@@ -119,12 +119,14 @@ class Control(NamedTuple):
         errors: rms, by channel.
         z: standard errors by which the errors of the model with effects are smaller.
         effect: the other one.
+        experiment: the model with it.
     """
 
     kind: str
     errors: dict[str, float]
     z: float
     effect: str = ""
+    experiment: Experiment | None = None
 
 
 class Accepted(NamedTuple):
@@ -246,8 +248,9 @@ class Proof:
             return []
         found = []
         if rival is not None:
-            other = self.other.compare(fit_model(search, rival.numbers, rival.theta).experiment)
-            found.append(Control("wrong", other.errors, beaten(self.other, other, after), rival.names[-1]))
+            experiment = fit_model(search, rival.numbers, rival.theta).experiment
+            other = self.other.compare(experiment)
+            found.append(Control("wrong", other.errors, beaten(self.other, other, after), rival.names[-1], experiment))
         added = {
             side: [one.torque - left.torque for one, left in zip(pieces, after.torques[side], strict=True)]
             for side, pieces in self.before.torques.items()

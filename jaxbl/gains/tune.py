@@ -53,7 +53,7 @@ class Tuning:
         candidates: for each side, one row for each pair of gains tried: `stage` (0 is the coarse map), `lambda`, `alpha`,
             `lambda_ratio`, `alpha_ratio`, whether all runs `converged` and are `finite`, largest `velocity_rmse`,
             `torque_rmse`, `convergence_time`, `convergence_time_worst` and `f_plus`, least `margin_alpha` and
-            `margin_exact`, `error` (the objective) and `feasible`.
+            `margin_exact`, `error` (the objective), `chatter` of the run that has it, and `feasible`.
         cost: seconds of compilation and of computing, and lanes computed in this call.
         scanned: what the fused loop did not know of runs that this call scanned in its place.
     """
@@ -147,6 +147,10 @@ class Search:
         """Ratio of neighbouring values of each gain in the last stage."""
         return {gain: _cell(ends, self.table.num) for gain, ends in self.windows[-1][side].items()}
 
+    def coarse_cell(self, gain: str) -> float:
+        """Ratio of neighbouring values of a gain in the coarse map."""
+        return _cell(self.limits[gain], self.table.num)
+
     def _zoomed(self, side: str) -> Window:
         """One cell each way about the best point so far, inside of the limits."""
         best, window = self.best(side), {}
@@ -165,7 +169,7 @@ class Search:
                 axes[gain][f"observer.{side}.{gain}"] = values.tolist()
         frame = self._sweep("coarse" if stage == 0 else f"refine-{stage}", axes)
         for side in self.sides:
-            new = self._judge(side, _worst(frame, side)).assign(stage=stage)
+            new = self._judge(side, _worst(frame, side, self.table.objective)).assign(stage=stage)
             old = self.candidates.get(side)
             self.candidates[side] = new if old is None else pd.concat([old, new], ignore_index=True)
             if not self.candidates[side]["feasible"].any():
@@ -278,12 +282,16 @@ _WORST = {
 """How figures of several runs become one."""
 
 
-def _worst(frame: pd.DataFrame, side: str) -> pd.DataFrame:
-    """One row for each pair of gains: the worst over scenarios and seeds; NaN where a run diverged or did not converge."""
+def _worst(frame: pd.DataFrame, side: str, objective: str) -> pd.DataFrame:
+    """One row for each pair of gains: the worst over scenarios and seeds; NaN where a run diverged or did not converge.
+    `chatter` is that of the run with the largest error."""
     keys = [f"observer.{side}.lambda", f"observer.{side}.alpha"]
     part = frame[[*keys, "finite"]].assign(**{name: frame[f"{side}.{name}"] for name in COMPARED})
     found = part.groupby(keys, sort=True).agg(_WORST).astype({"converged": bool, "finite": bool})
+    # a part of the worst run's error
+    worst = part.sort_values(f"{objective}_rmse", kind="stable").groupby(keys, sort=True)["chatter"].last()
+    found["chatter"] = worst
     # the largest of some is not the largest of all
     found.loc[~found["converged"], "convergence_time"] = np.nan
-    found.loc[~found["finite"], [name for name in _WORST if name not in ("converged", "finite")]] = np.nan
+    found.loc[~found["finite"], [*(name for name in _WORST if name not in ("converged", "finite")), "chatter"]] = np.nan
     return found.rename_axis(["lambda", "alpha"]).reset_index()

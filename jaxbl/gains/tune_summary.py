@@ -6,14 +6,14 @@
 import math
 from typing import TYPE_CHECKING, Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
 from jaxbl.files import plain
-from jaxbl.observer.conditions import peak_ratio
+from jaxbl.observer.conditions import judge_gains
 from jaxbl.sweeps.metrics import SIDE_METRICS
+
+from .limits import WORTH, limits_of
 
 if TYPE_CHECKING:
     from .tune import Search, Window
@@ -24,6 +24,7 @@ COMPARED = (
     "convergence_time_worst",
     "velocity_rmse",
     "torque_rmse",
+    "chatter",
     "margin_alpha",
     "margin_exact",
     "f_plus",
@@ -31,7 +32,6 @@ COMPARED = (
 """Metrics of a side that gains are judged by."""
 
 _FLAT = 0.05  # errors that differ by less are as good in practice
-_WORTH = 0.01  # a constraint that costs less is not worth a remark
 
 
 def pareto_front(candidates: pd.DataFrame) -> pd.DataFrame:
@@ -48,6 +48,7 @@ class Summary:
     def __init__(self, search: "Search", named: list[dict[str, Any]], held_out: list[dict[str, Any]]):
         self.search, self.table, self.config = search, search.table, search.scenarios.config
         self.best = {side: search.best(side) for side in search.sides}
+        self.conditions = {side: judge_gains(row["lambda"], row["alpha"], row["f_plus"]) for side, row in self.best.items()}
         self.named, self.rows = named, held_out
         self.held_out = {side: {row["name"]: row for row in held_out if row["side"] == side} for side in search.sides}
         self.factors = {side: self._factors(side) for side in search.sides}
@@ -69,6 +70,8 @@ class Summary:
             "margins": {"exact": table.margin_exact, "alpha": table.margin_alpha},
             "gains": {side: {key: float(self.best[side][key]) for key in keys} for side in sides},
             "achieved": {side: self._achieved(side) for side in sides},
+            "limits": {side: limits_of(search, side) for side in sides},
+            "conditions": self.conditions,
             "range": _ratios(search.limits) | {"num": table.num},
             "resolution": {side: {key: ratio - 1.0 for key, ratio in search.cells(side).items()} for side in sides},
             "stages": [{side: _ratios(window) for side, window in windows.items()} for windows in search.windows],
@@ -86,9 +89,8 @@ class Summary:
         }
 
     def _achieved(self, side: str) -> dict[str, Any]:
-        row = self.best[side]
-        ratio = _peak_ratio(row["lambda"], row["alpha"], row["f_plus"])
-        return plain({name: row[name] for name in COMPARED if name != "converged"} | {"peak_ratio": ratio})
+        names, rho = (name for name in COMPARED if name != "converged"), self.conditions[side]["peak_ratio"]
+        return plain({name: self.best[side][name] for name in names} | {"peak_ratio": rho})
 
     def _front(self, side: str) -> list[dict[str, Any]]:
         names = ["lambda", "alpha", "lambda_ratio", "alpha_ratio", "convergence_time", "error"]
@@ -147,7 +149,6 @@ class Summary:
         for gain, label, (low, high) in gains:
             ratio, near = row[f"{gain}_ratio"], 1.01
             if gain == "alpha" and row["margin_alpha"] < self.table.margin_alpha * near:
-                lines.append(f"{side}: the optimum lies at margin_alpha = {self.table.margin_alpha:g}.")
                 low = 0.0  # it is the margin that ends the range there
             lines += [
                 f"{side}: the optimum lies at the end {label} = {end:g} of the range searched (tune.{gain}_ratio); "
@@ -160,10 +161,10 @@ class Summary:
         for key in kept:
             # gains that miss this constraint alone
             missed = found[~kept[key] & np.logical_and.reduce([values for name, values in kept.items() if name != key])]
-            if key != "converged" and len(missed) and missed["error"].min() < (1.0 - _WORTH) * row["error"]:
+            if key != "converged" and len(missed) and missed["error"].min() < (1.0 - WORTH) * row["error"]:
                 least = missed.nsmallest(1, "error").iloc[0]
                 lines.append(
-                    f"{side}: {key} = {getattr(self.table, key):g} holds the optimum back: of the gains tried, lambda = "
+                    f"{side}: {key} = {getattr(self.table, key):g} forbids better gains: of those tried, lambda = "
                     f"{least['lambda']:.3g}, alpha = {least['alpha']:.3g} miss it alone, with an error of "
                     f"{least['error']:.3g} instead of {row['error']:.3g}."
                 )
@@ -218,16 +219,11 @@ def compared_figures(name: str, side: str, runs: pd.DataFrame, gains: tuple[floa
     worst = {name: figures[name].min() for name in ("margin_alpha", "margin_exact")}
     worst["convergence_time_worst"] = figures["convergence_time_worst"].max()
     row |= worst if finite.all() else dict.fromkeys(worst)
-    return plain(row | {"f_plus": bound, "peak_ratio": _peak_ratio(*gains, bound)})
+    return plain(row | {"f_plus": bound, "peak_ratio": judge_gains(*gains, bound)["peak_ratio"]})
 
 
 def _ratios(window: "Window") -> dict[str, list[float]]:
     return {f"{gain}_ratio": list(ends) for gain, ends in window.items()}
-
-
-def _peak_ratio(lambda_: float, alpha: float, f_plus: float) -> float | None:
-    with jax.enable_x64(True):
-        return plain(peak_ratio(*(jnp.asarray(float(x)) for x in (lambda_, alpha, f_plus))))
 
 
 def _ratio(value: float | None, other: float | None) -> float | None:

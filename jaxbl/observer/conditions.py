@@ -8,13 +8,14 @@ is. By homogeneity all of them are sqrt(f_plus) times a function of alpha / f_pl
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbl.errors import InputError
+from jaxbl.files import plain
 
 Values = Float[Array, "..."]
 
@@ -314,3 +315,39 @@ CONDITIONS = {
     "exact": Condition("exact, ρ < 1", least_lambda_exact),
 }
 """Conditions by the names that configs and metrics use."""
+
+
+@jax.jit
+def largest_f_plus_exact(lambda_: Values, alpha: Values) -> Values:
+    """Largest f_plus (rad/s^2) up to which rho < 1, which gains withstand. At most alpha; zero where lambda is."""
+    found, _ = bisect(lambda f_plus: ~(peak_ratio(lambda_, alpha, f_plus) < 1.0), alpha * jnp.ones_like(lambda_), 52)
+    return found
+
+
+@jax.jit
+def _judged(lambda_: Values, alpha: Values, f_plus: Values) -> tuple[dict[str, Values], Values, Values]:
+    least = {name: condition.least_lambda(alpha, f_plus) for name, condition in CONDITIONS.items()}
+    return least, peak_ratio(lambda_, alpha, f_plus), largest_f_plus_exact(lambda_, alpha)
+
+
+def judge_gains(lambda_: float, alpha: float, f_plus: float) -> dict[str, Any]:
+    """Gains of an observer against what each condition asks at a bound f_plus (rad/s^2), as plain data for JSON.
+
+    `least_lambda` (rad^0.5/s; None where no lambda does) and `holds` by condition, `peak_ratio`, and `largest_f_plus`
+    (rad/s^2), up to which the exact condition holds.
+    """
+    with jax.enable_x64(True):
+        found = _judged(*(jnp.asarray(float(x)) for x in (lambda_, alpha, f_plus)))
+        least, rho, largest = plain(found)
+    # a jitted function sorts the names
+    least = {name: least[name] for name in CONDITIONS}
+    return {
+        "lambda": float(lambda_),
+        "alpha": float(alpha),
+        "f_plus": f_plus,
+        "alpha_exceeds_f_plus": float(alpha) > f_plus,
+        "least_lambda": least,
+        "holds": {name: value is not None and float(lambda_) > value for name, value in least.items()},
+        "peak_ratio": rho,
+        "largest_f_plus": largest,
+    }

@@ -1,7 +1,7 @@
 """The error of an observer in its phase plane with the majorant curve of the proof: the paper's Fig. 29."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -19,6 +19,41 @@ _MOST_PLANES = 6
 """Marked gains that have a plane of their own."""
 
 
+class ErrorPath(NamedTuple):
+    """The error of an observer in its phase plane, as far as its peaks stand out from the chatter.
+
+    Attributes:
+        error: position error (rad).
+        slope: its slope (rad/s), of the same shape.
+        peaks: of the velocity error (rad/s), one a half cycle.
+        ratio: of a peak to the one before, by the majorant (37); None where there is none.
+        majorant: e (rad) and its slope (rad/s) along (36), from the first peak; empty where there is none.
+    """
+
+    error: np.ndarray
+    slope: np.ndarray
+    peaks: np.ndarray
+    ratio: float | None
+    majorant: tuple[np.ndarray, np.ndarray]
+
+
+def error_path(trace: pd.DataFrame, side: str, found: dict[str, Any]) -> ErrorPath:
+    """The path of an observer's error. Arguments as of :func:`error_plane`."""
+    error = (trace[f"{side}.position"] - trace[f"{side}.position_estimate"]).to_numpy()
+    rate = (trace[f"{side}.velocity"] - trace[f"{side}.velocity_estimate"]).to_numpy()
+    lambda_, alpha, bound = (found[name] for name in ("lambda", "alpha", "f_plus"))
+    slope = error_slope(error, rate, lambda_)
+    at, peaks = error_peaks(error, rate, _MOST_PEAKS)
+    end = at[-1] + 2 if len(at) > 1 else len(error)
+    shown = np.unique(np.linspace(0, end - 1, min(end, _MOST_POINTS)).astype(int))
+    least = found["least_lambda"]["davila_fridman"]
+    ratio = None if least is None or lambda_ == 0.0 else least / lambda_
+    curve = (np.zeros(0), np.zeros(0))
+    if len(peaks) and ratio is not None:
+        curve = majorant(peaks[0], lambda_, alpha, bound)
+    return ErrorPath(error[shown], slope[shown], peaks, ratio, curve)
+
+
 @style()
 def error_plane(trace: pd.DataFrame, side: str, found: dict[str, Any]) -> Drawn:
     """The error of an observer in its phase plane, and its peaks, beside the majorant of the proof.
@@ -28,23 +63,14 @@ def error_plane(trace: pd.DataFrame, side: str, found: dict[str, Any]) -> Drawn:
         side: motor or load.
         found: gains, f_plus, and what follows from them (`conditions` of the run's summary).
     """
-    error = (trace[f"{side}.position"] - trace[f"{side}.position_estimate"]).to_numpy()
-    rate = (trace[f"{side}.velocity"] - trace[f"{side}.velocity_estimate"]).to_numpy()
+    error, slope, peaks, ratio, curve = error_path(trace, side, found)
     lambda_, alpha, bound = (found[name] for name in ("lambda", "alpha", "f_plus"))
-    slope = error_slope(error, rate, lambda_)
-    at, peaks = error_peaks(error, rate, _MOST_PEAKS)
-    end = at[-1] + 2 if len(at) > 1 else len(error)
     figure, (left, right) = subplots(8.0, 3.8, columns=2)
-    shown = np.unique(np.linspace(0, end - 1, min(end, _MOST_POINTS)).astype(int))
-    left.plot(error[shown], slope[shown], color=COLOURS[1], lw=1.2, label="error")
+    left.plot(error, slope, color=COLOURS[1], lw=1.2, label="error")
     ratios = np.abs(peaks[1:] / peaks[:-1])
     said = f"ratio {np.median(ratios):.3g} (median)" if len(ratios) else "no two peaks beyond the chatter"
     right.plot(np.abs(peaks), "o", ms=4, color=COLOURS[1], label=f"run: {said}")
-    least = found["least_lambda"]["davila_fridman"]
-    ratio = None if least is None or lambda_ == 0.0 else least / lambda_
-    curve: Any = (np.zeros(1), np.zeros(1))
-    if len(peaks) and ratio is not None:
-        curve = majorant(peaks[0], lambda_, alpha, bound)
+    if len(curve[0]):
         left.plot(*curve, color=COLOURS[6], lw=1.0, label="majorant (36)")
         count = np.arange(max(len(peaks), 2))
         for label, one, dashes in (("majorant (37)", ratio, "-"), ("exact worst case", found["peak_ratio"], "--")):
@@ -57,13 +83,13 @@ def error_plane(trace: pd.DataFrame, side: str, found: dict[str, Any]) -> Drawn:
         right.set(xticks=[], yticks=[])
     else:
         right.set(yscale="log", ylim=(0.5 * np.abs(peaks).min(), 3.0 * np.abs(peaks).max()))
-    _set_limits(left, (error[shown], slope[shown]), curve)
+    _set_limits(left, (error, slope), curve)
     left.set(xlabel="position error e (rad)", ylabel="its slope ė (rad/s)")
     right.set(xlabel="half cycle", ylabel="peak of |ė| (rad/s)")
     left.locator_params(axis="x", nbins=5)
     for ax in (left, right) if len(peaks) else (left,):
         legend(ax)
-    why = "" if ratio is not None else f" There is no majorant: {'α is not above f⁺' if least is None else 'λ is zero'}."
+    why = "" if ratio is not None else f" There is no majorant: {'λ is zero' if alpha > bound else 'α is not above f⁺'}."
     caption = (
         f"Error of the {side} observer (λ = {lambda_:.3g} √rad/s, α = {alpha:.3g} rad/s²) in the phase plane, and its "
         f"velocity peaks (analogue of Fig. 29). The majorant of the proof is for the worst disturbance within "
@@ -78,7 +104,7 @@ def _set_limits(ax: Axes, shown: Any, outside: Any) -> None:
         reach = np.nanmax(np.abs(values), initial=0.0)
         if np.isfinite(reach) and reach > 0.0:
             # a majorant far outside would leave nothing of the error to be seen
-            largest = max(reach, np.abs(outer).max())
+            largest = max(reach, np.abs(outer).max(initial=0.0))
             reach = 1.1 * (largest if largest < 4.0 * reach else 1.2 * reach)
             ax.set(**{f"{axis}lim": (-reach, reach)})
 

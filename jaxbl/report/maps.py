@@ -474,7 +474,8 @@ def condition_curves(
             least = np.asarray(condition.least_lambda(jnp.asarray(fine), jnp.asarray(bound))) if fine.size else fine
         line = (fine, least) if alpha_is_x else (least, fine)
         outlined = [path_effects.Stroke(linewidth=3.6, foreground="black"), path_effects.Normal()]
-        ax.plot(*line, ls=dashes, color=colour, lw=2.0, path_effects=outlined)
+        # the label is what the pointer says on a page
+        ax.plot(*line, ls=dashes, color=colour, lw=2.0, path_effects=outlined, label=condition.title)
         handles.append(Line2D([], [], color=colour, ls=dashes, lw=2.0, label=condition.title, path_effects=outlined))
     return handles
 

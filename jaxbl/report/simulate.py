@@ -13,6 +13,7 @@ from jaxbl.sweeps.trial import Trial
 
 from .error_plane import error_plane
 from .figures import COLOURS, FAINT, SIDE_COLOURS, SIDES, Drawn, legend, stacked, style, subplots, with_unit
+from .gain_plane import conditions_line, draw_gain_plane
 from .page import PageTable, write_report
 
 _TRUE, _OBSERVED = COLOURS[6], COLOURS[1]
@@ -41,6 +42,9 @@ def write_trial_report(trial: Trial, folder: Path) -> list[str]:
             texts = ("undetermined" if value is None else f"{value:.4g}" for value in values)
             found = ", ".join(f"{text} ({side})" for text, side in zip(texts, sides, strict=True))
             lead.append(f"{name}: {found}; true {identified[name]['true']:.4g}")
+    lead += [
+        conditions_line(side, one, "the true bound along this run") for side, one in trial.summary["conditions"].items()
+    ]
     title, text = trial.config.title or "Run", trial.config.to_toml()
     return write_report(folder, title, lead, draw_trial(trial), tables, text, trial.summary["remarks"])
 
@@ -54,7 +58,9 @@ def draw_trial(trial: Trial) -> list[Drawn]:
     for side in sides:
         drawn += [_observed(trace, side, quantity, unit) for quantity, unit in (("velocity", "rad/s"), ("position", "rad"))]
     drawn.append(_torque(trace, sides))
-    drawn += [error_plane(trial.trace, side, found) for side, found in trial.summary["conditions"].items()]
+    judged = trial.summary["conditions"]
+    drawn += [draw_gain_plane(side, found) for side, found in judged.items() if found["f_plus"] > 0.0]
+    drawn += [error_plane(trial.trace, side, found) for side, found in judged.items()]
     if len(sides) == 2:
         last = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]]
         drawn += [_identified(trial, trace, last, sides), _hysteresis(last), _limit_cycle(last)]

@@ -5,6 +5,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import matplotlib.patheffects as path_effects
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -13,12 +14,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from jaxbl.files import write_atomic
+from jaxbl.gains.limits import PLACES
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.tune_summary import called_gains
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
 from .figures import COLOURS, MAP, MARKERS, MISSING, SIDES, Drawn, literal, mark, style, subplots, with_unit
+from .gain_plane import conditions_line, name_gains, name_ratio
 from .maps import cell_edges, color_norm, condition_curves, hatch_failures
 from .page import PageTable, write_report
 
@@ -29,7 +32,8 @@ _CONDITIONS = {name: CONDITIONS[name] for name in ("davila_fridman", "seeber_hor
 def draw_tuning(tuning: Tuning) -> list[Drawn]:
     """All figures of a tuning."""
     sides = [side for side in SIDES if side in tuning.candidates]
-    return [*(_map(tuning, side) for side in sides), *(_front(tuning, side) for side in sides), _comparison(tuning, sides)]
+    maps = [draw(tuning, side) for side in sides for draw in (_map, _limits)]
+    return [*maps, *(_front(tuning, side) for side in sides), _comparison(tuning, sides)]
 
 
 def _label(tuning: Tuning) -> str:
@@ -46,29 +50,35 @@ def _others(tuning: Tuning, side: str) -> list[tuple[str, str, dict[str, Any]]]:
 def _map(tuning: Tuning, side: str) -> Drawn:
     summary, bound = tuning.summary, tuning.summary["f_plus"][side]
     coarse = tuning.candidates[side].query("stage == 0")
-    tables = coarse.astype({"feasible": float}).pivot_table(
-        index="lambda_ratio", columns="alpha_ratio", values=["error", "feasible"], dropna=False
+    constraints, binding = (summary["limits"][side][key] for key in ("constraints", "binding"))
+    tables = coarse.astype({"feasible": float, "converged": float}).pivot_table(
+        index="lambda", columns="alpha", values=["error", "feasible", *(PLACES[name] for name in binding)], dropna=False
     )
     grid, feasible = tables["error"].to_numpy(float), tables["feasible"].to_numpy(float)
     xs, ys = tables["error"].columns.to_numpy(float), tables.index.to_numpy(float)
     norm = color_norm(grid, "log")
     edges = cell_edges(xs, True), cell_edges(ys, True)
-    figure, (ax,) = subplots(6.6, 5.4, beside=True)
+    figure, (ax,) = subplots(7.2, 6.0, beside=True)
     ax.grid(False)
     ax.set_facecolor(MISSING)
-    ax.set(xscale="log", yscale="log", xlabel="α / f⁺", ylabel="λ / √f⁺ (λ in √rad/s)")
+    ax.set(xscale="log", yscale="log", xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
     ax.pcolormesh(*edges, grid, cmap=MAP, norm=norm, rasterized=True)
     handles: list[Any] = [*hatch_failures(ax, (xs, ys), edges, feasible, "constraints not met")]
-    handles += condition_curves(ax, _CONDITIONS, 1.0, (edges[0][0], edges[0][-1]))
+    lines = {name: _binding_line(ax, edges, tables, name, constraints[name]) for name in binding}
+    handles += [handle for line in lines.values() for handle in line]
+    handles += condition_curves(ax, _CONDITIONS, bound, (edges[0][0], edges[0][-1]))
     for window in summary["stages"][1:2]:
-        (left, right), (low, high) = window[side]["alpha_ratio"], window[side]["lambda_ratio"]
+        (left, right), (low, high) = (
+            np.array(window[side][f"{gain}_ratio"]) * unit for gain, unit in (("alpha", bound), ("lambda", np.sqrt(bound)))
+        )
         ax.add_patch(Rectangle((left, low), right - left, high - low, fill=False, ec="white", ls="--", lw=1.2))
         handles.append(Patch(fill=False, ec="#777777", ls="--", label="first zoom"))
     gains = summary["gains"][side]
     ax.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
     for name, marker, row in _others(tuning, side):
-        handles.append(mark(ax, (row["alpha"] / bound, row["lambda"] / np.sqrt(bound)), marker, name, 8))
-    handles.append(mark(ax, (gains["alpha_ratio"], gains["lambda_ratio"]), "*", "tuned", 15))
+        handles.append(mark(ax, (row["alpha"], row["lambda"]), marker, name, 8))
+    handles.append(mark(ax, (gains["alpha"], gains["lambda"]), "*", "tuned", 15))
+    name_gains(ax, bound)
     ax.set_title(
         f"{side}: tuned ★ λ = {gains['lambda']:.3g} √rad/s, α = {gains['alpha']:.3g} rad/s²,  f⁺ = {bound:.3g} rad/s²"
     )
@@ -76,11 +86,158 @@ def _map(tuning: Tuning, side: str) -> Drawn:
     if np.isnan(grid).any():
         handles.append(Patch(facecolor=MISSING, label=f"diverged ({int(np.isnan(grid).sum())} points)"))
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    drawn = [name for name, line in lines.items() if line]
+    bold = f" Bold line: {' and '.join(drawn)}, which bind{'s' * (len(drawn) == 1)}." if drawn else ""
     caption = (
-        f"{side}: {_label(tuning)} over all runs, on the coarse map of normalised gains. Hatched: not converged, or a "
-        "margin not met. Curves: least λ of the gain conditions. The other gains are compared below."
+        f"{side}: {_label(tuning)} over all runs, on the coarse map; above and on the right the axes of the atlas "
+        f"(jaxbl verify). Hatched: not converged, or a margin not met.{bold} Curves: least λ of the gain conditions at the "
+        "f⁺ of the pilot run. The other gains are compared below."
     )
     return Drawn(f"tuning_{side}", figure, caption)
+
+
+def _binding_line(ax: Axes, edges: Any, tables: pd.DataFrame, name: str, found: dict[str, Any]) -> list[Line2D]:
+    """The line on the coarse map along which a constraint that binds is just met. Returns the legend's handles."""
+    values = tables[PLACES[name]]
+    xs, ys, level = values.columns.to_numpy(float), values.index.to_numpy(float), found.get("limit", 0.5)
+    shown = values.to_numpy(float)
+    if not np.nanmin(shown) < level < np.nanmax(shown):
+        return []
+    # out to the edges of the outer cells
+    xs, ys = (np.concatenate([e[:1], c, e[-1:]]) for c, e in zip((xs, ys), edges, strict=True))
+    lines = ax.contour(xs, ys, np.pad(shown, 1, mode="edge"), levels=[level], colors=_LIMITS[name], linewidths=3.0, zorder=3)
+    outlined = [path_effects.Stroke(linewidth=5.0, foreground="white"), path_effects.Normal()]
+    lines.set_path_effects(outlined)
+    return [Line2D([], [], color=_LIMITS[name], lw=3.0, path_effects=outlined, label=_called(name, found))]
+
+
+_LIMITS = {"converged": "#7F7F7F", "margin_alpha": "#3F51B5", "margin_exact": "#E8000B", "longest_convergence": "#8B4513"}
+"""Colours of constraints."""
+
+
+def _called(name: str, found: dict[str, Any]) -> str:
+    """A constraint with its limit, and whether it binds."""
+    limit = f" = {found['limit']:g}" if "limit" in found else ""
+    return f"{name}{limit}{' (binds)' if found['binds'] else ''}"
+
+
+def _missing(names: list[str]) -> str:
+    """What gains do that miss constraints."""
+    margins = [name for name in names if name != "converged"]
+    parts = [f"misses {' and '.join(margins)}"] if margins else []
+    return " and ".join([*parts, "does not converge"] if "converged" in names else parts)
+
+
+def _limits(tuning: Tuning, side: str) -> Drawn:
+    """The error along each gain through the optimum, and what ends the way to each side."""
+    summary, bound = tuning.summary, tuning.summary["f_plus"][side]
+    found, gains, error = summary["limits"][side], summary["gains"][side], summary["achieved"][side]
+    velocity = summary["objective"] == "velocity"
+    figure, axes = subplots(9.6, 4.6, columns=2, beside=True, sharey=True)
+    shaded: dict[str, Any] = {}
+    handles: dict[str, Any] = {}
+    for ax, (gain, symbol, unit, label, ratio) in zip(axes, _PLANES, strict=True):
+        line = pd.DataFrame(found["profiles"][gain])
+        x, y = line[gain].to_numpy(float), line["error"].to_numpy(float)
+        edges = cell_edges(x, True)
+        ax.set(xscale="log", yscale="log", xlim=edges[[0, -1]])
+        for name, one in found["constraints"].items():
+            look: dict[str, Any] = {"facecolor": _LIMITS[name], "alpha": 0.4 if one["binds"] else 0.15, "lw": 0.0}
+            missed = line["missed"].map(lambda names, name=name: name in names).to_numpy(bool)
+            for first, last in _stretches(missed):
+                ax.axvspan(edges[first], edges[last], **look)
+                shaded[name] = Patch(**look, label=f"not met: {_called(name, one)}")
+        (handles["error"],) = ax.plot(x, y, color=COLOURS[0], lw=2.0, label=_label(tuning))
+        if velocity:
+            chatter = line["chatter"].to_numpy(float)
+            with np.errstate(invalid="ignore"):
+                slow = np.sqrt(y**2 - chatter**2)
+            (handles["chatter"],) = ax.plot(x, chatter, color=COLOURS[4], lw=1.2, label="its chatter, sample to sample")
+            (handles["slow"],) = ax.plot(x, slow, color=COLOURS[2], lw=1.2, label="its slow part, the rest")
+        ax.axvline(gains[gain], color="black", lw=0.8)
+        handles["tuned"] = mark(ax, (gains[gain], error[f"{summary['objective']}_rmse"]), "*", "tuned", 15, held=False)
+        smaller, larger = (f"{way} {symbol}: {_short(one)}" for way, one in found["towards"][gain].items())
+        ax.set_title(f"← {smaller}", loc="left", fontsize=9)
+        ax.set_title(f"{larger} →", loc="right", fontsize=9)
+        ax.set_xlabel(f"{symbol} ({unit})")
+        name_ratio(ax, "x", ratio(bound), label)
+    axes[0].set_ylabel(_label(tuning))
+    figure.suptitle(f"{side}: what limits the gains", fontsize=10)
+    figure.legend(handles=[*shaded.values(), *handles.values()], loc="outside lower center", ncols=3)
+    caption = (
+        f"{side}: the error along each gain, with the other one as tuned, from the runs of all maps (between two rows of a "
+        "map, interpolated). "
+    )
+    if velocity:
+        caption += (
+            "Chatter is the rms change from sample to sample over √2; the slow part is the rest of the mean square, where "
+            "chatter is not above the error. "
+        )
+    caption += f"What limits the gains: {_limits_text(found)}"
+    return Drawn(f"limits_{side}", figure, caption)
+
+
+_PLANES = (
+    ("lambda", "λ", "√rad/s", "λ / √f⁺", np.sqrt),
+    ("alpha", "α", "rad/s²", "α / f⁺", float),
+)
+
+
+def _stretches(there: np.ndarray) -> list[tuple[int, int]]:
+    """First, and one after the last, index of each stretch that is true."""
+    steps = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
+    return list(zip(steps[::2], steps[1::2], strict=True))
+
+
+def _short(way: dict[str, Any]) -> str:
+    """What limits a gain towards one side, in few words."""
+    if way["limit"] == "constraint":
+        return " and ".join(way["missed"])
+    if way["limit"] == "range":
+        return "end of the range"
+    if way["change"] is None:
+        return "diverges"
+    return f"error {_size(way['change'])}"
+
+
+def _size(change: float) -> str:
+    """A relative change in few characters."""
+    return f"× {1.0 + change:.2g}" if change >= 1.0 else f"{100.0 * change:+.2g} %"
+
+
+def _limits_text(found: dict[str, Any]) -> str:
+    """What limits gains towards smaller and larger values (`limits` of a side), in sentences."""
+    binding = [f"{_called(name, one | {'binds': False})} (here {one['value']:.4g})" if "limit" in one else name
+               for name, one in found["constraints"].items() if one["binds"]]  # fmt: skip
+    if binding:
+        lines = [f"{' and '.join(binding)} bind{'s' * (len(binding) == 1)}."]
+    elif found["range_ends"]:
+        lines = ["no constraint binds, but the range searched ends at the optimum."]
+    else:
+        lines = ["no constraint binds, and the optimum lies inside of the range searched."]
+    for gain, symbol, unit, *_ in _PLANES:
+        ways = found["towards"][gain]
+        text = "; ".join(_way(way, symbol, unit, one) for way, one in ways.items())
+        lines.append(f"{text[0].upper()}{text[1:]}.")
+        if [one["by"] for one in ways.values()] == ["slow", "chatter"]:
+            lines.append(f"So for {symbol} the slow part of the error balances its chatter.")
+    return " ".join(lines)
+
+
+def _way(way: str, symbol: str, unit: str, found: dict[str, Any]) -> str:
+    """What limits a gain towards one side, as part of a sentence."""
+    if found["limit"] == "range":
+        return f"{way} {symbol}: outside of the range searched (tune.{'lambda' if symbol == 'λ' else 'alpha'}_ratio)"
+    if found["at"] is None:
+        return f"{way} {symbol}: {_missing(found['missed'])}"
+    at = f"{symbol} = {found['at']:.3g} {unit}"
+    if found["change"] is None:
+        return f"{way} {symbol}: runs diverge (at {at})"
+    size = f"error {_size(found['change'])} at {at}"
+    by = {"chatter": ", as its chatter grows", "slow": ", as its slow part grows", None: ""}[found["by"]]
+    joint = ", but it" if found["limit"] == "constraint" else ", and it"
+    missed = f"{joint} {_missing(found['missed'])}" if found["missed"] else ""
+    return f"{way} {symbol}: {size}{by}{missed}"
 
 
 def _front(tuning: Tuning, side: str) -> Drawn:
@@ -158,7 +315,7 @@ def _bars(ax: Axes, key: str, rows: list[dict[str, Any]]) -> None:
 def write_tune_report(tuning: Tuning, folder: Path) -> list[str]:
     """Write `gains.toml`, `tuning.json`, figures and report into a folder that exists. Returns lines for the terminal."""
     summary = tuning.summary
-    lead = _tune_headline(summary)
+    lead = tune_headline(summary)
     write_atomic(folder / "gains.toml", gains_toml(summary))
     write_atomic(folder / "tuning.json", json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False))
     tables = [
@@ -209,7 +366,7 @@ def _where(summary: dict[str, Any]) -> str:
     return "on the study's excitation with other noise" if held["same_excitation"] else other
 
 
-def _tune_headline(summary: dict[str, Any]) -> list[str]:
+def tune_headline(summary: dict[str, Any]) -> list[str]:
     """The chosen gains and their errors on the held-out runs, in sentences."""
     lines, metric = [], f"{summary['objective']}_rmse"
     unit = SIDE_METRICS[metric].unit
@@ -221,6 +378,10 @@ def _tune_headline(summary: dict[str, Any]) -> list[str]:
             f"{found[metric]:.3g} {unit} rms, converged after "
             f"{found['convergence_time']:.3g} s, the worst of {_runs_behind(summary)}."
         )
+    lines += [f"{side}, what limits the gains: {_limits_text(found)}" for side, found in summary["limits"].items()]
+    if any(way["by"] for found in summary["limits"].values() for ways in found["towards"].values() for way in ways.values()):
+        lines[-1] += " (Chatter is what changes from sample to sample, the slow part is the rest.)"
+    lines += [conditions_line(side, one, "the largest of all runs") for side, one in summary["conditions"].items()]
     where = _where(summary)
     rows = {(row["name"], row["side"]): row for row in summary["holdout"]["rows"]}
     for side, others in summary["holdout"]["factors"].items():

@@ -14,11 +14,12 @@ from jaxbl.config import Config, precision, prepare, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import plain
 from jaxbl.fused import Unsupported, attempted, say_scanned
-from jaxbl.observer.conditions import CONDITIONS, peak_ratio
+from jaxbl.observer.conditions import CONDITIONS, judge_gains
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.simulate import Experiment, Reducer, Signals, State, scan
 
 from .metrics import METRICS, identified, observer_gains, with_conditions
+from .programs import Backend
 from .store import identity
 
 
@@ -37,13 +38,17 @@ class Trial(NamedTuple):
     summary: dict[str, Any]
 
 
-def run(study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every: int = 1) -> Trial:
+def run(
+    study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every: int = 1, backend: Backend | None = None
+) -> Trial:
     """Run the experiment of a study once, without its axes.
 
     Args:
         study: TOML file, mapping or config.
         seed: seed of the encoder noise.
         every: keep every N-th sample of the trace.
+        backend: `scan` compiles for all values of the study's numbers, which is faster where many runs follow one another;
+            left out, the faster for one run.
 
     Raises:
         InputError: wrong config.
@@ -53,20 +58,29 @@ def run(study: str | Path | Mapping[str, Any] | Config, *, seed: int = 0, every:
         raise InputError(f"every: should be between 1 and the number of samples {config.run.steps}, not {every}")
     with precision(config):
         experiment = prepare(config)
-        what = (METRICS, _LAST), partial(_row, experiment), every
-        try:
-            with attempted():
-                from jaxbl.fused.single_run import recorded
-
-                figures, kept = recorded(experiment, seed, *what)
-        except Unsupported as why:
-            say_scanned(str(why))
-            figures, kept = jax.jit(lambda seed: scan(experiment, seed, *what))(jnp.asarray(seed))
+        figures, kept = _scanned(experiment, seed, every) if backend == "scan" else _recorded(experiment, seed, every)
         figures = with_conditions(figures, observer_gains(experiment))
         trace = pd.DataFrame({name: np.asarray(column, float) for name, column in kept.items()})
     last = {name: plain(figures.pop(name)) for name in list(figures) if name.startswith("last.")}
     metrics = {name: plain(value) for name, value in figures.items()}
     return Trial(config, trace, _summary(config, last, metrics, seed))
+
+
+def _recorded(experiment: Experiment, seed: int, every: int) -> tuple[dict[str, Any], Any]:
+    """By the fused loop if it can."""
+    try:
+        with attempted():
+            from jaxbl.fused.single_run import recorded
+
+            return recorded(experiment, seed, _REDUCERS, partial(_row, experiment), every)
+    except Unsupported as why:
+        say_scanned(str(why))
+        return _scanned(experiment, seed, every)
+
+
+@partial(jax.jit, static_argnums=2)
+def _scanned(experiment: Experiment, seed: Any, every: int) -> tuple[dict[str, Any], Any]:
+    return scan(experiment, seed, _REDUCERS, partial(_row, experiment), every)
 
 
 def _last(experiment: Experiment, largest: Any, state: State) -> dict[str, Any]:
@@ -82,6 +96,7 @@ _LAST = Reducer(
     lambda experiment, largest, index, signals: jnp.maximum(largest, jnp.abs(signals.torque)),
     _last,
 )
+_REDUCERS = METRICS, _LAST
 
 
 def _row(experiment: Experiment, state: State, signals: Signals) -> dict[str, Any]:
@@ -113,7 +128,8 @@ def _summary(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed
     for side in experiment.sides:
         f_plus = metrics[f"{side}.f_plus"]
         if f_plus is not None:
-            conditions[side] = _conditions(getattr(experiment.observer, side), f_plus)
+            observer = getattr(experiment.observer, side)
+            conditions[side] = judge_gains(observer.lambda_, observer.alpha, f_plus)
     return {
         "title": config.title,
         "single_run": identity(config, "simulate"),
@@ -122,30 +138,6 @@ def _summary(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed
         "identified": parameters,
         "conditions": conditions,
         "remarks": [*config.notes, *_remarks(experiment, last, metrics, conditions)],
-    }
-
-
-@jax.jit
-def _asked(lambda_: jax.Array, alpha: jax.Array, f_plus: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
-    """What each condition asks of lambda, and the ratio of peaks."""
-    least = {name: condition.least_lambda(alpha, f_plus) for name, condition in CONDITIONS.items()}
-    return least, peak_ratio(lambda_, alpha, f_plus)
-
-
-def _conditions(observer: Any, f_plus: float) -> dict[str, Any]:
-    """Gains of an observer against what each condition asks at a bound f_plus (rad/s^2)."""
-    with jax.enable_x64(True):
-        lambda_, alpha, bound = (jnp.asarray(x) for x in (float(observer.lambda_), float(observer.alpha), f_plus))
-        found, rho = _asked(lambda_, alpha, bound)
-    least = {name: plain(found[name]) for name in CONDITIONS}
-    return {
-        "lambda": float(observer.lambda_),
-        "alpha": float(observer.alpha),
-        "f_plus": f_plus,
-        "alpha_exceeds_f_plus": float(observer.alpha) > f_plus,
-        "least_lambda": least,
-        "holds": {name: value is not None and float(observer.lambda_) > value for name, value in least.items()},
-        "peak_ratio": plain(rho),
     }
 
 
@@ -171,7 +163,7 @@ def _remarks(experiment: Experiment, last: dict[str, Any], metrics: dict[str, An
             # what lambda would have to be where alpha does cover the torque
             torque_bound = largest * abs(float(experiment.drive.torque_gain(side))) / inertia
             if found["alpha"] > torque_bound:
-                found["torque_bound"] = _conditions(getattr(experiment.observer, side), torque_bound)
+                found["torque_bound"] = judge_gains(found["lambda"], found["alpha"], torque_bound)
         for label, values in (("the true f⁺", found), ("f⁺ = max |C| / J", found.get("torque_bound"))):
             if values is None or values["least_lambda"]["exact"] is None:
                 continue

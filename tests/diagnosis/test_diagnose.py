@@ -108,6 +108,16 @@ def test_what_is_held_out_keeps_its_times_and_is_not_fitted(logs, found):
     assert trace["motor.missing_after"].std() < trace["motor.missing_before"].std()
 
 
+def test_what_an_effect_takes_off_is_its_torque(found):
+    trace = found.trace[KEPT:]
+    taken = trace["motor.missing_without.motor.coulomb_friction"] - trace["motor.missing_after"]
+    # away from reversals, where the smoother rounds the jump
+    fast = trace["motor.velocity"].abs() > 0.5 * trace["motor.velocity"].abs().max()
+    friction = -FRICTION["torque"] * np.sign(trace["motor.velocity"])
+    np.testing.assert_allclose(taken[fast].median(), friction[fast].median(), rtol=0.1)
+    assert np.corrcoef(taken[fast], friction[fast])[0, 1] > 0.98
+
+
 def test_the_observers_are_a_second_witness(found):
     about = found.summary["where"]["motor"]["observed"]
     assert about["converged"] is True and about["correlation"] > 0.95

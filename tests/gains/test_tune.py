@@ -140,6 +140,8 @@ def test_summary_is_json_and_public_names_resolve(chosen):
         "margins",
         "gains",
         "achieved",
+        "limits",
+        "conditions",
         "holdout",
         "pareto",
         "remarks",
@@ -207,15 +209,51 @@ def test_an_interrupted_search_goes_on_where_it_stopped(tmp_path, monkeypatch):
 
 def test_a_range_that_ends_too_early_is_said():
     table = TABLE | {"alpha_ratio": {"start": 4.0, "stop": 20.0}, "refine": 0}
-    remarks = tune(one_side(tune=table)).summary["remarks"]
-    assert any("the optimum lies at the end alpha / f⁺ = 4 of the range searched (tune.alpha_ratio)" in r for r in remarks)
+    found = tune(one_side(tune=table)).summary
+    assert any(
+        "the optimum lies at the end alpha / f⁺ = 4 of the range searched (tune.alpha_ratio)" in remark
+        for remark in found["remarks"]
+    )
+    limits = found["limits"]["motor"]
+    assert limits["range_ends"] == ["smaller alpha"]
+    assert limits["binding"] == []
+    assert limits["towards"]["alpha"]["smaller"]["limit"] == "range"
 
 
 def test_a_constraint_that_holds_the_optimum_back_is_said():
     table = TABLE | {"margin_exact": 5.0, "refine": 0}
     found = tune(one_side(tune=table)).summary
     assert found["achieved"]["motor"]["margin_exact"] >= 5.0
-    assert any("margin_exact = 5 holds the optimum back" in remark for remark in found["remarks"])
+    assert any("margin_exact = 5 forbids better gains" in remark for remark in found["remarks"])
+    limits = found["limits"]["motor"]
+    assert limits["binding"] == ["margin_exact"]
+    assert limits["constraints"]["margin_exact"]["binds"]
+    assert not limits["constraints"]["margin_alpha"]["binds"]
+
+
+def test_limits_are_those_of_the_candidates(chosen):
+    limits, achieved = (chosen.summary[key]["motor"] for key in ("limits", "achieved"))
+    assert list(limits["constraints"]) == ["converged", "margin_alpha", "margin_exact"]
+    for name in ("margin_alpha", "margin_exact"):
+        one = limits["constraints"][name]
+        assert one["value"] == achieved[name]
+        assert one["room"] == pytest.approx(achieved[name] / 1.1)
+        assert one["binds"] == (name in limits["binding"])
+    gains, frame = chosen.summary["gains"]["motor"], chosen.candidates["motor"]
+    for gain, other in (("lambda", "alpha"), ("alpha", "lambda")):
+        line = pd.DataFrame(limits["profiles"][gain])
+        assert line[gain].is_monotonic_increasing
+        # where the zoom was run, its own runs
+        there = frame[(frame["stage"] == 1) & np.isclose(frame[other], gains[other], rtol=1e-9)].sort_values(gain)
+        shown = line[line[gain].between(there[gain].min() * 0.999, there[gain].max() * 1.001)]
+        np.testing.assert_allclose(shown[gain], there[gain])
+        np.testing.assert_allclose(shown["error"], there["error"])
+        assert [not names for names in shown["missed"]] == there["feasible"].to_list()
+        # and the whole range
+        assert line[f"{gain}_ratio"].iloc[[0, -1]].to_list() == pytest.approx(chosen.summary["range"][f"{gain}_ratio"])
+    held = chosen.summary["conditions"]["motor"]
+    assert held["lambda"] / held["least_lambda"]["exact"] == pytest.approx(achieved["margin_exact"], rel=1e-6)
+    assert held["f_plus"] == achieved["f_plus"]
 
 
 def test_gains_that_do_not_converge_have_no_factor():

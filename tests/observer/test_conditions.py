@@ -129,6 +129,28 @@ def test_least_lambda_exact_is_where_the_ratio_is_one(ratio, f_plus):
     np.testing.assert_allclose(RATIO(least, ratio * f_plus, f_plus), 1.0, rtol=1e-9)
 
 
+@pytest.mark.parametrize("alpha", [1.1, 3.0, 80.0])
+def test_largest_bound_of_the_exact_condition_is_where_it_is_just_met(alpha):
+    with jax.enable_x64(True):
+        least = conditions.least_lambda_exact(jnp.asarray(alpha), jnp.asarray(1.0))
+        np.testing.assert_allclose(conditions.largest_f_plus_exact(least, jnp.asarray(alpha)), 1.0, rtol=1e-9)
+        # with a large lambda it is alpha that limits, with none nothing is withstood
+        found = conditions.largest_f_plus_exact(jnp.asarray([0.0, 1e3]), jnp.asarray(alpha))
+        np.testing.assert_allclose(found, [0.0, alpha], rtol=1e-9, atol=1e-12)
+
+
+def test_gains_are_judged_by_every_condition():
+    found = conditions.judge_gains(1.5, 1.1, 1.0)
+    # the usual pair, docs/theory.md
+    assert [name for name, holds in found["holds"].items() if holds] == ["seeber_horn", "exact"]
+    assert list(found["least_lambda"]) == list(conditions.CONDITIONS)
+    assert found["peak_ratio"] == pytest.approx(0.54, abs=0.005)
+    assert 1.0 < found["largest_f_plus"] <= 1.1
+    missed = conditions.judge_gains(1.5, 1.0, 1.0)
+    assert (missed["peak_ratio"], set(missed["least_lambda"].values())) == (None, {None})
+    assert not any(missed["holds"].values())
+
+
 @settings(deadline=None, max_examples=100)
 @given(margin=st.floats(1e-3, 1e3), f_plus=POSITIVE)
 def test_order_of_the_conditions(margin, f_plus):

@@ -7,15 +7,16 @@ from jaxbl.report.figures import save
 from jaxbl.report.simulate import draw_trial
 from jaxbl.sweeps.trial import run
 
-BOTH = ["input", "motor_velocity", "motor_position", "load_velocity", "load_position", "torque", "error_plane_motor",
-        "error_plane_load", "dead_zone", "hysteresis", "limit_cycle"]  # fmt: skip
+AT_REST = ["input", "motor_velocity", "motor_position", "load_velocity", "load_position", "torque", "error_plane_motor",
+           "error_plane_load", "dead_zone", "hysteresis", "limit_cycle"]  # fmt: skip
+BOTH = [*AT_REST[:6], "gain_conditions_motor", "gain_conditions_load", *AT_REST[6:]]
 CASES = {
     "sigmoid": (small({"run.duration": 1.0}), BOTH),
     "dead zone": (small(transmission={"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.01}), BOTH),
     "shaft": (small(transmission={"law": "linear_shaft", "stiffness": 1.0}), BOTH),
-    "rigid": (rigid(), ["input", "motor_velocity", "motor_position", "torque", "error_plane_motor"]),
+    "rigid": (rigid(), [*BOTH[:3], "torque", "gain_conditions_motor", "error_plane_motor"]),
     # nothing moves, nothing is identified
-    "at rest": (small({"excitation.amplitude": 0.0, "encoders.noise": 0.0, "observer.motor.velocity_error": 0.0}), BOTH),
+    "at rest": (small({"excitation.amplitude": 0.0, "encoders.noise": 0.0, "observer.motor.velocity_error": 0.0}), AT_REST),
     "not identified": (small({"identifier.start": 10.0}), BOTH),
     "diverged": (rigid(effects=[{"kind": "motor.viscous_friction", "viscous": 1e4}]), ["input", "motor_velocity",
                  "motor_position", "torque"]),

@@ -1,5 +1,7 @@
 """What a tuning leaves behind: gains that can be included, numbers, figures, page."""
 
+import copy
+import dataclasses
 import json
 import tomllib
 
@@ -8,14 +10,15 @@ import numpy as np
 import pytest
 from browser import check, needs_chromium, opened
 from matplotlib.collections import QuadMesh
-from matplotlib.colors import LogNorm
+from matplotlib.colors import LogNorm, to_rgb
 from small_study import small
 from test_page import Page, place
 
 from jaxbl.config import read_config
 from jaxbl.gains.tune import tune
 from jaxbl.observer.conditions import CONDITIONS
-from jaxbl.report.tune import draw_tuning, write_tune_report
+from jaxbl.report.figures import save
+from jaxbl.report.tune import draw_tuning, tune_headline, write_tune_report
 from jaxbl.sweeps.trial import run
 
 SLOW = {"lambda": 1e-3, "alpha": 0.05}
@@ -58,11 +61,11 @@ def test_gains_can_be_included_and_run(folder, tuned):
 
 def test_numbers_figures_and_page(folder, tuned):
     assert json.loads((folder / "tuning.json").read_text(encoding="utf-8")) == tuned.summary
-    names = ["pareto_load", "pareto_motor", "tuning_holdout", "tuning_load", "tuning_motor"]
+    names = ["limits_load", "limits_motor", "pareto_load", "pareto_motor", "tuning_holdout", "tuning_load", "tuning_motor"]
     assert sorted(path.stem for path in (folder / "figures").iterdir()) == names
     assert plt.get_fignums() == []
     page = Page((folder / "report.html").read_text(encoding="utf-8"))
-    assert len(page.images) == 5
+    assert len(page.images) == 7
     lines = (folder / "lines").read_text().splitlines()
     for text in (*lines, "two <b> sides", "usual rule", "slow", "On the study's excitation with other noise"):
         assert text in page.text
@@ -70,7 +73,7 @@ def test_numbers_figures_and_page(folder, tuned):
     assert any("the gains 'slow' converge in 0 % of the runs" in line for line in lines)
 
 
-def test_map_has_the_coarse_stage_its_optimum_and_the_others(tuned):
+def test_map_has_the_coarse_stage_its_optimum_and_the_others(tuned, tmp_path):
     drawing = next(d for d in draw_tuning(tuned) if d.name == "tuning_motor")
     ax = drawing.figure.axes[0]
     (mesh,) = (c for c in ax.collections if isinstance(c, QuadMesh))
@@ -79,7 +82,13 @@ def test_map_has_the_coarse_stage_its_optimum_and_the_others(tuned):
     assert isinstance(mesh.norm, LogNorm)
     gains = tuned.summary["gains"]["motor"]
     star = next(line for line in ax.lines if line.get_marker() == "*")
-    assert (star.get_xdata()[0], star.get_ydata()[0]) == (gains["alpha_ratio"], gains["lambda_ratio"])
+    assert (star.get_xdata()[0], star.get_ydata()[0]) == (gains["alpha"], gains["lambda"])
+    # in units of f⁺ above and on the right
+    bound = tuned.summary["f_plus"]["motor"]
+    save(drawing.figure, tmp_path / "map.png")
+    top, right = ax.child_axes
+    np.testing.assert_allclose(top.get_xlim(), np.array(ax.get_xlim()) / bound)
+    np.testing.assert_allclose(right.get_ylim(), np.array(ax.get_ylim()) / np.sqrt(bound))
     legend = [text.get_text() for legend in drawing.figure.legends for text in legend.get_texts()]
     assert {"constraints not met", CONDITIONS["exact"].title, "usual rule", "config", "slow, off the map", "tuned"} <= set(
         legend
@@ -87,6 +96,59 @@ def test_map_has_the_coarse_stage_its_optimum_and_the_others(tuned):
     # on the edge, not outside
     low, high = ax.get_xlim()
     assert all(low <= x * (1 + 1e-9) and x <= high * (1 + 1e-9) for line in ax.lines for x in line.get_xdata())
+
+
+def bound_to(summary, binding):
+    """The summary, as if some constraints of the motor had bound."""
+    summary = copy.deepcopy(summary)
+    found = summary["limits"]["motor"]
+    found["binding"] = binding
+    for name in binding:
+        found["constraints"][name]["binds"] = True
+        found["towards"]["lambda"]["smaller"] = {
+            "limit": "constraint",
+            "missed": [name],
+            "at": 1.0,
+            "change": -0.5,
+            "by": None,
+        }
+    return summary
+
+
+def test_map_and_sentence_name_the_constraint_that_binds(tuned):
+    for binding in ([], ["margin_exact"]):
+        found = dataclasses.replace(tuned, summary=bound_to(tuned.summary, binding))
+        drawn = {d.name: d for d in draw_tuning(found)}
+        legends = {
+            name: [text.get_text() for legend in drawn[name].figure.legends for text in legend.get_texts()]
+            for name in ("tuning_motor", "limits_motor")
+        }
+        named = [any("margin_exact = 1.1 (binds)" in text for text in legend) for legend in legends.values()]
+        assert named == [bool(binding)] * 2
+        assert ("Bold line: margin_exact, which binds." in drawn["tuning_motor"].caption) == bool(binding)
+        lead = next(line for line in tune_headline(found.summary) if line.startswith("motor, what limits the gains: "))
+        assert lead.partition(": ")[2].partition(" (Chatter")[0] in drawn["limits_motor"].caption
+        assert ("margin_exact = 1.1 (here" in lead) == bool(binding)
+        assert ("no constraint binds" in lead) != bool(binding)
+        titles = [ax.get_title("left") for ax in drawn["limits_motor"].figure.axes]
+        assert ("← smaller λ: margin_exact" in titles) == bool(binding)
+
+
+def test_limits_are_drawn_as_the_numbers_have_them(tuned):
+    drawing = next(d for d in draw_tuning(tuned) if d.name == "limits_load")
+    found = tuned.summary["limits"]["load"]
+    for ax, gain in zip(drawing.figure.axes, ("lambda", "alpha"), strict=True):
+        line, profile = ax.lines[0], found["profiles"][gain]
+        np.testing.assert_allclose(line.get_xydata(), np.column_stack([profile[gain], profile["error"]]))
+        larger = found["towards"][gain]["larger"]
+        assert larger["limit"] == "error"
+        size = f"× {1 + larger['change']:.2g}" if larger["change"] >= 1.0 else f"{100 * larger['change']:+.2g} %"
+        assert size in ax.get_title("right")
+        # each stretch of missed constraints is shaded
+        missed = sum("margin_exact" in names for names in profile["missed"])
+        spans = [patch for patch in ax.patches if patch.get_facecolor()[:3] == to_rgb("#E8000B")]
+        inside = sum(one.get_x() < x < one.get_x() + one.get_width() for one in spans for x in profile[gain])
+        assert inside == missed > 0
 
 
 def test_front_says_who_does_not_converge(tuned):
@@ -109,7 +171,7 @@ def test_comparison_draws_what_the_numbers_say(tuned):
 @needs_chromium
 def test_bars_have_the_names_beside_them(folder, tuned):
     with opened(folder / "report.html") as (page,):
-        check(page, 5)
+        check(page, 7)
         figure = page.locator("figure[data-name=tuning_holdout]")
         panel = json.loads(figure.locator("script").text_content())[0]
         left, bottom, width, height = panel["bars"][0]

@@ -1,0 +1,94 @@
+"""A folder that a browser opens: a page, `data.js` with what it says, and `points.parquet`, which it reads column by column.
+
+A page opened from disk may not read files: for it the same bytes lie in scripts (`points.NNNN.js`), which it loads as it
+needs them.
+"""
+
+import base64
+import json
+from collections.abc import Callable, Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxbl.errors import InputError
+from jaxbl.files import is_empty, json_text, make_folder, writing
+
+ROW_GROUP = 1 << 17
+"""Rows of a row group of the Parquet file."""
+_SCRIPT = 4 << 20
+"""Bytes of the Parquet file in a script."""
+_MARKER = "jaxbl-explorer.json"
+"""Says that a folder is one of ours, which may be written anew."""
+_SHARED = ("explore.css", "hyparquet.js", "hyparquet.LICENSE.txt", "plot.js")
+
+
+class Source(NamedTuple):
+    """Results that are to be explored.
+
+    Attributes:
+        lead: what was found, in sentences.
+        write: writes page and data into an empty folder, to be served or not; says whether there is more to come.
+        answers: to questions of a page that is served, by name.
+        prepare: takes what time it can off the first answer.
+    """
+
+    lead: Sequence[str]
+    write: Callable[[Path, bool], bool]
+    answers: Mapping[str, Callable[[Any], Mapping[str, Any]]]
+    prepare: Callable[[], Any]
+
+
+def write_static(source: Source, out: Path) -> Path:
+    """Write a page and its data into a folder that is new, or of an earlier call.
+
+    Args:
+        source: what is to be explored.
+        out: the folder.
+
+    Returns:
+        The page to be opened.
+
+    Raises:
+        InputError: the folder holds something else.
+    """
+    make_folder(out)
+    if not is_empty(out) and not (out / _MARKER).exists():
+        raise InputError(f"{out}: is not empty, and was not written by jaxbl explore; choose another folder")
+    with writing(out):
+        (out / _MARKER).write_text(json_text({"made_by": "jaxbl explore"}), encoding="utf-8")
+        for old in out.glob("points.*"):
+            old.unlink()
+        source.write(out, False)
+    return out / "index.html"
+
+
+def write_page(out: Path, page: str, about: Mapping[str, Any], own: Sequence[str], *, scripts: bool = True) -> None:
+    """Write a page into a folder that has `points.parquet`.
+
+    Args:
+        out: the folder.
+        page: name of the page, of those in `page/`.
+        about: what it says, as plain data.
+        own: names of its own scripts.
+        scripts: whether it can be opened from disk.
+    """
+    points = out / "points.parquet"
+    told = {**about, "bytes": points.stat().st_size, "script": _SCRIPT}
+    (out / "data.js").write_text(f"jaxblData({json.dumps(told)});\n", encoding="utf-8")
+    if scripts:
+        with points.open("rb") as file:
+            for number, content in enumerate(iter(lambda: file.read(_SCRIPT), b"")):
+                text = f'jaxblBytes({number}, "{base64.b64encode(content).decode()}");\n'
+                (out / f"points.{number:04d}.js").write_text(text, encoding="ascii")
+    package = files("jaxbl.report")
+    (out / "page.css").write_bytes(package.joinpath("page.css").read_bytes())
+    for source, target in [(page, "index.html"), *((name, name) for name in (*_SHARED, *own))]:
+        (out / target).write_bytes(package.joinpath("explorer", "page", source).read_bytes())
+
+
+def encoded(values: Any) -> str:
+    """Numbers as float32 in base64, for a page."""
+    return base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()

@@ -1,0 +1,125 @@
+"""The maps of a study over a grid: its points as an array over the axes, for a page.
+
+Rows of `points.parquet` are in the order of the axes, which need not be stored then.
+"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from jaxbl.config import Config, numeric_paths
+from jaxbl.files import plain
+from jaxbl.observer.conditions import CONDITIONS
+from jaxbl.report.maps import drawn_values
+from jaxbl.sweeps.points import AxisColumns, Points
+from jaxbl.sweeps.sweep import StudyResult
+
+from .folder import ROW_GROUP, encoded
+
+_OVERVIEW = 512
+"""Cells of the overview along each axis, at most."""
+
+
+def dimensions(config: Config) -> list[AxisColumns] | None:
+    """Axes of a grid, those that advance together as one, the seed last; None of a study that has no map: of fewer than two
+    axes that vary, refined, or a quasi-random design."""
+    if config.sweep.refine is not None or config.sweep.design != "grid":
+        return None
+    first = config.sweep.first_seed
+    dims = [*Points(config).blocks, {"seed": np.arange(first, first + config.sweep.seeds)}]
+    return dims if sum(_length(one) > 1 for one in dims[:-1]) >= 2 else None
+
+
+def _length(dim: AxisColumns) -> int:
+    return len(next(iter(dim.values())))
+
+
+def _places(dim: AxisColumns, frame: pd.DataFrame) -> np.ndarray:
+    """Where rows of a frame lie along a dimension."""
+    if len(dim) == 1:
+        ((path, values),) = dim.items()
+        return pd.Index(values).get_indexer(pd.Index(frame[path]))
+    return pd.MultiIndex.from_arrays([*dim.values()]).get_indexer(pd.MultiIndex.from_arrays([frame[path] for path in dim]))
+
+
+def write_grid(result: StudyResult, metrics: list[str], first: str, out: Path) -> dict[str, Any]:
+    """Write `points.parquet`, and return what the page says of it.
+
+    Args:
+        result: a study over a grid; of an unfinished one, what is there.
+        metrics: columns that are kept.
+        first: the one that is drawn first.
+        out: folder.
+    """
+    dims, units = dimensions(result.config), numeric_paths(result.config)
+    assert dims is not None
+
+    def axis(path: str, values: np.ndarray) -> dict[str, Any]:
+        return {"path": path, "unit": units[path].unit if path in units else "", "values": plain(values)}
+
+    return {
+        "axes": [{"paths": [axis(path, values) for path, values in one.items()]} for one in dims],
+        "conditions": _conditions(),
+    } | _write_points(result, metrics, first, out, dims)
+
+
+def _write_points(result: StudyResult, metrics: list[str], first: str, out: Path, dims: list[AxisColumns]) -> dict[str, Any]:
+    """Write `points.parquet`: metrics as float32, rows in the order of the axes, nan where none is; in the memory of a part.
+    Returns what the page needs to read it, and its first picture."""
+    shape = [_length(one) for one in dims]
+    rows, found = math.prod(shape), 0
+    with TemporaryDirectory(dir=out, prefix=".draft.") as place:
+        kept = {name: np.memmap(Path(place) / str(i), np.float32, "w+", shape=(rows,)) for i, name in enumerate(metrics)}
+        for values in kept.values():
+            values[:] = np.nan
+        for frame in result.batches():
+            at = np.ravel_multi_index([_places(one, frame) for one in dims], shape)
+            found += len(frame)
+            for name, values in kept.items():
+                # what no float32 holds is as good as diverged
+                shown = drawn_values(frame, name)
+                values[at] = shown.where(shown.abs() < np.finfo(np.float32).max)
+        _write_table(out, kept, rows)
+        overview = _overview(kept[first], shape)
+    return {"rows": rows, "found": found, "overview": overview}
+
+
+def _write_table(out: Path, columns: Mapping[str, np.ndarray], rows: int) -> None:
+    schema = pa.schema([(name, pa.float32()) for name in columns])
+    with pq.ParquetWriter(out / "points.parquet", schema, use_dictionary=False) as writer:
+        for start in range(0, rows, ROW_GROUP):
+            part = {name: pa.array(np.array(values[start : start + ROW_GROUP])) for name, values in columns.items()}
+            writer.write_table(pa.table(part, schema=schema), row_group_size=ROW_GROUP)
+
+
+def _overview(values: np.ndarray, shape: list[int]) -> dict[str, Any]:
+    """The first picture: the map over the last two axes that vary, at the first value of the others, median over seeds."""
+    y, x = [i for i, size in enumerate(shape[:-1]) if size > 1][-2:]
+    index: list[Any] = [0] * len(shape)
+    for i in (y, x):
+        index[i] = slice(None, None, -(-shape[i] // _OVERVIEW))
+    index[-1] = slice(None)
+    seeds = values.reshape(shape)[tuple(index)]
+    cells = pd.DataFrame(seeds.reshape(-1, shape[-1])).median(axis=1).to_numpy().reshape(seeds.shape[:-1])
+    return {"x": x, "y": y, "shape": list(cells.shape), "values": encoded(cells)}
+
+
+def _conditions() -> list[dict[str, Any]]:
+    """Each condition as a curve: it is homogeneous, lambda / sqrt(f) over alpha / f."""
+    ratios = np.geomspace(1.0005, 2000.0, 600)
+    curves = []
+    for name, one in CONDITIONS.items():
+        with jax.enable_x64(True):
+            least = np.asarray(one.least_lambda(jnp.asarray(ratios), jnp.asarray(1.0)))
+        alpha, lambda_ = ([float(f"{number:.6g}") for number in values] for values in (ratios, least))
+        curves.append({"name": name, "title": one.title, "alpha": alpha, "lambda": lambda_})
+    return curves

@@ -1,0 +1,148 @@
+"use strict";
+/* Runs that the server simulates anew: traces, hysteresis, error in the phase plane; some pinned beside the newest. */
+
+const SIDES = ["motor", "load"];
+/** What is drawn of a run: title, axes, and lines [name, column of x, column of y, dashed]; of the last half where the first is transient. */
+const tracePlots = (columns) => {
+  const sides = SIDES.filter((side) => `${side}.velocity` in columns), time = { label: "time", unit: "s" }, plots = [];
+  const over = (caption, label, unit, lines) => plots.push({ caption, time: true, x: time, y: { label, unit }, lines: lines.map(([name, y, dash]) => [name, "t", y, dash]) });
+  for (const side of sides) {
+    const symbol = side === "motor" ? "θe" : "θs";
+    over(`${side}: position`, `position ${symbol}`, "rad", [["observed", `${side}.position_estimate`, false], ["true", `${side}.position`, true]]);
+    over(`${side}: velocity`, "velocity", "rad/s", [["observed", `${side}.velocity_estimate`, false], ["true", `${side}.velocity`, true]]);
+    over(`${side}: error of the velocity, true less observed`, "velocity error", "rad/s", [["error", `${side}.velocity_error`, false]]);
+  }
+  const what = "z" in columns ? "transmitted torque" : "disturbance torque";
+  over(`${what}, true and observed`, what, "N m", [...sides.map((side) => [`by the ${side} observer`, `${side}.torque_estimate`, false]), ["true", "torque", true]]);
+  if ("z" in columns) {
+    plots.push({ caption: "hysteresis: torque over twist, second half of the run", half: true, x: { label: "twist z", unit: "rad" }, y: { label: what, unit: "N m" },
+      lines: [["by the motor observer", "z", "motor.torque_estimate", false], ["true", "z", "torque", true]] });
+  }
+  return plots;
+};
+
+const exact = (value) => (typeof value === "string" ? JSON.stringify(value) : Number.isInteger(value) ? value.toFixed(1) : String(value));
+
+/** A point, its values by path, as a study that includes this one. */
+const pointText = (values) => `${['include = "study.toml"', "axes = []", "figures = []", ...Object.entries(values).map(([path, value]) => `${path} = ${exact(value)}`)].join("\n")}\n`;
+
+/** Gains of a point, for a study to include. */
+const gainsText = (gains, values) => {
+  const tables = Object.entries(gains).map(([side, own]) => {
+    const [lambda, alpha] = ["lambda", "alpha"].map((name) => exact(values[`observer.${side}.${name}`] ?? own[name]));
+    return `[observer.${side}]\nlambda = ${lambda}\nalpha = ${alpha}\n`;
+  });
+  return `# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.\n\n${tables.join("\n")}`;
+};
+
+class Runs {
+  constructor(study) {
+    Object.assign(this, { study, all: [], plots: [] });
+  }
+  /** Has the run of a point simulated, `values` by path; it takes the place of the newest, unless that is pinned. `stored` is
+   * what the sweep has of a metric: { metric, value }. */
+  async simulate(values, seed, stored) {
+    const asked = (this.asked = Symbol("asked"));
+    $("runs").hidden = false;
+    $("told").textContent = "simulating …";
+    $("point").disabled = true;
+    const began = performance.now();
+    let found;
+    try {
+      const answer = await fetch("run", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ values, seed }) });
+      found = await answer.json();
+      if (!answer.ok) throw new Error(found.error);
+    } catch (error) {
+      if (asked === this.asked) $("told").textContent = `Not simulated: ${error.message}`;
+      return;
+    }
+    if (asked !== this.asked) return;
+    this.all = this.all.filter((one) => one.pinned);
+    if (this.all.length === COLOURS.length) this.all.shift();
+    const free = COLOURS.filter((colour) => !this.all.some((one) => one.colour === colour));
+    const columns = Object.fromEntries(Object.entries(found.columns).map(([name, bytes]) => [name, unpacked(bytes)]));
+    for (const side of SIDES.filter((one) => `${one}.velocity` in columns)) {
+      columns[`${side}.velocity_error`] = columns[`${side}.velocity`].map((one, i) => one - columns[`${side}.velocity_estimate`][i]);
+    }
+    const name = [...this.study.named.map((path) => `${path.replace(/^observer\./, "")} ${text(values[path])}`), `seed ${seed}`].join(", ");
+    this.newest = { ...found, name, columns, colour: free[0], pinned: false };
+    this.all.push(this.newest);
+    this.draw();
+    $("told").textContent = this.said(found, stored);
+    $("point").disabled = false;
+    document.body.dataset.simulated = `${name}, ${Math.round(performance.now() - began)} ms`;
+  }
+  /** A metric as stored and of this run: they differ where the run is not the one of the sweep. */
+  said({ metrics, every }, { metric: { name, label, yes, size }, value }) {
+    const raw = metrics[name], now = yes ? Number(raw) : raw === null ? NaN : size ? Math.abs(raw) : raw;
+    const same = Math.abs(now - value) <= 1e-3 * Math.abs(value) || (Number.isNaN(value) && !Number.isFinite(now));
+    const drawn = every > 1 ? ` Every ${every}th sample is drawn.` : "";
+    return (same ? `${label}: ${text(now)}, as stored in the sweep.` : `This run differs from the sweep's: ${label} is ${text(now)}, stored ${text(value)}.`) + drawn;
+  }
+  config() { return this.newest.config; }
+  draw() {
+    const { columns } = this.newest, specs = tracePlots(columns), several = this.all.length > 1;
+    const range = this.plots.find((one) => one.spec.time)?.range;
+    $("pinned").replaceChildren(...this.all.map((one) => this.entry(one)));
+    $("key").replaceChildren(legend([["solid: observed, or error", "currentColor", false], ["dashed: true", "currentColor", true], ["dots: majorant of the proof", "#8a8d93", true]]));
+    const whole = $("traces");
+    whole.replaceChildren();
+    this.plots = [];
+    const add = (spec, lines) => {
+      const figure = made("figure");
+      whole.append(figure);
+      const plot = new Plot(figure, { ...spec, zoomed: spec.time && ((to) => this.follow(plot, to)) });
+      plot.spec = spec;
+      if (spec.time && range) plot.range = [range[0], null];
+      plot.set(lines);
+      this.plots.push(plot);
+    };
+    const named = (run, name) => (several ? `${run.name}: ${name}` : name);
+    for (const spec of specs) {
+      const sides = spec.lines.length > 2;
+      add({ ...spec, named: sides && !several }, this.all.flatMap((run) => spec.lines.filter(([, , y]) => y in run.columns).map(([name, x, y, dashed], i) => {
+        const part = (column) => (spec.half ? column.subarray(column.length >> 1) : column);
+        // two observers of one quantity
+        const colour = !several && sides && !dashed ? COLOURS[i] : several || !dashed ? run.colour : undefined;
+        return { name: named(run, name), x: part(run.columns[x]), y: part(run.columns[y]), colour, alpha: dashed ? 1 : 0.8, dash: dashed ? [6, 4] : [], width: dashed ? 1.3 : 1.8, sorted: x === "t" };
+      })));
+    }
+    for (const side of SIDES.filter((one) => this.newest.planes[one])) {
+      const bounded = this.all.some((run) => run.planes[side]?.majorant);
+      const spec = { caption: `${side}: error of the observer in the phase plane${bounded ? ", with the majorant of the proof (36)-(37)" : "; no peak stands out from the chatter"}`, height: 300,
+        x: { label: "position error e", unit: "rad" }, y: { label: "its slope ė", unit: "rad/s" } };
+      add(spec, this.all.filter((run) => run.planes[side]).flatMap((run) => {
+        const { error, slope, majorant } = run.planes[side];
+        const lines = [{ name: named(run, "error"), x: unpacked(error), y: unpacked(slope), colour: run.colour }];
+        return majorant ? [...lines, { name: named(run, "majorant"), x: unpacked(majorant[0]), y: unpacked(majorant[1]), colour: several ? run.colour : "#8a8d93", dash: [2, 3] }] : lines;
+      }));
+    }
+    this.table();
+  }
+  entry(one) {
+    const mark = made("span", { className: "mark" });
+    mark.style.borderTopColor = one.colour;
+    const pin = made("button", { type: "button", textContent: one.pinned ? "unpin" : "pin" });
+    pin.addEventListener("click", () => {
+      one.pinned = !one.pinned;
+      if (!one.pinned && one !== this.newest) this.all = this.all.filter((other) => other !== one);
+      this.draw();
+    });
+    return made("li", {}, mark, one.name, pin);
+  }
+  /** All plots over time show what one of them does. */
+  follow(from, range) {
+    for (const plot of this.plots) {
+      if (plot === from || !plot.spec.time) continue;
+      plot.range = range && [range[0], null];
+      plot.draw();
+    }
+  }
+  table() {
+    const { metrics } = this.newest, cell = (value) => made("td", { className: "number", textContent: typeof value === "boolean" ? (value ? "yes" : "no") : text(value) });
+    $("metrics").replaceChildren(
+      made("thead", {}, made("tr", {}, ...["metric", ...this.all.map((one) => one.name)].map((name) => made("th", { textContent: name, scope: "col" })))),
+      made("tbody", {}, ...Object.keys(metrics).map((name) => made("tr", {}, made("th", { textContent: this.study.metric(name)?.label ?? name, scope: "row" }), ...this.all.map((one) => cell(one.metrics[name]))))),
+    );
+  }
+}

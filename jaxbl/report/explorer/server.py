@@ -1,0 +1,192 @@
+"""Pages of the explorer, served to this machine's browser alone: bound to 127.0.0.1, behind a token, to no other site."""
+
+import json
+import mimetypes
+import re
+import secrets
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from jaxbl.errors import InputError
+
+from .folder import Source
+
+_MOST_ASKED = 1 << 16
+"""Bytes of a question."""
+_MOST_VERSIONS = 3
+"""Of a page that is written anew, as a study goes on; pages that are open may still read the older ones."""
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src data: blob:; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+
+
+@contextmanager
+def served(source: Source, port: int = 0) -> "Iterator[ExplorerServer]":
+    """A server for results, which waits for `serve_forever`; its pages are removed at the end.
+
+    Raises:
+        InputError: the port is another program's.
+    """
+    with TemporaryDirectory(prefix="jaxbl-explore-") as place:
+        try:
+            server = ExplorerServer(lambda out: source.write(out, True), source.answers, Path(place), port)
+        except OSError as error:
+            raise InputError(f"--port {port}: {error.strerror}; choose another one") from None
+        with server:
+            threading.Thread(target=source.prepare, name="jaxbl-prepare", daemon=True).start()
+            yield server
+
+
+class ExplorerServer(ThreadingHTTPServer):
+    """Serves a page and answers its questions; `url` is what the browser opens.
+
+    Args:
+        write: writes the page into an empty folder; says whether it is to be written again when it is loaded again.
+        answers: to a page's questions, by name: from what is asked to what is answered, as plain data. `InputError` is bad
+            input.
+        place: a folder for pages, which the caller removes.
+        port: to be bound; 0 for any that is free.
+
+    Raises:
+        OSError: the port cannot be bound.
+    """
+
+    daemon_threads = True
+
+    def __init__(
+        self,
+        write: Callable[[Path], bool],
+        answers: Mapping[str, Callable[[Any], Mapping[str, Any]]],
+        place: Path,
+        port: int = 0,
+    ):
+        super().__init__(("127.0.0.1", port), _Handler)
+        self.answers = answers
+        self._write, self._place = write, place
+        self._token = secrets.token_urlsafe(24)
+        self._lock, self._versions, self._stale = threading.Lock(), 0, True
+        self.names = {f"{name}:{self.server_port}" for name in ("127.0.0.1", "localhost")}
+        self.url = f"http://127.0.0.1:{self.server_port}/{self._token}/"
+
+    def is_known(self, token: str) -> bool:
+        """Whether a request comes from who was given the address."""
+        return secrets.compare_digest(token.encode(), self._token.encode())
+
+    def newest(self) -> str:
+        """Number of the newest version of the page, written now if the one before is out of date."""
+        with self._lock:
+            if self._stale:
+                folder = self._place / str(self._versions + 1)
+                folder.mkdir()
+                self._stale = self._write(folder)
+                self._versions += 1
+                old = self._place / str(self._versions - _MOST_VERSIONS)
+                if old.is_dir():
+                    for file in old.iterdir():
+                        file.unlink()
+                    old.rmdir()
+            return str(self._versions)
+
+    def file(self, version: str, name: str) -> Path | None:
+        """A file of a page; None if there is none."""
+        folder = self._place / version
+        if not version.isdecimal() or not folder.is_dir():
+            return None
+        return next((one for one in folder.iterdir() if one.name == name and one.is_file()), None)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: ExplorerServer
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "jaxbl", ""
+
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
+
+    def do_GET(self) -> None:
+        if (parts := self._parts()) is None:
+            return
+        if parts in ([], [""]):
+            self._send(HTTPStatus.FOUND, headers={"Location": f"{self.server.url}{self.server.newest()}/index.html"})
+            return
+        file = self.server.file(*parts) if len(parts) == 2 else None
+        if file is None:
+            self._refuse(HTTPStatus.NOT_FOUND, "there is no such page")
+            return
+        self._send_file(file)
+
+    def do_POST(self) -> None:
+        if (parts := self._parts()) is None:
+            return
+        length = self.headers.get("Content-Length", "")
+        answer = self.server.answers.get(parts[-1]) if len(parts) == 2 else None
+        if answer is None or self.headers.get_content_type() != "application/json":
+            self._refuse(HTTPStatus.NOT_FOUND, "there is no such question")
+        elif not length.isdecimal() or int(length) > _MOST_ASKED:
+            self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too long a question")
+        else:
+            try:
+                found = answer(json.loads(self.rfile.read(int(length))))
+            except (InputError, ValueError) as error:
+                self._refuse(HTTPStatus.BAD_REQUEST, str(error))
+            else:
+                self._send(HTTPStatus.OK, json.dumps(found, allow_nan=False).encode(), "application/json")
+
+    def _parts(self) -> list[str] | None:
+        """The address behind the token; None where the request was refused.
+
+        A page of another site may ask for this address, too: it would not have the token, and its browser names it.
+        """
+        origin = self.headers.get("Origin")
+        if self.headers.get("Host") not in self.server.names:
+            # a name of another site that was pointed to this machine
+            self._refuse(HTTPStatus.FORBIDDEN, "asked for by another name")
+        elif origin is not None and origin.removeprefix("http://") not in self.server.names:
+            self._refuse(HTTPStatus.FORBIDDEN, "asked for by another site")
+        else:
+            token, *parts = self.path.partition("?")[0].removeprefix("/").split("/")
+            if self.server.is_known(token):
+                return parts
+            self._refuse(HTTPStatus.FORBIDDEN, "open the address that jaxbl explore printed")
+        return None
+
+    def _send_file(self, file: Path) -> None:
+        """A file, or the bytes of it that are asked for."""
+        kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
+        size = file.stat().st_size
+        asked = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))
+        start, end = (int(asked[1]), min(int(asked[2]) + 1, size)) if asked else (0, size)
+        if start >= end:
+            self._send(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, headers={"Content-Range": f"bytes */{size}"})
+            return
+        with file.open("rb") as content:
+            content.seek(start)
+            part = content.read(end - start)
+        if asked:
+            self._send(HTTPStatus.PARTIAL_CONTENT, part, kind, {"Content-Range": f"bytes {start}-{end - 1}/{size}"})
+        else:
+            self._send(HTTPStatus.OK, part, kind)
+
+    def _refuse(self, status: HTTPStatus, why: str) -> None:
+        # what was not read of the request would be taken for the next one
+        self.close_connection = True
+        self._send(status, json.dumps({"error": why}).encode(), "application/json")
+
+    def _send(self, status: HTTPStatus, content: bytes = b"", kind: str = "", headers: Mapping[str, str] = {}) -> None:
+        self.send_response(status)
+        about = {"Content-Type": kind} if kind else {}
+        fixed = {
+            "Content-Length": str(len(content)), "Content-Security-Policy": _POLICY, "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer", "Cache-Control": "no-store", "Cross-Origin-Resource-Policy": "same-origin",
+        }  # fmt: skip
+        for name, value in (about | fixed | dict(headers)).items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(content)

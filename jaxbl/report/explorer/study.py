@@ -1,0 +1,140 @@
+"""A study in a browser: what its page needs, and single runs of it."""
+
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import to_hex
+
+from jaxbl.config import Config, is_boolean, with_values
+from jaxbl.errors import InputError
+from jaxbl.report.error_plane import error_path
+from jaxbl.report.figures import MAP
+from jaxbl.report.maps import value_label
+from jaxbl.report.sweep import headline
+from jaxbl.sweeps.metrics import is_magnitude
+from jaxbl.sweeps.sweep import StudyResult, open_study
+from jaxbl.sweeps.trial import run
+
+from .cloud import write_cloud
+from .folder import Source, encoded, write_page
+from .grid import dimensions, write_grid
+
+
+def study_source(folder: str | Path) -> Source:
+    """A study's folder, to be explored. Raises `InputError` where it holds no study."""
+    result = open_study(folder)
+    # single runs share the machine's cores with one another already
+    one_at_a_time = threading.Lock()
+
+    def write(out: Path, served: bool) -> bool:
+        now = open_study(folder)
+        return write_study(now, out, headline(now), served=served)
+
+    def answer(asked: Any) -> dict[str, Any]:
+        with one_at_a_time:
+            return simulated(result.config, asked)
+
+    first = {axis.path: axis.start if axis.values is None else axis.values[0] for axis in result.config.axes}
+    return Source(headline(result), write, {"run": answer}, lambda: answer({"values": first, "seed": 0}))
+
+
+def write_study(result: StudyResult, out: Path, lead: Sequence[str], *, served: bool = False) -> bool:
+    """Write the page of a study and its data into a folder: maps of a grid, points of other studies.
+
+    Args:
+        result: a study; of an unfinished one, what is there.
+        out: an empty folder.
+        lead: what was found, in sentences.
+        served: whether a server is to give the data, and simulates runs.
+
+    Returns:
+        Whether runs are still to come.
+    """
+    config = result.config
+    about = _about(config, result.columns) | {"lead": list(lead), "served": served}
+    names = [one["name"] for one in about["metrics"]]
+    if dimensions(config) is None:
+        about |= write_cloud(result, names, out)
+        page, script = "cloud.html", "cloud.js"
+    else:
+        about |= write_grid(result, names, about["first"], out)
+        page, script = "study.html", "map.js"
+    (out / "study.toml").write_text(config.to_toml(), encoding="utf-8")
+    write_page(out, page, about, (script, "runs.js"), scripts=not served)
+    return not result.is_finished(about["found"])
+
+
+_MOST_SAMPLES = 20_000
+"""Samples of a trace that a page draws: more than it has pixels, fewer than take time to be sent."""
+_COLUMNS = (
+    *("t", "u", "z", "torque"),
+    *(f"{side}.{name}" for side in ("motor", "load") for name in (
+        "position", "velocity", "position_estimate", "velocity_estimate", "torque_estimate")),
+)  # fmt: skip
+
+
+def point_of(config: Config, asked: Any) -> tuple[Config, int]:
+    """The study of one point without axes and figures, and the seed.
+
+    Args:
+        config: the whole study.
+        asked: `values`, by path of each axis, and `seed`.
+
+    Raises:
+        InputError: other values than those, or such as the study may not have.
+    """
+    values, seed = (asked.get(name) if isinstance(asked, dict) else None for name in ("values", "seed"))
+    paths = {axis.path for axis in config.axes}
+    if not isinstance(values, dict) or set(values) != paths:
+        raise InputError(f"values: should have a value of each axis: {', '.join(sorted(paths))}")
+    if not isinstance(seed, int) or not 0 <= seed < 2**31:
+        raise InputError("seed: should be a whole number from 0 and below 2^31")
+    return with_values(config, values).model_copy(update={"axes": [], "figures": []}), seed
+
+
+def simulated(config: Config, asked: Any) -> dict[str, Any]:
+    """One run of a study, for its page: metrics, traces (float32 in base64), the path of each error, the point as TOML.
+    Arguments and errors as of :func:`point_of`."""
+    point, seed = point_of(config, asked)
+    trial = run(point, seed=seed, backend="scan")
+    every = -(-len(trial.trace) // _MOST_SAMPLES)
+    trace = trial.trace.iloc[::every]
+    planes = {side: error_path(trial.trace, side, found) for side, found in trial.summary["conditions"].items()}
+    return {
+        "every": every,
+        "metrics": trial.summary["metrics"],
+        "columns": {name: encoded(trace[name]) for name in _COLUMNS if name in trace},
+        "planes": {
+            side: {"error": encoded(one.error), "slope": encoded(one.slope),
+                   "majorant": [encoded(part) for part in one.majorant] if len(one.majorant[0]) else None}
+            for side, one in planes.items()
+        },
+        "config": point.to_toml(),
+    }  # fmt: skip
+
+
+def _about(config: Config, columns: list[str]) -> dict[str, Any]:
+    """What the page says of a study and its columns."""
+    known = {axis.path for axis in config.axes} | {"seed"}
+    names = [name for name in columns if name not in known]
+    return {
+        "title": config.title or "Study",
+        "metrics": [
+            {"name": name, "label": value_label(name), "yes": is_boolean(name), "size": is_magnitude(name)} for name in names
+        ],
+        "first": next((name for name in names if name.endswith(".velocity_rmse")), names[0]),
+        "config": config.to_toml(),
+        "colours": [to_hex(one) for one in colormaps[MAP](np.linspace(0.0, 1.0, 256))],
+        "gains": _gains(config),
+    }
+
+
+def _gains(config: Config) -> dict[str, Any]:
+    """Gains of each side's observer, where no axis changes them."""
+    experiment = config.build()
+    sides = {side: getattr(experiment.observer, side) for side in experiment.sides}
+    return {side: {"lambda": float(one.lambda_), "alpha": float(one.alpha)} for side, one in sides.items()}

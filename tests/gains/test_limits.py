@@ -1,0 +1,129 @@
+"""What limits gains towards each side: on searches whose errors are formulas."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from jaxbl.config import TuneTable
+from jaxbl.gains.limits import limits_of
+from jaxbl.gains.tune import Search
+
+RANGE = (1.0, 100.0)
+NUM = 9
+
+
+def searched(error, *, chatter=lambda x, a: 0.0 * x, time=lambda x, a: 0.0 * x, exact=lambda x, a: 10.0 + 0.0 * x, **table):
+    """A search for lambda and alpha from 1 to 100, f_plus = 1, with one zoom; errors, their chatter, convergence times and
+    margins to the exact condition are functions of both gains."""
+    found = Search.__new__(Search)
+    found.table = TuneTable.model_validate({"num": NUM, "margin_alpha": 1.001} | table)
+    found.sides, found.f_plus, found.limits = ("motor",), {"motor": 1.0}, {"lambda": RANGE, "alpha": RANGE}
+    found.scenarios = SimpleNamespace()
+    found.windows, found.candidates = [{"motor": found.limits}], {}
+    for stage in range(2):
+        if stage:
+            found.windows.append({"motor": found._zoomed("motor")})
+        values = {gain: np.geomspace(*found.windows[-1]["motor"][gain], NUM) for gain in ("lambda", "alpha")}
+        x, a = (axis.ravel() for axis in np.meshgrid(*values.values()))
+        frame = pd.DataFrame({
+            "lambda": x, "alpha": a, "converged": True, "velocity_rmse": error(x, a), "chatter": chatter(x, a),
+            "convergence_time": time(x, a), "margin_alpha": 1.02 * a, "margin_exact": exact(x, a), "stage": stage,
+        })  # fmt: skip
+        frame["converged"] = np.isfinite(frame["velocity_rmse"])
+        found.candidates["motor"] = pd.concat([*found.candidates.values(), found._judge("motor", frame)], ignore_index=True)
+    return found
+
+
+def bowl(x, a):
+    """Least at 10 and 10."""
+    return np.cosh(np.log(x / 10.0)) + np.cosh(np.log(a / 10.0))
+
+
+def test_of_an_optimum_inside_it_is_said_which_parts_of_the_error_balance():
+    # mean squares: alpha / 10 of chatter, 10 / alpha of what is slow
+    search = searched(
+        lambda x, a: np.sqrt(a / 10.0 + 10.0 / a + np.log(x / 10.0) ** 2), chatter=lambda x, a: np.sqrt(a / 10.0)
+    )
+    found = limits_of(search, "motor")
+    assert (found["binding"], found["range_ends"]) == ([], [])
+    ways = found["towards"]["alpha"]
+    assert [ways[way]["by"] for way in ("smaller", "larger")] == ["slow", "chatter"]
+    assert [found["towards"]["lambda"][way]["by"] for way in ("smaller", "larger")] == ["slow", "slow"]
+    at = ways["larger"]["at"]
+    # a cell of the coarse map away
+    assert at == pytest.approx(10.0 * 100.0 ** (1.0 / (NUM - 1)))
+    assert ways["larger"]["change"] == pytest.approx(np.sqrt((at / 10.0 + 10.0 / at) / 2.0) - 1.0)
+
+
+def test_the_parts_of_another_error_are_not_known():
+    search = searched(bowl, chatter=lambda x, a: 0.5 * bowl(x, a))
+    search.table = search.table.model_copy(update={"objective": "torque"})
+    ways = limits_of(search, "motor")["towards"]["alpha"]
+    assert [(way["limit"], way["by"]) for way in ways.values()] == [("error", None)] * 2
+
+
+CONSTRAINTS = {
+    # exact margin 1.1 at lambda = 20
+    "margin_exact": ({"exact": lambda x, a: 1.1 * x / 20.0}, ("lambda", "smaller")),
+    # 1 s at alpha = 20
+    "longest_convergence": ({"time": lambda x, a: 20.0 / a, "longest_convergence": 1.0}, ("alpha", "smaller")),
+    "margin_alpha": ({"margin_alpha": 20.0}, ("alpha", "smaller")),
+}
+
+
+@pytest.mark.parametrize("name", CONSTRAINTS)
+def test_a_constraint_that_forbids_less_error_binds(name):
+    how, (gain, way) = CONSTRAINTS[name]
+    found = limits_of(searched(bowl, **how), "motor")
+    assert found["binding"] == [name]
+    assert [key for key, one in found["constraints"].items() if one["binds"]] == [name]
+    towards = found["towards"][gain][way]
+    assert (towards["limit"], towards["missed"]) == ("constraint", [name])
+    assert towards["change"] < -0.01
+    # the limit is within a step of the zoom
+    step = 100.0 ** (2.0 / (NUM - 1) ** 2)
+    assert 1.0 <= found["constraints"][name]["room"] <= step * 1.001
+    others = [one["limit"] for ways in found["towards"].values() for one in ways.values() if one is not towards]
+    assert others == ["error"] * 3
+
+
+def test_a_constraint_whose_gains_are_no_better_does_not_bind():
+    found = limits_of(searched(bowl, exact=lambda x, a: 1.1 * x / 9.0), "motor")
+    assert found["binding"] == []
+    smaller = found["towards"]["lambda"]["smaller"]
+    # both are said
+    assert (smaller["limit"], smaller["missed"]) == ("error", ["margin_exact"])
+
+
+def test_a_time_of_zero_has_room_without_end():
+    found = limits_of(searched(bowl, longest_convergence=1.0), "motor")
+    assert found["constraints"]["longest_convergence"] == {"value": 0.0, "limit": 1.0, "room": None, "binds": False}
+
+
+def test_ends_of_the_range_and_runs_that_diverge():
+    found = limits_of(searched(lambda x, a: np.where(x > 1.2, np.nan, 1.0 + np.log(a))), "motor")
+    assert found["towards"]["lambda"]["smaller"]["limit"] == "range"
+    assert found["towards"]["alpha"]["smaller"]["limit"] == "range"
+    assert found["range_ends"] == ["smaller lambda", "smaller alpha"]
+    larger = found["towards"]["lambda"]["larger"]
+    assert (larger["limit"], larger["change"], larger["missed"]) == ("error", None, ["converged"])
+
+
+def test_a_margin_at_the_end_of_the_range_binds_without_runs_beyond_it():
+    found = limits_of(searched(lambda x, a: 1.0 + np.log(a) + np.log(x / 10.0) ** 2, margin_alpha=1.02), "motor")
+    assert found["binding"] == ["margin_alpha"]
+    assert found["range_ends"] == []
+    assert found["towards"]["alpha"]["smaller"]["at"] is None
+
+
+def test_between_two_rows_of_the_coarse_map_errors_are_interpolated():
+    search = searched(lambda x, a: np.sqrt(np.log(x / 13.0) ** 2 + np.log(a / 10.0) ** 2 + 1.0))
+    line = pd.DataFrame(limits_of(search, "motor")["profiles"]["alpha"])
+    best = search.best("motor")["lambda"]
+    exact = np.sqrt(np.log(best / 13.0) ** 2 + np.log(line["alpha"] / 10.0) ** 2 + 1.0)
+    assert best not in search.candidates["motor"].query("stage == 0")["lambda"].to_numpy()
+    # a chord of a parabola lies above it by a quarter of its squared width at most
+    assert np.all(line["error"] >= exact - 1e-9)
+    assert np.all(line["error"] ** 2 - exact**2 <= np.log(100.0 ** (1.0 / (NUM - 1))) ** 2 / 4.0 * 1.001)

@@ -1,0 +1,155 @@
+"""A log and what models make of it in a browser: its columns, and its page by mouse and keyboard."""
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from browser import check, needs_chromium, opened
+
+from jaxbl.errors import InputError
+from jaxbl.files import json_text
+from jaxbl.report.explorer.folder import write_page, write_static
+from jaxbl.report.explorer.log import is_log_folder, log_source, write_log
+from jaxbl.report.explorer.study import study_source
+
+HOSTILE = "motor.<img src=x onerror=alert(1)>"
+TIME = np.arange(4000) * 1e-3 + 1e5
+ANGLE = 5.0 * np.sin(2.0 * TIME)
+RIPPLE = 0.1 * np.cos(3.0 * ANGLE)
+
+
+def trace():
+    columns = {"t": TIME, "u": np.cos(TIME), "theta_e": ANGLE, "theta_s": ANGLE / 5.0, "held_out": TIME[2999] < TIME}
+    columns |= {"motor.velocity": 10.0 * np.cos(2.0 * TIME), "motor.noise": 0.01 + 0.0 * TIME}
+    columns |= {"motor.missing_before": RIPPLE, "motor.missing_after": 0.01 * np.sign(np.sin(500.0 * TIME))}
+    columns |= {f"motor.missing_without.{HOSTILE}": RIPPLE + 0.02, "motor.missing_with.motor.stiction": 0.5 * RIPPLE}
+    frame = pd.DataFrame(columns)
+    frame.loc[:99, frame.columns.str.contains("missing")] = np.nan
+    return frame
+
+
+def summary(unit="rad"):
+    units = {"theta_e": unit, "theta_s": "rad"}
+    explained = {"speed": {"explained": 0.1}, "position": {"explained": 0.9}, "turn": {"explained": 0.2}}
+    return {
+        "title": "", "file": "axis.csv", "sample_period": 1e-3, "findings": [{"effect": HOSTILE}], "notes": [],
+        "gap": {"units": units, "holdout": {"bandwidth": {"motor": 40.0}}}, "where": {"motor": {"coordinates": explained}},
+    }  # fmt: skip
+
+
+def test_columns_and_what_is_said_of_them(tmp_path):
+    told = write_log(summary(), trace(), {"drive": {"gear_ratio": 4.0}}, tmp_path)
+    kept = pq.read_table(tmp_path / "points.parquet").to_pandas()
+    assert kept["t"].dtype == np.float64 and kept["u"].dtype == np.float32
+    np.testing.assert_array_equal(kept["t"], TIME)
+    np.testing.assert_allclose(kept["twist"], ANGLE - 0.8 * ANGLE, atol=1e-6)
+    assert kept["motor.turn"].between(0.0, 2.0 * np.pi).all() and "load.turn" not in kept and "motor.noise" not in kept
+    units = {one["column"]: one["unit"] for one in told["coordinates"]}
+    assert units["motor.velocity"] == "rad/s" and units["u"] == "N m" and told["held"]
+    # over what explains most
+    assert told["over"] == ["theta_e", "motor.turn"]
+    (group,) = told["groups"]
+    assert (group["name"], group["unit"], group["bandwidth"]) == ("motor: missing torque", "N m", 40.0)
+    assert {one["column"]: one["label"] for one in group["lines"]} == {
+        "motor.missing_before": "model as given",
+        "motor.missing_after": "with the missing effects",
+        f"motor.missing_without.{HOSTILE}": f"with the missing effects, without {HOSTILE}",
+        "motor.missing_with.motor.stiction": f"with motor.stiction in place of {HOSTILE}",
+    }
+
+
+def test_a_linear_axis_has_forces_and_no_turns(tmp_path):
+    told = write_log(summary("m"), trace(), {}, tmp_path)
+    units = {one["column"]: one["unit"] for one in told["coordinates"]}
+    assert units["theta_e"] == "m" and units["motor.velocity"] == "m/s" and units["u"] == "N"
+    assert "motor.turn" not in units and told["groups"][0]["name"] == "motor: missing force"
+
+
+def test_an_identification_and_an_element(tmp_path):
+    motor = (f"motor.{name}" for name in ("velocity", "velocity_estimate", "residual", "torque_estimate"))
+    frame = pd.DataFrame(dict.fromkeys(("t", "u", "theta_e", "torque", *motor), TIME))
+    found = {"residual": {"motor": {"unit": "rad"}}, "sample_period": 1e-3}
+    groups = write_log(found, frame, {}, tmp_path)["groups"]
+    assert [one["name"] for one in groups] == ["motor: position residual", "torque in the transmission", "motor: speed"]
+    element = {"kind": "element", "sample_period": 1e-3}
+    told = write_log(element, pd.DataFrame(dict.fromkeys(("t", "u", "displacement", "torque"), TIME)), {}, tmp_path)
+    assert told["over"] == ["displacement", "u"] or told["over"] == ["u", "displacement"]
+    assert [one["label"] for one in told["groups"][0]["lines"]] == ["measured", "by the fitted law"]
+    with pytest.raises(InputError, match=r"explore: trace\.parquet has no column that the page could draw"):
+        write_log(found, frame.loc[:, ["t", "u"]], {}, tmp_path)
+
+
+def stored(folder):
+    """A folder as `jaxbl identify` leaves it."""
+    trace().rename(columns={"motor.missing_before": "motor.residual"}).to_parquet(folder / "trace.parquet", index=False)
+    (folder / "model.toml").write_text("[drive]\ngear_ratio = 4.0\n")
+    found = {
+        "title": HOSTILE, "file": "axis.csv", "sample_period": 1e-3, "parameters": {}, "warnings": [], "notes": [],
+        "kind": "element", "refused": [], "torque": {"element": {"rms": 1.0, "relative": 0.1, "unit": "N m"}},
+        "method": {"element": {"terms": [], "gains": {}, "reversals": 4}},
+    }  # fmt: skip
+    (folder / "identification.json").write_text(json_text(found))
+
+
+def test_folders_without_results_and_damaged_ones(tmp_path):
+    assert not is_log_folder(tmp_path)
+    with pytest.raises(InputError, match=r"holds no results of a log \(no diagnosis\.json or identification\.json\)"):
+        log_source(tmp_path)
+    with pytest.raises(InputError, match="holds no study"):
+        study_source(tmp_path)
+    stored(tmp_path)
+    (tmp_path / "trace.parquet").write_bytes(b"no table")
+    assert is_log_folder(tmp_path)
+    with pytest.raises(InputError, match=r"trace\.parquet: cannot be read .*--overwrite"):
+        write_static(log_source(tmp_path), tmp_path / "out")
+
+
+@needs_chromium
+def test_lines_coordinates_and_moments(tmp_path):
+    told = write_log(summary(), trace(), {}, tmp_path) | {"title": HOSTILE, "lead": [HOSTILE], "config": HOSTILE}
+    write_page(tmp_path, "log.html", told, ("log.js",))
+    with opened(tmp_path / "index.html") as (page,):
+        page.wait_for_selector("body[data-drawn*='motor.missing_before motor.missing_after']")
+        assert page.locator("#title").text_content() == page.locator("#lead").text_content() == HOSTILE
+        assert page.locator("#overhead").inner_text().startswith("Over motor position θe, and over")
+
+        def sizes():
+            rows = (row.split("\t") for row in page.locator("#sizes tbody tr").all_inner_texts())
+            return {name: [float(one) for one in values] for name, *values in rows}
+
+        # the moving average leaves what is slow, and takes the fast part away
+        ripple = [np.sqrt(np.mean(part**2)) for part in (RIPPLE[100:3000], RIPPLE[3000:])]
+        assert (
+            sizes()["model as given"] == pytest.approx(ripple, rel=0.05) and max(sizes()["with the missing effects"]) < 2e-3
+        )
+        page.select_option("#cutoff", "none")
+        page.locator("#sizes td:text-is('0.01')").first.wait_for()
+        assert sizes()["model as given"] == pytest.approx(ripple, rel=1e-3)
+        # with one effect less: another line, another map
+        page.locator("#lines input").nth(2).check()
+        page.wait_for_selector("#over2 figure:nth-child(3)")
+        assert sizes()[f"with the missing effects, without {HOSTILE}"][0] == pytest.approx(
+            np.sqrt(np.mean((RIPPLE[100:3000] + 0.02) ** 2)), rel=1e-3
+        )
+        # the mean in a cell of position and speed is the ripple at that position
+        page.select_option("#y", "motor.velocity")
+        page.wait_for_selector("body[data-drawn^='motor: missing torque theta_e motor.velocity ']")
+        plane = page.locator("#over2 figure .plane").first
+        box = plane.bounding_box()
+        plane.hover(position={"x": 82 + 0.5 * (box["width"] - 166), "y": 10 + 0.01 * (box["height"] - 58)})
+        mean, position, speed = [
+            float(line.split(": ")[1].split()[0]) for line in plane.locator(".values").inner_text().split("\n")
+        ]
+        assert mean == pytest.approx(0.1 * np.cos(3.0 * position), abs=5e-3) and speed > 9.0
+        # a moment, and a part
+        page.locator("#moment").fill("500")
+        assert page.locator("#now").inner_text().startswith("t 100002 s, input u ")
+        whole = page.locator("#time .plane").bounding_box()
+        page.mouse.move(whole["x"] + 200, whole["y"] + 100)
+        page.mouse.down()
+        page.mouse.move(whole["x"] + 400, whole["y"] + 102, steps=3)
+        page.mouse.up()
+        assert page.locator("#state").inner_text().startswith("From 10000")
+        page.click("#play")
+        page.locator("#play:text-is('pause')").wait_for()
+        check(page, 0)

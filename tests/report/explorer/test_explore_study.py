@@ -1,0 +1,313 @@
+"""A study as maps in a browser: its data, and its page by mouse and keyboard, from disk and served."""
+
+import base64
+import json
+import threading
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from browser import check, needs_chromium, opened
+from small_study import ALPHA, LAMBDA, NOISE, listed, made, rigid, small, spaced
+
+from jaxbl.config import read_config
+from jaxbl.errors import InputError
+from jaxbl.report.explorer.folder import Source, write_static
+from jaxbl.report.explorer.server import served
+from jaxbl.report.explorer.study import study_source, write_study
+from jaxbl.sweeps.sweep import open_study, share, sweep
+from jaxbl.sweeps.trial import run
+
+HOSTILE = "</script><script>alert(1)</script> <b>a</b> \u202e"
+AXES = [listed(NOISE, 1e-5, 1e-4), spaced(ALPHA, 2.0, 50.0, 6), spaced(LAMBDA, 1.0, 20.0, 5)]
+
+
+def product(frame):
+    return frame[ALPHA] * frame[LAMBDA] * (1.0 + 1e3 * frame[NOISE]) + 0.1 * frame["seed"]
+
+
+def study(**columns):
+    data = rigid({"title": HOSTILE}, axes=AXES, sweep={"seeds": 3})
+    return made(data, motor__velocity_rmse=product, motor__f_plus=lambda frame: 1.0, **columns)
+
+
+def source(result, lead=()):
+    return Source(lead, lambda out, served: write_study(result, out, lead, served=served), {}, lambda: None)
+
+
+def about(folder):
+    return json.loads((folder / "data.js").read_text().removeprefix("jaxblData(").rstrip().removesuffix(");"))
+
+
+def test_rows_are_in_the_order_of_the_axes_whatever_that_of_the_parts(tmp_path):
+    result = study(motor__convergence_time=lambda frame: np.where(frame["seed"] > 0, np.inf, 1.0))
+    shuffled = result.frame.sample(frac=1.0, random_state=0).iloc[5:]
+    write_static(source(result.__class__(result.config, shuffled), ["found"]), tmp_path / "out")
+    told, table = about(tmp_path / "out"), pq.read_table(tmp_path / "out" / "points.parquet").to_pandas()
+    assert (told["rows"], told["found"], told["title"]) == (180, 175, HOSTILE)
+    paths = [one["path"] for axis in told["axes"] for one in axis["paths"]]
+    grid = pd.MultiIndex.from_product([axis["paths"][0]["values"] for axis in told["axes"]], names=paths)
+    expected = shuffled.set_index(paths)["motor.velocity_rmse"].reindex(grid).to_numpy()
+    np.testing.assert_allclose(table["motor.velocity_rmse"], expected, rtol=1e-6)
+    # what is infinite is not there
+    assert table["motor.convergence_time"].isna().sum() > 100
+    # the same bytes in scripts, for pages from disk
+    scripts = "".join(file.read_text() for file in sorted((tmp_path / "out").glob("points.*.js")))
+    assert scripts.startswith("jaxblBytes(0, ") and len(scripts) > 4 * told["bytes"] / 3
+
+
+def test_sizes_are_drawn_and_lanes_that_diverged_are_not_there(tmp_path):
+    columns = {"motor__stiffness_error": lambda frame: -2.0, "finite": lambda frame: frame["seed"] != 1}
+    result = made(small(axes=AXES, sweep={"seeds": 3}), **columns)
+    write_static(source(result, []), tmp_path)
+    table = pq.read_table(tmp_path / "points.parquet").to_pandas()
+    found = table["motor.stiffness_error"]
+    assert found.isna().mean() == pytest.approx(1.0 / 3.0) and set(found.dropna()) == {2.0}
+    assert set(table["finite"]) == {0.0, 1.0}
+    (told,) = [one for one in about(tmp_path)["metrics"] if one["name"] == "motor.stiffness_error"]
+    assert told["label"].startswith("motor: |")
+
+
+def test_zipped_axes_are_one(tmp_path):
+    axes = [spaced(ALPHA, 2.0, 50.0, 3), {"path": LAMBDA, "values": [1.0, 1.0, 3.0], "zip": "pair"},
+            {"path": NOISE, "values": [1e-5, 1e-4, 1e-4], "zip": "pair"}]  # fmt: skip
+    result = made(rigid(axes=axes), motor__velocity_rmse=product)
+    write_static(source(result, []), tmp_path)
+    table = pq.read_table(tmp_path / "points.parquet").to_pandas()
+    assert len(table) == 9 and [len(axis["paths"]) for axis in about(tmp_path)["axes"]] == [1, 2, 1]
+    np.testing.assert_allclose(table["motor.velocity_rmse"], result.frame["motor.velocity_rmse"], rtol=1e-6)
+
+
+def test_folders_of_others_are_refused(tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "index.html").write_text("mine")
+    with pytest.raises(InputError, match="mine: is not empty, and was not written by jaxbl explore"):
+        write_static(source(study(), []), tmp_path / "mine")
+    assert (tmp_path / "mine" / "index.html").read_text() == "mine"
+    for _ in range(2):
+        write_static(source(study(), []), tmp_path / "again")
+
+
+def read(values):
+    """The numbers beside the pointer: of the cell, of x, of y."""
+    return [float(line.split(": ")[-1].split()[0]) for line in values.inner_text().split("\n")]
+
+
+@needs_chromium
+def test_values_regions_cuts_and_a_point_as_config(tmp_path):
+    result = study(motor__converged=lambda frame: frame["seed"] > 0)
+    page_file = write_static(source(result, [HOSTILE]), tmp_path / "out")
+    with opened(page_file, color_scheme="dark") as (page,):
+        page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {LAMBDA} {ALPHA}']")
+        assert page.locator("#title").text_content() == page.locator("#lead").text_content() == HOSTILE
+        plot, values = page.locator("#plot"), page.locator("#values")
+        box = page.evaluate("[document.querySelector('#plot').clientWidth, document.querySelector('#plot').clientHeight]")
+
+        def place(x, y):
+            return {"x": 78 + x * (box[0] - 78 - 118), "y": 26 + (1 - y) * (box[1] - 26 - 52)}
+
+        # a cell: the median over seeds, at the first noise
+        plot.hover(position=place(0.5, 0.25))
+        alphas, lambdas = np.geomspace(2.0, 50.0, 6), np.geomspace(1.0, 20.0, 5)
+        assert read(values) == pytest.approx([alphas[1] * lambdas[2] * 1.01 + 0.1, lambdas[2], alphas[1]], rel=1e-3)
+        check(page, 0)
+        # of what is true or false, the share
+        page.select_option("#metric", "motor.converged")
+        page.wait_for_selector("body[data-drawn^='motor.converged ']")
+        plot.hover(position=place(0.5, 0.26))
+        assert read(values)[0] == pytest.approx(2.0 / 3.0, rel=1e-3)
+        page.select_option("#metric", "motor.velocity_rmse")
+        page.wait_for_selector("body[data-drawn^='motor.velocity_rmse ']")
+        # other noise, the largest seed
+        page.select_option("#at0", "1")
+        page.select_option("#how", "largest")
+        plot.hover(position=place(0.5, 0.26))
+        assert float(values.inner_text().split("\n")[0].split(": ")[-1]) == pytest.approx(
+            alphas[1] * lambdas[2] * 1.1 + 0.2, rel=1e-3
+        )
+        # axes change places, and conditions can be drawn over gains
+        page.select_option("#x", "1")
+        page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {ALPHA} {LAMBDA}']")
+        page.select_option("#condition", "exact")
+        page.wait_for_selector("#state:has-text('f⁺ = 1 rad/s²')")
+        # a region by mouse, a cell by keyboard
+        at = plot.bounding_box()
+        start, end = place(0.05, 0.9), place(0.6, 0.3)
+        page.mouse.move(at["x"] + start["x"], at["y"] + start["y"])
+        page.mouse.down()
+        page.mouse.move(at["x"] + end["x"], at["y"] + end["y"], steps=3)
+        page.mouse.up()
+        plot.hover(position=place(0.01, 0.01))
+        assert read(values)[1:] == pytest.approx([alphas[0], lambdas[1]], rel=1e-3)
+        plot.focus()
+        for key in ("ArrowRight", "Enter"):
+            page.keyboard.press(key)
+        assert page.locator("#chosen").is_visible()
+        with page.expect_download() as download:
+            page.click("#point")
+        (tmp_path / "out" / "point.toml").write_bytes(Path(download.value.path()).read_bytes())
+        with page.expect_download() as gains:
+            page.click("#gains")
+        (tmp_path / "gains.toml").write_bytes(Path(gains.value.path()).read_bytes())
+        # side by side, a map of each noise
+        page.select_option("#facet", "0")
+        page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {ALPHA} {LAMBDA} {NOISE}']")
+        page.click("#whole")
+        plot.hover(position={"x": 78 + 5, "y": 60})
+        assert values.inner_text().endswith(f"{NOISE} = 1e-5 rad")
+        with page.expect_download() as picture:
+            page.click("#picture")
+        assert Path(picture.value.path()).read_bytes().startswith(b"\x89PNG")
+    config = read_config(tmp_path / "out" / "point.toml")
+    assert config.encoders.noise == 1e-4 and config.axes == []
+    assert any(config.observer.motor.alpha == pytest.approx(one) for one in alphas)
+    found = tomllib.loads((tmp_path / "gains.toml").read_text())["observer"]
+    assert found == {"motor": {"lambda": config.observer.motor.lambda_, "alpha": config.observer.motor.alpha}}
+
+
+SWEPT = rigid(
+    axes=[listed(NOISE, 1e-5, 1e-4), spaced(ALPHA, 5.0, 50.0, 3), spaced(LAMBDA, 1.0, 20.0, 2)], sweep={"chunk": 4}
+)
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    """A sweep of twelve runs, stored."""
+    folder = tmp_path_factory.mktemp("swept")
+    sweep(SWEPT, folder)
+    return folder
+
+
+def test_a_run_simulated_anew_is_that_of_its_config(swept):
+    found = study_source(swept).answers["run"]({"values": {NOISE: 1e-4, ALPHA: 50.0, LAMBDA: 1.0}, "seed": 0})
+    trial = run(tomllib.loads(found["config"]))
+    assert trial.config.encoders.noise == 1e-4 and trial.config.observer.motor.alpha == pytest.approx(50.0)
+    assert set(found["metrics"]) == set(trial.summary["metrics"])
+    for name, value in trial.summary["metrics"].items():
+        assert found["metrics"][name] == (value if value is None else pytest.approx(value, rel=1e-9)), name
+    velocity = np.frombuffer(base64.b64decode(found["columns"]["motor.velocity"]), "<f4")
+    np.testing.assert_allclose(velocity, trial.trace["motor.velocity"], rtol=1e-5, atol=1e-7)
+    # the sweep stored the same
+    frame = open_study(swept).frame
+    row = frame[(frame[NOISE] == 1e-4) & (frame[ALPHA] > 49.0) & (frame[LAMBDA] < 2.0)]
+    assert row["motor.velocity_rmse"].item() == pytest.approx(found["metrics"]["motor.velocity_rmse"], rel=1e-6)
+
+
+VALUES = {NOISE: 1e-4, ALPHA: 50.0, LAMBDA: 1.0}
+
+
+@pytest.mark.parametrize(
+    ("asked", "why"),
+    [
+        (7, f"values: should have a value of each axis: {NOISE}, {ALPHA}, {LAMBDA}"),
+        ({"seed": 0}, "values: should have a value of each axis"),
+        ({"values": VALUES | {"run.duration": 1e9}, "seed": 0}, "values: should have a value of each axis"),
+        ({"values": VALUES | {NOISE: -1.0}, "seed": 0}, "encoders.noise"),
+        ({"values": VALUES | {ALPHA: "<b>"}, "seed": 0}, "observer.motor.alpha"),
+        ({"values": VALUES, "seed": -1}, r"seed: should be a whole number from 0 and below 2\^31"),
+        ({"values": VALUES}, "seed: should be a whole number"),
+    ],
+)
+def test_points_that_the_study_may_not_have_are_refused(swept, asked, why):
+    with pytest.raises(InputError, match=why):
+        study_source(swept).answers["run"](asked)
+
+
+@needs_chromium
+def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept, tmp_path):
+    with served(study_source(swept)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with opened(server.url) as (page,):
+            page.wait_for_selector("body[data-drawn^='motor.velocity_rmse ']")
+            plot = page.locator("#plot")
+            plot.click(position={"x": 200, "y": 100})
+            page.wait_for_selector("body[data-simulated*='motor.alpha 50, motor.lambda 1, seed 0, ']")
+            told = page.locator("#told").inner_text()
+            assert told.endswith("as stored in the sweep.")
+            with page.expect_download() as download:
+                page.click("#point")
+            (tmp_path / "point.toml").write_bytes(Path(download.value.path()).read_bytes())
+            error = run(tmp_path / "point.toml").summary["metrics"]["motor.velocity_rmse"]
+            assert float(told.split(": ")[-1].split(",")[0]) == pytest.approx(error, rel=1e-3)
+            page.click("#pinned button")
+            plot.click(position={"x": 700, "y": 500})
+            page.wait_for_selector("body[data-simulated*='motor.alpha 5, motor.lambda 20, seed 0, ']")
+            assert page.locator("#pinned li").count() == 2
+            figures = page.locator("#traces figure")
+            assert figures.count() == 5 and "error of the observer in the phase plane" in figures.last.inner_text()
+            # drawn, and read by keyboard
+            coloured = (
+                "getImageData(85, 15, 300, 150).data.some((byte, i, all) => i % 4 === 0 && Math.abs(byte - all[i + 2]) > 60)"
+            )
+            drawn = f"[...document.querySelectorAll('#traces canvas')].map((one) => one.getContext('2d').{coloured})"
+            assert all(page.evaluate(drawn))
+            figures.first.locator(".plane").focus()
+            page.keyboard.press("ArrowRight")
+            assert figures.first.locator(".values").inner_text().split("\n")[1] == "time: 0 s"
+            check(page, 0)
+        server.shutdown()
+
+
+def test_a_study_at_work_is_written_anew_when_its_page_is_loaded_again(tmp_path):
+    share(SWEPT, tmp_path / "out", (1, 2))
+    with served(study_source(tmp_path / "out")) as server:
+
+        def told(version):
+            file = server.file(version, "data.js")
+            assert file is not None
+            return about(file.parent)
+
+        versions = server.newest(), server.newest()
+        assert [told(one)["found"] for one in versions] == [8, 8] and told(versions[0])["served"]
+        sweep(SWEPT, tmp_path / "out")
+        last = server.newest()
+        assert told(last)["found"] == 12 and server.newest() == last
+
+
+WORDS = {"path": "observer.discretisation", "values": ["implicit", "explicit"]}
+
+
+def product_of_gains(frame):
+    return frame[ALPHA] * frame[LAMBDA]
+
+
+def test_points_of_a_design_keep_their_axes_words_among_them(tmp_path):
+    axes = [{"path": ALPHA, "start": 2.0, "stop": 50.0, "scale": "log"}, {"path": LAMBDA, "start": 1.0, "stop": 20.0}, WORDS]
+    data = rigid(axes=axes, sweep={"design": "sobol", "points": 8, "seeds": 2})
+    result = made(data, motor__velocity_rmse=product_of_gains, finite=lambda frame: frame["seed"] == 0)
+    write_study(result, tmp_path, ["found"])
+    told, table = about(tmp_path), pq.read_table(tmp_path / "points.parquet").to_pandas()
+    assert (told["rows"], told["found"], told["total"], told["sampled"]) == (32, 32, 32, True)
+    assert [(one["path"], one["words"], one["log"]) for one in told["axes"]] == [
+        (ALPHA, None, True), (LAMBDA, None, False), (WORDS["path"], WORDS["values"], False)
+    ]  # fmt: skip
+    np.testing.assert_array_equal(table[ALPHA], result.frame[ALPHA])
+    words = [WORDS["values"][int(one)] for one in table[WORDS["path"]]]
+    assert words == [*result.frame[WORDS["path"]]] and set(words) == set(WORDS["values"])
+    assert table["motor.velocity_rmse"].isna().equals(table["seed"] == 1.0)
+
+
+@needs_chromium
+def test_a_study_of_one_axis_is_drawn_over_it_and_its_points_kept(tmp_path):
+    result = made(rigid(axes=[spaced(ALPHA, 2.0, 50.0, 6)]), motor__velocity_rmse=lambda frame: 2.0 * frame[ALPHA])
+    page_file = write_static(source(result), tmp_path / "out")
+    with opened(page_file) as (page,):
+        page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {ALPHA} motor.velocity_rmse']")
+        page.select_option("#log", "false")
+        plane, values = page.locator("#plot .plane"), page.locator("#plot .values")
+        plane.focus()
+        for key in ("ArrowRight", "ArrowRight", "ArrowRight", "Enter"):
+            page.keyboard.press(key)
+        alpha = np.geomspace(2.0, 50.0, 6)[2]
+        assert [float(line.split(": ")[-1].split()[0]) for line in values.inner_text().split("\n")] == pytest.approx(
+            [2.0 * alpha, alpha, 2.0 * alpha], rel=1e-3
+        )
+        page.locator("#chosen").wait_for()
+        with page.expect_download() as download:
+            page.click("#point")
+        (tmp_path / "out" / "point.toml").write_bytes(Path(download.value.path()).read_bytes())
+        check(page, 0)
+    assert read_config(tmp_path / "out" / "point.toml").observer.motor.alpha == pytest.approx(alpha, rel=1e-12)

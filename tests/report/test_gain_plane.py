@@ -1,0 +1,63 @@
+"""Gains against the conditions in the units of a drive: what is drawn, and what is said of it."""
+
+import numpy as np
+import pytest
+
+from jaxbl.observer.conditions import CONDITIONS, judge_gains
+from jaxbl.report.figures import save
+from jaxbl.report.gain_plane import conditions_line, draw_gain_plane
+
+GAINS = {
+    "exact holds": (1.24, 2.84, 1.97, "gain conditions met: exact; not met: Davila-Fridman (32), Levant 1998, "),
+    "all hold": (12.0, 3.1, 1.5, "Lyapunov, exact (all). λ may fall by a factor of "),
+    "none holds": (0.005, 1.8, 1.59, "no gain condition holds. The exact one asks for λ above 1.21 √rad/s (243 "),
+    "no lambda": (0.0, 1.8, 1.59, "no gain condition holds. The exact one asks for λ above 1.21 √rad/s."),
+    "alpha too small": (4.0, 1.0, 1.5, "no gain condition can hold, as α = 1 rad/s² does not exceed it. The "),
+    "no gains": (0.0, 0.0, 1.5, "no gain condition can hold, as α = 0 rad/s² does not exceed it."),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", GAINS)
+def test_plane_and_sentence_agree_with_the_numbers(case, tmp_path):
+    lambda_, alpha, bound, text = GAINS[case]
+    found = judge_gains(lambda_, alpha, bound)
+    line = conditions_line("motor", found, "of a test")
+    assert line.startswith(f"motor: at f⁺ = {bound:g} rad/s², of a test, ")
+    assert text in line
+    drawn = draw_gain_plane("motor", found)
+    ax = drawn.figure.axes[0]
+    star = next(one for one in ax.lines if one.get_marker() == "*")
+    (x,), (y,) = star.get_data()
+    low, high = ax.get_ylim()
+    assert (x, y) == (max(alpha, ax.get_xlim()[0]), max(lambda_, low))
+    assert high > low > 0.0
+    # above and on the right the same in units of f⁺
+    save(drawn.figure, tmp_path / "plane.png")
+    top, right = ax.child_axes
+    np.testing.assert_allclose(top.get_xlim(), np.array(ax.get_xlim()) / bound)
+    np.testing.assert_allclose(right.get_ylim(), np.array(ax.get_ylim()) / np.sqrt(bound))
+    # the curves of the conditions, the exact one last
+    for curve, (name, condition) in zip(ax.lines, CONDITIONS.items(), strict=False):
+        assert curve.get_label() == condition.title
+        alphas, least = np.asarray(curve.get_xydata())[200]
+        assert least == pytest.approx(judge_gains(1.0, alphas, bound)["least_lambda"][name], rel=1e-6), condition.title
+
+
+def test_factors_lead_to_where_the_exact_condition_fails():
+    found = judge_gains(1.24, 2.84, 1.97)
+    line = conditions_line("motor", found, "of a test")
+    factor = float(line.partition("fall by a factor of ")[2].partition(" ")[0])
+    grown = float(line.partition("grow by one of ")[2].partition(" ")[0])
+    for share, held in ((0.999, True), (1.001, False)):
+        assert judge_gains(1.24 / (factor * share), 2.84, 1.97)["holds"]["exact"] == held
+        assert judge_gains(1.24, 2.84, 1.97 * grown * share)["holds"]["exact"] == held
+    # the dashed curve for that f⁺ goes through the gains
+    ax = draw_gain_plane("motor", found).figure.axes[0]
+    edge = next(one for one in ax.lines if one.get_color() == "black" and one.get_linestyle() == "--")
+    x, y = edge.get_data()
+    # the first point is that of the vertical part
+    assert np.interp(2.84, x[1:], y[1:]) == pytest.approx(1.24, rel=1e-3)
+
+
+def test_without_a_disturbance_no_condition_asks_for_anything():
+    assert "nothing disturbs the observer" in conditions_line("load", judge_gains(1.0, 2.0, 0.0), "of a test")
