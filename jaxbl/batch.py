@@ -9,6 +9,7 @@ import pandas as pd
 from .cluster import Scheduler, connected
 from .errors import InputError
 from .files import make_folder, results_of
+from .lines import described
 from .records.files import is_log, log_endings
 from .report.diagnose import probability, rms_text
 from .workers import Progress, each, forget_programs, worth
@@ -110,15 +111,18 @@ def batch_row(log: Path, summary: Mapping[str, Any] | None, refused: str = "") -
     return row
 
 
+_LONGEST_VERDICT = len("no discrepancy")
+
+
 def batch_lines(rows: list[dict[str, Any]]) -> list[str]:
     """The rows of a batch as a table for the terminal."""
-    width = max(len(row["log"]) for row in rows)
-    lines = []
+    cells = []
     for row in rows:
         if row["refused"]:
-            lines.append(f"{row['log']:<{width}}  refused         {row['refused']}")
-            continue
-        named = f"{row['findings']} ({probability(row['confidence'])})" if row["findings"] else ""
-        gap = f"{rms_text(row['theta_e_before'])} -> {rms_text(row['theta_e_after'])} ({rms_text(row['theta_e_floor'])})"
-        lines.append(f"{row['log']:<{width}}  {row['verdict'].replace('_', ' '):<14}  {named}  theta_e {gap}")
-    return lines
+            verdict, text = "refused", row["refused"]
+        else:
+            named = f"{row['findings']} ({probability(row['confidence'])})" if row["findings"] else ""
+            gap = " -> ".join(rms_text(row[f"theta_e_{when}"]) for when in ("before", "after"))
+            verdict, text = row["verdict"].replace("_", " "), f"{named}  theta_e {gap} ({rms_text(row['theta_e_floor'])})"
+        cells.append((row["log"], verdict.ljust(_LONGEST_VERDICT), text))
+    return described(cells)

@@ -132,7 +132,8 @@ class Cluster:
         except KilledWorker as error:
             raise NoResult(
                 f"a job has ended {error.allowed_failures + 1} workers, perhaps for want of memory (the last one: "
-                f"{error.last_worker.address}); what is finished is kept"
+                f"{error.last_worker.address}); what is finished is kept; go on with fewer lanes at once, "
+                "[sweep] chunk, or workers with more memory"
             ) from None
         except ModuleNotFoundError as error:
             raise InputError(

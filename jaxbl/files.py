@@ -43,7 +43,9 @@ def place(name: str | Path) -> Path:
             f"{name}: needs another package ({error}); pip install 'jaxbl[distributed]', s3fs for s3://"
         ) from None
     except ValueError as error:
-        raise InputError(f"{name}: is no place for results ({error})") from None
+        raise InputError(
+            f"{name}: is no place for results ({error}); it should be a folder, or s3://BUCKET/FOLDER"
+        ) from None
 
 
 def is_remote(path: Path) -> bool:

@@ -1,14 +1,12 @@
 """What a command does around its work: progress bar, interrupts, and names in front of messages of bad input."""
 
 import math
-import shlex
 import signal
 import sys
-import textwrap
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -17,6 +15,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from .errors import InputError, printable
+from .lines import command_line
 from .workers import listening
 
 if TYPE_CHECKING:
@@ -24,8 +23,6 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 """Exit code of an interrupted command: 128 and the signal's number."""
-_COLUMNS = 80
-"""Of a terminal."""
 _EVERY, _LOOK, _WINDOW = 10.0, 1.0, 60.0
 """Seconds between lines of progress in a pipe, between looks at what is done, and back to the look that gives the speed."""
 
@@ -77,7 +74,8 @@ def running(
         if not (interrupted or isinstance(error, KeyboardInterrupt)):
             raise
         state = "what is finished is kept. Go on with" if kept else "nothing was written. Start again with"
-        typer.echo(printable(f"interrupted; {state}: {_call_again(context, folder, kept=kept)}"), err=True)
+        again = command_line(*call_again(context, folder, kept=kept))
+        typer.echo(printable(f"interrupted; {state}: {again}"), err=True)
         raise typer.Exit(INTERRUPTED) from None
     finally:
         signal.signal(signal.SIGINT, before)
@@ -97,9 +95,9 @@ def until_interrupted(run: Callable[[], object]) -> None:
         run()
 
 
-def _call_again(context: typer.Context, folder: Path, *, kept: bool) -> str:
-    """The command line of this call, with the folder of its results; what is `kept` there is not to be overwritten."""
-    words = ["jaxbl", str(context.info_name)]
+def call_again(context: typer.Context, folder: Path, *, kept: bool = True) -> list[str]:
+    """The words of this call, with the folder of its results; what is `kept` there is not to be overwritten."""
+    words = [str(context.info_name)]
     for one in context.command.params:
         source, value = context.get_parameter_source(str(one.name)), context.params.get(str(one.name))
         if one.name in ("out", "overwrite" if kept else "out") or source is None or source.name != "COMMANDLINE":
@@ -108,7 +106,7 @@ def _call_again(context: typer.Context, folder: Path, *, kept: bool) -> str:
             words.append(one.opts[0])
         if value is not True:
             words += map(str, value if isinstance(value, list | tuple) else [value])
-    return shlex.join([*words, "--out", str(folder)])
+    return [*words, "--out", str(folder)]
 
 
 @contextmanager
@@ -218,19 +216,6 @@ def _lines(unit: str, first: str) -> "Iterator[Progress]":
     finally:
         ended.set()
         speaker.join()
-
-
-def two_columns(rows: Iterable[tuple[str, str]]) -> list[str]:
-    """Names and what is said of them, in lines of at most 80 columns but for what is longer in itself."""
-    rows = list(rows)
-    width = max(len(name) for name, _ in rows) + 2
-    lines = []
-    for name, text in rows:
-        lines += textwrap.wrap(
-            text, _COLUMNS, initial_indent=name.ljust(width), subsequent_indent=" " * width, break_long_words=False,
-            break_on_hyphens=False,
-        )  # fmt: skip
-    return lines
 
 
 def answers() -> bool:

@@ -2,7 +2,7 @@
 
 import difflib
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,6 +19,8 @@ _DEPTH = 16
 """Tables and arrays within one another: a study needs five."""
 _VALUES = 300_000
 """Values of a study, some seconds of reading. More are given as start, stop and num, or by a recorded file."""
+_LISTED = 5
+"""Files that a message names."""
 _LEAST, LARGEST = 1e-30, 1e30
 """The least positive number that may be divided by, and the largest magnitude of any: float32 ends at 1e-38 and 1e38, and no
 drive has quantities near that in SI units."""
@@ -107,6 +109,24 @@ def _fault(value: Any, longest: int = _TEXT) -> str:
     elif isinstance(value, int) and not -(2**63) <= value < 2**63:
         return f"should be a number of 64 bits, not {shortened(hex(value), 40)}"
     return ""
+
+
+def no_such_file(path: Path, endings: Collection[str]) -> str:
+    """What to say of a file that is not there: one beside it whose name is near, or those there are, of some endings."""
+    folder = path.parent
+    if not folder.is_dir():
+        return f"no such file: there is no folder {folder}"
+    try:
+        names = sorted(one.name for one in folder.iterdir() if one.suffix.lower() in endings and one.is_file())
+    except OSError:
+        names = []
+    stems = {Path(name).stem: name for name in reversed(names)}
+    if close := difflib.get_close_matches(path.stem, stems, n=1, cutoff=0.6):
+        return f"no such file; did you mean {folder / stems[close[0]]}?"
+    if not names:
+        where = folder if folder.name else "this folder"
+        return f"no such file; {where} has none of its kind"
+    return f"no such file; here are {', '.join([*names[:_LISTED], *(['...'] if len(names) > _LISTED else [])])}"
 
 
 def nearest(word: str, words: Any) -> str:

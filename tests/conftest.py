@@ -12,6 +12,8 @@ os.environ |= {
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     # tests change what is compiled
     "JAXBL_PROGRAMS": "",
+    # messages name the command as a shell finds it
+    "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),
 }
 
 import jax

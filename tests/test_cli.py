@@ -11,8 +11,11 @@ import sys
 import time
 import tomllib
 import urllib.request
+from html import unescape
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -24,10 +27,12 @@ from progress_lines import without_progress
 from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
 
 from jaxbl import cli, terminal
+from jaxbl.cli import setup
+from jaxbl.cli.next_steps import LogCall, after_diagnosis, after_identification
 from jaxbl.cli.options import folder_of
-from jaxbl.cli.outcome import Outcome
 from jaxbl.errors import InputError
 from jaxbl.files import locked
+from jaxbl.lines import lines_of, program
 from jaxbl.sweeps.engine import Engine
 
 FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
@@ -87,7 +92,7 @@ def test_a_sweep_and_its_second_call(tmp_path):
     ]  # fmt: skip
     lines = first.stdout.splitlines()
     assert lines[0].startswith("6 runs. The observers converged in ")
-    assert re.fullmatch(r"Compiled in [\d.]+ s, ran 6 lanes in [\d.]+ s\.", lines[-2])
+    assert re.fullmatch(r"Compiled in [\d.]+ s, ran 6 lanes in [\d.]+ s\.", lines[lines.index("Next:") - 1])
     assert lines[-1] == "results/study/report.html"
     second = jaxbl("sweep", "study.toml", cwd=tmp_path, **cache)
     assert second.stdout.splitlines() == [line for line in lines if not line.startswith("Compiled")]
@@ -121,8 +126,14 @@ def test_interrupt_anywhere_else():
     assert end.value.code == 130
 
 
+NONE = "no such file; here are axis.toml, below.toml, figure.toml, gains.toml, part.toml, ..."
 BAD = {
-    "no such file": (["sweep", "none.toml"], "none.toml: no such file"),
+    "no such file": (
+        ["sweep", "none.toml"],
+        f"none.toml: {NONE}",
+    ),
+    "a name that is near": (["sweep", "studi.toml"], "studi.toml: no such file; did you mean study.toml?"),
+    "no such folder": (["sweep", "studies/a.toml"], "studies/a.toml: no such file: there is no folder studies"),
     "a folder": (["simulate", "."], ".: is a folder; a TOML file is needed"),
     "no axes": (["sweep", "plain.toml"], "plain.toml: axes: the study has none; add [[axes]], or use 'jaxbl simulate'"),
     "wrong key": (["simulate", "wrong.toml"], "wrong.toml: run: unknown key 'durations'; did you mean 'duration'?"),
@@ -195,14 +206,17 @@ BAD = {
         ["verify", "gains.toml", "--out", "full"],
         "full: is not empty and holds no study; choose another folder with --out",
     ),
-    "nothing to include": (["tune", "part.toml"], "part.toml: include: none.toml: no such file"),
+    "nothing to include": (
+        ["tune", "part.toml"],
+        f"part.toml: include: none.toml: {NONE}",
+    ),
     "no such share": (
         ["sweep", "study.toml", "--share", "3/2"],
         "--share 3/2: should be I/N, such as 2/8: the second of eight",
     ),
     "a share of a cluster": (
         ["sweep", "study.toml", "--share", "1/2", "--scheduler", "local:2"],
-        "--share: does not go with --scheduler: other processes may be at work in the folder",
+        "--share: does not go with --scheduler: other processes may be at work in the folder; leave one of them out",
     ),
     "leaving no cluster": (
         ["sweep", "study.toml", "--detach"],
@@ -214,7 +228,7 @@ BAD = {
     ),
     "a cluster for one log": (
         ["diagnose", "log.csv", "--scheduler", "local:2"],
-        "--scheduler goes with --batch: one log is one process's work",
+        "--scheduler goes with --batch: one log is one process's work; leave it out, or give a folder",
     ),
     "no such cluster": (
         ["sweep", "study.toml", "--scheduler", "local:0"],
@@ -222,7 +236,7 @@ BAD = {
     ),
     "no such store": (
         ["sweep", "study.toml", "--out", "foo://bucket/a"],
-        "foo://bucket/a: is no place for results (Unsupported filesystem: 'foo')",
+        "foo://bucket/a: is no place for results (Unsupported filesystem: 'foo'); it should be a folder, or s3://BUCKET/FOLDER",
     ),
     "nothing of which to say the status": (
         ["status", "full"],
@@ -551,7 +565,8 @@ def test_shipped_studies_run_without_a_word_on_stderr(name, command, tmp_path):
 def test_inspect_writes_a_first_model(call, tmp_path):
     made(count=6000, gap=0.1, noise=1e-4).to_csv("axis.csv", index=False)
     code, lines, _ = call("inspect", "axis.csv", "--write", "axis.toml")
-    assert code == 0 and "axis.toml: a first model. Run: jaxbl identify axis.csv --model axis.toml" in lines
+    assert code == 0 and "axis.toml: a first model." in lines
+    assert [command for command, _ in steps_in(lines)] == ["jaxbl identify axis.csv --model axis.toml"]
     text = (tmp_path / "axis.toml").read_text()
     assert text.startswith("# Proposed by jaxbl inspect --write from axis.csv.") and "gear_ratio = 20.0" in text
     assert call("inspect", "axis.csv", "--model", "axis.toml", "--out", "again")[0] == 0
@@ -648,9 +663,10 @@ def test_a_refined_sweep_from_the_command_line(call, tmp_path):
     assert code == 0
     assert lines[:3] == [
         "points       9 on the coarse grid (9 runs with all seeds)",
-        "refinement   at most 289 points; as many as the boundaries need, not counted below",
+        "refinement   at most 289 points; as many as the borders need, not counted below",
         "chunks       1 of 32 lanes",
     ]
+    assert all(len(line) <= 80 for line in lines)
     code, first, _ = call("sweep", "study.toml")
     assert code == 0
     assert re.match(r"\d+ of 289 grid points simulated \([\d.]+ %\), \d+ runs\. ", first[0])
@@ -797,7 +813,7 @@ def quick(monkeypatch):
         tasks.append(task)
         return _Found(task)
 
-    def report(found, folder):
+    def report(found, folder, steps=()):
         from jaxbl.report.diagnose import diagnosis_lines
 
         (folder / "report.html").write_text("its page")
@@ -824,9 +840,12 @@ def test_a_log_is_diagnosed_once(axis, quick, call, tmp_path):
         "On the last part of the log (0.4 to 0.6 s), held out, over windows of 0.1 s, rms (noise; most that a complete "
         "model leaves): theta_e 0.1 -> 0.001 rad (0.001; 0.0012), "
     )
-    assert lines[-2].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
+    at = lines.index("Next:")
+    assert lines[at - 1].startswith("Nothing is tied") and not (tmp_path / "next.csv").exists()
+    run = "jaxbl simulate 'results/an axis/model.toml' --out 'results/an axis_run'"
+    assert [command for command, _ in steps_in(lines)] == [run, "jaxbl explore 'results/an axis'"]
     assert lines[-1] == "results/an axis/report.html"
-    assert call(*DIAGNOSE) == (0, [*lines[:-2], lines[-1]], [])
+    assert call(*DIAGNOSE) == (0, [*lines[: at - 1], *lines[at:]], [])
     assert len(quick) == 1
     shutil.copy("an axis.csv", "other.csv")
     with pytest.raises(InputError, match="results of another log"):
@@ -873,7 +892,8 @@ def test_a_folder_of_logs_is_diagnosed_and_goes_on_where_it_stopped(axis, quick,
     again = "diagnose", "--batch", "logs", "--model", "axis.toml", "--jobs", "1", "--out"
     code, lines, _ = call(*again, "out")
     assert code == 0
-    assert [line.split()[:2] for line in lines[:3]] == [
+    # what is found may go on below
+    assert [line.split()[:2] for line in lines if not line.startswith(" ")][:3] == [
         ["a.csv", "explained"],
         ["b.csv", "explained"],
         ["broken.csv", "refused"],
@@ -900,13 +920,14 @@ def test_one_json_object_has_what_was_found_or_what_is_wrong(call, tmp_path, mon
     assert (code, found["command"], found["exit"]) == (0, "sweep", 0)
     assert found["summary"] == {"title": "small", "runs": 3, "finished": True}
     assert found["found"][0].startswith("3 runs.") and found["open"] == "out/report.html"
+    assert [one["command"].split()[1] for one in found["next"]] == ["explore", "tune", "simulate"]
     assert set(found["files"]) == {f"out/{name}" for name in left(tmp_path / "out") if not name.startswith("points/")}
     assert call("sweep", "study.toml", "--quiet", "--out", "out") == (0, [], [])
     monkeypatch.setattr(sys, "argv", ["jaxbl", "sweep", "none.toml", "--json"])
     with pytest.raises(SystemExit) as end:
         cli.main()
     out, errors = capsys.readouterr()
-    said = "none.toml: no such file"
+    said = "none.toml: no such file; here are study.toml"
     assert (end.value.code, errors) == (2, f"jaxbl: {said}\n")
     assert json.loads(out) == {"command": "sweep", "exit": 2, "error": said}
 
@@ -920,17 +941,109 @@ def test_completion_knows_the_commands(tmp_path):
     assert shown.stdout.split() == ["sweep"]
 
 
-def test_the_demo_is_the_study_of_the_tree_or_of_the_wheel(call, tmp_path, monkeypatch):
-    given = {}
-
-    def sweep(context, config, out, backend):
-        given.update(config=config, out=out)
-        return Outcome(["2 runs."], tmp_path / "results" / "gain_map")
-
-    monkeypatch.setattr("jaxbl.cli.setup.sweep", sweep)
-    code, lines, _ = call("demo")
-    assert code == 0 and lines[0] == "2 runs." and lines[-1].endswith("results/gain_map/report.html")
-    assert given["config"].is_file() and given["config"].name == "gain_map.toml" and given["out"] is None
+def test_the_demo_is_the_study_of_the_tree_or_of_the_wheel():
+    shown = setup._shipped("gain_map.toml")
+    assert shown.is_file() and shown.name == "gain_map.toml"
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
     included = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
     assert included == {"sweeps/gain_map.toml": "jaxbl/studies/gain_map.toml"}
+
+
+def steps_in(lines):
+    """Command lines under "Next:", each with its question."""
+    at = lines.index("Next:") + 1
+    rows = lines[at : at + 2 * sum(line.startswith("  jaxbl ") for line in lines[at:])]
+    assert all(line.startswith("  jaxbl ") for line in rows[::2]) and all(len(line) <= 80 for line in rows[1::2])
+    return [(command.strip(), question.strip()) for command, question in zip(rows[::2], rows[1::2], strict=True)]
+
+
+@pytest.mark.slow
+def test_what_the_demo_says_to_try_next_works_as_it_stands(call, tmp_path, monkeypatch):
+    study = write(tmp_path, tunable() | {"axes": GAINS, "notes": ["The question: which gains?"]}, "a map.toml")
+    monkeypatch.setattr(setup, "_shipped", lambda name: study)
+    code, lines, _ = call("demo", "--out", "results/a map")
+    assert code == 0 and lines[-1] == "results/a map/report.html"
+    steps = steps_in(lines)
+    assert [shlex.split(command)[1] for command, _ in steps] == ["explore", "tune", "simulate", "init"]
+    page = unescape(Path("results/a map/report.html").read_text(encoding="utf-8"))
+    studied = (
+        "Studied: a rigid drive in runs of 0.2 s, sampled every 1 ms, over observer.motor.alpha (2 values, 5 to 9 rad/s²)"
+    )
+    assert all(
+        text in page for text in (lines[0], studied, "The question: which gains?", "What to try next", *chain(*steps))
+    )
+    # another page of the same study says the same
+    assert steps_in(call("plot", "results/a map")[1]) == steps[:-1]
+    for command, _ in steps[:-1]:
+        words = shlex.split(command)[1:]
+        # else it serves the page until it is ended
+        code, lines, _ = call(*words, *(["--static", "page"] if words[0] == "explore" else []))
+        assert code == 0 and Path(lines[-1]).is_file()
+    # the last one asks; who has such a file is not told to write it
+    with pytest.raises(InputError, match="these numbers are missing"):
+        call(*shlex.split(steps[-1][0])[1:])
+    write(tmp_path, name="drive.toml")
+    assert len(steps_in(call("demo", "--out", "results/a map")[1])) == 3
+
+
+def test_after_logs_what_is_open_by_what_was_found():
+    logs, model, folder = [Path("a b.csv")], Path("m.toml"), Path("out")
+    again = ["diagnose", "a b.csv", "--model", "m.toml", "--out", "out"]
+
+    def task(samples, parts=1, missing=("excitation",)):
+        cut = tuple(slice(i * samples // parts, (i + 1) * samples // parts) for i in range(parts))
+        return SimpleNamespace(record=SimpleNamespace(segments=cut), missing=frozenset(missing))
+
+    def commands(steps):
+        assert all(len(line) <= 80 for line in lines_of(steps) if line.startswith("    "))
+        assert steps[-1].command == "jaxbl explore out"
+        return [one.command for one in steps[:-1]]
+
+    def identified(rms, done=None, holdout=None, wanted=None, **more):
+        summary = {"residual": {"motor": {"rms": rms, "noise": 1.0}}} | more
+        return commands(
+            after_identification(done or task(1000), summary, again, folder, LogCall(logs, model, holdout, wanted))
+        )
+
+    diagnose = "jaxbl diagnose 'a b.csv' --model m.toml"
+    simulate = "jaxbl simulate out/model.toml --out out_run"
+    assert identified(3.0) == [f"{diagnose} --out out_diagnosed"]
+    # too short to hold a quarter out, but for another log
+    assert identified(3.0, task(300)) == []
+    assert identified(3.0, task(300), Path("b.csv")) == [f"{diagnose} --holdout b.csv --out out_diagnosed"]
+    assert identified(1.0) == [simulate]
+    # the input of a log with gaps cannot be played back; that of the study can
+    assert identified(1.0, task(1000, 2)) == [] and identified(1.0, task(1000, 2, ())) == [simulate]
+    unseen = {"backlash": {"shown": False}}
+    assert identified(1.0, **unseen) == [simulate, f"{diagnose} --out out --next-experiment out_next.csv"]
+    assert identified(1.0, wanted=Path("n.csv"), **unseen) == identified(1.0, backlash={"shown": True}) == [simulate]
+
+    def diagnosed(wanted=None, **more):
+        return commands(after_diagnosis(task(1000), DIAGNOSED | more, again, folder, LogCall(logs, model, None, wanted)))
+
+    assert diagnosed() == [simulate]
+    long = {"effect": "transmission.rotational_friction_of_somebody_elses_package", "confidence": 0.5}
+    tied = [DIAGNOSED["findings"][0] | {"alternatives": [long]}]
+    experiment = f"{diagnose} --out out --next-experiment out_next.csv"
+    assert diagnosed(findings=tied, rival=long) == [experiment, simulate]
+    assert diagnosed(Path("n.csv"), findings=tied, rival=long) == [simulate]
+    nothing = {"findings": [], "verdict": "no_discrepancy"}
+    assert diagnosed(**nothing) == ["jaxbl identify 'a b.csv' --model m.toml --out out_identified"]
+    assert diagnosed(findings=[], verdict="unknown_effect") == []
+
+
+def test_commands_are_named_as_a_shell_finds_them(tmp_path, monkeypatch):
+    folder = tmp_path / "my venv" / "bin"
+    folder.mkdir(parents=True)
+    for name in ("jaxbl", "python"):
+        (folder / name).touch(0o755)
+    monkeypatch.setattr(sys, "executable", str(folder / "python"))
+    monkeypatch.setenv("PATH", str(folder))
+    assert program() == "jaxbl"
+    # `make demo` runs what is in a folder that the shell does not search
+    monkeypatch.setenv("PATH", "/nowhere")
+    assert program() == shlex.quote(str(folder / "jaxbl"))
+    monkeypatch.chdir(tmp_path)
+    assert program() == "'my venv/bin/jaxbl'"
+    (folder / "jaxbl").unlink()
+    assert program() == f"{shlex.quote(str(folder / 'python'))} -m jaxbl"

@@ -2,15 +2,19 @@
 
 import math
 import tomllib
+from itertools import chain
+from pathlib import Path
 
 import pytest
 
 from jaxbl import read_config
 from jaxbl.cli import setup
-from jaxbl.datasheet import ITEMS
+from jaxbl.datasheet import KINDS, Given, first_study, named_items
 from jaxbl.errors import InputError
+from jaxbl.gains.tune import usual_rule
 
-BY_NAME = {item.name: item for item in ITEMS}
+ITEMS = {kind: {item.name: item for item in about.items} for kind, about in KINDS.items()}
+BY_NAME = ITEMS["geared"]
 
 
 @pytest.mark.parametrize(
@@ -18,7 +22,8 @@ BY_NAME = {item.name: item for item in ITEMS}
     [
         ("motor_inertia", "0.48 kg cm2", 4.8e-5),
         ("motor_inertia", "480gcm²", 4.8e-5),
-        ("motor_inertia", "4.8e-5", 4.8e-5),
+        ("motor_inertia", "4.8e-5 kg m^2", 4.8e-5),
+        ("backlash", "0", 0.0),
         ("motor_viscous", "2 mN·m/krpm", 2e-3 / (1000.0 * 2.0 * math.pi / 60.0)),
         ("torque", "1.3Nm", 1.3),
         ("speed", "3000 1/min", 100.0 * math.pi),
@@ -37,8 +42,27 @@ def test_numbers_become_si(name, text, value):
     assert BY_NAME[name].read(text).value == pytest.approx(value, rel=1e-14)
 
 
+@pytest.mark.parametrize(
+    ("kind", "name", "text", "value"),
+    [
+        ("screw", "lead", "10 mm", 200.0 * math.pi),  # rad of the motor for 1 m
+        ("screw", "stiffness", "120 N/µm", 1.2e8),
+        ("screw", "mass", "60kg", 60.0),
+        ("screw", "load_encoder", "100 nm", 1e-7),
+        ("screw", "load_viscous", "3 N/(m/min)", 180.0),
+        ("linear", "force", "0.2 kN", 200.0),
+        ("linear", "speed", "120 m/min", 2.0),
+        ("screw", "load_encoder", "none", 0.0),
+    ],
+)
+def test_numbers_of_linear_axes_become_si(kind, name, text, value):
+    assert ITEMS[kind][name].read(text).value == pytest.approx(value, rel=1e-14)
+
+
 def test_examples_and_defaults_can_be_read():
-    for item in ITEMS:
+    items = [item for _, item in chain.from_iterable(named_items().values())]
+    assert len(items) == sum(len(about.items) for about in KINDS.values())
+    for item in items:
         assert item.read(item.example).value > 0.0
         assert not item.default or item.left_out().text == "not given"
 
@@ -47,11 +71,18 @@ def test_examples_and_defaults_can_be_read():
     ("name", "text", "message"),
     [
         ("motor_inertia", "heavy", "--motor-inertia 'heavy': should be a number and its unit, such as '0.48 kg cm²'"),
+        ("speed", "3000", "--speed '3000': has no unit; such as '3000 rpm'; units: rad/s, rpm, deg/s"),
+        (
+            "torque",
+            "1,3 N m",
+            "--torque '1,3 N m': should be a number and its unit, with a decimal point, such as '1.3 N m'",
+        ),
         ("speed", "3000 km/h", "--speed '3000 km/h': the unit 'km/h' is not known here; known: rad/s, rpm, deg/s"),
         ("torque", "-1 N m", "--torque '-1 N m': should be more than 0 N m, such as '1.3 N m'"),
         ("backlash", "-1 arcmin", "--backlash '-1 arcmin': should be at least 0 rad, such as '3 arcmin'"),
         ("motor_encoder", "0 counts", "--motor-encoder '0 counts': should be at least 0 rad, such as '17 bit'"),
         ("gear_ratio", "50 teeth", "--gear-ratio '50 teeth': the unit 'teeth' is not known here; known: none"),
+        ("load_encoder", "no", "--load-encoder 'no': should be a number and its unit, such as '20 bit', or 'none'"),
     ],
 )
 def test_what_is_no_such_number_is_said(name, text, message):
@@ -88,7 +119,7 @@ def test_without_a_terminal_what_is_missing_is_said_in_one_line(call, tmp_path):
         call("init", "axis.toml", *WORDS[2:-4])
     assert str(error.value) == (
         "init: these numbers are missing, here with examples: --motor-inertia '0.48 kg cm²', --backlash '3 arcmin', "
-        "--load-inertia '0.4 kg m²'; on a terminal they are asked for"
+        "--load-inertia '0.4 kg m²'; on a terminal they are asked for; another kind of drive: --kind screw, direct, linear"
     )
     assert list(tmp_path.iterdir()) == []
 
@@ -103,8 +134,8 @@ def test_on_a_terminal_numbers_are_asked_for_again_until_they_are_some(monkeypat
         return next(answers) or default
 
     monkeypatch.setattr("typer.prompt", prompt)
-    assert setup._asked(BY_NAME["motor_inertia"]).value == pytest.approx(5e-5)
-    assert setup._asked(BY_NAME["sample_period"]).text == "not given"
+    assert setup._asked_number(BY_NAME["motor_inertia"]).value == pytest.approx(5e-5)
+    assert setup._asked_number(BY_NAME["sample_period"]).text == "not given"
     assert asked[0] == asked[1] and asked[2][1] == "1 ms"
     assert "should be a number and its unit" in capsys.readouterr().err
 
@@ -114,11 +145,167 @@ def test_a_gear_without_backlash_is_a_shaft(call, tmp_path):
     assert read_config(tmp_path / "axis.toml").transmission.law == "linear_shaft"
 
 
+SCREW = {
+    "motor_inertia": "1.2 kg cm²", "motor_friction": "0.1 N m", "torque": "1.3 N m", "speed": "3000 rpm", "lead": "10 mm",
+    "stiffness": "120 N/um", "backlash": "20 um", "mass": "60 kg", "load_viscous": "200 N s/m", "motor_encoder": "17 bit",
+    "load_encoder": "none",
+}  # fmt: skip
+DIRECT = {
+    "motor_inertia": "0.05 kg m²", "motor_friction": "0.2 N m", "torque": "10 N m", "speed": "300 rpm",
+    "motor_encoder": "20 bit",
+}  # fmt: skip
+LINEAR = {"mass": "8 kg", "motor_friction": "6 N", "force": "200 N", "speed": "2 m/s", "motor_encoder": "100 nm"}
+NO_STUDY = "these numbers make no study; look at their units"
+# so that a run is short
+SHORT = {"frequency": "20 Hz"}
+
+
+def words(kind, numbers):
+    return ["--kind", kind, *chain.from_iterable((f"--{name.replace('_', '-')}", text) for name, text in numbers.items())]
+
+
+def given(kind, numbers):
+    return {name: item.read(numbers[name]) if name in numbers else item.left_out() for name, item in ITEMS[kind].items()}
+
+
+def test_a_screw_moves_as_the_turning_drive_that_it_is_at_the_motor():
+    """Without a gear, its load has the inertia m / N², N in rad/m, and so has the rest of it."""
+    ratio, screw = 200.0 * math.pi, given("screw", SCREW | SHORT)
+    at_motor = {
+        "gear_ratio": 1.0, "stiffness": 1.2e8 / ratio**2, "backlash": 2e-5 * ratio, "load_inertia": 60.0 / ratio**2,
+        "load_viscous": 200.0 / ratio**2, "load_encoder": 0.0,
+    }  # fmt: skip
+    turning = {name: screw[name] for name in ITEMS["geared"] if name in screw}
+    turning |= {name: Given(value, "given: by hand") for name, value in at_motor.items()}
+    text, found = first_study(KINDS["screw"], screw, "")
+    _, other = first_study(KINDS["geared"], turning, "")
+    # numbers are written with six digits, of which impacts in the gap make more
+    assert found["motor"]["f_plus"] == pytest.approx(other["motor"]["f_plus"], rel=1e-2)
+    assert found["load"]["f_plus"] * ratio == pytest.approx(other["load"]["f_plus"], rel=1e-2)
+    for line in (
+        "load_inertia = 60.0 # kg, given: 60 kg",
+        "load_viscous = 200.0 # N s/m, given: 200 N s/m",
+        "gear_ratio = 628.319 # rad of the motor for 1 m of the carriage, given: 10 mm a turn",
+        "stiffness = 303.964 # N m/rad on the motor's shaft, given: 120 N/um at the carriage, divided by 628.319²",
+        "half_gap = 0.00628319 # rad on the motor's shaft, given: 20 um at the carriage, end to end; half of it times "
+        "628.319",
+        "load_resolution = 0.0 # m a count, 0 is ideal, given: none",
+    ):
+        assert f"\n{line}\n" in text
+    notes = tomllib.loads(text)["notes"]
+    assert notes[0].startswith("The load moves along a line") and notes[1].startswith(
+        "This drive has no encoder on its load"
+    )
+
+
+@pytest.mark.parametrize(
+    ("kind", "numbers", "lines"),
+    [
+        (
+            "direct",
+            DIRECT,
+            ("motor_inertia = 0.05 # kg m², given: 0.05 kg m²", "torque = 0.2 # N m, given: 0.2 N m"),
+        ),
+        (
+            "linear",
+            LINEAR,
+            (
+                "motor_inertia = 8.0 # kg, given: 8 kg",
+                "motor_viscous = 0.0 # N s/m, not given",
+                "torque = 6.0 # N, given: 6 N",
+                "motor_resolution = 1e-07 # m a count, 0 is ideal, given: 100 nm",
+            ),
+        ),
+    ],
+)
+def test_a_drive_without_a_gear_is_one_inertia(kind, numbers, lines, call, tmp_path):
+    code, said, _ = call("init", "axis.toml", *words(kind, numbers | SHORT))
+    assert code == 0 and ("m/s² (motor)." in said[0]) == (kind == "linear") and "load" not in said[0]
+    text = (tmp_path / "axis.toml").read_text()
+    assert all(f"\n{line}\n" in text for line in lines)
+    assert not any(unit in text.partition("[drive]")[2] for unit in ("rad", "N m", "kg m²")) or kind == "direct"
+    study = read_config(tmp_path / "axis.toml")
+    assert study.drive.kind == "rigid" and study.transmission is None and study.observer.load is None
+    assert bool(study.notes) == (kind == "linear")
+    # nothing but friction disturbs it: f+ is friction over inertia, where it turns around twice that
+    lambda_, alpha = usual_rule(float(study.effects[0].torque) / study.drive.motor_inertia)
+    assert (study.observer.motor.lambda_, study.observer.motor.alpha) == pytest.approx((lambda_, alpha), rel=2e-3)
+    assert call("simulate", "axis.toml")[0] == 0
+
+
+def test_the_usual_rule_in_a_study_is_that_of_tune():
+    text, _ = first_study(KINDS["linear"], given("linear", LINEAR | SHORT), "")
+    lambda_, alpha = usual_rule(1.0)
+    assert f"usual rule, lambda = {lambda_:g} sqrt(f+) and alpha = {alpha:g} f+;" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--kind", "belt"], "--kind 'belt': should be one of geared, screw, direct, linear; jaxbl init"),
+        (
+            [*words("direct", DIRECT), "--gear-ratio", "5", "--mass", "1 kg"],
+            "--gear-ratio, --mass: not asked of --kind direct, which has: --motor-inertia, --motor-viscous, ",
+        ),
+        (words("direct", DIRECT | SHORT | {"motor_friction": "20 N m"}), f"{NO_STUDY}: the motor does not move: --torque "),
+        (words("linear", LINEAR | SHORT | {"motor_friction": "400 N"}), f"{NO_STUDY}: the motor does not move: --force "),
+        (words("screw", SCREW | SHORT | {"backlash": "1 m"}), f"{NO_STUDY}: the load does not move: --backlash should be"),
+        (words("screw", SCREW | {"lead": "1e-7 mm"}), f"{NO_STUDY}: drive.gear_ratio: should be less than or equal to 1"),
+        (["--lead", "10 mm"], "--lead: not asked of --kind geared, which has: --motor-inertia, "),
+        (
+            words("linear", LINEAR | {"motor_friction": "0 N"}),
+            "--motor-friction '0 N': should be more than 0 N, such as '6 N'",
+        ),
+        (words("screw", SCREW | {"lead": "0 mm"}), "--lead '0 mm': should be more than 0 m, such as '10 mm'"),
+        (
+            words("screw", SCREW | {"mass": "60 kg m²"}),
+            "--mass '60 kg m²': the unit 'kg m²' is not known here; known: kg, g, t",
+        ),
+        (
+            ["--kind", "linear"],
+            "init: these numbers are missing, here with examples: --mass '8 kg', --motor-friction '6 N', ",
+        ),
+    ],
+)
+def test_what_no_such_drive_has_is_said_and_nothing_written(arguments, message, call, tmp_path):
+    with pytest.raises(InputError) as error:
+        call("init", "axis.toml", *arguments)
+    assert str(error.value).startswith(message)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_on_a_terminal_the_kind_is_asked_for_first(call, tmp_path, monkeypatch):
+    monkeypatch.setattr(setup, "answers", lambda: True)
+    examples = {item.asked: item.example for item in KINDS["linear"].items}
+    asked = []
+    said = iter(["gearless", "Linear", "8 kg"])
+
+    def prompt(text, default, err):
+        asked.append(text)
+        return next(said, default or examples.get(text.partition(", such as")[0]))
+
+    monkeypatch.setattr("typer.prompt", prompt)
+    code, lines, errors = call("init", "axis.toml", "--frequency", "20 Hz")
+    assert code == 0 and lines[0].startswith("axis.toml: a study")
+    assert asked[0] == asked[1] and asked[0] == "kind of this drive"
+    assert [text.partition(",")[0] for text in asked[2:]] == [
+        item.asked.partition(",")[0] for item in KINDS["linear"].items[:-1]
+    ]
+    assert errors[0] == "Kinds of drives:" and all(len(line) <= 80 for line in (*errors[:5], *asked))
+    assert errors[5].startswith("  --kind 'gearless': should be one of geared")
+    assert read_config(tmp_path / "axis.toml").drive.motor_inertia == 8.0
+
+
 @pytest.mark.slow
-def test_simulate_sweep_and_tune_run_what_is_written(call, tmp_path):
-    assert call("init", "axis.toml", *WORDS, "--frequency", "5 Hz", "--encoder-noise", "5 arcsec")[0] == 0
-    for command in ("simulate", "sweep", "tune"):
-        code, lines, _ = call(command, "axis.toml", "--out", command)
-        assert code == 0 and lines[-1] == f"{command}/report.html"
-    found = tomllib.loads((tmp_path / "tune" / "gains.toml").read_text())["observer"]
-    assert found["motor"]["alpha"] > 0.0 and found["load"]["lambda"] > 0.0
+@pytest.mark.parametrize("kind", KINDS)
+def test_simulate_sweep_and_tune_run_what_is_written(kind, call):
+    numbers = {"screw": words("screw", SCREW), "direct": words("direct", DIRECT), "linear": words("linear", LINEAR)}
+    noise = {"linear": "20 nm"}.get(kind, "5 arcsec")
+    code, lines, _ = call("init", "axis.toml", *numbers.get(kind, WORDS), "--frequency", "5 Hz", "--encoder-noise", noise)
+    assert code == 0
+    # as they are printed
+    for line in (line for line in lines if line.startswith("  jaxbl ")):
+        code, lines, _ = call(*line.split()[1:])
+        assert code == 0 and lines[-1].endswith("/report.html")
+    found = tomllib.loads(Path("results/axis_gains/gains.toml").read_text())["observer"]
+    assert found["motor"]["alpha"] > 0.0 and ("load" in found) == KINDS[kind].law

@@ -1,15 +1,18 @@
 """Commands on measured logs: inspect, identify, diagnose."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from jaxbl import workers
 from jaxbl.errors import InputError
-from jaxbl.terminal import running
+from jaxbl.lines import Step
+from jaxbl.terminal import call_again, running
 
+from .next_steps import LogCall, after_diagnosis, after_identification, after_proposal
 from .options import (
     FORMATS,
     LogArgument,
@@ -51,6 +54,7 @@ def inspect(
 
         table, gear_ratio, nominal = read_log_config(model)
     guesses: list[str] = []
+    steps = [] if write is None else after_proposal(log, write)
     if write is None:
         found = inspect_log(log, table, gear_ratio=gear_ratio, nominal=nominal)
     else:
@@ -60,7 +64,7 @@ def inspect(
         study, guesses, found = propose(log, given, gear_ratio=gear_ratio, nominal=nominal)
     folder = folder_of(log, out)
     claim_log_folder(folder, log, overwrite=overwrite)
-    lines = write_inspection_report(found, folder)
+    lines = write_inspection_report(found, folder, steps)
     if write is not None:
         import tomli_w
 
@@ -71,8 +75,8 @@ def inspect(
             *guesses,
         ]
         write_atomic(write, "".join(f"# {remark}\n" for remark in remarks) + tomli_w.dumps(study))
-        lines += ["", f"{write}: a first model. Run: jaxbl identify {log} --model {write}", *guesses]
-    return Outcome(lines, folder, summary="inspection.json")
+        lines += ["", f"{write}: a first model.", *guesses]
+    return Outcome(lines, folder, summary="inspection.json", steps=steps)
 
 
 def identify(
@@ -105,10 +109,10 @@ def identify(
             raise InputError("identify: several logs; of a transmission on a test rig one log is fitted at a time")
         if profile:
             raise InputError(
-                "identify: --profile is for drives; intervals of a transmission on a test rig are by a jackknife"
+                "identify: --profile is for drives; a transmission on a test rig has intervals without it; leave it out"
             )
         if next_experiment is not None:
-            raise InputError("identify: --next-experiment is for drives; a transmission on a test rig is loaded to and fro")
+            raise InputError("identify: --next-experiment is for drives, not for a transmission on a test rig; leave it out")
         return _identify_element(log[0], table, gear_ratio, holdout, folder_of(log[0], out), overwrite)
     from jaxbl.files import results_of
     from jaxbl.identification.identify import read_identification_task, run_identification
@@ -120,17 +124,25 @@ def identify(
 
         check_gap_sought(task)
     folder = folder_of(log[0], out)
+    given = LogCall(log, model, holdout, next_experiment)
+
+    def steps(summary: Mapping[str, Any]) -> list[Step]:
+        return after_identification(task, summary, call_again(context, folder), folder, given)
+
     with running(context, model, folder, unit="steps", kept=False) as progress:
-        file = folder / "identification.json"
         summary = results_of(
-            task, file, lambda task: run_identification(task, progress), write_identification_report, overwrite=overwrite
+            task,
+            folder / "identification.json",
+            lambda task: run_identification(task, progress),
+            lambda found, folder: write_identification_report(found, folder, steps(found.summary)),
+            overwrite=overwrite,
         )
     lines = identification_lines(summary)
     if next_experiment is not None:
         from jaxbl.diagnosis.next_experiment import write_gap_experiment
 
         lines += write_gap_experiment(folder, summary, task.record, next_experiment, max_torque, max_travel)
-    return Outcome(lines, folder, summary=summary)
+    return Outcome(lines, folder, summary=summary, steps=steps(summary))
 
 
 def _identify_element(
@@ -181,7 +193,8 @@ def diagnose(
         folder = out if out is not None else Path("results") / batch.name
         return _diagnose_batch(context, batch, model, folder, jobs, overwrite, scheduler)
     if jobs is not None or scheduler is not None:
-        raise InputError(f"{'--scheduler' if jobs is None else '--jobs'} goes with --batch: one log is one process's work")
+        option = "--scheduler" if jobs is None else "--jobs"
+        raise InputError(f"{option} goes with --batch: one log is one process's work; leave it out, or give a folder")
     if not log:
         raise InputError("diagnose: no log; give one or several of one machine, or a folder with --batch")
     if model is None:
@@ -193,10 +206,18 @@ def diagnose(
 
     task = read_diagnosis_task(log, model, holdout=holdout)
     folder = folder_of(log[0], out)
+    given = LogCall(log, model, holdout, next_experiment)
+
+    def steps(summary: Mapping[str, Any]) -> list[Step]:
+        return after_diagnosis(task, summary, call_again(context, folder), folder, given)
+
     with running(context, model, folder, unit="steps", kept=False) as progress:
-        file = folder / "diagnosis.json"
         summary = results_of(
-            task, file, lambda task: run_diagnosis(task, progress), write_diagnosis_report, overwrite=overwrite
+            task,
+            folder / "diagnosis.json",
+            lambda task: run_diagnosis(task, progress),
+            lambda found, folder: write_diagnosis_report(found, folder, steps(found.summary)),
+            overwrite=overwrite,
         )
     lines = diagnosis_lines(summary)
     if next_experiment is not None:
@@ -204,7 +225,7 @@ def diagnose(
 
         write = write_gap_experiment if "backlash" in summary else write_next_experiment
         lines += write(folder, summary, task.record, next_experiment, max_torque, max_travel)
-    return Outcome(lines, folder, summary=summary)
+    return Outcome(lines, folder, summary=summary, steps=steps(summary))
 
 
 def _check_limits(next_experiment: Path | None, torque: float | None, travel: float | None) -> None:

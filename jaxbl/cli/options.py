@@ -54,4 +54,4 @@ def check_new(file: Path, option: str) -> None:
     if file.exists():
         raise InputError(f"{file}: is there already; {option} needs a new name")
     if not file.parent.is_dir():
-        raise InputError(f"{file}: there is no folder {file.parent}")
+        raise InputError(f"{file}: there is no folder {file.parent}; make it first, or write elsewhere")

@@ -3,7 +3,7 @@
 import functools
 import inspect
 import json as json_format
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -11,6 +11,7 @@ import typer
 
 from jaxbl.errors import InputError, NoResult, printable
 from jaxbl.files import listed, read_json
+from jaxbl.lines import Step, lines_of
 from jaxbl.terminal import INTERRUPTED
 
 QuietOption = Annotated[bool, typer.Option("--quiet", help="print neither progress nor what was found, errors alone")]
@@ -26,6 +27,7 @@ class Outcome(NamedTuple):
         page: what is to be opened, in the folder; "" for nothing.
         summary: the same as data, or the file in the folder that has it.
         code: exit code.
+        steps: what to try next.
     """
 
     lines: list[str]
@@ -33,11 +35,12 @@ class Outcome(NamedTuple):
     page: str = "report.html"
     summary: Mapping[str, Any] | str | None = None
     code: int = 0
+    steps: Sequence[Step] = ()
 
     def text(self) -> list[str]:
-        """The lines, and what is to be opened."""
+        """The lines, what to try next, and what is to be opened."""
         opened = [str(self.folder / self.page)] if self.folder is not None and self.page else []
-        return [printable(part) for line in [*self.lines, *opened] for part in line.split("\n")]
+        return [printable(part) for line in [*self.lines, *lines_of(self.steps), *opened] for part in line.split("\n")]
 
     def data(self) -> dict[str, Any]:
         """The same as plain data, and the files in the folder; of a sweep's parts there may be millions."""
@@ -47,6 +50,8 @@ class Outcome(NamedTuple):
             found["folder"] = str(self.folder)
             found["open"] = str(self.folder / self.page) if self.page else None
             found["files"] = [str(file) for file in files if not file.name.startswith(".")]
+        if self.steps:
+            found["next"] = [one._asdict() for one in self.steps]
         if self.summary is not None:
             folder = self.folder or Path()
             found["summary"] = read_json(folder / self.summary) if isinstance(self.summary, str) else self.summary

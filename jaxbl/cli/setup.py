@@ -1,79 +1,124 @@
 """Commands before the work: init, schema, doctor, demo, bench."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
 
 from jaxbl import workers
-from jaxbl.datasheet import ITEMS, Given, Item, first_study, remark
+from jaxbl.datasheet import KINDS, NONE, Given, Item, first_study, named_items, option_of, remark
 from jaxbl.errors import InputError
 from jaxbl.files import write_atomic
-from jaxbl.terminal import answers, running, two_columns, working
+from jaxbl.lines import described
+from jaxbl.terminal import answers, running, working
 
+from .next_steps import after_demo, after_init
 from .options import BackendOption, OutOption, check_new
 from .outcome import Outcome, with_options
-from .studies import sweep
+from .studies import compute, read_study
 
+T = TypeVar("T")
 NewArgument = Annotated[Path, typer.Argument(metavar="[NEW.toml]", help="file to be written", show_default="drive.toml")]
+
+_KINDS_SAID = "; ".join(f"{name}: {kind.about}" for name, kind in KINDS.items()) + " [default: asked for, or geared]"
 
 
 def init(
     context: typer.Context,
     file: NewArgument = Path("drive.toml"),
+    kind: Annotated[str | None, typer.Option(metavar="KIND", help=_KINDS_SAID, show_default=False)] = None,
     title: Annotated[str, typer.Option(metavar="TEXT", help="headline of its report")] = "",
     **given: str | None,
 ) -> Outcome:
-    """Write a first study from a drive's data sheet: what no option says is asked for."""
+    """Write a first study from a drive's data sheet: what no option says is asked for.
+
+    Numbers have units, as in the examples. A unit that is not known here is answered with those that are.
+    """
     check_new(file, "init")
-    values = {one.name: one.read(text) for one in ITEMS if (text := given[one.name]) is not None}
-    if answers():
-        if len(values) < len(ITEMS):
+    asking, said = answers(), {name: text for name, text in given.items() if text is not None}
+    name = (_asked_kind() if asking else next(iter(KINDS))) if kind is None else _kind(kind)
+    items = KINDS[name].items
+    if others := [option_of(one) for one in said if one not in {item.name for item in items}]:
+        has, rest = ", ".join(item.option for item in items), ", ".join(kind for kind in KINDS if kind != name)
+        raise InputError(f"{', '.join(others)}: not asked of --kind {name}, which has: {has}; other kinds: {rest}")
+    values = {one.name: one.read(said[one.name]) for one in items if one.name in said}
+    if asking:
+        if len(values) < len(items):
             typer.echo("Numbers of the data sheet with their units; Enter takes what is in brackets.", err=True)
-        values = {one.name: values.get(one.name) or _asked(one) for one in ITEMS}
-    elif missing := [one for one in ITEMS if one.name not in values and not one.default]:
+        values = {one.name: values.get(one.name) or _asked_number(one) for one in items}
+    elif missing := [one for one in items if one.name not in values and not one.default]:
         wanted = ", ".join(f"{one.option} '{one.example}'" for one in missing)
-        raise InputError(f"init: these numbers are missing, here with examples: {wanted}; on a terminal they are asked for")
-    values = {one.name: values.get(one.name) or one.left_out() for one in ITEMS}
+        other = "" if kind else f"; another kind of drive: --kind {', '.join(list(KINDS)[1:])}"
+        raise InputError(
+            f"init: these numbers are missing, here with examples: {wanted}; on a terminal they are asked for{other}"
+        )
+    values = {one.name: values.get(one.name) or one.left_out() for one in items}
     workers.start_jax()
     with working(context, "running a pilot for the gains"):
-        text, found = first_study(values, title or file.stem)
+        text, found = first_study(KINDS[name], values, title or file.stem)
     check_new(file, "init")
     write_atomic(file, text)
     bounds = {side: one["f_plus"] for side, one in found.items()}
-    said = ", ".join(f"{bound:.3g} rad/s² ({side})" for side, bound in bounds.items())
+    largest = ", ".join(f"{bound:.3g} {KINDS[name].unit(side, 'rad/s²')} ({side})" for side, bound in bounds.items())
     lines = [
-        f"{file}: a study with comments. Gains by the usual rule, for unknown accelerations up to {said}.",
-        *([said] if (said := remark(values, found)) else []),
-        "Next:",
-        f"  jaxbl simulate {file}   one run, with figures",
-        f"  jaxbl sweep {file} --out results/{file.stem}_map   which gains work",
-        f"  jaxbl tune {file} --out results/{file.stem}_gains   the best ones",
+        f"{file}: a study with comments. Gains by the usual rule, for unknown accelerations up to {largest}.",
+        *([rest] if (rest := remark(KINDS[name], values, found)) else []),
     ]
-    data = {"file": str(file), "given": {name: one._asdict() for name, one in values.items()}, "f_plus": bounds}
-    return Outcome(lines, summary=data)
+    data = {
+        "file": str(file),
+        "kind": name,
+        "given": {name: one._asdict() for name, one in values.items()},
+        "f_plus": bounds,
+    }
+    return Outcome(lines, summary=data, steps=after_init(file))
 
 
-def _asked(item: Item) -> Given:
-    """What the user answers; asked again where that is no such number."""
+def _kind(text: str) -> str:
+    """The name of a kind of drive."""
+    name = text.strip().lower()
+    if name not in KINDS:
+        raise InputError(f"--kind '{text}': should be one of {', '.join(KINDS)}; jaxbl init --help says what they are")
+    return name
+
+
+def _asked_kind() -> str:
+    """The kind of drive that the user names; asked again where there is no such kind."""
+    typer.echo("Kinds of drives:", err=True)
+    for line in described((f"  {name}", kind.about) for name, kind in KINDS.items()):
+        typer.echo(line, err=True)
+    return _asked("kind of this drive", next(iter(KINDS)), _kind)
+
+
+def _asked_number(item: Item) -> Given:
+    """The number that the user says."""
+    other = f", or {NONE}" * item.absent
+    question = f"{item.asked}, such as {item.example}{other}"
+    return _asked(question, item.default, lambda text: item.left_out() if text == item.default else item.read(text))
+
+
+def _asked(question: str, default: str, read: Callable[[str], T]) -> T:
+    """What the user answers; asked again where it cannot be read."""
     while True:
-        known = ", ".join(unit for unit in item.units if unit)
-        question = f"{item.asked}, such as {item.example}{f' (units: {known})' if known else ''}"
-        text = typer.prompt(question, default=item.default or None, err=True)
         try:
-            return item.left_out() if text == item.default else item.read(text)
+            return read(typer.prompt(question, default=default or None, err=True))
         except InputError as error:
             typer.echo(f"  {error}", err=True)
 
 
-def _option(item: Item) -> object:
-    known = ", ".join(unit for unit in item.units if unit)
-    default = f" [default: {item.default}]" if item.default else ""
-    about = f"{item.asked}, such as '{item.example}'{f'; units: {known}' if known else ''}{default}"
-    return Annotated[str | None, typer.Option(item.option, metavar="VALUE", help=about, show_default=False)]
+def _option(items: list[tuple[str, Item]]) -> object:
+    """The option of items of one name: what each kind of drive understands by it."""
+    said: dict[str, list[str]] = {}
+    for kind, item in items:
+        default = f" [default: {item.default}]" if item.default else ""
+        other = f" or '{NONE}'" * item.absent
+        said.setdefault(f"{item.asked}, such as '{item.example}'{other}{default}", []).append(kind)
+    every = len(said) == 1 and len(items) == len(KINDS)
+    about = ". ".join(text if every else f"{', '.join(kinds)}: {text}" for text, kinds in said.items())
+    return Annotated[str | None, typer.Option(items[0][1].option, metavar="VALUE", help=about, show_default=False)]
 
 
-with_options(init, init, {item.name: _option(item) for item in ITEMS}, None)
+with_options(init, init, {name: _option(items) for name, items in named_items().items()}, None)
 
 
 def schema(
@@ -101,7 +146,7 @@ def doctor(context: typer.Context) -> Outcome:
 
         findings = examine()
     bad = [one.name for one in findings if not one.good]
-    lines = two_columns((one.name, one.found if one.good else f"FAILED: {one.found}") for one in findings)
+    lines = described((one.name, one.found if one.good else f"FAILED: {one.found}") for one in findings)
     lines.append(f"Not in order: {', '.join(bad)}." if bad else "All in order.")
     return Outcome(lines, summary={"findings": [one._asdict() for one in findings]}, code=1 if bad else 0)
 
@@ -113,15 +158,10 @@ def demo(
 ) -> Outcome:
     """Run the gain map of the README: 49 152 runs of a geared drive, some seconds to a minute."""
     config = _shipped("gain_map.toml")
-    found = sweep(context, config, out, backend=backend)
-    folder = found.folder
-    lines = [
-        *found.lines,
-        f"Open the page below in a browser. The study is {folder}/study.toml. To go on:",
-        f"  jaxbl simulate {folder}/study.toml --out results/one_run   one of its runs",
-        "  jaxbl init drive.toml   a study of your own drive, from its data sheet",
-    ]
-    return found._replace(lines=lines)
+    study, chosen = read_study(config, backend)
+    from jaxbl.sweeps.sweep import sweep
+
+    return compute(context, config, study, out, False, chosen, sweep, "sweep", after_demo)
 
 
 def _shipped(name: str) -> Path:

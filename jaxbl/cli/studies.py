@@ -5,7 +5,7 @@ import functools
 import math
 import sys
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,8 +15,10 @@ import typer
 from jaxbl import workers
 from jaxbl.errors import InputError, printable
 from jaxbl.files import Busy, place
+from jaxbl.lines import Step, described
 from jaxbl.terminal import duration, is_quiet, naming, running, until_interrupted, working
 
+from .next_steps import after_sweep
 from .options import (
     BackendOption,
     ConfigArgument,
@@ -83,7 +85,7 @@ def sweep(
         raise InputError("--detach: needs the --scheduler of a cluster that stays when this command has ended")
     if detach and (overwrite or verify_store):
         raise InputError("--detach: does not go with --overwrite or --verify-store; choose another folder with --out")
-    study, chosen = _study(config, backend)
+    study, chosen = read_study(config, backend)
     from jaxbl.report.checks import check_figures
     from jaxbl.sweeps.metrics import metric_columns
     from jaxbl.sweeps.points import Points
@@ -97,7 +99,7 @@ def sweep(
         if dry_run:
             return _expected_cost(study, chosen)
     run = functools.partial(run_sweep, verify_store=verify_store, scheduler=scheduler)
-    collect = functools.partial(_compute, context, config, study, out, overwrite, chosen, run, "sweep")
+    collect = functools.partial(compute, context, config, study, out, overwrite, chosen, run, "sweep", after_sweep)
     if detach or which is not None:
         from jaxbl.sweeps.sweep import share as run_share
         from jaxbl.sweeps.sweep import submit
@@ -125,7 +127,9 @@ def _share(text: str | None, others: dict[str, bool]) -> tuple[int, int] | None:
         return None
     for name, given in others.items():
         if given:
-            raise InputError(f"--share: does not go with {name}: other processes may be at work in the folder")
+            raise InputError(
+                f"--share: does not go with {name}: other processes may be at work in the folder; leave one of them out"
+            )
     number, _, count = text.partition("/")
     if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
         raise InputError(f"--share {text}: should be I/N, such as 2/8: the second of eight")
@@ -169,16 +173,18 @@ def _expected_cost(study: "Config", backend: "Backend | None") -> Outcome:
 
     cost = dry_run(study, backend=backend)
     refined = study.sweep.refine is not None
-    lines = [f"points       {cost.points}{' on the coarse grid' if refined else ''} ({cost.rows} runs with all seeds)"]
+    rows = [("points", f"{cost.points}{' on the coarse grid' if refined else ''} ({cost.rows} runs with all seeds)")]
     if refined:
-        lines.append(f"refinement   at most {cost.most_points} points; as many as the boundaries need, not counted below")
+        most = f"at most {cost.most_points} points; as many as the borders need, not counted below"
+        rows.append(("refinement", most))
     rate = f"{cost.lane_steps_per_second:.2g} lane-steps/s measured, backend {cost.backend}"
-    lines += [
-        f"chunks       {cost.chunks} of {cost.lanes_a_chunk} lanes",
-        f"memory       {cost.megabytes:.1f} MB a chunk",
-        f"compilation  about {duration(cost.compile_seconds)}",
-        f"run          about {duration(cost.run_seconds)} ({rate})",
+    rows += [
+        ("chunks", f"{cost.chunks} of {cost.lanes_a_chunk} lanes"),
+        ("memory", f"{cost.megabytes:.1f} MB a chunk"),
+        ("compilation", f"about {duration(cost.compile_seconds)}"),
+        ("run", f"about {duration(cost.run_seconds)} ({rate})"),
     ]
+    lines = described(rows)
     return Outcome(lines, summary=vars(cost))
 
 
@@ -191,11 +197,11 @@ def tune(
     scheduler: SchedulerOption = None,
 ) -> Outcome:
     """Choose lambda and alpha of both observers: gains.toml, comparison, report. Continues an interrupted search."""
-    study, chosen = _study(config, backend)
+    study, chosen = read_study(config, backend)
     from jaxbl.gains.tune import tune as run_tune
 
     run = functools.partial(run_tune, scheduler=scheduler)
-    return _compute(context, config, study, out, overwrite, chosen, run, "tune")
+    return compute(context, config, study, out, overwrite, chosen, run, "tune")
 
 
 def verify(
@@ -207,14 +213,14 @@ def verify(
     scheduler: SchedulerOption = None,
 ) -> Outcome:
     """Test the gain conditions by simulation: counterexamples, maps, report. Continues an interrupted verification."""
-    study, chosen = _study(config, backend)
+    study, chosen = read_study(config, backend)
     from jaxbl.gains.verify import verify as run_verify
 
     run = functools.partial(run_verify, scheduler=scheduler)
-    return _compute(context, config, study, out, overwrite, chosen, run, "verify")
+    return compute(context, config, study, out, overwrite, chosen, run, "verify")
 
 
-def _study(config: Path, backend: str | None) -> tuple["Config", "Backend | None"]:
+def read_study(config: Path, backend: str | None) -> tuple["Config", "Backend | None"]:
     """A study, and the backend that is asked for."""
     workers.start_jax()
     from jaxbl.sweeps.programs import backend_of
@@ -242,7 +248,7 @@ def _extent(result: "StudyResult") -> dict[str, Any]:
     return {"title": result.config.title, "runs": result.runs, "finished": result.is_finished(result.runs)}
 
 
-def _compute(
+def compute(
     context: typer.Context,
     config: Path,
     study: "Config",
@@ -251,8 +257,12 @@ def _compute(
     backend: "Backend | None",
     run: Callable[..., Any],
     command: str,
+    steps: Callable[[Any, Path], Sequence[Step]] | None = None,
 ) -> Outcome:
-    """Run a command on a study that continues where an interrupted call stopped, write its report, and say what it took."""
+    """Run a command on a study that continues where an interrupted call stopped, write its report, and say what it took.
+
+    `steps` says what to try next, of the result and the folder.
+    """
     folder = folder_of(config, out)
     with running(context, config, folder) as progress:
         result = run(study, folder, progress=progress, overwrite=overwrite, backend=backend)
@@ -261,14 +271,15 @@ def _compute(
     with working(context, "drawing"):
         # what draws is loaded when there is something to be drawn
         report = import_module(f"jaxbl.report.{command}")
-        lines = getattr(report, f"write_{command}_report")(result, folder)
+        following = [] if steps is None else steps(result, folder)
+        lines = getattr(report, f"write_{command}_report")(result, folder, *([following] if following else []))
     cost = getattr(result, "cost", None)
     if cost and cost["lanes"]:
         compiling, computing = duration(cost["compile_seconds"]), duration(cost["run_seconds"])
         lines.append(f"Compiled in {compiling}, ran {cost['lanes']:.0f} lanes in {computing}.")
     lines += (SCANNED % what for what in result.scanned)
     lines += (f"Damaged, and computed anew: {what}" for what in getattr(result, "damaged", ()))
-    return Outcome(lines, folder, summary=_SUMMARIES.get(command) or _extent(result))
+    return Outcome(lines, folder, summary=_SUMMARIES.get(command) or _extent(result), steps=following)
 
 
 def plot(
@@ -294,7 +305,8 @@ def plot(
             raise InputError(f"{config}: is not the study in {folder}; only title, notes and figures may differ")
         result = dataclasses.replace(result, config=study)
     with working(context, "drawing"):
-        return Outcome(write_sweep_report(result, where), where, summary=_extent(result))
+        steps = after_sweep(result, where)
+        return Outcome(write_sweep_report(result, where, steps), where, summary=_extent(result), steps=steps)
 
 
 def explore(

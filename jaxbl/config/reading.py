@@ -13,7 +13,7 @@ from jaxbl.errors import InputError
 from jaxbl.records import NominalDrive
 from jaxbl.records.reader import read_log_table
 from jaxbl.records.table import LogTable
-from jaxbl.validation import Key, brief, check_file, check_sizes, first_error
+from jaxbl.validation import Key, brief, check_file, check_sizes, first_error, no_such_file
 
 from .study import Config, nearest_path, numeric_paths
 
@@ -141,15 +141,15 @@ def _load(path: Path) -> dict[str, Any]:
         check_sizes(data)
         return data
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
+        raise InputError(f"{path}: {no_such_file(path, ['.toml'])}") from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; a TOML file is needed") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: is not text in UTF-8; a TOML file is needed") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+        raise InputError(f"{path}: cannot be read: {error.strerror}; mend the access to it") from None
     except RecursionError:
-        raise InputError(f"{path}: tables or arrays are nested too deep") from None
+        raise InputError(f"{path}: tables or arrays are nested too deep; a study needs five within one another") from None
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     # numbers of thousands of digits are a ValueError of another kind
@@ -176,7 +176,7 @@ def _included(
         try:
             path.stat()
         except OSError as error:
-            why = "no such file" if isinstance(error, FileNotFoundError) else error.strerror
+            why = no_such_file(path, [".toml"]) if isinstance(error, FileNotFoundError) else error.strerror
             raise InputError(f"{name}: include: {path}: {why}") from None
         if path.resolve() in chain:
             raise InputError(f"{name}: include: {path} includes this file in turn; files should not include one another")

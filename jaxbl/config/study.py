@@ -146,14 +146,14 @@ def _check_sides(config: Config) -> None:
     if rigid and config.transmission is not None:
         raise wrong("[transmission] has no meaning on a rigid drive; remove it, or use drive.kind = 'two_inertia'")
     if not rigid and config.transmission is None:
-        raise wrong("[transmission] is missing: a two_inertia drive needs a law")
+        raise wrong("[transmission] is missing: a two_inertia drive needs one, such as law = 'dead_zone'")
     others = () if config.tune is None else config.tune.compare
     gains = {"observer": config.observer} | {f"tune.compare[{i}]": other for i, other in enumerate(others)}
     for name, table in gains.items():
         if rigid and table.load is not None:
             raise wrong(f"{name}.load has no meaning on a rigid drive; remove it")
         if not rigid and table.load is None:
-            raise wrong(f"{name}.load is missing: a two_inertia drive has a load observer")
+            raise wrong(f"{name}.load is missing: a two_inertia drive has a load observer; give its lambda and alpha")
     for i, mark in enumerate(config.verify.marks):
         if rigid and mark.side == "load":
             raise wrong(f"verify.marks[{i}].side: 'load' has no meaning on a rigid drive; it should be 'motor'")

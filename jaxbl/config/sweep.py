@@ -65,7 +65,7 @@ class SweepTable(Table):
             raise wrong("metrics should name at least one, e.g. 'converged'; leave it out for all")
         for name in self.metrics or ():
             if self.metrics is not None and self.metrics.count(name) > 1:
-                raise wrong(f"metrics names '{name}' twice")
+                raise wrong(f"metrics names '{name}' twice; once is enough")
         if self.refine is not None and self.design != "grid":
             raise wrong(f"refine needs design = 'grid'; points of a {self.design} design have no neighbours")
         return self

@@ -205,6 +205,14 @@ def extended_study(
     return with_values(read_config(data), values)
 
 
+def tied(summary: Mapping[str, Any]) -> tuple[str, str] | None:
+    """The last finding that has an alternative, and that; None where nothing is tied."""
+    findings = summary["findings"]
+    if not findings or "rival" not in summary or not findings[-1]["alternatives"]:
+        return None
+    return findings[-1]["effect"], summary["rival"]["effect"]
+
+
 def rival_tables(config: Config, own: Sequence[Free], rival: Model) -> dict[str, Any]:
     """The best model with another effect, as tables of a study."""
     data = extended_study(config, rival.numbers, free_values(own, rival.theta)).resolved()

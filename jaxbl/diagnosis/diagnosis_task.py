@@ -72,11 +72,16 @@ def _long(record: Record) -> Record:
     return dataclasses.replace(record, segments=parts)
 
 
+def can_hold_out(record: Record) -> bool:
+    """Whether a log is long enough for a quarter of it to be held out."""
+    return HELD_OUT * sum(part.stop - part.start for part in record.segments) >= _LEAST_SAMPLES
+
+
 def split_off_last_quarter(record: Record) -> tuple[Record, Record]:
     """The samples to be fitted, and those held out: the last of the log, at their own times."""
     total = sum(part.stop - part.start for part in record.segments)
     left = round((1.0 - HELD_OUT) * total)
-    if HELD_OUT * total < _LEAST_SAMPLES:
+    if not can_hold_out(record):
         raise InputError(
             f"{record.path}: {total} samples are too few to hold a quarter of them out; at least "
             f"{int(np.ceil(_LEAST_SAMPLES / HELD_OUT))} are needed, or another log: --holdout"

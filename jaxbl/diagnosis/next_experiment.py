@@ -27,6 +27,7 @@ from jaxbl.identification.unseen_load import GAPS
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment, trajectory
 
+from .diagnosis_summary import tied
 from .neutral_effects import with_added
 
 _KINDS = "sine", "multisine", "chirp", "steps"
@@ -161,7 +162,7 @@ def _written(found: Input, record: Record, path: Path) -> str:
         path.parent.mkdir(parents=True, exist_ok=True)
         pd.DataFrame({"t": time, "u": found.torque}).to_csv(path, index=False, float_format="%.9g")
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+        raise InputError(f"{path}: cannot be written: {error.strerror}; name another file") from None
     clear = "" if found.apart > _DECISIVE else ": too little; --max-torque and --max-travel allow for more"
     unit = unit_on(record, "motor.torque", "N m")
     mean = f" about a mean of {found.mean:.3g} {unit}" if found.mean else ""
@@ -169,14 +170,6 @@ def _written(found: Input, record: Record, path: Path) -> str:
         f"{found.kind} of {found.amplitude:.3g} {unit}{mean}, {found.frequency:.3g} Hz, "
         f"{time[-1] + record.sample_period:.3g} s; it would separate them by up to {found.apart:.2g} nats{clear}: {path}"
     )
-
-
-def tied(summary: Mapping[str, Any]) -> tuple[str, str] | None:
-    """The last finding that has an alternative, and that; None where nothing is tied."""
-    findings = summary["findings"]
-    if not findings or "rival" not in summary or not findings[-1]["alternatives"]:
-        return None
-    return findings[-1]["effect"], summary["rival"]["effect"]
 
 
 def next_experiment(

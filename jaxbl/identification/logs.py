@@ -211,7 +211,7 @@ def _checked(config: Config, record: Record) -> Record:
     if "motor" not in record.positions:
         raise InputError(
             f"{record.path}: no motor position ({POSITION_CHANNELS['motor']}), which a {config.drive.kind} drive needs; "
-            f"the log has {', '.join(record.positions)}"
+            f"the log has {', '.join(record.positions)}; [log] theta_e can name its column"
         )
     if config.drive.kind == "two_inertia" and "load" not in record.positions:
         if record.torque is None:

@@ -90,7 +90,7 @@ def free_parameters(experiment: Experiment, paths: Sequence[str], torque: float)
         if path not in known:
             raise InputError(f"'{path}' is no number of the plant; fitted can be: {', '.join(known)}")
         if path in paths[: len(free)]:
-            raise InputError(f"'{path}' is named twice")
+            raise InputError(f"'{path}' is named twice; once is enough")
         nominal, about = float(get_leaf(experiment, path)), known[path]
         positive = is_positive(about)
         if positive and nominal <= 0.0:

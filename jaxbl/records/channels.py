@@ -171,7 +171,7 @@ def _torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamps, *,
             row = int(np.argmax(np.abs(values)))
             raise file.wrong(
                 f"column {column!r}, data row {stamps.rows[row] + 1}: {values[row]:g} exceeds [log] {name}.saturation = "
-                f"{table.saturation:g}"
+                f"{table.saturation:g}; saturation should be the largest value that there can be"
             )
         saturated = float(np.mean(np.abs(values) >= table.saturation * (1.0 - 1e-9)))
     factor = 1.0 if table.factor is None else table.factor

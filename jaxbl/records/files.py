@@ -23,7 +23,7 @@ import pandas as pd
 
 from jaxbl.errors import InputError, printable
 from jaxbl.registry import Registry
-from jaxbl.validation import LARGEST, check_file, nearest
+from jaxbl.validation import LARGEST, check_file, nearest, no_such_file
 
 from .libraries import Column, Columns, read_bag, read_mcap, read_mdf, read_tdms
 
@@ -205,11 +205,11 @@ def read_log_file(path: Path, wanted: Collection[str | int] = ()) -> LogFile:
             columns.update(named)
         return LogFile(path, columns)
     except FileNotFoundError:
-        why = "no such file"
+        why = no_such_file(path, log_endings())
     except IsADirectoryError:
         why = "is a folder; a log file is needed"
     except OSError as error:
-        why = f"cannot be read: {error.strerror or error}"
+        why = f"cannot be read: {error.strerror or error}; mend the access to it"
     except InputError as error:
         why = str(error)
     raise InputError(f"{path}: {why}")
@@ -319,7 +319,7 @@ def _reading(kind: str, *passed: type[Exception]) -> Iterator[None]:
         raise
     except Exception as error:
         first = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"cannot be read as {kind}: {first}") from None
+        raise InputError(f"cannot be read as {kind}: {first}; write it anew, or as CSV") from None
 
 
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eEdD][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)

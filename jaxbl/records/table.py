@@ -250,9 +250,11 @@ class LogTable(StrictTable):
         if "theta_e" in absent and "theta_s" in absent:
             raise wrong("absent: a log without theta_e and theta_s has no position; one of them is needed")
         if self.theta_e is not None and self.theta_e.skew == "estimate":
-            raise wrong("theta_e.skew: 'estimate' is for theta_s, whose skew is found against theta_e")
+            raise wrong(
+                "theta_e.skew: 'estimate' is for theta_s, whose skew is found against theta_e; give that of theta_e in s"
+            )
         if self.theta_s is not None and self.theta_s.skew == "estimate" and "theta_e" in absent:
-            raise wrong("theta_s.skew: 'estimate' needs theta_e, which is said to be absent")
+            raise wrong("theta_s.skew: 'estimate' needs theta_e, which is said to be absent; give the skew in s")
         return self
 
     def columns(self) -> set[str | int]:

@@ -5,6 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from jaxbl.files import write_atomic
+from jaxbl.lines import table
 from jaxbl.throughput.run import CEILING, OURS, PRECISIONS, SCAN, BenchResult
 
 from .figures import COLOURS, Drawn, style, subplots
@@ -59,38 +60,34 @@ def _curve(result: BenchResult) -> Drawn:
     return Drawn("lanes", figure, caption)
 
 
-def _table(result: BenchResult) -> list[list[str]]:
-    """Header and rows of the table, as text."""
-    rows = [["", "bits", "lanes", "lane-steps/s", "median", "of C++", "first call", "deviation"]]
+def _table(result: BenchResult, precision: str) -> list[list[str]]:
+    """Header and rows of the table of one precision, as text."""
+    rows = [[precision, "lanes", "best", "median", "of C++", "first", "off by"]]
+    ceiling = result.speed(CEILING, precision)
     for row in result.rows:
-        ceiling = result.speed(CEILING, row.precision)
-        share = f"{row.lane_steps_per_second / ceiling:.2g}" if ceiling else "–"
-        speeds = f"{row.lane_steps_per_second:.3g}", f"{row.median_lane_steps_per_second:.3g}", share
-        rows.append(
-            [row.name, row.precision[-2:], str(row.lanes), *speeds, f"{row.first_seconds:.2f} s", f"{row.deviation:.1g}"]
-        )
+        if row.precision == precision:
+            share = f"{row.lane_steps_per_second / ceiling:.2g}" if ceiling else "–"
+            speeds = f"{row.lane_steps_per_second:.3g}", f"{row.median_lane_steps_per_second:.3g}", share
+            rows.append([row.name, str(row.lanes), *speeds, f"{row.first_seconds:.2f} s", f"{row.deviation:.1g}"])
     return rows
 
 
 def throughput_lines(result: BenchResult) -> list[str]:
     """The benchmark for the terminal."""
-    rows = _table(result)
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = [
-        "  ".join(cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True)))
-        for row in rows
-    ]
+    lines = ["Lane-steps/s, best and median of the calls; time of the first call; deviation of the results."]
+    for precision in PRECISIONS:
+        lines += ["", *table(_table(result, precision), numbers=True)]
     machine, study = result.machine, result.study[0]
     on = f"{machine['processor']}, {machine['cores']} cores; jax {machine['versions']['jax']}"
     lines.insert(0, f"{on}; {result.rows[0].steps} samples a run")
     lines += ["", f"A small study from nothing, {study['lanes']} lanes of {study['steps']} samples, {study['precision']}:"]
-    lines += [f"  {row['name'].ljust(widths[0])}  {row['seconds']:.2f} s" for row in result.study]
+    lines += table([(f"  {row['name']}", f"{row['seconds']:.2f} s") for row in result.study], numbers=True)
     if result.studies:
-        lines += ["", "Studies as they stand, float64, several seeds, every metric of a run, all cores:"]
+        lines += ["", "Studies as they stand, float64, every metric, all cores; lane-steps/s:"]
     for row in result.studies:
-        about = f"{row['name']}, {row['seeds']} seeds of {row['lanes']} lanes of {row['steps']} samples"
+        about = f"{row['name']}, {row['seeds']} seeds of {row['lanes']} lanes"
         share = f"{row['jaxbl'] / row['c++']:.2g}"
-        lines.append(f"  {about}: jaxbl {row['jaxbl']:.3g} lane-steps/s, C++ {row['c++']:.3g}, {share} of it")
+        lines.append(f"  {about}: jaxbl {row['jaxbl']:.3g}, C++ {row['c++']:.3g}, {share} of it")
     lines += [f"{name}: left out, {why}" for name, why in result.left_out.items()]
     return lines
 

@@ -19,6 +19,7 @@ from matplotlib.patches import Patch
 
 from jaxbl.config import Config, is_boolean, numeric_paths
 from jaxbl.files import json_text, write_atomic
+from jaxbl.lines import COLUMNS, table
 from jaxbl.sweeps.compare import FALSE, Comparison, MetricChange
 from jaxbl.sweeps.metrics import metric_of
 
@@ -26,7 +27,6 @@ from .figures import COLOURS, MISSING, Drawn, style, subplots, with_unit
 from .maps import cell_edges, hatch_failures, is_log
 from .page import save_all
 
-_WIDTH = 80
 _FIGURE = "comparison"
 _PANELS = 3
 _LISTED = 12
@@ -98,8 +98,8 @@ def _metric_lines(comparison: Comparison) -> list[str]:
     if numbers and numbers[0].most is not None:
         lines += ["", *_changed_most(comparison, numbers[0])]
     if numbers:
-        head = f"{'metric':29}{'points':>7}{'better':>7}{'worse':>7}  factor (99 %)"
-        lines += ["", head, *(_row(one) for one in numbers[: 2 * _LISTED])]
+        head = "metric", "points", "better", "worse", "factor (99 %)"
+        lines += ["", *table([head, *map(_row, numbers[: 2 * _LISTED])])]
         if len(numbers) > 2 * _LISTED:
             lines.append(f"and {len(numbers) - 2 * _LISTED} more, in comparison.json")
     for i, side in enumerate(comparison.names):
@@ -145,13 +145,14 @@ def _direction(one: MetricChange) -> str:
     return f", better at {better}, worse at {worse}"
 
 
-def _row(one: MetricChange) -> str:
+def _row(one: MetricChange) -> tuple[str, ...]:
     up, down = one.up, one.count - one.up
     better, worse = ("–", "–") if not one.better else (up, down) if one.better == "more" else (down, up)
-    factor = f"  {one.moved.value:.3g}" if math.isfinite(one.moved.value) else "  –"
+    factor = f"{one.moved.value:.3g}" if math.isfinite(one.moved.value) else "–"
     if not math.isnan(one.moved.low):
         factor += f" ({one.moved.low:.3g} to {one.moved.high:.3g})"
-    return f"{one.metric:29}{one.count:>7}{better:>7}{worse:>7}{factor}"
+    # numbers end below one another, factors begin so
+    return one.metric, f"{one.count:>6}", f"{better:>6}", f"{worse:>5}", factor
 
 
 def _share(value: float) -> str:
@@ -171,7 +172,7 @@ def _listed(items: list[str]) -> list[str]:
 
 
 def _wrapped(text: str, indent: str) -> str:
-    wrapped = textwrap.wrap(text, _WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    wrapped = textwrap.wrap(text, COLUMNS, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
     return "\n".join(wrapped)
 
 

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.identification.logs import unit_on
+from jaxbl.lines import Step
 
 from .figures import COLOURS, FAINT, MISSING, Drawn, decades, legend, stacked, style, subplots, with_unit
 from .motor_alone_figures import draw_motor_alone
@@ -22,14 +23,15 @@ _CHANNELS = {
 }  # fmt: skip
 
 
-def write_diagnosis_report(found: Diagnosis, folder: Path) -> list[str]:
+def write_diagnosis_report(found: Diagnosis, folder: Path, steps: Sequence[Step] = ()) -> list[str]:
     """Write `diagnosis.json`, `model.toml`, `trace.parquet`, figures and report into a folder that exists.
 
-    They are put there together when all are drawn. Returns the lines for the terminal.
+    They are put there together when all are drawn; the page says what to try next (`steps`). Returns the lines for the
+    terminal.
     """
     tables = [*_finding_tables(found.summary), _gap_table(found.summary["gap"]), _number_table(found.summary)]
     lead, remarks = _headline(found.summary), _remarks(found.summary)
-    return write_log_results(found, folder, "diagnosis", lead, draw_diagnosis(found), tables, remarks)
+    return write_log_results(found, folder, "diagnosis", lead, draw_diagnosis(found), tables, remarks, steps)
 
 
 def diagnosis_lines(summary: dict[str, Any]) -> list[str]:

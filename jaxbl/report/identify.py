@@ -1,20 +1,23 @@
 """What `jaxbl identify` leaves to be read: numbers with intervals, and what the log shows of motion, torque and gap."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from jaxbl.identification.identify import Identification
 from jaxbl.identification.search import NOISE_ALONE
+from jaxbl.lines import Step
 
 from .figures import SIDES
 from .identify_figures import draw_identification
 from .page import PageTable, write_log_results
 
 
-def write_identification_report(found: Identification, folder: Path) -> list[str]:
+def write_identification_report(found: Identification, folder: Path, steps: Sequence[Step] = ()) -> list[str]:
     """Write `identification.json`, `model.toml`, `trace.parquet`, figures and report into a folder that exists.
 
-    They are put there together when all are drawn. Returns the lines for the terminal.
+    They are put there together when all are drawn; the page says what to try next (`steps`). Returns the lines for the
+    terminal.
     """
     tables = [_parameter_table(found.summary)]
     if "regression" in found.summary["method"]:
@@ -22,7 +25,7 @@ def write_identification_report(found: Identification, folder: Path) -> list[str
     if found.summary["method"]["recursive"]:
         tables.append(_recursive_table(found))
     lead, remarks = _headline(found.summary), _remarks(found.summary)
-    return write_log_results(found, folder, "identification", lead, draw_identification(found), tables, remarks)
+    return write_log_results(found, folder, "identification", lead, draw_identification(found), tables, remarks, steps)
 
 
 def identification_lines(summary: dict[str, Any]) -> list[str]:

@@ -8,6 +8,7 @@ import numpy as np
 import tomli_w
 
 from jaxbl.files import plain, write_atomic
+from jaxbl.lines import Step, described, table
 from jaxbl.records import POSITION_CHANNELS, Inspection, Record
 from jaxbl.records.inspection import main_side, velocity
 from jaxbl.records.signal_quality import longest, low_passed, spectrum
@@ -18,8 +19,8 @@ from .page import PageTable, write_report
 
 _POINTS = 6000
 """Points of a line: a page is about 1000 pixels wide."""
-_LINES = 25
-"""Lines printed at most: a terminal shows about that many."""
+_LINES, _REMARKS = 25, 3
+"""Lines that a terminal shows, about; and lines of remarks that are printed beyond that, too."""
 _CHANNELS = {
     "u": ("input u", COLOURS[6]), "theta_e": ("motor θe", COLOURS[0]), "theta_s": ("load θs", COLOURS[1]),
     "transmitted": ("transmitted", COLOURS[2]),
@@ -27,8 +28,11 @@ _CHANNELS = {
 """Label and colour of each channel."""
 
 
-def write_inspection_report(inspection: Inspection, folder: Path) -> list[str]:
-    """Write `inspection.json`, figures and report into a folder that exists. Returns the lines for the terminal."""
+def write_inspection_report(inspection: Inspection, folder: Path, steps: Sequence[Step] = ()) -> list[str]:
+    """Write `inspection.json`, figures and report into a folder that exists; the page says what to try next (`steps`).
+
+    Returns the lines for the terminal.
+    """
     record = inspection.record
     text = json.dumps(plain(inspection.to_dict()), indent=2, ensure_ascii=False)
     write_atomic(folder / "inspection.json", text)
@@ -37,9 +41,9 @@ def write_inspection_report(inspection: Inspection, folder: Path) -> list[str]:
         PageTable("What the log can identify", ["quantity", "", "why"], judgements),
         PageTable("Channels", _CHANNEL_COLUMNS, list(_channel_rows(record))),
     ]
-    table = tomli_w.dumps({"log": inspection.log.model_dump(exclude_none=True)})
+    how = tomli_w.dumps({"log": inspection.log.model_dump(exclude_none=True)})
     lead = [*record.warnings, _headline(record), inspection.as_read()]
-    write_report(folder, record.path.name, lead, draw_inspection(inspection), tables, table, record.notes)
+    write_report(folder, record.path.name, lead, draw_inspection(inspection), tables, how, record.notes, steps)
     return summary(inspection)
 
 
@@ -65,21 +69,17 @@ def _channel_rows(record: Record) -> Iterator[tuple[str, ...]]:
 
 
 def summary(inspection: Inspection) -> list[str]:
-    """The log in at most 25 lines: channels, what can be identified, what was done."""
+    """The log: channels and what can be identified, in tables of 80 columns, and as many remarks as there is room for."""
     record = inspection.record
     lines = [*record.warnings, f"{record.path.name}: {_headline(record)}", inspection.as_read(), ""]
-    lines += _aligned([_CHANNEL_COLUMNS, *_channel_rows(record)])
-    lines += ["", *_aligned([("identifies", "", ""), *((j.quantity, j.answer, j.why) for j in inspection.judgements)])]
-    room = _LINES - len(lines) - 1
+    columns = list(zip(_CHANNEL_COLUMNS, *_channel_rows(record), strict=True))
+    lines += table(zip(*(column for column in columns if {*column[1:]} != {"–"}), strict=True))
+    lines += ["", *described([("identifies", "", ""), *((j.quantity, j.answer, j.why) for j in inspection.judgements)])]
+    room = max(_LINES - len(lines) - 1, _REMARKS)
     notes = list(record.notes)
     if len(notes) > room:
         notes = [*notes[: room - 1], f"... and {len(notes) - room + 1} more remarks in the report"]
     return [*lines, *([""] if notes else []), *notes]
-
-
-def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 @style()

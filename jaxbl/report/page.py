@@ -21,6 +21,7 @@ import numpy as np
 import tomli_w
 
 from jaxbl.files import json_text, write_atomic, writing
+from jaxbl.lines import Step
 
 from .figures import Drawn, save
 from .picture import Picture, picture
@@ -48,13 +49,14 @@ def write_report(
     tables: Sequence[PageTable],
     config: str,
     remarks: Sequence[str] = (),
+    steps: Sequence[Step] = (),
 ) -> list[str]:
-    """Write figures into `figures/`, and `report.html` with what was found (`lead`) and remarks in sentences.
+    """Write figures into `figures/`, and `report.html` with what was found (`lead`), remarks, and what to try next.
 
     Returns lead and remarks, the lines for the terminal.
     """
     save_all(drawn, folder)
-    page = html(title, lead, remarks, [(one.name, picture(one)) for one in drawn], tables, config)
+    page = html(title, lead, remarks, [(one.name, picture(one)) for one in drawn], tables, config, steps)
     write_atomic(folder / "report.html", page)
     return [*lead, *remarks]
 
@@ -76,6 +78,7 @@ def write_log_results(
     drawn: Sequence[Drawn],
     tables: Sequence[PageTable],
     remarks: Sequence[str],
+    steps: Sequence[Step] = (),
 ) -> list[str]:
     """Write the summary (`name`.json), `model.toml`, `trace.parquet`, figures and report into a folder that exists.
 
@@ -83,7 +86,9 @@ def write_log_results(
     for the terminal.
     """
     title = found.config.title or f"{_TITLES[name]} {found.record.path.name}"
-    return write_results(folder, name, title, found.summary, found.trace, _model_text(found), lead, drawn, tables, remarks)
+    return write_results(
+        folder, name, title, found.summary, found.trace, _model_text(found), lead, drawn, tables, remarks, steps
+    )
 
 
 def write_results(
@@ -97,13 +102,14 @@ def write_results(
     drawn: Sequence[Drawn],
     tables: Sequence[PageTable],
     remarks: Sequence[str],
+    steps: Sequence[Step] = (),
 ) -> list[str]:
     """As :func:`write_log_results`, of anything that has a summary, a trace and a model in TOML."""
     with writing(folder), TemporaryDirectory(dir=folder, prefix=".draft.") as place:
         draft = Path(place)
         trace.to_parquet(draft / "trace.parquet", index=False)
         (draft / "model.toml").write_text(model, encoding="utf-8")
-        lines = write_report(draft, title, lead, drawn, tables, model, remarks)
+        lines = write_report(draft, title, lead, drawn, tables, model, remarks, steps)
         write_atomic(draft / f"{name}.json", json_text(summary))
         for file in sorted(draft.rglob("*"), key=lambda one: one.name == f"{name}.json"):
             if file.is_file():
@@ -128,6 +134,7 @@ def html(
     pictures: Sequence[tuple[str, Picture]],
     tables: Sequence[PageTable],
     config: str,
+    steps: Sequence[Step] = (),
 ) -> str:
     """The whole page. Figures have names; the first line of the lead is the answer."""
     style, script = (files("jaxbl.report").joinpath(name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
@@ -137,6 +144,8 @@ def html(
     parts = [f'<p class="{rank}">{escape(line)}</p>' for rank, line in zip(ranks, lead, strict=False)]
     if remarks:
         parts += ["<h2>Remarks</h2><ul>", *(f"<li>{escape(line)}</li>" for line in remarks), "</ul>"]
+    if steps:
+        parts += ["<h2>What to try next</h2><dl>", *map(_step, steps), "</dl>"]
     if pictures:
         parts += ["<h2>Figures</h2>", *(_figure(name, one) for name, one in pictures)]
     parts += map(_table, tables)
@@ -149,6 +158,10 @@ def html(
 {chr(10).join(parts)}
 </main><footer>{escape(_origin())}</footer><script>{script}</script></body></html>
 """
+
+
+def _step(one: Step) -> str:
+    return f"<dt>{escape(one.answers)}</dt><dd><pre>{escape(one.command)}</pre></dd>"
 
 
 def _figure(name: str, shown: Picture) -> str:

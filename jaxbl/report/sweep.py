@@ -5,15 +5,17 @@
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from jaxbl.config import Config, numeric_paths
 from jaxbl.files import write_atomic
 from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law, accuracy_laws
+from jaxbl.lines import Step
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
@@ -24,10 +26,16 @@ from .maps import draw
 from .page import PageTable, write_report
 
 
-def write_sweep_report(result: StudyResult, folder: Path) -> list[str]:
+def write_sweep_report(result: StudyResult, folder: Path, steps: Sequence[Step] = ()) -> list[str]:
     """Write figures, `report.html`, and `laws.json` if figures ask for laws, into a study's folder.
 
-    Returns the lines for the terminal.
+    Args:
+        result: the study.
+        folder: that exists.
+        steps: what the page says of what to try next.
+
+    Returns:
+        The lines for the terminal.
     """
     laws = accuracy_laws(result)
     drawn = draw(result, laws)
@@ -39,8 +47,28 @@ def write_sweep_report(result: StudyResult, folder: Path) -> list[str]:
     lead = [*_headline(result, survey), *_law_lines(laws)]
     tables = [*([_law_table(laws)] if laws else []), _axes_table(survey), _metric_table(result)]
     config = result.config
-    write_report(folder, config.title or "Study", lead, drawn, tables, config.to_toml(), config.notes)
+    answer, *more = lead
+    shown = [answer, _studied(config, survey), *more]
+    write_report(folder, config.title or "Study", shown, drawn, tables, config.to_toml(), config.notes, steps)
     return lead
+
+
+_DRIVES = {"two_inertia": "a drive of two inertias", "rigid": "a rigid drive"}
+
+
+def _studied(config: Config, found: "_Survey") -> str:
+    """What was varied, in a sentence."""
+    units, varied = numeric_paths(config), []
+    for path, values in found.values.items():
+        if not pd.api.types.is_numeric_dtype(values):
+            varied.append(f"{path} ({', '.join(map(str, values))})")
+        elif len(values) > 1:
+            unit = f" {units[path].unit}" if path in units else ""
+            varied.append(f"{path} ({len(values)} values, {values.min():.4g} to {values.max():.4g}{unit})".rstrip())
+    over = f", over {', '.join(varied)}" if varied else ""
+    seeds = f", each with {config.sweep.seeds} sequences of encoder noise" if config.sweep.seeds > 1 else ""
+    run = f"{config.run.duration:g} s, sampled every {1e3 * config.run.sample_period:g} ms"
+    return f"Studied: {_DRIVES[config.drive.kind]} in runs of {run}{over}{seeds}."
 
 
 class _Survey:

@@ -145,7 +145,7 @@ def compute(bundle: Bundle) -> _Done:
     with locked(folder, shared=True, wait=_SEEN):
         store = Store.open(folder, keeps_manifest=False)
         if store.manifest["identity"] != bundle.identity:
-            raise InputError(f"{folder}: holds another study by now")
+            raise InputError(f"{folder}: holds another study by now; begin again with another --out")
         engine = _engine(*bundle[:-1])
         engine.compile_seconds = engine.run_seconds = 0.0
         run = Run(engine, store)

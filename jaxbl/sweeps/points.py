@@ -164,7 +164,9 @@ class Points:
             if axis.path not in self.leaves:
                 raise InputError(f"axes: '{axis.path}' is fixed at compile time; list its values instead of sampling it")
             if axis.zip is not None:
-                raise InputError(f"axes: '{axis.path}' is sampled quasi-randomly and cannot be zipped")
+                raise InputError(
+                    f"axes: '{axis.path}' is sampled quasi-randomly and cannot be zipped; leave zip out, or list its values"
+                )
         blocks: list[AxisColumns] = []
         labels: dict[str, int] = {}
         for axis in config.axes:
@@ -180,7 +182,8 @@ class Points:
                 block, values = blocks[labels[axis.zip]], axis.grid()
                 if len(values) != (others := _length(block)):
                     raise InputError(
-                        f"axes: '{axis.path}' has {len(values)} values, the others zipped as '{axis.zip}' have {others}"
+                        f"axes: '{axis.path}' has {len(values)} values, the others zipped as '{axis.zip}' have {others}; "
+                        "they should have equally many"
                     )
                 block[axis.path] = values
         for label, index in labels.items():
@@ -228,7 +231,8 @@ def _criterion(config: Config, base: Config, metrics: list[str], refined: list[s
         converged = [name for name in metrics if name.endswith(".converged")]
         if not converged:
             raise InputError(
-                "sweep.refine_metric is missing: neighbours are compared in 'converged', which sweep.metrics lacks"
+                "sweep.refine_metric is missing: neighbours are compared in 'converged', which sweep.metrics lacks; "
+                "add it there, or name another metric"
             )
         of_gains = [
             name for name in converged if any(path.startswith(f"observer.{name.partition('.')[0]}.") for path in refined)

@@ -243,7 +243,10 @@ class Store:
                 raise
             raise InputError(f"{path}: is damaged; 'jaxbl repair {folder}' writes it anew by what the parts say") from None
         if manifest.get("format") != FORMAT:
-            raise InputError(f"{path}: has format {manifest.get('format')}; this version reads {FORMAT}")
+            raise InputError(
+                f"{path}: has format {manifest.get('format')}; this version reads {FORMAT}; read it with the jaxbl "
+                "that wrote it, or sweep anew into another folder"
+            )
         return cls(folder, manifest, keeps_manifest=keeps_manifest)
 
     @property

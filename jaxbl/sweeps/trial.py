@@ -144,7 +144,7 @@ def _summary(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed
 def _remarks(experiment: Experiment, last: dict[str, Any], metrics: dict[str, Any], conditions: dict[str, Any]) -> list[str]:
     """What a reader of the figures should know, in sentences."""
     if not metrics["finite"]:
-        return ["The run diverged: its figures are not finite."]
+        return ["The run diverged: its figures are not finite. Look at units; more [run] substeps are more stable."]
     remarks = []
     what = "the disturbance torque" if experiment.transmission is None else "the transmitted torque |C|"
     largest = last["last.largest_torque"]

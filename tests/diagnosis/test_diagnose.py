@@ -12,8 +12,9 @@ import jaxbl.diagnosis.diagnosis_summary as summary_module
 import jaxbl.diagnosis.effect_search as explain
 from jaxbl.config import read_config
 from jaxbl.diagnosis.diagnose import diagnose, new_search, run_diagnosis
+from jaxbl.diagnosis.diagnosis_summary import tied
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task, split_off_last_quarter
-from jaxbl.diagnosis.next_experiment import next_experiment, tied, write_next_experiment
+from jaxbl.diagnosis.next_experiment import next_experiment, write_next_experiment
 from jaxbl.diagnosis.observer_residual import observed_torques
 from jaxbl.diagnosis.proof import is_better
 from jaxbl.diagnosis.setup import set_up

@@ -12,7 +12,7 @@ from jaxbl.throughput.run import CEILING, OURS, SCAN, BenchResult, Row
 def result():
     rows = []
     for precision, speed in (("float32", 2e9), ("float64", 5e8)):
-        for name, share in ((CEILING, 1.0), (OURS, 0.8), (SCAN, 0.2), ("NumPy, one lane", 1e-5)):
+        for name, share in ((CEILING, 1.0), (OURS, 0.8), (SCAN, 0.2), ("diffrax, Euler, one device", 1e-5)):
             row = Row(name, precision, 1000, 100, 1.5, 1e-12, seconds=[1e5 / speed / share, 2e5 / speed / share])
             rows.append(row)
     curve = [
@@ -40,7 +40,11 @@ def test_the_table_says_who_where_and_how_far_from_the_ceiling(result):
     lines = throughput_lines(result)
     assert lines[0].startswith("a processor, 2 cores; jax 1.0; 100 samples")
     ours = next(line for line in lines if line.startswith(OURS))
-    assert ours.split()[4:] == ["32", "1000", "1.6e+09", "1.07e+09", "0.8", "1.50", "s", "1e-12"]
+    assert lines[3].split() == ["float32", "lanes", "best", "median", "of", "C++", "first", "off", "by"]
+    assert ours.split()[4:] == ["1000", "1.6e+09", "1.07e+09", "0.8", "1.50", "s", "1e-12"]
+    # those of both precisions below one another, within a terminal
+    assert [line.split()[0] for line in lines if "lanes  " in line] == ["float32", "float64"]
+    assert all(len(line) <= 80 for line in lines[3:])
     assert lines[-1] == "numba, prange: left out, no numba; pip install 'jaxbl[bench]'"
     assert any("1.25 s" in line for line in lines)
     assert any("gain_map, 4 seeds of 12288 lanes" in line and line.endswith("C++ 1e+08, 0.9 of it") for line in lines)

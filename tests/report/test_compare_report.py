@@ -46,6 +46,9 @@ def test_command_writes_text_json_and_figure(folders, called):
     code, output = called(*words)
     assert code == 0, output
     assert "excitation.amplitude: 0.1 -> 0.4" in output
+    assert all(len(line) <= 80 for line in output.splitlines() if "/" not in line)
+    head = next(i for i, line in enumerate(output.splitlines()) if line.split()[:2] == ["metric", "points"])
+    assert "motor.f_plus_acceleration" in "".join(output.splitlines()[head:])
     assert "Points: 6 in both; 0 in the first alone, 4 in the second alone." in output
     assert "Noise: by differences seed by seed, 4 seeds" in output
     data = json.loads((folders / "both" / "comparison.json").read_text())

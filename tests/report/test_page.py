@@ -12,6 +12,7 @@ from browser import check, needs_chromium, opened
 from small_study import ALPHA, LAMBDA, listed, made, rigid, small, spaced
 
 from jaxbl.files import write_atomic
+from jaxbl.lines import Step
 from jaxbl.report.page import PageTable, html
 from jaxbl.report.picture import Picture
 from jaxbl.report.simulate import write_trial_report
@@ -50,15 +51,15 @@ HOSTILE = "<script>alert('a')</script> & \"b\" <b>"
 def test_everything_is_escaped_and_in_its_place():
     shown = Picture(b"<svg>", (96, 48), HOSTILE, HOSTILE, [{"title": HOSTILE}])
     table = PageTable(HOSTILE, [HOSTILE, "n"], [[HOSTILE, 1.23456789], [None, True], ["x", float("nan")], ["y", 3]])
-    text = html(HOSTILE, [HOSTILE], [HOSTILE], [(HOSTILE, shown)], [table], f'title = "{HOSTILE}"')
+    text = html(HOSTILE, [HOSTILE], [HOSTILE], [(HOSTILE, shown)], [table], f'title = "{HOSTILE}"', [Step(HOSTILE, HOSTILE)])
     page = Page(text)
     # values of the figure, and the page's own
     assert page.tags.count("script") == 2
     assert "b" not in page.tags
     image = {"src": "data:image/svg+xml;base64,PHN2Zz4=", "alt": HOSTILE, "width": "96", "height": "48"}
     assert page.images == [image]
-    # title twice, lead, remark, caption, table's heading, head and cell, config
-    assert page.text.count(HOSTILE) == 9
+    # title twice, lead, remark, step and its question, caption, table's heading, head and cell, config
+    assert page.text.count(HOSTILE) == 11
     values = text.partition('<script type="application/json">')[2].partition("</script>")[0]
     assert json.loads(values) == [{"title": HOSTILE}]
     for cell in ("1.235", "–", "yes", "nan", ">3<"):
@@ -108,7 +109,7 @@ def test_page_of_a_run_and_its_files(tmp_path):
     assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8")) == trial.summary
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "trace.parquet"), trial.trace)
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
-    assert len(page.images) == 11
+    assert len(page.images) == 13
     assert (tmp_path / "report.html").stat().st_size < 5e6
     assert "b" not in page.tags and HOSTILE in lines
     for text in (*lines, "half_gap", "rms velocity error"):
@@ -119,7 +120,8 @@ def test_page_of_a_run_and_its_files(tmp_path):
 def test_figures_say_their_values_and_zoom_and_tables_sort(tmp_path):
     axes = [spaced(ALPHA, 1.0, 50.0, 5), spaced(LAMBDA, 1.0, 20.0, 4)]
     result = made(rigid(axes=axes), motor__velocity_rmse=lambda frame: frame[ALPHA] * frame[LAMBDA])
-    write_sweep_report(result, tmp_path)
+    long = Step(f"jaxbl explore {'a_long_folder/' * 30} --static page", "How do other metrics look?")
+    write_sweep_report(result, tmp_path, [long])
     with opened(tmp_path / "report.html", color_scheme="dark") as (page,):
         check(page, 1)
         view, values = page.locator(".view"), page.locator(".values")

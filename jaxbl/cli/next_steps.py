@@ -1,0 +1,139 @@
+"""What to try after a command, for its page and for the terminal: only what is open by what it found."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from jaxbl.files import is_remote
+from jaxbl.lines import Step, command_line
+
+if TYPE_CHECKING:
+    from jaxbl.identification.logs import LogTask
+    from jaxbl.sweeps.sweep import StudyResult
+
+
+def after_init(file: Path) -> list[Step]:
+    """What a first study from a data sheet can be given to."""
+    name = Path("results") / file.stem
+    return [
+        Step(command_line("simulate", file), "How do the drive and the estimates of its observers move? One run."),
+        Step(command_line("sweep", file, "--out", f"{name}_map"), "Which gains of the motor observer work? A map."),
+        Step(command_line("tune", file, "--out", f"{name}_gains"), "Which gains have the least error, and how large is it?"),
+    ]
+
+
+def after_demo(result: "StudyResult", folder: Path) -> list[Step]:
+    """As :func:`after_sweep`, and a study of one's own."""
+    steps, own = after_sweep(result, folder), Path("drive.toml")
+    if not own.exists():
+        steps.append(Step(command_line("init", own), "And my own drive? A study of it, from the numbers of its data sheet."))
+    return steps
+
+
+def after_sweep(result: "StudyResult", folder: Path) -> list[Step]:
+    """What can be asked of a sweep, and of its study, which its folder has, too."""
+    study = folder / "study.toml"
+    steps = [Step(command_line("explore", folder), "How do other metrics look, over other axes? Maps in the browser.")]
+    if is_remote(study):
+        return steps
+    gains = {f"observer.{side}.{gain}" for side in ("motor", "load") for gain in ("lambda", "alpha")}
+    if gains & {axis.path for axis in result.config.axes} and _all_converge_somewhere(result):
+        answers = "Which gains have the least error, and are they better than the usual rule?"
+        steps.append(Step(command_line("tune", study, "--out", f"{folder}_gains"), answers))
+    answers = "What happens over time? One run, with the numbers that the study itself has."
+    return [*steps, Step(command_line("simulate", study, "--out", f"{folder}_run"), answers)]
+
+
+def _all_converge_somewhere(result: "StudyResult") -> bool:
+    """Whether each observer converged in some run."""
+    wanted = {f"{side}.converged" for side in result.config.build().sides}
+    if not wanted <= set(result.columns):
+        return False
+    for frame in result.batches(sorted(wanted)):
+        wanted -= {name for name in wanted if bool(frame[name].to_numpy().any())}
+        if not wanted:
+            return True
+    return False
+
+
+def after_proposal(log: Path, model: Path) -> list[Step]:
+    """What a proposed model is for."""
+    answers = "Which numbers does the machine have, and how sure are they?"
+    return [Step(command_line("identify", log, "--model", model), answers)]
+
+
+def after_identification(
+    task: "LogTask", summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: "LogCall"
+) -> list[Step]:
+    """What is open after an identification.
+
+    Args:
+        task: what was done.
+        summary: its `identification.json`.
+        again: the words of this call, with the folder of its results.
+        folder: of the results.
+        given: what the call was about.
+    """
+    from jaxbl.diagnosis.diagnosis_task import can_hold_out
+    from jaxbl.identification.search import NOISE_ALONE
+
+    steps = []
+    if any(one["rms"] >= NOISE_ALONE * one["noise"] for one in summary["residual"].values()):
+        if given.holdout is not None or can_hold_out(task.record):
+            words = ("diagnose", *given.words(), "--out", f"{folder}_diagnosed")
+            steps.append(Step(command_line(*words), "What does the model lack? Its errors are larger than noise."))
+    elif _runs(task):
+        words = ("simulate", folder / "model.toml", "--out", f"{folder}_run")
+        steps.append(Step(command_line(*words), "How does the drive move with these numbers, and what do observers see?"))
+    return [*steps, *_gap_experiment(summary, again, folder, given), _along_the_log(folder)]
+
+
+def after_diagnosis(
+    task: "LogTask", summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: "LogCall"
+) -> list[Step]:
+    """What is open after a diagnosis; arguments as of :func:`after_identification`."""
+    from jaxbl.diagnosis.diagnosis_summary import tied
+
+    steps, model = _gap_experiment(summary, again, folder, given), folder / "model.toml"
+    pair = None if "backlash" in summary or given.next_experiment else tied(summary)
+    if pair is not None:
+        words = (*again, "--next-experiment", f"{folder}_next.csv")
+        steps.append(Step(command_line(*words), f"Is it {pair[0]} or {pair[1]}? An input that shows it."))
+    if summary["verdict"] == "no_discrepancy":
+        words = ("identify", *given.words(), "--out", f"{folder}_identified")
+        steps.append(Step(command_line(*words), "How sure are the model's numbers? 95 % intervals of each."))
+    if summary["findings"] and _runs(task):
+        words = ("simulate", model, "--out", f"{folder}_run")
+        steps.append(Step(command_line(*words), "How does the drive move with what was found? The extended study, run."))
+    return [*steps, _along_the_log(folder)]
+
+
+class LogCall(NamedTuple):
+    """What a command on logs was about: logs, model, log held out, and a file for the next experiment."""
+
+    logs: Sequence[Path]
+    model: Path
+    holdout: Path | None
+    next_experiment: Path | None
+
+    def words(self) -> list[object]:
+        """Logs and model on a command line."""
+        return [*self.logs, "--model", self.model, *(["--holdout", self.holdout] if self.holdout else [])]
+
+
+def _along_the_log(folder: Path) -> Step:
+    return Step(command_line("explore", folder), "Where along the log do model and machine differ? In the browser.")
+
+
+def _gap_experiment(summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: LogCall) -> list[Step]:
+    """The move that would show a gap to the motor's encoder alone, where the log does not."""
+    said = summary.get("backlash")
+    if said is None or said["shown"] or given.next_experiment is not None:
+        return []
+    words = (*again, "--next-experiment", f"{folder}_next.csv")
+    return [Step(command_line(*words), "Is there a gap? A move that shows it to the motor's encoder.")]
+
+
+def _runs(task: "LogTask") -> bool:
+    """Whether the model that is written has an input: its own, or that of a log without gaps."""
+    return "excitation" not in task.missing or len(task.record.segments) == 1
