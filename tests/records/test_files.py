@@ -420,7 +420,7 @@ def test_readers_of_installed_packages_read_the_files_of_their_ending(read, inst
         (lambda path: None, "the reader of .rec files should give columns of one dimension by name"),
         (lambda path: {"t": np.zeros((2, 2))}, "the reader of .rec files should give columns of one dimension by name"),
         (lambda path: {0: T}, "the reader of .rec files should give columns of one dimension by name"),
-        (lambda path: {}["t"], "cannot be read as a log by the reader of .rec files: 't'"),
+        (lambda path: {}["t"], "cannot be read as a log by the reader of .rec files: 't'; write it anew, or as CSV"),
     ],
 )
 def test_what_a_reader_of_a_package_does_wrong_is_one_line(found, said, installed, tmp_path):

@@ -99,16 +99,23 @@ def point_of(config: Config, asked: Any) -> tuple[Config, int]:
 
 
 def simulated(config: Config, asked: Any) -> dict[str, Any]:
-    """One run of a study, for its page: metrics, traces (float32 in base64), the path of each error, the point as TOML.
+    """One run of a study, for its page: metrics, those with gains that differ in the last digit (`nearby`), traces (float32
+    in base64), the path of each error, the point as TOML.
     Arguments and errors as of :func:`point_of`."""
     point, seed = point_of(config, asked)
     trial = run(point, seed=seed, backend="scan")
+    # under noise an observer may amplify rounding: how far figures go apart then
+    next_gains = {
+        f"observer.{side}.lambda": float(np.nextafter(one["lambda"], np.inf)) for side, one in _gains(point).items()
+    }
+    nearby = run(with_values(point, next_gains), seed=seed, backend="scan")
     every = -(-len(trial.trace) // _MOST_SAMPLES)
     trace = trial.trace.iloc[::every]
     planes = {side: error_path(trial.trace, side, found) for side, found in trial.summary["conditions"].items()}
     return {
         "every": every,
         "metrics": trial.summary["metrics"],
+        "nearby": nearby.summary["metrics"],
         "columns": {name: encoded(trace[name]) for name in _COLUMNS if name in trace},
         "planes": {
             side: {"error": encoded(one.error), "slope": encoded(one.slope),

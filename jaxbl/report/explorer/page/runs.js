@@ -72,12 +72,15 @@ class Runs {
     $("point").disabled = false;
     document.body.dataset.simulated = `${name}, ${Math.round(performance.now() - began)} ms`;
   }
-  /** A metric as stored and of this run: they differ where the run is not the one of the sweep. */
-  said({ metrics, every }, { metric: { name, label, yes, size }, value }) {
-    const raw = metrics[name], now = yes ? Number(raw) : raw === null ? NaN : size ? Math.abs(raw) : raw;
-    const same = Math.abs(now - value) <= 1e-3 * Math.abs(value) || (Number.isNaN(value) && !Number.isFinite(now));
-    const drawn = every > 1 ? ` Every ${every}th sample is drawn.` : "";
-    return (same ? `${label}: ${text(now)}, as stored in the sweep.` : `This run differs from the sweep's: ${label} is ${text(now)}, stored ${text(value)}.`) + drawn;
+  /** A metric as stored and of this run: they differ where rounding does, or where the run is not the one of the sweep. */
+  said({ metrics, nearby, every }, { metric: { name, label, yes, size }, value }) {
+    const [now, near] = [metrics[name], nearby[name]].map((raw) => (yes ? Number(raw) : raw === null ? NaN : size ? Math.abs(raw) : raw));
+    const apart = Math.abs(now - value), same = apart <= 1e-3 * Math.abs(value) || (Number.isNaN(value) && !Number.isFinite(now));
+    const drawn = every > 1 ? ` Every ${every}th sample is drawn.` : "", both = `${label} is ${text(now)}, stored ${text(value)}`;
+    if (same) return `${label}: ${text(now)}, as stored in the sweep.${drawn}`;
+    const by = Math.abs(now - near);
+    return (apart <= 4 * by ? `${both}. Rounding decides: with λ changed in its last digit it is ${text(near)}, as the observer amplifies it under noise.`
+      : `This run differs from the sweep's: ${both}.`) + drawn;
   }
   config() { return this.newest.config; }
   draw() {

@@ -1,0 +1,63 @@
+"""The pictures of docs/explore.md: `python docs/explore_pictures.py SWEEP DIAGNOSIS`, folders of `jaxbl sweep` on
+sweeps/gain_map.toml and of `jaxbl diagnose` as in docs/log_tutorial.md. Needs Chromium."""
+
+import shutil
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from jaxbl.report.explorer.folder import Source
+from jaxbl.report.explorer.log import log_source
+from jaxbl.report.explorer.server import served
+from jaxbl.report.explorer.study import study_source
+
+FIGURES = Path(__file__).parent / "figures"
+
+
+def opened(browser: Browser, url: str) -> Page:
+    """A page whose figures are drawn."""
+    page = browser.new_page(viewport={"width": 1000, "height": 700})
+    page.goto(url)
+    page.locator("body[data-drawn*=motor]").wait_for()
+    return page
+
+
+def sweep(page: Page) -> None:
+    """A map with a gain condition, and the run of a cell."""
+    page.select_option("#condition", "exact")
+    page.select_option("#at0", "2")
+    page.locator("body[data-drawn*=motor]").wait_for()
+    page.locator("#plot").click(position={"x": 420, "y": 300})
+    page.locator("body[data-simulated]").wait_for()
+    page.mouse.move(2, 2)
+    parts = page.locator("#plot").bounding_box(), page.locator("#traces figure").nth(2).bounding_box()
+    assert parts[0] is not None and parts[1] is not None
+    clip = {"x": 0, "y": 0, "width": 1000, "height": parts[1]["y"] + parts[1]["height"]}
+    page.screenshot(path=FIGURES / "explore_sweep.png", full_page=True, clip=clip)  # pyright: ignore[reportArgumentType]
+
+
+def log(page: Page) -> None:
+    """Missing torque, before and after."""
+    page.locator("#moment").fill("400")
+    part = page.locator("#over2").bounding_box()
+    assert part is not None
+    clip = {"x": 0, "y": 0, "width": 1000, "height": part["y"] + part["height"]}
+    page.screenshot(path=FIGURES / "explore_log.png", full_page=True, clip=clip)  # pyright: ignore[reportArgumentType]
+
+
+def draw(source: Source, picture: Callable[[Page], None]) -> None:
+    """Serve a page, and have its picture taken."""
+    with served(source) as server, sync_playwright() as playwright:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        picture(opened(browser, server.url))
+        browser.close()
+        server.shutdown()
+
+
+if __name__ == "__main__":
+    draw(study_source(sys.argv[1]), sweep)
+    draw(log_source(sys.argv[2]), log)
