@@ -1,7 +1,8 @@
 """A study in a browser: what its page needs, and single runs of it."""
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,14 +35,14 @@ def study_source(folder: str | Path) -> Source:
         now = open_study(folder)
         return write_study(now, out, headline(now), served=served)
 
-    def answer(asked: Any) -> dict[str, Any]:
+    def answer(to: Callable[[Config, Any], dict[str, Any]], asked: Any) -> dict[str, Any]:
         with one_at_a_time:
-            return simulated(result.config, asked)
+            return to(result.config, asked)
 
+    answers = {to.__name__: partial(answer, to) for to in (simulated, nearby)}
     first = {axis.path: axis.start if axis.values is None else axis.values[0] for axis in result.config.axes}
-    return Source(
-        headline(result), write, {"run": answer}, lambda: answer({"values": first, "seed": 0}), one_at_a_time.acquire
-    )
+    prepare = partial(answer, simulated, {"values": first, "seed": 0})
+    return Source(headline(result), write, answers, prepare, one_at_a_time.acquire)
 
 
 def write_study(result: StudyResult, out: Path, lead: Sequence[str], *, served: bool = False) -> bool:
@@ -99,23 +100,16 @@ def point_of(config: Config, asked: Any) -> tuple[Config, int]:
 
 
 def simulated(config: Config, asked: Any) -> dict[str, Any]:
-    """One run of a study, for its page: metrics, those with gains that differ in the last digit (`nearby`), traces (float32
-    in base64), the path of each error, the point as TOML.
+    """One run of a study, for its page: metrics, traces (float32 in base64), the path of each error, the point as TOML.
     Arguments and errors as of :func:`point_of`."""
     point, seed = point_of(config, asked)
     trial = run(point, seed=seed, backend="scan")
-    # under noise an observer may amplify rounding: how far figures go apart then
-    next_gains = {
-        f"observer.{side}.lambda": float(np.nextafter(one["lambda"], np.inf)) for side, one in _gains(point).items()
-    }
-    nearby = run(with_values(point, next_gains), seed=seed, backend="scan")
     every = -(-len(trial.trace) // _MOST_SAMPLES)
     trace = trial.trace.iloc[::every]
     planes = {side: error_path(trial.trace, side, found) for side, found in trial.summary["conditions"].items()}
     return {
         "every": every,
         "metrics": trial.summary["metrics"],
-        "nearby": nearby.summary["metrics"],
         "columns": {name: encoded(trace[name]) for name in _COLUMNS if name in trace},
         "planes": {
             side: {"error": encoded(one.error), "slope": encoded(one.slope),
@@ -124,6 +118,14 @@ def simulated(config: Config, asked: Any) -> dict[str, Any]:
         },
         "config": point.to_toml(),
     }  # fmt: skip
+
+
+def nearby(config: Config, asked: Any) -> dict[str, Any]:
+    """Metrics of a run whose gains λ differ in their last digit: how far apart they come by rounding, which an observer may
+    amplify under noise. Arguments and errors as of :func:`point_of`."""
+    point, seed = point_of(config, asked)
+    gains = {f"observer.{side}.lambda": float(np.nextafter(one["lambda"], np.inf)) for side, one in _gains(point).items()}
+    return {"metrics": run(with_values(point, gains), seed=seed, backend="scan").summary["metrics"]}
 
 
 def _about(config: Config, columns: list[str]) -> dict[str, Any]:

@@ -182,7 +182,7 @@ def swept(tmp_path_factory):
 
 
 def test_a_run_simulated_anew_is_that_of_its_config(swept):
-    found = study_source(swept).answers["run"]({"values": {NOISE: 1e-4, ALPHA: 50.0, LAMBDA: 1.0}, "seed": 0})
+    found = study_source(swept).answers["simulated"]({"values": {NOISE: 1e-4, ALPHA: 50.0, LAMBDA: 1.0}, "seed": 0})
     trial = run(tomllib.loads(found["config"]))
     assert trial.config.encoders.noise == 1e-4 and trial.config.observer.motor.alpha == pytest.approx(50.0)
     assert set(found["metrics"]) == set(trial.summary["metrics"])
@@ -213,7 +213,13 @@ VALUES = {NOISE: 1e-4, ALPHA: 50.0, LAMBDA: 1.0}
 )
 def test_points_that_the_study_may_not_have_are_refused(swept, asked, why):
     with pytest.raises(InputError, match=why):
-        study_source(swept).answers["run"](asked)
+        study_source(swept).answers["simulated"](asked)
+
+
+def test_gains_that_differ_in_the_last_digit_give_nearly_the_same(swept):
+    answers, asked = study_source(swept).answers, {"values": VALUES, "seed": 0}
+    found, near = (answers[name](asked)["metrics"]["motor.velocity_rmse"] for name in ("simulated", "nearby"))
+    assert near == pytest.approx(found, rel=1e-3)
 
 
 @needs_chromium
@@ -225,6 +231,7 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept, tmp_
             plot = page.locator("#plot")
             plot.click(position={"x": 200, "y": 100})
             page.wait_for_selector("body[data-simulated*='motor.alpha 50, motor.lambda 1, seed 0, ']")
+            page.locator("#told:has-text('sweep')").wait_for()
             told = page.locator("#told").inner_text()
             assert told.endswith("as stored in the sweep.")
             with page.expect_download() as download:

@@ -47,11 +47,15 @@ class Runs {
     $("told").textContent = "simulating …";
     $("point").disabled = true;
     const began = performance.now();
+    const ask = async (what) => {
+      const answer = await fetch(what, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ values, seed }) });
+      const found = await answer.json();
+      if (!answer.ok) throw new Error(found.error);
+      return found;
+    };
     let found;
     try {
-      const answer = await fetch("run", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ values, seed }) });
-      found = await answer.json();
-      if (!answer.ok) throw new Error(found.error);
+      found = await ask("simulated");
     } catch (error) {
       if (asked === this.asked) $("told").textContent = `Not simulated: ${error.message}`;
       return;
@@ -68,19 +72,20 @@ class Runs {
     this.newest = { ...found, name, columns, colour: free[0], pinned: false };
     this.all.push(this.newest);
     this.draw();
-    $("told").textContent = this.said(found, stored);
+    $("told").textContent = found.every > 1 ? `Every ${found.every}th sample is drawn.` : "";
     $("point").disabled = false;
     document.body.dataset.simulated = `${name}, ${Math.round(performance.now() - began)} ms`;
+    const compared = await this.compared(found, stored, ask);
+    if (asked === this.asked) $("told").textContent += compared;
   }
   /** A metric as stored and of this run: they differ where rounding does, or where the run is not the one of the sweep. */
-  said({ metrics, nearby, every }, { metric: { name, label, yes, size }, value }) {
-    const [now, near] = [metrics[name], nearby[name]].map((raw) => (yes ? Number(raw) : raw === null ? NaN : size ? Math.abs(raw) : raw));
-    const apart = Math.abs(now - value), same = apart <= 1e-3 * Math.abs(value) || (Number.isNaN(value) && !Number.isFinite(now));
-    const drawn = every > 1 ? ` Every ${every}th sample is drawn.` : "", both = `${label} is ${text(now)}, stored ${text(value)}`;
-    if (same) return `${label}: ${text(now)}, as stored in the sweep.${drawn}`;
-    const by = Math.abs(now - near);
-    return (apart <= 4 * by ? `${both}. Rounding decides: with λ changed in its last digit it is ${text(near)}, as the observer amplifies it under noise.`
-      : `This run differs from the sweep's: ${both}.`) + drawn;
+  async compared({ metrics }, { metric: { name, label, yes, size }, value }, ask) {
+    const number = (raw) => (yes ? Number(raw) : raw === null ? NaN : size ? Math.abs(raw) : raw), now = number(metrics[name]);
+    const apart = Math.abs(now - value), both = `${label} is ${text(now)}, stored ${text(value)}`;
+    if (apart <= 1e-3 * Math.abs(value) || (Number.isNaN(value) && !Number.isFinite(now))) return `${label}: ${text(now)}, as stored in the sweep.`;
+    const near = number((await ask("nearby")).metrics[name]);
+    return apart <= 4 * Math.abs(now - near) ? `${both}. Rounding decides: with λ changed in its last digit it is ${text(near)}, as the observer amplifies it under noise.`
+      : `This run differs from the sweep's: ${both}.`;
   }
   config() { return this.newest.config; }
   draw() {
