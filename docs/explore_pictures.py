@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Locator, Page, sync_playwright
 
 from jaxbl.report.explorer.folder import Source
 from jaxbl.report.explorer.log import log_source
@@ -33,19 +33,21 @@ def sweep(page: Page) -> None:
     page.locator("#plot").click(position={"x": 420, "y": 300})
     page.locator("body[data-simulated]").wait_for()
     page.mouse.move(2, 2)
-    parts = page.locator("#plot").bounding_box(), page.locator("#traces figure").nth(2).bounding_box()
-    assert parts[0] is not None and parts[1] is not None
-    clip = {"x": 0, "y": 0, "width": 1000, "height": parts[1]["y"] + parts[1]["height"]}
-    page.screenshot(path=FIGURES / "explore_sweep.png", full_page=True, clip=clip)  # pyright: ignore[reportArgumentType]
+    save(page, page.locator("#traces figure").nth(2), "explore_sweep.png")
 
 
 def log(page: Page) -> None:
     """Missing torque, before and after."""
     page.locator("#moment").fill("400")
-    part = page.locator("#over2").bounding_box()
-    assert part is not None
-    clip = {"x": 0, "y": 0, "width": 1000, "height": part["y"] + part["height"]}
-    page.screenshot(path=FIGURES / "explore_log.png", full_page=True, clip=clip)  # pyright: ignore[reportArgumentType]
+    save(page, page.locator("#over2"), "explore_log.png")
+
+
+def save(page: Page, last: Locator, name: str) -> None:
+    """A page down to an element."""
+    box = last.bounding_box()
+    assert box is not None
+    height = box["y"] + page.evaluate("window.scrollY") + box["height"]
+    page.screenshot(path=FIGURES / name, full_page=True, clip={"x": 0, "y": 0, "width": 1000, "height": height})
 
 
 def draw(source: Source, picture: Callable[[Page], None]) -> None:
