@@ -146,6 +146,10 @@ def test_values_regions_cuts_and_a_point_as_config(tmp_path):
         for key in ("ArrowRight", "Enter"):
             page.keyboard.press(key)
         assert page.locator("#chosen").is_visible()
+        where = page.locator("#where").inner_text()
+        # what is saved stays the chosen cell, whatever is looked at then
+        page.keyboard.press("ArrowLeft")
+        page.select_option("#at0", "0")
         with page.expect_download() as download:
             page.click("#point")
         (tmp_path / "out" / "point.toml").write_bytes(Path(download.value.path()).read_bytes())
@@ -163,9 +167,32 @@ def test_values_regions_cuts_and_a_point_as_config(tmp_path):
         assert Path(picture.value.path()).read_bytes().startswith(b"\x89PNG")
     config = read_config(tmp_path / "out" / "point.toml")
     assert config.encoders.noise == 1e-4 and config.axes == []
-    assert any(config.observer.motor.alpha == pytest.approx(one) for one in alphas)
+    motor = config.observer.motor
+    assert any(motor.alpha == pytest.approx(one) for one in alphas)
+    assert where.startswith(f"{NOISE}: 1e-4 rad, {ALPHA}: {motor.alpha:.4g} ")
+    assert f", {LAMBDA}: {motor.lambda_:.4g} " in where
     found = tomllib.loads((tmp_path / "gains.toml").read_text())["observer"]
     assert found == {"motor": {"lambda": config.observer.motor.lambda_, "alpha": config.observer.motor.alpha}}
+
+
+@needs_chromium
+def test_signs_whole_numbers_and_axes_in_any_order(tmp_path):
+    axes = [listed("run.substeps", 1, 2), spaced(ALPHA, 2.0, 50.0, 6), listed(LAMBDA, 20.0, 1.0, 5.0)]
+    result = made(rigid(axes=axes), motor__velocity_rmse=lambda frame: frame[ALPHA] - 10.0, motor__f_plus=lambda frame: 1.0)
+    with opened(write_static(source(result), tmp_path / "out")) as (page,):
+        page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {LAMBDA} {ALPHA}']")
+        # from the least to the largest, which no logarithm shows
+        assert page.locator("#map").get_attribute("aria-label").endswith("from -8 to 40")
+        # a curve goes from small to large
+        assert page.locator("#condition").count() == 0
+        page.locator("#plot").click(position={"x": 100, "y": 100})
+        with page.expect_download() as download:
+            page.click("#point")
+        (tmp_path / "out" / "point.toml").write_bytes(Path(download.value.path()).read_bytes())
+        # enlarged until numbers end
+        assert page.evaluate("ticks(1, 1 + Number.EPSILON, 5).length") <= 6
+    config = read_config(tmp_path / "out" / "point.toml")
+    assert (config.run.substeps, config.observer.motor.lambda_, config.observer.motor.alpha) == (1, 20.0, 50.0)
 
 
 SWEPT = rigid(
@@ -255,6 +282,18 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept, tmp_
             page.keyboard.press("ArrowRight")
             assert figures.first.locator(".values").inner_text().split("\n")[1] == "time: 0 s"
             check(page, 0)
+            # a run that the sweep has no figures of
+            one = "{ metric: { name: 'm', label: 'error', yes: false, size: true }, value: NaN }"
+            said = page.evaluate(f"new Runs({{}}).compared({{ metrics: {{ m: -2 }} }}, {one})")
+            assert said == "error: 2. The sweep has none: its run diverged, or is not there yet."
+            # points that cannot be read are told, and read later
+            page.route("**/points.parquet", lambda route: route.fulfill(status=206, body=b"nothing"))
+            page.select_option("#metric", "motor.position_rmse")
+            page.locator('#state:has-text("The study\'s points cannot be read")').wait_for()
+            page.unroute("**/points.parquet")
+            page.select_option("#metric", "motor.velocity_rmse")
+            page.select_option("#metric", "motor.position_rmse")
+            page.wait_for_selector("body[data-drawn^='motor.position_rmse ']")
         server.shutdown()
 
 

@@ -153,8 +153,8 @@ class Picture {
   scale() {
     const { log, metric } = this.view, { label, yes } = this.study.metric(metric);
     let values = this.panels.flatMap(({ shown }) => [...shown.values]);
-    // a scale of logarithms has no place for zeros
-    const positive = log && !yes ? values.filter((one) => one > 0) : [];
+    // a scale of logarithms has no place for zeros, and none for a sign
+    const positive = log && !yes && !values.some((one) => one < 0) ? values.filter((one) => one > 0) : [];
     if (positive.length) values = positive;
     return Scale.of(values, { colours: this.study.colours, label, ...(yes ? { low: 0, high: 1 } : {}), ...(log && !yes ? {} : { log: false }) });
   }
@@ -207,8 +207,9 @@ class Picture {
     const known = this.curved.map(({ bound }) => bound).filter((one) => one > 0);
     return known.length ? `f⁺ = ${known.map(text).join("; ")} rad/s²: the median of what is shown` : "";
   }
-  /** The side whose gains the axes are, if they are. */
+  /** The side whose gains the axes are, if they are, from small to large. */
   gains() {
+    if ([this.view.x, this.view.y].some(({ values }) => values.some((one, k) => k && !(one > values[k - 1])))) return null;
     const [a, b] = [this.view.x.name, this.view.y.name].sort(), side = a.split(".")[1];
     const both = a === `observer.${side}.alpha` && b === `observer.${side}.lambda`;
     return both && this.study.metric(`${side}.f_plus`) ? side : null;
@@ -328,11 +329,12 @@ globalThis.jaxblData = async (about) => {
   const study = new Study(about);
   head(about);
   const picture = new Picture(study), { view } = picture, plot = $("plot");
-  const runs = about.served ? new Runs(study) : null;
+  const runs = about.served ? new Runs(study) : null, update = reporting("The study's points", () => picture.update());
+  let chosen = null;
   $("hint").textContent = `Move over the map to read values. Drag to enlarge a region. Click a cell to cut through it${runs ? " and to simulate its run" : ""}. Grey: no value, as the run diverged or is not there yet.`;
   const form = () => {
     const dims = study.varied.filter((dim) => !dim.seed), drawn = () => [view.x, view.y, view.facet];
-    const changed = (act) => (value) => { act(value); form(); picture.update(); };
+    const changed = (act) => (value) => { act(value); form(); update(); };
     const pick = (label, id, options, chosen, act) => choose(label, id, options, chosen, changed(act));
     const forget = () => {
       picture.cursor = null;
@@ -378,12 +380,13 @@ globalThis.jaxblData = async (about) => {
     picture.cursor = found;
     picture.mark();
     $("chosen").hidden = false;
-    $("where").textContent = picture.lines(found).slice(1).join(", ");
+    chosen = picture.point();
+    const { values, seed, stored } = chosen;
+    $("where").textContent = pointWords(study.varied.filter((dim) => !dim.seed).flatMap((dim) => dim.paths), values) + (runs ? `, seed ${seed}` : "");
     picture.cuts = [cut($("cutx"), picture, 0), cut($("cuty"), picture, 1)];
     const several = study.varied.filter((dim) => ![view.x, view.y, view.facet].includes(dim) && view.at[dim.i] === "all" && !(dim.seed && !runs));
     const first = several.length ? ` It is the run of the first value of ${several.map((dim) => dim.name).join(", ")}.` : "";
     $("command").textContent = (runs ? "" : "Save the point beside study.toml, and simulate it: jaxbl simulate point.toml.") + first;
-    const { values, seed, stored } = picture.point();
     runs?.simulate(values, seed, stored);
   };
   plot.addEventListener("pointerdown", (event) => { if (picture.column) { picture.brush = [at(event), at(event)]; plot.setPointerCapture(event.pointerId); } });
@@ -401,7 +404,7 @@ globalThis.jaxblData = async (about) => {
     if (a && b && a.panel === b.panel && Math.hypot(brush[0][0] - brush[1][0], brush[0][1] - brush[1][1]) > 8) {
       view.from = [0, 1].map((i) => Math.min(a.cell[i], b.cell[i]));
       view.to = [0, 1].map((i) => Math.max(a.cell[i], b.cell[i]) + 1);
-      picture.update();
+      update();
     } else if (a) take(a);
     picture.mark();
   });
@@ -414,19 +417,15 @@ globalThis.jaxblData = async (about) => {
       picture.mark();
       $("state").textContent = picture.lines(picture.cursor).join("; ");
     } else if (event.key === "Enter" && picture.cursor) take(picture.cursor);
-    else if (event.key === "0") { picture.whole(); picture.update(); }
+    else if (event.key === "0") { picture.whole(); update(); }
     else return;
     event.preventDefault();
   });
-  $("whole").addEventListener("click", () => { picture.whole(); picture.update(); });
+  $("whole").addEventListener("click", () => { picture.whole(); update(); });
   $("picture").addEventListener("click", () => save("map.png", picture.canvas.toDataURL("image/png")));
-  $("point").addEventListener("click", () => saveText("point.toml", runs ? runs.config() : pointText(picture.point().values)));
-  $("gains").addEventListener("click", () => saveText("gains.toml", gainsText(study.gains, picture.point().values)));
-  addEventListener("resize", () => { picture.update(); for (const one of [...(picture.cuts ?? []), ...(runs?.plots ?? [])]) one.draw(); });
+  $("point").addEventListener("click", () => saveText("point.toml", runs ? runs.config() : pointText(chosen.values)));
+  $("gains").addEventListener("click", () => saveText("gains.toml", gainsText(study.gains, chosen.values)));
+  addEventListener("resize", () => { update(); for (const one of [...(picture.cuts ?? []), ...(runs?.plots ?? [])]) one.draw(); });
   picture.first();
-  try {
-    await picture.update();
-  } catch (error) {
-    $("state").textContent = `The study's points cannot be read: ${error.message}`;
-  }
+  await update();
 };
