@@ -177,8 +177,11 @@ def test_values_regions_cuts_and_a_point_as_config(tmp_path):
 
 @needs_chromium
 def test_signs_whole_numbers_and_axes_in_any_order(tmp_path):
-    axes = [listed("run.substeps", 1, 2), spaced(ALPHA, 2.0, 50.0, 6), listed(LAMBDA, 20.0, 1.0, 5.0)]
-    result = made(rigid(axes=axes), motor__velocity_rmse=lambda frame: frame[ALPHA] - 10.0, motor__f_plus=lambda frame: 1.0)
+    axes = [listed("run.substeps", 1, 2), listed("effects.1.torque", 0.25, 0.5), listed("effects.motor.cogging.harmonic", 3, 4)]
+    axes += [spaced(ALPHA, 2.0, 50.0, 6), listed(LAMBDA, 20.0, 1.0, 5.0)]
+    friction = {"kind": "motor.coulomb_friction", "torque": 0.02}
+    effects = [friction, friction, {"kind": "motor.cogging", "amplitude": 0.01, "harmonic": 2}]
+    result = made(rigid(axes=axes, effects=effects), motor__velocity_rmse=lambda frame: frame[ALPHA] - 10.0, motor__f_plus=lambda frame: 1.0)
     with opened(write_static(source(result), tmp_path / "out")) as (page,):
         page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {LAMBDA} {ALPHA}']")
         # from the least to the largest, which no logarithm shows
@@ -193,6 +196,8 @@ def test_signs_whole_numbers_and_axes_in_any_order(tmp_path):
         assert page.evaluate("ticks(1, 1 + Number.EPSILON, 5).length") <= 6
     config = read_config(tmp_path / "out" / "point.toml")
     assert (config.run.substeps, config.observer.motor.lambda_, config.observer.motor.alpha) == (1, 20.0, 50.0)
+    drawn = config.resolved()["effects"]
+    assert [one.get("torque", one.get("harmonic")) for one in drawn] == [0.02, 0.25, 3]
 
 
 SWEPT = rigid(

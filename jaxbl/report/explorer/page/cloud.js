@@ -74,7 +74,7 @@ globalThis.jaxblData = async (about) => {
   };
 
   $("hint").textContent = `Move over the points to read values. Drag to enlarge a region, double click for the whole. Click a point to ${runs ? "simulate its run" : "save it as a config"}. Grey: no value, as the run diverged.`;
-  $("point").addEventListener("click", () => saveText("point.toml", runs ? runs.config() : pointText(chosen)));
+  $("point").addEventListener("click", () => saveText("point.toml", runs ? runs.config() : pointText(chosen, about.effects)));
   $("gains").addEventListener("click", () => saveText("gains.toml", gainsText(about.gains, chosen)));
   addEventListener("resize", () => { plot?.draw(); for (const one of runs?.plots ?? []) one.draw(); });
   form();

@@ -423,7 +423,7 @@ globalThis.jaxblData = async (about) => {
   });
   $("whole").addEventListener("click", () => { picture.whole(); update(); });
   $("picture").addEventListener("click", () => save("map.png", picture.canvas.toDataURL("image/png")));
-  $("point").addEventListener("click", () => saveText("point.toml", runs ? runs.config() : pointText(chosen.values)));
+  $("point").addEventListener("click", () => saveText("point.toml", runs ? runs.config() : pointText(chosen.values, study.effects)));
   $("gains").addEventListener("click", () => saveText("gains.toml", gainsText(study.gains, chosen.values)));
   addEventListener("resize", () => { update(); for (const one of [...(picture.cuts ?? []), ...(runs?.plots ?? [])]) one.draw(); });
   picture.first();

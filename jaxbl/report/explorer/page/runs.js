@@ -22,13 +22,25 @@ const tracePlots = (columns) => {
 };
 
 /** A value as TOML: a whole number stands for a real one, too. */
-const exact = (value) => (typeof value === "string" ? JSON.stringify(value) : String(value));
+const exact = (value) => (typeof value === "number" ? String(value) : JSON.stringify(value));
 
 /** A point in words: axes as { path, unit }, values by path. */
 const pointWords = (axes, values) => axes.map(({ path, unit }) => `${path}: ${text(values[path])} ${unit}`.trim()).join(", ");
 
-/** A point, its values by path, as a study that includes this one. */
-const pointText = (values) => `${['include = "study.toml"', "axes = []", "figures = []", ...Object.entries(values).map(([path, value]) => `${path} = ${exact(value)}`)].join("\n")}\n`;
+/** A point, its values by path, as a study that includes this one; it has all of its `effects` if one of them is varied. */
+const pointText = (values, effects) => {
+  const lines = ['include = "study.toml"', "axes = []", "figures = []"], tables = effects.map((one) => ({ ...one }));
+  let varied = false;
+  for (const [path, value] of Object.entries(values)) {
+    const [, name, key] = /^effects\.(.+)\.([^.]+)$/.exec(path) ?? [];
+    // two of a kind go by their numbers
+    if (name) tables[/^\d+$/.test(name) ? Number(name) : tables.findIndex(({ kind }) => kind === name)][key] = value;
+    else lines.push(`${path} = ${exact(value)}`);
+    varied ||= Boolean(name);
+  }
+  for (const one of varied ? tables : []) lines.push("", "[[effects]]", ...Object.entries(one).map(([key, value]) => `${key} = ${exact(value)}`));
+  return `${lines.join("\n")}\n`;
+};
 
 /** Gains of a point, for a study to include. */
 const gainsText = (gains, values) => {
