@@ -177,11 +177,12 @@ def test_values_regions_cuts_and_a_point_as_config(tmp_path):
 
 @needs_chromium
 def test_signs_whole_numbers_and_axes_in_any_order(tmp_path):
-    axes = [listed("run.substeps", 1, 2), listed("effects.1.torque", 0.25, 0.5), listed("effects.motor.cogging.harmonic", 3, 4)]
-    axes += [spaced(ALPHA, 2.0, 50.0, 6), listed(LAMBDA, 20.0, 1.0, 5.0)]
+    axes = [listed("run.substeps", 1, 2), spaced(ALPHA, 2.0, 50.0, 6), listed(LAMBDA, 20.0, 1.0, 5.0)]
+    axes = [listed("effects.1.torque", 0.25, 0.5), listed("effects.motor.cogging.harmonic", 3, 4), *axes]
     friction = {"kind": "motor.coulomb_friction", "torque": 0.02}
     effects = [friction, friction, {"kind": "motor.cogging", "amplitude": 0.01, "harmonic": 2}]
-    result = made(rigid(axes=axes, effects=effects), motor__velocity_rmse=lambda frame: frame[ALPHA] - 10.0, motor__f_plus=lambda frame: 1.0)
+    columns = {"motor__velocity_rmse": lambda frame: frame[ALPHA] - 10.0, "motor__f_plus": lambda frame: 1.0}
+    result = made(rigid(axes=axes, effects=effects), **columns)
     with opened(write_static(source(result), tmp_path / "out")) as (page,):
         page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {LAMBDA} {ALPHA}']")
         # from the least to the largest, which no logarithm shows
