@@ -177,7 +177,8 @@ def test_values_regions_cuts_and_a_point_as_config(tmp_path):
 
 @needs_chromium
 def test_signs_whole_numbers_and_axes_in_any_order(tmp_path):
-    axes = [listed("run.substeps", 1, 2), spaced(ALPHA, 2.0, 50.0, 6), listed(LAMBDA, 20.0, 1.0, 5.0)]
+    together = [listed("run.substeps", 1, 2, zip="pair"), listed(NOISE, 1e-5, 1e-4, zip="pair")]
+    axes = [*together, spaced(ALPHA, 2.0, 50.0, 6), listed(LAMBDA, 20.0, 1.0, 5.0)]
     axes = [listed("effects.1.torque", 0.25, 0.5), listed("effects.motor.cogging.harmonic", 3, 4), *axes]
     friction = {"kind": "motor.coulomb_friction", "torque": 0.02}
     effects = [friction, friction, {"kind": "motor.cogging", "amplitude": 0.01, "harmonic": 2}]
@@ -187,6 +188,7 @@ def test_signs_whole_numbers_and_axes_in_any_order(tmp_path):
         page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {LAMBDA} {ALPHA}']")
         # from the least to the largest, which no logarithm shows
         assert page.locator("#map").get_attribute("aria-label").endswith("from -8 to 40")
+        assert page.locator("#at2 option").all_inner_texts() == ["all", "1, 1e-5 rad", "2, 1e-4 rad"]
         # a curve goes from small to large
         assert page.locator("#condition").count() == 0
         page.locator("#plot").click(position={"x": 100, "y": 100})
@@ -329,7 +331,8 @@ def product_of_gains(frame):
 def test_points_of_a_design_keep_their_axes_words_among_them(tmp_path):
     axes = [{"path": ALPHA, "start": 2.0, "stop": 50.0, "scale": "log"}, {"path": LAMBDA, "start": 1.0, "stop": 20.0}, WORDS]
     data = rigid(axes=axes, sweep={"design": "sobol", "points": 8, "seeds": 2})
-    result = made(data, motor__velocity_rmse=product_of_gains, finite=lambda frame: frame["seed"] == 0)
+    columns = {"finite": lambda frame: frame["seed"] == 0, "motor__position_rmse": lambda frame: 1e300}
+    result = made(data, motor__velocity_rmse=product_of_gains, **columns)
     write_study(result, tmp_path, ["found"])
     told, table = about(tmp_path), pq.read_table(tmp_path / "points.parquet").to_pandas()
     assert (told["rows"], told["found"], told["total"], told["sampled"]) == (32, 32, 32, True)
@@ -340,6 +343,7 @@ def test_points_of_a_design_keep_their_axes_words_among_them(tmp_path):
     words = [WORDS["values"][int(one)] for one in table[WORDS["path"]]]
     assert words == [*result.frame[WORDS["path"]]] and set(words) == set(WORDS["values"])
     assert table["motor.velocity_rmse"].isna().equals(table["seed"] == 1.0)
+    assert table["motor.position_rmse"].isna().all()
 
 
 @needs_chromium

@@ -10,6 +10,9 @@ class Study {
     this.dims = about.axes.map((axis, i) => ({
       i, size: axis.paths[0].values.length, paths: axis.paths, name: axis.paths.map((one) => one.path).join(", "),
       unit: axis.paths[0].unit, values: axis.paths[0].values, seed: axis.paths[0].path === "seed",
+      // of axes that advance together an axis has room for the first one's values
+      label: [withUnit(axis.paths[0].path, axis.paths[0].unit), ...axis.paths.slice(1).map((one) => `with ${one.path}`)].join(", "),
+      said: (k) => axis.paths.map(({ values, unit }) => `${text(values[k])} ${unit}`.trim()).join(", "),
     }));
     this.colours = coloursOf(about);
     let stride = 1;
@@ -107,7 +110,7 @@ class Picture {
     this.height = Math.round(high * Math.ceil(facets.length / columns));
     this.panels = facets.map((index, k) => ({
       index,
-      title: index === null ? "" : `${this.view.facet.name} = ${text(this.view.facet.values[index])} ${this.view.facet.unit}`.trim(),
+      title: index === null ? "" : `${this.view.facet.name} = ${this.view.facet.said(index)}`,
       box: {
         left: (k % columns) * wide + MARGIN.left, top: Math.floor(k / columns) * high + MARGIN.top,
         width: wide - MARGIN.left - MARGIN.right, height: high - MARGIN.top - MARGIN.bottom,
@@ -240,11 +243,10 @@ class Picture {
         if (i) context.fillText(text(dim.values[k]), box.left - 8, box.top + box.height * (1 - share));
         else context.fillText(text(dim.values[k]), box.left + box.width * share, box.top + box.height + 8);
       }
-      const name = withUnit(dim.name, dim.unit);
       context.save();
       context.textAlign = "center";
-      if (i) { context.translate(box.left - MARGIN.left + 14, box.top + box.height / 2); context.rotate(-Math.PI / 2); context.fillText(name, 0, 0, box.height + 40); }
-      else context.fillText(name, box.left + box.width / 2, box.top + box.height + 30, box.width + 40);
+      if (i) { context.translate(box.left - MARGIN.left + 14, box.top + box.height / 2); context.rotate(-Math.PI / 2); context.fillText(dim.label, 0, 0, box.height + 40); }
+      else context.fillText(dim.label, box.left + box.width / 2, box.top + box.height + 30, box.width + 40);
       context.restore();
     });
     context.textAlign = "left";
@@ -264,7 +266,7 @@ class Picture {
   lines({ panel, cell }) {
     const { shown, title } = this.panels[panel];
     const at = cell.map((one, i) => Math.floor((one - this.view.from[i]) / shown.step[i]));
-    const places = [this.view.x, this.view.y].map((dim, i) => `${dim.name}: ${text(dim.values[cell[i]])} ${dim.unit}`.trim());
+    const places = [this.view.x, this.view.y].map((dim, i) => `${dim.name}: ${dim.said(cell[i])}`);
     return [`${this.label()}: ${text(shown.values[at[1] * shown.cells[0] + at[0]])}`, ...places, ...(title ? [title] : [])];
   }
   /** What is drawn over the maps: conditions, the region that is being drawn, the chosen cell. */
@@ -318,7 +320,7 @@ const cut = (element, picture, i) => {
   along.to[i] = dim.size;
   const { values } = mapped(study, picture.column, along), finite = values.filter(Number.isFinite);
   const log = picture.scaled.log && Math.max(...finite) > 10 * Math.min(...finite);
-  const plot = new Plot(element, { x: { label: dim.name, unit: dim.unit, names: dim.values.map(text) }, y: { label: picture.label(), log }, height: 270 });
+  const plot = new Plot(element, { x: { label: dim.label, names: dim.values.map(text) }, y: { label: picture.label(), log }, height: 270 });
   plot.set([{ name: "", x: values.map((_, k) => k), y: values, colour: COLOURS[1], width: 2, marks: [cell[i]], sorted: true }]);
   return plot;
 };
@@ -354,7 +356,7 @@ globalThis.jaxblData = async (about) => {
       ...(dims.length > 2 ? [pick("side by side", "facet", [["none", "none"], ...dims.filter((dim) => dim !== view.x && dim !== view.y).map((dim) => [dim.i, dim.name])],
         view.facet?.i ?? "none", (value) => { view.facet = study.dims[value] ?? null; forget(); })] : []),
       ...study.varied.filter((dim) => !drawn().includes(dim)).map((dim) =>
-        pick(dim.name, `at${dim.i}`, [["all", "all"], ...dim.values.map((value, i) => [i, `${text(value)} ${dim.unit}`.trim()])], view.at[dim.i],
+        pick(dim.name, `at${dim.i}`, [["all", "all"], ...dim.values.map((_, i) => [i, dim.said(i)])], view.at[dim.i],
           (value) => { view.at[dim.i] = value === "all" ? value : Number(value); })),
       pick("of several", "how", Object.keys(reduced).map((one) => [one, one]), view.how, (value) => { view.how = value; }),
       ...(picture.gains() ? [pick("gain condition", "condition", [["none", "none"], ...study.conditions.map((one) => [one.name, one.title])], view.condition ?? "none",
