@@ -328,10 +328,10 @@ def explore(
         raise InputError("--static: writes a page and serves none; --port and --browser do not go with it; leave them out")
     workers.start_jax()
     from jaxbl.report.explorer.folder import write_static
-    from jaxbl.report.explorer.log import is_log_folder, log_source
+    from jaxbl.report.explorer.log import log_source
     from jaxbl.report.explorer.study import study_source
 
-    source = log_source(folder) if is_log_folder(folder) else study_source(folder)
+    source = log_source(folder) or study_source(folder)
     if static is not None:
         with working(context, "writing the page"):
             page = write_static(source, static)
