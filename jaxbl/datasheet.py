@@ -141,7 +141,9 @@ def _spelt(unit: str) -> str:
     """A unit in one spelling."""
     for other, ours in _WAYS.items():
         unit = unit.replace(other, ours)
-    return re.sub(r"[\s·*^]", "", unit).lower()
+    unit = re.sub(r"[\s·*^]", "", unit)
+    # mega is no milli
+    return unit if unit.startswith("MN") else unit.lower()
 
 
 class Kind(NamedTuple):

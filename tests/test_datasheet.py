@@ -71,6 +71,7 @@ def test_examples_and_defaults_can_be_read():
     ("name", "text", "message"),
     [
         ("motor_inertia", "heavy", "--motor-inertia 'heavy': should be a number and its unit, such as '0.48 kg cm²'"),
+        ("torque", "1 MN m", "--torque '1 MN m': the unit 'MN m' is not known here; known: N m, mN m, N cm, N mm"),
         ("speed", "3000", "--speed '3000': has no unit; such as '3000 rpm'; units: rad/s, rpm, deg/s"),
         (
             "torque",

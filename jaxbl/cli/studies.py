@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import math
 import sys
+import threading
 import webbrowser
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -324,13 +325,13 @@ def explore(
 ) -> Outcome:
     """Explore a sweep, an identification or a diagnosis in the browser; --static: a page that needs no Python."""
     if static is not None and (port or browser is not None):
-        raise InputError("--static: writes a page and serves none; --port and --browser do not go with it")
+        raise InputError("--static: writes a page and serves none; --port and --browser do not go with it; leave them out")
     workers.start_jax()
     from jaxbl.report.explorer.folder import write_static
-    from jaxbl.report.explorer.log import is_log_folder, log_source
+    from jaxbl.report.explorer.log import log_source
     from jaxbl.report.explorer.study import study_source
 
-    source = log_source(folder) if is_log_folder(folder) else study_source(folder)
+    source = log_source(folder) or study_source(folder)
     if static is not None:
         with working(context, "writing the page"):
             page = write_static(source, static)
@@ -342,7 +343,8 @@ def explore(
             for line in (*source.lead, f"Open {server.url}", "Ctrl+C ends it."):
                 typer.echo(printable(line), err=True)
         if browser if browser is not None else sys.stdout.isatty():
-            webbrowser.open(server.url)
+            # a browser in the terminal ends when it is left
+            threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
         until_interrupted(server.serve_forever)
     return Outcome([])
 

@@ -204,7 +204,10 @@ def _missing(
     after = residual_torques(fitted.experiment, setup.fitted.segments), accepted.after.torques
     found = {"missing_before": (setup.lacking, proof.before.torques), "missing_after": after}
     for name, experiment in others.items():
-        held = residual_torques(at_period(experiment, setup.holdout.period), setup.holdout.segments)
+        held: dict[str, list[Residual]] = {}
+        # the trace has no samples of another log
+        if not setup.task.separate:
+            held = residual_torques(at_period(experiment, setup.holdout.period), setup.holdout.segments)
         found[name] = residual_torques(experiment, setup.fitted.segments), held
     return found
 

@@ -220,7 +220,7 @@ def rival_tables(config: Config, own: Sequence[Free], rival: Model) -> dict[str,
 
 
 Torques = Mapping[str, Sequence[Residual]]
-"""Torques that a model lacks as given and with the effects, by side, segment by segment."""
+"""Torques that a model lacks, by side, segment by segment."""
 
 
 def trace_of(

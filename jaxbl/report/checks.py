@@ -37,7 +37,7 @@ def check_figures(config: Config, figures: list[FigureTable], columns: list[str]
             if path is not None and key in parts and (count := counts[path]) > MOST_PARTS:
                 raise InputError(
                     f"figures[{i}].{key}: '{path}' has {count} values, each of which would be a {parts[key]}; at most "
-                    f"{MOST_PARTS} can be drawn"
+                    f"{MOST_PARTS} can be drawn; name another axis, or give it fewer values"
                 )
         metrics = [column for column in columns if column not in (*axes, "seed")]
         of_curves = ("converged", "f_plus") if figure.overlays else ()

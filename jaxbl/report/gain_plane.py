@@ -45,7 +45,7 @@ def conditions_line(side: str, found: dict[str, Any], which: str) -> str:
     lambda_, alpha, bound, largest = (found[name] for name in ("lambda", "alpha", "f_plus", "largest_f_plus"))
     at = f"{side}: at f⁺ = {bound:.3g} rad/s², {which},"
     if bound == 0.0:
-        return f"{at} nothing disturbs the observer: no condition asks for more than λ > 0."
+        return f"{at} nothing disturbs the observer: the exact gain condition asks for λ > 0 alone."
     holds = [name for name, held in found["holds"].items() if held]
     if not found["alpha_exceeds_f_plus"]:
         return (

@@ -43,6 +43,13 @@ def test_plane_and_sentence_agree_with_the_numbers(case, tmp_path):
         assert least == pytest.approx(judge_gains(1.0, alphas, bound)["least_lambda"][name], rel=1e-6), condition.title
 
 
+def test_undisturbed_the_exact_condition_alone_asks_for_no_more_than_a_lambda():
+    found = judge_gains(0.1, 1.0, 0.0)
+    line = conditions_line("motor", found, "of a test")
+    assert line.endswith("nothing disturbs the observer: the exact gain condition asks for λ > 0 alone.")
+    assert found["holds"]["exact"] and not found["holds"]["seeber_horn"]
+
+
 def test_factors_lead_to_where_the_exact_condition_fails():
     found = judge_gains(1.24, 2.84, 1.97)
     line = conditions_line("motor", found, "of a test")

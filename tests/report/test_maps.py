@@ -279,7 +279,8 @@ def test_more_parts_than_a_figure_can_have(figure, key, part):
     axes = [*GAINS, spaced(NOISE, 1e-6, 1e-3, 61)]
     with pytest.raises(InputError) as error:
         draw(made(rigid(axes=axes, figures=[figure(**{key: NOISE})])))
-    said = f"figures[0].{key}: '{NOISE}' has 61 values, each of which would be a {part}; at most 60 can be drawn"
+    said = f"figures[0].{key}: '{NOISE}' has 61 values, each of which would be a {part}; at most 60 "
+    said += "can be drawn; name another axis, or give it fewer values"
     assert str(error.value) == said
     # a study that asks for no figures gets one all the same
     (drawing,) = draw(made(rigid(axes=axes[::-1])))

@@ -8,10 +8,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from jaxbl.config import numeric_paths
-from jaxbl.report.maps import drawn_values
 from jaxbl.sweeps.sweep import StudyResult
 
-from .folder import ROW_GROUP
+from .folder import ROW_GROUP, page_values
 
 
 def write_cloud(result: StudyResult, metrics: list[str], out: Path) -> dict[str, Any]:
@@ -37,7 +36,7 @@ def write_cloud(result: StudyResult, metrics: list[str], out: Path) -> dict[str,
             columns = {
                 path: [words[path].index(one) for one in frame[path]] if path in words else frame[path] for path in axes
             }
-            columns |= {"seed": frame["seed"]} | {name: drawn_values(frame, name) for name in metrics}
+            columns |= {"seed": frame["seed"]} | {name: page_values(frame, name) for name in metrics}
             arrays = {
                 name: np.asarray(values, float).astype(schema.field(name).type.to_pandas_dtype())
                 for name, values in columns.items()

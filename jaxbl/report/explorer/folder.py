@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from jaxbl.errors import InputError
 from jaxbl.files import is_empty, json_text, make_folder, writing
+from jaxbl.report.maps import drawn_values
 
 ROW_GROUP = 1 << 17
 """Rows of a row group of the Parquet file."""
@@ -92,5 +94,12 @@ def write_page(out: Path, page: str, about: Mapping[str, Any], own: Sequence[str
 
 
 def encoded(values: Any) -> str:
-    """Numbers as float32 in base64, for a page."""
-    return base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()
+    """Numbers as float32 in base64, for a page; infinite where they are too large for it."""
+    with np.errstate(over="ignore"):
+        return base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()
+
+
+def page_values(frame: pd.DataFrame, name: str) -> pd.Series:
+    """A metric as pages draw it: as :func:`drawn_values`; what no float32 holds is as good as diverged."""
+    values = drawn_values(frame, name)
+    return values.where(values.abs() < np.finfo(np.float32).max)

@@ -19,11 +19,10 @@ import pyarrow.parquet as pq
 from jaxbl.config import Config, numeric_paths
 from jaxbl.files import plain
 from jaxbl.observer.conditions import CONDITIONS
-from jaxbl.report.maps import drawn_values
 from jaxbl.sweeps.points import AxisColumns, Points
 from jaxbl.sweeps.sweep import StudyResult
 
-from .folder import ROW_GROUP, encoded
+from .folder import ROW_GROUP, encoded, page_values
 
 _OVERVIEW = 512
 """Cells of the overview along each axis, at most."""
@@ -85,9 +84,7 @@ def _write_points(result: StudyResult, metrics: list[str], first: str, out: Path
             at = np.ravel_multi_index([_places(one, frame) for one in dims], shape)
             found += len(frame)
             for name, values in kept.items():
-                # what no float32 holds is as good as diverged
-                shown = drawn_values(frame, name)
-                values[at] = shown.where(shown.abs() < np.finfo(np.float32).max)
+                values[at] = page_values(frame, name)
         _write_table(out, kept, rows)
         overview = _overview(kept[first], shape)
     return {"rows": rows, "found": found, "overview": overview}

@@ -27,26 +27,21 @@ _LABELS = {"t": "time", "u": "input u", "theta_e": "motor position θe", "theta_
 _RESULTS = {"diagnosis.json": "Diagnosis of", "identification.json": "Identification from"}
 
 
-def is_log_folder(folder: str | Path) -> bool:
-    """Whether a folder holds results of a log."""
-    return _summary_file(folder) is not None
-
-
 def _summary_file(folder: str | Path) -> Path | None:
     """The newest summary in a folder: identify and diagnose may have written into one, the trace is of the last."""
     files = [file for name in _RESULTS if (file := place(folder) / name).is_file()]
     return max(files, key=lambda one: one.stat().st_mtime_ns, default=None)
 
 
-def log_source(folder: str | Path) -> Source:
-    """Results of `jaxbl identify` or `jaxbl diagnose`, to be explored.
+def log_source(folder: str | Path) -> Source | None:
+    """Results of `jaxbl identify` or `jaxbl diagnose`, to be explored; None where a folder holds none.
 
     Raises:
-        InputError: there are none, or files are damaged or missing.
+        InputError: files are damaged or missing.
     """
     file = _summary_file(folder)
     if file is None:
-        raise InputError(f"{folder}: holds no results of a log (no {' or '.join(_RESULTS)}); run 'jaxbl diagnose' first")
+        return None
     summary = read_json(file)
     if summary.get("kind") == "element":
         lead = element_lines(summary)

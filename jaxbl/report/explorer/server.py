@@ -4,6 +4,8 @@ import json
 import mimetypes
 import re
 import secrets
+import shutil
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -13,7 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from jaxbl.errors import InputError
+from jaxbl.errors import InputError, NoResult
 
 from .folder import Source
 
@@ -41,9 +43,11 @@ def served(source: Source, port: int = 0) -> "Iterator[ExplorerServer]":
             raise InputError(f"--port {port}: {error.strerror}; choose another one") from None
         with server:
             threading.Thread(target=source.prepare, name="jaxbl-prepare", daemon=True).start()
-            yield server
-            # threads of XLA that still compute would take the interpreter down
-            source.finish()
+            try:
+                yield server
+            finally:
+                # threads of XLA that still compute would take the interpreter down
+                source.finish()
 
 
 class ExplorerServer(ThreadingHTTPServer):
@@ -73,6 +77,7 @@ class ExplorerServer(ThreadingHTTPServer):
         self._write, self._place = write, place
         self._token = secrets.token_urlsafe(24)
         self._lock, self._versions, self._stale = threading.Lock(), 0, True
+        self._loaded: set[str] = set()
         super().__init__(("127.0.0.1", port), _Handler)
         self.names = {f"{name}:{self.server_port}" for name in ("127.0.0.1", "localhost")}
         self.url = f"http://127.0.0.1:{self.server_port}/{self._token}/"
@@ -82,31 +87,54 @@ class ExplorerServer(ThreadingHTTPServer):
         # a page that is being written is written to the end, and no other one
         self._lock.acquire()
 
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        # a browser that leaves a page ends what it was reading
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
+
     def is_known(self, token: str) -> bool:
         """Whether a request comes from who was given the address."""
         return secrets.compare_digest(token.encode(), self._token.encode())
 
     def newest(self) -> str:
-        """Number of the newest version of the page, written now if the one before is out of date."""
+        """Number of the newest version of the page, written now if the one before is out of date.
+
+        Raises:
+            InputError: the results are not there any more, or damaged.
+            NoResult, OSError: the page cannot be written.
+        """
         with self._lock:
             if self._stale:
                 folder = self._place / str(self._versions + 1)
                 folder.mkdir()
-                self._stale = self._write(folder)
+                try:
+                    self._stale = self._write(folder)
+                except BaseException:
+                    shutil.rmtree(folder)
+                    raise
                 self._versions += 1
-                old = self._place / str(self._versions - _MOST_VERSIONS)
-                if old.is_dir():
-                    for file in old.iterdir():
-                        file.unlink()
-                    old.rmdir()
+                shutil.rmtree(self._place / str(self._versions - _MOST_VERSIONS), ignore_errors=True)
             return str(self._versions)
+
+    def is_outdated(self, version: str, name: str) -> bool:
+        """Whether a page is loaded again while there is, or may be, a newer version of it."""
+        if name != "index.html":
+            return False
+        with self._lock:
+            again = version in self._loaded
+            if version in self._written():
+                self._loaded.add(version)
+            return again and (self._stale or version != str(self._versions))
 
     def file(self, version: str, name: str) -> Path | None:
         """A file of a page; None if there is none."""
-        folder = self._place / version
-        if not version.isdecimal() or not folder.is_dir():
+        folder = self._place / version if version in self._written() else None
+        if folder is None or not folder.is_dir():
             return None
         return next((one for one in folder.iterdir() if one.name == name and one.is_file()), None)
+
+    def _written(self) -> Iterator[str]:
+        return map(str, range(1, self._versions + 1))
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -120,8 +148,13 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         if (parts := self._parts()) is None:
             return
-        if parts in ([], [""]):
-            self._send(HTTPStatus.FOUND, headers={"Location": f"{self.server.url}{self.server.newest()}/index.html"})
+        if parts in ([], [""]) or (len(parts) == 2 and self.server.is_outdated(*parts)):
+            try:
+                newest = self.server.newest()
+            except (InputError, NoResult, OSError) as error:
+                self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, str(error))
+            else:
+                self._send(HTTPStatus.FOUND, headers={"Location": f"{self.server.url}{newest}/index.html"})
             return
         file = self.server.file(*parts) if len(parts) == 2 else None
         if file is None:
@@ -136,12 +169,12 @@ class _Handler(BaseHTTPRequestHandler):
         answer = self.server.answers.get(parts[-1]) if len(parts) == 2 else None
         if answer is None or self.headers.get_content_type() != "application/json":
             self._refuse(HTTPStatus.NOT_FOUND, "there is no such question")
-        elif not length.isdecimal() or int(length) > _MOST_ASKED:
+        elif not re.fullmatch(r"\d{1,9}", length) or int(length) > _MOST_ASKED:
             self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too long a question")
         else:
             try:
                 found = answer(json.loads(self.rfile.read(int(length))))
-            except (InputError, ValueError) as error:
+            except (ValueError, RecursionError, NoResult) as error:
                 self._refuse(HTTPStatus.BAD_REQUEST, str(error))
             else:
                 self._send(HTTPStatus.OK, json.dumps(found, allow_nan=False).encode(), "application/json")
@@ -168,7 +201,7 @@ class _Handler(BaseHTTPRequestHandler):
         """A file, or the bytes of it that are asked for."""
         kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
         size = file.stat().st_size
-        asked = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))
+        asked = re.fullmatch(r"bytes=(\d{1,15})-(\d{1,15})", self.headers.get("Range", ""))
         start, end = (int(asked[1]), min(int(asked[2]) + 1, size)) if asked else (0, size)
         if start >= end:
             self._send(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, headers={"Content-Range": f"bytes */{size}"})

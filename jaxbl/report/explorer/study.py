@@ -141,6 +141,7 @@ def _about(config: Config, columns: list[str]) -> dict[str, Any]:
         "config": config.to_toml(),
         "colours": [to_hex(one) for one in colormaps[MAP](np.linspace(0.0, 1.0, 256))],
         "gains": _gains(config),
+        "effects": config.resolved()["effects"],
     }
 
 

@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import socket
 import threading
 from pathlib import Path
 
@@ -89,6 +90,78 @@ def test_questions(server):
     assert call(server, "1/other", "POST", '{"at": 1}', **kind)[0] == 404
     assert call(server, "1/run", "POST", "[" * 70_000, **kind)[0] == 413
     assert call(server, "1/run", "POST", '{"at": 1}', Origin="http://evil.example", **kind)[0] == 403
+
+
+def test_what_no_browser_asks_is_refused_without_a_traceback(server, capfd):
+    call(server, "")
+    kind = {"Content_Type": "application/json"}
+    assert call(server, "1/run", "POST", "[" * 60_000, **kind)[0] == 400
+    assert call(server, "1/run", "POST", "", Content_Length="9" * 5000, **kind)[0] == 413
+    assert call(server, "1/points.parquet", Range=f"bytes=0-{'9' * 5000}")[0] == 200
+    assert call(server, f"{'1' * 5000}/index.html")[0] == 404
+    assert call(server, "/" + "x" * 70_000)[0] == 414
+    assert call(server, "1/index.html", "HEAD")[0] == call(server, "1/index.html", "OPTIONS")[0] == 501
+    assert capfd.readouterr().err == ""
+
+
+def test_a_page_that_is_left_while_it_is_read_says_nothing(capfd, monkeypatch):
+    def write(out, served):
+        (out / "index.html").write_bytes(bytes(1 << 25))
+        return False
+
+    with served(Source([], write, {}, lambda: None, lambda: None)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        server.newest()
+        own = f"127.0.0.1:{server.server_port}"
+        request = f"GET {server.url.partition(own)[2]}1/index.html HTTP/1.1\r\nHost: {own}\r\n\r\n"
+        ended, close = threading.Event(), server.shutdown_request
+        monkeypatch.setattr(server, "shutdown_request", lambda request: (close(request), ended.set()))
+        with socket.create_connection(("127.0.0.1", server.server_port)) as one:
+            one.sendall(request.encode())
+            assert one.recv(100).startswith(b"HTTP/1.1 200")
+        assert ended.wait(10.0)
+        server.shutdown()
+    assert capfd.readouterr().err == ""
+
+
+def test_a_page_loaded_again_is_the_newest():
+    left = [True, True, False]
+
+    def write(out, served):
+        (out / "index.html").write_text(str(len(left)))
+        return left.pop(0)
+
+    with served(Source([], write, {}, lambda: None, lambda: None)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        assert call(server, "")[1]["Location"] == f"{server.url}1/index.html"
+        assert call(server, "1/index.html")[2] == b"3"
+        # by the browser's button, which asks for this version
+        status, headers, _ = call(server, "1/index.html")
+        assert (status, headers["Location"]) == (302, f"{server.url}2/index.html")
+        assert call(server, "2/index.html")[2] == b"2"
+        assert call(server, "2/index.html")[1]["Location"] == f"{server.url}3/index.html"
+        # nothing is to come: it stays
+        assert call(server, "3/index.html")[2] == call(server, "3/index.html")[2] == b"1"
+        assert call(server, "1/index.html")[1]["Location"] == f"{server.url}3/index.html"
+        server.shutdown()
+
+
+def test_results_that_cannot_be_read_are_told_and_read_later():
+    why = [InputError("study.toml: is missing"), OSError("no space left")]
+
+    def write(out, served):
+        (out / "index.html").write_text("page")
+        if why:
+            raise why.pop(0)
+        return False
+
+    with served(Source([], write, {}, lambda: None, lambda: None)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        for said in ("study.toml: is missing", "no space left"):
+            status, _, content = call(server, "")
+            assert (status, json.loads(content)) == (503, {"error": said})
+        assert call(server, "")[0] == 302
+        server.shutdown()
 
 
 def test_a_port_of_another_program(server):

@@ -146,6 +146,10 @@ def test_values_regions_cuts_and_a_point_as_config(tmp_path):
         for key in ("ArrowRight", "Enter"):
             page.keyboard.press(key)
         assert page.locator("#chosen").is_visible()
+        where = page.locator("#where").inner_text()
+        # what is saved stays the chosen cell, whatever is looked at then
+        page.keyboard.press("ArrowLeft")
+        page.select_option("#at0", "0")
         with page.expect_download() as download:
             page.click("#point")
         (tmp_path / "out" / "point.toml").write_bytes(Path(download.value.path()).read_bytes())
@@ -163,9 +167,40 @@ def test_values_regions_cuts_and_a_point_as_config(tmp_path):
         assert Path(picture.value.path()).read_bytes().startswith(b"\x89PNG")
     config = read_config(tmp_path / "out" / "point.toml")
     assert config.encoders.noise == 1e-4 and config.axes == []
-    assert any(config.observer.motor.alpha == pytest.approx(one) for one in alphas)
+    motor = config.observer.motor
+    assert any(motor.alpha == pytest.approx(one) for one in alphas)
+    assert where.startswith(f"{NOISE}: 1e-4 rad, {ALPHA}: {motor.alpha:.4g} ")
+    assert f", {LAMBDA}: {motor.lambda_:.4g} " in where
     found = tomllib.loads((tmp_path / "gains.toml").read_text())["observer"]
     assert found == {"motor": {"lambda": config.observer.motor.lambda_, "alpha": config.observer.motor.alpha}}
+
+
+@needs_chromium
+def test_signs_whole_numbers_and_axes_in_any_order(tmp_path):
+    together = [listed("run.substeps", 1, 2, zip="pair"), listed(NOISE, 1e-5, 1e-4, zip="pair")]
+    axes = [*together, spaced(ALPHA, 2.0, 50.0, 6), listed(LAMBDA, 20.0, 1.0, 5.0)]
+    axes = [listed("effects.1.torque", 0.25, 0.5), listed("effects.motor.cogging.harmonic", 3, 4), *axes]
+    friction = {"kind": "motor.coulomb_friction", "torque": 0.02}
+    effects = [friction, friction, {"kind": "motor.cogging", "amplitude": 0.01, "harmonic": 2}]
+    columns = {"motor__velocity_rmse": lambda frame: frame[ALPHA] - 10.0, "motor__f_plus": lambda frame: 1.0}
+    result = made(rigid(axes=axes, effects=effects), **columns)
+    with opened(write_static(source(result), tmp_path / "out")) as (page,):
+        page.wait_for_selector(f"body[data-drawn='motor.velocity_rmse {LAMBDA} {ALPHA}']")
+        # from the least to the largest, which no logarithm shows
+        assert page.locator("#map").get_attribute("aria-label").endswith("from -8 to 40")
+        assert page.locator("#at2 option").all_inner_texts() == ["all", "1, 1e-5 rad", "2, 1e-4 rad"]
+        # a curve goes from small to large
+        assert page.locator("#condition").count() == 0
+        page.locator("#plot").click(position={"x": 100, "y": 100})
+        with page.expect_download() as download:
+            page.click("#point")
+        (tmp_path / "out" / "point.toml").write_bytes(Path(download.value.path()).read_bytes())
+        # enlarged until numbers end
+        assert page.evaluate("ticks(1, 1 + Number.EPSILON, 5).length") <= 6
+    config = read_config(tmp_path / "out" / "point.toml")
+    assert (config.run.substeps, config.observer.motor.lambda_, config.observer.motor.alpha) == (1, 20.0, 50.0)
+    drawn = config.resolved()["effects"]
+    assert [one.get("torque", one.get("harmonic")) for one in drawn] == [0.02, 0.25, 3]
 
 
 SWEPT = rigid(
@@ -255,6 +290,18 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept, tmp_
             page.keyboard.press("ArrowRight")
             assert figures.first.locator(".values").inner_text().split("\n")[1] == "time: 0 s"
             check(page, 0)
+            # a run that the sweep has no figures of
+            one = "{ metric: { name: 'm', label: 'error', yes: false, size: true }, value: NaN }"
+            said = page.evaluate(f"new Runs({{}}).compared({{ metrics: {{ m: -2 }} }}, {one})")
+            assert said == "error: 2. The sweep has none: its run diverged, or is not there yet."
+            # points that cannot be read are told, and read later
+            page.route("**/points.parquet", lambda route: route.fulfill(status=206, body=b"nothing"))
+            page.select_option("#metric", "motor.position_rmse")
+            page.locator('#state:has-text("The study\'s points cannot be read")').wait_for()
+            page.unroute("**/points.parquet")
+            page.select_option("#metric", "motor.velocity_rmse")
+            page.select_option("#metric", "motor.position_rmse")
+            page.wait_for_selector("body[data-drawn^='motor.position_rmse ']")
         server.shutdown()
 
 
@@ -284,7 +331,8 @@ def product_of_gains(frame):
 def test_points_of_a_design_keep_their_axes_words_among_them(tmp_path):
     axes = [{"path": ALPHA, "start": 2.0, "stop": 50.0, "scale": "log"}, {"path": LAMBDA, "start": 1.0, "stop": 20.0}, WORDS]
     data = rigid(axes=axes, sweep={"design": "sobol", "points": 8, "seeds": 2})
-    result = made(data, motor__velocity_rmse=product_of_gains, finite=lambda frame: frame["seed"] == 0)
+    columns = {"finite": lambda frame: frame["seed"] == 0, "motor__position_rmse": lambda frame: 1e300}
+    result = made(data, motor__velocity_rmse=product_of_gains, **columns)
     write_study(result, tmp_path, ["found"])
     told, table = about(tmp_path), pq.read_table(tmp_path / "points.parquet").to_pandas()
     assert (told["rows"], told["found"], told["total"], told["sampled"]) == (32, 32, 32, True)
@@ -295,6 +343,7 @@ def test_points_of_a_design_keep_their_axes_words_among_them(tmp_path):
     words = [WORDS["values"][int(one)] for one in table[WORDS["path"]]]
     assert words == [*result.frame[WORDS["path"]]] and set(words) == set(WORDS["values"])
     assert table["motor.velocity_rmse"].isna().equals(table["seed"] == 1.0)
+    assert table["motor.position_rmse"].isna().all()
 
 
 @needs_chromium

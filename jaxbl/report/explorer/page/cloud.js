@@ -22,7 +22,7 @@ globalThis.jaxblData = async (about) => {
 
   const form = () => {
     const all = Object.entries(known).map(([name, { label, unit }]) => [name, withUnit(label, unit)]);
-    const pick = (label, id, options, now, act) => choose(label, id, options, now, (given) => { act(given); form(); update(); });
+    const pick = (label, id, options, now, act) => choose(label, id, options, now, (given) => { act(given); form(); redraw(); });
     $("choice").replaceChildren(
       pick("colours", "metric", all, view.shade, (given) => { view.shade = given; }),
       pick("x", "x", all, view.x, (given) => { view.x = given; }),
@@ -56,6 +56,7 @@ globalThis.jaxblData = async (about) => {
     said = $("state").textContent = some + (about.found < about.total ? `${about.found} of ${about.total} runs so far.${about.served ? " Load the page again for more." : ""}` : "");
     document.body.dataset.drawn = `${view.shade} ${view.x} ${view.y}`;
   };
+  const redraw = reporting("The study's points", update);
 
   /** A point by its row: values by path, and its seed. */
   const take = async (row) => {
@@ -63,7 +64,7 @@ globalThis.jaxblData = async (about) => {
     const found = Object.fromEntries(axes.map(({ path }, i) => [path, value(path, read[i][row])])), { seed, ...values } = found;
     chosen = values;
     $("chosen").hidden = false;
-    $("where").textContent = `${about.axes.map(({ path, unit }) => `${path}: ${text(values[path])} ${unit}`.trim()).join(", ")}, seed ${seed}`;
+    $("where").textContent = `${pointWords(about.axes, values)}, seed ${seed}`;
     $("command").textContent = runs ? "" : "Save the point beside study.toml, and simulate it: jaxbl simulate point.toml.";
     plot.cursor = [data[view.x][row], data[view.y][row]];
     plot.draw();
@@ -73,13 +74,9 @@ globalThis.jaxblData = async (about) => {
   };
 
   $("hint").textContent = `Move over the points to read values. Drag to enlarge a region, double click for the whole. Click a point to ${runs ? "simulate its run" : "save it as a config"}. Grey: no value, as the run diverged.`;
-  $("point").addEventListener("click", () => saveText("point.toml", runs ? runs.config() : pointText(chosen)));
+  $("point").addEventListener("click", () => saveText("point.toml", runs ? runs.config() : pointText(chosen, about.effects)));
   $("gains").addEventListener("click", () => saveText("gains.toml", gainsText(about.gains, chosen)));
   addEventListener("resize", () => { plot?.draw(); for (const one of runs?.plots ?? []) one.draw(); });
   form();
-  try {
-    await update();
-  } catch (error) {
-    $("state").textContent = `The study's points cannot be read: ${error.message}`;
-  }
+  await redraw();
 };

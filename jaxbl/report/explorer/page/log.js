@@ -66,7 +66,7 @@ globalThis.jaxblData = async (about) => {
 
   const form = () => {
     const coordinates = about.coordinates.filter((one) => one.column !== "t").map((one) => [one.column, withUnit(one.label, one.unit)]);
-    const pick = (label, id, options, chosen, act) => choose(label, id, options, chosen, (value) => { act(value); form(); update(); });
+    const pick = (label, id, options, chosen, act) => choose(label, id, options, chosen, (value) => { act(value); form(); redraw(); });
     const cutoffs = [...new Set([view.group.bandwidth, 200, 100, 50, 20, 10, 5, 2].filter((one) => one && one < 0.45 / about.period))].sort((a, b) => b - a);
     $("choice").replaceChildren(
       pick("what", "group", about.groups.map((one, i) => [i, withUnit(one.name, one.unit)]), about.groups.indexOf(view.group), (value) => begin(about.groups[value])),
@@ -80,7 +80,7 @@ globalThis.jaxblData = async (about) => {
       mark.style.borderTopColor = colour(column);
       box.addEventListener("change", () => {
         view.shown = view.group.lines.map((one) => one.column).filter((one) => (one === column ? box.checked : view.shown.includes(one)));
-        update();
+        redraw();
       });
       return made("label", {}, box, " ", mark, label);
     }));
@@ -101,6 +101,7 @@ globalThis.jaxblData = async (about) => {
     draw();
     document.body.dataset.drawn = [view.group.name, view.x, view.y, ...view.shown].join(" ");
   };
+  const redraw = reporting("The log", update);
 
   const draw = () => {
     const [from, to] = rows(), { group, shown } = view, y = { label: group.quantity, unit: group.unit };
@@ -190,9 +191,5 @@ globalThis.jaxblData = async (about) => {
   });
   addEventListener("resize", () => { for (const [plot] of plots) plot.draw(); });
   form();
-  try {
-    await update();
-  } catch (error) {
-    $("state").textContent = `The log cannot be read: ${error.message}`;
-  }
+  await redraw();
 };

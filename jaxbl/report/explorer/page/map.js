@@ -10,6 +10,9 @@ class Study {
     this.dims = about.axes.map((axis, i) => ({
       i, size: axis.paths[0].values.length, paths: axis.paths, name: axis.paths.map((one) => one.path).join(", "),
       unit: axis.paths[0].unit, values: axis.paths[0].values, seed: axis.paths[0].path === "seed",
+      // of axes that advance together an axis has room for the first one's values
+      label: [withUnit(axis.paths[0].path, axis.paths[0].unit), ...axis.paths.slice(1).map((one) => `with ${one.path}`)].join(", "),
+      said: (k) => axis.paths.map(({ values, unit }) => `${text(values[k])} ${unit}`.trim()).join(", "),
     }));
     this.colours = coloursOf(about);
     let stride = 1;
@@ -107,7 +110,7 @@ class Picture {
     this.height = Math.round(high * Math.ceil(facets.length / columns));
     this.panels = facets.map((index, k) => ({
       index,
-      title: index === null ? "" : `${this.view.facet.name} = ${text(this.view.facet.values[index])} ${this.view.facet.unit}`.trim(),
+      title: index === null ? "" : `${this.view.facet.name} = ${this.view.facet.said(index)}`,
       box: {
         left: (k % columns) * wide + MARGIN.left, top: Math.floor(k / columns) * high + MARGIN.top,
         width: wide - MARGIN.left - MARGIN.right, height: high - MARGIN.top - MARGIN.bottom,
@@ -153,8 +156,8 @@ class Picture {
   scale() {
     const { log, metric } = this.view, { label, yes } = this.study.metric(metric);
     let values = this.panels.flatMap(({ shown }) => [...shown.values]);
-    // a scale of logarithms has no place for zeros
-    const positive = log && !yes ? values.filter((one) => one > 0) : [];
+    // a scale of logarithms has no place for zeros, and none for a sign
+    const positive = log && !yes && !values.some((one) => one < 0) ? values.filter((one) => one > 0) : [];
     if (positive.length) values = positive;
     return Scale.of(values, { colours: this.study.colours, label, ...(yes ? { low: 0, high: 1 } : {}), ...(log && !yes ? {} : { log: false }) });
   }
@@ -207,8 +210,9 @@ class Picture {
     const known = this.curved.map(({ bound }) => bound).filter((one) => one > 0);
     return known.length ? `f⁺ = ${known.map(text).join("; ")} rad/s²: the median of what is shown` : "";
   }
-  /** The side whose gains the axes are, if they are. */
+  /** The side whose gains the axes are, if they are, from small to large. */
   gains() {
+    if ([this.view.x, this.view.y].some(({ values }) => values.some((one, k) => k && !(one > values[k - 1])))) return null;
     const [a, b] = [this.view.x.name, this.view.y.name].sort(), side = a.split(".")[1];
     const both = a === `observer.${side}.alpha` && b === `observer.${side}.lambda`;
     return both && this.study.metric(`${side}.f_plus`) ? side : null;
@@ -239,11 +243,10 @@ class Picture {
         if (i) context.fillText(text(dim.values[k]), box.left - 8, box.top + box.height * (1 - share));
         else context.fillText(text(dim.values[k]), box.left + box.width * share, box.top + box.height + 8);
       }
-      const name = withUnit(dim.name, dim.unit);
       context.save();
       context.textAlign = "center";
-      if (i) { context.translate(box.left - MARGIN.left + 14, box.top + box.height / 2); context.rotate(-Math.PI / 2); context.fillText(name, 0, 0, box.height + 40); }
-      else context.fillText(name, box.left + box.width / 2, box.top + box.height + 30, box.width + 40);
+      if (i) { context.translate(box.left - MARGIN.left + 14, box.top + box.height / 2); context.rotate(-Math.PI / 2); context.fillText(dim.label, 0, 0, box.height + 40); }
+      else context.fillText(dim.label, box.left + box.width / 2, box.top + box.height + 30, box.width + 40);
       context.restore();
     });
     context.textAlign = "left";
@@ -263,7 +266,7 @@ class Picture {
   lines({ panel, cell }) {
     const { shown, title } = this.panels[panel];
     const at = cell.map((one, i) => Math.floor((one - this.view.from[i]) / shown.step[i]));
-    const places = [this.view.x, this.view.y].map((dim, i) => `${dim.name}: ${text(dim.values[cell[i]])} ${dim.unit}`.trim());
+    const places = [this.view.x, this.view.y].map((dim, i) => `${dim.name}: ${dim.said(cell[i])}`);
     return [`${this.label()}: ${text(shown.values[at[1] * shown.cells[0] + at[0]])}`, ...places, ...(title ? [title] : [])];
   }
   /** What is drawn over the maps: conditions, the region that is being drawn, the chosen cell. */
@@ -317,7 +320,7 @@ const cut = (element, picture, i) => {
   along.to[i] = dim.size;
   const { values } = mapped(study, picture.column, along), finite = values.filter(Number.isFinite);
   const log = picture.scaled.log && Math.max(...finite) > 10 * Math.min(...finite);
-  const plot = new Plot(element, { x: { label: dim.name, unit: dim.unit, names: dim.values.map(text) }, y: { label: picture.label(), log }, height: 270 });
+  const plot = new Plot(element, { x: { label: dim.label, names: dim.values.map(text) }, y: { label: picture.label(), log }, height: 270 });
   plot.set([{ name: "", x: values.map((_, k) => k), y: values, colour: COLOURS[1], width: 2, marks: [cell[i]], sorted: true }]);
   return plot;
 };
@@ -328,11 +331,12 @@ globalThis.jaxblData = async (about) => {
   const study = new Study(about);
   head(about);
   const picture = new Picture(study), { view } = picture, plot = $("plot");
-  const runs = about.served ? new Runs(study) : null;
+  const runs = about.served ? new Runs(study) : null, update = reporting("The study's points", () => picture.update());
+  let chosen = null;
   $("hint").textContent = `Move over the map to read values. Drag to enlarge a region. Click a cell to cut through it${runs ? " and to simulate its run" : ""}. Grey: no value, as the run diverged or is not there yet.`;
   const form = () => {
     const dims = study.varied.filter((dim) => !dim.seed), drawn = () => [view.x, view.y, view.facet];
-    const changed = (act) => (value) => { act(value); form(); picture.update(); };
+    const changed = (act) => (value) => { act(value); form(); update(); };
     const pick = (label, id, options, chosen, act) => choose(label, id, options, chosen, changed(act));
     const forget = () => {
       picture.cursor = null;
@@ -352,7 +356,7 @@ globalThis.jaxblData = async (about) => {
       ...(dims.length > 2 ? [pick("side by side", "facet", [["none", "none"], ...dims.filter((dim) => dim !== view.x && dim !== view.y).map((dim) => [dim.i, dim.name])],
         view.facet?.i ?? "none", (value) => { view.facet = study.dims[value] ?? null; forget(); })] : []),
       ...study.varied.filter((dim) => !drawn().includes(dim)).map((dim) =>
-        pick(dim.name, `at${dim.i}`, [["all", "all"], ...dim.values.map((value, i) => [i, `${text(value)} ${dim.unit}`.trim()])], view.at[dim.i],
+        pick(dim.name, `at${dim.i}`, [["all", "all"], ...dim.values.map((_, i) => [i, dim.said(i)])], view.at[dim.i],
           (value) => { view.at[dim.i] = value === "all" ? value : Number(value); })),
       pick("of several", "how", Object.keys(reduced).map((one) => [one, one]), view.how, (value) => { view.how = value; }),
       ...(picture.gains() ? [pick("gain condition", "condition", [["none", "none"], ...study.conditions.map((one) => [one.name, one.title])], view.condition ?? "none",
@@ -378,12 +382,13 @@ globalThis.jaxblData = async (about) => {
     picture.cursor = found;
     picture.mark();
     $("chosen").hidden = false;
-    $("where").textContent = picture.lines(found).slice(1).join(", ");
+    chosen = picture.point();
+    const { values, seed, stored } = chosen;
+    $("where").textContent = pointWords(study.varied.filter((dim) => !dim.seed).flatMap((dim) => dim.paths), values) + (runs ? `, seed ${seed}` : "");
     picture.cuts = [cut($("cutx"), picture, 0), cut($("cuty"), picture, 1)];
     const several = study.varied.filter((dim) => ![view.x, view.y, view.facet].includes(dim) && view.at[dim.i] === "all" && !(dim.seed && !runs));
     const first = several.length ? ` It is the run of the first value of ${several.map((dim) => dim.name).join(", ")}.` : "";
     $("command").textContent = (runs ? "" : "Save the point beside study.toml, and simulate it: jaxbl simulate point.toml.") + first;
-    const { values, seed, stored } = picture.point();
     runs?.simulate(values, seed, stored);
   };
   plot.addEventListener("pointerdown", (event) => { if (picture.column) { picture.brush = [at(event), at(event)]; plot.setPointerCapture(event.pointerId); } });
@@ -401,7 +406,7 @@ globalThis.jaxblData = async (about) => {
     if (a && b && a.panel === b.panel && Math.hypot(brush[0][0] - brush[1][0], brush[0][1] - brush[1][1]) > 8) {
       view.from = [0, 1].map((i) => Math.min(a.cell[i], b.cell[i]));
       view.to = [0, 1].map((i) => Math.max(a.cell[i], b.cell[i]) + 1);
-      picture.update();
+      update();
     } else if (a) take(a);
     picture.mark();
   });
@@ -414,19 +419,15 @@ globalThis.jaxblData = async (about) => {
       picture.mark();
       $("state").textContent = picture.lines(picture.cursor).join("; ");
     } else if (event.key === "Enter" && picture.cursor) take(picture.cursor);
-    else if (event.key === "0") { picture.whole(); picture.update(); }
+    else if (event.key === "0") { picture.whole(); update(); }
     else return;
     event.preventDefault();
   });
-  $("whole").addEventListener("click", () => { picture.whole(); picture.update(); });
+  $("whole").addEventListener("click", () => { picture.whole(); update(); });
   $("picture").addEventListener("click", () => save("map.png", picture.canvas.toDataURL("image/png")));
-  $("point").addEventListener("click", () => saveText("point.toml", runs ? runs.config() : pointText(picture.point().values)));
-  $("gains").addEventListener("click", () => saveText("gains.toml", gainsText(study.gains, picture.point().values)));
-  addEventListener("resize", () => { picture.update(); for (const one of [...(picture.cuts ?? []), ...(runs?.plots ?? [])]) one.draw(); });
+  $("point").addEventListener("click", () => saveText("point.toml", runs ? runs.config() : pointText(chosen.values, study.effects)));
+  $("gains").addEventListener("click", () => saveText("gains.toml", gainsText(study.gains, chosen.values)));
+  addEventListener("resize", () => { update(); for (const one of [...(picture.cuts ?? []), ...(runs?.plots ?? [])]) one.draw(); });
   picture.first();
-  try {
-    await picture.update();
-  } catch (error) {
-    $("state").textContent = `The study's points cannot be read: ${error.message}`;
-  }
+  await update();
 };

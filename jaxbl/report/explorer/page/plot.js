@@ -88,7 +88,10 @@ class Columns {
   get(name, Kind = Float32Array) {
     if (!this.kept.has(name)) {
       if (this.kept.size >= this.most) this.kept.delete(this.kept.keys().next().value);
-      this.kept.set(name, this.read(name, Kind));
+      const read = this.read(name, Kind);
+      // it may be there later
+      read.catch(() => { this.kept.delete(name); this.metadata = null; });
+      this.kept.set(name, read);
     }
     return this.kept.get(name);
   }
@@ -111,6 +114,9 @@ class Columns {
   }
 }
 
+/** What reads and draws, as a function that says it where that fails. */
+const reporting = (what, act) => () => act().catch((error) => { $("state").textContent = `${what} cannot be read: ${error.message}`; });
+
 /* ------------------------------------------------------------------------------------------------------------ plots */
 
 /** Okabe and Ito's colours, which colour-blind readers can tell apart. */
@@ -129,9 +135,10 @@ const before = (values, x) => {
 /** Round values between two ends, about so many. */
 const ticks = (low, high, count) => {
   const rough = (high - low) / count, size = 10 ** Math.floor(Math.log10(rough));
-  const step = [1, 2, 5, 10].map((one) => one * size).find((one) => one >= rough);
+  const step = [1, 2, 5, 10].map((one) => one * size).find((one) => one >= rough), first = Math.ceil(low / step);
   const out = [];
-  for (let k = Math.ceil(low / step); k * step <= high + 1e-9 * step; k++) out.push(Number((k * step).toPrecision(12)));
+  // where an axis is enlarged beyond what numbers tell apart, there is no next one
+  for (let k = 0; k <= count && (first + k) * step <= high + 1e-9 * step; k++) out.push(Number(((first + k) * step).toPrecision(12)));
   return out;
 };
 

@@ -21,10 +21,26 @@ const tracePlots = (columns) => {
   return plots;
 };
 
-const exact = (value) => (typeof value === "string" ? JSON.stringify(value) : Number.isInteger(value) ? value.toFixed(1) : String(value));
+/** A value as TOML: a whole number stands for a real one, too. */
+const exact = (value) => (typeof value === "number" ? String(value) : JSON.stringify(value));
 
-/** A point, its values by path, as a study that includes this one. */
-const pointText = (values) => `${['include = "study.toml"', "axes = []", "figures = []", ...Object.entries(values).map(([path, value]) => `${path} = ${exact(value)}`)].join("\n")}\n`;
+/** A point in words: axes as { path, unit }, values by path. */
+const pointWords = (axes, values) => axes.map(({ path, unit }) => `${path}: ${text(values[path])} ${unit}`.trim()).join(", ");
+
+/** A point, its values by path, as a study that includes this one; it has all of its `effects` if one of them is varied. */
+const pointText = (values, effects) => {
+  const lines = ['include = "study.toml"', "axes = []", "figures = []"], tables = effects.map((one) => ({ ...one }));
+  let varied = false;
+  for (const [path, value] of Object.entries(values)) {
+    const [, name, key] = /^effects\.(.+)\.([^.]+)$/.exec(path) ?? [];
+    // two of a kind go by their numbers
+    if (name) tables[/^\d+$/.test(name) ? Number(name) : tables.findIndex(({ kind }) => kind === name)][key] = value;
+    else lines.push(`${path} = ${exact(value)}`);
+    varied ||= Boolean(name);
+  }
+  for (const one of varied ? tables : []) lines.push("", "[[effects]]", ...Object.entries(one).map(([key, value]) => `${key} = ${exact(value)}`));
+  return `${lines.join("\n")}\n`;
+};
 
 /** Gains of a point, for a study to include. */
 const gainsText = (gains, values) => {
@@ -75,7 +91,7 @@ class Runs {
     $("told").textContent = found.every > 1 ? `Every ${found.every}th sample is drawn.` : "";
     $("point").disabled = false;
     document.body.dataset.simulated = `${name}, ${Math.round(performance.now() - began)} ms`;
-    const compared = await this.compared(found, stored, ask);
+    const compared = await this.compared(found, stored, ask).catch((error) => `Not compared: ${error.message}`);
     if (asked === this.asked) $("told").textContent += compared;
   }
   /** A metric as stored and of this run: they differ where rounding does, or where the run is not the one of the sweep. */
@@ -83,6 +99,7 @@ class Runs {
     const number = (raw) => (yes ? Number(raw) : raw === null ? NaN : size ? Math.abs(raw) : raw), now = number(metrics[name]);
     const apart = Math.abs(now - value), both = `${label} is ${text(now)}, stored ${text(value)}`;
     if (apart <= 1e-3 * Math.abs(value) || (Number.isNaN(value) && !Number.isFinite(now))) return `${label}: ${text(now)}, as stored in the sweep.`;
+    if (Number.isNaN(value)) return `${label}: ${text(now)}. The sweep has none: its run diverged, or is not there yet.`;
     const near = number((await ask("nearby")).metrics[name]);
     return apart <= 4 * Math.abs(now - near) ? `${both}. Rounding decides: with λ changed in its last digit it is ${text(near)}, as the observer amplifies it under noise.`
       : `This run differs from the sweep's: ${both}.`;
