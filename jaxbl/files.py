@@ -310,8 +310,9 @@ def has_file(folder: Path, name: str) -> bool:
     return (folder / name).exists()
 
 
-def make_folder(path: Path, instead: str = "choose another folder with --out") -> None:
-    """Make a folder that can be written to. Raises `InputError` where that is not possible; `instead` is what to do then."""
+def make_folder(path: Path, instead: str = "choose another folder with --out", option: str = "--out") -> None:
+    """Make a folder that can be written to. Raises `InputError` where that is not possible; `instead` is what to do then,
+    `option` what names the folder."""
     if is_remote(path):
         with access(path, "written to"):
             (path / ".probe").write_bytes(b"")
@@ -323,9 +324,9 @@ def make_folder(path: Path, instead: str = "choose another folder with --out") -
         probe.touch()
         probe.unlink()
     except FileExistsError:
-        raise InputError(f"{path}: is a file; --out should name a folder") from None
+        raise InputError(f"{path}: is a file; {option} should name a folder") from None
     except NotADirectoryError:
-        raise InputError(f"{path}: lies under a file; --out should name a folder") from None
+        raise InputError(f"{path}: lies under a file; {option} should name a folder") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be written to ({error.strerror}); {instead}") from None
 

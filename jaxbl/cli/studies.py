@@ -15,7 +15,7 @@ import typer
 
 from jaxbl import workers
 from jaxbl.errors import InputError, printable
-from jaxbl.files import Busy, place
+from jaxbl.files import Busy, has_file, place
 from jaxbl.lines import Step, described
 from jaxbl.terminal import duration, is_quiet, naming, running, until_interrupted, working
 
@@ -331,7 +331,11 @@ def explore(
     from jaxbl.report.explorer.log import log_source
     from jaxbl.report.explorer.study import study_source
 
-    source = log_source(folder) or study_source(folder)
+    source = log_source(folder)
+    if source is None and not has_file(place(folder), "manifest.json"):
+        what = "is missing" if not place(folder).exists() else "holds no sweep, identification or diagnosis"
+        raise InputError(f"{folder}: {what}; give a folder that 'jaxbl sweep', 'identify' or 'diagnose' wrote")
+    source = source or study_source(folder)
     if static is not None:
         with working(context, "writing the page"):
             page = write_static(source, static)
@@ -339,9 +343,9 @@ def explore(
     from jaxbl.report.explorer.server import served
 
     with served(source, port) as server:
-        if not is_quiet(context):
-            for line in (*source.lead, f"Open {server.url}", "Ctrl+C ends it."):
-                typer.echo(printable(line), err=True)
+        # the address is what was asked for
+        for line in (*([] if is_quiet(context) else source.lead), f"Open {server.url}", "Ctrl+C ends it."):
+            typer.echo(printable(line), err=True)
         if browser if browser is not None else sys.stdout.isatty():
             # a browser in the terminal ends when it is left
             threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()

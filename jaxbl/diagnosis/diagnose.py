@@ -70,7 +70,8 @@ class Diagnosis:
             as given (`motor.missing_before`, its noise is `motor.noise`), with the effects (`motor.missing_after`), without
             one of these (`motor.missing_without.NAME`), and with another one in place of the last
             (`motor.missing_with.NAME`), N m; what the model as given lacks by the observers (`motor.observed_before`,
-            `motor.observed_noise`), N m, empty while they converge; and the smoothed `motor.velocity`, rad/s.
+            `motor.observed_noise`), N m, empty while they converge; and the smoothed `motor.velocity`, rad/s, and
+            `motor.acceleration`, rad/s^2.
         residuals: torques that the model as given lacks, by side, of each segment that was fitted.
         observed: the same by the observers' equivalent control.
         coordinates: along them, by side, of each segment.

@@ -249,7 +249,8 @@ def trace_of(
 
     before, _ = missing["missing_before"]
     for side in before:
-        columns[f"{side}.velocity"] = along(one.smoothed[side].state[:, 1] for _, segments in logs for one in segments)
+        for order, name in ((1, "velocity"), (2, "acceleration")):
+            columns[f"{side}.{name}"] = along(one.smoothed[side].state[:, order] for _, segments in logs for one in segments)
         for name, torques in missing.items():
             pieces = [one for torque in torques[: len(logs)] for one in torque[side]]
             columns[f"{side}.{name}"] = along(one.torque for one in pieces)

@@ -137,7 +137,8 @@ def _headline(result: StudyResult, found: _Survey) -> list[str]:
         varied = [path for path, values in found.values.items() if len(values) > 1 and path.startswith(f"observer.{side}")]
         if varied:
             where = ", ".join(f"{path} = {row[path]:.3g}" for path in varied)
-            lines.append(f"Least {side} velocity error {row[f'{side}.velocity_rmse']:.3g} rad/s rms, at {where}.")
+            least = f"{row[f'{side}.velocity_rmse']:.3g} rad/s rms"
+            lines.append(f"Least {side} velocity error of a run that converged: {least}, at {where}.")
     return lines
 
 

@@ -386,7 +386,7 @@ class Store:
         self.refuse_others()
         found = [path for _, path in self._indexed()]
         if not found:
-            raise InputError(f"{self.folder}: holds no points yet; run 'jaxbl sweep' to the end")
+            raise InputError(f"{self.folder}: holds no points yet; wait for the sweep at work in it, or run 'jaxbl sweep'")
         return found
 
     def columns(self) -> list[str]:

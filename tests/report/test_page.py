@@ -93,7 +93,8 @@ def test_page_of_a_sweep(tmp_path):
     lead = write_sweep_report(result, tmp_path)
     assert lead == [
         "40 runs. The observers converged in 80.0 % (motor) of them.",
-        "Least motor velocity error 2.66 rad/s rms, at observer.motor.alpha = 2.66, observer.motor.lambda = 1.",
+        "Least motor velocity error of a run that converged: 2.66 rad/s rms, at observer.motor.alpha = 2.66, "
+        "observer.motor.lambda = 1.",
     ]
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert len(page.images) == len(list((tmp_path / "figures").iterdir())) == 1

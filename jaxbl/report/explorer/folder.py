@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.errors import InputError
-from jaxbl.files import is_empty, json_text, make_folder, writing
+from jaxbl.files import is_empty, json_text, make_folder, read_json, writing
 from jaxbl.report.maps import drawn_values
 
 ROW_GROUP = 1 << 17
@@ -31,6 +31,7 @@ class Source(NamedTuple):
     """Results that are to be explored.
 
     Attributes:
+        identity: what tells them from other results.
         lead: what was found, in sentences.
         write: writes page and data into an empty folder, to be served or not; says whether there is more to come.
         answers: to questions of a page that is served, by name.
@@ -38,6 +39,7 @@ class Source(NamedTuple):
         finish: waits for the answer that is being computed; none is computed after it.
     """
 
+    identity: str
     lead: Sequence[str]
     write: Callable[[Path, bool], bool]
     answers: Mapping[str, Callable[[Any], Mapping[str, Any]]]
@@ -58,11 +60,14 @@ def write_static(source: Source, out: Path) -> Path:
     Raises:
         InputError: the folder holds something else.
     """
-    make_folder(out)
-    if not is_empty(out) and not (out / _MARKER).exists():
+    make_folder(out, "choose another folder for --static", "--static")
+    marker = out / _MARKER
+    if not is_empty(out) and not marker.exists():
         raise InputError(f"{out}: is not empty, and was not written by jaxbl explore; choose another folder")
+    if marker.exists() and read_json(marker).get("of") != source.identity:
+        raise InputError(f"{out}: holds the page of other results; choose another folder, or remove it")
     with writing(out):
-        (out / _MARKER).write_text(json_text({"made_by": "jaxbl explore"}), encoding="utf-8")
+        marker.write_text(json_text({"made_by": "jaxbl explore", "of": source.identity}), encoding="utf-8")
         for old in out.glob("points.*"):
             old.unlink()
         source.write(out, False)

@@ -55,7 +55,7 @@ def log_source(folder: str | Path) -> Source | None:
         write_page(out, "log.html", about | {"title": title, "lead": lead, "config": model}, ("log.js",), scripts=not served)
         return False
 
-    return Source(lead, write, {}, lambda: None, lambda: None)
+    return Source(str(summary["identity"]), lead, write, {}, lambda: None, lambda: None)
 
 
 def _read(file: Path) -> Any:
@@ -187,7 +187,13 @@ def _groups(summary: Mapping[str, Any], frame: pd.DataFrame, units: Mapping[str,
     lines |= {f"{side}.torque_estimate": f"by the {side} observer" for side in units}
     if summary.get("kind") == "element":
         lines = {"u": "measured", "torque": "by the fitted law"}
-    yield group("torque in the transmission", "torque" if force == "N m" else "force", force, lines)
+    inside = "transmitted" in frame or "torque" in frame
+    yield group(
+        "torque in the transmission" if inside else "disturbance torque",
+        "torque" if force == "N m" else "force",
+        force,
+        lines,
+    )
     for side, unit in units.items():
         lines = {f"{side}.velocity": "smoothed", f"{side}.velocity_estimate": "by the observer"}
         if f"{side}.velocity_estimate" in frame:

@@ -17,6 +17,7 @@ from jaxbl.report.figures import MAP
 from jaxbl.report.maps import value_label
 from jaxbl.report.sweep import headline
 from jaxbl.sweeps.metrics import is_magnitude
+from jaxbl.sweeps.store import Store, identity
 from jaxbl.sweeps.sweep import StudyResult, open_study
 from jaxbl.sweeps.trial import run
 
@@ -33,7 +34,7 @@ def study_source(folder: str | Path) -> Source:
 
     def write(out: Path, served: bool) -> bool:
         now = open_study(folder)
-        return write_study(now, out, headline(now), served=served)
+        return write_study(now, out, _lead(now), served=served)
 
     def answer(to: Callable[[Config, Any], dict[str, Any]], asked: Any) -> dict[str, Any]:
         with one_at_a_time:
@@ -42,7 +43,14 @@ def study_source(folder: str | Path) -> Source:
     answers = {to.__name__: partial(answer, to) for to in (simulated, nearby)}
     first = {axis.path: axis.start if axis.values is None else axis.values[0] for axis in result.config.axes}
     prepare = partial(answer, simulated, {"values": first, "seed": 0})
-    return Source(headline(result), write, answers, prepare, one_at_a_time.acquire)
+    return Source(identity(result.config), _lead(result), write, answers, prepare, one_at_a_time.acquire)
+
+
+def _lead(result: StudyResult) -> list[str]:
+    """What was found, and the study's notes; of a sweep at work no figures, which would be out of date on the page."""
+    manifest = result.source.manifest if isinstance(result.source, Store) else {"finished": True}
+    found = headline(result) if manifest["finished"] else ["This sweep is unfinished: the page shows the runs so far."]
+    return [*found, *result.config.notes]
 
 
 def write_study(result: StudyResult, out: Path, lead: Sequence[str], *, served: bool = False) -> bool:
@@ -81,7 +89,7 @@ _COLUMNS = (
 
 
 def point_of(config: Config, asked: Any) -> tuple[Config, int]:
-    """The study of one point without axes and figures, and the seed.
+    """The study of one point without axes, figures and notes, and the seed.
 
     Args:
         config: the whole study.
@@ -96,7 +104,7 @@ def point_of(config: Config, asked: Any) -> tuple[Config, int]:
         raise InputError(f"values: should have a value of each axis: {', '.join(sorted(paths))}")
     if not isinstance(seed, int) or not 0 <= seed < 2**31:
         raise InputError("seed: should be a whole number from 0 and below 2^31")
-    return with_values(config, values).model_copy(update={"axes": [], "figures": []}), seed
+    return with_values(config, values).model_copy(update={"axes": [], "figures": [], "notes": []}), seed
 
 
 def simulated(config: Config, asked: Any) -> dict[str, Any]:
@@ -120,12 +128,21 @@ def simulated(config: Config, asked: Any) -> dict[str, Any]:
     }  # fmt: skip
 
 
+_NEARBY = 6
+"""Runs that show how far apart rounding brings figures."""
+
+
 def nearby(config: Config, asked: Any) -> dict[str, Any]:
-    """Metrics of a run whose gains λ differ in their last digit: how far apart they come by rounding, which an observer may
-    amplify under noise. Arguments and errors as of :func:`point_of`."""
+    """Metrics of runs whose gains λ and motor inertia differ in their last digits: how far apart they come by rounding,
+    which an observer may amplify under noise, and a plant with a gap. Arguments and errors as of :func:`point_of`."""
     point, seed = point_of(config, asked)
-    gains = {f"observer.{side}.lambda": float(np.nextafter(one["lambda"], np.inf)) for side, one in _gains(point).items()}
-    return {"metrics": run(with_values(point, gains), seed=seed, backend="scan").summary["metrics"]}
+    numbers = {f"observer.{side}.lambda": one["lambda"] for side, one in _gains(point).items()}
+    numbers["drive.motor_inertia"] = float(point.build().drive.inertia("motor"))
+    found = []
+    for k in range(1, _NEARBY + 1):
+        changed = {path: value * (1.0 + k * np.finfo(float).eps) for path, value in numbers.items()}
+        found.append(run(with_values(point, changed), seed=seed, backend="scan").summary["metrics"])
+    return {"metrics": found}
 
 
 def _about(config: Config, columns: list[str]) -> dict[str, Any]:

@@ -27,7 +27,7 @@ def ask(asked):
 
 @pytest.fixture
 def server():
-    with served(Source([], write, {"run": ask}, lambda: None, lambda: None)) as one:
+    with served(Source("", [], write, {"run": ask}, lambda: None, lambda: None)) as one:
         threading.Thread(target=one.serve_forever, daemon=True).start()
         yield one
         one.shutdown()
@@ -109,7 +109,7 @@ def test_a_page_that_is_left_while_it_is_read_says_nothing(capfd, monkeypatch):
         (out / "index.html").write_bytes(bytes(1 << 25))
         return False
 
-    with served(Source([], write, {}, lambda: None, lambda: None)) as server:
+    with served(Source("", [], write, {}, lambda: None, lambda: None)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         server.newest()
         own = f"127.0.0.1:{server.server_port}"
@@ -131,7 +131,7 @@ def test_a_page_loaded_again_is_the_newest():
         (out / "index.html").write_text(str(len(left)))
         return left.pop(0)
 
-    with served(Source([], write, {}, lambda: None, lambda: None)) as server:
+    with served(Source("", [], write, {}, lambda: None, lambda: None)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         assert call(server, "")[1]["Location"] == f"{server.url}1/index.html"
         assert call(server, "1/index.html")[2] == b"3"
@@ -155,7 +155,7 @@ def test_results_that_cannot_be_read_are_told_and_read_later():
             raise why.pop(0)
         return False
 
-    with served(Source([], write, {}, lambda: None, lambda: None)) as server:
+    with served(Source("", [], write, {}, lambda: None, lambda: None)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         for said in ("study.toml: is missing", "no space left"):
             status, _, content = call(server, "")
@@ -165,7 +165,7 @@ def test_results_that_cannot_be_read_are_told_and_read_later():
 
 
 def test_a_port_of_another_program(server):
-    source = Source([], write, {}, lambda: None, lambda: None)
+    source = Source("", [], write, {}, lambda: None, lambda: None)
     with (
         pytest.raises(InputError, match=f"--port {server.server_port}: .*; choose another one"),
         served(source, server.server_port),

@@ -147,6 +147,7 @@ globalThis.jaxblData = async (about) => {
       for (let i = from; i < to; i++) if (held[i] === which && Number.isFinite(values[i])) { sum += values[i] ** 2; count++; }
       return count ? Math.sqrt(sum / count) : NaN;
     };
+    $("sizeshead").textContent = `Root mean square of what is shown${view.cutoff ? ", after the moving average" : ""}`;
     $("sizes").replaceChildren(
       made("thead", {}, made("tr", {}, ...[withUnit(view.group.name, view.group.unit), ...parts.map(([name]) => name)].map((textContent) => made("th", { textContent, scope: "col" })))),
       made("tbody", {}, ...view.shown.map((column) => made("tr", {}, made("th", { textContent: label(column), scope: "row" }),

@@ -138,6 +138,8 @@ class Picture {
     this.fit();
     for (const panel of this.panels) panel.shown = mapped(this.study, column, this.viewed(panel.index));
     this.curved = bounds ? this.panels.map((panel) => this.curve(bounds, panel)) : [];
+    await this.hatch();
+    if (asked !== this.asked) return;
     this.draw();
     const { facet } = this.view, some = facet && facet.size > this.panels.length ? `${this.panels.length} of ${facet.size} values of ${facet.name}. ` : "";
     $("state").textContent = some + (this.study.found < this.study.rows ? `${this.study.found} of ${this.study.rows} runs so far.${this.study.served ? " Load the page again for more." : ""} ` : "") + this.told();
@@ -172,18 +174,22 @@ class Picture {
     }
     scale.draw(context, style.color, this.width - BAR + 10, top, height);
     const over = `${this.view.x.name} and ${this.view.y.name}${this.view.facet ? `, for values of ${this.view.facet.name}` : ""}`;
-    this.canvas.setAttribute("aria-label", `${this.label()} over ${over}, from ${text(scale.low)} to ${text(scale.high)}`);
+    this.canvas.setAttribute("aria-label", `${this.label()} over ${over}: ${scale.said}`);
     this.mark();
   }
-  cells(context, { box, shown: { cells, values, step } }, scale) {
-    const image = new ImageData(cells[0], cells[1]);
+  cells(context, { box, shown: { cells, values, step }, failed }, scale) {
+    const image = new ImageData(cells[0], cells[1]), mask = new ImageData(cells[0], cells[1]);
     for (let j = 0; j < cells[1]; j++) {
       for (let i = 0; i < cells[0]; i++) {
         image.data.set([...scale.colour(values[j * cells[0] + i]), 255], 4 * ((cells[1] - 1 - j) * cells[0] + i));
+        if (failed?.[j * cells[0] + i] < 0.5) mask.data[4 * ((cells[1] - 1 - j) * cells[0] + i) + 3] = 255;
       }
     }
-    const sheet = Object.assign(document.createElement("canvas"), { width: cells[0], height: cells[1] });
-    sheet.getContext("2d").putImageData(image, 0, 0);
+    const sheetOf = (data) => {
+      const sheet = Object.assign(document.createElement("canvas"), { width: cells[0], height: cells[1] });
+      sheet.getContext("2d").putImageData(data, 0, 0);
+      return sheet;
+    };
     context.imageSmoothingEnabled = false;
     // the last cell may have fewer points than the others
     const size = this.size(), reach = cells.map((one, i) => (one * step[i]) / size[i]);
@@ -191,8 +197,28 @@ class Picture {
     context.beginPath();
     context.rect(box.left, box.top, box.width, box.height);
     context.clip();
-    context.drawImage(sheet, box.left, box.top + box.height * (1 - reach[1]), box.width * reach[0], box.height * reach[1]);
+    const place = [box.left, box.top + box.height * (1 - reach[1]), box.width * reach[0], box.height * reach[1]];
+    context.drawImage(sheetOf(image), ...place);
+    if (this.hatched) {
+      // strokes where the mask is
+      const strokes = Object.assign(document.createElement("canvas"), { width: this.width, height: this.height }), own = strokes.getContext("2d");
+      own.imageSmoothingEnabled = false;
+      own.strokeStyle = "#ffffffb0";
+      own.beginPath();
+      for (let k = -box.height; k < box.width; k += 9) { own.moveTo(box.left + k, box.top + box.height); own.lineTo(box.left + k + box.height, box.top); }
+      own.stroke();
+      own.globalCompositeOperation = "destination-in";
+      own.drawImage(sheetOf(mask), ...place);
+      context.drawImage(strokes, 0, 0);
+    }
     context.restore();
+  }
+  /** Cells of a side's metrics in which its observer did not converge, in most runs. */
+  async hatch() {
+    const name = `${this.view.metric.split(".")[0]}.converged`, known = this.study.metric(name) && this.view.metric !== name;
+    const column = known ? await this.study.column(name) : null;
+    for (const panel of this.panels) panel.failed = column && mapped(this.study, column, { ...this.viewed(panel.index), metric: name }).values;
+    this.hatched = this.panels.some(({ failed }) => failed?.some((one) => one < 0.5));
   }
   /** The column with the bound f_plus that a gain condition is drawn for, if one is asked for. */
   bounds() {
@@ -207,8 +233,9 @@ class Picture {
     return { bound, points: this.view.x.name.endsWith(".alpha") ? points : points.map(([a, b]) => [b, a]) };
   }
   told() {
+    const hatched = this.hatched ? `Hatched: the ${this.view.metric.split(".")[0]} observer did not converge${this.view.at.includes("all") ? " in most runs" : ""}. ` : "";
     const known = this.curved.map(({ bound }) => bound).filter((one) => one > 0);
-    return known.length ? `f⁺ = ${known.map(text).join("; ")} rad/s²: the median of what is shown` : "";
+    return hatched + (known.length ? `f⁺ = ${[...new Set(known.map(text))].join("; ")} rad/s²: the median of what is shown.` : "");
   }
   /** The side whose gains the axes are, if they are, from small to large. */
   gains() {
@@ -285,6 +312,7 @@ class Picture {
       context.restore();
       if (this.cursor?.panel !== k) return;
       const size = this.size(), shares = this.cursor.cell.map((one, i) => (one - this.view.from[i] + 0.5) / size[i]);
+      if (shares.some((one) => one < 0 || one > 1)) return;
       const place = [box.left + box.width * shares[0], box.top + box.height * (1 - shares[1])];
       this.outlined(context, ["#ffffff", 3], ["#000000", 6], () => context.arc(...place, 6, 0, 2 * Math.PI));
     });
@@ -333,7 +361,7 @@ globalThis.jaxblData = async (about) => {
   const picture = new Picture(study), { view } = picture, plot = $("plot");
   const runs = about.served ? new Runs(study) : null, update = reporting("The study's points", () => picture.update());
   let chosen = null;
-  $("hint").textContent = `Move over the map to read values. Drag to enlarge a region. Click a cell to cut through it${runs ? " and to simulate its run" : ""}. Grey: no value, as the run diverged or is not there yet.`;
+  $("hint").textContent = `Move over the map to read values. Drag to enlarge a region. Click a cell to cut through it${runs ? " and to simulate its run" : ""}. Grey: no value, as the run diverged, is not there yet, or has no such number.`;
   const form = () => {
     const dims = study.varied.filter((dim) => !dim.seed), drawn = () => [view.x, view.y, view.facet];
     const changed = (act) => (value) => { act(value); form(); update(); };
@@ -384,7 +412,7 @@ globalThis.jaxblData = async (about) => {
     $("chosen").hidden = false;
     chosen = picture.point();
     const { values, seed, stored } = chosen;
-    $("where").textContent = pointWords(study.varied.filter((dim) => !dim.seed).flatMap((dim) => dim.paths), values) + (runs ? `, seed ${seed}` : "");
+    $("where").textContent = `${picture.lines(found)[0]} at ` + pointWords(study.varied.filter((dim) => !dim.seed).flatMap((dim) => dim.paths), values) + (runs ? `, seed ${seed}` : "");
     picture.cuts = [cut($("cutx"), picture, 0), cut($("cuty"), picture, 1)];
     const several = study.varied.filter((dim) => ![view.x, view.y, view.facet].includes(dim) && view.at[dim.i] === "all" && !(dim.seed && !runs));
     const first = several.length ? ` It is the run of the first value of ${several.map((dim) => dim.name).join(", ")}.` : "";

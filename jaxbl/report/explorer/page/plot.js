@@ -160,13 +160,17 @@ class Scale {
   static of(values, about) {
     let [low, high] = [Infinity, -Infinity];
     for (const one of values) if (Number.isFinite(one)) { low = Math.min(low, one); high = Math.max(high, one); }
+    // of no values, or of one value
+    const one = low > high ? "no value" : low === high ? text(low) : "";
     if (low > high) [low, high] = [0, 1];
     if (low === high) [low, high] = [low - 0.5 * Math.abs(low) - 1e-12, high + 0.5 * Math.abs(high) + 1e-12];
-    return new Scale({ low, high, log: low > 0 && high / low > 30, ...about });
+    return new Scale({ one, low, high, log: low > 0 && high / low > 30, ...about });
   }
   share(value) { return this.log ? Math.log(value / this.low) / Math.log(this.high / this.low) : (value - this.low) / (this.high - this.low); }
   value(share) { return this.log ? this.low * (this.high / this.low) ** share : this.low + share * (this.high - this.low); }
   colour(value) { return Number.isFinite(value) ? this.colours[Math.round(255 * Math.min(1, Math.max(0, this.share(value))))] : MISSING; }
+  /** What it says. */
+  get said() { return this.one || `from ${text(this.low)} to ${text(this.high)}`; }
   /** A bar with values beside it. */
   draw(context, colour, left, top, height) {
     for (let k = 0; k < height; k++) {
@@ -174,7 +178,8 @@ class Scale {
       context.fillRect(left, top + k, 14, 1.5);
     }
     Object.assign(context, { fillStyle: colour, font: "13px system-ui, sans-serif", textAlign: "left", textBaseline: "middle" });
-    for (let k = 0; k <= 4; k++) context.fillText(text(this.value(k / 4)), left + 18, top + height * (1 - k / 4));
+    if (this.one) context.fillText(this.one, left + 18, top + height / 2, 76);
+    else for (let k = 0; k <= 4; k++) context.fillText(text(this.value(k / 4)), left + 18, top + height * (1 - k / 4));
   }
 }
 const coloursOf = (about) => about.colours.map((one) => [1, 3, 5].map((i) => parseInt(one.slice(i, i + 2), 16)));
@@ -269,7 +274,7 @@ class Plot {
     }
     context.restore();
     const { scale } = this, names = this.lines.map((one) => one.name).filter(Boolean).join(", ");
-    const told = scale ? `colours: ${withUnit(scale.label, scale.unit)}, from ${text(scale.low)} to ${text(scale.high)}` : names;
+    const told = scale ? `colours: ${withUnit(scale.label, scale.unit)}, ${scale.said}` : names;
     canvas.setAttribute("aria-label", `${withUnit(this.y.label, this.y.unit)} over ${withUnit(this.x.label, this.x.unit)}, from ${text(y.ends[0])} to ${text(y.ends[1])}: ${told}`);
     this.view.setAttribute("aria-label", `${this.y.label} over ${this.x.label}: arrow keys read values, 0 shows the whole`);
   }

@@ -29,7 +29,7 @@ const pointWords = (axes, values) => axes.map(({ path, unit }) => `${path}: ${te
 
 /** A point, its values by path, as a study that includes this one; it has all of its `effects` if one of them is varied. */
 const pointText = (values, effects) => {
-  const lines = ['include = "study.toml"', "axes = []", "figures = []"], tables = effects.map((one) => ({ ...one }));
+  const lines = ['include = "study.toml"', "axes = []", "figures = []", "notes = []"], tables = effects.map((one) => ({ ...one }));
   let varied = false;
   for (const [path, value] of Object.entries(values)) {
     const [, name, key] = /^effects\.(.+)\.([^.]+)$/.exec(path) ?? [];
@@ -100,9 +100,10 @@ class Runs {
     const apart = Math.abs(now - value), both = `${label} is ${text(now)}, stored ${text(value)}`;
     if (apart <= 1e-3 * Math.abs(value) || (Number.isNaN(value) && !Number.isFinite(now))) return `${label}: ${text(now)}, as stored in the sweep.`;
     if (Number.isNaN(value)) return `${label}: ${text(now)}. The sweep has none: its run diverged, or is not there yet.`;
-    const near = number((await ask("nearby")).metrics[name]);
-    return apart <= 4 * Math.abs(now - near) ? `${both}. Rounding decides: with λ changed in its last digit it is ${text(near)}, as the observer amplifies it under noise.`
-      : `This run differs from the sweep's: ${both}.`;
+    const near = [now, ...(await ask("nearby")).metrics.map((one) => number(one[name]))].filter(Number.isFinite);
+    const [low, high] = [Math.min(...near), Math.max(...near)], room = 0.5 * (high - low);
+    const spread = `with λ and the motor's inertia changed in their last digits it is ${text(low)} to ${text(high)}`;
+    return value >= low - room && value <= high + room ? `${both}. Rounding decides: ${spread}.` : `This run differs from the sweep's: ${both}; ${spread}.`;
   }
   config() { return this.newest.config; }
   draw() {
@@ -167,7 +168,7 @@ class Runs {
     const { metrics } = this.newest, cell = (value) => made("td", { className: "number", textContent: typeof value === "boolean" ? (value ? "yes" : "no") : text(value) });
     $("metrics").replaceChildren(
       made("thead", {}, made("tr", {}, ...["metric", ...this.all.map((one) => one.name)].map((name) => made("th", { textContent: name, scope: "col" })))),
-      made("tbody", {}, ...Object.keys(metrics).map((name) => made("tr", {}, made("th", { textContent: this.study.metric(name)?.label ?? name, scope: "row" }), ...this.all.map((one) => cell(one.metrics[name]))))),
+      made("tbody", {}, ...Object.keys(metrics).map((name) => made("tr", {}, made("th", { textContent: this.study.metric(name)?.label ?? name, scope: "row" }), ...this.all.map((one) => cell(this.study.metric(name)?.size && one.metrics[name] !== null ? Math.abs(one.metrics[name]) : one.metrics[name]))))),
     );
   }
 }
