@@ -84,8 +84,8 @@ def stored(folder):
     trace().rename(columns={"motor.missing_before": "motor.residual"}).to_parquet(folder / "trace.parquet", index=False)
     (folder / "model.toml").write_text("[drive]\ngear_ratio = 4.0\n")
     found = {
-        "title": HOSTILE, "identity": "1", "file": "axis.csv", "sample_period": 1e-3, "parameters": {}, "warnings": [], "notes": [],
-        "kind": "element", "refused": [], "torque": {"element": {"rms": 1.0, "relative": 0.1, "unit": "N m"}},
+        "title": HOSTILE, "identity": "1", "file": "axis.csv", "sample_period": 1e-3, "parameters": {}, "notes": [],
+        "kind": "element", "warnings": [], "refused": [], "torque": {"element": {"rms": 1.0, "relative": 0.1, "unit": "N m"}},
         "method": {"element": {"terms": [], "gains": {}, "reversals": 4}},
     }  # fmt: skip
     (folder / "identification.json").write_text(json_text(found))
