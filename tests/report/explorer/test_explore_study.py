@@ -257,6 +257,22 @@ def test_gains_that_differ_in_the_last_digit_give_nearly_the_same(swept):
     assert near == pytest.approx(found, rel=1e-3)
 
 
+CLICKS = """async () => {
+  const seeds = [], fetched = fetch, runs = new Runs({ named: [] });
+  globalThis.fetch = async (what, { body }) => {
+    seeds.push(JSON.parse(body).seed);
+    await new Promise((resolve) => setTimeout(resolve, 50));
+    return { ok: false, json: async () => ({ error: "no" }) };
+  };
+  const first = runs.simulate({}, 1);
+  while (!seeds.length) await new Promise((resolve) => setTimeout(resolve));
+  await Promise.all([first, runs.simulate({}, 2), runs.simulate({}, 3)]);
+  globalThis.fetch = fetched;
+  return seeds;
+}"""
+"""Two clicks while the run of another is simulated, and the seeds that the server is asked for."""
+
+
 @needs_chromium
 def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept, tmp_path):
     with served(study_source(swept)) as server:
@@ -294,6 +310,9 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept, tmp_
             one = "{ metric: { name: 'm', label: 'error', yes: false, size: true }, value: NaN }"
             said = page.evaluate(f"new Runs({{}}).compared({{ metrics: {{ m: -2 }} }}, {one})")
             assert said == "error: 2. The sweep has none: its run diverged, or is not there yet."
+            # of clicks while one is simulated the last one counts
+            assert page.evaluate(CLICKS) == [1, 3]
+            assert page.locator("#told").inner_text() == "Not simulated: no"
             # points that cannot be read are told, and read later
             page.route("**/points.parquet", lambda route: route.fulfill(status=206, body=b"nothing"))
             page.select_option("#metric", "motor.position_rmse")
