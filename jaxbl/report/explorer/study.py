@@ -124,7 +124,9 @@ def nearby(config: Config, asked: Any) -> dict[str, Any]:
     """Metrics of a run whose gains λ differ in their last digit: how far apart they come by rounding, which an observer may
     amplify under noise. Arguments and errors as of :func:`point_of`."""
     point, seed = point_of(config, asked)
-    gains = {f"observer.{side}.lambda": float(np.nextafter(one["lambda"], np.inf)) for side, one in _gains(point).items()}
+    # the last decimal that its precision has: one bit may be lost in the first product
+    last = 1.0 + 8.0 * float(np.finfo(point.run.precision).eps)
+    gains = {f"observer.{side}.lambda": last * one["lambda"] for side, one in _gains(point).items()}
     return {"metrics": run(with_values(point, gains), seed=seed, backend="scan").summary["metrics"]}
 
 
