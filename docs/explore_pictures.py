@@ -62,4 +62,6 @@ def draw(source: Source, picture: Callable[[Page], None]) -> None:
 
 if __name__ == "__main__":
     draw(study_source(sys.argv[1]), sweep)
-    draw(log_source(sys.argv[2]), log)
+    diagnosed = log_source(sys.argv[2])
+    assert diagnosed is not None, f"{sys.argv[2]}: holds no results of a log"
+    draw(diagnosed, log)

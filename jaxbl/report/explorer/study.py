@@ -138,9 +138,10 @@ def nearby(config: Config, asked: Any) -> dict[str, Any]:
     point, seed = point_of(config, asked)
     numbers = {f"observer.{side}.lambda": one["lambda"] for side, one in _gains(point).items()}
     numbers["drive.motor_inertia"] = float(point.build().drive.inertia("motor"))
-    found = []
+    # the last decimal that its precision has: one bit may be lost in the first product
+    last, found = 8.0 * float(np.finfo(point.run.precision).eps), []
     for k in range(1, _NEARBY + 1):
-        changed = {path: value * (1.0 + k * np.finfo(float).eps) for path, value in numbers.items()}
+        changed = {path: value * (1.0 + k * last) for path, value in numbers.items()}
         found.append(run(with_values(point, changed), seed=seed, backend="scan").summary["metrics"])
     return {"metrics": found}
 

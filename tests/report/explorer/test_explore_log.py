@@ -85,8 +85,8 @@ def stored(folder):
     (folder / "model.toml").write_text("[drive]\ngear_ratio = 4.0\n")
     found = {
         "title": HOSTILE, "identity": "1", "file": "axis.csv", "sample_period": 1e-3, "parameters": {}, "notes": [],
-        "kind": "element", "warnings": [], "refused": [], "torque": {"element": {"rms": 1.0, "relative": 0.1, "unit": "N m"}},
-        "method": {"element": {"terms": [], "gains": {}, "reversals": 4}},
+        "kind": "element", "warnings": [], "refused": [],
+        "torque": {"element": {"rms": 1.0, "relative": 0.1, "unit": "N m"}}, "method": {"element": {"terms": [], "gains": {}, "reversals": 4}},
     }  # fmt: skip
     (folder / "identification.json").write_text(json_text(found))
 

@@ -17,7 +17,7 @@ from jaxbl.config import read_config
 from jaxbl.errors import InputError
 from jaxbl.report.explorer.folder import Source, write_static
 from jaxbl.report.explorer.server import served
-from jaxbl.report.explorer.study import study_source, write_study
+from jaxbl.report.explorer.study import nearby, simulated, study_source, write_study
 from jaxbl.sweeps.sweep import open_study, share, sweep
 from jaxbl.sweeps.trial import run
 
@@ -264,11 +264,27 @@ def test_points_that_the_study_may_not_have_are_refused(swept, asked, why):
         study_source(swept).answers["simulated"](asked)
 
 
-def test_gains_that_differ_in_the_last_digit_give_nearly_the_same(swept):
-    answers, asked = study_source(swept).answers, {"values": VALUES, "seed": 0}
+def test_numbers_that_differ_in_the_last_digit_of_their_precision_give_nearly_the_same():
+    config, asked = read_config(SWEPT | {"run": SWEPT["run"] | {"precision": "float32"}}), {"values": VALUES, "seed": 0}
     name = "motor.velocity_rmse"
-    found, near = answers["simulated"](asked)["metrics"][name], [one[name] for one in answers["nearby"](asked)["metrics"]]
+    found, near = simulated(config, asked)["metrics"][name], [one[name] for one in nearby(config, asked)["metrics"]]
     assert near == pytest.approx([found] * 6, rel=1e-3) and len({found, *near}) > 3
+
+
+CLICKS = """async () => {
+  const seeds = [], fetched = fetch, runs = new Runs({ named: [] });
+  globalThis.fetch = async (what, { body }) => {
+    seeds.push(JSON.parse(body).seed);
+    await new Promise((resolve) => setTimeout(resolve, 50));
+    return { ok: false, json: async () => ({ error: "no" }) };
+  };
+  const first = runs.simulate({}, 1);
+  while (!seeds.length) await new Promise((resolve) => setTimeout(resolve));
+  await Promise.all([first, runs.simulate({}, 2), runs.simulate({}, 3)]);
+  globalThis.fetch = fetched;
+  return seeds;
+}"""
+"""Two clicks while the run of another is simulated, and the seeds that the server is asked for."""
 
 
 @needs_chromium
@@ -308,6 +324,9 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept, tmp_
             one = "{ metric: { name: 'm', label: 'error', yes: false, size: true }, value: NaN }"
             said = page.evaluate(f"new Runs({{}}).compared({{ metrics: {{ m: -2 }} }}, {one})")
             assert said == "error: 2. The sweep has none: its run diverged, or is not there yet."
+            # of clicks while one is simulated the last one counts
+            assert page.evaluate(CLICKS) == [1, 3]
+            assert page.locator("#told").inner_text() == "Not simulated: no"
             # points that cannot be read are told, and read later
             page.route("**/points.parquet", lambda route: route.fulfill(status=206, body=b"nothing"))
             page.select_option("#metric", "motor.position_rmse")

@@ -63,12 +63,16 @@ class Runs {
     $("told").textContent = "simulating …";
     $("point").disabled = true;
     const began = performance.now();
-    const ask = async (what) => {
+    const answered = async (what) => {
       const answer = await fetch(what, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ values, seed }) });
       const found = await answer.json();
       if (!answer.ok) throw new Error(found.error);
       return found;
     };
+    const ask = (what) => (this.waiting = answered(what));
+    // one is computed at a time: of clicks meanwhile the last one counts
+    await this.waiting?.catch(() => null);
+    if (asked !== this.asked) return;
     let found;
     try {
       found = await ask("simulated");
