@@ -86,7 +86,8 @@ def stored(folder):
     found = {
         "title": HOSTILE, "identity": "1", "file": "axis.csv", "sample_period": 1e-3, "parameters": {}, "notes": [],
         "kind": "element", "warnings": [], "refused": [],
-        "torque": {"element": {"rms": 1.0, "relative": 0.1, "unit": "N m"}}, "method": {"element": {"terms": [], "gains": {}, "reversals": 4}},
+        "torque": {"element": {"rms": 1.0, "relative": 0.1, "unit": "N m"}},
+        "method": {"element": {"terms": [], "gains": {}, "reversals": 4}},
     }  # fmt: skip
     (folder / "identification.json").write_text(json_text(found))
 

@@ -413,9 +413,10 @@ globalThis.jaxblData = async (about) => {
     chosen = picture.point();
     const { values, seed, stored } = chosen;
     picture.cuts = [cut($("cutx"), picture, 0), cut($("cuty"), picture, 1)];
-    const several = study.varied.filter((dim) => ![view.x, view.y, view.facet].includes(dim) && view.at[dim.i] === "all" && !(dim.seed && !runs));
-    const taken = several.length && !study.metric(view.metric).yes ? ` (${view.how})` : "";
-    $("where").textContent = `${picture.lines(found)[0]}${taken} at ` + pointWords(study.varied.filter((dim) => !dim.seed).flatMap((dim) => dim.paths), values) + (runs ? `, seed ${seed}` : "");
+    const together = study.varied.filter((dim) => ![view.x, view.y, view.facet].includes(dim) && view.at[dim.i] === "all");
+    const several = together.filter((dim) => !dim.seed || runs), taken = together.length && !study.metric(view.metric).yes ? ` (${view.how})` : "";
+    const seeds = runs && !several.some((dim) => dim.seed) ? `, seed ${seed}` : "";
+    $("where").textContent = `${picture.lines(found)[0]}${taken} at ${pointWords(study.varied.filter((dim) => !dim.seed).flatMap((dim) => dim.paths), values)}${seeds}`;
     const first = several.length ? ` It is the run of the first value of ${several.map((dim) => dim.name).join(", ")}.` : "";
     $("command").textContent = (runs ? "" : "Save the point beside study.toml, and simulate it: jaxbl simulate point.toml.") + first;
     runs?.simulate(values, seed, stored);
