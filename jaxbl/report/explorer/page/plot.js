@@ -153,7 +153,8 @@ const logTicks = (low, high, count) => {
   return out;
 };
 
-/** Colours of values from low to high: { colours, low, high, log, label, unit }, colours as [red, green, blue]. */
+/** Colours of values from low to high: { colours, low, high, log, label, unit, names }, colours as [red, green, blue]; names as of
+ * an axis. */
 class Scale {
   constructor(of) { Object.assign(this, of); }
   /** Of finite values; logarithmic where they are positive and span more than a factor of 30. */
@@ -174,7 +175,8 @@ class Scale {
       context.fillRect(left, top + k, 14, 1.5);
     }
     Object.assign(context, { fillStyle: colour, font: "13px system-ui, sans-serif", textAlign: "left", textBaseline: "middle" });
-    for (let k = 0; k <= 4; k++) context.fillText(text(this.value(k / 4)), left + 18, top + height * (1 - k / 4));
+    const marks = this.names ? this.names.map((name, k) => [name, this.share(k)]) : [0, 1, 2, 3, 4].map((k) => [text(this.value(k / 4)), k / 4]);
+    for (const [name, share] of marks) if (share >= 0 && share <= 1) context.fillText(name, left + 18, top + height * (1 - share));
   }
 }
 const coloursOf = (about) => about.colours.map((one) => [1, 3, 5].map((i) => parseInt(one.slice(i, i + 2), 16)));
