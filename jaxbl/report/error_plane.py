@@ -101,12 +101,18 @@ def error_plane(trace: pd.DataFrame, side: str, found: dict[str, Any]) -> Drawn:
 def _set_limits(ax: Axes, shown: Any, outside: Any) -> None:
     """Ends of the plane, from x and y of the error and of its majorant."""
     for axis, values, outer in zip(("x", "y"), shown, outside, strict=True):
-        reach = np.nanmax(np.abs(values), initial=0.0)
-        if np.isfinite(reach) and reach > 0.0:
-            # a majorant far outside would leave nothing of the error to be seen
-            largest = max(reach, np.abs(outer).max(initial=0.0))
-            reach = 1.1 * (largest if largest < 4.0 * reach else 1.2 * reach)
+        if reach := plane_reach(values, outer):
             ax.set(**{f"{axis}lim": (-reach, reach)})
+
+
+def plane_reach(error: np.ndarray, majorant: np.ndarray) -> float:
+    """How far an axis of the phase plane goes from zero; 0 where no finite error says so."""
+    reach = float(np.nanmax(np.abs(error), initial=0.0))
+    if not np.isfinite(reach):
+        return 0.0
+    # a majorant far outside would leave nothing of the error to be seen
+    largest = max(reach, float(np.abs(majorant).max(initial=0.0)))
+    return 1.1 * (largest if largest < 4.0 * reach else 1.2 * reach)
 
 
 _TURNS = 6

@@ -48,17 +48,20 @@ def run(
         seed: seed of the encoder noise.
         every: keep every N-th sample of the trace.
         backend: `scan` compiles for all values of the study's numbers, which is faster where many runs follow one another;
-            left out, the faster for one run.
+            `fused` is faster for one run; left out, `fused` where it can run the study.
 
     Raises:
-        InputError: wrong config.
+        InputError: wrong config, or a study that `fused` cannot run.
     """
     config = read_config(study)
     if not 1 <= every <= config.run.steps:
         raise InputError(f"every: should be between 1 and the number of samples {config.run.steps}, not {every}")
     with precision(config):
         experiment = prepare(config)
-        figures, kept = _scanned(experiment, seed, every) if backend == "scan" else _recorded(experiment, seed, every)
+        if backend == "scan":
+            figures, kept = _scanned(experiment, seed, every)
+        else:
+            figures, kept = _recorded(experiment, seed, every, insist=backend == "fused")
         figures = with_conditions(figures, observer_gains(experiment))
         trace = pd.DataFrame({name: np.asarray(column, float) for name, column in kept.items()})
     last = {name: plain(figures.pop(name)) for name in list(figures) if name.startswith("last.")}
@@ -66,14 +69,16 @@ def run(
     return Trial(config, trace, _summary(config, last, metrics, seed))
 
 
-def _recorded(experiment: Experiment, seed: int, every: int) -> tuple[dict[str, Any], Any]:
-    """By the fused loop if it can."""
+def _recorded(experiment: Experiment, seed: int, every: int, *, insist: bool) -> tuple[dict[str, Any], Any]:
+    """By the fused loop; if that cannot, by XLA's own, unless one insists."""
     try:
         with attempted():
             from jaxbl.fused.single_run import recorded
 
             return recorded(experiment, seed, _REDUCERS, partial(_row, experiment), every)
     except Unsupported as why:
+        if insist:
+            raise InputError(f"backend: the fused loop does not know {why}; use 'scan', or leave it out") from None
         say_scanned(str(why))
         return _scanned(experiment, seed, every)
 

@@ -10,6 +10,7 @@ from small_study import listed, rigid, small
 
 from jaxbl.config import read_config, with_values
 from jaxbl.errors import InputError
+from jaxbl.fused import Unsupported
 from jaxbl.sweeps.trial import run
 
 SWEEPS = Path(__file__).parents[2] / "sweeps"
@@ -125,3 +126,20 @@ def test_decimation_thins_the_trace_and_nothing_else():
     assert thin.summary["remarks"] == whole.summary["remarks"]
     for name, found in whole.summary["identified"].items():
         assert thin.summary["identified"][name] == pytest.approx(found, rel=1e-9)
+
+
+def test_backends(monkeypatch):
+    """Both give the same; one that is asked for is not replaced."""
+    study = rigid({"run.duration": 0.1})
+    both = [run(study, backend=backend) for backend in ("fused", "scan")]
+    pd.testing.assert_frame_equal(both[0].trace, both[1].trace, rtol=1e-9)
+
+    def unsupported(*_):
+        raise Unsupported("a step of its own")
+
+    monkeypatch.setattr("jaxbl.fused.single_run.recorded", unsupported)
+    with pytest.raises(
+        InputError, match=r"backend: the fused loop does not know a step of its own; use 'scan', or leave it out"
+    ):
+        run(study, backend="fused")
+    pd.testing.assert_frame_equal(run(study).trace, both[1].trace)

@@ -92,7 +92,7 @@ def write_log(summary: Mapping[str, Any], trace: pd.DataFrame, model: Mapping[st
     return {
         "rows": len(frame),
         "period": summary["sample_period"],
-        "held": "held_out" in frame,
+        "held": "held_out" in frame and bool(frame["held_out"].any()),
         "coordinates": coordinates,
         "over": _first(summary, frame),
         "groups": groups,

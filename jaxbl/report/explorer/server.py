@@ -8,7 +8,7 @@ import shutil
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -42,12 +42,18 @@ def served(source: Source, port: int = 0) -> "Iterator[ExplorerServer]":
         except OSError as error:
             raise InputError(f"--port {port}: {error.strerror}; choose another one") from None
         with server:
-            threading.Thread(target=source.prepare, name="jaxbl-prepare", daemon=True).start()
+            threading.Thread(target=_prepare, args=(source,), name="jaxbl-prepare", daemon=True).start()
             try:
                 yield server
             finally:
                 # threads of XLA that still compute would take the interpreter down
                 source.finish()
+
+
+def _prepare(source: Source) -> None:
+    # what is wrong, the first answer says
+    with suppress(ValueError, RuntimeError, MemoryError, NoResult):
+        source.prepare()
 
 
 class ExplorerServer(ThreadingHTTPServer):
@@ -176,6 +182,9 @@ class _Handler(BaseHTTPRequestHandler):
                 found = answer(json.loads(self.rfile.read(int(length))))
             except (ValueError, RecursionError, NoResult) as error:
                 self._refuse(HTTPStatus.BAD_REQUEST, str(error))
+            except (RuntimeError, MemoryError) as error:
+                # of XLA, too
+                self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, f"{type(error).__name__}: {error}")
             else:
                 self._send(HTTPStatus.OK, json.dumps(found, allow_nan=False).encode(), "application/json")
 

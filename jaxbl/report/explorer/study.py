@@ -12,7 +12,7 @@ from matplotlib.colors import to_hex
 
 from jaxbl.config import Config, is_boolean, with_values
 from jaxbl.errors import InputError
-from jaxbl.report.error_plane import error_path
+from jaxbl.report.error_plane import error_path, plane_reach
 from jaxbl.report.figures import MAP
 from jaxbl.report.maps import value_label
 from jaxbl.report.sweep import headline
@@ -121,6 +121,7 @@ def simulated(config: Config, asked: Any) -> dict[str, Any]:
         "columns": {name: encoded(trace[name]) for name in _COLUMNS if name in trace},
         "planes": {
             side: {"error": encoded(one.error), "slope": encoded(one.slope),
+                   "reach": [plane_reach(one.error, one.majorant[0]), plane_reach(one.slope, one.majorant[1])],
                    "majorant": [encoded(part) for part in one.majorant] if len(one.majorant[0]) else None}
             for side, one in planes.items()
         },

@@ -20,6 +20,8 @@ def write(out: Path, served: bool) -> bool:
 
 
 def ask(asked):
+    if asked == {"at": 2}:
+        raise RuntimeError("out of memory")
     if asked != {"at": 1}:
         raise InputError("at: should be 1")
     return {"value": 2.0}
@@ -86,6 +88,8 @@ def test_questions(server):
     for body, why in (('{"at": 3}', "at: should be 1"), ("{", "Expecting property name"), (b"\xff", "codec can't decode")):
         status, _, content = call(server, "1/run", "POST", body, **kind)
         assert status == 400 and why in json.loads(content)["error"]
+    status, _, content = call(server, "1/run", "POST", '{"at": 2}', **kind)
+    assert status == 500 and json.loads(content) == {"error": "RuntimeError: out of memory"}
     assert call(server, "1/run", "POST", '{"at": 1}')[0] == 404
     assert call(server, "1/other", "POST", '{"at": 1}', **kind)[0] == 404
     assert call(server, "1/run", "POST", "[" * 70_000, **kind)[0] == 413

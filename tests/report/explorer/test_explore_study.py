@@ -238,6 +238,10 @@ def test_a_run_simulated_anew_is_that_of_its_config(swept):
         assert found["metrics"][name] == (value if value is None else pytest.approx(value, rel=1e-9)), name
     velocity = np.frombuffer(base64.b64decode(found["columns"]["motor.velocity"]), "<f4")
     np.testing.assert_allclose(velocity, trial.trace["motor.velocity"], rtol=1e-5, atol=1e-7)
+    # its phase plane shows the error, though the majorant goes far beyond it
+    plane = found["planes"]["motor"]
+    error, slope = (np.frombuffer(base64.b64decode(plane[name]), "<f4") for name in ("error", "slope"))
+    assert plane["reach"] == pytest.approx([1.32 * np.abs(one).max() for one in (error, slope)], rel=1e-5)
     # the sweep stored the same
     frame = open_study(swept).frame
     row = frame[(frame[NOISE] == 1e-4) & (frame[ALPHA] > 49.0) & (frame[LAMBDA] < 2.0)]

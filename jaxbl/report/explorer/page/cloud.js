@@ -45,12 +45,12 @@ globalThis.jaxblData = async (about) => {
       const positive = values.every((one) => !(one <= 0));
       return { ...known[name], log: view.log && positive && (known[name].spread || high / low > 30) && !known[name].names };
     };
-    const shade = rows.map((i) => data[view.shade][i]), { label, unit } = known[view.shade];
+    const shade = rows.map((i) => data[view.shade][i]), { label, unit, names: words } = known[view.shade];
     const shaded = (i) => `${withUnit(label, unit)}: ${text(value(view.shade, shade[i]))}`;
     const range = plot && plot.of === `${view.x} ${view.y}` ? plot.range : null;
     plot = new Plot($("plot"), { x: axis(view.x), y: axis(view.y), height: 560, picked: ({ i }) => take(rows[i]), caption: `${withUnit(label, unit)} by colour` });
     Object.assign(plot, { of: `${view.x} ${view.y}`, range });
-    plot.scale = Scale.of(shade, { colours: coloursOf(about), label, unit, ...(metric(view.shade)?.yes ? { low: 0, high: 1 } : {}), ...(view.log ? {} : { log: false }) });
+    plot.scale = Scale.of(shade, { colours: coloursOf(about), label, unit, names: words, ...(metric(view.shade)?.yes ? { low: 0, high: 1 } : {}), ...(view.log ? {} : { log: false }) });
     plot.set([{ name: "", x: rows.map((i) => data[view.x][i]), y: rows.map((i) => data[view.y][i]), shade, dots: rows.length > 5000 ? 3 : 6, said: (i) => [shaded(i)] }]);
     const some = rows.length < about.rows ? `${rows.length} of ${about.rows} points are drawn. ` : "";
     said = $("state").textContent = some + (about.found < about.total ? `${about.found} of ${about.total} runs so far.${about.served ? " Load the page again for more." : ""}` : "");

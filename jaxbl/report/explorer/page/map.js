@@ -347,7 +347,7 @@ const cut = (element, picture, i) => {
   along.from[i] = 0;
   along.to[i] = dim.size;
   const { values } = mapped(study, picture.column, along), finite = values.filter(Number.isFinite);
-  const log = picture.scaled.log && Math.max(...finite) > 10 * Math.min(...finite);
+  const log = picture.scaled.log && reduced.largest(finite) > 10 * reduced.least(finite);
   const plot = new Plot(element, { x: { label: dim.label, names: dim.values.map(text) }, y: { label: picture.label(), log }, height: 270 });
   plot.set([{ name: "", x: values.map((_, k) => k), y: values, colour: COLOURS[1], width: 2, marks: [cell[i]], sorted: true }]);
   return plot;

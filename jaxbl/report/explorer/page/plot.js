@@ -153,7 +153,8 @@ const logTicks = (low, high, count) => {
   return out;
 };
 
-/** Colours of values from low to high: { colours, low, high, log, label, unit }, colours as [red, green, blue]. */
+/** Colours of values from low to high: { colours, low, high, log, label, unit, names }, colours as [red, green, blue]; names as of
+ * an axis. */
 class Scale {
   constructor(of) { Object.assign(this, of); }
   /** Of finite values; logarithmic where they are positive and span more than a factor of 30. */
@@ -178,8 +179,9 @@ class Scale {
       context.fillRect(left, top + k, 14, 1.5);
     }
     Object.assign(context, { fillStyle: colour, font: "13px system-ui, sans-serif", textAlign: "left", textBaseline: "middle" });
-    if (this.one) context.fillText(this.one, left + 18, top + height / 2, 76);
-    else for (let k = 0; k <= 4; k++) context.fillText(text(this.value(k / 4)), left + 18, top + height * (1 - k / 4));
+    const shares = this.one ? [[this.one, 0.5]] : [0, 1, 2, 3, 4].map((k) => [text(this.value(k / 4)), k / 4]);
+    const marks = this.names ? this.names.map((name, k) => [name, this.share(k)]) : shares;
+    for (const [name, share] of marks) if (share >= 0 && share <= 1) context.fillText(name, left + 18, top + height * (1 - share), 76);
   }
 }
 const coloursOf = (about) => about.colours.map((one) => [1, 3, 5].map((i) => parseInt(one.slice(i, i + 2), 16)));

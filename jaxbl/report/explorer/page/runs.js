@@ -138,9 +138,10 @@ class Runs {
       })));
     }
     for (const side of SIDES.filter((one) => this.newest.planes[one])) {
-      const bounded = this.all.some((run) => run.planes[side]?.majorant);
+      const planes = this.all.map((run) => run.planes[side]).filter(Boolean), bounded = planes.some(({ majorant }) => majorant);
+      const [x, y] = [0, 1].map((i) => Math.max(...planes.map(({ reach }) => reach[i]))).map((reach) => (reach > 0 ? [-reach, reach] : null));
       const spec = { caption: `${side}: error of the observer in the phase plane${bounded ? ", with the majorant of the proof (36)-(37)" : "; no peak stands out from the chatter"}`, height: 300,
-        x: { label: "position error e", unit: "rad" }, y: { label: "its slope ė", unit: "rad/s" } };
+        x: { label: "position error e", unit: "rad", limits: x }, y: { label: "its slope ė", unit: "rad/s", limits: y } };
       add(spec, this.all.filter((run) => run.planes[side]).flatMap((run) => {
         const { error, slope, majorant } = run.planes[side];
         const lines = [{ name: named(run, "error"), x: unpacked(error), y: unpacked(slope), colour: run.colour }];
