@@ -63,7 +63,8 @@ def run(
         else:
             figures, kept = _recorded(experiment, seed, every, insist=backend == "fused")
         figures = with_conditions(figures, observer_gains(experiment))
-        trace = pd.DataFrame({name: np.asarray(column, float) for name, column in kept.items()})
+        # compiled programs sort their results by name
+        trace = pd.DataFrame({name: np.asarray(kept[name], float) for name in _columns(experiment)})
     last = {name: plain(figures.pop(name)) for name in list(figures) if name.startswith("last.")}
     metrics = {name: plain(value) for name, value in figures.items()}
     return Trial(config, trace, _summary(config, last, metrics, seed))
@@ -104,6 +105,18 @@ _LAST = Reducer(
 _REDUCERS = METRICS, _LAST
 
 
+_TRUE = "position", "velocity", "acceleration"
+_ESTIMATES = "position_estimate", "velocity_estimate", "equivalent_control", "torque_estimate"
+
+
+def _columns(experiment: Experiment) -> list[str]:
+    """Columns of the trace in their order."""
+    found, sides = [] if experiment.transmission is None else [*experiment.transmission.truth()], experiment.sides
+    log = ["t", "u", *(POSITION_CHANNELS[side] for side in sides), *(["z"] if len(sides) == 2 else []), "torque"]
+    parts = (f"{side}.{name}" for names in ((*_TRUE, *_ESTIMATES), found) for side in sides for name in names)
+    return [*log, *parts]
+
+
 def _row(experiment: Experiment, state: State, signals: Signals) -> dict[str, Any]:
     """Columns of the trace at one sample."""
     row = {"t": signals.time, "u": signals.input}
@@ -113,9 +126,8 @@ def _row(experiment: Experiment, state: State, signals: Signals) -> dict[str, An
     row["torque"] = signals.torque
     for side in experiment.sides:
         s = signals.side(side)
-        true = {f"{side}.{name}": getattr(s.true, name) for name in ("position", "velocity", "acceleration")}
-        estimates = "position_estimate", "velocity_estimate", "equivalent_control", "torque_estimate"
-        row |= true | {f"{side}.{name}": getattr(s, name) for name in estimates}
+        row |= {f"{side}.{name}": getattr(s.true, name) for name in _TRUE}
+        row |= {f"{side}.{name}": getattr(s, name) for name in _ESTIMATES}
     found = identified(experiment, state)
     for side in experiment.sides:
         row |= {f"{side}.{name}": value for name, value in found.get(side, {}).items()}
