@@ -1,14 +1,4 @@
-"use strict";
 // Reads values off figures, zooms them, and sorts tables. Without it, the page is whole.
-
-const unpacked = (text) => {
-  const bytes = Uint8Array.from(atob(text), (one) => one.charCodeAt(0));
-  return new Float32Array(bytes.buffer);
-};
-const number = (value) => {
-  const size = Math.abs(value);
-  return size !== 0 && (size < 1e-3 || size >= 1e5) ? value.toExponential(3) : String(Number(value.toPrecision(4)));
-};
 
 /** An axis of a panel: values at shares of its length, and back. */
 class Axis {
@@ -24,7 +14,7 @@ class Axis {
     return this.log ? Math.exp(mapped) : mapped;
   }
   text(value) {
-    if (!this.names?.length) return number(value);
+    if (!this.names?.length) return text(value);
     const near = this.names.reduce((a, b) => (Math.abs(b[0] - value) < Math.abs(a[0] - value) ? b : a));
     return Math.abs(near[0] - value) <= 0.5 ? near[1] : "";
   }
@@ -34,16 +24,6 @@ class Axis {
     return this.label && text ? [`${this.label}: ${text}`] : this.names?.length && text ? [text] : [];
   }
 }
-
-/** The largest index whose value is not beyond x. */
-const before = (values, x) => {
-  let low = 0, high = values.length - 1;
-  while (low < high) {
-    const middle = (low + high + 1) >> 1;
-    if (values[middle] <= x) low = middle; else high = middle - 1;
-  }
-  return low;
-};
 
 /** What a panel has at a place: lines of text (of a map, those of the cell), and where the nearest point is (shares of the panel). */
 const found = (panel, at, size) => {
@@ -67,7 +47,7 @@ const found = (panel, at, size) => {
       // the point that the cell is drawn around
       const centre = [x, y].flatMap((axis, i) =>
         axis.line(axis.value((axis.share(edges[i][index[i]]) + axis.share(edges[i][index[i] + 1])) / 2)));
-      return { text: [`${name}: ${Number.isNaN(value) ? "none" : number(value)}`, ...centre] };
+      return { text: [`${name}: ${text(value)}`, ...centre] };
     }
   }
   let best = null, least = 30 * 30;
@@ -86,8 +66,8 @@ const found = (panel, at, size) => {
   }
   if (!best) return { text: place };
   const head = best.line.name ? [best.line.name] : [];
-  const text = [...head, ...x.line(best.line.x[best.i]), ...y.line(best.line.y[best.i])];
-  return { text, at: best.shares, colour: best.line.colour };
+  const said = [...head, ...x.line(best.line.x[best.i]), ...y.line(best.line.y[best.i])];
+  return { text: said, at: best.shares, colour: best.line.colour };
 };
 
 const unpack = (panels) => panels.map((panel) => ({

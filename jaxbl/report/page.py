@@ -1,6 +1,7 @@
 """The files of a report: one HTML page that holds everything, figures, and the results of a log, whole or not at all.
 
-The page needs nothing from elsewhere, and runs no script but its own (`page.js`): a policy in its head forbids both.
+The page needs nothing from elsewhere, and runs no script but its own (`shared.js`, `page.js`): a policy in its head
+forbids both.
 """
 
 import base64
@@ -127,6 +128,9 @@ def _model_text(found: "Identification | Diagnosis") -> str:
     return tomli_w.dumps(data)
 
 
+_PARTS = "page.css", "shared.js", "page.js"
+
+
 def html(
     title: str,
     lead: Sequence[str],
@@ -137,7 +141,8 @@ def html(
     steps: Sequence[Step] = (),
 ) -> str:
     """The whole page. Figures have names; the first line of the lead is the answer."""
-    style, script = (files("jaxbl.report").joinpath(name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
+    style, *scripts = (files("jaxbl.report").joinpath(name).read_text(encoding="utf-8") for name in _PARTS)
+    script = "\n".join(scripts)
     allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{allowed}'"
     ranks = ["lead answer", *("lead" for _ in lead[1:])]

@@ -24,7 +24,8 @@ _SCRIPT = 4 << 20
 """Bytes of the Parquet file in a script."""
 _MARKER = "jaxbl-explorer.json"
 """Says that a folder is one of ours, which may be written anew."""
-_SHARED = ("explore.css", "hyparquet.js", "hyparquet.LICENSE.txt", "plot.js")
+_SHARED = ("explore.css", "hyparquet.LICENSE.txt")
+_SCRIPTS = ("hyparquet", "shared", "plot")
 
 
 class Source(NamedTuple):
@@ -74,14 +75,13 @@ def write_static(source: Source, out: Path) -> Path:
     return out / "index.html"
 
 
-def write_page(out: Path, page: str, about: Mapping[str, Any], own: Sequence[str], *, scripts: bool = True) -> None:
+def write_page(out: Path, parts: Sequence[str], about: Mapping[str, Any], *, scripts: bool = True) -> None:
     """Write a page into a folder that has `points.parquet`.
 
     Args:
         out: the folder.
-        page: name of the page, of those in `page/`.
+        parts: of the page, by name: each has elements and a script in `page/`.
         about: what it says, as plain data.
-        own: names of its own scripts.
         scripts: whether it can be opened from disk.
     """
     points = out / "points.parquet"
@@ -92,10 +92,16 @@ def write_page(out: Path, page: str, about: Mapping[str, Any], own: Sequence[str
             for number, content in enumerate(iter(lambda: file.read(_SCRIPT), b"")):
                 text = f'jaxblBytes({number}, "{base64.b64encode(content).decode()}");\n'
                 (out / f"points.{number:04d}.js").write_text(text, encoding="ascii")
-    package = files("jaxbl.report")
-    (out / "page.css").write_bytes(package.joinpath("page.css").read_bytes())
-    for source, target in [(page, "index.html"), *((name, name) for name in (*_SHARED, *own))]:
-        (out / target).write_bytes(package.joinpath("explorer", "page", source).read_bytes())
+    report = files("jaxbl.report")
+    own, used = report.joinpath("explorer", "page"), [*_SCRIPTS, *parts]
+    elements = "".join(own.joinpath(f"{name}.html").read_text(encoding="utf-8") for name in parts)
+    loaded = "\n".join(f'<script src="{name}.js"></script>' for name in [*used, "data"])
+    page = own.joinpath("page.html").read_text(encoding="utf-8").replace("{parts}", elements).replace("{scripts}", loaded)
+    (out / "index.html").write_text(page, encoding="utf-8")
+    copied = [*(report.joinpath(name) for name in ("page.css", "shared.js")), *(own.joinpath(name) for name in _SHARED)]
+    copied += [own.joinpath(f"{name}.js") for name in used if name != "shared"]
+    for one in copied:
+        (out / one.name).write_bytes(one.read_bytes())
 
 
 def encoded(values: Any) -> str:

@@ -52,7 +52,8 @@ def log_source(folder: str | Path) -> Source | None:
     def write(out: Path, served: bool) -> bool:
         model, frame = (_read(file.with_name(name)) for name in ("model.toml", "trace.parquet"))
         about = write_log(summary, frame, tomllib.loads(model), out)
-        write_page(out, "log.html", about | {"title": title, "lead": lead, "config": model}, ("log.js",), scripts=not served)
+        about |= {"title": title, "lead": lead, "config": model, "file": "model.toml"}
+        write_page(out, ("log",), about, scripts=not served)
         return False
 
     return Source(str(summary["identity"]), lead, write, {}, lambda: None, lambda: None)

@@ -70,12 +70,12 @@ def write_study(result: StudyResult, out: Path, lead: Sequence[str], *, served: 
     names = [one["name"] for one in about["metrics"]]
     if dimensions(config) is None:
         about |= write_cloud(result, names, out)
-        page, script = "cloud.html", "cloud.js"
+        page = "cloud"
     else:
         about |= write_grid(result, names, about["first"], out)
-        page, script = "study.html", "map.js"
+        page = "map"
     (out / "study.toml").write_text(config.to_toml(), encoding="utf-8")
-    write_page(out, page, about, (script, "runs.js"), scripts=not served)
+    write_page(out, (page, "runs"), about, scripts=not served)
     return not result.is_finished(about["found"])
 
 
@@ -158,6 +158,7 @@ def _about(config: Config, columns: list[str]) -> dict[str, Any]:
         ],
         "first": next((name for name in names if name.endswith(".velocity_rmse")), names[0]),
         "config": config.to_toml(),
+        "file": "study.toml",
         "colours": [to_hex(one) for one in colormaps[MAP](np.linspace(0.0, 1.0, 256))],
         "gains": _gains(config),
         "effects": config.resolved()["effects"],

@@ -106,8 +106,8 @@ def test_folders_without_results_and_damaged_ones(tmp_path):
 
 @needs_chromium
 def test_lines_coordinates_and_moments(tmp_path):
-    told = write_log(summary(), trace(), {}, tmp_path) | {"title": HOSTILE, "lead": [HOSTILE], "config": HOSTILE}
-    write_page(tmp_path, "log.html", told, ("log.js",))
+    said = {"title": HOSTILE, "lead": [HOSTILE], "config": HOSTILE, "file": "model.toml"}
+    write_page(tmp_path, ("log",), write_log(summary(), trace(), {}, tmp_path) | said)
     with opened(tmp_path / "index.html") as (page,):
         page.wait_for_selector("body[data-drawn*='motor.missing_before motor.missing_after']")
         assert page.locator("#title").text_content() == page.locator("#lead").text_content() == HOSTILE

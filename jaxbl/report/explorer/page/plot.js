@@ -7,16 +7,9 @@ const made = (tag, properties = {}, ...children) => {
   one.append(...children);
   return one;
 };
-const text = (value) => {
-  if (typeof value === "string") return value;
-  if (value === null || Number.isNaN(value)) return "none";
-  const size = Math.abs(value);
-  return size !== 0 && (size < 1e-3 || size >= 1e5) ? value.toExponential(3).replace(/\.?0+e/, "e") : String(Number(value.toPrecision(4)));
-};
 /** The same with as many digits as tell values between these ends apart. */
 const textBetween = (value, [low, high]) =>
   Number.isFinite(value) && high - low < 0.05 * Math.abs(value) ? String(Number(value.toPrecision(9))) : text(value);
-const unpacked = (bytes) => new Float32Array(Uint8Array.from(atob(bytes), (one) => one.charCodeAt(0)).buffer);
 const withUnit = (name, unit) => (unit ? `${name} (${unit})` : name);
 const save = (name, url) => made("a", { href: url, download: name }).click();
 const saveText = (name, content) => save(name, URL.createObjectURL(new Blob([content], { type: "application/toml" })));
@@ -27,11 +20,12 @@ const choose = (label, id, options, chosen, act) => {
 };
 
 /** Title, what was found, and the config. */
-const head = ({ title, lead, config }) => {
+const head = ({ title, lead, config, file }) => {
   const lines = lead.map((line) => made("p", { textContent: line })), more = lines.splice(3);
   document.title = $("title").textContent = title;
   $("lead").replaceChildren(...lines, ...(more.length ? [made("details", {}, made("summary", { textContent: "more of what was found" }), ...more)] : []));
   $("config").textContent = config;
+  $("configname").textContent = file;
 };
 
 /* ------------------------------------------------------------------------------------------------------------- data */
@@ -121,16 +115,6 @@ const reporting = (what, act) => () => act().catch((error) => { $("state").textC
 
 /** Okabe and Ito's colours, which colour-blind readers can tell apart. */
 const COLOURS = ["#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"];
-
-/** The largest index whose value is not beyond x. */
-const before = (values, x) => {
-  let low = 0, high = values.length - 1;
-  while (low < high) {
-    const middle = (low + high + 1) >> 1;
-    if (values[middle] <= x) low = middle; else high = middle - 1;
-  }
-  return low;
-};
 
 /** Round values between two ends, about so many. */
 const ticks = (low, high, count) => {
