@@ -1,7 +1,6 @@
 """Pages of the explorer, served to this machine's browser alone: bound to 127.0.0.1, behind a token, to no other site."""
 
 import json
-import mimetypes
 import re
 import secrets
 import shutil
@@ -23,6 +22,8 @@ _MOST_ASKED = 1 << 16
 """Bytes of a question."""
 _MOST_VERSIONS = 3
 """Of a page that is written anew, as a study goes on; pages that are open may still read the older ones."""
+_KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".toml": "text/plain"}
+"""Of files, by their endings; what the machine says of them may be anything."""
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src data: blob:; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -208,7 +209,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _send_file(self, file: Path) -> None:
         """A file, or the bytes of it that are asked for."""
-        kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
+        kind = _KINDS.get(file.suffix, "application/octet-stream")
         size = file.stat().st_size
         asked = re.fullmatch(r"bytes=(\d{1,15})-(\d{1,15})", self.headers.get("Range", ""))
         start, end = (int(asked[1]), min(int(asked[2]) + 1, size)) if asked else (0, size)
