@@ -48,7 +48,13 @@ def _headline(summary: dict[str, Any]) -> list[str]:
         and not 1.0 / _FAR < one["value"] / one["nominal"] < _FAR
     ]
     lines = [f"Doubtful: {', '.join(far)}: a unit, a factor or a sign in [log] may be wrong."] if far else []
-    lines = [*summary["warnings"], *lines, *_backlash(summary)]
+    # intervals do not count what a model lacks: that it does is said before them
+    lines = [
+        *summary["warnings"],
+        *lines,
+        *(line for complete, line in _residuals(summary) if not complete),
+        *_backlash(summary),
+    ]
     for path, one in summary["parameters"].items():
         low, high = one["interval"]
         if None in (one["value"], one["standard_error"], low, high):
@@ -83,13 +89,7 @@ def _remarks(summary: dict[str, Any]) -> list[str]:
         lines.append(f"Not identifiable: {shares}: {refusal['why']}.")
     if summary["held"]:
         lines.append(f"Held at the nominal value, which the other numbers depend on: {', '.join(summary['held'])}.")
-    for side, residual in summary["residual"].items():
-        ratio = residual["rms"] / residual["noise"]
-        meaning = "noise alone" if ratio < NOISE_ALONE else "the model is incomplete"
-        if "backlash" in summary and ratio >= NOISE_ALONE:
-            meaning = "noise of the torque, or something that the model lacks"
-        size = f"{residual['rms']:.2g} {residual['unit']} rms"
-        lines.append(f"{side}: position residual {size}, {ratio:.3g} times the noise: {meaning}.")
+    lines += (line for complete, line in _residuals(summary) if complete)
     fit = summary["method"]["trajectory"]
     lines.append(
         "Fitted to the prediction errors of the motor over all of the log; the load moves as the model says."
@@ -109,6 +109,19 @@ def _remarks(summary: dict[str, Any]) -> list[str]:
     if "holdout" in summary:
         lines += _on_holdout(summary["holdout"])
     return [*lines, *summary["notes"]]
+
+
+def _residuals(summary: dict[str, Any]) -> list[tuple[bool, str]]:
+    """Of each side, whether no more than noise is left of its positions, and a sentence that says so."""
+    found = []
+    for side, residual in summary["residual"].items():
+        ratio = residual["rms"] / residual["noise"]
+        meaning = "noise alone" if ratio < NOISE_ALONE else "the model is incomplete"
+        if "backlash" in summary and ratio >= NOISE_ALONE:
+            meaning = "noise of the torque, or something that the model lacks"
+        size = f"{residual['rms']:.2g} {residual['unit']} rms"
+        found.append((ratio < NOISE_ALONE, f"{side}: position residual {size}, {ratio:.3g} times the noise: {meaning}."))
+    return found
 
 
 def _shares(torque: dict[str, Any]) -> str:

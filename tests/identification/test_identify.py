@@ -11,7 +11,7 @@ from jaxbl.errors import InputError
 from jaxbl.identification import observer_gains
 from jaxbl.identification.identify import identify
 from jaxbl.observer.conditions import least_lambda_exact
-from jaxbl.report.identify import write_identification_report
+from jaxbl.report.identify import identification_lines, write_identification_report
 from jaxbl.sweeps.trial import run
 
 LAW = {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08}
@@ -108,7 +108,10 @@ def test_model_runs_with_the_numbers_found(found, tmp_path):
 def test_report_has_every_number_and_figure(found, tmp_path):
     lines = write_identification_report(found, tmp_path)
     assert lines[0].startswith("drive.motor_inertia = 0.05")
-    assert any("times the noise: noise alone." in line for line in lines)
+    assert any("times the noise: noise alone." in line for line in lines[1:])
+    # what a model lacks is said before numbers whose intervals do not count it
+    lacking = identification_lines(found.summary | {"residual": {"motor": {"rms": 2e-4, "noise": 1e-4, "unit": "rad"}}})
+    assert lacking[0] == "motor: position residual 0.0002 rad rms, 2 times the noise: the model is incomplete."
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"identification.json", "model.toml", "trace.parquet", "figures", "report.html"}
     drawn = {path.stem for path in (tmp_path / "figures").iterdir()}
