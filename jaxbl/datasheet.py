@@ -506,6 +506,8 @@ def _observers(
         f"# Gains by the usual rule, lambda = {usual[0]:g} sqrt(f+) and alpha = {usual[1]:g} f+; f+ is the largest",
         f"# acceleration in a run of this study that observers do not know: {bounds}.",
         "# 'jaxbl tune' looks for better ones.",
+        f"# The motor's largest speed in that run: {found['motor']['largest_velocity']:.3g} {angle}/s; rated: "
+        f"{given['speed'].value:.3g}. Change excitation.amplitude if that is too fast.",
         "[observer]",
     ]
     for side, (lambda_, alpha) in gains.items():

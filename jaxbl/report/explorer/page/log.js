@@ -129,7 +129,7 @@ globalThis.jaxblData = async (about) => {
     found.forEach((values, k) => {
       const figure = made("figure");
       $("over2").append(figure);
-      const plot = new Plot(figure, { x: { ...axis(view.x), limits: limits[0] }, y: { ...axis(view.y), limits: limits[1] }, height: 300, caption: `${group.name}, ${label(shown[k])}: mean in each cell; empty cells have fewer than 3 samples` });
+      const plot = new Plot(figure, { x: { ...axis(view.x), limits: limits[0] }, y: { ...axis(view.y), limits: limits[1] }, height: 300, caption: `${group.name}, ${label(shown[k])}: mean in each cell; grey: fewer than 3 samples` });
       plot.cells = { x: limits[0], y: limits[1], size: CELLS, values };
       plot.scale = new Scale({ colours, low: -limit, high: limit, log: false, label: group.quantity, unit: group.unit });
       plot.set([]);
@@ -165,7 +165,7 @@ globalThis.jaxblData = async (about) => {
       plot.draw();
     }
     $("moment").value = String(Math.round((1000 * (i - from)) / Math.max(to - 1 - from, 1)));
-    const say = (name, value, unit) => `${name} ${text(value)} ${unit}`.trim();
+    const say = (name, value, unit) => (Number.isNaN(value) ? `${name} none` : `${name} ${text(value)} ${unit}`.trim());
     $("now").textContent = [`t ${textBetween(time[i], [time[0], time[time.length - 1]])} s`, ...about.coordinates.filter((one) => one.column !== "t").map((one) => say(one.label, data[one.column][i], one.unit)),
       ...view.shown.map((column) => say(view.group.lines.find((one) => one.column === column).label, data[column][i], view.group.unit))].join(", ");
   };

@@ -280,6 +280,9 @@ class Plot {
     context.beginPath();
     context.rect(box.left, box.top, box.width, box.height);
     context.clip();
+    // where there is none, which is no zero
+    context.fillStyle = "#8a8d9340";
+    context.fillRect(box.left, box.top, box.width, box.height);
     context.drawImage(sheet, left, top, right - left, bottom - top);
     context.restore();
   }
