@@ -31,7 +31,7 @@ def sweep(page: Page) -> None:
     page.select_option("#at0", "2")
     page.locator("body[data-drawn*=motor]").wait_for()
     page.locator("#plot").click(position={"x": 420, "y": 300})
-    page.locator("body[data-simulated]").wait_for()
+    page.locator("#told:has-text('stored')").wait_for()
     page.mouse.move(2, 2)
     save(page, page.locator("#traces figure").nth(2), "explore_sweep.png")
 

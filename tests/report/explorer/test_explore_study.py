@@ -300,7 +300,7 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept, tmp_
             plot = page.locator("#plot")
             plot.click(position={"x": 200, "y": 100})
             page.wait_for_selector("body[data-simulated*='motor.alpha 50, motor.lambda 1, seed 0, ']")
-            page.locator("#told:has-text('sweep')").wait_for()
+            page.locator("#told:has-text('stored')").wait_for()
             told = page.locator("#told").inner_text()
             assert told.endswith("as stored in the sweep.")
             with page.expect_download() as download:

@@ -92,11 +92,12 @@ class Runs {
     this.newest = { ...found, name, columns, colour: free[0], pinned: false };
     this.all.push(this.newest);
     this.draw();
-    $("told").textContent = found.every > 1 ? `Every ${found.every}th sample is drawn.` : "";
+    const drawn = found.every > 1 ? `Every ${found.every}th sample is drawn. ` : "";
+    $("told").textContent = `${drawn}Comparing with the sweep …`;
     $("point").disabled = false;
     document.body.dataset.simulated = `${name}, ${Math.round(performance.now() - began)} ms`;
     const compared = await this.compared(found, stored, ask).catch((error) => `Not compared: ${error.message}`);
-    if (asked === this.asked) $("told").textContent += compared;
+    if (asked === this.asked) $("told").textContent = drawn + compared;
   }
   /** A metric as stored and of this run: they differ where rounding does, or where the run is not the one of the sweep. */
   async compared({ metrics }, { metric: { name, label, yes, size }, value }, ask) {
