@@ -225,7 +225,7 @@ KINDS = {
         (
             Item("motor_inertia", "inertia of rotor and load", _INERTIA, "0.05 kg m²"),
             Item("motor_viscous", "viscous friction at the motor", _VISCOUS, "2 mN m/krpm", "0 N m s/rad", above=False),
-            Item("motor_friction", "dry friction, with cogging and what else disturbs", _TORQUE, "0.2 N m"),
+            Item("motor_friction", "dry friction, with what else disturbs", _TORQUE, "0.2 N m"),
             *_RATED,
             _ENCODER,
             _NOISE,
@@ -238,7 +238,7 @@ KINDS = {
         (
             Item("mass", "mass that moves", _MASS, "8 kg", key="motor_inertia"),
             Item("motor_viscous", "viscous friction of the guides", _DRAG, "20 N s/m", "0 N s/m", above=False),
-            Item("motor_friction", "dry friction, with cogging and what else disturbs", _FORCE, "6 N"),
+            Item("motor_friction", "dry friction, with what else disturbs", _FORCE, "6 N"),
             Item("force", "rated force of the motor", _FORCE, "200 N", key="torque"),
             Item("speed", "rated speed of the motor", _VELOCITY, "2 m/s"),
             Item("motor_encoder", "one count of the scale", _LENGTH, "100 nm", "0 m", above=False),
