@@ -256,8 +256,8 @@ def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precisi
             for name, figure in found.items():
                 assert figure.dtype == expected[name].dtype
                 np.testing.assert_array_equal(figure, expected[name], err_msg=name)
-            # some two thirds of the lanes leave
-            assert sum(samples) < 0.6 * lanes * whole.run.steps
+            # some two thirds of the lanes leave; the last of a thread's vectors need not be full
+            assert sum(samples) < (0.6 * lanes + threads * loop.lanes) * whole.run.steps
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
