@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from .errors import InputError
+from .units import on_a_line
 
 Unit = float | Callable[[float], float]
 """A factor to SI, or a function that gives the SI value."""
@@ -163,13 +164,8 @@ class Kind(NamedTuple):
 
     def unit(self, side: str, unit: str) -> str:
         """A unit of a turning side, or what stands for it where the side moves in m."""
-        return _LINEAR[unit] if side in self.linear else unit
+        return on_a_line(unit) if side in self.linear else unit
 
-
-_LINEAR = {
-    "kg m²": "kg", "N m s/rad": "N s/m", "N m": "N", "rad": "m", "rad/s": "m/s", "rad/s²": "m/s²", "√rad/s": "√m/s",
-}  # fmt: skip
-"""Units of a side that moves in m, by those of one that turns."""
 
 _END = (
     Item("sample_period", "sampling period of the drive", _PERIOD, "0.25 ms", "1 ms"),
@@ -368,7 +364,9 @@ def _drive(kind: Kind, given: Mapping[str, Given], title: str) -> str:
         noise = " (the load's is this divided by the gear ratio; load_noise says otherwise)"
         load = [line("load_resolution", "load_encoder", f"{kind.unit('load', 'rad')} a count, 0 is ideal")]
         load_numbers = value["load_inertia"], value["load_viscous"]
-        nominal = NominalDrive(value["motor_inertia"], value["motor_viscous"], *load_numbers, *_gear(value))
+        ratio = value["gear_ratio"]
+        at_motor = (factor * value[name] for factor, name in zip(_to_motor(ratio), ("stiffness", "backlash"), strict=True))
+        nominal = NominalDrive(value["motor_inertia"], value["motor_viscous"], *load_numbers, ratio, *at_motor)
     else:
         nominal = NominalDrive(value["motor_inertia"], value["motor_viscous"])
     lines += [
@@ -393,10 +391,9 @@ def _drive(kind: Kind, given: Mapping[str, Given], title: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _gear(value: Mapping[str, float]) -> tuple[float, float, float]:
-    """Gear ratio; stiffness and half of the gap as they are on the motor's shaft."""
-    ratio = value["gear_ratio"]
-    return ratio, value["stiffness"] / ratio**2, 0.5 * ratio * value["backlash"]
+def _to_motor(ratio: float) -> tuple[float, float]:
+    """Factors from stiffness and backlash at the output to stiffness and half of the gap on the motor's shaft."""
+    return ratio**-2, 0.5 * ratio
 
 
 def _notes(kind: Kind, given: Mapping[str, Given]) -> list[str]:
@@ -417,7 +414,8 @@ def _transmitted(
     kind: Kind, given: Mapping[str, Given], numbers: Callable[..., list[str]], line: Callable[..., str]
 ) -> list[str]:
     """What goes on with `[drive]`: the load, the gear and its law."""
-    ratio, _, gap = _gear({name: one.value for name, one in given.items()})
+    ratio, gap = given["gear_ratio"].value, given["backlash"].value
+    stiff, half = _to_motor(ratio)
     turning = "load" not in kind.linear
     at_motor, where = "on the motor's shaft", "at the output" if turning else "at the carriage"
     if turning:
@@ -430,11 +428,11 @@ def _transmitted(
         "",
         "[transmission]",
         'law = "dead_zone" # a hard gap' if gap else 'law = "linear_shaft" # no backlash was given',
-        line("stiffness", "stiffness", f"N m/rad {at_motor}", ratio**-2, f" {where}, divided by {ratio:.6g}²"),
+        line("stiffness", "stiffness", f"N m/rad {at_motor}", stiff, f" {where}, divided by {ratio:.6g}²"),
     ]
     if gap:
         how = f" {where}, end to end; half of it times {ratio:.6g}"
-        lines.append(line("half_gap", "backlash", f"rad {at_motor}", 0.5 * ratio, how))
+        lines.append(line("half_gap", "backlash", f"rad {at_motor}", half, how))
     return lines
 
 

@@ -310,9 +310,9 @@ def has_file(folder: Path, name: str) -> bool:
     return (folder / name).exists()
 
 
-def make_folder(path: Path, instead: str = "choose another folder with --out", option: str = "--out") -> None:
-    """Make a folder that can be written to. Raises `InputError` where that is not possible; `instead` is what to do then,
-    `option` what names the folder."""
+def make_folder(path: Path, instead: str = "", option: str = "--out") -> None:
+    """Make a folder that can be written to. Raises `InputError` where that is not possible; `option` is what names the
+    folder, `instead` what to do where that is not to name another one."""
     if is_remote(path):
         with access(path, "written to"):
             (path / ".probe").write_bytes(b"")
@@ -328,7 +328,9 @@ def make_folder(path: Path, instead: str = "choose another folder with --out", o
     except NotADirectoryError:
         raise InputError(f"{path}: lies under a file; {option} should name a folder") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be written to ({error.strerror}); {instead}") from None
+        raise InputError(
+            f"{path}: cannot be written to ({error.strerror}); {instead or f'choose another folder with {option}'}"
+        ) from None
 
 
 def claim_log_folder(folder: Path, log: Path, *, overwrite: bool) -> None:

@@ -75,10 +75,10 @@ def after_identification(
         given: what the call was about.
     """
     from jaxbl.diagnosis.diagnosis_task import can_hold_out
-    from jaxbl.identification.search import NOISE_ALONE
+    from jaxbl.identification.search import is_noise
 
     steps = []
-    if any(one["rms"] >= NOISE_ALONE * one["noise"] for one in summary["residual"].values()):
+    if not all(map(is_noise, summary["residual"].values())):
         if given.holdout is not None or can_hold_out(task.record):
             words = ("diagnose", *given.words(), "--out", f"{folder}_diagnosed")
             steps.append(Step(command_line(*words), "What does the model lack? Its errors are larger than noise."))

@@ -118,7 +118,14 @@ class AxisTable(Table):
             return np.array(self.values, dtype=object if any(isinstance(v, str) for v in self.values) else None)
         assert self.start is not None and self.stop is not None and self.num is not None
         space = np.geomspace if self.scale == "log" else np.linspace
-        return space(self.start, self.stop, (self.num - 1 << depth) + 1)
+        return space(self.start, self.stop, self.size(depth))
+
+    def size(self, depth: int = 0) -> int:
+        """How many values :meth:`grid` has."""
+        if self.values is not None:
+            return len(self.values)
+        assert self.num is not None
+        return (self.num - 1 << depth) + 1
 
 
 class FigureTable(Table):

@@ -71,8 +71,8 @@ def coordinates_of(
     found["speed"] = CoordinateValues(velocity, f"{length}/s", symbol=omega)
     for one in [name for name in part.position if name in (side, "load") and name not in sliding]:
         position = np.asarray(part.position[one])
-        if np.ptp(position) > 1.2 * 2.0 * np.pi:
-            name, turned = "turn" if one == side else f"{one} turn", np.mod(position, 2.0 * np.pi)
+        if (turned := within_turn(position)) is not None:
+            name = "turn" if one == side else f"{one} turn"
             found[name] = CoordinateValues(turned, "rad", symbol=f"{_ANGLES[one]} mod 2π")
     found["position"] = position_of(side)
     if side != "load" and geared:
@@ -90,6 +90,11 @@ def coordinates_of(
     found["acceleration"] = CoordinateValues(acceleration, f"{length}/s²", symbol="a")
     found["time"] = CoordinateValues(np.asarray(part.time), "s", symbol="t")
     return found
+
+
+def within_turn(position: np.ndarray) -> np.ndarray | None:
+    """Positions (rad) modulo a turn; None where they hardly exceed one."""
+    return np.mod(position, 2.0 * np.pi) if np.nanmax(position) - np.nanmin(position) > 1.2 * 2.0 * np.pi else None
 
 
 def all_coordinates(

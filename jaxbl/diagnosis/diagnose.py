@@ -66,12 +66,12 @@ class Diagnosis:
         record: the part of the log that was fitted.
         holdout: what was held out: the rest of the log, or another one.
         summary: as in `diagnosis.json`.
-        trace: one row a sample of the log: `t`, `u`, positions, `held_out`, and on each side the torque that the model lacks
-            as given (`motor.missing_before`, its noise is `motor.noise`), with the effects (`motor.missing_after`), without
-            one of these (`motor.missing_without.NAME`), and with another one in place of the last
-            (`motor.missing_with.NAME`), N m; what the model as given lacks by the observers (`motor.observed_before`,
-            `motor.observed_noise`), N m, empty while they converge; and the smoothed `motor.velocity`, rad/s, and
-            `motor.acceleration`, rad/s^2.
+        trace: one row a sample of the log: `t`, `u`, positions, `twist`, `held_out`, and on each side the torque that the
+            model lacks as given (`motor.missing_before`, its noise is `motor.noise`), with the effects
+            (`motor.missing_after`), without one of these (`motor.missing_without.NAME`), and with another one in place of
+            the last (`motor.missing_with.NAME`), N m; what the model as given lacks by the observers
+            (`motor.observed_before`, `motor.observed_noise`), N m, empty while they converge; and the smoothed
+            `motor.velocity`, rad/s, and `motor.acceleration`, rad/s^2.
         residuals: torques that the model as given lacks, by side, of each segment that was fitted.
         observed: the same by the observers' equivalent control.
         coordinates: along them, by side, of each segment.

@@ -237,6 +237,8 @@ def trace_of(
     whole = task.record if task.separate else task.holdout
     columns: dict[str, Any] = {"t": whole.time, "u": whole.torque}
     columns |= {POSITION_CHANNELS[side]: whole.positions[side] for side in POSITION_CHANNELS if side in whole.positions}
+    if setup.nominal.transmission is not None:
+        columns["twist"] = setup.nominal.plant.twist(whole.positions)
     columns["held_out"] = np.arange(len(whole.time)) >= len(task.record.time)
     logs = [(task.record, setup.fitted.segments)] + ([] if task.separate else [(task.holdout, setup.holdout.segments)])
     parts = [rows for record, _ in logs for rows in record.segments]

@@ -49,6 +49,7 @@ class Summary:
         self.search, self.table, self.config = search, search.table, search.scenarios.config
         self.best = {side: search.best(side) for side in search.sides}
         self.conditions = {side: judge_gains(row["lambda"], row["alpha"], row["f_plus"]) for side, row in self.best.items()}
+        self.limits = {side: limits_of(search, side) for side in search.sides}
         self.named, self.rows = named, held_out
         self.held_out = {side: {row["name"]: row for row in held_out if row["side"] == side} for side in search.sides}
         self.factors = {side: self._factors(side) for side in search.sides}
@@ -70,7 +71,7 @@ class Summary:
             "margins": {"exact": table.margin_exact, "alpha": table.margin_alpha},
             "gains": {side: {key: float(self.best[side][key]) for key in keys} for side in sides},
             "achieved": {side: self._achieved(side) for side in sides},
-            "limits": {side: limits_of(search, side) for side in sides},
+            "limits": self.limits,
             "conditions": self.conditions,
             "range": _ratios(search.limits) | {"num": table.num},
             "resolution": {side: {key: ratio - 1.0 for key, ratio in search.cells(side).items()} for side in sides},
@@ -145,17 +146,13 @@ class Summary:
 
     def _about_optimum(self, side: str) -> list[str]:
         search, row, lines = self.search, self.best[side], []
-        gains = (("alpha", "alpha / f⁺", search.limits["alpha"]), ("lambda", "lambda / √f⁺", search.limits["lambda"]))
-        for gain, label, (low, high) in gains:
-            ratio, near = row[f"{gain}_ratio"], 1.01
-            if gain == "alpha" and row["margin_alpha"] < self.table.margin_alpha * near:
-                low = 0.0  # it is the margin that ends the range there
-            lines += [
-                f"{side}: the optimum lies at the end {label} = {end:g} of the range searched (tune.{gain}_ratio); "
+        labels = {"alpha": "alpha / f⁺", "lambda": "lambda / √f⁺"}
+        for way, gain in map(str.split, self.limits[side]["range_ends"]):
+            end = search.limits[gain][way == "larger"]
+            lines.append(
+                f"{side}: the optimum lies at the end {labels[gain]} = {end:g} of the range searched (tune.{gain}_ratio); "
                 "beyond it may be better gains."
-                for end, there in ((low, ratio <= low * near), (high, ratio >= high / near))
-                if there
-            ]
+            )
         found = search.candidates[side]
         kept = search.kept(found)
         for key in kept:
@@ -163,8 +160,9 @@ class Summary:
             missed = found[~kept[key] & np.logical_and.reduce([values for name, values in kept.items() if name != key])]
             if key != "converged" and len(missed) and missed["error"].min() < (1.0 - WORTH) * row["error"]:
                 least = missed.nsmallest(1, "error").iloc[0]
+                where = "" if key in self.limits[side]["binding"] else ", if not beside the optimum"
                 lines.append(
-                    f"{side}: {key} = {getattr(self.table, key):g} forbids better gains: of those tried, lambda = "
+                    f"{side}: {key} = {getattr(self.table, key):g} forbids better gains{where}: of those tried, lambda = "
                     f"{least['lambda']:.3g}, alpha = {least['alpha']:.3g} miss it alone, with an error of "
                     f"{least['error']:.3g} instead of {row['error']:.3g}."
                 )

@@ -21,6 +21,7 @@ from jaxbl.drive.parameters import get_leaf, leaf_paths
 from jaxbl.errors import InputError
 from jaxbl.records import POSITION_CHANNELS, Record, TurningLog, check_positions, join, read_record, turned
 from jaxbl.simulate import Experiment
+from jaxbl.units import on_a_line
 from jaxbl.workers import Progress
 
 from .observer_gains import ChosenGains, choose_gains
@@ -301,14 +302,10 @@ def gains_for(
     return {side: chosen[side] for side in sides}, values
 
 
-_LINEAR = (("kg m²", "kg"), ("N m", "N"), ("rad", "m"))
-
-
 def unit_on(record: Record, path: str, unit: str) -> str:
     """The unit of a number on a log: N and m where its side moves in m."""
     side = "load" if any(part.startswith("load") for part in path.split(".")) else "motor"
     channels = record.findings.channels
     if POSITION_CHANNELS[side] in channels and channels[POSITION_CHANNELS[side]].unit == "m":
-        for turning, linear in _LINEAR:
-            unit = unit.replace(turning, linear)
+        return on_a_line(unit)
     return unit

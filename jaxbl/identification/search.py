@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -29,6 +29,11 @@ _PASSES = 2
 """Choices of the predictor's gain, each followed by a fit."""
 NOISE_ALONE = 1.1
 """Residuals over the noise, rms, up to which a model counts as explaining a record."""
+
+
+def is_noise(residual: Mapping[str, float]) -> bool:
+    """Whether what a model leaves of a record's positions (`rms` and `noise` of a residual) counts as noise alone."""
+    return residual["rms"] < NOISE_ALONE * residual["noise"]
 
 
 @dataclasses.dataclass(frozen=True)

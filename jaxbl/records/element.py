@@ -19,6 +19,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxbl.units import on_a_line
+
 from .least_squares import BLOCKS, jackknifed
 from .signal_quality import SHORTEST, bandwidth, longest, low_passed
 
@@ -438,15 +440,14 @@ def _summed_up(rig: _Rig, whole: _Rig, model: _Fitted, gains: dict[str, float], 
 
 
 _UNITS = {
-    "stiffness": ("N m/rad", "N/m"), "offset": ("N m", "N"), "damping": ("N m s/rad", "N s/m"), "dry_friction": ("N m", "N"),
-    "hysteresis": ("N m", "N"), "centre": ("rad", "m"), "half_gap": ("rad", "m"), "length": ("rad", "m"),
-    "friction_coefficient": ("", ""),
+    "stiffness": "N m/rad", "offset": "N m", "damping": "N m s/rad", "dry_friction": "N m", "hysteresis": "N m",
+    "centre": "rad", "half_gap": "rad", "length": "rad", "friction_coefficient": "",
 }  # fmt: skip
-"""Number -> unit on a turning axis, and on a linear one."""
+"""Units of numbers on a turning axis."""
 
 
 def _unit(name: str, linear: bool) -> str:
-    return _UNITS[name][linear]
+    return on_a_line(_UNITS[name]) if linear else _UNITS[name]
 
 
 def error_on(

@@ -11,12 +11,10 @@ MOST_PARTS = 60
 
 
 def values_of(config: Config, axis: AxisTable) -> int:
-    """How many values an axis has."""
+    """How many values an axis has, of a quasi-random one as many as points."""
     if axis.values is not None:
         return len(set(axis.values))
-    if axis.num is None:
-        return config.sweep.points or 0
-    return (axis.num - 1 << (config.sweep.refine or 0)) + 1
+    return (config.sweep.points or 0) if axis.num is None else axis.size(config.sweep.refine or 0)
 
 
 def check_figures(config: Config, figures: list[FigureTable], columns: list[str]) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxbl.identification.identify import Identification
-from jaxbl.identification.search import NOISE_ALONE
+from jaxbl.identification.search import is_noise
 from jaxbl.lines import Step
 
 from .figures import SIDES
@@ -116,11 +116,12 @@ def _residuals(summary: dict[str, Any]) -> list[tuple[bool, str]]:
     found = []
     for side, residual in summary["residual"].items():
         ratio = residual["rms"] / residual["noise"]
-        meaning = "noise alone" if ratio < NOISE_ALONE else "the model is incomplete"
-        if "backlash" in summary and ratio >= NOISE_ALONE:
-            meaning = "noise of the torque, or something that the model lacks"
+        lacking = (
+            "noise of the torque, or something that the model lacks" if "backlash" in summary else "the model is incomplete"
+        )
+        meaning = "noise alone" if (complete := is_noise(residual)) else lacking
         size = f"{residual['rms']:.2g} {residual['unit']} rms"
-        found.append((ratio < NOISE_ALONE, f"{side}: position residual {size}, {ratio:.3g} times the noise: {meaning}."))
+        found.append((complete, f"{side}: position residual {size}, {ratio:.3g} times the noise: {meaning}."))
     return found
 
 

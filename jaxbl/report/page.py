@@ -171,10 +171,9 @@ def _step(one: Step) -> str:
 
 def _figure(name: str, shown: Picture) -> str:
     width, height = shown.size
-    data = base64.b64encode(shown.svg).decode()
     # a script of data ends where the next tag of that name begins, whatever it holds
     panels = json.dumps(shown.panels, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
-    image = f'<img src="data:image/svg+xml;base64,{data}" alt="{escape(shown.described)}" width="{width}" height="{height}">'
+    image = f'<img src="{shown.source}" alt="{escape(shown.described)}" width="{width}" height="{height}">'
     label = "figure: arrow keys read values, plus and minus zoom, 0 shows the whole"
     return (
         f'<figure data-name="{escape(name)}"><div class="view" tabindex="0" role="group" aria-label="{label}" '

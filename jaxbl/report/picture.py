@@ -43,6 +43,11 @@ class Picture(NamedTuple):
     described: str
     panels: list[dict[str, Any]]
 
+    @property
+    def source(self) -> str:
+        """The drawing as an address that holds it."""
+        return f"data:image/svg+xml;base64,{base64.b64encode(self.svg).decode()}"
+
 
 @style()
 def picture(drawn: Drawn) -> Picture:
@@ -119,9 +124,9 @@ def _panel(figure: Figure, ax: Axes, value: str | None, every: int) -> dict[str,
             if cells.size <= _MOST_VALUES and cells.ndim == 2:
                 panel["cells"] = {
                     "name": value,
-                    "x": _packed(corners[0, :, 0]),
-                    "y": _packed(corners[:, 0, 1]),
-                    "values": _packed(cells.ravel()),
+                    "x": packed(corners[0, :, 0]),
+                    "y": packed(corners[:, 0, 1]),
+                    "values": packed(cells.ravel()),
                 }
             break
     bars = [(*one.get_xy(), one.get_width(), one.get_height()) for one in _bars(ax)]
@@ -159,8 +164,8 @@ def _line(line: Line2D, every: int) -> dict[str, Any]:
     return {
         "name": "" if label.startswith("_") else _plain(label),
         "colour": to_hex(line.get_color() if line.get_linestyle() != "None" else line.get_markerfacecolor()),
-        "x": _packed(x),
-        "y": _packed(y),
+        "x": packed(x),
+        "y": packed(y),
         "sorted": bool(np.all(np.diff(x) >= 0.0)),
     }
 
@@ -168,8 +173,8 @@ def _line(line: Line2D, every: int) -> dict[str, Any]:
 _LARGEST = float(np.finfo(np.float32).max)
 
 
-def _packed(values: np.ndarray) -> str:
-    """Numbers as float32, little-endian, in base 64."""
+def packed(values: Any) -> str:
+    """Numbers for a page: float32, little-endian, in base64; the largest where they are larger."""
     held = np.clip(np.asarray(values, float), -_LARGEST, _LARGEST)
     return base64.b64encode(held.astype("<f4").tobytes()).decode()
 

@@ -1,6 +1,5 @@
 """Figures and report of any result: what Python calls, and a notebook shows."""
 
-import base64
 from collections.abc import Callable
 from html import escape
 from pathlib import Path
@@ -53,9 +52,8 @@ class Drawings(list[Drawn]):
 def _figure(drawn: Drawn) -> str:
     lay_out(drawn.figure)
     shown = picture(drawn)
-    data = base64.b64encode(shown.svg).decode()
     return (
-        f'<figure><img src="data:image/svg+xml;base64,{data}" alt="{escape(shown.described)}" style="max-width:100%">'
+        f'<figure><img src="{shown.source}" alt="{escape(shown.described)}" style="max-width:100%">'
         f"<figcaption>{escape(shown.caption)}</figcaption></figure>"
     )
 

@@ -212,9 +212,9 @@ def _limits_text(found: dict[str, Any]) -> str:
     if binding:
         lines = [f"{' and '.join(binding)} bind{'s' * (len(binding) == 1)}."]
     elif found["range_ends"]:
-        lines = ["no constraint binds, but the range searched ends at the optimum."]
+        lines = ["no constraint binds beside the optimum, but the range searched ends there."]
     else:
-        lines = ["no constraint binds, and the optimum lies inside of the range searched."]
+        lines = ["no constraint binds beside the optimum, which lies inside of the range searched."]
     for gain, symbol, unit, *_ in _PLANES:
         ways = found["towards"][gain]
         text = "; ".join(_way(way, symbol, unit, one) for way, one in ways.items())

@@ -1,5 +1,6 @@
 """One experiment with its whole trace: the function behind `jaxbl simulate` (`jaxbl.run` in Python)."""
 
+from collections import OrderedDict
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from jaxbl.config import Config, precision, prepare, read_config
+from jaxbl.config import Config, precision, prepare, read_config, with_values
 from jaxbl.errors import InputError
 from jaxbl.files import plain
 from jaxbl.fused import Unsupported, attempted, say_scanned
@@ -63,11 +64,22 @@ def run(
         else:
             figures, kept = _recorded(experiment, seed, every, insist=backend == "fused")
         figures = with_conditions(figures, observer_gains(experiment))
-        # compiled programs sort their results by name
-        trace = pd.DataFrame({name: np.asarray(kept[name], float) for name in _columns(experiment)})
+        trace = pd.DataFrame({name: np.asarray(column, float) for name, column in kept.items()})
     last = {name: plain(figures.pop(name)) for name in list(figures) if name.startswith("last.")}
     metrics = {name: plain(value) for name, value in figures.items()}
     return Trial(config, trace, _summary(config, last, metrics, seed))
+
+
+def neighbours(study: Config, seed: int, count: int) -> list[dict[str, Any]]:
+    """Metrics of runs whose gains λ and motor inertia differ from a study's in their last digits: how far figures come apart
+    by rounding, which an observer may amplify under noise, and a plant with a gap."""
+    experiment = study.build()
+    numbers: dict[str, Any] = {f"observer.{side}.lambda": one.lambda_ for side, one in observer_gains(experiment).items()}
+    numbers["drive.motor_inertia"] = experiment.drive.inertia("motor")
+    # the last decimal that its precision has: one bit may be lost in the first product
+    last = 8.0 * float(np.finfo(study.run.precision).eps)
+    changes = ({path: float(value) * (1.0 + k * last) for path, value in numbers.items()} for k in range(1, count + 1))
+    return [run(with_values(study, one), seed=seed, backend="scan").summary["metrics"] for one in changes]
 
 
 def _recorded(experiment: Experiment, seed: int, every: int, *, insist: bool) -> tuple[dict[str, Any], Any]:
@@ -105,18 +117,6 @@ _LAST = Reducer(
 _REDUCERS = METRICS, _LAST
 
 
-_TRUE = "position", "velocity", "acceleration"
-_ESTIMATES = "position_estimate", "velocity_estimate", "equivalent_control", "torque_estimate"
-
-
-def _columns(experiment: Experiment) -> list[str]:
-    """Columns of the trace in their order."""
-    found, sides = [] if experiment.transmission is None else [*experiment.transmission.truth()], experiment.sides
-    log = ["t", "u", *(POSITION_CHANNELS[side] for side in sides), *(["z"] if len(sides) == 2 else []), "torque"]
-    parts = (f"{side}.{name}" for names in ((*_TRUE, *_ESTIMATES), found) for side in sides for name in names)
-    return [*log, *parts]
-
-
 def _row(experiment: Experiment, state: State, signals: Signals) -> dict[str, Any]:
     """Columns of the trace at one sample."""
     row = {"t": signals.time, "u": signals.input}
@@ -126,12 +126,14 @@ def _row(experiment: Experiment, state: State, signals: Signals) -> dict[str, An
     row["torque"] = signals.torque
     for side in experiment.sides:
         s = signals.side(side)
-        row |= {f"{side}.{name}": getattr(s.true, name) for name in _TRUE}
-        row |= {f"{side}.{name}": getattr(s, name) for name in _ESTIMATES}
+        true = {f"{side}.{name}": getattr(s.true, name) for name in ("position", "velocity", "acceleration")}
+        estimates = "position_estimate", "velocity_estimate", "equivalent_control", "torque_estimate"
+        row |= true | {f"{side}.{name}": getattr(s, name) for name in estimates}
     found = identified(experiment, state)
     for side in experiment.sides:
         row |= {f"{side}.{name}": value for name, value in found.get(side, {}).items()}
-    return row
+    # compiled programs sort the names of other dicts
+    return OrderedDict(row)
 
 
 def _summary(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed: int) -> dict[str, Any]:

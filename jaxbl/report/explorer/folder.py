@@ -61,7 +61,7 @@ def write_static(source: Source, out: Path) -> Path:
     Raises:
         InputError: the folder holds something else.
     """
-    make_folder(out, "choose another folder for --static", "--static")
+    make_folder(out, option="--static")
     marker = out / _MARKER
     if not is_empty(out) and not marker.exists():
         raise InputError(f"{out}: is not empty, and was not written by jaxbl explore; choose another folder")
@@ -104,13 +104,12 @@ def write_page(out: Path, parts: Sequence[str], about: Mapping[str, Any], *, scr
         (out / one.name).write_bytes(one.read_bytes())
 
 
-def encoded(values: Any) -> str:
-    """Numbers as float32 in base64, for a page; infinite where they are too large for it."""
-    with np.errstate(over="ignore"):
-        return base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()
+def page_values(frame: pd.DataFrame, name: str) -> np.ndarray:
+    """A metric as pages draw it: as :func:`drawn_values`."""
+    return drawable(drawn_values(frame, name))
 
 
-def page_values(frame: pd.DataFrame, name: str) -> pd.Series:
-    """A metric as pages draw it: as :func:`drawn_values`; what no float32 holds is as good as diverged."""
-    values = drawn_values(frame, name)
-    return values.where(values.abs() < np.finfo(np.float32).max)
+def drawable(values: Any) -> np.ndarray:
+    """Numbers that a page draws: what no float32 holds is as good as diverged, nan."""
+    values = np.asarray(values, float)
+    return np.where(np.abs(values) < np.finfo(np.float32).max, values, np.nan)

@@ -19,10 +19,11 @@ import pyarrow.parquet as pq
 from jaxbl.config import Config, numeric_paths
 from jaxbl.files import plain
 from jaxbl.observer.conditions import CONDITIONS
+from jaxbl.report.picture import packed
 from jaxbl.sweeps.points import AxisColumns, Points
 from jaxbl.sweeps.sweep import StudyResult
 
-from .folder import ROW_GROUP, encoded, page_values
+from .folder import ROW_GROUP, page_values
 
 _OVERVIEW = 512
 """Cells of the overview along each axis, at most."""
@@ -107,7 +108,7 @@ def _overview(values: np.ndarray, shape: list[int]) -> dict[str, Any]:
     index[-1] = slice(None)
     seeds = values.reshape(shape)[tuple(index)]
     cells = pd.DataFrame(seeds.reshape(-1, shape[-1])).median(axis=1).to_numpy().reshape(seeds.shape[:-1])
-    return {"x": x, "y": y, "shape": list(cells.shape), "values": encoded(cells)}
+    return {"x": x, "y": y, "shape": list(cells.shape), "values": packed(cells)}
 
 
 def _conditions() -> list[dict[str, Any]]:

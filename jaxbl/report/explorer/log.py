@@ -1,6 +1,5 @@
 """A log and what models make of it, in a browser: results of `jaxbl identify` and `jaxbl diagnose`."""
 
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,16 +11,18 @@ import pyarrow.parquet as pq
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
+from jaxbl.diagnosis.coordinates import within_turn
 from jaxbl.errors import InputError
 from jaxbl.files import place, read_json
+from jaxbl.records import POSITION_CHANNELS
 from jaxbl.report.diagnose import diagnosis_lines
 from jaxbl.report.element import element_lines
 from jaxbl.report.identify import identification_lines
 from jaxbl.report.residuals import missing_quantity
+from jaxbl.units import on_a_line
 
 from .folder import ROW_GROUP, Source, write_page
 
-_POSITIONS = {"motor": "theta_e", "load": "theta_s"}
 _LABELS = {"t": "time", "u": "input u", "theta_e": "motor position θe", "theta_s": "load position θs", "twist": "twist z",
            "displacement": "displacement"}  # fmt: skip
 _RESULTS = {"diagnosis.json": "Diagnosis of", "identification.json": "Identification from"}
@@ -51,7 +52,7 @@ def log_source(folder: str | Path) -> Source | None:
 
     def write(out: Path, served: bool) -> bool:
         model, frame = (_read(file.with_name(name)) for name in ("model.toml", "trace.parquet"))
-        about = write_log(summary, frame, tomllib.loads(model), out)
+        about = write_log(summary, frame, out)
         about |= {"title": title, "lead": lead, "config": model, "file": "model.toml"}
         write_page(out, ("log",), about, scripts=not served)
         return False
@@ -69,17 +70,16 @@ def _read(file: Path) -> Any:
         ) from None
 
 
-def write_log(summary: Mapping[str, Any], trace: pd.DataFrame, model: Mapping[str, Any], out: Path) -> dict[str, Any]:
+def write_log(summary: Mapping[str, Any], trace: pd.DataFrame, out: Path) -> dict[str, Any]:
     """Write `points.parquet`, and return what the page says of its columns.
 
     Args:
         summary: as in `diagnosis.json` or `identification.json`.
         trace: as in `trace.parquet`.
-        model: the study with the numbers found, as plain data.
         out: folder.
     """
     units = _units(summary)
-    frame = trace.assign(**_further(trace, model, units))
+    frame = trace.assign(**_turns(trace, units))
     coordinates = list(_coordinates(frame, units))
     groups = [one for one in _groups(summary, frame, units) if one["lines"]]
     if not groups:
@@ -104,23 +104,20 @@ def write_log(summary: Mapping[str, Any], trace: pd.DataFrame, model: Mapping[st
 def _units(summary: Mapping[str, Any]) -> dict[str, str]:
     """Unit of each side's position: m on a linear axis."""
     if "gap" in summary:
-        return {side: summary["gap"]["units"].get(name, "rad") for side, name in _POSITIONS.items()}
-    return {side: summary.get("residual", {}).get(side, {}).get("unit", "rad") for side in _POSITIONS}
+        return {side: summary["gap"]["units"].get(name, "rad") for side, name in POSITION_CHANNELS.items()}
+    return {side: summary.get("residual", {}).get(side, {}).get("unit", "rad") for side in POSITION_CHANNELS}
 
 
 def _force(unit: str) -> str:
-    return "N" if unit == "m" else "N m"
+    return on_a_line("N m") if unit == "m" else "N m"
 
 
-def _further(trace: pd.DataFrame, model: Mapping[str, Any], units: Mapping[str, str]) -> dict[str, np.ndarray]:
-    """Coordinates that follow from others: positions within a turn, and the twist."""
+def _turns(trace: pd.DataFrame, units: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """Positions within a turn."""
     found = {}
-    for side, name in _POSITIONS.items():
-        if name in trace and units[side] == "rad" and np.ptp(trace[name].dropna()) > 1.2 * 2.0 * np.pi:
-            found[f"{side}.turn"] = np.mod(trace[name], 2.0 * np.pi)
-    ratio = model.get("drive", {}).get("gear_ratio")
-    if ratio is not None and {"theta_e", "theta_s"} <= set(trace) and "twist" not in trace:
-        found["twist"] = trace["theta_e"] - ratio * trace["theta_s"]
+    for side, name in POSITION_CHANNELS.items():
+        if name in trace and units[side] == "rad" and (turned := within_turn(trace[name].to_numpy())) is not None:
+            found[f"{side}.turn"] = turned
     return found
 
 
@@ -131,7 +128,7 @@ def _coordinates(frame: pd.DataFrame, units: Mapping[str, str]) -> Iterable[dict
     for name, unit in known.items():
         if name in frame:
             yield {"column": name, "label": _LABELS[name], "unit": unit}
-    for side in _POSITIONS:
+    for side in POSITION_CHANNELS:
         for name, label, per in (
             ("velocity", "speed", "/s"),
             ("acceleration", "acceleration", "/s²"),

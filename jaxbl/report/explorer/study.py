@@ -15,14 +15,15 @@ from jaxbl.errors import InputError
 from jaxbl.report.error_plane import error_path, plane_reach
 from jaxbl.report.figures import MAP
 from jaxbl.report.maps import value_label
+from jaxbl.report.picture import packed
 from jaxbl.report.sweep import headline
-from jaxbl.sweeps.metrics import is_magnitude
+from jaxbl.sweeps.metrics import is_magnitude, observer_gains
 from jaxbl.sweeps.store import Store, identity
 from jaxbl.sweeps.sweep import StudyResult, open_study
-from jaxbl.sweeps.trial import run
+from jaxbl.sweeps.trial import neighbours, run
 
 from .cloud import write_cloud
-from .folder import Source, encoded, write_page
+from .folder import Source, drawable, write_page
 from .grid import dimensions, write_grid
 
 
@@ -118,11 +119,11 @@ def simulated(config: Config, asked: Any) -> dict[str, Any]:
     return {
         "every": every,
         "metrics": trial.summary["metrics"],
-        "columns": {name: encoded(trace[name]) for name in _COLUMNS if name in trace},
+        "columns": {name: packed(drawable(trace[name])) for name in _COLUMNS if name in trace},
         "planes": {
-            side: {"error": encoded(one.error), "slope": encoded(one.slope),
+            side: {"error": packed(drawable(one.error)), "slope": packed(drawable(one.slope)),
                    "reach": [plane_reach(one.error, one.majorant[0]), plane_reach(one.slope, one.majorant[1])],
-                   "majorant": [encoded(part) for part in one.majorant] if len(one.majorant[0]) else None}
+                   "majorant": [packed(part) for part in one.majorant] if len(one.majorant[0]) else None}
             for side, one in planes.items()
         },
         "config": point.to_toml(),
@@ -134,17 +135,9 @@ _NEARBY = 6
 
 
 def nearby(config: Config, asked: Any) -> dict[str, Any]:
-    """Metrics of runs whose gains λ and motor inertia differ in their last digits: how far apart they come by rounding,
-    which an observer may amplify under noise, and a plant with a gap. Arguments and errors as of :func:`point_of`."""
-    point, seed = point_of(config, asked)
-    numbers = {f"observer.{side}.lambda": one["lambda"] for side, one in _gains(point).items()}
-    numbers["drive.motor_inertia"] = float(point.build().drive.inertia("motor"))
-    # the last decimal that its precision has: one bit may be lost in the first product
-    last, found = 8.0 * float(np.finfo(point.run.precision).eps), []
-    for k in range(1, _NEARBY + 1):
-        changed = {path: value * (1.0 + k * last) for path, value in numbers.items()}
-        found.append(run(with_values(point, changed), seed=seed, backend="scan").summary["metrics"])
-    return {"metrics": found}
+    """Metrics of runs whose numbers differ from a point's in their last digits. Arguments and errors as of
+    :func:`point_of`."""
+    return {"metrics": neighbours(*point_of(config, asked), _NEARBY)}
 
 
 def _about(config: Config, columns: list[str]) -> dict[str, Any]:
@@ -167,6 +160,5 @@ def _about(config: Config, columns: list[str]) -> dict[str, Any]:
 
 def _gains(config: Config) -> dict[str, Any]:
     """Gains of each side's observer, where no axis changes them."""
-    experiment = config.build()
-    sides = {side: getattr(experiment.observer, side) for side in experiment.sides}
-    return {side: {"lambda": float(one.lambda_), "alpha": float(one.alpha)} for side, one in sides.items()}
+    gains = observer_gains(config.build())
+    return {side: {"lambda": float(one.lambda_), "alpha": float(one.alpha)} for side, one in gains.items()}

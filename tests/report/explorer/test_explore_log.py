@@ -19,7 +19,14 @@ RIPPLE = 0.1 * np.cos(3.0 * ANGLE)
 
 
 def trace():
-    columns = {"t": TIME, "u": np.cos(TIME), "theta_e": ANGLE, "theta_s": ANGLE / 5.0, "held_out": TIME[2999] < TIME}
+    columns = {
+        "t": TIME,
+        "u": np.cos(TIME),
+        "theta_e": ANGLE,
+        "theta_s": ANGLE / 5.0,
+        "twist": 0.2 * ANGLE,
+        "held_out": TIME[2999] < TIME,
+    }
     columns |= {"motor.velocity": 10.0 * np.cos(2.0 * TIME), "motor.noise": 0.01 + 0.0 * TIME}
     columns |= {"motor.missing_before": RIPPLE, "motor.missing_after": 0.01 * np.sign(np.sin(500.0 * TIME))}
     columns |= {f"motor.missing_without.{HOSTILE}": RIPPLE + 0.02, "motor.missing_with.motor.stiction": 0.5 * RIPPLE}
@@ -38,11 +45,11 @@ def summary(unit="rad"):
 
 
 def test_columns_and_what_is_said_of_them(tmp_path):
-    told = write_log(summary(), trace(), {"drive": {"gear_ratio": 4.0}}, tmp_path)
+    told = write_log(summary(), trace(), tmp_path)
     kept = pq.read_table(tmp_path / "points.parquet").to_pandas()
     assert kept["t"].dtype == np.float64 and kept["u"].dtype == np.float32
     np.testing.assert_array_equal(kept["t"], TIME)
-    np.testing.assert_allclose(kept["twist"], ANGLE - 0.8 * ANGLE, atol=1e-6)
+    np.testing.assert_allclose(kept["twist"], 0.2 * ANGLE, atol=1e-6)
     assert kept["motor.turn"].between(0.0, 2.0 * np.pi).all() and "load.turn" not in kept and "motor.noise" not in kept
     units = {one["column"]: one["unit"] for one in told["coordinates"]}
     assert units["motor.velocity"] == "rad/s" and units["u"] == "N m" and told["held"]
@@ -59,7 +66,7 @@ def test_columns_and_what_is_said_of_them(tmp_path):
 
 
 def test_a_linear_axis_has_forces_and_no_turns(tmp_path):
-    told = write_log(summary("m"), trace(), {}, tmp_path)
+    told = write_log(summary("m"), trace(), tmp_path)
     units = {one["column"]: one["unit"] for one in told["coordinates"]}
     assert units["theta_e"] == "m" and units["motor.velocity"] == "m/s" and units["u"] == "N"
     assert "motor.turn" not in units and told["groups"][0]["name"] == "motor: missing force"
@@ -69,14 +76,14 @@ def test_an_identification_and_an_element(tmp_path):
     motor = (f"motor.{name}" for name in ("velocity", "velocity_estimate", "residual", "torque_estimate"))
     frame = pd.DataFrame(dict.fromkeys(("t", "u", "theta_e", "torque", *motor), TIME))
     found = {"residual": {"motor": {"unit": "rad"}}, "sample_period": 1e-3}
-    groups = write_log(found, frame, {}, tmp_path)["groups"]
+    groups = write_log(found, frame, tmp_path)["groups"]
     assert [one["name"] for one in groups] == ["motor: position residual", "torque in the transmission", "motor: speed"]
     element = {"kind": "element", "sample_period": 1e-3}
-    told = write_log(element, pd.DataFrame(dict.fromkeys(("t", "u", "displacement", "torque"), TIME)), {}, tmp_path)
+    told = write_log(element, pd.DataFrame(dict.fromkeys(("t", "u", "displacement", "torque"), TIME)), tmp_path)
     assert told["over"] == ["u", "displacement"]
     assert [one["label"] for one in told["groups"][0]["lines"]] == ["measured", "by the fitted law"]
     with pytest.raises(InputError, match=r"explore: trace\.parquet has no column that the page could draw"):
-        write_log(found, frame.loc[:, ["t", "u"]], {}, tmp_path)
+        write_log(found, frame.loc[:, ["t", "u"]], tmp_path)
 
 
 def stored(folder):
@@ -107,7 +114,7 @@ def test_folders_without_results_and_damaged_ones(tmp_path):
 @needs_chromium
 def test_lines_coordinates_and_moments(tmp_path):
     said = {"title": HOSTILE, "lead": [HOSTILE], "config": HOSTILE, "file": "model.toml"}
-    write_page(tmp_path, ("log",), write_log(summary(), trace(), {}, tmp_path) | said)
+    write_page(tmp_path, ("log",), write_log(summary(), trace(), tmp_path) | said)
     with opened(tmp_path / "index.html") as (page,):
         page.wait_for_selector("body[data-drawn*='motor.missing_before motor.missing_after']")
         assert page.locator("#title").text_content() == page.locator("#lead").text_content() == HOSTILE
