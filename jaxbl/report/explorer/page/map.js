@@ -178,18 +178,6 @@ class Picture {
     this.mark();
   }
   cells(context, { box, shown: { cells, values, step }, failed }, scale) {
-    const image = new ImageData(cells[0], cells[1]), mask = new ImageData(cells[0], cells[1]);
-    for (let j = 0; j < cells[1]; j++) {
-      for (let i = 0; i < cells[0]; i++) {
-        image.data.set([...scale.colour(values[j * cells[0] + i]), 255], 4 * ((cells[1] - 1 - j) * cells[0] + i));
-        if (failed?.[j * cells[0] + i] < 0.5) mask.data[4 * ((cells[1] - 1 - j) * cells[0] + i) + 3] = 255;
-      }
-    }
-    const sheetOf = (data) => {
-      const sheet = Object.assign(document.createElement("canvas"), { width: cells[0], height: cells[1] });
-      sheet.getContext("2d").putImageData(data, 0, 0);
-      return sheet;
-    };
     context.imageSmoothingEnabled = false;
     // the last cell may have fewer points than the others
     const size = this.size(), reach = cells.map((one, i) => (one * step[i]) / size[i]);
@@ -198,7 +186,7 @@ class Picture {
     context.rect(box.left, box.top, box.width, box.height);
     context.clip();
     const place = [box.left, box.top + box.height * (1 - reach[1]), box.width * reach[0], box.height * reach[1]];
-    context.drawImage(sheetOf(image), ...place);
+    context.drawImage(sheetOf(cells, (k) => [...scale.colour(values[k]), 255]), ...place);
     if (this.hatched) {
       // strokes where the mask is
       const strokes = Object.assign(document.createElement("canvas"), { width: this.width, height: this.height }), own = strokes.getContext("2d");
@@ -208,7 +196,7 @@ class Picture {
       for (let k = -box.height; k < box.width; k += 9) { own.moveTo(box.left + k, box.top + box.height); own.lineTo(box.left + k + box.height, box.top); }
       own.stroke();
       own.globalCompositeOperation = "destination-in";
-      own.drawImage(sheetOf(mask), ...place);
+      own.drawImage(sheetOf(cells, (k) => (failed[k] < 0.5 ? [0, 0, 0, 255] : null)), ...place);
       context.drawImage(strokes, 0, 0);
     }
     context.restore();
@@ -402,9 +390,7 @@ globalThis.jaxblData = async (about) => {
     values.hidden = !found;
     if (!found) return;
     values.textContent = picture.lines(found).join("\n");
-    const right = place[0] + 16 + values.offsetWidth > plot.clientWidth;
-    values.style.left = `${right ? place[0] - 16 - values.offsetWidth : place[0] + 16}px`;
-    values.style.top = `${Math.min(place[1] + 16, plot.clientHeight - values.offsetHeight)}px`;
+    beside(values, place, plot);
   };
   const take = (found) => {
     picture.cursor = found;

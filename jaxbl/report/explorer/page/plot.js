@@ -172,6 +172,25 @@ const coloursOf = (about) => about.colours.map((one) => [1, 3, 5].map((i) => par
 /** The colour of no value. */
 const MISSING = [189, 189, 189];
 
+/** A canvas of one pixel a cell, [red, green, blue, opacity] by the cell's number, rows upwards; null leaves it empty. */
+const sheetOf = ([width, height], pixel) => {
+  const sheet = Object.assign(document.createElement("canvas"), { width, height }), image = new ImageData(width, height);
+  for (let j = 0; j < height; j++) {
+    for (let i = 0; i < width; i++) {
+      const colour = pixel(j * width + i);
+      if (colour) image.data.set(colour, 4 * ((height - 1 - j) * width + i));
+    }
+  }
+  sheet.getContext("2d").putImageData(image, 0, 0);
+  return sheet;
+};
+/** Puts a box of values beside a place in a view, inside of it. */
+const beside = (values, [x, y], view) => {
+  const right = x + 14 + values.offsetWidth > view.clientWidth;
+  values.style.left = `${Math.max(0, right ? x - 14 - values.offsetWidth : x + 14)}px`;
+  values.style.top = `${Math.max(0, Math.min(y + 14, view.clientHeight - values.offsetHeight))}px`;
+};
+
 /**
  * Lines over axes in a canvas: values under the pointer and by arrow keys, drag to enlarge, double click or 0 for the whole.
  *
@@ -265,15 +284,8 @@ class Plot {
     this.view.setAttribute("aria-label", `${this.y.label} over ${this.x.label}: arrow keys read values, 0 shows the whole`);
   }
   image(context, x, y) {
-    const { size, values } = this.cells, image = new ImageData(size[0], size[1]);
-    for (let j = 0; j < size[1]; j++) {
-      for (let i = 0; i < size[0]; i++) {
-        const value = values[j * size[0] + i];
-        if (Number.isFinite(value)) image.data.set([...this.scale.colour(value), 255], 4 * ((size[1] - 1 - j) * size[0] + i));
-      }
-    }
-    const sheet = Object.assign(document.createElement("canvas"), { width: size[0], height: size[1] });
-    sheet.getContext("2d").putImageData(image, 0, 0);
+    const { size, values } = this.cells;
+    const sheet = sheetOf(size, (k) => (Number.isFinite(values[k]) ? [...this.scale.colour(values[k]), 255] : null));
     context.imageSmoothingEnabled = false;
     const { box } = this, [left, right] = this.cells.x.map(x.place), [bottom, top] = this.cells.y.map(y.place);
     context.save();
@@ -399,9 +411,7 @@ class Plot {
     const { line, i, cell } = found, say = (axis, value, ends) => `${axis.label}: ${axis.names ? axis.names[Math.round(value)] : textBetween(value, ends)} ${axis.unit ?? ""}`.trim();
     const place = cell ?? [line.x[i], line.y[i]], name = cell ? say(this.scale, found.value, [-Infinity, Infinity]) : line.name;
     this.values.textContent = [name, ...(line?.said?.(i) ?? []), say(this.x, place[0], x.ends), say(this.y, place[1], y.ends)].filter(Boolean).join("\n");
-    const at = [x.place(place[0]), y.place(place[1])], right = at[0] + 14 + this.values.offsetWidth > this.width;
-    this.values.style.left = `${Math.max(0, right ? at[0] - 14 - this.values.offsetWidth : at[0] + 14)}px`;
-    this.values.style.top = `${Math.max(0, Math.min(at[1] + 14, this.height - this.values.offsetHeight))}px`;
+    beside(this.values, [x.place(place[0]), y.place(place[1])], this.view);
   }
   zoom(range) {
     this.range = range;

@@ -51,6 +51,9 @@ const gainsText = (gains, values) => {
   return `# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.\n\n${tables.join("\n")}`;
 };
 
+/** A metric's figure of a run as maps draw it: sizes of what has a sign, 1 and 0 of what is true or not, nan where there is none. */
+const drawnFigure = ({ yes, size }, raw) => (yes ? Number(raw) : raw === null ? NaN : size ? Math.abs(raw) : raw);
+
 class Runs {
   constructor(study) {
     Object.assign(this, { study, all: [], plots: [] });
@@ -100,12 +103,12 @@ class Runs {
     if (asked === this.asked) $("told").textContent = drawn + compared;
   }
   /** A metric as stored and of this run: they differ where rounding does, or where the run is not the one of the sweep. */
-  async compared({ metrics }, { metric: { name, label, yes, size }, value }, ask) {
-    const number = (raw) => (yes ? Number(raw) : raw === null ? NaN : size ? Math.abs(raw) : raw), now = number(metrics[name]);
+  async compared({ metrics }, { metric, value }, ask) {
+    const { name, label } = metric, now = drawnFigure(metric, metrics[name]);
     const apart = Math.abs(now - value), both = `${label} is ${text(now)}, stored ${text(value)}`;
     if (apart <= 1e-3 * Math.abs(value) || (Number.isNaN(value) && !Number.isFinite(now))) return `${label}: ${text(now)}, as stored in the sweep.`;
     if (Number.isNaN(value)) return `${label}: ${text(now)}. The sweep has none: its run diverged, or is not there yet.`;
-    const near = [now, ...(await ask("nearby")).metrics.map((one) => number(one[name]))].filter(Number.isFinite);
+    const near = [now, ...(await ask("nearby")).metrics.map((one) => drawnFigure(metric, one[name]))].filter(Number.isFinite);
     const [low, high] = [Math.min(...near), Math.max(...near)], room = 0.5 * (high - low);
     const spread = `with λ and the motor's inertia changed in their last digits it is ${text(low)} to ${text(high)}`;
     return value >= low - room && value <= high + room ? `${both}. Rounding decides: ${spread}.` : `This run differs from the sweep's: ${both}; ${spread}.`;
@@ -171,10 +174,11 @@ class Runs {
     }
   }
   table() {
-    const { metrics } = this.newest, cell = (value) => made("td", { className: "number", textContent: typeof value === "boolean" ? (value ? "yes" : "no") : text(value) });
+    const { metrics } = this.newest;
+    const cell = (name, own) => made("td", { className: "number", textContent: typeof own[name] === "boolean" ? (own[name] ? "yes" : "no") : text(drawnFigure(this.study.metric(name) ?? {}, own[name])) });
     $("metrics").replaceChildren(
       made("thead", {}, made("tr", {}, ...["metric", ...this.all.map((one) => one.name)].map((name) => made("th", { textContent: name, scope: "col" })))),
-      made("tbody", {}, ...Object.keys(metrics).map((name) => made("tr", {}, made("th", { textContent: this.study.metric(name)?.label ?? name, scope: "row" }), ...this.all.map((one) => cell(this.study.metric(name)?.size && one.metrics[name] !== null ? Math.abs(one.metrics[name]) : one.metrics[name]))))),
+      made("tbody", {}, ...Object.keys(metrics).map((name) => made("tr", {}, made("th", { textContent: this.study.metric(name)?.label ?? name, scope: "row" }), ...this.all.map((one) => cell(name, one.metrics))))),
     );
   }
 }
