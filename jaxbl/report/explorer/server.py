@@ -147,6 +147,9 @@ class ExplorerServer(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     server: ExplorerServer
     protocol_version = "HTTP/1.1"
+    # head and content of an answer go together: apart, each waits for the browser's word that the other one came
+    wbufsize = -1
+    disable_nagle_algorithm = True
     server_version, sys_version = "jaxbl", ""
 
     def log_message(self, format: str, *args: Any) -> None:
