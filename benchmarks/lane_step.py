@@ -30,7 +30,7 @@ from jax.sharding import Mesh, PartitionSpec  # noqa: E402
 from jaxbl import simulate  # noqa: E402
 from jaxbl.drive import Encoders, Initial, SigmoidBacklash, TwoInertia, as_arrays, set_leaves  # noqa: E402
 from jaxbl.drive.excitation import Sine  # noqa: E402
-from jaxbl.observer import OBSERVERS, EquivalentControl, Identifier, Observers  # noqa: E402
+from jaxbl.observer import DISCRETISATIONS, EquivalentControl, Identifier, Observers  # noqa: E402
 from jaxbl.sweeps.metrics import METRICS  # noqa: E402
 
 
@@ -49,7 +49,7 @@ class Variant(NamedTuple):
 def compile_variant(variant: Variant, steps: int):
     """The compiled sweep of one block, and its arguments."""
     dtype = {32: jnp.float32, 64: jnp.float64}[variant.precision]
-    observer = OBSERVERS[variant.observer]
+    observer = DISCRETISATIONS[variant.observer]
     experiment = simulate.Experiment(
         drive=TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0),
         transmission=SigmoidBacklash(1.0, 0.02, 20.0),

@@ -20,9 +20,9 @@ from .drive.excitation import AbstractExcitation
 from .drive.parameters import Scalar, option, parameter
 from .drive.plant import AbstractDrive, Initial, Plant, PlantState
 from .drive.transmission import AbstractTransmission
+from .observer.base import Observers, ObserverState
 from .observer.equivalent_control import EquivalentControl
 from .observer.recursive import Identifier, IdentifierState
-from .observer.super_twisting import Observers, ObserverState
 
 UNROLL_SUBSTEPS = False
 # unrolled, XLA fuses each substep with copies of all before it: quadratic work (benchmarks/NOTES.md)
@@ -145,11 +145,24 @@ def initial_state(experiment: Experiment, measured: dict[str, Number] | None = N
     if plant is not None:
         velocity = plant.velocity
         position = {side: experiment.plant.read(side, plant.position[side], velocity[side]) for side in experiment.sides}
-    observer = {side: getattr(experiment.observer, side).init(position[side], velocity[side]) for side in experiment.sides}
+    observers = {side: getattr(experiment.observer, side) for side in experiment.sides}
+    observer = {
+        side: observer_state(experiment, side, position[side] - o.position_error, velocity[side] - o.velocity_error)
+        for side, o in observers.items()
+    }
     identifier = None
     if experiment.identifier is not None and experiment.transmission is not None:
         identifier = experiment.identifier.init(experiment.transmission, experiment.sides, zero)
     return State(plant, observer, rest, identifier)
+
+
+def observer_state(experiment: Experiment, side: str, position: Scalar, velocity: Scalar) -> ObserverState:
+    """A side's observer before the first sample, for which it predicts a position (rad) and a velocity (rad/s)."""
+
+    def nominal(velocity: Number) -> Number:
+        return experiment.drive.acceleration(side, velocity, jnp.zeros_like(velocity))
+
+    return getattr(experiment.observer, side).start(position, velocity, nominal, experiment.run.sample_period)
 
 
 def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, Signals]:

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 
 from jaxbl.drive import Encoders, Initial, SigmoidBacklash, TwoInertia, as_arrays
 from jaxbl.drive.excitation import Sine
-from jaxbl.observer import OBSERVERS, EquivalentControl, Identifier, Observers
+from jaxbl.observer import DISCRETISATIONS, EquivalentControl, Identifier, Observers
 from jaxbl.simulate import Experiment, Run
 
 DRIVE = TwoInertia(0.05, 0.15, 7.0, 16.0, 5.0)
@@ -25,7 +25,7 @@ def paper(
     **others,
 ) -> Experiment:
     """The experiment; `others` replaces whole members."""
-    observer = OBSERVERS[discretisation]
+    observer = DISCRETISATIONS[discretisation]
     members = {
         "drive": DRIVE,
         "transmission": LAW,

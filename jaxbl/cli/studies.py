@@ -88,15 +88,13 @@ def sweep(
         raise InputError("--detach: does not go with --overwrite or --verify-store; choose another folder with --out")
     study, chosen = read_study(config, backend)
     from jaxbl.report.checks import check_figures
-    from jaxbl.sweeps.metrics import metric_columns
     from jaxbl.sweeps.points import Points
     from jaxbl.sweeps.sweep import sweep as run_sweep
 
     if not study.axes and study.sweep.seeds == 1:
         raise InputError(f"{config}: axes: the study has none; add [[axes]], or use 'jaxbl simulate'")
     with naming(config):
-        Points(study)
-        check_figures(study, study.figures, metric_columns(study.build()))
+        check_figures(study, study.figures, Points(study).metrics)
         if dry_run:
             return _expected_cost(study, chosen)
     run = functools.partial(run_sweep, verify_store=verify_store, scheduler=scheduler)

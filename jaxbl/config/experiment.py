@@ -3,23 +3,22 @@
 # pyright: reportInvalidTypeForm=false
 # types of keys are made as the module is imported
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, create_model, model_validator
 
 from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.encoders import Encoders
 from jaxbl.drive.excitation import EXCITATIONS, Recorded
-from jaxbl.drive.parameters import parameters
+from jaxbl.drive.parameters import key_of, parameters
 from jaxbl.drive.plant import DRIVES, Initial
 from jaxbl.drive.transmission import TRANSMISSIONS
 from jaxbl.errors import InputError
-from jaxbl.observer.equivalent_control import EquivalentControl
-from jaxbl.observer.recursive import Identifier
-from jaxbl.observer.super_twisting import OBSERVERS, AbstractSuperTwisting, Observers
+from jaxbl.observer import DISCRETISATIONS, OBSERVERS, AbstractObserver, EquivalentControl, Identifier, Observers
 from jaxbl.records.files import read_log_file
 from jaxbl.simulate import Run
 from jaxbl.validation import wrong
@@ -65,25 +64,58 @@ ExcitationTable = tagged(
     [RecordedTable if name == "recorded" else table_for(cls, kind=name) for name, cls in EXCITATIONS.items()], "kind"
 )
 EffectTable = tagged([table_for(cls, partial(make_effect, name), kind=name) for name, cls in EFFECTS.items()], "kind")
-GainsTable = table_for(AbstractSuperTwisting)
 InitialTable = table_for(Initial)
 EncodersTable = table_for(Encoders)
 EquivalentControlTable = table_for(EquivalentControl)
 IdentifierTable = table_for(Identifier)
 
 
-class ObserverTable(Table):
-    """Super-twisting observers (7)-(8) of both sides."""
+_GAINS = {field.name: key_of(field.name) for cls in OBSERVERS.values() for field, _ in parameters(cls)}
+"""Gains of all observers: fields and config keys."""
 
-    discretisation: Literal["implicit", "explicit"] = Field(
-        default="implicit", description="implicit: proximal backward Euler; explicit: forward Euler of (7)"
+
+class _ObserverTable(Table):
+    """Observers of both sides."""
+
+    discretisation: Literal[tuple(DISCRETISATIONS)] = Field(
+        default="implicit",
+        description="of kind super_twisting. implicit: proximal backward Euler; explicit: forward Euler of (7)",
     )
-    motor: GainsTable = Field(description="gains of the motor observer")
-    load: GainsTable | None = Field(default=None, description="gains of the load observer; none on a rigid drive")
+
+    @property
+    def observer(self) -> type[AbstractObserver]:
+        """Class of the observers."""
+        return OBSERVERS[self.kind].discretised(self.discretisation)
 
     def build(self) -> Observers:
-        cls = OBSERVERS[self.discretisation]
-        return Observers(cls(**dict(self.motor)), None if self.load is None else cls(**dict(self.load)))
+        """The observers, without gains of other kinds."""
+        names = [field.name for field, _ in parameters(self.observer)]
+        sides = (self.motor, self.load)
+        return Observers(*(s and self.observer(**{name: getattr(s, name) for name in names}) for s in sides))
+
+
+def _observer_table(kind: str, cls: type[AbstractObserver]) -> type[Table]:
+    """The table of observers of a kind. Their sides may hold gains of other kinds, for studies over `observer.kind`."""
+    own = {field.name for field, _ in parameters(cls)}
+    others: dict[str, Any] = {
+        name: (float | None, Field(default=None, alias=key if key != name else None, description="a gain of other kinds"))
+        for name, key in _GAINS.items()
+        if name not in own
+    }
+    gains = table_for(cls, base=create_model("OtherGains", __base__=Table, **others))
+    sides: dict[str, Any] = {
+        "motor": (gains, Field(description="gains of the motor observer")),
+        "load": (gains | None, Field(default=None, description="gains of the load observer; none on a rigid drive")),
+    }
+    tag: Any = (Literal[kind], Field(default=kind if kind == _USUAL else ..., description="kind of observer"))
+    return create_model(f"{cls.__name__}Table", __base__=_ObserverTable, __doc__=cls.__doc__, kind=tag, **sides)
+
+
+_USUAL = "super_twisting"
+ObserverTable = Annotated[
+    tagged([_observer_table(name, cls) for name, cls in OBSERVERS.items()], "kind"),
+    BeforeValidator(lambda given: {"kind": _USUAL} | dict(given) if isinstance(given, Mapping) else given),
+]
 
 
 _MOST_STEPS = 2e9

@@ -219,7 +219,10 @@ def _validate(name: str, data: dict[str, Any], origins: Origins) -> Config:
         raise InputError(f"{name}: {text}" if name else text) from None
 
 
-_UNIONS = {("drive",): 1, ("transmission",): 1, ("excitation",): 1, ("effects",): 2, ("tune", "holdout"): 2}
+_UNIONS = {(key,): 1 for key in ("drive", "transmission", "excitation", "observer")} | {
+    ("effects",): 2,
+    ("tune", "holdout"): 2,
+}
 """Unions, and how far into a location pydantic puts the tag of their member."""
 
 

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.excitation import EXCITATIONS
-from jaxbl.drive.parameters import Parameter, as_arrays, parameters
+from jaxbl.drive.parameters import Parameter, as_arrays, key_of, parameters
 from jaxbl.records import NominalDrive
 from jaxbl.records.table import LogTable
 from jaxbl.simulate import Experiment, Run
@@ -212,6 +212,10 @@ def numeric_paths(config: Config) -> dict[str, Parameter]:
         table = getattr(config, section)
         if table is not None:
             found |= dict(_paths(table, section))
+    # sides may hold gains of other observers
+    gains = {key_of(field.name) for field, _ in parameters(config.observer.observer)}
+    found = {path: known for path, known in found.items() if path.count(".") < 2 or path.rpartition(".")[2] in gains}
+    found[KIND] = Parameter("", "kind of observer")
     kinds = [effect.kind for effect in config.effects]
     for i, effect in enumerate(config.effects):
         label = effect.kind if kinds.count(effect.kind) == 1 else str(i)
@@ -225,6 +229,8 @@ def numeric_paths(config: Config) -> dict[str, Parameter]:
     return found
 
 
+KIND = "observer.kind"
+"""Path of the kind of observer, which an axis may vary."""
 _FIXED = ("kind", "law", "file", "time_column", "torque_column", "precision")
 """Keys that no axis varies."""
 

@@ -34,7 +34,14 @@ class Parameter(NamedTuple):
 
 
 def parameter(
-    unit: str, doc: str, *, default: Any = dataclasses.MISSING, fixed: bool = False, static: bool = False, **about: Any
+    unit: str,
+    doc: str,
+    *,
+    default: Any = dataclasses.MISSING,
+    fixed: bool = False,
+    static: bool = False,
+    kw_only: bool = False,
+    **about: Any,
 ) -> Any:
     """Declare a number of a module as an `equinox` field.
 
@@ -44,10 +51,11 @@ def parameter(
         default: value where the config gives none; without it the key is required.
         fixed: what is compiled depends on the number, so that an axis over it has one program a value.
         static: the number is no leaf at all.
+        kw_only: given by name alone; numbers of classes derived from this one then come first.
         **about: `minimum` (inclusive), `above` (exclusive), `maximum` (inclusive), `role`.
     """
     metadata = {"parameter": Parameter(unit, doc, **about), "fixed": fixed}
-    return eqx.field(static=static, default=default, metadata=metadata)
+    return eqx.field(static=static, default=default, kw_only=kw_only, metadata=metadata)
 
 
 def option(doc: str, **about: Any) -> Any:

@@ -1,5 +1,12 @@
-"""What runs in real time: super-twisting observers, equivalent control, recursive least squares; and gain conditions."""
+"""What runs in real time: observers, equivalent control, recursive least squares; and gain conditions.
 
+Observers are in the order in which lists name them.
+"""
+
+# ruff: noqa: I001
+from .base import OBSERVERS, AbstractObserver, Conditions, Estimate, Observers, ObserverState
+from .super_twisting import DISCRETISATIONS, AbstractSuperTwisting, ExplicitSuperTwisting, ImplicitSuperTwisting
+from .differentiator import COEFFICIENTS, DIFFERENTIATORS, AbstractDifferentiator
+from .linear import DirtyDerivative, ExtendedState, Kalman, Luenberger
 from .equivalent_control import EquivalentControl
 from .recursive import Identifier
-from .super_twisting import OBSERVERS, ExplicitSuperTwisting, ImplicitSuperTwisting, Observers, ObserverState

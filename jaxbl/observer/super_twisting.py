@@ -1,75 +1,54 @@
-"""Super-twisting observers (7)-(8) of one side, in continuous form discretised explicitly or implicitly.
+"""Super-twisting observers (7)-(8) of one side, in continuous form discretised explicitly or implicitly."""
 
-Both take the measured position and the nominal acceleration, and know nothing of where the measurement comes from.
-"""
+from collections.abc import Mapping
+from typing import ClassVar
 
-import abc
-from collections.abc import Callable
-from typing import ClassVar, NamedTuple
-
-import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from jaxbl.drive.parameters import Scalar, parameter
 
-
-class ObserverState(NamedTuple):
-    """Position (rad) and velocity (rad/s) predicted for the coming sample."""
-
-    position: Scalar
-    velocity: Scalar
+from .base import OBSERVERS, AbstractObserver, Conditions, Estimate, ObserverState, predicted
 
 
-class Estimate(NamedTuple):
-    """Position (rad), velocity (rad/s) and equivalent control z_2 (rad/s^2, unfiltered) at the sample."""
+class AbstractSuperTwisting(AbstractObserver):
+    """A super-twisting observer (7)-(8), J. Davila, L. Fridman, A. Levant, IEEE Trans. Autom. Control 50 (2005)."""
 
-    position: Scalar
-    velocity: Scalar
-    control: Float[Array, ""]
-
-
-class AbstractSuperTwisting(eqx.Module):
-    """A super-twisting observer; `position_error` and `velocity_error` are x - x_hat at t = 0."""
-
-    name: ClassVar[str]
+    name: ClassVar[str] = "super_twisting"
+    discretisation: ClassVar[str]
+    """Key `discretisation` of the config."""
     lambda_: Scalar = parameter("√rad/s", "gain lambda of the square-root term (8)", minimum=0.0)
     alpha: Scalar = parameter("rad/s²", "gain alpha of the switching term (8)", minimum=0.0)
-    position_error: Scalar = parameter("rad", "position error x - x_hat at t = 0", default=0.0)
-    velocity_error: Scalar = parameter("rad/s", "velocity error x - x_hat at t = 0", default=0.0)
 
-    def init(self, position: Scalar, velocity: Scalar) -> ObserverState:
-        """State that misses the given position (rad) and velocity (rad/s) by the configured errors."""
-        return ObserverState(position - self.position_error, velocity - self.velocity_error)
+    @classmethod
+    def discretised(cls, discretisation):
+        return DISCRETISATIONS[discretisation]
 
-    @abc.abstractmethod
-    def step(
-        self, state: ObserverState, measured: Float[Array, ""], acceleration: Callable[[Scalar], Scalar], step: Scalar
-    ) -> tuple[ObserverState, Estimate]:
-        """Take in one sample and predict the next.
+    @classmethod
+    def search(cls, at: Conditions) -> Mapping[str, tuple[float, float]]:
+        root = at.f_plus**0.5
+        return {"lambda": (0.3 * root, 50.0 * root), "alpha": (1.1 * at.f_plus, 100.0 * at.f_plus)}
 
-        Args:
-            state: prediction for this sample.
-            measured: position in rad.
-            acceleration: nominal acceleration (rad/s^2) as a function of velocity, the input held at its present value.
-            step: sampling period in s.
-        """
+    def start(self, position, velocity, acceleration, period):
+        return ObserverState(position, velocity)
+
+
+OBSERVERS.add(AbstractSuperTwisting)
 
 
 class ExplicitSuperTwisting(AbstractSuperTwisting):
     """Forward Euler of (7)-(8); the estimate at a sample is the prediction for it."""
 
-    name: ClassVar[str] = "explicit"
+    discretisation: ClassVar[str] = "explicit"
 
-    def step(self, state, measured, acceleration, step):
+    def step(self, state, measured, acceleration, period):
         error = measured - state.position
         magnitude, switch = jnp.abs(error), jnp.sign(error)
         # the slope of the root is infinite at zero; where() keeps it out of derivatives
         root = switch * jnp.sqrt(jnp.where(magnitude > 0.0, magnitude, 1.0))
         control = self.alpha * switch
         new = ObserverState(
-            state.position + step * (state.velocity + self.lambda_ * root),
-            state.velocity + step * (acceleration(state.velocity) + control),
+            state.position + period * (state.velocity + self.lambda_ * root),
+            state.velocity + period * (acceleration(state.velocity) + control),
         )
         return new, Estimate(state.position, state.velocity, control)
 
@@ -82,12 +61,12 @@ class ImplicitSuperTwisting(AbstractSuperTwisting):
     Reference: V. Acary, B. Brogliato, Y. Orlov, IEEE Trans. Autom. Control 57 (2012), for the method; the form is design's.
     """
 
-    name: ClassVar[str] = "implicit"
+    discretisation: ClassVar[str] = "implicit"
 
-    def step(self, state, measured, acceleration, step):
+    def step(self, state, measured, acceleration, period):
         innovation = measured - state.position
-        reach = step * step * self.alpha
-        damping = step * self.lambda_
+        reach = period * period * self.alpha
+        damping = period * self.lambda_
         # what is left of the innovation in the sliding set, alpha s h^2, is its clip
         sliding = jnp.clip(innovation, -reach, reach)
         beyond = innovation - sliding
@@ -95,23 +74,14 @@ class ImplicitSuperTwisting(AbstractSuperTwisting):
         denominator = damping + jnp.sqrt(damping * damping + 4.0 * jnp.abs(beyond))
         half = beyond / jnp.maximum(denominator, jnp.finfo(denominator.dtype).tiny)
         error = 4.0 * half * jnp.abs(half)
-        control = sliding / (step * step)
+        control = sliding / (period * period)
         position = measured - error
-        velocity = state.velocity + step * control
-        # the estimate lags by half a step of the perturbation; the mean velocity over the coming step makes up for it,
-        # else viscous friction of that lag would be taken for perturbation
-        predicted = acceleration(velocity + step * (control + 0.5 * acceleration(velocity)))
-        new = ObserverState(position + step * (velocity + 0.5 * step * predicted), velocity + step * predicted)
+        velocity = state.velocity + period * control
+        new = ObserverState(*predicted(position, velocity, acceleration, period, missing=control))
         return new, Estimate(position, velocity, control)
 
 
-OBSERVERS: dict[str, type[AbstractSuperTwisting]] = {
-    observer.name: observer for observer in (ExplicitSuperTwisting, ImplicitSuperTwisting)
+DISCRETISATIONS: dict[str, type[AbstractSuperTwisting]] = {
+    observer.discretisation: observer for observer in (ImplicitSuperTwisting, ExplicitSuperTwisting)
 }
-
-
-class Observers(eqx.Module):
-    """The observers of both sides; `load` is None on a rigid drive."""
-
-    motor: AbstractSuperTwisting
-    load: AbstractSuperTwisting | None = None
+"""Super-twisting observers by the key `discretisation` of the config."""

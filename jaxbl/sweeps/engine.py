@@ -20,7 +20,7 @@ import pandas as pd
 from jaxbl.config import Config, precision, prepare
 
 from .costs import Work, costs, faster, lanes_at_once, work_of
-from .metrics import Names, ObserverGains, compile_conditions, metric_columns, needs_conditions, with_conditions
+from .metrics import Names, ObserverGains, compile_conditions, needs_conditions, with_conditions
 from .points import Points
 from .programs import BACKENDS, Backend, Layout, Program, backend_of, compile_program, computed, not_put_into_cache
 
@@ -114,7 +114,7 @@ class Engine:
         self.compile_seconds = 0.0
         self.run_seconds = 0.0
         self.scanned: list[str] = []
-        self._compiled: OrderedDict[int, tuple[Program, list[str]]] = OrderedDict()
+        self._compiled: OrderedDict[int, Program] = OrderedDict()
         self._judging: set[str] = set()
 
     def _faster(self) -> Backend:
@@ -212,7 +212,7 @@ class Engine:
     def run(self, chunk: Chunk) -> pd.DataFrame:
         """Compute one chunk: a frame of one row for each seed and point, padding taken off."""
         group = self.points.groups[chunk.group]
-        program, names = self._program(chunk.group)
+        program = self._program(chunk.group)
         with precision(group.config):
             given = self._arguments(group.config, self.points.columns(chunk.points), chunk.seeds)
             start = time.perf_counter()
@@ -224,8 +224,9 @@ class Engine:
             figures = self._judged(*found)
             self.run_seconds += time.perf_counter() - start
         data = self.labels(chunk)
-        for name in names:
-            data[name] = np.asarray(figures[name])[: len(chunk.seeds), : len(chunk.points)].ravel()
+        for name in self.points.metrics:
+            own = np.asarray(figures.get(name, np.full((len(chunk.seeds), len(chunk.points)), np.nan)))
+            data[name] = own[: len(chunk.seeds), : len(chunk.points)].ravel()
         return pd.DataFrame(data)
 
     def labels(self, chunk: Chunk) -> dict[str, np.ndarray]:
@@ -252,8 +253,8 @@ class Engine:
         for group in reversed(range(len(self.points.groups))):
             self._program(group)
 
-    def _program(self, group: int) -> tuple[Program, list[str]]:
-        """The compiled program of a group and the names of its figures; those used last are kept."""
+    def _program(self, group: int) -> Program:
+        """The compiled program of a group; those used last are kept."""
         if group not in self._compiled:
             self._compiled[group] = self._compile(self.points.groups[group].config)
         self._compiled.move_to_end(group)
@@ -261,7 +262,7 @@ class Engine:
             self._compiled.popitem(last=False)
         return self._compiled[group]
 
-    def _compile(self, config: Config) -> tuple[Program, list[str]]:
+    def _compile(self, config: Config) -> Program:
         with precision(config):
             experiment = prepare(config)
             columns, _ = self._arguments(config, self.points.columns(np.arange(1)), np.arange(1))
@@ -272,7 +273,7 @@ class Engine:
             self.compile_seconds += time.perf_counter() - start
             if program.instead is not None and program.instead not in self.scanned:
                 self.scanned.append(program.instead)
-            return program, metric_columns(experiment, config.sweep.metrics)
+            return program
 
     def _judged(self, figures: dict[str, Any], gains: dict[str, ObserverGains]) -> Mapping[str, Any]:
         """Figures of a chunk with those that follow from them, if any of these is asked for."""
@@ -291,7 +292,7 @@ class Engine:
         group = max(range(len(groups)), key=lambda index: groups[index].config.run.steps)
         config, chunk = groups[group].config, self.chunk(group * (len(self) // len(groups)))
         with not_put_into_cache():
-            program, _ = self._compile(config)
+            program = self._compile(config)
             a_program = self.compile_seconds
             with precision(config):
                 self._compile_conditions(config.run.precision)
@@ -303,7 +304,7 @@ class Engine:
         brief = config.model_copy(
             update={"run": config.run.model_copy(update={"duration": steps * config.run.sample_period})}
         )
-        tried, _ = self._compile(brief)
+        tried = self._compile(brief)
         running, judging = [], []
         with precision(config):
             given = self._arguments(brief, self.points.columns(chunk.points), chunk.seeds)

@@ -19,7 +19,7 @@ from jaxtyping import Array, Int
 
 from jaxbl.drive.transmission import TRANSMISSIONS
 from jaxbl.errors import InputError
-from jaxbl.observer import conditions
+from jaxbl.observer import AbstractSuperTwisting, conditions
 from jaxbl.registry import Registry, check_subclass, check_text
 from jaxbl.simulate import Experiment, Number, Reducer, Signals, State, TrueSide
 from jaxbl.validation import nearest
@@ -137,7 +137,11 @@ class ObserverGains(NamedTuple):
 
 
 class GainMetric(Metric):
-    """A metric of gains and f_plus alone, computed after the loop over time by a program that serves all studies."""
+    """A metric of a super-twisting observer's gains and f_plus alone, computed after the loop over time by a program that
+    serves all studies."""
+
+    def applies(self, experiment):
+        return bool(observer_gains(experiment))
 
     @abc.abstractmethod
     def judge(self, gains: ObserverGains, f_plus: Array) -> Array:
@@ -483,8 +487,10 @@ def needs_conditions(names: Names) -> bool:
 
 
 def observer_gains(experiment: Experiment) -> dict[str, ObserverGains]:
-    """Gains of the experiment's observers by side."""
+    """Gains of the experiment's observers by side; none of observers that the conditions are not for."""
     fields = ObserverGains._fields
+    if not isinstance(experiment.observer.motor, AbstractSuperTwisting):
+        return {}
     return {s: ObserverGains(*(getattr(getattr(experiment.observer, s), f) for f in fields)) for s in experiment.sides}
 
 
@@ -494,6 +500,8 @@ def with_conditions(figures: Mapping[str, Any], gains: dict[str, ObserverGains])
     Apart from the loop over time, by programs that serve all studies.
     """
     found = {name: np.asarray(value) for name, value in figures.items()}
+    if not gains:
+        return found
     f_plus = np.stack([found[f"{side}.f_plus"] for side in gains])
     columns = [[np.asarray(x, f_plus.dtype) for x in given] for given in zip(*gains.values(), strict=True)]
     for side, *given in zip(gains, *columns, f_plus, strict=True):
@@ -542,18 +550,21 @@ def is_magnitude(column: str) -> bool:
     return column.endswith("_error")
 
 
-def metric_columns(experiment: Experiment, names: Iterable[str] | None = None) -> list[str]:
-    """The columns of this experiment, of the metrics asked for or of all: what :func:`metrics` and :func:`with_conditions`
-    give.
+def metric_columns(
+    experiment: Experiment, names: Iterable[str] | None = None, others: Iterable[Experiment] = ()
+) -> list[str]:
+    """The columns of this experiment, or of any of several with the same sides, of the metrics asked for or of all: what
+    :func:`metrics` and :func:`with_conditions` give.
 
     Raises:
-        InputError: there is no such metric, or this experiment does not have it.
+        InputError: there is no such metric, or no experiment has it.
     """
-    own = [name for name, metric in _metrics(Metric).items() if metric.applies(experiment)]
+    each = [experiment, *others]
+    own = [name for name, metric in _metrics(Metric).items() if any(metric.applies(one) for one in each)]
     wanted = own if names is None else list(names)
     for i, name in enumerate(wanted):
         if name not in own:
-            what = "does not apply to this drive" if name in SIDE_METRICS else "is no metric"
+            what = "does not apply to this study" if name in SIDE_METRICS else "is no metric"
             raise InputError(f"sweep.metrics[{i}]: '{name}' {what}; {nearest(name, own)}")
     return ["finite", *(f"{side}.{name}" for side in experiment.sides for name in own if name in wanted)]
 

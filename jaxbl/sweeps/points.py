@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxbl.config import TOLERANCE, AxisTable, Config, with_values
+from jaxbl.config import KIND, TOLERANCE, AxisTable, Config, numeric_paths, with_values
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.errors import InputError
 from jaxbl.files import plain
+from jaxbl.simulate import Experiment
 
 from .metrics import metric_columns, no_metric
 from .refine import CellGrid, Criterion
@@ -50,6 +51,7 @@ class Points:
     Each group, one for each combination of structural values, has `lanes` points. `coarse_lanes` of them are always
     simulated: all, or the coarse grid of a refined study. `blocks` has the values of each axis in the order of the config,
     those that advance together as one.
+    `metrics` are the columns of all groups: one that does not apply to the observers of a group is NaN there.
     """
 
     def __init__(self, config: Config):
@@ -58,7 +60,7 @@ class Points:
             if path in self.paths[:i]:
                 raise InputError(f"axes[{i}]: path '{path}' has an axis already; each path may have one")
         base, self.leaves = self._check(config)
-        metrics = metric_columns(base.build(), config.sweep.metrics)
+        self.metrics = metrics = metric_columns(base.build(), config.sweep.metrics, self._kinds(config, base))
         refined = self._refined(config)
         depth = config.sweep.refine or 0
         self.blocks = blocks = self._blocks(config, dict.fromkeys(refined, depth))
@@ -130,6 +132,21 @@ class Points:
                     f"sweep.refine: {depth} makes more than {_MOST_VALUES:.0e} values of '{axis.path}'; it {limit}"
                 )
         return [axis.path for axis in axes]
+
+    @staticmethod
+    def _kinds(config: Config, base: Config) -> list[Experiment]:
+        """An experiment with each kind of observer, where that is an axis; each has the gains that other axes vary."""
+        kinds = [axis.values or [] for axis in config.axes if axis.path == KIND]
+        found = [with_values(base, {KIND: kind}) for kind in (kinds[0] if kinds else ())]
+        for one in found:
+            known = numeric_paths(one)
+            for i, axis in enumerate(config.axes):
+                if axis.path not in known:
+                    raise InputError(
+                        f"axes[{i}]: '{axis.path}' is no gain of kind '{one.observer.kind}', which is among the values of "
+                        f"{KIND}; an axis over it needs gains that all kinds listed have, or a study of its own"
+                    )
+        return [one.build() for one in found]
 
     @staticmethod
     def _check(config: Config) -> tuple[Config, set[str]]:

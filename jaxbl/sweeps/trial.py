@@ -144,11 +144,10 @@ def _summary(config: Config, last: dict[str, Any], metrics: dict[str, Any], seed
             sides = {side: last[f"last.{side}.{name}"] for side in experiment.sides}
             parameters[name] = {"true": true, **sides}
     conditions = {}
-    for side in experiment.sides:
+    for side, gains in observer_gains(experiment).items():
         f_plus = metrics[f"{side}.f_plus"]
         if f_plus is not None:
-            observer = getattr(experiment.observer, side)
-            conditions[side] = judge_gains(observer.lambda_, observer.alpha, f_plus)
+            conditions[side] = judge_gains(float(gains.lambda_), float(gains.alpha), f_plus)
     return {
         "title": config.title,
         "single_run": identity(config, "simulate"),
@@ -193,14 +192,15 @@ def _remarks(experiment: Experiment, last: dict[str, Any], metrics: dict[str, An
             ]
             if missed:
                 remarks.append(f"{side}: lambda = {found['lambda']:g} misses, at {label}: {'; '.join(missed)}.")
-        converged = metrics[f"{side}.converged"]
-        if converged and not found["holds"]["exact"]:
+        if metrics[f"{side}.converged"] and not found["holds"]["exact"]:
             remarks.append(
                 f"{side}: the observer converged all the same: the conditions are for the worst disturbance, which this run "
                 "need not contain, and they leave out viscous friction, which can shrink the error asymptotically."
             )
-        if not converged:
-            run, ratio = experiment.run, float(experiment.drive.ratio(side))
+    run = experiment.run
+    for side in experiment.sides:
+        if not metrics[f"{side}.converged"]:
+            ratio = float(experiment.drive.ratio(side))
             remarks.append(
                 f"{side}: the observer did not stay within {run.position_tolerance / ratio:.2g} rad and "
                 f"{run.velocity_tolerance / ratio:.2g} rad/s over the last quarter of the run "

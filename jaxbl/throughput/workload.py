@@ -111,7 +111,10 @@ class Workload(NamedTuple):
             initial=Initial(),
             excitation=Sine(**INPUT),
             encoders=Encoders(1e-4),
-            observer=Observers(ExplicitSuperTwisting(4.0, 9.0, velocity_error=_MISS), ExplicitSuperTwisting(0.5, 0.2)),
+            observer=Observers(
+                ExplicitSuperTwisting(lambda_=4.0, alpha=9.0, velocity_error=_MISS),
+                ExplicitSuperTwisting(lambda_=0.5, alpha=0.2),
+            ),
             equivalent_control=EquivalentControl(_LOW_PASS),
             identifier=Identifier(self.start * _PERIOD),
             run=Run(_PERIOD, self.steps, 1),

@@ -19,7 +19,7 @@ from jaxbl.fused.ahead import Looped
 from jaxbl.fused.jaxprs import contracted, substituted
 from jaxbl.fused.pallas import LANES, Kernel
 from jaxbl.fused.passage import DevicePassage, HostPassage
-from jaxbl.observer import OBSERVERS, EquivalentControl, Identifier, Observers
+from jaxbl.observer import DISCRETISATIONS, EquivalentControl, Identifier, Observers
 from jaxbl.simulate import Experiment, Reducer, Run, scan
 from jaxbl.sweeps.metrics import METRICS, metrics
 from jaxbl.throughput.workload import FIGURES, RANGES, SEED, Workload
@@ -30,7 +30,7 @@ OTHERS = [*(name for name in VALUES if name not in HALF), *ENCODERS]
 
 
 def experiment(names, law=None, observer="implicit", rigid=False, substeps=2, steps=700, precision="float64"):
-    kind = OBSERVERS[observer]
+    kind = DISCRETISATIONS[observer]
     motor = kind(10.0, 90.0, velocity_error=0.5)
     return as_arrays(
         Experiment(
