@@ -93,8 +93,8 @@ def predicted(
 ) -> tuple[Scalar, Scalar]:
     """Position and velocity one sampling period later.
 
-    Friction is that of the mean velocity over the period: that of its beginning would be half a period late, and the observer
-    would take the difference for a disturbance.
+    Friction is that of the mean velocity over the period: that of its beginning would be half a period late, which the
+    observer would take for a disturbance.
 
     Args:
         position, velocity: now.

@@ -111,7 +111,7 @@ class AbstractDifferentiator(AbstractObserver):
     """
 
     order: ClassVar[int]
-    lipschitz: eqx.AbstractVar[Scalar]
+    lipschitz: eqx.AbstractVar[Scalar]  # pyright: ignore[reportGeneralTypeIssues]
 
     @classmethod
     def search(cls, at: Conditions) -> Mapping[str, tuple[float, float]]:
