@@ -440,7 +440,7 @@ def test_leaves_of_the_experiment_have_the_paths_of_the_config(data):
         assert known[path].doc
         moved = with_values(config, {path: 0.625})
         assert get_leaf(moved.build(), path) == 0.625, path
-    structural = {"observer.discretisation", "run.duration", "run.sample_period", "run.substeps"}
+    structural = {"observer.discretisation", "observer.kind", "run.duration", "run.sample_period", "run.substeps"}
     absent = {"encoders.load_noise", "identifier.regressor_filter"} if experiment.identifier else set()
     assert set(known) - set(leaves) == structural | absent
 

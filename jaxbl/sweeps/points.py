@@ -8,6 +8,7 @@ A refined study has the points of its fine grid; those of the coarse grid, where
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -152,6 +153,10 @@ class Points:
     def _check(config: Config) -> tuple[Config, set[str]]:
         """The config with every axis at its first value (so that optional numbers exist), and the paths that are leaves."""
         first = {}
+        # what gains there are depends on it
+        kinds = [axis.values[0] for axis in config.axes if axis.path == KIND and axis.values]
+        with suppress(InputError):
+            config = with_values(config, {KIND: kind for kind in kinds})
         for i, axis in enumerate(config.axes):
             ends = axis.values if axis.values is not None else [axis.start, axis.stop]
             for value in _extremes(ends):

@@ -182,7 +182,7 @@ def test_some_metrics_alone():
             r"^sweep.metrics\[1\]: 'velocity_rms' is no metric; did you mean 'velocity_rmse'\?$",
         ),
         (["motor.converged"], r"did you mean 'converged'\?$"),
-        (["stiffness_error"], r"^sweep.metrics\[0\]: 'stiffness_error' does not apply to this drive; "),
+        (["stiffness_error"], r"^sweep.metrics\[0\]: 'stiffness_error' does not apply to this study; "),
     ],
 )
 def test_metrics_that_cannot_be_had(names, message):

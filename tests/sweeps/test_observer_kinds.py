@@ -1,0 +1,94 @@
+"""Studies over the kind of observer: gains of several kinds beside one another, by both loops."""
+
+import numpy as np
+import pytest
+from small_study import small
+
+import jaxbl
+from jaxbl.config import numeric_paths, read_config
+from jaxbl.drive.parameters import parameters
+from jaxbl.errors import InputError
+from jaxbl.observer import OBSERVERS
+from jaxbl.observer.base import Conditions
+
+GAINS = {
+    "lambda": 4.0,
+    "alpha": 9.0,
+    "bandwidth": 150.0,
+    "damping": 0.8,
+    "position_noise": 1e-5,
+    "disturbance_noise": 100.0,
+    "time_constant": 0.004,
+    "lipschitz": 50.0,
+}
+
+
+def study(**more):
+    return small(observer={"motor": GAINS, "load": GAINS}, encoders={"noise": 1e-5}) | more
+
+
+def test_a_sweep_over_the_kind_by_both_loops():
+    axes = [
+        {"path": "observer.kind", "values": list(OBSERVERS)},
+        {"path": "transmission.stiffness", "values": [1.0, 1.4]},
+    ]
+    fused, scanned = (jaxbl.sweep(study(axes=axes), backend=backend).frame for backend in ("fused", "scan"))
+    assert list(fused["observer.kind"].unique()) == list(OBSERVERS)
+    conditions = [name for name in fused if "margin" in name or "bound" in name or "worst" in name]
+    usual = fused["observer.kind"] == "super_twisting"
+    assert len(conditions) == 2 * 8
+    # conditions on lambda and alpha are not for the others
+    assert fused.loc[usual, conditions].notna().all(axis=None)
+    assert fused.loc[~usual, conditions].isna().all(axis=None)
+    numbers = [name for name in fused if name not in (*conditions, "observer.kind", "motor.convergence_time")]
+    assert fused["finite"].all()
+    np.testing.assert_allclose(fused[numbers].astype(float), scanned[numbers].astype(float), rtol=1e-5, atol=1e-9)
+    # each kind does something of its own
+    assert fused["motor.velocity_rmse"].nunique() == len(fused)
+
+
+def test_an_axis_over_gains_needs_kinds_that_have_them():
+    kinds = {"path": "observer.kind", "values": ["luenberger", "extended_state"]}
+    shared = {"path": "observer.motor.bandwidth", "values": [100.0, 200.0]}
+    found = jaxbl.sweep(study(axes=[kinds, shared], sweep={"metrics": ["velocity_rmse"]})).frame
+    assert found["motor.velocity_rmse"].nunique() == 4
+    kinds["values"].append("kalman")
+    with pytest.raises(InputError, match=r"axes\[1\]: 'observer.motor.bandwidth' is no gain of kind 'kalman'"):
+        jaxbl.sweep(study(axes=[kinds, shared]))
+
+
+@pytest.mark.parametrize(
+    ("observer", "message"),
+    [
+        ({"kind": "kalmann", "motor": {}}, r"observer.kind: unknown kind 'kalmann'; did you mean 'kalman'"),
+        ({"kind": "luenberger", "motor": {"lambda": 1.0}}, r"observer.motor.bandwidth: this key is missing"),
+        ({"kind": "luenberger", "motor": {"bandwidth": -1.0}}, r"observer.motor.bandwidth: should be greater than 0"),
+        (
+            {"kind": "luenberger", "motor": {"bandwith": 1.0}},
+            r"observer.motor: unknown key 'bandwith'; did you mean 'bandwidth'",
+        ),
+        ({"motor": {"bandwidth": 1.0, "alpha": 9.0}}, r"observer.motor.lambda: this key is missing"),
+        ({"kind": 3, "motor": {}}, r"observer"),
+        (3, r"observer: should be a table"),
+    ],
+)
+def test_wrong_observers_get_one_line(observer, message):
+    with pytest.raises(InputError, match=message) as caught:
+        read_config(small() | {"observer": observer})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", OBSERVERS)
+def test_every_kind_says_what_a_search_should_try(kind):
+    """Gains of the class, positive, and a study with them runs."""
+    cls = OBSERVERS[kind].discretised("implicit")
+    found = cls.search(Conditions(f_plus=3.0, period=1e-3, noise=1e-5))
+    assert found
+    assert all(0.0 < least <= largest < np.inf for least, largest in found.values())
+    middle = {key: (least * largest) ** 0.5 for key, (least, largest) in found.items()}
+    config = read_config(study(observer={"kind": kind, "motor": middle, "load": middle}))
+    paths = [path for path in numeric_paths(config) if path.startswith("observer.motor.")]
+    assert {f"observer.motor.{key}" for key in found} <= set(paths)
+    assert config.build().observer.motor.name == kind
+    # gains of other kinds are no numbers of this study
+    assert len(paths) == len(list(parameters(cls)))
