@@ -70,6 +70,8 @@ EquivalentControlTable = table_for(EquivalentControl)
 IdentifierTable = table_for(Identifier)
 
 
+OTHERS = "a gain of other kinds of observer"
+"""What the table of a kind says of it."""
 _GAINS = {field.name: key_of(field.name) for cls in OBSERVERS.values() for field, _ in parameters(cls)}
 """Gains of all observers: fields and config keys."""
 
@@ -98,7 +100,7 @@ def _observer_table(kind: str, cls: type[AbstractObserver]) -> type[Table]:
     """The table of observers of a kind. Their sides may hold gains of other kinds, for studies over `observer.kind`."""
     own = {field.name for field, _ in parameters(cls)}
     others: dict[str, Any] = {
-        name: (float | None, Field(default=None, alias=key if key != name else None, description="a gain of other kinds"))
+        name: (float | None, Field(default=None, alias=key if key != name else None, description=OTHERS))
         for name, key in _GAINS.items()
         if name not in own
     }

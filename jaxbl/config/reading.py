@@ -198,7 +198,7 @@ def _merge(into: dict[str, Any], data: dict[str, Any], new: Origins, origins: Or
         if (
             isinstance(old, dict)
             and isinstance(value, dict)
-            and all(value.get(tag, old.get(tag)) == old.get(tag) for tag in ("kind", "law"))
+            and all(tag not in old or value.get(tag, old[tag]) == old[tag] for tag in ("kind", "law"))
         ):
             origins[name] = Origin(new[name].file, origins[name].keys)
             _merge(old, value, new[name].keys, origins[name].keys)

@@ -179,14 +179,15 @@ def observers_say(
     they say nothing."""
     found, notes = {}, []
     for side, pieces in observed.items():
-        gains = getattr(nominal.observer, side)
+        gains = getattr(nominal.observer, side).gains()
         found[side] = compared(nominal, pieces, setup.lacking[side], setup.fitted.bandwidth[side]) | {
-            "gains": {"lambda": float(gains.lambda_), "alpha": float(gains.alpha)},
+            "gains": gains,
             "time_constant": float(nominal.equivalent_control.time_constant),
         }
         if not found[side]["converged"]:
+            listed = ", ".join(f"{key} = {value:.3g}" for key, value in gains.items())
             notes.append(
-                f"The {side}'s observer does not converge on this log (alpha = {float(gains.alpha):.3g}): its "
+                f"The {side}'s observer does not converge on this log ({listed}): its "
                 "equivalent control says nothing of the missing torque. The verdict does not use it."
             )
     return found, notes

@@ -20,6 +20,7 @@ from scipy.ndimage import uniform_filter1d
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.regression import Kinematics
 from jaxbl.identification.segments import Segment
+from jaxbl.observer import AbstractSuperTwisting
 from jaxbl.records.linear_filters import filtered, parzen
 from jaxbl.simulate import Experiment, Signals, State, initial_state, observer_state, replay
 
@@ -148,8 +149,12 @@ def _observed(experiment: Experiment, side: str, part: Kinematics, controls: np.
         min(1.0 / (2.0 * np.pi * constant), 0.5 / period) if constant > 0.0 else 0.5 / period,
     )  # fmt: skip
     width = max(math.ceil(5.0 / share), _LEAST_SKIPPED)
-    mean = np.abs(uniform_filter1d(controls[0, skipped:], width))
-    stuck = float(np.mean(mean > _STUCK * float(getattr(experiment.observer, side).alpha)))
+    observer = getattr(experiment.observer, side)
+    stuck = 0.0
+    # of a switching term, whose size is bounded
+    if isinstance(observer, AbstractSuperTwisting):
+        mean = np.abs(uniform_filter1d(controls[0, skipped:], width))
+        stuck = float(np.mean(mean > _STUCK * float(observer.alpha)))
     return Observed(residual, skipped, stuck)
 
 

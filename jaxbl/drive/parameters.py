@@ -64,8 +64,8 @@ def option(doc: str, **about: Any) -> Any:
 
 
 def parameters(module: Any) -> Iterator[tuple[dataclasses.Field, Parameter]]:
-    """The declared fields of a module or module class, in order."""
-    for field in dataclasses.fields(module):
+    """The declared fields of a module or module class, in order; those given by name alone last."""
+    for field in sorted(dataclasses.fields(module), key=lambda field: field.kw_only is True):
         if "parameter" in field.metadata:
             yield field, field.metadata["parameter"]
 

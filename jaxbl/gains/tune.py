@@ -19,7 +19,8 @@ import pandas as pd
 
 from jaxbl.cluster import Scheduler
 from jaxbl.config import TUNE_NAMES, Config, TuneTable, read_config
-from jaxbl.errors import NoResult
+from jaxbl.errors import InputError, NoResult
+from jaxbl.observer import AbstractSuperTwisting
 from jaxbl.sweeps.metrics import undisturbed
 from jaxbl.sweeps.programs import Backend
 from jaxbl.workers import Progress
@@ -89,6 +90,11 @@ def tune(
     """
     config = read_config(study)
     table = config.tune or TuneTable()
+    if config.observer.kind != AbstractSuperTwisting.name:
+        raise InputError(
+            f"observer.kind: tune chooses lambda and alpha of kind '{AbstractSuperTwisting.name}', not the gains of "
+            f"'{config.observer.kind}'"
+        )
     config = config.model_copy(update={"tune": table})
     scenarios = scenarios_of(config, table)
     given = {"progress": progress, "devices": devices, "overwrite": overwrite, "backend": backend}

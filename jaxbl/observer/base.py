@@ -13,7 +13,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxbl.drive.parameters import Scalar, parameter
+from jaxbl.drive.parameters import Scalar, key_of, parameter, parameters
 from jaxbl.registry import Registry, check_module
 
 Acceleration = Callable[[Scalar], Scalar]
@@ -63,6 +63,11 @@ class AbstractObserver(eqx.Module):
     def search(cls, at: Conditions) -> Mapping[str, tuple[float, float]]:
         """Least and largest value of each gain that a search for gains should try, positive, by its config key; the same
         twice for one that it takes for given."""
+
+    def gains(self) -> dict[str, float]:
+        """Gains of this observer by config key."""
+        names = [field.name for field, _ in parameters(self) if not field.kw_only]
+        return {key_of(name): float(getattr(self, name)) for name in names}
 
     @abc.abstractmethod
     def start(self, position: Scalar, velocity: Scalar, acceleration: Acceleration, period: Scalar) -> ObserverState:

@@ -154,9 +154,9 @@ class Points:
         """The config with every axis at its first value (so that optional numbers exist), and the paths that are leaves."""
         first = {}
         # what gains there are depends on it
-        kinds = [axis.values[0] for axis in config.axes if axis.path == KIND and axis.values]
+        kind = {axis.path: axis.values[0] for axis in config.axes if axis.path == KIND and axis.values}
         with suppress(InputError):
-            config = with_values(config, {KIND: kind for kind in kinds})
+            config = with_values(config, kind)
         for i, axis in enumerate(config.axes):
             ends = axis.values if axis.values is not None else [axis.start, axis.stop]
             for value in _extremes(ends):

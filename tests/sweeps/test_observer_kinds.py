@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import tomli_w
 from small_study import small
 
 import jaxbl
@@ -92,3 +93,18 @@ def test_every_kind_says_what_a_search_should_try(kind):
     assert config.build().observer.motor.name == kind
     # gains of other kinds are no numbers of this study
     assert len(paths) == len(list(parameters(cls)))
+
+
+def test_tune_says_which_observers_it_is_for():
+    with pytest.raises(InputError, match=r"observer.kind: tune chooses lambda and alpha of kind 'super_twisting'"):
+        jaxbl.tune(study(observer={"kind": "kalman", "motor": GAINS, "load": GAINS}))
+
+
+def test_gains_of_any_kind_can_be_included(tmp_path):
+    """A file of gains alone, as the explorer saves them, under a study that names the kind."""
+    (tmp_path / "gains.toml").write_text("[observer.motor]\nbandwidth = 70.0\n[observer.load]\nbandwidth = 80.0\n")
+    data = read_config(study(observer={"kind": "extended_state", "motor": GAINS, "load": GAINS})).resolved()
+    data["observer"] = {"kind": "extended_state"}
+    (tmp_path / "study.toml").write_text('include = "gains.toml"\n' + tomli_w.dumps(data))
+    observer = read_config(tmp_path / "study.toml").build().observer
+    assert (observer.motor.gains(), observer.load.gains()) == ({"bandwidth": 70.0}, {"bandwidth": 80.0})

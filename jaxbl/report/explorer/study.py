@@ -17,7 +17,7 @@ from jaxbl.report.figures import MAP
 from jaxbl.report.maps import value_label
 from jaxbl.report.picture import packed
 from jaxbl.report.sweep import headline
-from jaxbl.sweeps.metrics import is_magnitude, observer_gains
+from jaxbl.sweeps.metrics import is_magnitude
 from jaxbl.sweeps.store import Store, identity
 from jaxbl.sweeps.sweep import StudyResult, open_study
 from jaxbl.sweeps.trial import neighbours, run
@@ -160,5 +160,5 @@ def _about(config: Config, columns: list[str]) -> dict[str, Any]:
 
 def _gains(config: Config) -> dict[str, Any]:
     """Gains of each side's observer, where no axis changes them."""
-    gains = observer_gains(config.build())
-    return {side: {"lambda": float(one.lambda_), "alpha": float(one.alpha)} for side, one in gains.items()}
+    experiment = config.build()
+    return {side: getattr(experiment.observer, side).gains() for side in experiment.sides}
