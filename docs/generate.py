@@ -6,8 +6,10 @@ from typing import Any, get_args, get_origin
 from pydantic import BaseModel
 
 from jaxbl import config
-from jaxbl.drive.effects import EFFECTS
+from jaxbl.drive.effects import EFFECTS, make_effect
+from jaxbl.drive.mujoco_parts import MujocoParts, SideParts
 from jaxbl.drive.parameters import parameters
+from jaxbl.drive.transmission import TRANSMISSIONS
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
 PAGE = Path(__file__).with_name("reference.md")
@@ -52,6 +54,27 @@ def section(title: str, table: type[BaseModel]) -> str:
     return f"### {title}\n\n{' '.join(doc.split())}\n" + (f"\n{HEAD}\n{body}\n" if body else "")
 
 
+def in_mujoco(part: Any, *side: str) -> str:
+    """What a MuJoCo model has of a law or an effect."""
+    how, text = part.to_mujoco(MujocoParts({"motor": SideParts(1.0), "load": SideParts(1.0)}, 1.0, 1e-4), *side)
+    # beyond the colon are figures, which are those of a study
+    text = text if how == "not said" else text.partition(":")[0]
+    return f"{how} | {text.replace('|', chr(92) + '|')}"
+
+
+def unit_numbers(cls: Any) -> dict[str, float]:
+    """1 for each number that has no default."""
+    return {field.name: 1.0 for field, _ in parameters(cls) if repr(field.default).startswith("<")}
+
+
+def mujoco_rows() -> list[str]:
+    """Laws and effects in a MuJoCo model."""
+    rows = [f"| `{law}` | {in_mujoco(cls(**unit_numbers(cls)))} |" for law, cls in sorted(TRANSMISSIONS.items())]
+    for name in sorted(EFFECTS):
+        rows.append(f"| `{name}` | {in_mujoco(make_effect(name, **unit_numbers(EFFECTS[name])), 'motor')} |")
+    return rows
+
+
 def page() -> str:
     """The whole page."""
     parts = [
@@ -89,6 +112,11 @@ def page() -> str:
     parts += [
         f"| `side.{name}` | {about.unit} | {about.doc.replace('|', chr(92) + '|')} |" for name, about in SIDE_METRICS.items()
     ]
+    parts.append(
+        "\n## Laws and effects in MuJoCo\n\nWhat an exported [MuJoCo model](mujoco.md) has of each. `mjcf.json`, beside a "
+        "model, has the figures.\n\n| law or effect | said | by what, or why not |\n|---|---|---|"
+    )
+    parts += mujoco_rows()
     return "\n".join(parts) + "\n"
 
 

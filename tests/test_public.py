@@ -32,7 +32,7 @@ FLOORS = [
     {"sweeps", "identification"},
     {"gains", "diagnosis"},
     {"throughput"},
-    {"report"},
+    {"exports", "report"},
     {"datasheet", "doctor"},
     {"batch", "terminal"},
     {"cli"},

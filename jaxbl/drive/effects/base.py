@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxbl.registry import Registry, check_text
 
+from ..mujoco_parts import MujocoParts, Said, unsaid
 from ..parameters import Parameter, parameter, parameters
 
 Value = Any  # a number or an array of one: hooks are duck-typed, neutral ones answer the Python number 0.0
@@ -242,6 +243,13 @@ class AbstractEffect(eqx.Module):
         """Inertia in kg m^2 added to the side's nominal one. It has no state: one that varies needs a torque as well."""
         return 0.0
 
+    def to_mujoco(self, parts: MujocoParts, side: str) -> Said:
+        """Add to the parts of a MuJoCo model what it has of the effect, and say how well it has it.
+
+        The numbers are Python floats. `side` is where the effect acts; of one in the gear or the actuator, the motor.
+        """
+        return unsaid("its class does not say how")
+
     # what a diagnosis asks of the class
 
     @classmethod
@@ -322,6 +330,9 @@ class EncoderEffect(AbstractEffect):
     places: ClassVar[tuple[str, ...]] = ("encoder",)
     encoder: ClassVar[str] = "load"
     in_log: ClassVar[str] = "its readings have it already"
+
+    def to_mujoco(self, parts, side):
+        return unsaid("the sensors of a model read true positions; it changes no motion")
 
 
 class _Effects(Registry):

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
+from ..mujoco_parts import exactly, nearly, unsaid
 from ..parameters import Scalar
 from .base import EFFECTS, Scales, TransmissionEffect, angle, harmonic, shape, size
 
@@ -37,6 +38,10 @@ class Backlash(TransmissionEffect):
     def free_play(self):
         return self.half_gap
 
+    def to_mujoco(self, parts, side):
+        parts.half_gap += self.half_gap
+        return exactly("the springs of the gear are slack within the gap (springlength)")
+
     @classmethod
     def suits(cls, transmission):
         # beside a law with a gap of its own the two cannot be told apart
@@ -53,6 +58,10 @@ class Hardening(TransmissionEffect):
     def transmit(self, state, deflection, rate):
         return self.cubic_stiffness * deflection**3
 
+    def to_mujoco(self, parts, side):
+        parts.spring(0.0, self.cubic_stiffness)
+        return exactly("cubic stiffness of a tendon")
+
 
 @EFFECTS.add
 class Damping(TransmissionEffect):
@@ -64,6 +73,14 @@ class Damping(TransmissionEffect):
 
     def transmit(self, state, deflection, rate):
         return self.damping * rate
+
+    def to_mujoco(self, parts, side):
+        parts.damping += self.damping
+        if parts.half_gap == 0.0:
+            return exactly("damping of the tendon; with a gap its limits, which is only near")
+        return nearly(
+            "limits of the tendon that act as spring and damper: as the law, but the flanks do not pull as they part"
+        )
 
 
 @EFFECTS.add
@@ -95,6 +112,11 @@ class Hysteresis(TransmissionEffect):
     def transmit(self, state, deflection, rate):
         return self.torque * state[0]
 
+    def to_mujoco(self, parts, side):
+        return unsaid(
+            "a spring that yields (springyield) breaks sharply: it would be up to 24 % of the hysteretic torque off"
+        )
+
 
 @EFFECTS.add
 class Eccentricity(TransmissionEffect):
@@ -109,6 +131,9 @@ class Eccentricity(TransmissionEffect):
 
     def transmission_error(self, state, load_position):
         return self.amplitude * jnp.sin(self.harmonic * load_position + self.phase)
+
+    def to_mujoco(self, parts, side):
+        return unsaid("tendons between joints are linear in the positions")
 
 
 @EFFECTS.add
@@ -126,3 +151,6 @@ class LoadFriction(TransmissionEffect):
 
     def gear_friction(self, state, torque):
         return self.coefficient * jnp.abs(torque)
+
+    def to_mujoco(self, parts, side):
+        return unsaid("the friction of a joint does not depend on what its tendon carries")

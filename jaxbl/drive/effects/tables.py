@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
+from ..mujoco_parts import exactly, unsaid
 from ..parameters import Scalar, option
 from .base import EFFECTS, SideEffect, Value, table
 
@@ -28,6 +29,15 @@ class Tabulated(SideEffect):
             position = position - 2.0 * jnp.pi * jnp.floor(position / (2.0 * jnp.pi))
         of_position = _interpolated(position, self.positions, self.position_torques)
         return of_position + _interpolated(motion.velocity, self.speeds, self.speed_torques)
+
+    def to_mujoco(self, parts, side):
+        if self.speeds:
+            return unsaid("the damping of a joint is a cubic in the velocity, no table")
+        if self.positions and self.turn:
+            return unsaid("springs know no turns: a table within a turn does not repeat")
+        if self.positions:
+            parts.piecewise(side, self.positions, self.position_torques)
+        return exactly("springs of the joint, slack up to the points of a table over position; one over speed is not said")
 
     @classmethod
     def fault(cls, numbers: Mapping[str, Any], period: float) -> str:

@@ -1,0 +1,1 @@
+"""Code and models for other systems, from a study."""

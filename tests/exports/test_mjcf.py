@@ -1,0 +1,204 @@
+"""Models for MuJoCo: the same accelerations as the plant's, the same free runs, and nothing left out in silence."""
+
+import json
+import xml.etree.ElementTree as ET
+
+import jax.numpy as jnp
+import mjcf as bench
+import mujoco
+import numpy as np
+import pytest
+from effect_values import ENCODERS, VALUES
+from small_study import rigid, small
+
+from jaxbl.config import read_config
+from jaxbl.drive import as_arrays
+from jaxbl.drive.effects import SideEffect
+from jaxbl.drive.mujoco_parts import ActuatorParts, MujocoParts, SideParts
+from jaxbl.drive.transmission import LinearShaft, SigmoidBacklash
+from jaxbl.errors import InputError
+from jaxbl.exports.mjcf import export_mjcf, mjcf
+
+SHAFT = {"law": "linear_shaft", "stiffness": 1.0}
+GAP = {"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.1}
+TABLE = {"positions": [-1.0, 0.0, 2.0], "position_torques": [0.5, -0.2, 1.0]}
+SAID = [
+    ({"kind": name, **{key: list(one) if isinstance(one, tuple) else one for key, one in numbers.items()}}, SHAFT, ())
+    for name, numbers in VALUES.items()
+    # its bristles are relaxed at first
+    if not name.endswith("stribeck_friction")
+]
+SAID += [
+    ({"kind": "motor.tabulated", **TABLE}, SHAFT, ()),
+    ({"kind": "load.asymmetric_friction", "viscous_difference": 0.0, "torque_difference": -0.3}, SHAFT, ()),
+    ({"kind": "load.gravity", "torque": -0.5, "phase": 0.4}, SHAFT, ()),
+    ({"kind": "load.gravity", "torque": 0.5, "phase": 0.4}, SHAFT, ("load",)),
+    ({"kind": "load.flexibility", "inertia": 0.08, "frequency": 1.5, "damping_ratio": 0.1}, SHAFT, ("motor", "load")),
+    ({"kind": "load.inertia", "inertia": 1.0}, GAP, ()),
+    ({"kind": "transmission.hardening", "cubic_stiffness": 20.0}, GAP, ()),
+    ({"kind": "transmission.damping", "damping": 0.1}, GAP, ()),
+    ({"kind": "transmission.backlash", "half_gap": 0.05}, small()["transmission"], ()),
+]
+
+
+def study(*effects, **tables):
+    """A study of 1 ms samples with these effects."""
+    return read_config(small(effects=list(effects), **tables))
+
+
+def compiled(config, linear=()):
+    """The model at the study's initial state, and what it has of the study."""
+    text, _, said = mjcf(config, linear=linear)
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    return model, data, said
+
+
+def numbered(found):
+    """A test's name."""
+    effect, law, linear = found
+    return "-".join((effect["kind"], law["law"], *linear))
+
+
+@pytest.mark.parametrize("case", SAID, ids=numbered)
+def test_accelerations_are_those_of_the_plant(case):
+    effect, law, linear = case
+    if effect["kind"] == "actuator.delay":
+        effect = effect | {"delay": 0.004}
+    config = study(effect, transmission=law)
+    model, data, said = compiled(config, linear)
+    (how, text) = said[f"effects.{effect['kind']}"]
+    assert text
+    plant = as_arrays(config.build().plant, jnp.float64)
+    off = []
+    for state in np.random.default_rng(0).uniform(-1.0, 1.0, (20, 5)):
+        # a twist of some half gaps, outward motion: a gap's flanks do not pull
+        twist, load, speed, rate, u = state * [0.5, 2.0, 1.0, 1.0, 0.4]
+        rate = abs(rate) * np.sign(twist)
+        position = {"motor": jnp.asarray(5.0 * load + twist), "load": jnp.asarray(load)}
+        velocity = {"motor": jnp.asarray(5.0 * speed + rate), "load": jnp.asarray(speed)}
+        states, torque = plant.actuate(tuple(one.settled(u) for one in plant.effects), u, 1e-4)
+        expected = []
+        for side, (total, level) in plant.torques(position, velocity, states, torque, 0.0).items():
+            own = total - plant.drive.viscous(side) * velocity[side]
+            expected.append((own - level * jnp.sign(velocity[side])) / plant.inertia(side))
+        mujoco.mj_resetData(model, data)
+        for side in ("motor", "load"):
+            data.joint(side).qpos[0], data.joint(side).qvel[0] = position[side], velocity[side]
+        for joint in range(2, model.njnt):
+            data.qvel[joint] = -velocity["load"]
+        data.ctrl[0] = u
+        if model.actuator_actadr[0] >= 0:
+            data.act[model.actuator_actadr[0]] = u
+        if model.actuator_delay[0]:
+            mujoco.mj_initCtrlHistory(model, data, 0, None, np.full(model.actuator_history[0][0], u))
+        mujoco.mj_forward(model, data)
+        found = [data.joint(side).qacc[0] for side in ("motor", "load")]
+        off.append(np.abs((np.array(found) - expected) / (1.0 + np.abs(expected))))
+    if how != "not said":
+        # weak constraints take 1e-4 of what acts beside them
+        assert np.max(off) < (1e-9 if how == said["transmission"].how == "exactly" else 2e-3)
+
+
+@pytest.mark.parametrize("kind", bench.KINDS)
+def test_free_runs_over_ten_seconds(kind):
+    # fifty drives, and two with a friction that is only near
+    count = 2 if kind == bench.COARSE else 5
+    found, _ = bench.free_runs(kind, count)
+    assert len(found) == count
+    assert max(found) < (0.03 if kind == bench.COARSE else 0.01)
+
+
+def test_smooth_gap_by_chords_is_as_near_as_said():
+    law = SigmoidBacklash(2.0, 0.03, 40.0)
+    parts = MujocoParts({"motor": SideParts(1.0), "load": SideParts(1.0)}, 1.0, 1e-4)
+    _, text = law.to_mujoco(parts)
+    z = np.linspace(-1.0, 1.0, 4001)
+    springs = sum(one.linear * (z - np.clip(z, one.low, one.high)) for one in parts.springs)
+    off = np.max(np.abs(springs - law.torque(jnp.asarray(z))))
+    said = float(text.split(" N m off")[0].split()[-1])
+    assert 0.5 * said < off < 1.05 * said
+    assert said < 1e-3 * 4.0 * 0.03 * 2.0
+
+
+def test_every_part_is_listed_with_its_path(tmp_path):
+    effects = [
+        {"kind": "motor.cogging", "amplitude": 0.1, "harmonic": 6.0},
+        {"kind": "transmission.hysteresis", "torque": 0.1, "length": 0.1},
+        {"kind": "load.coulomb_friction", "torque": 0.1},
+        {"kind": "encoder.offset", **ENCODERS["encoder.offset"]},
+    ]
+    out = export_mjcf(study(*effects, title="rough -- new"), tmp_path / "out")
+    about = json.loads((tmp_path / "out" / "mjcf.json").read_text())
+    groups = {how: set(about[how]) for how in ("exactly", "approximated", "not said")}
+    assert groups["exactly"] == {"drive", "effects.motor.cogging", "initial"}
+    assert groups["approximated"] == {"transmission", "effects.load.coulomb_friction"}
+    gone = {"effects.transmission.hysteresis", "effects.encoder.offset", "excitation", "encoders", "observer"}
+    assert groups["not said"] == gone
+    assert set(out.said) == set().union(*groups.values())
+    assert about["time_step"] == out.step
+    text = out.model.read_text(encoding="utf-8")
+    assert "drive.motor_inertia = 0.05 kg m²" in text
+    assert "effects.motor.cogging: amplitude = 0.1 N m, harmonic = 6 1/turn" in text
+    assert all(f"Not in this model: {path}: " in text for path in gone)
+    model = mujoco.MjModel.from_xml_path(str(out.model))
+    assert [model.sensor(i).name for i in range(model.nsensor)][-2:] == ["twist", "motor_torque"]
+    assert model.opt.timestep == out.step
+
+
+def test_sides_on_a_line_slide():
+    numbers = {"amplitude": 0.1, "harmonic": 6.0}
+    config = read_config(rigid(effects=[{"kind": "motor.cogging", **numbers}]))
+    text, _, _ = mjcf(config, linear=["motor"])
+    (joint,) = ET.fromstring(text).iter("joint")
+    assert joint.get("type") == "slide"
+    assert "drive.motor_inertia = 0.05 kg -->" in text
+    assert "amplitude = 0.1 N," in text
+    assert mujoco.MjModel.from_xml_string(text).body("motor").mass[0] == 0.05
+    with pytest.raises(InputError, match=r"^linear: the drive has no side 'load'; it should be among motor$"):
+        mjcf(config, linear=["load"])
+
+
+def test_starts_as_the_study_does():
+    flexible = {"kind": "load.flexibility", "inertia": 0.5, "frequency": 2.0}
+    config = study(flexible, initial={"motor_position": 0.5, "load_position": 0.1, "load_velocity": 0.3})
+    _, data, _ = compiled(config)
+    np.testing.assert_array_equal(data.qpos, [0.5, 0.1, 0.0])
+    np.testing.assert_array_equal(data.qvel, [0.0, 0.3, -0.3])
+
+
+def test_limits_keep_their_place_in_the_chain():
+    chain = ActuatorParts()
+    chain.scale(2.0)
+    chain.clip(3.0)
+    chain.scale(0.5)
+    assert (chain.limit, chain.gain) == (1.5, 1.0)
+    chain.lag = 0.01
+    chain.clip(1.0)
+    chain.scale(-4.0)
+    chain.clip(5.0)
+    assert (chain.limit, chain.torque_limit, chain.gain) == (1.5, 4.0, -4.0)
+
+
+def test_steps_resolve_gear_and_effects():
+    config = study(transmission=GAP | {"stiffness": 400.0}, run={"duration": 0.1, "substeps": 10})
+    _, step, _ = mjcf(config)
+    fastest = np.sqrt(400.0 * (1.0 / 0.05 + 25.0 / 7.0))
+    assert step == 1e-3 / np.ceil(max(10.0, 1e-3 * fastest / 0.1))
+    quick = {"kind": "actuator.lag", "time_constant": 5e-5}
+    assert mjcf(study(quick, transmission=SHAFT))[1] == pytest.approx(5e-6)
+    assert mjcf(study(quick, quick, transmission=SHAFT))[2]["effects.1"].how == "not said"
+
+
+def test_what_its_class_does_not_say(monkeypatch):
+    class Own(SideEffect):
+        """Of a package that knows nothing of MuJoCo."""
+
+        kind = "own"
+
+    assert Own(side="motor").to_mujoco(MujocoParts({}, None, 1e-4), "motor").how == "not said"
+    base = LinearShaft.__mro__[1].to_mujoco
+    monkeypatch.setattr(LinearShaft, "to_mujoco", base)
+    with pytest.raises(InputError, match=r"^transmission\.law: MuJoCo cannot say 'linear_shaft': .*; another law"):
+        mjcf(study(transmission=SHAFT))
