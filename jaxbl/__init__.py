@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from .diagnosis.diagnose import diagnose as diagnose
     from .errors import InputError as InputError
     from .errors import NoResult as NoResult
+    from .exports import Export as Export
+    from .exports import export as export
     from .gains.accuracy_laws import Law as Law
     from .gains.accuracy_laws import accuracy_laws as accuracy_laws
     from .gains.tune import Tuning as Tuning
@@ -50,6 +52,7 @@ _NAMES = {
     "config": ("Config", "read_config"),
     "diagnosis.diagnose": ("Diagnosis", "diagnose"),
     "errors": ("InputError", "NoResult"),
+    "exports": ("Export", "export"),
     "gains.accuracy_laws": ("Law", "accuracy_laws"),
     "gains.tune": ("Tuning", "tune"),
     "gains.verify": ("Verdict", "verify"),

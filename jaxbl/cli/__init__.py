@@ -10,7 +10,7 @@ import typer
 from jaxbl.errors import InputError, NoResult
 from jaxbl.terminal import INTERRUPTED
 
-from . import logs, setup, studies
+from . import exporting, logs, setup, studies
 from .outcome import told
 
 app = typer.Typer(
@@ -40,7 +40,7 @@ def _main(
 
 for _command in (
     *(setup.demo, setup.init),
-    *(studies.simulate, studies.sweep, studies.status, studies.tune, studies.verify),
+    *(studies.simulate, studies.sweep, studies.status, studies.tune, studies.verify, exporting.export),
     *(logs.inspect, logs.identify, logs.diagnose),
     *(studies.plot, studies.explore, studies.compare, studies.repair, setup.bench, setup.doctor),
 ):

@@ -55,14 +55,16 @@ def export_mjcf(config: Config, folder: Path, *, linear: Iterable[str] = ()) -> 
     """
     model, step, said = mjcf(config, linear=linear)
     make_folder(folder)
-    grouped = {
-        how: {path: one.text for path, one in said.items() if one.how == how}
-        for how in ("exactly", "approximated", "not said")
-    }
-    about = {"title": config.title, "mujoco": MUJOCO, "time_step": step, **grouped}
+    about = {"title": config.title, "mujoco": MUJOCO, "time_step": step, **by_answer(said)}
     write_atomic(folder / "model.xml", model)
     write_atomic(folder / "mjcf.json", json_text(about))
     return MjcfExport(folder / "model.xml", step, said)
+
+
+def by_answer(said: dict[str, Said]) -> dict[str, dict[str, str]]:
+    """What the model has `exactly`, `approximated` or `not said`, by config path."""
+    answers = ("exactly", "approximated", "not said")
+    return {how: {path: one.text for path, one in said.items() if one.how == how} for how in answers}
 
 
 def mjcf(config: Config, *, linear: Iterable[str] = ()) -> tuple[str, float, dict[str, Said]]:

@@ -7,6 +7,7 @@ of equations, from here.
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache, partial
+from pathlib import PurePath
 from typing import Any
 
 import jax
@@ -109,6 +110,22 @@ def repetition(eqn: JaxprEqn) -> tuple[int, ClosedJaxpr, int]:
     if fixed < 0 or (len(body.in_avals), len(body.out_avals)) != (len(eqn.invars), len(eqn.outvars)):
         raise UnknownForm("scan that reads or makes others than its body")
     return parameter_of(eqn, "length"), body, fixed
+
+
+def branches_of(eqn: JaxprEqn) -> Sequence[ClosedJaxpr]:
+    """Of a choice (`jax.lax.cond`), what it does where its index is 0, 1, ..."""
+    return parameter_of(eqn, "branches")
+
+
+def source_of(eqn: JaxprEqn) -> str:
+    """File and function of the package that asked for an equation, such as `observer/recursive.py: step`; "" where JAX does
+    not say. Functions of the drive and the export itself only pass it on."""
+    frames = getattr(getattr(eqn.source_info, "traceback", None), "frames", ())
+    for frame in frames:
+        where = PurePath(frame.file_name).parts
+        if "jaxbl" in where and (inside := "/".join(where[len(where) - where[::-1].index("jaxbl") :])):
+            return f"{inside}: {frame.function_name}"
+    return ""
 
 
 def _inlined(closed: ClosedJaxpr, functions: Mapping[str, Callable[..., Any]], *arguments: Any) -> list[Any]:

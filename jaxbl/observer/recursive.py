@@ -120,9 +120,14 @@ class Identifier(eqx.Module):
         NaN where the excitation so far determines nothing.
         """
         return {
-            side: law.from_theta(_solve(_values(state, state.information), _values(state, totals)))
-            for side, totals in state.right.items()
+            side: law.from_theta(tuple(jnp.where(determined, x, jnp.nan) for x in theta))
+            for side, (determined, theta) in self.solution(state).items()
         }
+
+    def solution(self, state: IdentifierState) -> dict[str, tuple[Number, tuple[Number, ...]]]:
+        """Of each side, whether the excitation so far determines the coefficients theta, and theta: finite in any case."""
+        information = _values(state, state.information)
+        return {side: _solve(information, _values(state, totals)) for side, totals in state.right.items()}
 
     def excitation(self, state: IdentifierState) -> Number:
         """Smallest eigenvalue of the information matrix scaled to unit diagonal: 0 undetermined, 1 orthogonal."""
@@ -142,16 +147,16 @@ def _correlation(information: tuple[Number, ...]) -> Number:
     return jnp.where(size > 0.0, both / jnp.where(size > 0.0, size, 1.0), 1.0)
 
 
-def _solve(information: tuple[Number, ...], right: tuple[Number, ...]) -> tuple[Number, ...]:
-    """Solve the scaled normal equations for n = 1 or 2, elementwise over lanes."""
+def _solve(information: tuple[Number, ...], right: tuple[Number, ...]) -> tuple[Number, tuple[Number, ...]]:
+    """Whether the scaled normal equations for n = 1 or 2 have a solution, and it; elementwise over lanes."""
     if len(right) == 1:
         total = information[0]
-        return (jnp.where(total > 0.0, right[0] / jnp.where(total > 0.0, total, 1.0), jnp.nan),)
+        determined = total > 0.0
+        return determined, (right[0] / jnp.where(determined, total, 1.0),)
     first, second = jnp.sqrt(information[0]), jnp.sqrt(information[2])
     correlation = _correlation(information)
     determinant = 1.0 - correlation * correlation
     determined = determinant > 4.0 * jnp.finfo(determinant.dtype).eps
     first, second, determinant = (jnp.where(determined, x, 1.0) for x in (first, second, determinant))
     a, b = right[0] / first, right[1] / second
-    theta = ((a - correlation * b) / (determinant * first), (b - correlation * a) / (determinant * second))
-    return jax.tree.map(lambda x: jnp.where(determined, x, jnp.nan), theta)
+    return determined, ((a - correlation * b) / (determinant * first), (b - correlation * a) / (determinant * second))

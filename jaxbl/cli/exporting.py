@@ -1,0 +1,37 @@
+"""The command that writes code for other systems."""
+
+from typing import Annotated
+
+import typer
+
+from jaxbl import workers
+from jaxbl.terminal import working
+
+from .options import ConfigArgument, folder_of
+from .outcome import Outcome
+
+_TARGETS = "c: C99, one source file and one header; st: structured text (IEC 61131-3); mjcf: a MuJoCo model of the drive"
+
+
+def export(
+    context: typer.Context,
+    config: ConfigArgument,
+    target: Annotated[str, typer.Option(metavar="TARGET", help=_TARGETS)] = "c",
+    out: Annotated[
+        str | None, typer.Option(metavar="DIR", help="folder for the files [default: results/<config name>_<target>]")
+    ] = None,
+    precision: Annotated[
+        str | None, typer.Option(metavar="TYPE", help="double or float [default: as the study computes]", show_default=False)
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(metavar="NAME", help="of functions and files [default: the config's]", show_default=False)
+    ] = None,
+) -> Outcome:
+    """Write a study's observers and identifier as code for a controller, or its drive as a model for a simulator."""
+    workers.start_jax()
+    from jaxbl.exports import export as run_export
+
+    folder = folder_of(config.with_name(f"{config.stem}_{target}.toml"), out)
+    with working(context, "exporting"):
+        made = run_export(config, folder, target, precision=precision, name=name)
+    return Outcome(made.lines, made.folder, "", "export.json")

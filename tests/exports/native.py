@@ -1,0 +1,102 @@
+"""Exported C compiled for this machine and called from Python; tests are skipped where a compiler is missing."""
+
+import ctypes
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxbl.files import read_json
+
+STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wdouble-promotion", "-Wconversion", "-Werror")
+UNCONTRACTED = ("-ffp-contract=off",)
+_CTYPES = {"float64": ctypes.c_double, "float32": ctypes.c_float, "int32": ctypes.c_int32, "bool": ctypes.c_bool}
+
+
+def needs(*programs):
+    """Skips a test where a program is missing."""
+    missing = [one for one in programs if shutil.which(one) is None]
+    return pytest.mark.skipif(
+        bool(missing), reason=f"{', '.join(missing)} is not here (Debian: apt-get install {' '.join(missing)})"
+    )
+
+
+COMPILERS = [pytest.param(one, marks=needs(one)) for one in ("gcc", "clang")]
+
+
+def ran(*command, cwd=None, **options):
+    """Run a program; what it says is shown where it fails."""
+    done = subprocess.run(list(map(str, command)), cwd=cwd, capture_output=True, text=True, check=False, **options)
+    assert done.returncode == 0, f"{' '.join(map(str, command))}\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}"
+    return done
+
+
+def harness(summary, header=True):
+    """C that runs many samples, with outputs as rows of real numbers."""
+    name, real = summary["name"], summary["precision"]
+    inputs, outputs, first = (len(summary[key]) for key in ("inputs", "outputs", "first"))
+    return "\n".join(
+        [
+            f'#include "{name}.h"',
+            "#include <stddef.h>",
+            f"size_t size_of_state(void); void begin({name}_state *s, const {real} *in);",
+            f"void go({name}_state *s, long n, const {real} *in, {real} *out);",
+            f"size_t size_of_state(void) {{ return sizeof({name}_state); }}",
+            f"void begin({name}_state *s, const {real} *in)",
+            f"{{ {name}_init(s, {', '.join(f'in[{i}]' for i in range(first))}); }}",
+            f"void go({name}_state *s, long n, const {real} *in, {real} *out)",
+            f"{{ long i; {name}_outputs o; for (i = 0; i < n; i++) {{",
+            f"  {name}_step(s, {', '.join(f'in[i * {inputs} + {k}]' for k in range(inputs))}, &o);",
+            *(f"  out[i * {outputs} + {k}] = ({real})o.{one['name']};" for k, one in enumerate(summary["outputs"])),
+            "} }",
+            "",
+        ]
+    )
+
+
+class Native:
+    """Exported code of a folder, compiled; its state is a structure of ctypes."""
+
+    def __init__(self, folder: Path, compiler="gcc", flags=("-O2", *UNCONTRACTED)):
+        self.summary = read_json(folder / "export.json")
+        name = self.summary["name"]
+        build = folder / f"build_{compiler}_{'_'.join(flags)}".replace("=", "_")
+        build.mkdir(exist_ok=True)
+        (build / "harness.c").write_text(harness(self.summary))
+        objects = ["-I", folder, folder / f"{name}.c", build / "harness.c"]
+        ran(compiler, *STRICT, *flags, "-fPIC", "-shared", *objects, "-o", build / "code.so", "-lm")
+        self._library = ctypes.CDLL(str(build / "code.so"))
+        self._library.size_of_state.restype = ctypes.c_size_t
+        self.dtype = np.dtype(np.float32 if self.summary["precision"] == "float" else np.float64)
+        fields = [(one["name"], _CTYPES[one["type"]]) for one in self.summary["state"]]
+        self.state = type("State", (ctypes.Structure,), {"_fields_": fields})()
+        self.size = self._library.size_of_state()
+
+    def start(self, first):
+        self._library.begin(
+            ctypes.byref(self.state), np.ascontiguousarray(first, self.dtype).ctypes.data_as(ctypes.c_void_p)
+        )
+
+    def run(self, inputs):
+        """Outputs (samples, outputs) of inputs (samples, inputs)."""
+        inputs = np.ascontiguousarray(inputs, self.dtype)
+        out = np.empty((len(inputs), len(self.summary["outputs"])), self.dtype)
+        places = (one.ctypes.data_as(ctypes.c_void_p) for one in (inputs, out))
+        self._library.go(ctypes.byref(self.state), ctypes.c_long(len(inputs)), *places)
+        return out
+
+
+def samples(count, sides, period=1e-3, seed=0):
+    """Inputs (samples, 1 + sides): a torque and positions with noise, as of a drive that swings through its gap."""
+    time, noise = np.arange(count) * period, np.random.default_rng(seed)
+    motor = 0.4 * np.sin(9.0 * time) + 0.2 * np.sin(23.0 * time) + 1e-4 * noise.standard_normal(count)
+    load = (motor - 0.08 * np.tanh(8.0 * motor)) / 5.0 + 2e-5 * noise.standard_normal(count)
+    torque = 0.3 * np.sin(9.0 * time + 0.5)
+    return np.stack([torque, motor, load][: 1 + sides], axis=1)
+
+
+def bits(values):
+    """Numbers as integers, so that zeros of both signs differ."""
+    return np.ascontiguousarray(values).view(f"i{values.dtype.itemsize}")

@@ -1,0 +1,185 @@
+"""A traced block as generated Python, each operation rounded once: written for these tests, apart from the lowering."""
+
+import math
+import struct
+
+import numpy as np
+from jax.extend.core import Literal
+
+from jaxbl.fused.elementary import FUNCTIONS
+from jaxbl.fused.jaxprs import branches_of, callee, parameter_of, repetition, traced_of_one
+
+_CODES = {"float32": "f", "float64": "d", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q"}
+
+
+def _over_zero(a, b):
+    with np.errstate(all="ignore"):
+        return type(a)(np.divide(a, b))
+
+
+def _root(x):
+    return math.sqrt(x) if x >= 0.0 else math.nan
+
+
+def _cast(value, old, new):
+    return struct.unpack(f"<{_CODES[new]}", struct.pack(f"<{_CODES[old]}", value))[0]
+
+
+def _nearest(x):
+    return math.copysign(float(round(x)), x)
+
+
+class Strict:
+    """`start(first)` gives the state as a list, `step(state, inputs)` the new state and the outputs."""
+
+    def __init__(self, block):
+        self.single = block.dtype == np.float32
+        numbers = [self.real(one.value) for one in block.known.values()]
+        count, known = len(block.state), len(numbers)
+        self._start = self._made(block.start, known, [])(*numbers)
+        self._step = self._made(block.step, known, [])(*numbers)
+        self._count = count
+
+    def real(self, value):
+        return np.float32(value) if self.single else float(value)
+
+    def start(self, first):
+        return list(self._start(*map(self.real, first)))
+
+    def step(self, state, inputs):
+        found = self._step(*state, *inputs)
+        return list(found[: self._count]), list(found[self._count :])
+
+    def _made(self, closed, known, _):
+        """A function of known numbers, which gives that of the others."""
+        names = [f"a{i}" for i in range(len(closed.jaxpr.invars))]
+        self._lines, self._number, self._constants = ([], []), 0, {}
+        results = self._write(closed, [(one, i >= known) for i, one in enumerate(names)], "    ")
+        outer, inner = self._lines
+        text = "\n".join(
+            [
+                f"def make({', '.join(names[:known])}):",
+                *outer,
+                f"    def run({', '.join(names[known:])}):",
+                *(f"    {line}" for line in inner),
+                f"        return ({', '.join(name for name, _ in results)},)",
+                "    return run",
+            ]
+        )
+        scope = {"sqrt": np.sqrt if self.single else _root, "over_zero": _over_zero, "cast": _cast, "math": math}
+        scope |= {"f32": np.float32, "np": np, "nearest": _nearest} | self._constants
+        exec(compile(text, "strict", "exec"), scope)
+        return scope["make"]
+
+    def _constant(self, value, dtype):
+        if dtype.kind == "f":
+            name = f"c{len(self._constants)}"
+            self._constants[name] = np.float32(value) if dtype == np.float32 else float(value)
+            return name
+        return repr(np.asarray(value).item())
+
+    def _write(self, closed, given, indent):
+        """Lines for a jaxpr. Values are names, and whether they depend on more than known numbers."""
+        jaxpr = closed.jaxpr
+        env = dict(zip(jaxpr.invars, given, strict=True))
+        for v, value in zip(jaxpr.constvars, closed.consts, strict=True):
+            env[v] = self._constant(np.asarray(value)[()], np.dtype(v.aval.dtype)), False
+
+        def read(v):
+            return (self._constant(v.val, np.dtype(v.aval.dtype)), False) if isinstance(v, Literal) else env[v]
+
+        for eqn in jaxpr.eqns:
+            env |= dict(zip(eqn.outvars, self._equation(eqn, [read(v) for v in eqn.invars], indent), strict=True))
+        return [read(v) for v in jaxpr.outvars]
+
+    def _new(self):
+        self._number += 1
+        return f"t{self._number}"
+
+    def _put(self, varies, line, indent):
+        self._lines[varies].append(f"{indent}{line}")
+
+    def _equation(self, eqn, given, indent):
+        name, dtype = eqn.primitive.name, np.dtype(eqn.invars[0].aval.dtype)
+        varies = any(one for _, one in given)
+        texts = [text for text, _ in given]
+        if (called := callee(eqn)) is not None:
+            return self._write(called, given, indent)
+        if name in FUNCTIONS and dtype.kind == "f":
+            return self._write(traced_of_one(FUNCTIONS[name], dtype), given, indent)
+        if name == "scan":
+            times, body, fixed = repetition(eqn)
+            state = [self._new() for _ in texts[fixed:]]
+            self._put(varies, f"{', '.join(state)}, = {', '.join(texts[fixed:])},", indent)
+            self._put(varies, f"for _ in range({times}):", indent)
+            inside = [*((one, varies) for one in texts[:fixed]), *((one, varies) for one in state)]
+            made = self._write(body, inside, f"{indent}    ")
+            self._put(varies, f"{', '.join(state)}, = {', '.join(one for one, _ in made)},", f"{indent}    ")
+            return [(one, varies) for one in state]
+        if name == "cond" and not eqn.outvars:
+            return []
+        if name == "cond":
+            outs = [self._new() for _ in eqn.outvars]
+            for i, branch in enumerate(branches_of(eqn)):
+                self._put(varies, f"if {texts[0]} == {i}:", indent)
+                made = self._write(branch, [(one, varies) for one in texts[1:]], f"{indent}    ")
+                self._put(varies, f"{', '.join(outs)}, = {', '.join(one for one, _ in made)},", f"{indent}    ")
+            return [(one, varies) for one in outs]
+        out = self._new()
+        self._put(varies, f"{out} = {self._expression(eqn, name, dtype, texts)}", indent)
+        return [(out, varies)]
+
+    def _expression(self, eqn, name, dtype, x):
+        one = self._constant(1.0, dtype) if dtype.kind == "f" else "1"
+        if name in _INFIX:
+            return f"{x[0]} {_INFIX[name]} {x[1]}"
+        if name == "div":
+            return (
+                f"{x[0]} / {x[1]} if {x[1]} else over_zero({x[0]}, {x[1]})" if dtype.kind == "f" else f"int({x[0]} / {x[1]})"
+            )
+        if name == "integer_pow":
+            power = parameter_of(eqn, "y")
+            product = " * ".join([x[0]] * abs(power))
+            return product if power > 0 else f"{one} / ({product})"
+        if name == "select_n":
+            return f"{x[2]} if {x[0]} else {x[1]}"
+        if name == "convert_element_type":
+            new = np.dtype(eqn.outvars[0].aval.dtype)
+            return {"f": f"f32({x[0]})" if new == np.float32 else f"float({x[0]})", "b": f"{x[0]} != 0"}.get(
+                new.kind, f"int({x[0]})"
+            )
+        if name == "bitcast_convert_type":
+            cast = f"cast({x[0]}, {str(dtype)!r}, {str(eqn.outvars[0].aval.dtype)!r})"
+            return f"f32({cast})" if eqn.outvars[0].aval.dtype == np.float32 else cast
+        if name == "round":
+            found = (
+                "nearest({})"
+                if int(parameter_of(eqn, "rounding_method"))
+                else "math.copysign(math.floor(abs({0}) + 0.5), {0})"
+            )
+            return f"f32({found.format(x[0])})" if self.single else found.format(x[0])
+        if name == "clamp":
+            return f"min(max({x[1]}, {x[0]}), {x[2]})"
+        if name == "sign":
+            return f"({one} if {x[0]} > 0 else -{one} if {x[0]} < 0 else {x[0]})"
+        rules = {
+            "neg": "-{0}",
+            "abs": "abs({0})",
+            "square": "{0} * {0}",
+            "sqrt": "sqrt({0})",
+            "floor": "f32(math.floor({0}))" if self.single else "float(math.floor({0}))",
+            "ceil": "f32(math.ceil({0}))" if self.single else "float(math.ceil({0}))",
+            "is_finite": "math.isfinite({0})",
+            "not": "(not {0})" if dtype.kind == "b" else "~{0}",
+            "copy": "{0}",
+            **dict.fromkeys(("max", "min"), f"{name}({{0}}, {{1}})"),
+            **dict.fromkeys(("broadcast_in_dim", "reshape", "squeeze"), "{0}"),
+        }
+        assert name in rules, f"strict evaluation does not know {name}"
+        return rules[name].format(*x)
+
+
+_INFIX = {
+    "add": "+", "add_any": "+", "sub": "-", "mul": "*", "gt": ">", "ge": ">=", "lt": "<", "le": "<=", "eq": "==", "ne": "!=",
+    "and": "&", "or": "|", "xor": "^", "shift_left": "<<", "shift_right_logical": ">>", "rem": "%",
+}  # fmt: skip

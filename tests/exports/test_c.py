@@ -1,0 +1,157 @@
+"""Exported C: bit for bit the traced step, on this machine's compilers at all levels, and near the replay in JAX."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from native import COMPILERS, STRICT, UNCONTRACTED, Native, bits, needs, ran, samples
+from small_study import small
+from strict import Strict
+
+import jaxbl
+from jaxbl.config import read_config
+from jaxbl.drive.parameters import as_arrays
+from jaxbl.errors import InputError
+from jaxbl.exports.chain import observer_chain
+from jaxbl.exports.targets import TARGETS
+from jaxbl.observer import OBSERVERS
+from jaxbl.simulate import replay
+
+GAINS = {
+    "lambda": 4.0, "alpha": 9.0, "bandwidth": 150.0, "damping": 0.8, "position_noise": 1e-4, "disturbance_noise": 100.0,
+    "time_constant": 0.004, "lipschitz": 50.0,
+}  # fmt: skip
+
+
+def study(kind="super_twisting", **more):
+    observer = {"kind": kind, "motor": GAINS, "load": GAINS} | more.pop("observer", {})
+    return small(identifier={"start": 0.1}, observer=observer, **more)
+
+
+def exported(tmp_path, data, precision="double", **flags):
+    jaxbl.export(data, tmp_path, precision=precision, name="drive")
+    return Native(tmp_path, **flags)
+
+
+def outputs(native, inputs):
+    native.start(inputs[0, 1:])
+    return native.run(inputs)
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize("level", ["-O0", "-O1", "-O2", "-O3"])
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_all_compilers_and_levels_give_the_same_bits(tmp_path, compiler, level, precision):
+    inputs = samples(3000, 2)
+    first = outputs(exported(tmp_path / "a", study(), precision, compiler="gcc", flags=("-O0", *UNCONTRACTED)), inputs)
+    found = outputs(exported(tmp_path / "b", study(), precision, compiler=compiler, flags=(level, *UNCONTRACTED)), inputs)
+    assert np.isfinite(found).all()
+    assert (bits(found) == bits(first)).all()
+
+
+def strictly(data, precision, inputs):
+    dtype = np.dtype(np.float32 if precision == "float" else np.float64)
+    block = Strict(observer_chain(read_config(data), "drive", dtype))
+    state, rows = block.start(inputs[0, 1:].astype(dtype)), []
+    for row in inputs.astype(dtype):
+        state, out = block.step(state, list(row) if precision == "float" else row.tolist())
+        rows.append([dtype.type(one) for one in out])
+    return np.array(rows, dtype)
+
+
+@needs("gcc")
+@pytest.mark.parametrize("kind", OBSERVERS)
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_every_kind_is_the_traced_step_bit_for_bit(tmp_path, kind, precision):
+    inputs = samples(1500, 2)
+    native = exported(tmp_path, study(kind), precision, flags=("-O0", *UNCONTRACTED))
+    assert native.size == native.summary["state_bytes"]
+    found, expected = outputs(native, inputs), strictly(study(kind), precision, inputs)
+    assert (bits(found) == bits(expected)).all()
+
+
+@pytest.mark.slow
+@needs("gcc")
+def test_a_million_steps_are_the_traced_step_bit_for_bit(tmp_path):
+    inputs = samples(1_000_000, 2)
+    native = exported(tmp_path, study(), flags=("-O0", *UNCONTRACTED))
+    assert (bits(outputs(native, inputs)) == bits(strictly(study(), "double", inputs))).all()
+
+
+@needs("gcc")
+@pytest.mark.parametrize("explicit", [False, True])
+@pytest.mark.parametrize("law", ["sigmoid_backlash", "dead_zone", "linear_shaft", None])
+def test_the_code_is_the_replay_of_a_record(tmp_path, law, explicit):
+    """Within rounding, which an observer may amplify: XLA joins products with sums."""
+    numbers = {"sigmoid_backlash": {"dead_zone": 0.02, "slope": 20.0}, "dead_zone": {"half_gap": 0.05}}
+    data = study(observer={"discretisation": "explicit" if explicit else "implicit"})
+    if law is None:
+        data.pop("transmission"), data.pop("identifier"), data["observer"].pop("load")
+        data["drive"] = {"kind": "rigid", "motor_inertia": 0.05, "motor_viscous": 0.15}
+    else:
+        data["transmission"] = {"law": law, "stiffness": 1.0} | numbers.get(law, {})
+    sides = ("motor",) if law is None else ("motor", "load")
+    inputs = samples(4000, len(sides))
+    native = exported(tmp_path, data)
+    found = outputs(native, inputs)
+    with jax.enable_x64(True):
+        experiment = as_arrays(read_config(data).build(), jnp.float64)
+        measured = {side: jnp.asarray(inputs[:, 1 + i]) for i, side in enumerate(sides)}
+
+        def keep(state, signals):
+            return {f"{s}_torque_estimate": signals.side(s).torque_estimate for s in sides} | {
+                f"{s}_velocity_estimate": signals.side(s).velocity_estimate for s in sides
+            }
+
+        expected = jax.jit(lambda u, y: replay(experiment, u, y, record=keep)[1])(jnp.asarray(inputs[:, 0]), measured)
+    names = [one["name"] for one in native.summary["outputs"]]
+    for name, values in expected.items():
+        # a switching term takes the other side where rounding decides
+        tolerance = 1e-9 if not explicit else 2e-2
+        own, other = found[:, names.index(name)], np.asarray(values)
+        assert np.sqrt(np.mean((own - other) ** 2)) <= tolerance * np.sqrt(np.mean(other**2)), name
+
+
+@needs("gcc")
+def test_the_example_filter_reads_and_writes_csv(tmp_path):
+    jaxbl.export(study(), tmp_path, name="drive")
+    ran("gcc", *STRICT, "-O2", "drive.c", "drive_filter.c", "-lm", "-o", "filter", cwd=tmp_path)
+    inputs = samples(200, 2)
+    rows = "\n".join(f"{i * 1e-3!r},{','.join(map(repr, row.tolist()))}" for i, row in enumerate(inputs))
+    said = ran("./filter", cwd=tmp_path, input=f"t,u,theta_e,theta_s\n{rows}\n").stdout.splitlines()
+    native = Native(tmp_path)
+    found = np.array([[float(x) for x in line.split(",")] for line in said[1:]])
+    assert said[0].split(",")[1:] == [one["name"] for one in native.summary["outputs"]]
+    np.testing.assert_allclose(found[:, 1:], outputs(native, inputs), rtol=1e-12, atol=1e-300)
+
+
+def test_code_without_allocation_and_with_no_more_of_libm_than_it_says(tmp_path):
+    made = jaxbl.export(study(), tmp_path, name="drive")
+    source = (tmp_path / "drive.c").read_text()
+    assert set(made.files) >= {"drive.c", "drive.h", "drive_filter.c", "export.json"}
+    for word in ("malloc", "pow(", " exp(", "tanh(", " cos(", "fma("):
+        assert word not in source
+    # gains can be recognised
+    assert "observer.motor.alpha" in source
+    assert TARGETS.keys() >= {"c", "st", "mjcf"}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"target": "rust"}, r"--target rust: should be one of c, st, mjcf"),
+        ({"precision": "half"}, r"--precision half: should be one of double, float"),
+        ({"name": "For"}, r"--name For: should be small letters"),
+    ],
+)
+def test_wrong_requests_get_one_line_and_leave_nothing(tmp_path, given, message):
+    with pytest.raises(InputError, match=message):
+        jaxbl.export(study(), tmp_path / "new", **given)
+    assert not (tmp_path / "new").exists()
+
+
+def test_another_folder_is_not_overwritten(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="is not empty and holds no export"):
+        jaxbl.export(study(), tmp_path, name="drive")
+    assert [one.name for one in tmp_path.iterdir()] == ["mine.txt"]
