@@ -1,0 +1,73 @@
+"""The best possible error of a differentiator: linear program, closed form and a brute force over quotients agree."""
+
+import math
+
+import numpy as np
+import pytest
+
+from jaxbl.errors import InputError
+from jaxbl.gains.differentiation_bound import (
+    best_samples,
+    difference_error,
+    least_exact_error,
+    least_worst_error,
+    worst_signal,
+)
+
+CASES = [(1e-5, 8.0, 1e-3), (0.0, 8.0, 1e-3), (1.0, 1.0, 1.0), (3e-4, 2.0, 2e-3), (1e-6, 100.0, 1e-4), (0.2, 1.0, 1.0)]
+
+
+@pytest.mark.parametrize(("noise", "slope", "period"), CASES)
+def test_the_linear_program_agrees_with_the_closed_form_and_its_signal_is_admitted(noise, slope, period):
+    samples = 2 * best_samples(noise, slope, period) + 5
+    found = worst_signal(noise, slope, period, samples)
+    assert found.error == pytest.approx(least_worst_error(noise, slope, period), rel=1e-7)
+    assert np.abs(found.signal).max() <= noise + 1e-9 * slope * period**2
+    assert np.abs(found.acceleration).max() <= slope * (1.0 + 1e-9)
+    # the signal's values are those that its own second derivative makes
+    velocity, value, values = found.error, found.signal[0], [found.signal[0]]
+    for acceleration in found.acceleration:
+        value += -period * velocity + 0.5 * period**2 * acceleration
+        velocity -= period * acceleration
+        values.append(value)
+    np.testing.assert_allclose(values, found.signal, atol=1e-9 * (noise + slope * period**2))
+
+
+@pytest.mark.parametrize(("noise", "slope", "period"), CASES)
+def test_no_quotient_is_better_and_the_best_one_reaches_it(noise, slope, period):
+    errors = [difference_error(noise, slope, period, i) for i in range(1, 400)]
+    assert least_worst_error(noise, slope, period) == pytest.approx(min(errors), rel=1e-12)
+    assert errors[best_samples(noise, slope, period) - 1] == pytest.approx(min(errors), rel=1e-12)
+
+
+def test_a_short_history_costs_accuracy():
+    noise, slope, period = 1e-3, 1.0, 1e-3
+    for samples in (1, 5, 30):
+        expected = least_worst_error(noise, slope, period, most=samples)
+        assert worst_signal(noise, slope, period, samples).error == pytest.approx(expected, rel=1e-7)
+        assert expected > least_worst_error(noise, slope, period)
+
+
+def test_limits():
+    assert least_worst_error(0.0, 8.0, 1e-3) == pytest.approx(4e-3)  # L T / 2
+    assert least_worst_error(1e-4, 4.0) == pytest.approx(2.0 * math.sqrt(4e-4))
+    # 4 N / (L T^2) = i^2: the continuous bound at a window of i periods
+    assert least_worst_error(1e-4, 4.0, 1e-4) == pytest.approx(least_worst_error(1e-4, 4.0))
+    assert least_exact_error(1e-4, 4.0) == pytest.approx(math.sqrt(2.0) * least_worst_error(1e-4, 4.0))
+    assert worst_signal(0.0, 0.0, 1e-3, 5).error == 0.0
+    assert least_worst_error(1.0, 0.0, 1e-3, most=4) == pytest.approx(2.0 / 4e-3)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: least_worst_error(-1.0, 1.0),
+        lambda: least_worst_error(1.0, math.inf),
+        lambda: worst_signal(1.0, 1.0, 0.0, 5),
+        lambda: worst_signal(1.0, 1.0, 1.0, 0),
+        lambda: best_samples(1.0, 0.0, 1.0),
+    ],
+)
+def test_wrong_bounds_are_input_errors(call):
+    with pytest.raises(InputError, match=r"^(noise|slope|period|samples):"):
+        call()
