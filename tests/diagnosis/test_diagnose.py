@@ -143,7 +143,7 @@ def test_an_observer_that_does_not_converge_is_noted(logs):
         observed = observed_torques(setup.bare, setup.fitted.segments)
         about, (note,) = summary_module.observers_say(setup.bare, observed, setup)
     assert about["motor"]["converged"] is False and about["motor"]["rms"] is None
-    assert note.startswith("The motor's observer does not converge on this log (alpha = 1)")
+    assert note.startswith("The motor's observer does not converge on this log (lambda = 2, alpha = 1)")
 
 
 def test_the_extended_model_runs_and_the_report_says_what_was_found(found, tmp_path):
