@@ -215,7 +215,7 @@ def test_memory_grows_neither_with_points_nor_with_duration():
         config = read_config(rigid({"run.duration": duration}, axes=[spaced(ALPHA, 1.0, 2.0, points)], sweep={"chunk": 64}))
         engine = Engine(config, backend="scan")
         assert tuple(engine.layout) == (1, 64)
-        return 1e6 * engine._compile(config)[0].megabytes
+        return 1e6 * engine._compile(config).megabytes
 
     # both durations draw their noise in blocks of the same length; a trace of 102.4 s would be 800 kB a lane
     short = memory(64, 1.024)
