@@ -113,8 +113,8 @@ def page() -> str:
         f"| `side.{name}` | {about.unit} | {about.doc.replace('|', chr(92) + '|')} |" for name, about in SIDE_METRICS.items()
     ]
     parts.append(
-        "\n## Laws and effects in MuJoCo\n\nWhat an exported [MuJoCo model](mujoco.md) has of each. `mjcf.json`, beside a "
-        "model, has the figures.\n\n| law or effect | said | by what, or why not |\n|---|---|---|"
+        "\n## Laws and effects in MuJoCo\n\nWhat an exported [MuJoCo model](mujoco.md) has of each. `export.json`, beside "
+        "a model, has the figures.\n\n| law or effect | said | by what, or why not |\n|---|---|---|"
     )
     parts += mujoco_rows()
     return "\n".join(parts) + "\n"

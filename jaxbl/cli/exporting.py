@@ -21,10 +21,16 @@ def export(
         str | None, typer.Option(metavar="DIR", help="folder for the files [default: results/<config name>_<target>]")
     ] = None,
     precision: Annotated[
-        str | None, typer.Option(metavar="TYPE", help="double or float [default: as the study computes]", show_default=False)
+        str | None,
+        typer.Option(metavar="TYPE", help="of code: double or float [default: as the study computes]", show_default=False),
     ] = None,
     name: Annotated[
-        str | None, typer.Option(metavar="NAME", help="of functions and files [default: the config's]", show_default=False)
+        str | None,
+        typer.Option(metavar="NAME", help="of the code's functions and files [default: the config's]", show_default=False),
+    ] = None,
+    linear: Annotated[
+        list[str] | None,
+        typer.Option(metavar="SIDE", help="of a model: motor or load, a side that moves along a line; may be given twice"),
     ] = None,
 ) -> Outcome:
     """Write a study's observers and identifier as code for a controller, or its drive as a model for a simulator."""
@@ -33,5 +39,5 @@ def export(
 
     folder = folder_of(config.with_name(f"{config.stem}_{target}.toml"), out)
     with working(context, "exporting"):
-        made = run_export(config, folder, target, precision=precision, name=name)
+        made = run_export(config, folder, target, precision=precision, name=name, linear=linear or ())
     return Outcome(made.lines, made.folder, "", "export.json")

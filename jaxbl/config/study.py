@@ -19,6 +19,7 @@ from pydantic import Field, model_validator
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.excitation import EXCITATIONS
 from jaxbl.drive.parameters import Parameter, as_arrays, key_of, parameters
+from jaxbl.observer import OBSERVERS
 from jaxbl.records import NominalDrive
 from jaxbl.records.table import LogTable
 from jaxbl.simulate import Experiment, Run
@@ -212,10 +213,9 @@ def numeric_paths(config: Config) -> dict[str, Parameter]:
         table = getattr(config, section)
         if table is not None:
             found |= dict(_paths(table, section))
-    # sides may hold gains of other observers
-    gains = {key_of(field.name) for field, _ in parameters(config.observer.observer)}
-    found = {path: known for path, known in found.items() if path.count(".") < 2 or path.rpartition(".")[2] in gains}
     found[KIND] = Parameter("", "kind of observer")
+    for path in _of_other_kinds(config):
+        found.pop(path, None)
     kinds = [effect.kind for effect in config.effects]
     for i, effect in enumerate(config.effects):
         label = effect.kind if kinds.count(effect.kind) == 1 else str(i)
@@ -227,6 +227,16 @@ def numeric_paths(config: Config) -> dict[str, Parameter]:
             if path.startswith("effects.") or ("load" not in path and not path.startswith("identifier."))
         }
     return found
+
+
+def _of_other_kinds(config: Config) -> Iterator[str]:
+    """Paths of observers that say nothing of the study's own kind: its sides may hold gains of others."""
+    own = config.observer.observer
+    if own is OBSERVERS[config.observer.kind]:
+        yield "observer.discretisation"
+    gains = {key_of(field.name) for field, _ in parameters(own)}
+    others = {key_of(field.name) for cls in OBSERVERS.values() for field, _ in parameters(cls)} - gains
+    yield from (f"observer.{side}.{key}" for side in ("motor", "load") for key in others)
 
 
 KIND = "observer.kind"

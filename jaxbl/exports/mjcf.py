@@ -7,14 +7,12 @@ dead band is the gear with its gap. What an effect or a law is in MuJoCo says it
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from jaxbl.config import Config
 from jaxbl.drive.mujoco_parts import IMPEDANCE, RESOLVED, MujocoParts, Said, SideParts, Spring, exactly, unsaid
 from jaxbl.drive.parameters import parameters
 from jaxbl.errors import InputError
-from jaxbl.files import json_text, make_folder, write_atomic
 from jaxbl.simulate import Experiment
 from jaxbl.units import on_a_line
 
@@ -28,39 +26,6 @@ _ARM = 0.06
 _COLOURS = {"motor": "0.35 0.45 0.60 1", "load": "0.75 0.55 0.30 1"}
 
 
-class MjcfExport(NamedTuple):
-    """What was written.
-
-    Attributes:
-        model: the file of the model.
-        step: its time step in s, a whole part of the study's sample period.
-        said: how well the model has each part of the study, by config path.
-    """
-
-    model: Path
-    step: float
-    said: dict[str, Said]
-
-
-def export_mjcf(config: Config, folder: Path, *, linear: Iterable[str] = ()) -> MjcfExport:
-    """Write `model.xml`, a MuJoCo model of the study's drive, and `mjcf.json`, which says how well it has each part.
-
-    Args:
-        config: the study; its axes are not used.
-        folder: is made.
-        linear: the sides (`motor`, `load`) that move along a line; they have slide joints, and kg, N, m.
-
-    Raises:
-        InputError: no such side, a transmission law that MuJoCo cannot say, or a folder that cannot be written to.
-    """
-    model, step, said = mjcf(config, linear=linear)
-    make_folder(folder)
-    about = {"title": config.title, "mujoco": MUJOCO, "time_step": step, **by_answer(said)}
-    write_atomic(folder / "model.xml", model)
-    write_atomic(folder / "mjcf.json", json_text(about))
-    return MjcfExport(folder / "model.xml", step, said)
-
-
 def by_answer(said: dict[str, Said]) -> dict[str, dict[str, str]]:
     """What the model has `exactly`, `approximated` or `not said`, by config path."""
     answers = ("exactly", "approximated", "not said")
@@ -68,7 +33,15 @@ def by_answer(said: dict[str, Said]) -> dict[str, dict[str, str]]:
 
 
 def mjcf(config: Config, *, linear: Iterable[str] = ()) -> tuple[str, float, dict[str, Said]]:
-    """A study's model as text, its time step in s, and how well it has each part; arguments as of :func:`export_mjcf`."""
+    """A study's model as text, its time step in s, and how well it has each part, by config path.
+
+    Args:
+        config: the study; its axes are not used.
+        linear: the sides (`motor`, `load`) that move along a line; they have slide joints, and kg, N, m.
+
+    Raises:
+        InputError: no such side, or a transmission law that MuJoCo cannot say.
+    """
     experiment, slides = config.build(), tuple(linear)
     for side in slides:
         if side not in experiment.sides:

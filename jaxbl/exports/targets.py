@@ -1,7 +1,7 @@
 """What a study can be exported to: a table of targets, and the call that writes one into a folder."""
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,11 +30,13 @@ _LONGEST_NAME = 23
 
 
 class Request(NamedTuple):
-    """What is asked for: a study, its name in the code, the type of its numbers, and the file it came from ("" for none)."""
+    """What is asked for: a study, its name in the code, the type of its numbers, the sides that move along a line, and the
+    file that the study came from ("" for none)."""
 
     config: Config
     name: str
     precision: str
+    linear: tuple[str, ...]
     file: str
 
 
@@ -47,10 +49,12 @@ class Files(NamedTuple):
 
 
 class Target(NamedTuple):
-    """A target: what it is, and what makes its files. Raises `Unsupported` where a study has what it cannot say."""
+    """A target: what it is, what makes its files, and which options it has. `make` raises `Unsupported` where a study has
+    what the target cannot say."""
 
     about: str
     make: Callable[[Request], Files]
+    options: tuple[str, ...]
 
 
 class Export(NamedTuple):
@@ -93,17 +97,18 @@ def _st(request: Request) -> Files:
 
 
 def _mjcf(request: Request) -> Files:
-    text, step, said = mjcf(request.config)
+    text, step, said = mjcf(request.config, linear=request.linear)
     lists = by_answer(said)
     lines = [f"model.xml: MuJoCo {MUJOCO} or later, steps of {step:.3g} s."]
     lines += [f"{how}: {path}: {why}" for how in ("approximated", "not said") for path, why in lists[how].items()]
     return Files({"model.xml": text}, {"mujoco": MUJOCO, "time_step": step} | lists, lines)
 
 
+_OF_CODE = "precision", "name"
 TARGETS: dict[str, Target] = {
-    "c": Target("C99: observers, equivalent control and identifier, one source file and one header", _c),
-    "st": Target("structured text (IEC 61131-3): the same as a function block", _st),
-    "mjcf": Target("a MuJoCo model of the drive, its gap and its effects", _mjcf),
+    "c": Target("C99: observers, equivalent control and identifier, one source file and one header", _c, _OF_CODE),
+    "st": Target("structured text (IEC 61131-3): the same as a function block", _st, _OF_CODE),
+    "mjcf": Target("a MuJoCo model of the drive, its gap and its effects", _mjcf, ("linear",)),
 }
 """By the names of --target."""
 
@@ -115,8 +120,10 @@ def export(
     *,
     precision: str | None = None,
     name: str | None = None,
+    linear: Sequence[str] = (),
 ) -> Export:
-    """Write code for a drive from a study: what `jaxbl.simulate.step` does with a recorded input and measured positions.
+    """Write a study for another system: as code what `jaxbl.simulate.step` does with a recorded input and measured
+    positions, or the drive as a model for a simulator.
 
     Args:
         config: the study.
@@ -124,6 +131,7 @@ def export(
         target: one of `TARGETS`.
         precision: "double" or "float"; left out, that of the study.
         name: of functions and files, a C identifier of small letters; left out, that of the study's file, or `observer`.
+        linear: of a model, the sides (`motor`, `load`) that move along a line: in kg, N, m.
 
     Raises:
         InputError: of these, or the study has what the target cannot say.
@@ -132,10 +140,14 @@ def export(
     study = read_config(config)
     if target not in TARGETS:
         raise InputError(f"--target {target}: should be one of {', '.join(TARGETS)}")
+    given = {"precision": precision, "name": name, "linear": linear}
+    for option, value in given.items():
+        if value and option not in TARGETS[target].options:
+            raise InputError(f"--{option}: --target {target} has no such option; leave it out")
     chosen = {long: short for short, long in PRECISIONS.items()}[study.run.precision] if precision is None else precision
     if chosen not in PRECISIONS:
         raise InputError(f"--precision {chosen}: should be one of {', '.join(PRECISIONS)}")
-    request = Request(study, _name(file) if name is None else checked_name(name), chosen, file)
+    request = Request(study, _name(file) if name is None else checked_name(name), chosen, tuple(linear), file)
     try:
         made = TARGETS[target].make(request)
     except Unsupported as why:

@@ -4,7 +4,7 @@ Observers are in the order in which lists name them.
 """
 
 # ruff: noqa: I001
-from .base import OBSERVERS, AbstractObserver, Conditions, Estimate, Observers, ObserverState
+from .base import OBSERVERS, AbstractObserver, OperatingConditions, Estimate, Observers, ObserverState
 from .super_twisting import DISCRETISATIONS, AbstractSuperTwisting, ExplicitSuperTwisting, ImplicitSuperTwisting
 from .differentiator import COEFFICIENTS, DIFFERENTIATORS, AbstractDifferentiator
 from .linear import DirtyDerivative, ExtendedState, Kalman, Luenberger

@@ -36,7 +36,7 @@ class Estimate(NamedTuple):
     control: Float[Array, ""]
 
 
-class Conditions(NamedTuple):
+class OperatingConditions(NamedTuple):
     """What gains are chosen for: the bound f_plus (rad/s^2) of the acceleration missing in the nominal model, the sampling
     period (s), and the rms error of the encoder (rad), with that of its resolution."""
 
@@ -60,7 +60,7 @@ class AbstractObserver(eqx.Module):
 
     @classmethod
     @abc.abstractmethod
-    def search(cls, at: Conditions) -> Mapping[str, tuple[float, float]]:
+    def search(cls, at: OperatingConditions) -> Mapping[str, tuple[float, float]]:
         """Least and largest value of each gain that a search for gains should try, positive, by its config key; the same
         twice for one that it takes for given."""
 

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 
 from jaxbl.drive.parameters import Scalar, parameter
 
-from .base import OBSERVERS, AbstractObserver, Acceleration, Conditions, Estimate, ObserverState, predicted
+from .base import OBSERVERS, AbstractObserver, Acceleration, Estimate, ObserverState, OperatingConditions, predicted
+from .super_twisting import ImplicitSuperTwisting
 
 COEFFICIENTS: Mapping[int, tuple[float, ...]] = {
     1: (1.5, 1.1),
@@ -58,10 +59,6 @@ def _root_above(value: Any, power: int) -> Any:
 def solve_correction(coefficients: Sequence[float], value: Any) -> Any:
     """The root rho >= 0 of rho^(n+1) + k_1 rho^n + ... + k_n rho = value >= 0, by Newton's method from above."""
     order = len(coefficients) - 1
-    if order == 1:
-        # without cancellation
-        first = coefficients[0]
-        return 2.0 * value / (first + jnp.sqrt(first * first + 4.0 * value))
     whole = (1.0, *coefficients[:order])
     # each term alone is not above the value
     bounds = [_root_above(value / whole[i], order + 1 - i) for i in range(order + 1)]
@@ -114,7 +111,7 @@ class AbstractDifferentiator(AbstractObserver):
     lipschitz: eqx.AbstractVar[Scalar]  # pyright: ignore[reportGeneralTypeIssues]
 
     @classmethod
-    def search(cls, at: Conditions) -> Mapping[str, tuple[float, float]]:
+    def search(cls, at: OperatingConditions) -> Mapping[str, tuple[float, float]]:
         # f_plus times as many derivatives, of motions from slow to as fast as samples
         slow, fast = (rate ** (cls.order - 1) for rate in (1e-3 / at.period, 1.0 / at.period))
         return {"lipschitz": (1.1 * at.f_plus * slow, 100.0 * at.f_plus * fast)}
@@ -141,10 +138,6 @@ class AbstractDifferentiator(AbstractObserver):
         states = [state.position, state.velocity, *state.further]
         new = [x + sum(weights[i][j] * corrections[j] for j in range(i, n + 1)) / steps[i] for i, x in enumerate(states)]
         position, velocity, *rest = new
-        if n == 1:
-            control = sliding / steps[2]
-            ahead = predicted(position, velocity, acceleration, period, missing=control)
-            return ObserverState(*ahead), Estimate(position, velocity, control)
         return _ahead(position, velocity, rest, acceleration, steps), Estimate(position, velocity, rest[0])
 
 
@@ -162,9 +155,20 @@ def _ahead(
     return ObserverState(at, speed, tuple(series))
 
 
+class _FirstOrder(AbstractDifferentiator):
+    """The implicit super-twisting observer: the same equation, with one gain for both of its own."""
+
+    def step(self, state, measured, acceleration, period):
+        first, second = COEFFICIENTS[1]
+        observer = ImplicitSuperTwisting(lambda_=first * jnp.sqrt(self.lipschitz), alpha=second * self.lipschitz)
+        return observer.step(state, measured, acceleration, period)
+
+
 def _of_order(n: int, unit: str) -> type[AbstractDifferentiator]:
+    base: Any = _FirstOrder if n == 1 else AbstractDifferentiator
+
     @OBSERVERS.add
-    class Differentiator(AbstractDifferentiator):
+    class Differentiator(base):
         __doc__ = AbstractDifferentiator.__doc__
         name: ClassVar[str] = f"differentiator_{n}"
         order: ClassVar[int] = n

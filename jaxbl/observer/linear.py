@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from jaxbl.drive.parameters import Scalar, parameter
 
-from .base import OBSERVERS, AbstractObserver, Acceleration, Conditions, Estimate, ObserverState, predicted
+from .base import OBSERVERS, AbstractObserver, Acceleration, Estimate, ObserverState, OperatingConditions, predicted
 
 _SLOWEST, _FASTEST = 1e-3, 3.0
 """Bandwidths worth a search, rad/s times the sampling period: poles at 0.999 and 0.05."""
@@ -72,7 +72,7 @@ class Luenberger(AbstractLinearObserver):
     damping: Scalar = parameter("", "damping ratio of the observer's poles", default=1.0, above=0.0)
 
     @classmethod
-    def search(cls, at: Conditions) -> Mapping[str, tuple[float, float]]:
+    def search(cls, at: OperatingConditions) -> Mapping[str, tuple[float, float]]:
         return {"bandwidth": (_SLOWEST / at.period, _FASTEST / at.period), "damping": (0.3, 3.0)}
 
     def correction(self, acceleration, period):
@@ -100,7 +100,7 @@ class ExtendedState(AbstractLinearObserver):
     bandwidth: Scalar = parameter("rad/s", "natural frequency of the observer's poles", above=0.0)
 
     @classmethod
-    def search(cls, at: Conditions) -> Mapping[str, tuple[float, float]]:
+    def search(cls, at: OperatingConditions) -> Mapping[str, tuple[float, float]]:
         return {"bandwidth": (_SLOWEST / at.period, _FASTEST / at.period)}
 
     def correction(self, acceleration, period):
@@ -128,7 +128,7 @@ class Kalman(AbstractLinearObserver):
     )
 
     @classmethod
-    def search(cls, at: Conditions) -> Mapping[str, tuple[float, float]]:
+    def search(cls, at: OperatingConditions) -> Mapping[str, tuple[float, float]]:
         # only ratios matter: an ideal encoder may have any noise. Without the other noise, a bandwidth w needs a density of
         # position_noise sqrt(h) w^3, or w^2
         noise = max(at.noise, 1e-9)
@@ -237,7 +237,7 @@ class DirtyDerivative(AbstractObserver):
     time_constant: Scalar = parameter("s", "time constant of the low-pass on each difference", minimum=0.0)
 
     @classmethod
-    def search(cls, at: Conditions) -> Mapping[str, tuple[float, float]]:
+    def search(cls, at: OperatingConditions) -> Mapping[str, tuple[float, float]]:
         return {"time_constant": (at.period / _FASTEST, at.period / _SLOWEST)}
 
     def start(self, position, velocity, acceleration, period):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from jaxbl.drive.parameters import Scalar, parameter
 
-from .base import OBSERVERS, AbstractObserver, Conditions, Estimate, ObserverState, predicted
+from .base import OBSERVERS, AbstractObserver, Estimate, ObserverState, OperatingConditions, predicted
 
 
 class AbstractSuperTwisting(AbstractObserver):
@@ -24,7 +24,7 @@ class AbstractSuperTwisting(AbstractObserver):
         return DISCRETISATIONS[discretisation]
 
     @classmethod
-    def search(cls, at: Conditions) -> Mapping[str, tuple[float, float]]:
+    def search(cls, at: OperatingConditions) -> Mapping[str, tuple[float, float]]:
         root = at.f_plus**0.5
         return {"lambda": (0.3 * root, 50.0 * root), "alpha": (1.1 * at.f_plus, 100.0 * at.f_plus)}
 

@@ -18,9 +18,9 @@ _CTYPES = {"float64": ctypes.c_double, "float32": ctypes.c_float, "int32": ctype
 def needs(*programs):
     """Skips a test where a program is missing."""
     missing = [one for one in programs if shutil.which(one) is None]
-    return pytest.mark.skipif(
-        bool(missing), reason=f"{', '.join(missing)} is not here (Debian: apt-get install {' '.join(missing)})"
-    )
+    packages = " ".join({"arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi"}.get(one, one) for one in missing)
+    reason = f"compiles, runs or checks exported code by {', '.join(missing)} (Debian: apt-get install {packages})"
+    return pytest.mark.skipif(bool(missing), reason=reason)
 
 
 COMPILERS = [pytest.param(one, marks=needs(one)) for one in ("gcc", "clang")]

@@ -11,13 +11,14 @@ import pytest
 from effect_values import ENCODERS, VALUES
 from small_study import rigid, small
 
+import jaxbl
 from jaxbl.config import read_config
 from jaxbl.drive import as_arrays
 from jaxbl.drive.effects import SideEffect
 from jaxbl.drive.mujoco_parts import ActuatorParts, MujocoParts, SideParts
 from jaxbl.drive.transmission import LinearShaft, SigmoidBacklash
 from jaxbl.errors import InputError
-from jaxbl.exports.mjcf import export_mjcf, mjcf
+from jaxbl.exports.mjcf import mjcf
 
 SHAFT = {"law": "linear_shaft", "stiffness": 1.0}
 GAP = {"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.1}
@@ -129,22 +130,26 @@ def test_every_part_is_listed_with_its_path(tmp_path):
         {"kind": "load.coulomb_friction", "torque": 0.1},
         {"kind": "encoder.offset", **ENCODERS["encoder.offset"]},
     ]
-    out = export_mjcf(study(*effects, title="rough -- new"), tmp_path / "out")
-    about = json.loads((tmp_path / "out" / "mjcf.json").read_text())
+    config = study(*effects, title="rough -- new")
+    out = jaxbl.export(config, tmp_path / "out", "mjcf")
+    about = json.loads((tmp_path / "out" / "export.json").read_text())
+    assert out.summary.items() <= about.items()
+    written, step, said = mjcf(config)
     groups = {how: set(about[how]) for how in ("exactly", "approximated", "not said")}
     assert groups["exactly"] == {"drive", "effects.motor.cogging", "initial"}
     assert groups["approximated"] == {"transmission", "effects.load.coulomb_friction"}
     gone = {"effects.transmission.hysteresis", "effects.encoder.offset", "excitation", "encoders", "observer"}
     assert groups["not said"] == gone
-    assert set(out.said) == set().union(*groups.values())
-    assert about["time_step"] == out.step
-    text = out.model.read_text(encoding="utf-8")
+    assert set(said) == set().union(*groups.values())
+    assert about["time_step"] == step
+    text = (out.folder / "model.xml").read_text(encoding="utf-8")
+    assert text == written
     assert "drive.motor_inertia = 0.05 kg m²" in text
     assert "effects.motor.cogging: amplitude = 0.1 N m, harmonic = 6 1/turn" in text
     assert all(f"Not in this model: {path}: " in text for path in gone)
-    model = mujoco.MjModel.from_xml_path(str(out.model))
+    model = mujoco.MjModel.from_xml_path(str(out.folder / "model.xml"))
     assert [model.sensor(i).name for i in range(model.nsensor)][-2:] == ["twist", "motor_torque"]
-    assert model.opt.timestep == out.step
+    assert model.opt.timestep == step
 
 
 def test_sides_on_a_line_slide():
@@ -158,6 +163,17 @@ def test_sides_on_a_line_slide():
     assert mujoco.MjModel.from_xml_string(text).body("motor").mass[0] == 0.05
     with pytest.raises(InputError, match=r"^linear: the drive has no side 'load'; it should be among motor$"):
         mjcf(config, linear=["load"])
+
+
+def test_options_of_another_target_are_refused(tmp_path):
+    for option, value in (("precision", "float"), ("name", "axis")):
+        with pytest.raises(InputError, match=rf"^--{option}: --target mjcf has no such option; leave it out$"):
+            jaxbl.export(study(), tmp_path / "new", "mjcf", **{option: value})
+    with pytest.raises(InputError, match=r"^--linear: --target c has no such option"):
+        jaxbl.export(study(), tmp_path / "new", "c", linear=["load"])
+    assert not (tmp_path / "new").exists()
+    jaxbl.export(study(), tmp_path / "line", "mjcf", linear=["load"])
+    assert 'type="slide"' in (tmp_path / "line" / "model.xml").read_text(encoding="utf-8")
 
 
 def test_starts_as_the_study_does():

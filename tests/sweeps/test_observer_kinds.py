@@ -10,7 +10,7 @@ from jaxbl.config import numeric_paths, read_config
 from jaxbl.drive.parameters import parameters
 from jaxbl.errors import InputError
 from jaxbl.observer import OBSERVERS
-from jaxbl.observer.base import Conditions
+from jaxbl.observer.base import OperatingConditions
 
 GAINS = {
     "lambda": 4.0,
@@ -83,7 +83,7 @@ def test_wrong_observers_get_one_line(observer, message):
 def test_every_kind_says_what_a_search_should_try(kind):
     """Gains of the class, positive, and a study with them runs."""
     cls = OBSERVERS[kind].discretised("implicit")
-    found = cls.search(Conditions(f_plus=3.0, period=1e-3, noise=1e-5))
+    found = cls.search(OperatingConditions(f_plus=3.0, period=1e-3, noise=1e-5))
     assert found
     assert all(0.0 < least <= largest < np.inf for least, largest in found.values())
     middle = {key: (least * largest) ** 0.5 for key, (least, largest) in found.items()}
