@@ -5,9 +5,11 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from jaxbl.validation import wrong
+from jaxbl.observer import OBSERVERS
+from jaxbl.validation import nearest, wrong
 
 from .experiment import ExcitationTable
+from .sweep import AxisTable
 from .tables import Table
 
 
@@ -56,7 +58,10 @@ TUNE_NAMES = ("tuned", "usual rule", "config")
 
 
 class TuneTable(Table):
-    """How `jaxbl tune` chooses lambda and alpha; f⁺ is the bound that a pilot run of the study finds."""
+    """How `jaxbl tune` chooses gains; f⁺ is the bound that a pilot run of the study finds.
+
+    Left out, `observers` is the study's own kind, super_twisting, whose lambda and alpha are searched on a map.
+    """
 
     objective: Literal["velocity", "torque"] = Field(
         default="velocity", description="rms error over the last quarter of the run that is made least, worst over the seeds"
@@ -82,6 +87,18 @@ class TuneTable(Table):
         description="a table as [excitation]: input that gains are compared on; left out: the study's, with other noise",
     )
     compare: list[CompareTable] = Field(default=[], max_length=50, description="named gains to compare with")
+    observers: list[str] = Field(
+        default=[],
+        max_length=50,
+        description="kinds of observer to choose from: each is tuned by the same search on the same runs; margins, alpha_ratio, "
+        "lambda_ratio, num and compare do not apply",
+    )
+    trials: int = Field(
+        default=256, ge=8, le=65536, description="of observers: gains tried of each kind, over its whole range and in each zoom"
+    )
+    axes: list[AxisTable] = Field(
+        default=[], max_length=10, description="of observers: [[axes]] of a grid over which the best kind is mapped"
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> "TuneTable":
@@ -89,11 +106,38 @@ class TuneTable(Table):
             raise wrong(
                 f"alpha_ratio: stop {self.alpha_ratio.stop} is below margin_alpha {self.margin_alpha}; it should be above it"
             )
+        self._check_observers()
         names = [other.name for other in self.compare]
         for i, name in enumerate(names):
             if name in names[:i] or name in TUNE_NAMES:
                 raise wrong(f"compare[{i}].name: '{name}' is taken; choose another one")
         return self
+
+
+    def _check_observers(self) -> None:
+        """Kinds that exist, and keys that go with them."""
+        changed = [
+            name for name, field in type(self).model_fields.items()
+            if getattr(self, name) != field.get_default(call_default_factory=True)
+        ]  # fmt: skip
+        if not self.observers:
+            for key in ("trials", "axes"):
+                if key in changed:
+                    raise wrong(f"{key} needs observers, the kinds to choose from; add them, or leave {key} out")
+            return
+        for i, kind in enumerate(self.observers):
+            if kind not in OBSERVERS:
+                raise wrong(f"observers[{i}]: unknown kind '{kind}'; {nearest(kind, OBSERVERS)}")
+            if kind in self.observers[:i]:
+                raise wrong(f"observers[{i}]: '{kind}' is listed already; each kind may be listed once")
+        for key in ("margin_exact", "margin_alpha", "alpha_ratio", "lambda_ratio", "num", "compare"):
+            if key in changed:
+                raise wrong(f"{key} does not go with observers; leave one of them out")
+        for i, axis in enumerate(self.axes):
+            if axis.path.partition(".")[0] in ("observer", "equivalent_control"):
+                raise wrong(f"axes[{i}].path: '{axis.path}' is the observer's, which is searched; choose another path")
+            if axis.values is None and axis.num is None:
+                raise wrong(f"axes[{i}].num is missing; how many values should the axis have?")
 
 
 class RangeTable(_SpanTable):

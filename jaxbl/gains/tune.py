@@ -25,6 +25,7 @@ from jaxbl.sweeps.metrics import undisturbed
 from jaxbl.sweeps.programs import Backend
 from jaxbl.workers import Progress
 
+from .observer_choice import ObserverChoice, choose_observer
 from .pilot import Scenarios, pilot, scenarios_of
 from .stages import Stages, stages_in
 from .tune_summary import COMPARED, Summary, compared_figures
@@ -75,8 +76,8 @@ def tune(
     overwrite: bool = False,
     backend: Backend | None = None,
     scheduler: Scheduler = None,
-) -> Tuning:
-    """Choose lambda and alpha of both observers for a study.
+) -> Tuning | ObserverChoice:
+    """Choose lambda and alpha of both observers for a study, or with `tune.observers` a kind of observer and its gains.
 
     `out`, `progress`, `devices`, `overwrite`, `backend` and `scheduler` are as in :func:`jaxbl.sweep`, over all runs of the
     search.
@@ -90,14 +91,17 @@ def tune(
     """
     config = read_config(study)
     table = config.tune or TuneTable()
-    if config.observer.kind != AbstractSuperTwisting.name:
+    if config.observer.kind != AbstractSuperTwisting.name and not table.observers:
         raise InputError(
-            f"observer.kind: tune chooses lambda and alpha of kind '{AbstractSuperTwisting.name}', not the gains of "
-            f"'{config.observer.kind}'"
+            f"observer.kind: tune chooses lambda and alpha of kind '{AbstractSuperTwisting.name}'; for the gains of "
+            f"'{config.observer.kind}', put observers = [\"{config.observer.kind}\"] into [tune]"
         )
     config = config.model_copy(update={"tune": table})
-    scenarios = scenarios_of(config, table)
     given = {"progress": progress, "devices": devices, "overwrite": overwrite, "backend": backend}
+    if table.observers:
+        with stages_in(config, "tune", out, scheduler, **given) as stages:
+            return choose_observer(config, table, stages)
+    scenarios = scenarios_of(config, table)
     with stages_in(config, "tune", out, scheduler, **given) as stages:
         return _tuned(config, table, scenarios, stages)
 

@@ -114,7 +114,7 @@ class AbstractDifferentiator(AbstractObserver):
     def search(cls, at: OperatingConditions) -> Mapping[str, tuple[float, float]]:
         # f_plus times as many derivatives, of motions from slow to as fast as samples
         slow, fast = (rate ** (cls.order - 1) for rate in (1e-3 / at.period, 1.0 / at.period))
-        return {"lipschitz": (1.1 * at.f_plus * slow, 100.0 * at.f_plus * fast)}
+        return {"lipschitz": (0.01 * at.f_plus * slow, 100.0 * at.f_plus * fast)}
 
     def start(self, position, velocity, acceleration, period):
         zero = jnp.zeros_like(jnp.asarray(position + velocity))

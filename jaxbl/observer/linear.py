@@ -73,7 +73,7 @@ class Luenberger(AbstractLinearObserver):
 
     @classmethod
     def search(cls, at: OperatingConditions) -> Mapping[str, tuple[float, float]]:
-        return {"bandwidth": (_SLOWEST / at.period, _FASTEST / at.period), "damping": (0.3, 3.0)}
+        return {"bandwidth": (_SLOWEST / at.period, _FASTEST / at.period), "damping": (0.003, 10.0)}
 
     def correction(self, acceleration, period):
         reach = self.bandwidth * period

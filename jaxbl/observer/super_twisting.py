@@ -26,7 +26,8 @@ class AbstractSuperTwisting(AbstractObserver):
     @classmethod
     def search(cls, at: OperatingConditions) -> Mapping[str, tuple[float, float]]:
         root = at.f_plus**0.5
-        return {"lambda": (0.3 * root, 50.0 * root), "alpha": (1.1 * at.f_plus, 100.0 * at.f_plus)}
+        # below f_plus it follows no faster disturbance exactly, and may still have less noise
+        return {"lambda": (0.01 * root, 1e3 * root), "alpha": (0.01 * at.f_plus, 1e3 * at.f_plus)}
 
     def start(self, position, velocity, acceleration, period):
         return ObserverState(position, velocity)
