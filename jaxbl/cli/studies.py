@@ -7,7 +7,6 @@ import sys
 import threading
 import webbrowser
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -195,7 +194,7 @@ def tune(
     backend: BackendOption = None,
     scheduler: SchedulerOption = None,
 ) -> Outcome:
-    """Choose lambda and alpha of both observers: gains.toml, comparison, report. Continues an interrupted search."""
+    """Choose the observers' gains, or their kind: gains.toml, comparison, report. Continues an interrupted search."""
     study, chosen = read_study(config, backend)
     from jaxbl.gains.tune import tune as run_tune
 
@@ -269,9 +268,10 @@ def compute(
 
     with working(context, "drawing"):
         # what draws is loaded when there is something to be drawn
-        report = import_module(f"jaxbl.report.{command}")
+        from jaxbl.report.results import writer
+
         following = [] if steps is None else steps(result, folder)
-        lines = getattr(report, f"write_{command}_report")(result, folder, *([following] if following else []))
+        lines = writer(result)(result, folder, *([following] if following else []))
     cost = getattr(result, "cost", None)
     if cost and cost["lanes"]:
         compiling, computing = duration(cost["compile_seconds"]), duration(cost["run_seconds"])

@@ -8,6 +8,7 @@ from typing import Any
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.errors import InputError
 from jaxbl.files import place, writing
+from jaxbl.gains.observer_choice import ObserverChoice
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.verify import Verdict
 from jaxbl.identification.element import ElementIdentification
@@ -24,6 +25,7 @@ from .identify import write_identification_report
 from .identify_figures import draw_identification
 from .inspect import draw_inspection, write_inspection_report
 from .maps import draw as draw_study
+from .observer_choice import draw_choice, write_choice_report
 from .picture import picture
 from .simulate import draw_trial, write_trial_report
 from .sweep import write_sweep_report
@@ -34,6 +36,7 @@ _KINDS: dict[type, tuple[Callable[[Any], list[Drawn]], Callable[[Any, Path], lis
     Trial: (draw_trial, write_trial_report),
     StudyResult: (draw_study, write_sweep_report),
     Tuning: (draw_tuning, write_tune_report),
+    ObserverChoice: (draw_choice, write_choice_report),
     Verdict: (draw_verdict, write_verify_report),
     Inspection: (draw_inspection, write_inspection_report),
     Identification: (draw_identification, write_identification_report),
@@ -86,11 +89,16 @@ def write_report(result: Any, folder: str | Path) -> list[str]:
         InputError: no result of these.
         NoResult: the files cannot be written.
     """
-    write = _of(result)[1]
+    write = writer(result)
     where = place(folder)
     with writing(where):
         where.mkdir(parents=True, exist_ok=True)
     return write(result, where)
+
+
+def writer(result: Any) -> Callable[..., list[str]]:
+    """What writes the report of a result into a folder that exists. Raises `InputError`."""
+    return _of(result)[1]
 
 
 def _of(result: Any) -> tuple[Callable[[Any], list[Drawn]], Callable[[Any, Path], list[str]]]:
