@@ -90,11 +90,14 @@ class TuneTable(Table):
     observers: list[str] = Field(
         default=[],
         max_length=50,
-        description="kinds of observer to choose from: each is tuned by the same search on the same runs; margins, alpha_ratio, "
-        "lambda_ratio, num and compare do not apply",
+        description="kinds of observer to choose from: each is tuned by the same search on the same runs; margins, "
+        "alpha_ratio, lambda_ratio, num and compare do not apply",
     )
     trials: int = Field(
-        default=256, ge=8, le=65536, description="of observers: gains tried of each kind, over its whole range and in each zoom"
+        default=256,
+        ge=8,
+        le=65536,
+        description="of observers: gains tried of each kind, over its whole range and in each zoom",
     )
     axes: list[AxisTable] = Field(
         default=[], max_length=10, description="of observers: [[axes]] of a grid over which the best kind is mapped"
@@ -112,7 +115,6 @@ class TuneTable(Table):
             if name in names[:i] or name in TUNE_NAMES:
                 raise wrong(f"compare[{i}].name: '{name}' is taken; choose another one")
         return self
-
 
     def _check_observers(self) -> None:
         """Kinds that exist, and keys that go with them."""

@@ -1,8 +1,8 @@
 """Which kind of observer suits a drive best, and by how much: `jaxbl tune` with `tune.observers`.
 
-Each kind is tuned by the same search on the same runs: quasi-random gains over the range that its class gives, then over zooms
-about the best of them, each side by its own error. The tuned observers are then compared on held-out runs, pair by pair
-under the same noise. With `tune.axes` that is done at each point of a grid.
+Each kind is tuned by the same search on the same runs: quasi-random gains over the range that its class gives, then over
+zooms about the best of them, each side by its own error. The tuned observers are then compared on held-out runs, pair by
+pair under the same noise. With `tune.axes` that is done at each point of a grid.
 """
 
 # pandas' own annotations are wider than what its methods return
@@ -152,6 +152,10 @@ class _Search:
         """Sides that are searched in the same runs: they share no gain but the low-pass on the equivalent control."""
         return [(side,) for side in self.sides] if self.table.objective == "torque" else [self.sides]
 
+    def _joined(self, sides: Mapping[str, Mapping[str, Any]], share: tuple[str, ...]) -> dict[str, Any]:
+        """Gains of both sides in one run; what they share is as the sides say that the run is for."""
+        return {path: value for side in reversed((*share, *self.sides)) for path, value in sides[side].items()}
+
     def tune(self, kind: str) -> None:
         """Find the gains of a kind on both sides, at all points."""
         self.found[kind] = [[self._begun(kind, place, group.config) for place in group.places] for group in self.groups]
@@ -162,11 +166,10 @@ class _Search:
                 unit = _quasi_random(free, self.table.trials, stage)
                 tried = [{side: one.trials(unit) for side, one in sides.items()} for sides in searches]
                 for share in self._shares():
-                    rows = [
-                        (i, {path: float(v[j]) for side in reversed((*share, *self.sides)) for path, v in sides[side].items()})
-                        for i, sides in enumerate(tried)
-                        for j in range(len(unit))
-                    ]
+                    rows = []
+                    for i, sides in enumerate(tried):
+                        columns = self._joined(sides, share)
+                        rows += [(i, {path: float(v[j]) for path, v in columns.items()}) for j in range(len(unit))]
                     name = f"{kind}-{'-'.join(share)}-{number}-{stage}"
                     errors = self._errors(kind, group, rows, name, share)
                     for side in share:
@@ -181,11 +184,10 @@ class _Search:
         for number, group in enumerate(self.groups):
             places: list[dict[str, np.ndarray]] = [{} for _ in group.places]
             for share in self._shares():
-                rows = [
-                    (i, {path: value for side in reversed((*share, *self.sides)) for path, value in sides[side].best.items()})
-                    for i, sides in enumerate(self.found[kind][number])
-                    if all(sides[side].best for side in self.sides)
-                ]
+                rows = []
+                for i, sides in enumerate(self.found[kind][number]):
+                    best = {side: sides[side].best for side in self.sides}
+                    rows += [(i, self._joined(best, share))] if all(best.values()) else []
                 if not rows:
                     continue
                 name = f"{kind}-{'-'.join(share)}-{number}-holdout"
@@ -302,7 +304,8 @@ def _groups(config: Config, table: TuneTable, stages: Stages) -> list[Group]:
             key = repr({path: v for path, v in (group.structural | lane).items() if not path.startswith("encoders.")})
             if key not in pilots:
                 pilots[key] = known.get(key) or pilot(scenarios, table)
-            places.append(Place(group.structural | lane, scenarios, pilots[key]))
+            values = group.structural | lane
+            places.append(Place({axis.path: values[axis.path] for axis in table.axes}, scenarios, pilots[key]))
             lanes.append(lane)
         groups.append(Group(group.config, places, lanes))
     if known != pilots:
@@ -317,9 +320,9 @@ def ranked(errors: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
         errors: by kind, shape (runs,), the same runs of all: positive, or infinite.
 
     Returns:
-        by kind: `error` (geometric mean over the runs), `worst`, and of the ratios to the best kind's error in the same run
-        the geometric mean `ratio` with its 95 % interval `low` ... `high` (Student's t on their logarithms); None where a run
-        is infinite.
+        by kind: `error` (geometric mean over the runs), `worst`, and of the ratios to the best kind's error in the same
+        run the geometric mean `ratio` with its 95 % interval `low` ... `high` (Student's t on their logarithms); None where a
+        run is infinite.
     """
     logs = {kind: np.log(np.maximum(one, np.finfo(float).tiny)) for kind, one in errors.items() if np.isfinite(one).all()}
     order = sorted(logs, key=lambda kind: float(logs[kind].mean()))
@@ -338,8 +341,9 @@ def ranked(errors: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
             "low": math.exp(mean - half),
             "high": math.exp(mean + half),
         }
-    none = dict.fromkeys(("error", "worst", "ratio", "low", "high"))
-    return found | {kind: dict(none) for kind in errors if kind not in found}
+    for kind in errors:
+        found.setdefault(kind, dict.fromkeys(("error", "worst", "ratio", "low", "high")))
+    return found
 
 
 def not_told_apart(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -419,8 +423,8 @@ def _remarks(search: _Search, places: Sequence[Mapping[str, Any]]) -> list[str]:
     if table.holdout is None:
         lines.append("No tune.holdout is given: kinds are compared on the study's own excitation, under other noise.")
     lines.append(
-        f"Intervals ({100 * _CONFIDENCE:g} %) are over {search.held_out_seeds} noise seeds of the held-out runs, kinds compared "
-        "under the same noise. Another input or drive may rank otherwise."
+        f"Intervals ({100 * _CONFIDENCE:g} %) are over {search.held_out_seeds} noise seeds of the held-out runs, kinds "
+        "compared under the same noise. Another input or drive may rank otherwise."
     )
     for side in search.sides:
         ends: dict[tuple[str, str], int] = {}
@@ -437,7 +441,9 @@ def _remarks(search: _Search, places: Sequence[Mapping[str, Any]]) -> list[str]:
             said = ", ".join(f"{kind}.{key}{f' ({n} {of})' if of else ''}" for (kind, key), n in ends.items())
             lines.append(f"{side}: best values at an end of the range searched: {said}. Beyond it may be better ones.")
         if unfinished:
-            said = ", ".join(f"{kind} ({f'{n} {of}, ' if of else ''}{100 * most:.2g} %)" for kind, (n, most) in unfinished.items())
+            said = ", ".join(
+                f"{kind} ({f'{n} {of}, ' if of else ''}{100 * most:.2g} %)" for kind, (n, most) in unfinished.items()
+            )
             lines.append(
                 f"{side}: the last zoom still made errors smaller by more than {100 * _UNFINISHED:g} %: {said}. More "
                 "tune.refine or tune.trials may help these kinds."

@@ -25,7 +25,18 @@ from .figures import COLOURS, MISSING, SIDE_COLOURS, Drawn, style, subplots, wit
 from .maps import cell_edges
 from .page import PageTable, write_report
 
-_KIND_COLOURS = ("#CC6677", "#88CCEE", "#DDCC77", "#117733", "#AA4499", "#44AA99", "#999933", "#882255", "#332288", "#DDDDDD")
+_KIND_COLOURS = (
+    "#CC6677",
+    "#88CCEE",
+    "#DDCC77",
+    "#117733",
+    "#AA4499",
+    "#44AA99",
+    "#999933",
+    "#882255",
+    "#332288",
+    "#DDDDDD",
+)
 """Of kinds on a map: P. Tol's muted scheme, for all colour visions."""
 
 
@@ -36,7 +47,7 @@ def draw_choice(choice: ObserverChoice) -> list[Drawn]:
     sides = list(summary["points"][0]["sides"])
     if len(summary["points"]) == 1:
         return [_bars(summary, sides)]
-    if len(_varied(choice.config, summary)) == 1:
+    if len(_varied(choice.config, summary, sides[0])) == 1:
         return [_lines(choice.config, summary, side) for side in sides]
     return [_map(choice.config, summary, side) for side in sides]
 
@@ -59,12 +70,12 @@ def _bars(summary: Mapping[str, Any], sides: Sequence[str]) -> Drawn:
         found = summary["points"][0]["sides"][side]["kinds"]
         shown = _ordered(found)
         highest = max((one["high"] for _, one in shown), default=1.0)
-        for i, (kind, one) in enumerate(shown):
+        for i, (_, one) in enumerate(shown):
             away = [[one["ratio"] - one["low"]], [one["high"] - one["ratio"]]]
             ax.errorbar(one["ratio"], i, xerr=away, fmt="o", ms=6, capsize=3, color=SIDE_COLOURS[side])
             text = "best" if i == 0 else _ratio(one)
             ax.annotate(f"  {text}", (one["high"], i), va="center", fontsize=9, xytext=(4, 0), textcoords="offset points")
-        for i, kind in enumerate([kind for kind, one in found.items() if one["ratio"] is None], len(shown)):
+        for i in range(len(shown), count):
             ax.annotate("diverged, or too slow", (0.02, i), xycoords=("axes fraction", "data"), va="center", color="#555555")
         ax.axvline(1.0, color="black", lw=0.8)
         ax.set(xscale="log", xlim=(0.9, 1.2 * (2.0 + highest) ** 1.5), title=side, xlabel="times the best one's error")
@@ -73,8 +84,8 @@ def _bars(summary: Mapping[str, Any], sides: Sequence[str]) -> Drawn:
         ax.set_ylim(count - 0.5, -0.5)
         ax.grid(axis="y", visible=False)
     caption = (
-        f"{_error(summary)} of each kind over the best one's, {_where(summary)}: geometric mean over noise seeds, with its 95 % "
-        "interval."
+        f"{_error(summary)} of each kind over the best one's, {_where(summary)}: geometric mean over noise seeds, with its "
+        "95 % interval."
     )
     return Drawn("observers", figure, caption)
 
@@ -83,15 +94,15 @@ def _ratio(one: Mapping[str, Any]) -> str:
     return f"{one['ratio']:.3g} ({one['low']:.3g} to {one['high']:.3g})"
 
 
-def _varied(config: Config, summary: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """Values of the axes that have several, in their order; of axes that advance together, those of the first."""
-    found, zipped = {}, set()
+def _varied(config: Config, summary: Mapping[str, Any], side: str) -> dict[str, list[Any]]:
+    """Values of the axes that have several, in their order; of axes that advance together, those of the side's own, or of
+    the first."""
+    together: dict[str, list[str]] = {}
     for axis in config.tune.axes if config.tune is not None else ():
-        values = list(dict.fromkeys(one["values"][axis.path] for one in summary["points"]))
-        if len(values) > 1 and axis.zip not in zipped:
-            found[axis.path] = values
-        zipped |= {axis.zip} - {None}
-    return found
+        together.setdefault(axis.zip or axis.path, []).append(axis.path)
+    paths = [min(some, key=lambda path: f".{side}_" not in path) for some in together.values()]
+    columns = {path: list(dict.fromkeys(one["values"][path] for one in summary["points"])) for path in paths}
+    return {path: values for path, values in columns.items() if len(values) > 1}
 
 
 def _axis_label(config: Config, path: str) -> str:
@@ -112,7 +123,7 @@ def _place(ax: Axes, which: str, values: Sequence[Any]) -> np.ndarray:
 
 def _lines(config: Config, summary: Mapping[str, Any], side: str) -> Drawn:
     """Errors over the one axis that has several values."""
-    ((path, values),) = _varied(config, summary).items()
+    ((path, values),) = _varied(config, summary, side).items()
     figure, (ax,) = subplots(8.4, 4.6, beside=True)
     xs = _place(ax, "x", values)
     for i, kind in enumerate(summary["observers"]):
@@ -148,7 +159,7 @@ def short_names(kinds: Sequence[str]) -> dict[str, str]:
 
 def _map(config: Config, summary: Mapping[str, Any], side: str) -> Drawn:
     """The best kind at each point; a panel for each value of further axes."""
-    varied, short = _varied(config, summary), short_names(summary["observers"])
+    varied, short = _varied(config, summary, side), short_names(summary["observers"])
     (x, xs), (y, ys) = list(varied.items())[-1:-3:-1]
     further = {path: values for path, values in varied.items() if path not in (x, y)}
     panels = list(product(*further.values()))
@@ -200,8 +211,8 @@ def _map(config: Config, summary: Mapping[str, Any], side: str) -> Drawn:
     figure.suptitle(f"{side}: observer with the least {summary['objective']} error", fontsize=11)
     figure.legend(handles=handles, loc="outside lower center", ncols=max(int(size[0] / 2.7), 1))
     caption = (
-        f"{side}: the kind with the least {_error(summary)} at each point, {_where(summary)}, and below it how many times that "
-        f"error {reference} has (–: diverged). An equals sign: another kind's error may be as small (95 % interval)."
+        f"{side}: the kind with the least {_error(summary)} at each point, {_where(summary)}, and below it how many times "
+        f"that error {reference} has (–: diverged). An equals sign: another kind's error may be as small (95 % interval)."
     )
     return Drawn(f"observers_{side}", figure, caption)
 
@@ -215,7 +226,9 @@ def write_choice_report(choice: ObserverChoice, folder: Path) -> list[str]:
     write_atomic(folder / "tuning.json", json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False))
     title, config = choice.config.title or "Observers", choice.config.to_toml()
     lead = choice_headline(summary)
-    return write_report(folder, title, lead, draw_choice(choice), _tables(choice.config, summary), config, summary["remarks"])
+    return write_report(
+        folder, title, lead, draw_choice(choice), _tables(choice.config, summary), config, summary["remarks"]
+    )
 
 
 def observer_toml(summary: Mapping[str, Any]) -> str | None:

@@ -1,0 +1,202 @@
+"""The choice of an observer: against brute force, against runs of its own, and what it says where kinds are alike."""
+
+import math
+
+import numpy as np
+import pytest
+import tomli_w
+from scipy import stats
+from small_study import listed, rigid, small
+
+from jaxbl.config import read_config
+from jaxbl.errors import InputError
+from jaxbl.gains.observer_choice import Side, not_told_apart, ranked
+from jaxbl.gains.tune import tune
+from jaxbl.report.observer_choice import observer_toml
+from jaxbl.sweeps.sweep import sweep
+
+KINDS = ["super_twisting", "luenberger", "kalman", "dirty_derivative"]
+SINE = {"kind": "sine", "amplitude": 0.05, "frequency": 5.0}
+
+
+def study(changes=None, **table):
+    """The rigid drive under a constant torque that the observers do not know."""
+    base = {"observer.motor.velocity_error": 0.1, "encoders.noise": 1e-5, "run.duration": 0.4}
+    effects = [{"kind": "motor.constant_torque", "torque": 0.05}]
+    given = {"observers": KINDS, "trials": 16, "refine": 2} | table
+    return rigid(base | (changes or {}), effects=effects, tune=given, sweep={"seeds": 2})
+
+
+@pytest.fixture(scope="module")
+def chosen():
+    return tune(study(holdout=SINE, trials=64))
+
+
+def test_ratios_have_the_interval_of_a_paired_test():
+    rng = np.random.default_rng(0)
+    common = rng.uniform(1.0, 5.0, 10)
+    errors = {"a": 2.0 * common * np.exp(0.1 * rng.standard_normal(10)), "b": common, "c": np.full(10, np.inf)}
+    found = ranked(errors)
+    assert list(found) == ["b", "a", "c"]
+    expected = stats.ttest_rel(np.log(errors["a"]), np.log(errors["b"])).confidence_interval()
+    np.testing.assert_allclose((found["a"]["low"], found["a"]["high"]), np.exp(expected))
+    assert found["a"]["ratio"] == pytest.approx(stats.gmean(errors["a"]) / stats.gmean(errors["b"]))
+    assert (found["b"]["error"], found["b"]["worst"]) == (pytest.approx(stats.gmean(common)), common.max())
+    assert [found["b"][key] for key in ("ratio", "low", "high")] == [1.0] * 3
+    assert set(found["c"].values()) == {None}
+    assert not_told_apart(found) == []
+
+
+def test_kinds_that_noise_alone_parts_are_not_told_apart():
+    """Of two kinds with the same errors but for noise, the second's interval holds 1 in 19 of 20 draws or more: the first
+    is the better one by chance, so that its ratio begins above 1."""
+    rng = np.random.default_rng(1)
+    told = 0
+    for _ in range(400):
+        errors = {kind: np.exp(0.2 * rng.standard_normal(8)) for kind in "ab"}
+        told += not not_told_apart(ranked(errors))
+    assert told / 400 == pytest.approx(0.05, abs=3 * math.sqrt(0.05 * 0.95 / 400))
+
+
+def test_the_search_agrees_with_brute_force(chosen):
+    """A sweep of its own over a fine grid finds no gains that are much better."""
+    config = read_config(study())
+    found = chosen.summary["points"][0]["sides"]["motor"]["kinds"]["luenberger"]
+    data = config.resolved()
+    data.pop("tune")
+    data["observer"] = {"kind": "luenberger", "motor": found["gains"] | {"velocity_error": 0.1}}
+    axes = {"bandwidth": np.geomspace(1.0, 3e3, 60), "damping": np.geomspace(0.003, 10.0, 40)}
+    data["axes"] = [listed(f"observer.motor.{key}", *values) for key, values in axes.items()]
+    frame = sweep(data).frame
+    errors = frame.groupby(list(map("observer.motor.{}".format, axes)))["motor.velocity_rmse"].max()
+    # between its values the search may find better ones
+    assert 0.85 * errors.min() < found["error_in_search"] < 1.02 * errors.min()
+
+
+def test_held_out_errors_are_those_of_runs_with_these_gains(chosen):
+    """Of every kind, on the other input and with seeds that the search has not seen."""
+    point = chosen.summary["points"][0]["sides"]["motor"]
+    assert chosen.summary["seeds"] == [0, 1]
+    assert chosen.summary["holdout"]["seeds"] == [2, 9]
+    logs = {}
+    for kind, one in point["kinds"].items():
+        data = read_config(study()).resolved()
+        data.pop("tune")
+        data |= {"excitation": SINE, "sweep": {"seeds": 8, "first_seed": 2}}
+        data["observer"] = {"kind": kind, "motor": one["gains"] | {"velocity_error": 0.1}}
+        errors = sweep(data).frame["motor.velocity_rmse"]
+        assert one["worst"] == pytest.approx(errors.max())
+        logs[kind] = np.log(errors).mean()
+        assert one["error"] == pytest.approx(math.exp(logs[kind]), rel=1e-4)
+    assert point["best"] == min(logs, key=logs.__getitem__)
+    for kind, one in point["kinds"].items():
+        assert one["ratio"] == pytest.approx(math.exp(logs[kind] - logs[point["best"]]), rel=1e-4)
+        assert one["low"] <= one["ratio"] <= one["high"]
+
+
+def test_the_chosen_observer_can_be_included(chosen, tmp_path):
+    kind = chosen.summary["for_both_sides"]
+    assert kind == chosen.summary["points"][0]["sides"]["motor"]["best"]
+    (tmp_path / "gains.toml").write_text(observer_toml(chosen.summary), encoding="utf-8")
+    data = read_config(study()).resolved()
+    data.pop("tune")
+    data.pop("observer")
+    (tmp_path / "study.toml").write_text('include = "gains.toml"\n' + tomli_w.dumps(data), encoding="utf-8")
+    observer = read_config(tmp_path / "study.toml").build().observer.motor
+    assert observer.name == kind
+    gains = chosen.summary["points"][0]["sides"]["motor"]["kinds"][kind]["gains"]
+    assert {key: getattr(observer, key) for key in gains} == gains
+
+
+def test_a_point_of_a_map_is_what_the_study_there_gives(tmp_path):
+    """Also where the point is fixed at compile time; a finished search is only read."""
+    axes = [listed("run.sample_period", 1e-3, 2e-3), listed("encoders.noise", 1e-5, 1e-4)]
+    table = {"observers": ["super_twisting", "kalman"], "trials": 8, "refine": 1}
+    whole = tune(study(**table, axes=axes), tmp_path)
+    assert [list(one["values"].values()) for one in whole.summary["points"]] == [
+        [1e-3, 1e-5], [1e-3, 1e-4], [2e-3, 1e-5], [2e-3, 1e-4]
+    ]  # fmt: skip
+    alone = tune(study({"run.sample_period": 2e-3, "encoders.noise": 1e-4}, **table))
+    for kind, one in alone.summary["points"][0]["sides"]["motor"]["kinds"].items():
+        there = whole.summary["points"][3]["sides"]["motor"]["kinds"][kind]
+        assert there == {key: pytest.approx(value) for key, value in one.items()}
+    again = tune(study(**table, axes=axes), tmp_path)
+    assert (again.cost["lanes"], again.summary) == (0.0, whole.summary)
+    assert whole.cost["lanes"] == 4 * 2 * (2 * 8 * 2 + 8)
+
+
+def test_the_low_pass_is_searched_with_the_torque_and_each_side_has_its_own():
+    found = tune(
+        small(tune={"observers": ["super_twisting", "extended_state"], "objective": "torque", "trials": 8, "refine": 1})
+    )
+    sides = found.summary["points"][0]["sides"]
+    constants = [sides[side]["kinds"]["extended_state"]["gains"]["equivalent_control.time_constant"] for side in sides]
+    assert constants[0] != constants[1]
+    kind = found.summary["for_both_sides"]
+    text = observer_toml(found.summary)
+    assert f'kind = "{kind}"' in text
+    assert "# A study has one equivalent_control.time_constant" in text
+
+
+def test_drives_of_an_uncertain_model_are_served_at_once():
+    """The worst over the corners is not below the nominal drive's error."""
+    table = {"observers": ["luenberger", "kalman"], "trials": 16}
+    worst, nominal = (tune(study(**table, worst_over_uncertainty=flag)).summary for flag in (True, False))
+    assert len(worst["scenarios"]) == 5
+    assert "worst over 5 drives" in " ".join(worst["remarks"])
+    for kind, one in nominal["points"][0]["sides"]["motor"]["kinds"].items():
+        assert worst["points"][0]["sides"]["motor"]["kinds"][kind]["error"] > 0.99 * one["error"]
+
+
+def test_what_is_too_slow_is_not_chosen():
+    found = tune(study(observers=["luenberger", "dirty_derivative"], longest_convergence=1e-9)).summary
+    side = found["points"][0]["sides"]["motor"]
+    assert (side["best"], found["for_both_sides"], observer_toml(found)) == (None, None, None)
+
+
+def test_a_search_zooms_inside_of_its_range_and_says_where_it_ends():
+    side = Side({"a": (1.0, 100.0), "b": (2.0, 2.0)}, {"a": (1.0, 100.0), "b": (2.0, 2.0)}, {})
+    tried = side.trials(np.array([[0.0], [0.5], [1.0]]))
+    np.testing.assert_allclose(tried["a"], [1.0, 10.0, 100.0])
+    assert set(tried["b"]) == {2.0}
+    side.take(tried, np.array([1.0, 2.0, 3.0]))
+    assert (side.best, side.error, side.ends()) == ({"a": 1.0, "b": 2.0}, 1.0, ["a"])
+    low, high = side.window["a"]
+    assert (low, high) == (1.0, pytest.approx(100.0 ** (1.0 / 3.0)))
+    # trials that are worse change nothing but the window
+    side.take(side.trials(np.array([[0.5]])), np.array([5.0]))
+    assert (side.best["a"], side.before) == (1.0, 1.0)
+    # a kind that diverges everywhere has no best
+    lost = Side({"a": (1.0, 100.0)}, {"a": (1.0, 100.0)}, {})
+    lost.take(lost.trials(np.array([[0.5]])), np.array([np.inf]))
+    assert (lost.best, lost.window["a"]) == ({}, (1.0, 100.0))
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"observers": ["kalmann"]}, r"tune: observers\[0\]: unknown kind 'kalmann'; did you mean 'kalman'\?"),
+        ({"observers": ["kalman", "kalman"]}, r"observers\[1\]: 'kalman' is listed already"),
+        ({"observers": ["kalman"], "margin_exact": 1.5}, r"margin_exact does not go with observers"),
+        (
+            {"observers": ["kalman"], "axes": [listed("observer.motor.alpha", 1.0)]},
+            r"axes\[0\].path: 'observer.motor.alpha' is",
+        ),
+        (
+            {"observers": ["kalman"], "axes": [{"path": "encoders.noise", "start": 0.0, "stop": 1.0}]},
+            r"axes\[0\].num is missing",
+        ),
+        ({"axes": [listed("encoders.noise", 1.0)]}, r"axes needs observers"),
+        ({"trials": 8}, r"trials needs observers"),
+    ],
+)
+def test_wrong_tables_get_one_line(table, message):
+    given = rigid(tune=table)
+    with pytest.raises(InputError, match=message) as caught:
+        tune(given)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_axis_over_no_path_names_the_nearest():
+    with pytest.raises(InputError, match=r"axes\[0\]: unknown path 'encoders.nois'; nearest valid path: 'encoders.noise'"):
+        tune(study(axes=[listed("encoders.nois", 1e-5)]))

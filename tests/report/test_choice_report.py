@@ -1,0 +1,134 @@
+"""What a choice of observer leaves behind: sentences, figures, tables that agree with its numbers."""
+
+import copy
+import json
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from small_study import listed, rigid
+from test_page import Page
+
+from jaxbl.gains.tune import tune
+from jaxbl.report.figures import save
+from jaxbl.report.observer_choice import choice_headline, draw_choice, short_names, write_choice_report
+from jaxbl.report.results import draw
+
+KINDS = ["super_twisting", "luenberger", "kalman"]
+
+
+def chosen(*axes):
+    effects = [{"kind": "motor.constant_torque", "torque": 0.05}]
+    table = {"observers": KINDS, "trials": 8, "refine": 0, "axes": list(axes)}
+    changes = {"observer.motor.velocity_error": 0.1, "encoders.noise": 1e-5}
+    return tune(rigid(changes, title="a <b> choice", effects=effects, tune=table))
+
+
+@pytest.fixture(scope="module")
+def point():
+    return chosen()
+
+
+@pytest.fixture(scope="module")
+def mapped():
+    return chosen(listed("encoders.noise", 1e-6, 1e-5, 1e-4), listed("encoders.motor_resolution", 0.0, 1e-4))
+
+
+@pytest.fixture(scope="module", params=["point", "mapped"])
+def folder(request, tmp_path_factory):
+    path = tmp_path_factory.mktemp(request.param)
+    lines = write_choice_report(request.getfixturevalue(request.param), path)
+    (path / "lines").write_text("\n".join(lines), encoding="utf-8")
+    return path
+
+
+def test_report_holds_lines_numbers_and_figures(folder):
+    summary = json.loads((folder / "tuning.json").read_text(encoding="utf-8"))
+    single = len(summary["points"]) == 1
+    assert (folder / "gains.toml").exists() == single
+    page = Page((folder / "report.html").read_text(encoding="utf-8"))
+    assert "a <b> choice" in page.text
+    names = {"observers"} if single else {"observers_motor"}
+    assert {path.stem for path in (folder / "figures").iterdir()} == names
+    lines = (folder / "lines").read_text(encoding="utf-8").splitlines()
+    assert all(line in page.text for line in lines)
+    for line in summary["remarks"]:
+        assert line in lines
+
+
+def test_sentences_have_the_numbers_of_the_summary(point):
+    found = point.summary["points"][0]["sides"]["motor"]
+    line, chosen_line = choice_headline(point.summary)
+    assert line.startswith(f"motor: {found['best']} ")
+    for kind, one in list(found["kinds"].items())[1:]:
+        assert f"{kind} {one['ratio']:.3g} ({one['low']:.3g} to {one['high']:.3g})" in line
+    assert point.summary["for_both_sides"] in chosen_line
+
+
+def test_kinds_that_are_alike_are_said_first(point):
+    summary = copy.deepcopy(point.summary)
+    side = summary["points"][0]["sides"]["motor"]
+    best, second = list(side["kinds"])[:2]
+    side["not_told_apart"] = [second]
+    assert f"motor: {best} and {second} are the best and cannot be told apart" in choice_headline(summary)[0]
+    side["kinds"] = {kind: one | {"ratio": None} for kind, one in side["kinds"].items()}
+    summary["for_both_sides"] = None
+    assert choice_headline(summary)[0] == "motor: all kinds diverged or were too slow."
+
+
+def test_the_point_figure_has_a_dot_at_each_ratio(point):
+    (drawn,) = draw_choice(point)
+    (ax,) = drawn.figure.axes
+    kinds = point.summary["points"][0]["sides"]["motor"]["kinds"]
+    assert [label.get_text() for label in ax.get_yticklabels()] == list(kinds)
+    dots = [line.get_xdata()[0] for line in ax.lines if line.get_marker() == "o"]
+    np.testing.assert_allclose(dots, [one["ratio"] for one in kinds.values()])
+    assert drawn.name == "observers" and "rad/s" in drawn.caption
+
+
+def test_the_map_names_the_best_kind_in_each_cell(mapped, tmp_path):
+    (drawn,) = draw(mapped, "observers_motor")
+    (ax,) = drawn.figure.axes
+    short = short_names(KINDS)
+    cells = {text.get_position(): text.get_text() for text in ax.texts}
+    assert len(cells) == 6
+    for one in mapped.summary["points"]:
+        noise, resolution = one["values"].values()
+        side = one["sides"]["motor"]
+        # x is the last axis; a resolution of zero has no place on a logarithmic scale
+        text = cells[float(resolution > 0.0), noise]
+        first, _, second = text.partition("\n")
+        assert first == short[side["best"]] + "=" * bool(side["not_told_apart"])
+        assert bool(second) == (side["best"] != "super_twisting")
+    save(drawn.figure, tmp_path / "map.png")
+    plt.close(drawn.figure)
+
+
+def test_one_axis_is_drawn_as_lines(mapped):
+    line = chosen(listed("encoders.noise", 1e-6, 1e-5, 1e-4))
+    (drawn,) = draw_choice(line)
+    (ax,) = drawn.figure.axes
+    assert [one.get_label() for one in ax.lines] == KINDS
+    errors = [one["sides"]["motor"]["kinds"]["kalman"]["error"] for one in line.summary["points"]]
+    np.testing.assert_allclose(ax.lines[2].get_ydata(), errors)
+    # the same points are in the map
+    np.testing.assert_allclose(
+        errors, [one["sides"]["motor"]["kinds"]["kalman"]["error"] for one in mapped.summary["points"]][::2]
+    )
+
+
+def test_points_won_are_counted(mapped):
+    first, second = choice_headline(mapped.summary)
+    won = [one["sides"]["motor"]["best"] for one in mapped.summary["points"]]
+    for kind in set(won):
+        assert f"{kind} at {won.count(kind)}" in first
+    ratios = [one["sides"]["motor"]["kinds"]["kalman"]["ratio"] for one in mapped.summary["points"]]
+    assert f"kalman {min(ratios):.3g} to {max(ratios):.3g}" in second
+
+
+def test_short_names_are_different():
+    names = ["super_twisting", "differentiator_3", "differentiator_1", "dirty_derivative", "slow_tracker", "steady_twin"]
+    found = short_names(names)
+    assert found["super_twisting"] == "ST"
+    assert found["differentiator_3"] == "D3"
+    assert len(set(found.values())) == len(names)
