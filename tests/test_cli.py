@@ -543,6 +543,7 @@ def test_default_folder():
         ("gain_boundary", "sweep"),
         ("paper_table1", "simulate"),
         ("tune_paper_drive", "tune"),
+        ("observer_choice", "tune"),
         ("condition_atlas", "verify"),
     ],
 )
@@ -550,7 +551,11 @@ def test_shipped_studies_run_without_a_word_on_stderr(name, command, tmp_path):
     # in a process of its own, where float64 is on only inside the engine
     study = tomllib.loads((Path(__file__).parents[1] / "sweeps" / f"{name}.toml").read_text(encoding="utf-8"))
     study["run"]["duration"] = 0.5
-    study.get("tune", {}).update(num=3, refine=0)
+    tuned = study.get("tune", {})
+    tuned["refine"] = 0
+    tuned["trials" if "observers" in tuned else "num"] = 8 if "observers" in tuned else 3
+    for axis in tuned.get("axes", []):
+        axis["values"] = axis["values"][-1:]
     if "refine" in study.get("sweep", {}):
         study["sweep"]["refine"] = 1
     for name in {"alpha_ratio", "lambda_ratio"} & set(study.get("verify", {})):
