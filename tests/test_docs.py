@@ -40,7 +40,8 @@ def test_reference_is_generated_from_this_code():
 
 def test_tutorial_configs_are_valid():
     # blocks that begin with a file's name are files of their own
-    blocks = re.findall(r"```toml\n(?!# \w+\.toml)(.*?)```", (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8"), re.S)
+    text = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```toml\n(?!# \w+\.toml)(.*?)```", text, re.S)
     assert len(blocks) == 3
     config = read_config(tomllib.loads("".join(blocks)))
     assert [axis.num for axis in config.axes] == [32, 32]
