@@ -321,8 +321,8 @@ def ranked(errors: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
 
     Returns:
         by kind: `error` (geometric mean over the runs), `worst`, and of the ratios to the best kind's error in the same
-        run the geometric mean `ratio` with its 95 % interval `low` ... `high` (Student's t on their logarithms); None where a
-        run is infinite.
+        run the geometric mean `ratio` with its 95 % interval `low` ... `high` (Student's t on their logarithms); None where
+        a run is infinite.
     """
     logs = {kind: np.log(np.maximum(one, np.finfo(float).tiny)) for kind, one in errors.items() if np.isfinite(one).all()}
     order = sorted(logs, key=lambda kind: float(logs[kind].mean()))
