@@ -310,6 +310,8 @@ def _said_of_map(side: str, summary: Mapping[str, Any]) -> list[str]:
         + (f" ({shared[kind]} not told apart from another)" if shared.get(kind) else "")
         for kind in order
     ]
+    first = summary["observers"][0]
+    parts += [f"{first} at none"] if first not in order else []
     lines = [f"{side}, {len(points)} points, least {summary['objective']} error ({_where(summary)}): {', '.join(parts)}."]
     spans = []
     for kind in summary["observers"]:
