@@ -100,6 +100,29 @@ def test_the_adaptive_quotient_has_the_least_worst_error_of_those_that_know_no_n
     assert found == pytest.approx(least, rel=1e-6)
 
 
+def proved(noise):
+    """The bound of the proof in docs/theory.md (T = L = 1): the larger one over all noises that the readings may show."""
+    whole = np.arange(1, int(4.0 * math.sqrt(noise)) + 10)
+    worst = 0.0
+    for shown in np.linspace(0.0, noise, 1001):
+        level = 0.5 * whole - 2.0 * shown / whole
+        m = int((level <= 0.5 + 1e-12).sum())
+        share = max((0.5 - level[m - 1]) / (level[m] - level[m - 1]), 0.0)
+        own = 0.5 * whole + 2.0 * noise / whole
+        direct = (1.0 - share) * own[m - 1] + share * own[m]
+        longer = whole[m if share > 1e-12 else m - 1 :]
+        worst = max(worst, min(direct, (longer + 2.0 * noise / longer).min() - 0.5))
+    return worst
+
+
+@pytest.mark.parametrize(
+    "noise", [0.0, 0.05, 0.13, 0.25, 0.4, 0.5, 0.6, 0.7, 0.9, 1.0, 1.3, 2.0, 4.0, 10.0, 33.0, 100.0, 1000.0]
+)
+def test_the_proof_gives_the_bound(noise):
+    ratio = proved(noise) / least_exact_error(noise, 1.0, 1.0)
+    assert 1.0 - 1e-9 <= ratio <= (1.2 if 0.0 < noise < 0.5 else 1.0 + 1e-9)
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.05, 0.2, 0.4])
 def test_the_adaptive_quotient_under_little_noise(noise):
     found = climbed(noise, 4) / least_exact_error(noise, 1.0, 1.0)
