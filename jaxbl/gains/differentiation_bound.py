@@ -110,7 +110,7 @@ def adaptive_quotient(readings: np.ndarray, slope: float, period: float) -> np.n
     s < i, where Q is what u(s) is off the line through u(0) and u(i). The least such N is at most the true one; with it,
     m / 2 - 2 N / (m L T^2) = 1 / 2 is solved for the number of periods m, linear between whole ones. Without noise that is
     one period, with an error of at most L T / 2. Under noise the worst-case error is :func:`least_exact_error` for
-    N >= L T^2 / 2, and at most 1.2 times that below, if the readings go back by sqrt(2 N / L) + T.
+    N >= L T^2 / 2, and at most 1.21 times that below, if the readings go back by sqrt(2 N / L) + T.
 
     Args:
         readings: newest first along the last axis, shape (..., samples + 1), rad; samples >= 1.

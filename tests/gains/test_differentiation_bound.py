@@ -96,7 +96,7 @@ def test_the_adaptive_quotient_has_the_least_worst_error_of_those_that_know_no_n
     """The pair of signals behind the bound makes it err by just that, and no search finds more."""
     least = least_exact_error(noise, 1.0, 1.0)
     assert least >= least_worst_error(noise, 1.0, 1.0)
-    found = climbed(noise, math.ceil(math.sqrt(2.0 * noise)) + 2)
+    found = climbed(noise, math.ceil(math.sqrt(2.0 * noise)) + 1)
     assert found == pytest.approx(least, rel=1e-6)
 
 
@@ -116,17 +116,17 @@ def proved(noise):
 
 
 @pytest.mark.parametrize(
-    "noise", [0.0, 0.05, 0.13, 0.25, 0.4, 0.5, 0.6, 0.7, 0.9, 1.0, 1.3, 2.0, 4.0, 10.0, 33.0, 100.0, 1000.0]
+    "noise", [0.0, 0.05, 0.145, 0.25, 0.4, 0.5, 0.6, 0.7, 0.9, 1.0, 1.3, 2.0, 4.0, 10.0, 33.0, 100.0, 1000.0]
 )
 def test_the_proof_gives_the_bound(noise):
     ratio = proved(noise) / least_exact_error(noise, 1.0, 1.0)
-    assert 1.0 - 1e-9 <= ratio <= (1.2 if 0.0 < noise < 0.5 else 1.0 + 1e-9)
+    assert 1.0 - 1e-9 <= ratio <= (1.21 if 0.0 < noise < 0.5 else 1.0 + 1e-9)
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.05, 0.2, 0.4])
+@pytest.mark.parametrize("noise", [0.0, 0.05, 0.145, 0.2, 0.4])
 def test_the_adaptive_quotient_under_little_noise(noise):
     found = climbed(noise, 4) / least_exact_error(noise, 1.0, 1.0)
-    assert found <= (1.2 if noise else 1.0 + 1e-12)
+    assert found <= (1.21 if noise else 1.0 + 1e-12)
     # every noise that it takes for granted is there
     assert found >= 0.999
 
