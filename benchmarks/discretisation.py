@@ -1,27 +1,158 @@
-"""Observers' worst velocity error beside the least one that any causal differentiator can have, and their chatter at rest.
+"""Discretisations of differentiators: bias and chatter without noise, and the worst velocity error under noise.
 
     python benchmarks/discretisation.py
 
-A double integrator under an unknown acceleration |d| <= L, read every T with a noise |eta| <= N. An adversary chooses d and
-eta for the largest velocity error at the end, by the signs of gradients through the simulation, from random signals and that
-of the linear program. What it finds is a lower bound of the worst case; for the explicit form a weaker one, as a switching
-term has no gradient. Units: T = 1, L = 1.
+Without noise: orders 1 to 5 on a polynomial of degree n, on a sinusoid and at rest, four schemes beside one another.
+
+Under noise: a double integrator under an unknown acceleration |d| <= L, read every T with a noise |eta| <= N, and the worst
+velocity error beside the least one that any causal differentiator can have. For linear observers that is the sum of absolute
+sensitivities. For switching ones it is the largest of those that adversaries find, a lower bound of the worst case:
+
+- a search over reachable errors: the error obeys equations of its own, and of all errors reached so far those are kept that
+  are farthest in each of many directions, over all sides of d and many values of eta. No gradient is needed, and the horizon
+  costs nothing but time. The path that it found is simulated again.
+- the two pairs of signals behind the bounds of jaxbl.gains.differentiation_bound.
+
+Units there: T = 1, L = 1.
 """
 
 import functools
+from math import factorial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.gains.differentiation_bound import best_samples, least_worst_error, worst_signal
-from jaxbl.observer import DIFFERENTIATORS, ExplicitSuperTwisting, ExtendedState, ImplicitSuperTwisting, Luenberger
-
-STARTS, ROUNDS = 96, 300
+from jaxbl.gains.differentiation_bound import best_samples, least_exact_error, least_worst_error, worst_signal
+from jaxbl.observer import (
+    COEFFICIENTS,
+    DIFFERENTIATORS,
+    ExplicitSuperTwisting,
+    ExtendedState,
+    ImplicitSuperTwisting,
+    Luenberger,
+    ObserverState,
+)
+from jaxbl.observer.differentiator import solve_correction
 
 
 def free(velocity):
     return 0.0 * velocity
+
+
+# without noise
+
+
+def taylor(n, h):
+    return np.array([[h ** (j - i) / factorial(j - i) if j >= i else 0.0 for j in range(n + 1)] for i in range(n + 1)])
+
+
+def terms(n, lipschitz, size, sign):
+    """Corrections of states 0 ... n for an error of this size."""
+    j = np.arange(1, n + 2)
+    return jnp.asarray(COEFFICIENTS[n]) * lipschitz ** (j / (n + 1)) * size ** ((n + 1 - j) / (n + 1)) * sign
+
+
+def explicit(n, lipschitz, h):
+    """Forward Euler of each correction, Taylor's series between samples; the outputs are the states."""
+
+    def step(z, y):
+        error = y - z[0]
+        return taylor(n, h) @ z + h * terms(n, lipschitz, jnp.abs(error), jnp.sign(error)), z
+
+    return step
+
+
+def each_implicit(n, lipschitz, h):
+    """Taylor's series, and each state corrected by its own term at the new error; the outputs are the states.
+
+    The equation is that of the first state, e + h k_1 L^(1/(n+1)) |e|^(n/(n+1)) s = b: no set-valued term in it.
+    """
+    slope = h * COEFFICIENTS[n][0] * lipschitz ** (1.0 / (n + 1))
+
+    def step(z, y):
+        z = taylor(n, h) @ z
+        b = y - z[0]
+
+        def halved(_, bounds):
+            low, high = bounds
+            middle = 0.5 * (low + high)
+            above = middle + slope * middle ** (n / (n + 1)) > jnp.abs(b)
+            return jnp.where(above, low, middle), jnp.where(above, middle, high)
+
+        low, high = jax.lax.fori_loop(0, 60, halved, (jnp.zeros(()), jnp.abs(b)))
+        z = z + h * terms(n, lipschitz, 0.5 * (low + high), jnp.sign(b))
+        return z, z
+
+    return step
+
+
+def backward_euler(n, lipschitz, h):
+    """All states at the new sample; the outputs are the states."""
+    unit = lipschitz * h ** (n + 1)
+    reach = COEFFICIENTS[n][n] * unit
+
+    def step(z, y):
+        b = y - h ** np.arange(n + 1) @ z
+        beyond = b - jnp.clip(b, -reach, reach)
+        size = unit * solve_correction(COEFFICIENTS[n], jnp.abs(beyond) / unit) ** (n + 1)
+        corrections = terms(n, lipschitz, size, jnp.sign(beyond)).at[n].set((b - beyond) / h ** (n + 1))
+        rows = []
+        for i in range(n, -1, -1):
+            rows.append(z[i] + h * (corrections[i] + (rows[-1] if rows else 0.0)))
+        z = jnp.stack(rows[::-1])
+        return z, z
+
+    return step
+
+
+def proper(n, lipschitz, h):
+    """The package's: backward Euler with exact outputs."""
+    observer = DIFFERENTIATORS[n](jnp.asarray(lipschitz))
+
+    def step(z, y):
+        new, estimate = observer.step(ObserverState(z[0], z[1], tuple(z[2:])), y, free, jnp.asarray(h))
+        return jnp.stack([new.position, new.velocity, *new.further]), jnp.stack([estimate.position, estimate.velocity])
+
+    return step
+
+
+SCHEMES = {
+    "explicit": explicit,
+    "implicit, each state alone": each_implicit,
+    "backward Euler, its own states": backward_euler,
+    "backward Euler, exact outputs (jaxbl)": proper,
+}
+
+
+def late_velocity(scheme, n, lipschitz, h, y, start):
+    """Velocities of the last quarter along readings, from the states `start`."""
+    return np.asarray(jax.lax.scan(scheme(n, lipschitz, h), jnp.asarray(start), jnp.asarray(y))[1])[-y.size // 4 :, 1]
+
+
+def without_noise(h=0.02):
+    """Rows of the table: scheme, order, and errors in h^n L."""
+    t = h * np.arange(-1500, 1501)
+    late = t[-t.size // 4 :]
+    w = 2.0
+    for name, scheme in SCHEMES.items():
+        for n in range(1, 6):
+            lipschitz = w ** (n + 1)
+            unit = h**n * lipschitz
+            polynomial = np.polynomial.Polynomial([3.0 * 0.3**i / factorial(i) for i in range(n + 1)])
+            first = [polynomial.deriv(i)(t[0]) if i else polynomial(t[0]) for i in range(n + 1)]
+            found = late_velocity(scheme, n, lipschitz, h, polynomial(t), first)
+            bias = np.abs(found - polynomial.deriv()(late)).max() / unit
+            first = [w**i * np.sin(w * t[0] + i * np.pi / 2) for i in range(n + 1)]
+            found = late_velocity(scheme, n, lipschitz, h, np.sin(w * t), first)
+            sine = np.abs(found - w * np.cos(w * late)).max() / unit
+            rest = late_velocity(scheme, n, lipschitz, h, 0.0 * t, [1e-3 * (i == 0) for i in range(n + 1)])
+            # what rounding of readings of this size makes of a velocity
+            rounding = 2**n * np.finfo(float).eps * np.abs(polynomial(t)).max() / h / unit
+            yield name, n, bias, sine, np.abs(np.diff(rest)).max() / unit, rounding
+
+
+# under noise
 
 
 def error(observer, noise_bound, shares):
@@ -42,32 +173,101 @@ def error(observer, noise_bound, shares):
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def ascended(kind, gains, noise_bound, shares):
-    """The largest error over starts and rounds, of ascents with steps that shrink."""
-    observer = kind(*gains)
-    value = jax.vmap(jax.value_and_grad(lambda x: error(observer, noise_bound, x)))
+def simulated(kind, gains, noise, shares):
+    return jnp.abs(error(kind(*gains), noise, shares))
 
-    def rise(i, carry):
-        x, best = carry
-        found, slope = value(x)
-        step = 2.0 * 0.5 ** (6.0 * i / ROUNDS)
-        new = jnp.clip(x + step * jnp.sign(jnp.nan_to_num(slope)), -1.0, 1.0)
-        return new, jnp.maximum(best, jnp.nanmax(jnp.abs(found)))
 
-    return jax.lax.fori_loop(0, ROUNDS, rise, (shares, jnp.zeros(())))[1]
+@functools.partial(jax.jit, static_argnums=(0, 3))
+def worst_linear(kind, gains, noise, samples):
+    """The worst case itself of an observer that is linear in d and eta."""
+    sensitivity = jax.grad(lambda x: error(kind(*gains), noise, x))(jnp.zeros((2, samples)))
+    return jnp.abs(sensitivity).sum()
+
+
+NEAR = np.array([0.0, 1.0, 4.0])
+"""Innovations (T² L) to try beside noises from -N to N: those near zero decide what a switching term does."""
+
+
+@functools.partial(jax.jit, static_argnums=(0, 3, 4, 5, 6))
+def reached(kind, gains, noise, samples, width, levels, cells):
+    """Largest velocity error after each sample, its candidate and noise; the candidates kept and their noise."""
+    observer, zero = kind(*gains), jnp.zeros(())
+    first = observer.start(zero, zero, free, jnp.ones(()))
+    size = 2 + len(first.further)
+    sides = round(cells ** (1.0 / size))
+    angles = 2.0 * np.pi * (np.arange(width) + 0.5) / width
+    random = np.random.default_rng(0).normal(size=(width, size))
+    directions = np.stack([np.cos(angles), np.sin(angles)], 1) if size == 2 else random
+    directions = jnp.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    # the true position and velocity stay zero: what d adds to them is taken from the observer's
+    shift = np.array([0.5, 1.0] + [0.0] * (size - 2))
+    sides_of_d = jnp.asarray(np.outer([-1.0, 1.0], shift)[None, None])
+    spaced, near = noise * jnp.linspace(-1.0, 1.0, levels), jnp.asarray([*-NEAR[:0:-1], *NEAR])
+
+    def step(x):
+        etas = jnp.concatenate([spaced, jnp.clip(x[0] + near, -noise, noise)])
+
+        def under(eta):
+            new, estimate = observer.step(ObserverState(x[0], x[1], tuple(x[2:])), eta, free, jnp.ones(()))
+            return jnp.stack([new.position, new.velocity, *new.further]), jnp.abs(estimate.velocity)
+
+        return *jax.vmap(under)(etas), etas
+
+    def one(x, _):
+        new, miss, etas = jax.vmap(step)(x)
+        # two candidates for each, one for either side of d
+        candidates = (new[:, :, None, :] - sides_of_d).reshape(-1, size)
+        # in coordinates in which they spread alike on all sides
+        scaled = candidates / jnp.maximum(jnp.abs(candidates).max(axis=0, keepdims=True), 1e-300)
+        spread, turn = jnp.linalg.eigh(scaled.T @ scaled / scaled.shape[0])
+        scaled = scaled @ (turn / jnp.sqrt(jnp.maximum(spread, 1e-12 * spread[-1]))[None])
+        support = (scaled @ directions.T).argmax(axis=0)
+        # the set is not convex: one of each cell of a grid over it, too, the one farthest from zero
+        places = scaled / jnp.abs(scaled).max(axis=0, keepdims=True)
+        cell = ((0.5 * places + 0.5) * sides * (1.0 - 1e-12)).astype(int) @ sides ** np.arange(size)
+        radius = jnp.linalg.norm(scaled, axis=1)
+        most = jax.ops.segment_max(radius, cell, sides**size)
+        inner = jnp.where(radius >= most[cell], jnp.arange(radius.size), -1)
+        inner = jax.ops.segment_max(inner, cell, sides**size)
+        kept = jnp.concatenate([support, jnp.where(inner < 0, support[0], inner)])
+        best = miss.argmax()
+        return candidates[kept], (miss.max(), best, etas.ravel()[best], kept, etas.ravel()[kept // 2])
+
+    start = jnp.tile(jnp.stack([first.position, first.velocity, *first.further]), (width + sides**size, 1))
+    return jax.lax.scan(one, start, None, length=samples)[1]
+
+
+def searched(kind, gains, noise, samples, width=64, levels=5, cells=500):
+    """The shares of d and eta that lead to the largest velocity error of the search, shape (2, samples)."""
+    found = (np.asarray(x) for x in reached(kind, gains, noise, samples, width, levels, cells))
+    largest, best, best_eta, kept, kept_eta = found
+    each = levels + 2 * NEAR.size - 1
+    last = int(largest.argmax())
+    d, eta = np.zeros(last + 1), np.zeros(last + 1)
+    eta[last], at = best_eta[last], best[last] // each
+    for i in range(last - 1, -1, -1):
+        before, side = divmod(int(kept[i][at]), 2)
+        d[i], eta[i], at = 2.0 * side - 1.0, kept_eta[i][at], before // each
+    return np.stack([d, eta / max(noise, 1e-300)])
+
+
+@functools.cache
+def pairs(noise, samples):
+    """Shares of the signals behind the bounds: read as zero throughout, and read as minus itself, a signal without noise."""
+    found = []
+    for slope, part in ((1.0, 1.0), (2.0, 0.5)):
+        made = worst_signal(noise, slope, 1.0, samples - 1)
+        d = part * np.append(made.acceleration[::-1], 0.0)
+        found.append(jnp.asarray(np.stack([d, -made.signal[::-1] / max(noise, 1e-300)])))
+    return found
 
 
 def worst(kind, gains, noise, samples):
-    rng = np.random.default_rng(0)
-    starts = rng.uniform(-1.0, 1.0, (STARTS, 2, samples))
-    # pieces of one sign, of several lengths
-    for i in range(STARTS // 2):
-        length = 2 ** (i % 6)
-        starts[i] = np.repeat(np.sign(rng.normal(size=(2, -(-samples // length)))), length, axis=1)[:, :samples]
-    found = worst_signal(noise, 1.0, 1.0, samples - 1)
-    starts[-1, 0] = np.append(found.acceleration[::-1], 0.0)
-    starts[-1, 1] = -found.signal[::-1] / noise if noise else 0.0
-    return float(ascended(kind, gains, noise, jnp.asarray(starts)))
+    """The largest velocity error found."""
+    if kind in (Luenberger, ExtendedState):
+        return float(worst_linear(kind, gains, noise, samples))
+    paths = [jnp.asarray(searched(kind, gains, noise, samples)), *pairs(noise, samples)]
+    return max(float(simulated(kind, gains, noise, path)) for path in paths)
 
 
 def chatter(observer):
@@ -83,30 +283,48 @@ def chatter(observer):
     return float(np.abs(np.diff(late)).max())
 
 
-def main() -> None:
+def horizon(noise):
+    return 30 * best_samples(noise, 1.0, 1.0) + 60
+
+
+def under_noise(sizes):
+    """Rows of the table: observer, worst errors found over the least possible one, and chatter."""
     usual = (1.5, 1.1)
-    bandwidths = (0.1, 0.2, 0.4, 0.8, 1.6, 6.0)
-    grid = [(k * a**0.5, a) for a in (1.1, 2.0, 4.0) for k in (0.5, 1.0, 1.5, 2.0, 3.0)]
+    bandwidths = (0.1, 0.15, 0.2, 0.3, 0.4, 0.8, 1.6, 6.0)
+    gains = [(k * a**0.5, a) for a in (1.1, 1.3, 2.0) for k in (1.5, 1.8, 2.1)]
     rows = {
         "super-twisting, explicit": (ExplicitSuperTwisting, [usual]),
         "super-twisting, implicit": (ImplicitSuperTwisting, [usual]),
-        "the same, its best gains": (ImplicitSuperTwisting, grid),
-        "luenberger, its best gains": (Luenberger, [(w, z) for w in bandwidths for z in (0.7, 1.0)]),
+        "the same, its best gains": (ImplicitSuperTwisting, gains),
+        "Luenberger, its best gains": (Luenberger, [(w, z) for w in bandwidths for z in (0.7, 1.0)]),
         "extended state, its best gains": (ExtendedState, [(w,) for w in bandwidths]),
-        "differentiator of order 2, L = 1": (DIFFERENTIATORS[2], [(1.0,)]),
+        "differentiator of order 2, its best gain": (DIFFERENTIATORS[2], [(x,) for x in (0.1, 0.3, 1.0)]),
     }
-    sizes = (0.0, 1.0, 10.0, 100.0)
-    least = ", ".join(f"{least_worst_error(n, 1.0, 1.0):.3g} T L at N = {n:g} T² L" for n in sizes)
-    print(f"Worst velocity error found, over the least possible one ({least})\n")
-    print(f"| observer | {' | '.join(f'N = {n:g}' for n in sizes)} | chatter at rest, T L |")
-    print("|" + "---|" * (len(sizes) + 2))
     for name, (kind, choices) in rows.items():
         ratios = []
         for noise in sizes:
-            samples = max(12 * best_samples(noise, 1.0, 1.0), 60)
-            found = min(worst(kind, gains, noise, samples) for gains in choices)
-            ratios.append(found / least_worst_error(noise, 1.0, 1.0))
-        print(f"| {name} | " + " | ".join(f"{r:.2f}" for r in ratios) + f" | {chatter(kind(*choices[0])):.1e} |", flush=True)
+            found, best = min((worst(kind, gains, noise, horizon(noise)), gains) for gains in choices)
+            ratios.append(f"{found / least_worst_error(noise, 1.0, 1.0):.2f}")
+            if len(choices) > 1:
+                ratios[-1] += f" ({', '.join(f'{x:.2g}' for x in best)})"
+        yield name, ratios, chatter(kind(*choices[0]))
+
+
+def main() -> None:
+    print("Without noise, in h^n L: velocity error on a polynomial of degree n (what rounding makes), on a sinusoid with")
+    print("the largest (n+1)-th derivative L, and the largest change from sample to sample at rest\n")
+    print("| scheme | order | polynomial | sinusoid | at rest |\n|---|---|---|---|---|")
+    for name, n, bias, sine, rest, rounding in without_noise():
+        print(f"| {name} | {n} | {bias:.1e} ({rounding:.0e}) | {sine:.3g} | {rest:.1e} |", flush=True)
+    sizes = (0.0, 1.0, 10.0, 100.0)
+    least = ", ".join(f"{least_worst_error(n, 1.0, 1.0):.4g} T L at N = {n:g} T² L" for n in sizes)
+    print(f"\nWorst velocity error found, over the least possible one ({least})\n")
+    print(f"| observer | {' | '.join(f'N = {n:g}' for n in sizes)} | chatter at rest, T L |")
+    print("|" + "---|" * (len(sizes) + 2))
+    exact = [least_exact_error(n, 1.0, 1.0) / least_worst_error(n, 1.0, 1.0) for n in sizes]
+    print(f"| least with the least error without noise (adaptive quotient) | {' | '.join(f'{r:.2f}' for r in exact)} | 0 |")
+    for name, ratios, rest in under_noise(sizes):
+        print(f"| {name} | {' | '.join(ratios)} | {rest:.1e} |", flush=True)
 
 
 if __name__ == "__main__":

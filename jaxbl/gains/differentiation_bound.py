@@ -2,11 +2,13 @@
 
 A signal f with |f''| <= L (rad/s^2) is read every T (s) with a noise of at most N (rad). No causal differentiator can have a
 smaller worst-case error of f' at a sample than :func:`least_worst_error`, and a difference quotient over the right number of
-periods has just that. All functions take and return plain numbers in SI units.
+periods has just that. One that has to be as good as any without noise, and so cannot count on N, has at least
+:func:`least_exact_error`; :func:`adaptive_quotient` reaches it from N = L T^2 / 2 on. All numbers are in SI units.
 
 References: R. Seeber, H. Haimovich, Optimal robust exact differentiation via linear adaptive techniques, Automatica 148
-(2023), for the question and for the continuous bound of exact differentiators, 2 sqrt(2 N L); E. Landau (1913) for
-|f'| <= 2 sqrt(N L) on a half line. The proof of the sampled form is in docs/theory.md.
+(2023), for the question, for the continuous bound of exact differentiators, 2 sqrt(2 N L), and for a quotient over a time
+that adapts to the noise; E. Landau (1913) for |f'| <= 2 sqrt(N L) on a half line. The sampled forms and their proofs are
+our own (docs/theory.md).
 """
 
 import math
@@ -86,14 +88,62 @@ def least_worst_error(noise: float, slope: float, period: float = 0.0, most: int
     return difference_error(noise, slope, period, best_samples(noise, slope, period, most))
 
 
-def least_exact_error(noise: float, slope: float) -> float:
-    """Least worst-case error (rad/s) of differentiators that know no N and are exact without noise: 2 sqrt(2 N L).
+def least_exact_error(noise: float, slope: float, period: float = 0.0) -> float:
+    """Least worst-case error (rad/s) of differentiators that know no N and have the least error without noise, L T / 2.
 
-    For continuous readings. Readings that are a signal with |f''| <= L themselves must be differentiated exactly, while the
-    true signal may differ from them by N and in f'' by 2 L. Reference: R. Seeber, H. Haimovich, Automatica 148 (2023).
+    Such readings may be a signal without noise themselves, to be differentiated within L T / 2, while the true signal
+    differs from them by N and in f'' by 2 L. Without a period (0) that of continuous readings, 2 sqrt(2 N L).
+
+    Args:
+        noise: bound N of the noise, rad.
+        slope: bound L of the second derivative, rad/s^2.
+        period: sampling period T, s.
     """
-    _checked(noise, slope, 0.0)
-    return 2.0 * math.sqrt(2.0 * noise * slope)
+    exact = least_worst_error(noise, 2.0 * slope, period) - 0.5 * slope * period
+    return max(exact, least_worst_error(noise, slope, period))
+
+
+def adaptive_quotient(readings: np.ndarray, slope: float, period: float) -> np.ndarray:
+    """Derivative by a difference quotient over as many periods as the noise that the readings show asks for.
+
+    No N is known. That f may be within N of all readings, u(0) newest, needs |Q| <= 2 N + L T^2 s (i - s) / 2 for all
+    s < i, where Q is what u(s) is off the line through u(0) and u(i). The least such N is at most the true one; with it,
+    m / 2 - 2 N / (m L T^2) = 1 / 2 is solved for the number of periods m, linear between whole ones. Without noise that is
+    one period, with an error of at most L T / 2. Under noise the worst-case error is :func:`least_exact_error` for
+    N >= L T^2 / 2, and at most 1.21 times that below, if the readings go back by sqrt(2 N / L) + T.
+
+    Args:
+        readings: newest first along the last axis, shape (..., samples + 1), rad; samples >= 1.
+        slope: bound L > 0 of the second derivative, rad/s^2.
+        period: sampling period T > 0, s.
+
+    Returns:
+        Derivative at the newest reading, shape (...), rad/s.
+    """
+    _checked(0.0, slope, period)
+    last = readings.shape[-1] - 1
+    unit = slope * period * period
+    if unit == 0.0 or last < 1:
+        raise InputError(
+            f"readings: an adaptive quotient needs two readings, a slope > 0 and a period > 0, not {last + 1} reading(s), "
+            f"{slope} and {period}"
+        )
+    rise = readings[..., :1] - readings
+    twice_noise = np.zeros(readings.shape[:-1])
+    for i in range(2, last + 1):
+        s = np.arange(1, i)
+        off = np.abs(s / i * rise[..., i, None] - rise[..., 1:i]) / unit - 0.5 * s * (i - s)
+        twice_noise = np.maximum(twice_noise, off.max(axis=-1))
+    periods = np.arange(1, last + 1)
+    level = 0.5 * periods - twice_noise[..., None] / periods
+    quotients = rise[..., 1:] / (periods * period)
+    # level rises by more than 1/2 per period: a share for each quotient beside where it passes 1/2
+    below = np.clip((level <= 0.5).sum(axis=-1) - 1, 0, last - 1)[..., None]
+    above = np.minimum(below + 1, last - 1)
+    low, high = (np.take_along_axis(level, at, -1)[..., 0] for at in (below, above))
+    share = np.clip((0.5 - low) / np.where(high > low, high - low, 1.0), 0.0, 1.0)
+    first, second = (np.take_along_axis(quotients, at, -1)[..., 0] for at in (below, above))
+    return first + share * (second - first)
 
 
 def worst_signal(noise: float, slope: float, period: float, samples: int) -> WorstSignal:

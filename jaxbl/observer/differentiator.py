@@ -2,6 +2,11 @@
 
 With order n the states are position, velocity, the disturbance (acceleration missing in the nominal model) and its first
 n - 2 derivatives; of order 1 the disturbance is the switching term alone, as of the super-twisting observer.
+
+The scheme is backward Euler of the differentiator, of which the states kept here are those linear combinations that are
+derivatives of a polynomial of degree n exactly (docs/theory.md): what R. Seeber, Proper implicit discretization of
+arbitrary-order robust exact differentiators (2024, arXiv 2404.02770), calls proper. Backward Euler's own states z_i are
+backward differences in the sliding set, and so lag behind derivatives by some periods.
 Reference: A. Levant, Int. J. Control 76 (2003); coefficients of its non-recursive form from A. Levant, M. Livne, IEEE Trans.
 Autom. Control 65 (2020).
 """

@@ -7,6 +7,7 @@ import pytest
 
 from jaxbl.errors import InputError
 from jaxbl.gains.differentiation_bound import (
+    adaptive_quotient,
     best_samples,
     difference_error,
     least_exact_error,
@@ -54,8 +55,91 @@ def test_limits():
     # 4 N / (L T^2) = i^2: the continuous bound at a window of i periods
     assert least_worst_error(1e-4, 4.0, 1e-4) == pytest.approx(least_worst_error(1e-4, 4.0))
     assert least_exact_error(1e-4, 4.0) == pytest.approx(math.sqrt(2.0) * least_worst_error(1e-4, 4.0))
+    # sampled ones lose L T / 2 less, and without noise nothing
+    assert least_exact_error(1e-4, 4.0, 1e-6) == pytest.approx(least_exact_error(1e-4, 4.0), rel=1e-3)
+    assert least_exact_error(0.0, 8.0, 1e-3) == pytest.approx(4e-3)
     assert worst_signal(0.0, 0.0, 1e-3, 5).error == 0.0
     assert least_worst_error(1.0, 0.0, 1e-3, most=4) == pytest.approx(2.0 / 4e-3)
+
+
+def climbed(noise, samples, starts=200):
+    """Largest error of the adaptive quotient (T = L = 1) found by changes of single values of noise and f''.
+
+    From random signs, and from the pair of signals behind the bound, one of which is the reading and the other one true.
+    """
+    rng = np.random.default_rng(0)
+    choice = rng.choice([-1.0, 1.0], (starts, 2 * samples + 1))
+    pair = worst_signal(noise, 2.0, 1.0, samples)
+    choice[::2, :samples] = 0.5 * pair.acceleration
+    choice[::2, samples:] = -(pair.signal - pair.signal[0]) / max(noise, 1e-300) - 1.0
+    choice = np.clip(choice, -1.0, 1.0)
+    back = np.arange(samples + 1)
+    weights = np.maximum(back[:, None] - np.arange(samples)[None, :] - 0.5, 0.0)
+
+    def errors(choice):
+        # f(0) = f'(0) = 0
+        readings = choice[:, :samples] @ weights.T + noise * choice[:, samples:]
+        return np.abs(adaptive_quotient(readings, 1.0, 1.0))
+
+    best = errors(choice)
+    for j in [*rng.permutation(2 * samples + 1)] * 4:
+        turned = choice.copy()
+        turned[:, j] = np.where(rng.random(starts) < 0.5, -turned[:, j], rng.uniform(-1.0, 1.0, starts))
+        found = errors(turned)
+        better = found > best
+        choice[better], best = turned[better], np.maximum(best, found)
+    return best.max()
+
+
+@pytest.mark.parametrize("noise", [0.5, 1.0, 3.0, 10.0, 40.0])
+def test_the_adaptive_quotient_has_the_least_worst_error_of_those_that_know_no_noise(noise):
+    """The pair of signals behind the bound makes it err by just that, and no search finds more."""
+    least = least_exact_error(noise, 1.0, 1.0)
+    assert least >= least_worst_error(noise, 1.0, 1.0)
+    found = climbed(noise, math.ceil(math.sqrt(2.0 * noise)) + 1)
+    assert found == pytest.approx(least, rel=1e-6)
+
+
+def proved(noise):
+    """The bound of the proof in docs/theory.md (T = L = 1): the larger one over all noises that the readings may show."""
+    whole = np.arange(1, int(4.0 * math.sqrt(noise)) + 10)
+    worst = 0.0
+    for shown in np.linspace(0.0, noise, 1001):
+        level = 0.5 * whole - 2.0 * shown / whole
+        m = int((level <= 0.5 + 1e-12).sum())
+        share = max((0.5 - level[m - 1]) / (level[m] - level[m - 1]), 0.0)
+        own = 0.5 * whole + 2.0 * noise / whole
+        direct = (1.0 - share) * own[m - 1] + share * own[m]
+        longer = whole[m if share > 1e-12 else m - 1 :]
+        worst = max(worst, min(direct, (longer + 2.0 * noise / longer).min() - 0.5))
+    return worst
+
+
+@pytest.mark.parametrize(
+    "noise", [0.0, 0.05, 0.145, 0.25, 0.4, 0.5, 0.6, 0.7, 0.9, 1.0, 1.3, 2.0, 4.0, 10.0, 33.0, 100.0, 1000.0]
+)
+def test_the_proof_gives_the_bound(noise):
+    ratio = proved(noise) / least_exact_error(noise, 1.0, 1.0)
+    assert 1.0 - 1e-9 <= ratio <= (1.21 if 0.0 < noise < 0.5 else 1.0 + 1e-9)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05, 0.145, 0.2, 0.4])
+def test_the_adaptive_quotient_under_little_noise(noise):
+    found = climbed(noise, 4) / least_exact_error(noise, 1.0, 1.0)
+    assert found <= (1.21 if noise else 1.0 + 1e-12)
+    # every noise that it takes for granted is there
+    assert found >= 0.999
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_the_adaptive_quotient_scales_with_units_and_takes_many_rows(dtype):
+    rng = np.random.default_rng(1)
+    rows = rng.normal(size=(3, 4, 20)).astype(dtype)
+    plain = adaptive_quotient(rows, 1.0, 1.0)
+    assert plain.shape == (3, 4)
+    other = adaptive_quotient(dtype(1e-4) * rows, 100.0, 1e-3)
+    np.testing.assert_allclose(other, 0.1 * plain, rtol=1e-10 if dtype == np.float64 else 1e-3)
+    np.testing.assert_allclose(adaptive_quotient(rows + dtype(2.0), 1.0, 1.0), plain, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -66,8 +150,10 @@ def test_limits():
         lambda: worst_signal(1.0, 1.0, 0.0, 5),
         lambda: worst_signal(1.0, 1.0, 1.0, 0),
         lambda: best_samples(1.0, 0.0, 1.0),
+        lambda: adaptive_quotient(np.zeros(5), 0.0, 1.0),
+        lambda: adaptive_quotient(np.zeros(1), 1.0, 1.0),
     ],
 )
 def test_wrong_bounds_are_input_errors(call):
-    with pytest.raises(InputError, match=r"^(noise|slope|period|samples):"):
+    with pytest.raises(InputError, match=r"^(noise|slope|period|samples|readings):"):
         call()

@@ -1,13 +1,16 @@
 """Differentiators of orders 1 to 5: their set-valued equation, exactness, no chatter, and the accuracy laws."""
 
+from math import factorial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import brentq
 
-from jaxbl.observer import COEFFICIENTS, DIFFERENTIATORS
+from jaxbl.observer import COEFFICIENTS, DIFFERENTIATORS, ObserverState
 from jaxbl.observer.differentiator import solve_correction
 
 ORDERS = sorted(DIFFERENTIATORS)
@@ -77,6 +80,108 @@ def test_a_step_solves_its_set_valued_equation(order, innovation, sign, lipschit
         assert e * sign >= 0.0
 
 
+def backward_euler(order, lipschitz, h, measured):
+    """Outputs of Levant's differentiator by backward Euler, shape (samples, order + 1), in plain NumPy.
+
+    States z_i = z_i + h (correction i + z_(i+1)), all at the new sample; outputs y_i = (D^i z)_0 with D = -ln(1 - B) / h,
+    where B^m stands for h^m z_m: powers of the logarithm's series, cut off behind B^order.
+    """
+    n, j = order, np.arange(1, order + 2)
+    gains = np.array(COEFFICIENTS[n]) * lipschitz ** (j / (n + 1))
+    logarithm = np.array([0.0, *(1.0 / np.arange(1, n + 1))])
+    series = [np.eye(n + 1)[0]]
+    for _ in range(n):
+        series.append(np.convolve(series[-1], logarithm)[: n + 1])
+    outputs = np.array([[series[i][m] * h ** (m - i) for m in range(n + 1)] for i in range(n + 1)])
+    z, found = np.zeros(n + 1), []
+    for y in measured:
+        innovation = y - h ** np.arange(n + 1) @ z
+        reach = h ** (n + 1) * gains[n]
+        corrections = np.zeros(n + 1)
+        corrections[n] = np.clip(innovation, -reach, reach) / h ** (n + 1)
+        if abs(innovation) > reach:
+            # the root of e + sum_j h^j gain_j e^((n + 1 - j)/(n + 1)) = |b|, in r = e^(1 / (n + 1))
+            polynomial = np.polynomial.Polynomial([reach - abs(innovation), *(h**j * gains)[:n][::-1], 1.0])
+            root = brentq(polynomial, 0.0, abs(innovation) ** (1 / (n + 1)), xtol=1e-300, rtol=1e-15)
+            corrections = gains * root ** (n + 1 - j) * np.sign(innovation)
+        above = 0.0
+        for i in range(n, -1, -1):
+            above = z[i] = z[i] + h * (corrections[i] + above)
+        found.append(outputs @ z)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_the_scheme_is_backward_euler_with_exact_outputs(order):
+    """In and out of the sliding set: the states are linear combinations of those of backward Euler."""
+    h = 1e-2
+    t = h * np.arange(600)
+    noise = np.where(t > 3.0, 1e-2 * np.random.default_rng(0).normal(size=t.size), 0.0)
+    y = np.sin(3.0 * t) + noise
+    lipschitz = 3.0 ** (order + 1)
+    estimate, _ = observed(DIFFERENTIATORS[order](lipschitz), y, h)
+    expected = backward_euler(order, lipschitz, h, y)
+    found = [estimate.position, estimate.velocity, *([estimate.control] if order >= 2 else [])]
+    # the roots of order 5 differ by rounding, which its gains magnify
+    for own, other in zip(found, expected.T, strict=False):
+        np.testing.assert_allclose(own, other, atol=1e-7 * np.abs(other).max())
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_known_accelerations_leave_it_exact(order):
+    """A polynomial, and beside it any known acceleration that is held over each period."""
+    h, count = 1e-2, 3000
+    t = h * np.arange(count)
+    known = np.random.default_rng(2).uniform(-30.0, 30.0, count)
+    # what the known acceleration makes of velocity and position at the samples
+    speed = np.concatenate([[0.0], h * np.cumsum(known)[:-1]])
+    place = np.concatenate([[0.0], np.cumsum(h * speed + 0.5 * h * h * known)[:-1]])
+    own = np.polynomial.Polynomial(0.5 ** np.arange(order + 1) / [factorial(i) for i in range(order + 1)])
+    # acceleration of polynomials of degree 1 is zero: all of it is known
+    y = own(t) + place
+    observer = DIFFERENTIATORS[order](40.0)
+
+    def one(state, given):
+        return observer.step(state, given[0], lambda _: given[1], h)
+
+    start = observer.start(jnp.asarray(y[0]), jnp.asarray(0.3), free, jnp.asarray(h))
+    estimate = jax.lax.scan(one, start, (jnp.asarray(y), jnp.asarray(known)))[1]
+    late = slice(-300, None)
+    rounding = np.finfo(float).eps * np.abs(y).max()
+    velocity = own.deriv()(t) + speed
+    np.testing.assert_allclose(estimate.velocity[late], velocity[late], atol=2**order * 40.0 * rounding / h)
+    disturbance = own.deriv(2)(t) if order >= 2 else 0.0 * t
+    np.testing.assert_allclose(estimate.control[late], disturbance[late], atol=4**order * 40.0 * rounding / h**2)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_any_start_leads_into_the_sliding_set(order):
+    """Errors up to 40^(n+1-i) times those of a period, while the highest derivative jumps between its bounds."""
+    n, h, lanes, count = order, 1.0, 64, 20_000
+    rng = np.random.default_rng(3)
+    observer = DIFFERENTIATORS[n](1.0)
+    size = 10.0 ** rng.uniform(-1.0, np.log10(40.0), lanes)
+    error = rng.normal(size=(n + 1, lanes)) * size ** np.arange(n + 1, 0, -1)[:, None]
+    # signs that stay for long, for a while, and for one period
+    length = rng.choice([1, 10, 100, 10_000], lanes)
+    top = np.sign(np.sin(np.pi * (np.arange(count)[:, None] + rng.uniform(0.0, 1.0, lanes) * length) / length + 1e-3))
+    taylor = np.array([[1.0 / factorial(j - i) if j >= i else 0.0 for j in range(n + 1)] for i in range(n + 1)])
+    push = np.array([1.0 / factorial(n + 1 - i) for i in range(n + 1)])
+
+    def one(state, top):
+        # the error is observed: true states zero, but for what the highest derivative does over the period
+        new, estimate = jax.vmap(lambda s: observer.step(s, jnp.zeros(()), free, jnp.asarray(h)))(state)
+        position, velocity, *further = (
+            x - p * top for x, p in zip([new.position, new.velocity, *new.further], push, strict=True)
+        )
+        return ObserverState(position, velocity, tuple(further)), estimate.position
+
+    position, velocity, *further = jnp.asarray(taylor @ error)
+    found = np.asarray(jax.lax.scan(one, ObserverState(position, velocity, tuple(further)), jnp.asarray(top))[1])
+    assert np.abs(found[0]).max() > 1e2
+    assert np.abs(found[-2000:]).max() == 0.0
+
+
 @pytest.mark.parametrize("order", ORDERS)
 def test_polynomials_are_differentiated_exactly_and_without_chatter(order):
     """In the sliding set the states follow the polynomial through the last n + 1 samples, to rounding."""
@@ -97,15 +202,18 @@ def test_polynomials_are_differentiated_exactly_and_without_chatter(order):
         np.testing.assert_allclose(estimate.control[late], expected, atol=4**order * 40.0 * rounding / h**2)
 
 
+@pytest.mark.parametrize(("dtype", "h"), [(np.float64, 5e-3), (np.float32, 0.2)])
 @pytest.mark.parametrize("order", ORDERS)
-def test_a_smooth_signal_never_leaves_the_sliding_set_again(order):
+def test_a_smooth_signal_never_leaves_the_sliding_set_again(order, dtype, h):
     """|y^(n+1)| <= L: the position has no error at all, and the velocity that of interpolation, h^n L / (n + 1)."""
-    h = 5e-3
     t = h * np.arange(8000)
-    estimate, _ = observed(DIFFERENTIATORS[order](1.0), np.sin(t), h, velocity=1.0)
+    rounding = float(np.finfo(dtype).eps)
+    estimate, _ = observed(DIFFERENTIATORS[order](dtype(1.0)), np.sin(t).astype(dtype), h, velocity=1.0)
+    assert estimate.velocity.dtype == dtype
     late = slice(-2000, None)
-    assert np.abs(estimate.position - np.sin(t))[late].max() <= 2e-15
-    assert np.abs(estimate.velocity - np.cos(t))[late].max() <= 1.01 * h**order / (order + 1) + 1e-12 * 2**order
+    assert np.abs(estimate.position - np.sin(t))[late].max() <= 9.0 * rounding
+    bound = 1.01 * h**order / (order + 1) + 2**order * 20.0 * rounding / h
+    assert np.abs(estimate.velocity - np.cos(t))[late].max() <= bound
 
 
 @pytest.mark.slow

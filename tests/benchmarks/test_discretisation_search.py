@@ -1,0 +1,87 @@
+"""The audit of discretisations: its search against all sequences of a short horizon, and against a linear worst case."""
+
+import itertools
+
+import discretisation as audit
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxbl.gains.differentiation_bound import least_exact_error, least_worst_error
+from jaxbl.observer import DIFFERENTIATORS, ExplicitSuperTwisting, ImplicitSuperTwisting, Luenberger
+
+
+@pytest.fixture(autouse=True)
+def _double():
+    with jax.enable_x64(True):
+        yield
+
+
+def largest(kind, gains, noise, paths):
+    return float(jax.vmap(lambda x: audit.simulated(kind, gains, noise, x))(paths).max())
+
+
+@pytest.mark.parametrize(
+    ("kind", "gains"),
+    [(ImplicitSuperTwisting, (1.5, 1.1)), (ExplicitSuperTwisting, (1.5, 1.1)), (DIFFERENTIATORS[2], (1.0,))],
+)
+def test_the_search_finds_what_all_sequences_of_a_short_horizon_have(kind, gains):
+    noise, samples = 3.0, 5
+    d = list(itertools.product([-1.0, 1.0], repeat=samples - 1))
+    # the sets are symmetric
+    eta = [(1.0, *rest) for rest in itertools.product([-1.0, 0.0, 1.0], repeat=samples - 1)]
+    every = jnp.asarray([[(*a, 0.0), b] for a in d for b in eta])
+    expected = max(largest(kind, gains, noise, every[..., -k:]) for k in (samples - 1, samples))
+    path = audit.searched(kind, gains, noise, samples)
+    assert np.abs(path).max() <= 1.0
+    assert float(audit.simulated(kind, gains, noise, jnp.asarray(path))) >= 0.999 * expected
+
+
+def test_the_path_is_the_error_of_the_search():
+    """Reached errors, of which true motion is taken away, are those of a simulation with it."""
+    for kind, gains in ((ImplicitSuperTwisting, (1.5, 1.1)), (DIFFERENTIATORS[3], (1.0,))):
+        found = np.asarray(audit.reached(kind, gains, 2.0, 40, 32, 5, 100)[0]).max()
+        path = audit.searched(kind, gains, 2.0, 40, width=32, cells=100)
+        assert float(audit.simulated(kind, gains, 2.0, jnp.asarray(path))) == pytest.approx(found, rel=1e-9)
+
+
+def test_pairs_make_super_twisting_err_by_the_bounds():
+    noise, gains = 10.0, (1.8 * 1.1**0.5, 1.1)
+    samples = audit.horizon(noise)
+    plain, exact = (float(audit.simulated(ImplicitSuperTwisting, gains, noise, x)) for x in audit.pairs(noise, samples))
+    assert plain == pytest.approx(least_worst_error(noise, 1.0, 1.0), rel=1e-6)
+    assert exact == pytest.approx(least_exact_error(noise, 1.0, 1.0), rel=1e-6)
+
+
+def test_a_linear_observer_has_its_worst_case_in_closed_form():
+    kind, gains, noise, samples = Luenberger, (0.4, 0.7), 3.0, 60
+    found = float(audit.worst_linear(kind, gains, noise, samples))
+    sensitivity = jax.grad(lambda x: audit.error(kind(*gains), noise, x))(jnp.zeros((2, samples)))
+    assert found == pytest.approx(float(audit.simulated(kind, gains, noise, jnp.sign(sensitivity))), rel=1e-9)
+    random = np.random.default_rng(0).choice([-1.0, 1.0], (500, 2, samples))
+    assert largest(kind, gains, noise, jnp.asarray(random)) < found
+
+
+@pytest.mark.parametrize("order", range(1, 6))
+def test_schemes_without_noise(order):
+    """Only exact outputs have neither bias nor chatter; backward Euler's own states lag by half a period of f''."""
+    h, lipschitz = 0.02, 2.0 ** (order + 1)
+    t = h * np.arange(1500)
+    unit = h**order * lipschitz
+    bias, rest = {}, {}
+    for name, scheme in audit.SCHEMES.items():
+        y = 0.5 * t**2 if order >= 2 else t
+        start = [0.0, 0.0 if order >= 2 else 1.0, 1.0, *[0.0] * 3][: order + 1]
+        velocity = t if order >= 2 else 0.0 * t + 1.0
+        found = audit.late_velocity(scheme, order, lipschitz, h, y, start)
+        bias[name] = np.abs(found - velocity[-found.size :]).max()
+        still = audit.late_velocity(scheme, order, lipschitz, h, 0.0 * t, [1e-3, *[0.0] * order])
+        rest[name] = np.abs(np.diff(still)).max()
+    rounding = 2**order * np.finfo(float).eps * 450.0 / h
+    first, alone, own, exact = audit.SCHEMES
+    assert bias[exact] <= 4.0 * rounding
+    assert rest[exact] <= 1e-12 * unit
+    assert bias[own] == pytest.approx(0.5 * h if order >= 2 else 0.0, abs=4.0 * rounding)
+    assert rest[own] <= 1e-12 * unit
+    assert min(rest[first], rest[alone]) > 0.1 * unit
