@@ -10,8 +10,10 @@ from jaxbl.terminal import working
 from .options import ConfigArgument, folder_of
 from .outcome import Outcome
 
-_TARGETS = "c: C99, one source file and one header; st: structured text (IEC 61131-3); mjcf: a MuJoCo model of the drive; fmu: the drive "
-_TARGETS += "for co-simulation"
+_TARGETS = (
+    "c: C99, one source file and one header; st: structured text (IEC 61131-3); mjcf: a MuJoCo model of the drive; "
+    "fmu: the drive for co-simulation"
+)
 
 
 def export(
@@ -31,7 +33,9 @@ def export(
     ] = None,
     linear: Annotated[
         list[str] | None,
-        typer.Option(metavar="SIDE", help="of a MuJoCo model: motor or load, a side that moves along a line; may be given twice"),
+        typer.Option(
+            metavar="SIDE", help="of a MuJoCo model: motor or load, a side that moves along a line; may be given twice"
+        ),
     ] = None,
     fmi: Annotated[
         int | None, typer.Option(metavar="2|3", help="version of an FMU [default: 3]", show_default=False)

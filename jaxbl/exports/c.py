@@ -122,9 +122,7 @@ class _C(Writer):
         self.line()
         self._function(step, 1, program.step, block.inputs, program.state_variables)
 
-    def _function(
-        self, head: str, which: int, routine: Routine, given: Sequence[Quantity], old: Sequence[Variable]
-    ) -> None:
+    def _function(self, head: str, which: int, routine: Routine, given: Sequence[Quantity], old: Sequence[Variable]) -> None:
         """One of the two; `old` are variables for the state that it finds."""
         program, block = self.program, self.program.block
         self.line(head)

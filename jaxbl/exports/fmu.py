@@ -274,9 +274,13 @@ def _description(
 def _variable(parent: ET.Element, reference: int, one: Scalar, fmi: int) -> None:
     about = {"name": one.name, "valueReference": str(reference), "causality": one.causality, "variability": one.variability}
     if one.causality != "independent":
-        about |= {"initial": "calculated"} if one.start is None else {"initial": "exact"} if one.causality == "parameter" else {}
+        about |= (
+            {"initial": "calculated"} if one.start is None else {"initial": "exact"} if one.causality == "parameter" else {}
+        )
     number = {"unit": unit_name(one.unit)} if one.unit else {}
-    number |= {key: _n(value) for key, value in (("min", one.least), ("max", one.most), ("start", one.start)) if value is not None}
+    number |= {
+        key: _n(value) for key, value in (("min", one.least), ("max", one.most), ("start", one.start)) if value is not None
+    }
     text = {"description": one.about} if one.about else {}
     if fmi == 3:
         ET.SubElement(parent, "Float64", about | text | number)
@@ -321,9 +325,7 @@ def _model(plant: PlantProgram, variables: Sequence[Scalar], token: str, period:
         places = (place[_structured(plant.parameters.get(one.name, one.name))] for one in quantities)
         return [f"{single}model->values[{i}]" for i in places]
 
-    outputs = [
-        f"    model->values[{place[plant.outputs[one.name]]}] = {double}outputs.{one.name};" for one in block.outputs
-    ]
+    outputs = [f"    model->values[{place[plant.outputs[one.name]]}] = {double}outputs.{one.name};" for one in block.outputs]
     lines = [
         "/*",
         f" * Variables of {name} by value reference, and the calls of its code with them.",
@@ -341,6 +343,9 @@ def _model(plant: PlantProgram, variables: Sequence[Scalar], token: str, period:
         "#define MODEL_TIME 0u",
         f"#define MODEL_VARIABLES {len(variables)}u",
         "",
+        "/* An end of a range that has none. */",
+        "#define ANY ((double)INFINITY)",
+        "",
         "/* When a variable may be set. */",
         "enum",
         "{",
@@ -351,7 +356,7 @@ def _model(plant: PlantProgram, variables: Sequence[Scalar], token: str, period:
         "",
         "typedef struct",
         "{",
-        "    const char *name;",
+        f"    char name[{max(len(one.name) for one in variables) + 1}];",
         "    int change;",
         "    double start;",
         "    double least;",
@@ -400,5 +405,5 @@ def _wrapped(arguments: Sequence[str]) -> str:
 
 
 def _limit(value: float | None, sign: str) -> str:
-    """An end of a range: INFINITY is a float, whose double is exact."""
-    return f"{sign}(double)INFINITY" if value is None else _n(value)
+    """An end of a range."""
+    return f"{sign}ANY" if value is None else _n(value)

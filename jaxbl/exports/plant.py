@@ -85,7 +85,7 @@ def _identifier(path: str) -> str:
 
 
 def _traced(
-    experiment: Experiment, name: str, dtype: np.dtype, first: Mapping[str, Parameter], later: Mapping[str, Parameter]
+    experiment: Experiment, name: str, dtype: np.dtype, first: dict[str, Parameter], later: dict[str, Parameter]
 ) -> Program:
     """The program whose start is given some numbers by config path, and whose step others."""
     numbers = {path: _identifier(path) for path in (first | later)}

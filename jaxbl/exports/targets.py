@@ -257,7 +257,7 @@ def _precision(program: Program) -> str:
 
 def _about(request: Request, program: Program, call: list[str]) -> list[str]:
     """Lines for the beginning of a file."""
-    config, sides = request.config, [one.name.removesuffix("_position") for one in program.block.first]
+    sides = [one.name.removesuffix("_position") for one in program.block.first]
     parts = f"{'observers' if len(sides) > 1 else 'observer'} of {' and '.join(sides)}, equivalent control"
     identifier = ", identifier" if any(one.name.endswith("_identified") for one in program.block.outputs) else ""
     return _head(request, f"{request.name}: {parts}{identifier}, from sample to sample.", call)

@@ -358,6 +358,55 @@ FMI_EXPORT int NAME(fmi3GetOutputDerivatives)(void *instance, const uint32_t ref
     return absent(instance, count, "derivatives of outputs");
 }
 
+/* Functions of the other kinds of FMUs: tools may look them up. */
+#define OTHER_KIND(name, ...)                                                                                              \
+    FMI_EXPORT int NAME(fmi3##name)(void *instance, __VA_ARGS__)                                                           \
+    {                                                                                                                      \
+        (void)first;                                                                                                       \
+        (void)second;                                                                                                      \
+        return absent(instance, 1u, "model exchange and no scheduled execution");                                          \
+    }
+
+OTHER_KIND(SetContinuousStates, const double first[], size_t second)
+OTHER_KIND(GetContinuousStateDerivatives, double first[], size_t second)
+OTHER_KIND(GetEventIndicators, double first[], size_t second)
+OTHER_KIND(GetContinuousStates, double first[], size_t second)
+OTHER_KIND(GetNominalsOfContinuousStates, double first[], size_t second)
+OTHER_KIND(ActivateModelPartition, uint32_t first, double second)
+
+FMI_EXPORT int NAME(fmi3EnterContinuousTimeMode)(void *instance)
+{
+    return absent(instance, 1u, "model exchange");
+}
+
+FMI_EXPORT int NAME(fmi3CompletedIntegratorStep)(void *instance, bool no_earlier_state, bool *event, bool *terminate)
+{
+    (void)no_earlier_state;
+    (void)event;
+    (void)terminate;
+    return absent(instance, 1u, "model exchange");
+}
+
+FMI_EXPORT int NAME(fmi3SetTime)(void *instance, double time)
+{
+    (void)time;
+    return absent(instance, 1u, "model exchange");
+}
+
+FMI_EXPORT int NAME(fmi3GetNumberOfEventIndicators)(void *instance, size_t *count)
+{
+    (void)instance;
+    *count = 0u;
+    return (int)OK;
+}
+
+FMI_EXPORT int NAME(fmi3GetNumberOfContinuousStates)(void *instance, size_t *count)
+{
+    (void)instance;
+    *count = 0u;
+    return (int)OK;
+}
+
 FMI_EXPORT int NAME(fmi3DoStep)(void *instance, double time, double length, bool no_earlier_state, bool *event,
                                 bool *terminate, bool *early, double *reached)
 {
