@@ -93,7 +93,8 @@ def _traced(
     begins, steps = (
         [Quantity(numbers[path], one.unit, one.doc, dtype) for path, one in some.items()] for some in (first, later)
     )
-    torque = Quantity(_INPUT, "N m", "input torque, held from this sample to the next", dtype)
+    unit = experiment.plant.input_unit
+    torque = Quantity(_INPUT, unit, f"input{' torque' * (unit == 'N m')}, held from this sample to the next", dtype)
 
     def own(known: dict[str, Any], given: dict[str, Any]) -> Experiment:
         return set_leaves(experiment, known | {path: given[one] for path, one in numbers.items() if one in given})

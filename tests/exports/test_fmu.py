@@ -47,13 +47,14 @@ def study(*places, base=small, **tables):
     return base({"run.duration": 1.5, "run.substeps": 4}, **given | tables)
 
 
+ALL = "all effects"
 STUDIES = {
     "rigid": study(base=rigid),
     "rigid with effects": study("motor.", "actuator.", "encoder.", base=rigid),
     "shaft": study(transmission={"law": "linear_shaft", "stiffness": 1.0}),
     "gap": study(transmission=GAP, initial=MOVED),
     **{f"effects of {place}": study(place) for place in ("motor.", "load.", "transmission.", "actuator.", "encoder.")},
-    "all effects": study("", initial=MOVED),
+    ALL: study("", initial=MOVED),
 }
 
 
@@ -158,8 +159,9 @@ class Instance:
 
 
 @COMPILED
-@pytest.mark.slow
-@pytest.mark.parametrize("data", STUDIES.values(), ids=list(STUDIES))
+@pytest.mark.parametrize(
+    "data", [pytest.param(data, id=name, marks=[pytest.mark.slow] * (name == ALL)) for name, data in STUDIES.items()]
+)
 def test_the_free_run_is_that_of_the_simulation(tmp_path, data):
     trace = jaxbl.run(data).trace
     for fmi in (3, 2) if data["effects"] == [] or len(data["effects"]) > 30 else (3,):
@@ -375,19 +377,20 @@ def test_the_sources_compile_without_a_warning_or_a_global_number(tmp_path, comp
     assert not {*found} & {*"dDbBC"}
 
 
-@pytest.mark.slow
-def test_the_build_description_is_enough_to_compile_it(tmp_path, monkeypatch):
-    """By FMPy, with CMake and headers of its own: then the FMU runs."""
-    build = pytest.importorskip("fmpy.util", reason="compiles FMUs by FMPy (pip install fmpy)")
-    if shutil.which("cmake") is None:
-        pytest.skip("compiles FMUs by cmake (Debian: apt-get install cmake)")
+@VERSIONS
+@needs("cc", "cmake")
+def test_another_tool_compiles_the_sources_from_what_the_fmu_says_of_them(tmp_path, monkeypatch, fmi):
+    """FMPy by CMake, which reads which files these are."""
+    build = pytest.importorskip("fmpy.build", reason="compiles FMUs by FMPy (pip install fmpy)")
     data = study(transmission=GAP)
-    trace = jaxbl.run(data).trace
     with monkeypatch.context() as without:
         without.setattr("jaxbl.exports.fmu.shutil.which", lambda name: None)
-        path, summary = written(data, tmp_path)
-    build.compile_platform_binary(path)
-    assert agrees(free_run(path, summary, trace), trace)
+        path, summary = written(data, tmp_path, fmi)
+    folder = fmpy.extract(path, tmp_path / "there")
+    (tmp_path / "build").mkdir()
+    build.build_platform_binary(folder, tmp_path / "build")
+    trace = jaxbl.run(data).trace
+    assert agrees(free_run(folder, summary, trace), trace)
 
 
 def test_the_same_study_gives_the_same_bytes_and_another_one_another_token(tmp_path):
@@ -399,6 +402,12 @@ def test_the_same_study_gives_the_same_bytes_and_another_one_another_token(tmp_p
     assert files[0] == files[1] != files[2]
     assert tokens[0] == tokens[1] != tokens[2]
     assert tokens[0].startswith(jaxbl.run(study()).summary["single_run"])
+
+
+def test_a_motor_fed_by_voltage_has_an_input_in_volts(tmp_path):
+    path, _ = written(study("actuator."), tmp_path)
+    units = {one.name: one.unit for one in fmpy.read_model_description(path).modelVariables}
+    assert (units["u"], units["torque"]) == ("V", "N.m")
 
 
 def test_two_effects_of_one_kind_have_names_of_their_own(tmp_path):

@@ -241,14 +241,15 @@ static int do_step(Instance *one, double time, double length)
     const double now = state->start + ((double)state->samples * MODEL_PERIOD);
     /* the end is what the environment can say exactly: a step is a difference of rounded times */
     const double slack = (STEP_OFF * MODEL_PERIOD) + (4.0 * DBL_EPSILON * (fabs(time) + fabs(length)));
-    const double samples = floor((length / MODEL_PERIOD) + 0.5);
+    const double ratio = length / MODEL_PERIOD;
+    const int64_t samples = ((ratio > 0.0) && (ratio < MOST_SAMPLES)) ? (int64_t)(ratio + 0.5) : 0;
     int64_t left;
     size_t i;
     if (state->phase != (int32_t)STEPPING)
     {
         return failed(one, "a step needs an initialized instance");
     }
-    if (!(samples >= 1.0) || !(samples <= MOST_SAMPLES) || !(fabs(length - (samples * MODEL_PERIOD)) <= slack))
+    if ((samples < 1) || !(fabs(length - ((double)samples * MODEL_PERIOD)) <= slack))
     {
         return failed(one, "the communication step size %.17g s should be a multiple of the sample period %.17g s", length,
                       MODEL_PERIOD);
@@ -257,7 +258,7 @@ static int do_step(Instance *one, double time, double length)
     {
         return failed(one, "a step from %.17g s, but the instance is at %.17g s", time, now);
     }
-    for (left = (int64_t)samples; left > 0; left--)
+    for (left = samples; left > 0; left--)
     {
         model_sample(&state->model);
         state->samples++;
