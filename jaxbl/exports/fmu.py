@@ -255,7 +255,9 @@ def _description(
     ET.SubElement(root, "DefaultExperiment", startTime="0", stopTime=_n(run.duration), stepSize=period)
     places = ET.SubElement(root, "ModelVariables")
     structure = ET.SubElement(root, "ModelStructure")
-    for i, one in enumerate(variables):
+    # FMI 2 does not need the time, and the FMI Library misses a start value of it
+    declared = [(i, one) for i, one in enumerate(variables) if fmi == 3 or one.causality != "independent"]
+    for i, one in declared:
         _variable(places, i, one, fmi)
     outputs = [i for i, one in enumerate(variables) if one.causality == "output"]
     if fmi == 3:
@@ -266,8 +268,9 @@ def _description(
     else:
         for group, more in (("Outputs", {"dependencies": ""}), ("InitialUnknowns", {})):
             parent = ET.SubElement(structure, group)
-            for i in outputs:
-                ET.SubElement(parent, "Unknown", {"index": str(i + 1)} | more)
+            for place, (i, _) in enumerate(declared, 1):
+                if i in outputs:
+                    ET.SubElement(parent, "Unknown", {"index": str(place)} | more)
     return _xml(root)
 
 

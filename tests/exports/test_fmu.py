@@ -124,6 +124,10 @@ class Instance:
     def outputs(self):
         return self.get(*(one.name for one in self.about.modelVariables if one.causality == "output"))
 
+    def time(self):
+        last_successful = 2
+        return self.unit.getRealStatus(last_successful) if self.two else self.get("time")[0]
+
     def step(self, time, length):
         self.unit.doStep(currentCommunicationPoint=time, communicationStepSize=length)
 
@@ -284,14 +288,15 @@ def test_steps_are_multiples_of_the_sample_period(tmp_path, fmi):
     # of several instances of FMI 2, FMPy gives the log to the last one
     with Instance(path) as two, Instance(path) as one:
         one.begin(10.0), two.begin()
-        assert one.get("motor.position", "load.velocity", "z", "time") == [0.3, 0.4, 0.3 - 5.0 * 0.02, 10.0]
+        assert one.get("motor.position", "load.velocity", "z") == [0.3, 0.4, 0.3 - 5.0 * 0.02]
+        assert one.time() == 10.0
         one.set(u=1.5), two.set(u=1.5)
         # as sums of decimal numbers give it
         one.step(10.0, 0.1 + 0.2 - 0.29)
         for i in range(10):
             two.step(i * 1e-3, 1e-3)
         assert one.outputs() == two.outputs()
-        assert one.get("time") == [10.01]
+        assert one.time() == 10.01
         before = one.outputs()
         for time, length, message in (
             (10.01, 1.5e-3, "the communication step size 0.0015 s should be a multiple of the sample period 0.001 s"),
@@ -325,7 +330,7 @@ def test_what_is_refused_has_a_line_in_the_log(tmp_path, fmi):
             one.step(0.0, 1e-3)
         assert one.said[-1] == "a step needs an initialized instance"
         one.begin()
-        for name in ("initial__motor_position", "motor__position", "time"):
+        for name in ("initial__motor_position", "motor__position", *(() if one.two else ("time",))):
             with pytest.raises(FMICallException):
                 one.set(**{name: 1.0})
             assert one.said[-1].startswith(f"{name.replace('__', '.')} cannot be set")
