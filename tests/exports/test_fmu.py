@@ -20,7 +20,7 @@ from jaxbl.errors import InputError
 from jaxbl.exports.fmu import base_unit, unit_name
 from jaxbl.exports.plant import plant_program
 
-fmpy = pytest.importorskip("fmpy", reason="runs FMUs by FMPy (pip install fmpy)")
+fmpy = pytest.importorskip("fmpy", reason="runs FMUs by FMPy (pip install 'jaxbl[fmu]')")
 from fmpy.fmi1 import FMICallException  # noqa: E402
 from fmpy.validation import validate_fmu  # noqa: E402
 
@@ -386,7 +386,7 @@ def test_the_sources_compile_without_a_warning_or_a_global_number(tmp_path, comp
 @needs("cc", "cmake")
 def test_another_tool_compiles_the_sources_from_what_the_fmu_says_of_them(tmp_path, monkeypatch, fmi):
     """FMPy by CMake, which reads which files these are."""
-    build = pytest.importorskip("fmpy.build", reason="compiles FMUs by FMPy (pip install fmpy)")
+    build = pytest.importorskip("fmpy.build", reason="compiles FMUs by FMPy (pip install 'jaxbl[fmu]')")
     data = study(transmission=GAP)
     with monkeypatch.context() as without:
         without.setattr("jaxbl.exports.fmu.shutil.which", lambda name: None)
