@@ -10,6 +10,7 @@ import numpy as np
 from jaxbl.config import Config
 from jaxbl.drive.parameters import Parameter, as_arrays, get_leaf, leaf_paths, set_leaves
 from jaxbl.drive.plant import PlantState
+from jaxbl.fused import Unsupported
 from jaxbl.simulate import Experiment, move
 
 from .block import Program, Quantity, program_of, traced_block
@@ -89,7 +90,8 @@ def _traced(
 ) -> Program:
     """The program whose start is given some numbers by config path, and whose step others."""
     numbers = {path: _identifier(path) for path in (first | later)}
-    assert len(set(numbers.values())) == len(numbers), "two paths with one name"
+    if len(set(numbers.values())) < len(numbers):
+        raise Unsupported("two numbers that have one name in code")
     begins, steps = (
         [Quantity(numbers[path], one.unit, one.doc, dtype) for path, one in some.items()] for some in (first, later)
     )
