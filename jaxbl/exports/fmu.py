@@ -39,8 +39,8 @@ _LONGEST_COMPILATION = 300.0
 
 
 class Scalar(NamedTuple):
-    """A variable of the model: name, place in the order of all (its value reference), causality, variability, unit,
-    description, start value (None: computed) and range."""
+    """A variable of the model: name, causality, variability, unit, description, start value (None: computed) and range, of
+    which `above` is the lower end where that is excluded."""
 
     name: str
     causality: str
@@ -53,8 +53,8 @@ class Scalar(NamedTuple):
     most: float | None = None
 
 
-class Unit(NamedTuple):
-    """An archive, and what it has.
+class Archive(NamedTuple):
+    """An FMU.
 
     Attributes:
         content: of the file.
@@ -71,7 +71,7 @@ class Unit(NamedTuple):
     why: str
 
 
-def fmu(config: Config, plant: PlantProgram, about: Sequence[str], fmi: int) -> Unit:
+def fmu(config: Config, plant: PlantProgram, about: Sequence[str], fmi: int) -> Archive:
     """The archive of a drive.
 
     Args:
@@ -89,10 +89,11 @@ def fmu(config: Config, plant: PlantProgram, about: Sequence[str], fmi: int) -> 
     sources = {
         f"{name}.c": code.source,
         f"{name}.h": code.header,
-        "model.h": _model(plant, variables, token, config.run.sample_period),
-        "instance.h": (here / "instance.h").read_text(encoding="utf-8"),
-        f"fmi{fmi}.c": (here / f"fmi{fmi}.c").read_text(encoding="utf-8"),
+        "fmi-model.h": _model(plant, variables, token, config.run.sample_period),
     }
+    # a name has no hyphen: these files have their own
+    for file in ("fmi-instance.h", f"fmi-{fmi}.c"):
+        sources[file] = (here / file).read_text(encoding="utf-8")
     compiled = [one for one in sources if one.endswith(".c")]
     files: dict[str, str | bytes] = {"modelDescription.xml": _description(config, plant, variables, token, fmi, compiled)}
     if fmi == 3:
@@ -103,7 +104,7 @@ def fmu(config: Config, plant: PlantProgram, about: Sequence[str], fmi: int) -> 
         binary, why = _binary(name, ending, sources)
         if binary:
             files[f"binaries/{place}/{name}.{ending}"] = binary
-    return Unit(_archive(files), variables, token, place if not why else "", why)
+    return Archive(_archive(files), variables, token, place if not why else "", why)
 
 
 def _archive(files: Mapping[str, str | bytes]) -> bytes:
@@ -311,7 +312,7 @@ def _n(value: float) -> str:
 
 
 def _model(plant: PlantProgram, variables: Sequence[Scalar], token: str, period: float) -> str:
-    """`model.h`: variables by value reference, and calls of the code with them."""
+    """`fmi-model.h`: variables by value reference, and calls of the code with them."""
     block = plant.program.block
     name, real = block.name, c_type(block.dtype)
     double = "" if real == "double" else "(double)"
@@ -334,8 +335,8 @@ def _model(plant: PlantProgram, variables: Sequence[Scalar], token: str, period:
         f" * Variables of {name} by value reference, and the calls of its code with them.",
         " */",
         "",
-        "#ifndef MODEL_H",
-        "#define MODEL_H",
+        "#ifndef FMI_MODEL_HEADER",
+        "#define FMI_MODEL_HEADER",
         "",
         "#include <math.h>",
         "",
@@ -377,7 +378,7 @@ def _model(plant: PlantProgram, variables: Sequence[Scalar], token: str, period:
         "    double values[MODEL_VARIABLES];",
         "} Model;",
         "",
-        f"static void model_outputs(Model *model, const {name}_outputs outputs)",
+        f"static void model_found(Model *model, const {name}_outputs outputs)",
         "{",
         *outputs,
         "}",
@@ -386,17 +387,17 @@ def _model(plant: PlantProgram, variables: Sequence[Scalar], token: str, period:
         "{",
         f"    {name}_outputs outputs;",
         f"    {name}_init({_wrapped(['&model->state', *given(block.first), '&outputs'])});",
-        "    model_outputs(model, outputs);",
+        "    model_found(model, outputs);",
         "}",
         "",
         "static void model_sample(Model *model)",
         "{",
         f"    {name}_outputs outputs;",
         f"    {name}_step({_wrapped(['&model->state', *given(block.inputs), '&outputs'])});",
-        "    model_outputs(model, outputs);",
+        "    model_found(model, outputs);",
         "}",
         "",
-        "#endif /* MODEL_H */",
+        "#endif /* FMI_MODEL_HEADER */",
     ]
     return plain_text("\n".join(lines) + "\n")
 

@@ -352,7 +352,7 @@ def test_without_a_compiler_it_holds_the_sources_alone(tmp_path, monkeypatch):
     ]
     assert made.summary["binary"] is None
     names = zipfile.ZipFile(tmp_path / "axis.fmu").namelist()
-    assert {"modelDescription.xml", "sources/buildDescription.xml", "sources/axis.c", "sources/fmi3.c"} <= {*names}
+    assert {"modelDescription.xml", "sources/buildDescription.xml", "sources/axis.c", "sources/fmi-3.c"} <= {*names}
     assert not [one for one in names if one.startswith("binaries")]
     assert validate_fmu(str(tmp_path / "axis.fmu")) == []
 
@@ -421,6 +421,17 @@ def test_two_effects_of_one_kind_have_names_of_their_own(tmp_path):
     names = [one["name"] for one in summary["variables"] if one["name"].startswith("effects")]
     assert names[::3] == ["effects[0].amplitude", "effects[1].amplitude"]
     assert validate_fmu(path) == []
+
+
+@COMPILED
+@pytest.mark.parametrize(
+    "name", ["model", "fmi_model", "fmi_instance", "fmi3", "set", "taken", "free", "u", "state", "variables", "z"]
+)
+def test_any_name_that_is_allowed_compiles(tmp_path, name):
+    path, summary = written(study(transmission=GAP), tmp_path, name=name)
+    assert summary["binary"]
+    with Instance(path) as one:
+        assert np.isfinite(one.begin().run([1.0] * 3)).all()
 
 
 @pytest.mark.parametrize(

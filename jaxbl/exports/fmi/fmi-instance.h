@@ -2,8 +2,8 @@
  * One instance of the model, and what both versions of FMI do with it. Nothing is shared between instances.
  */
 
-#ifndef INSTANCE_H
-#define INSTANCE_H
+#ifndef FMI_INSTANCE_HEADER
+#define FMI_INSTANCE_HEADER
 
 #include <float.h>
 #include <math.h>
@@ -15,7 +15,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "model.h"
+#include "fmi-model.h"
 
 #if defined _WIN32
 #define FMI_EXPORT __declspec(dllexport)
@@ -276,7 +276,7 @@ static int do_step(Instance *one, double time, double length)
 }
 
 /* States of an instance: copies, in a place of the environment's or a new one. */
-static int get_state(const Instance *one, void **place)
+static int kept(const Instance *one, void **place)
 {
     if (*place == NULL)
     {
@@ -290,7 +290,7 @@ static int get_state(const Instance *one, void **place)
     return (int)OK;
 }
 
-static int set_state(Instance *one, const void *place)
+static int taken_back(Instance *one, const void *place)
 {
     if (place == NULL)
     {
@@ -300,7 +300,7 @@ static int set_state(Instance *one, const void *place)
     return (int)OK;
 }
 
-static int free_state(void **place)
+static int forgotten(void **place)
 {
     if (place != NULL)
     {
@@ -319,7 +319,7 @@ static Head head(void)
     return made;
 }
 
-static size_t bytes_of_state(void)
+static size_t bytes_needed(void)
 {
     return sizeof(Head) + sizeof(State);
 }
@@ -327,9 +327,9 @@ static size_t bytes_of_state(void)
 static int serialise(const Instance *one, const void *place, unsigned char bytes[], size_t size)
 {
     const Head first = head();
-    if ((place == NULL) || (size < bytes_of_state()))
+    if ((place == NULL) || (size < bytes_needed()))
     {
-        return failed(one, "a state needs %zu bytes, not %zu", bytes_of_state(), size);
+        return failed(one, "a state needs %zu bytes, not %zu", bytes_needed(), size);
     }
     memcpy(bytes, &first, sizeof(Head));
     memcpy(&bytes[sizeof(Head)], place, sizeof(State));
@@ -339,7 +339,7 @@ static int serialise(const Instance *one, const void *place, unsigned char bytes
 static int deserialise(const Instance *one, const unsigned char bytes[], size_t size, void **place)
 {
     const Head first = head();
-    if ((size < bytes_of_state()) || (memcmp(bytes, &first, sizeof(Head)) != 0))
+    if ((size < bytes_needed()) || (memcmp(bytes, &first, sizeof(Head)) != 0))
     {
         return failed(one, "these %zu bytes are no state of this model", size);
     }
@@ -355,4 +355,4 @@ static int deserialise(const Instance *one, const unsigned char bytes[], size_t 
     return (int)OK;
 }
 
-#endif /* INSTANCE_H */
+#endif /* FMI_INSTANCE_HEADER */

@@ -3,7 +3,7 @@
  * own: no other header is needed. Where many are linked into one program, define FMI3_FUNCTION_PREFIX.
  */
 
-#include "instance.h"
+#include "fmi-instance.h"
 
 #if defined FMI3_FUNCTION_PREFIX && !defined FMI3_OVERRIDE_FUNCTION_PREFIX
 #define PASTED(prefix, name) prefix##name
@@ -280,25 +280,25 @@ FMI_EXPORT int NAME(fmi3GetVariableDependencies)(void *instance, uint32_t depend
 
 FMI_EXPORT int NAME(fmi3GetFMUState)(void *instance, void **place)
 {
-    return get_state((const Instance *)instance, place);
+    return kept((const Instance *)instance, place);
 }
 
 FMI_EXPORT int NAME(fmi3SetFMUState)(void *instance, void *place)
 {
-    return set_state((Instance *)instance, place);
+    return taken_back((Instance *)instance, place);
 }
 
 FMI_EXPORT int NAME(fmi3FreeFMUState)(void *instance, void **place)
 {
     (void)instance;
-    return free_state(place);
+    return forgotten(place);
 }
 
 FMI_EXPORT int NAME(fmi3SerializedFMUStateSize)(void *instance, void *place, size_t *size)
 {
     (void)instance;
     (void)place;
-    *size = bytes_of_state();
+    *size = bytes_needed();
     return (int)OK;
 }
 

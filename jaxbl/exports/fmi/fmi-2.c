@@ -3,7 +3,7 @@
  * own: no other header is needed. Where many are linked into one program, define FMI2_FUNCTION_PREFIX.
  */
 
-#include "instance.h"
+#include "fmi-instance.h"
 
 #if defined FMI2_FUNCTION_PREFIX && !defined FMI2_OVERRIDE_FUNCTION_PREFIX
 #define PASTED(prefix, name) prefix##name
@@ -165,25 +165,25 @@ OF_TYPE(String, String)
 
 FMI_EXPORT int NAME(fmi2GetFMUstate)(void *instance, void **place)
 {
-    return get_state((const Instance *)instance, place);
+    return kept((const Instance *)instance, place);
 }
 
 FMI_EXPORT int NAME(fmi2SetFMUstate)(void *instance, void *place)
 {
-    return set_state((Instance *)instance, place);
+    return taken_back((Instance *)instance, place);
 }
 
 FMI_EXPORT int NAME(fmi2FreeFMUstate)(void *instance, void **place)
 {
     (void)instance;
-    return free_state(place);
+    return forgotten(place);
 }
 
 FMI_EXPORT int NAME(fmi2SerializedFMUstateSize)(void *instance, void *place, size_t *size)
 {
     (void)instance;
     (void)place;
-    *size = bytes_of_state();
+    *size = bytes_needed();
     return (int)OK;
 }
 
