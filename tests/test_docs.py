@@ -181,7 +181,7 @@ INSTEAD = {
 }
 
 
-EXTRAS = {"cluster.md": "distributed", "mujoco.md": "mujoco"}
+EXTRAS = {"cluster.md": "distributed", "fmu.md": "fmu", "mujoco.md": "mujoco"}
 """What pages say that it has to be installed."""
 
 

@@ -10,7 +10,10 @@ from jaxbl.terminal import working
 from .options import ConfigArgument, folder_of
 from .outcome import Outcome
 
-_TARGETS = "c: C99, one source file and one header; st: structured text (IEC 61131-3); mjcf: a MuJoCo model of the drive"
+_TARGETS = (
+    "c: C99, one source file and one header; st: structured text (IEC 61131-3); mjcf: a MuJoCo model of the drive; "
+    "fmu: the drive for co-simulation"
+)
 
 
 def export(
@@ -30,7 +33,12 @@ def export(
     ] = None,
     linear: Annotated[
         list[str] | None,
-        typer.Option(metavar="SIDE", help="of a model: motor or load, a side that moves along a line; may be given twice"),
+        typer.Option(
+            metavar="SIDE", help="of a MuJoCo model: motor or load, a side that moves along a line; may be given twice"
+        ),
+    ] = None,
+    fmi: Annotated[
+        int | None, typer.Option(metavar="2|3", help="version of an FMU [default: 3]", show_default=False)
     ] = None,
 ) -> Outcome:
     """Write a study's observers and identifier as code for a controller, or its drive as a model for a simulator."""
@@ -39,5 +47,5 @@ def export(
 
     folder = folder_of(config.with_name(f"{config.stem}_{target}.toml"), out)
     with working(context, "exporting"):
-        made = run_export(config, folder, target, precision=precision, name=name, linear=linear or ())
+        made = run_export(config, folder, target, precision=precision, name=name, linear=linear or (), fmi=fmi)
     return Outcome(made.lines, made.folder, "", "export.json")

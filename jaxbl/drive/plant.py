@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .effects import AbstractEffect, EncoderEffect, Motion
+from .effects import AbstractEffect, ActuatorEffect, EncoderEffect, Motion
 from .parameters import Scalar, parameter
 from .transmission import AbstractTransmission
 
@@ -219,6 +219,11 @@ class Plant(eqx.Module):
         """Torque on the motor for one unit of the input, which may be a voltage: of a small one that has lasted."""
         states = tuple(effect.settled(_SMALL) for effect in self.effects)
         return self.actuate(states, _SMALL, _LONG)[1] / _SMALL
+
+    @property
+    def input_unit(self) -> str:
+        """Unit of the input."""
+        return next((one.input_unit for one in self.effects if isinstance(one, ActuatorEffect) and one.input_unit), "N m")
 
     @property
     def memory(self) -> bool:

@@ -38,8 +38,9 @@ class Block(NamedTuple):
         first: what `start` is given besides.
         state: what is carried from sample to sample.
         inputs, outputs: of each sample.
-        start: known numbers, first -> state.
+        start: known numbers, first -> state; outputs before the first step, too, where it is asked for these.
         step: known numbers, state, inputs -> state, outputs.
+        starts_with_outputs: whether it is.
     """
 
     name: str
@@ -51,12 +52,14 @@ class Block(NamedTuple):
     outputs: Sequence[Quantity]
     start: ClosedJaxpr
     step: ClosedJaxpr
+    starts_with_outputs: bool = False
 
 
 class Program(NamedTuple):
     """A block as operations, without states that nothing reads or that never change.
 
-    `start` gives the new state, `step` the new state, then the outputs. Variables have the names of their quantities.
+    `start` and `step` give the new state, then the outputs (of `start`: where it has any). Variables have the names of their
+    quantities.
     """
 
     block: Block
@@ -75,6 +78,7 @@ def traced_block(
     inputs: Sequence[Quantity],
     start: Callable[[dict[str, Any], dict[str, Any]], Any],
     step: Callable[[dict[str, Any], Any, dict[str, Any]], tuple[Any, dict[str, tuple[Any, str, str]]]],
+    outputs: Callable[[dict[str, Any], Any, dict[str, Any]], dict[str, Any]] | None = None,
 ) -> Block:
     """Trace the functions of a block.
 
@@ -82,6 +86,8 @@ def traced_block(
         name, dtype, known, first, inputs: as of :class:`Block`.
         start: from the numbers of the study by config path, and what it is given by name, to a pytree of scalars.
         step: the same with the state, to the new state and the outputs: value, unit and description by name.
+        outputs: values of the same outputs before the first step, where they are asked for: from what `start` is given, and
+            the state that it gives.
     """
     with with_x64(dtype):
         numbers = {path: jax.ShapeDtypeStruct((), dtype) for path in known}
@@ -92,8 +98,9 @@ def traced_block(
         said: dict[str, tuple[str, str]] = {}
 
         def flat_start(numbers: list[Any], begin: list[Any]) -> list[Any]:
-            found = start(dict(zip(known, numbers, strict=True)), _named(first, begin))
-            return jax.tree.leaves(found)
+            own, given = dict(zip(known, numbers, strict=True)), _named(first, begin)
+            found = start(own, given)
+            return [*jax.tree.leaves(found), *(outputs(own, found, given).values() if outputs else ())]
 
         def flat_step(numbers: list[Any], leaves: list[Any], sample: list[Any]) -> list[Any]:
             tree = jax.tree.structure(state).unflatten(leaves)
@@ -105,10 +112,10 @@ def traced_block(
         started = traced(flat_start, list(numbers.values()), list(begin.values()))
         stepped = traced(flat_step, list(numbers.values()), leaves, list(sample.values()))
     dtypes = [np.dtype(aval.dtype) for aval in stepped.out_avals]
-    outputs = [Quantity(name, *said[name], dtype) for name, dtype in zip(said, dtypes[len(leaves) :], strict=True)]
+    found = [Quantity(name, *said[name], dtype) for name, dtype in zip(said, dtypes[len(leaves) :], strict=True)]
     names = [_identifier(path) for path, _ in jax.tree_util.tree_flatten_with_path(state)[0]]
     carried = [Quantity(one, "", "", dtype) for one, dtype in zip(names, dtypes[: len(leaves)], strict=True)]
-    return Block(name, dtype, known, first, carried, inputs, outputs, started, stepped)
+    return Block(name, dtype, known, first, carried, inputs, found, started, stepped, outputs is not None)
 
 
 def _named(quantities: Sequence[Quantity], values: Sequence[Any]) -> dict[str, Any]:
@@ -127,7 +134,8 @@ def program_of(block: Block) -> Program:
     with with_x64(block.dtype):
         start = lowered(block.start, [*known, *_variables(block.first)])
         # a state that begins as a constant, and is that again after each step, is none, if all such are taken together
-        fixed = {i: one for i, one in enumerate(start.results) if isinstance(one, Constant)}
+        begin = start.results[: len(block.state)]
+        fixed = {i: one for i, one in enumerate(begin) if isinstance(one, Constant)}
         while True:
             state = _variables(block.state)
             given = [fixed.get(i, variable) for i, variable in enumerate(state)]
@@ -149,7 +157,7 @@ def program_of(block: Block) -> Program:
     return Program(
         block,
         tuple(block.state[i] for i in places),
-        without_unread(Routine(start.statements, tuple(start.results[i] for i in places))),
+        without_unread(Routine(start.statements, (*(start.results[i] for i in places), *start.results[count:]))),
         without_unread(wanted),
         tuple(state[i] for i in places),
     )

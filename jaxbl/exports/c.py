@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .block import Program, Quantity
-from .lowering import Constant, Operation, Value, constants_of
+from .lowering import Constant, Operation, Routine, Value, Variable, constants_of
 from .writer import Writer, plain_text, shortest, unread
 
 _TYPES = {
@@ -91,8 +91,9 @@ def signatures(program: Program) -> tuple[str, str]:
     block, name = program.block, program.block.name
     first = [f"{c_type(one.dtype)} {one.name}" for one in block.first]
     inputs = [f"{c_type(one.dtype)} {one.name}" for one in block.inputs]
-    start = ", ".join([f"{name}_state *state", *first])
-    step = ", ".join([f"{name}_state *state", *inputs, f"{name}_outputs *outputs"])
+    found = f"{name}_outputs *outputs"
+    start = ", ".join([f"{name}_state *state", *first, *([found] if block.starts_with_outputs else [])])
+    step = ", ".join([f"{name}_state *state", *inputs, found])
     return f"void {name}_init({start})", f"void {name}_step({step})"
 
 
@@ -117,42 +118,33 @@ class _C(Writer):
         """Write init and step."""
         program, block = self.program, self.program.block
         start, step = signatures(program)
-        self.line(start)
-        self.line("{")
-        self._depth += 1
-        self._own_constants(0)
-        if not program.state:
-            self.line("state->unused = 0;")
-        for name in unread(program.start, block.first):
-            self.line(f"(void){name};")
-        self.statements(program.start.statements)
-        for one, value in zip(program.state, program.start.results, strict=True):
-            self.line(f"state->{one.name} = {self.text(value)};")
-        self._depth -= 1
-        self.line("}")
+        self._function(start, 0, program.start, block.first, ())
         self.line()
-        self.line(step)
+        self._function(step, 1, program.step, block.inputs, program.state_variables)
+
+    def _function(self, head: str, which: int, routine: Routine, given: Sequence[Quantity], old: Sequence[Variable]) -> None:
+        """One of the two; `old` are variables for the state that it finds."""
+        program, block = self.program, self.program.block
+        self.line(head)
         self.line("{")
         self._depth += 1
-        self._own_constants(1)
+        self._own_constants(which)
         if not program.state:
-            self.line("(void)state;")
-        for name in unread(program.step, block.inputs):
+            self.line("(void)state;" if which else "state->unused = 0;")
+        for name in unread(routine, given):
             self.line(f"(void){name};")
-        for one, variable in zip(program.state, program.state_variables, strict=True):
+        for one, variable in zip(program.state, old, strict=which == 1):
             self.call(variable, f"old_{one.name}")
             self.define(variable, f"state->{one.name}")
         self.line()
         self._source = ""
-        self.statements(program.step.statements)
+        self.statements(routine.statements)
         self.line()
-        count = len(program.state)
-        places = [*(f"state->{one.name}" for one in program.state), *(f"outputs->{one.name}" for one in block.outputs)]
-        for place, value in zip(places, program.step.results, strict=True):
+        states = [f"state->{one.name}" for one in program.state]
+        outputs = [f"outputs->{one.name}" for one in block.outputs]
+        found = len(routine.results) - len(states)
+        for place, value in zip((*states, *outputs[:found]), routine.results, strict=True):
             self.line(f"{place} = {self.text(value)};")
-            count -= 1
-            if count == 0:
-                self.line()
         self._depth -= 1
         self.line("}")
 

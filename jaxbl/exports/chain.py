@@ -13,8 +13,9 @@ from jaxbl.simulate import LONGEST_BLOCK, Experiment, Run, Sample, State, end_of
 from .block import Block, Known, Quantity, traced_block
 from .lowering import with_x64
 
-_PERIOD = "run.sample_period"
-_LAST = np.iinfo(np.int32).max
+PERIOD = "run.sample_period"
+LAST = np.iinfo(np.int32).max
+"""Largest index of a sample."""
 
 
 class _Chain(NamedTuple):
@@ -45,7 +46,7 @@ def observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
     """
     with with_x64(dtype):
         experiment = as_arrays(config.build(), dtype)
-    known = _known(experiment)
+    known = known_numbers(experiment)
     sides = experiment.sides
     positions = [Quantity(f"{side}_position", "rad", f"measured position of the {side}", dtype) for side in sides]
     torque = Quantity("input", "N m", "input torque, held from this sample to the next", dtype)
@@ -78,16 +79,16 @@ def observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
         # sums lose nothing over some hundred samples
         full = state.unsettled >= LONGEST_BLOCK - 1
         settled = jax.lax.cond(full, lambda state: end_of_block(own, (state, ()))[0], lambda state: state, new)
-        samples = jnp.minimum(state.samples, _LAST - 1) + 1
+        samples = jnp.minimum(state.samples, LAST - 1) + 1
         return _chain(settled, samples, jnp.where(full, 0, state.unsettled + 1).astype(jnp.int32)), out
 
     return traced_block(name, dtype, known, positions, [torque, *positions], start, sample)
 
 
-def _known(experiment: Experiment) -> dict[str, Known]:
+def known_numbers(experiment: Experiment) -> dict[str, Known]:
     """Numbers of the study by config path; the sampling period is one, too."""
     about = leaf_paths(experiment)
-    about[_PERIOD] = next(one for field, one in parameters(Run) if field.name == "sample_period")
+    about[PERIOD] = next(one for field, one in parameters(Run) if field.name == "sample_period")
     return {path: Known(float(get_leaf(experiment, path)), one.unit, one.doc) for path, one in about.items()}
 
 

@@ -18,8 +18,10 @@ from .block import Program, Quantity, program_of
 from .c import c_code
 from .chain import observer_chain
 from .filter import columns, filter_code
+from .fmu import FMI, fmu
 from .lowering import operations_of
 from .mjcf import MUJOCO, by_answer, mjcf
+from .plant import plant_program
 from .st import st_code
 
 SUMMARY = "export.json"
@@ -30,31 +32,33 @@ _LONGEST_NAME = 23
 
 
 class Request(NamedTuple):
-    """What is asked for: a study, its name in the code, the type of its numbers, the sides that move along a line, and the
-    file that the study came from ("" for none)."""
+    """What is asked for: a study, its name in the code, the type of its numbers, the sides that move along a line, the
+    version of FMI, and the file that the study came from ("" for none)."""
 
     config: Config
     name: str
     precision: str
     linear: tuple[str, ...]
+    fmi: int
     file: str
 
 
 class Files(NamedTuple):
-    """What a target makes: texts by file name, what it says of itself in `export.json`, and lines for the terminal."""
+    """What a target makes: contents by file name, what it says of itself in `export.json`, and lines for the terminal."""
 
-    texts: Mapping[str, str]
+    contents: Mapping[str, str | bytes]
     summary: Mapping[str, Any]
     lines: list[str]
 
 
 class Target(NamedTuple):
-    """A target: what it is, what makes its files, and which options it has. `make` raises `Unsupported` where a study has
-    what the target cannot say."""
+    """A target: what it is, what makes its files, which options it has, and the name of what comes from no file. `make`
+    raises `Unsupported` where a study has what the target cannot say."""
 
     about: str
     make: Callable[[Request], Files]
     options: tuple[str, ...]
+    unnamed: str = "observer"
 
 
 class Export(NamedTuple):
@@ -104,11 +108,33 @@ def _mjcf(request: Request) -> Files:
     return Files({"model.xml": text}, {"mujoco": MUJOCO, "time_step": step} | lists, lines)
 
 
+def _fmu(request: Request) -> Files:
+    name, fmi = request.name, FMI[request.fmi]
+    plant = plant_program(request.config, name, np.dtype(PRECISIONS[request.precision]))
+    call = ["Called by the functions of FMI. Functions touch nothing but their arguments."]
+    made = fmu(request.config, plant, _head(request, f"{name}: the drive, from sample to sample.", call), request.fmi)
+    period, count = request.config.run.sample_period, sum(one.causality == "parameter" for one in made.variables)
+    what = f"{name}.fmu: FMI {fmi}, co-simulation, steps of {period:g} s, {count} parameters"
+    lines = [
+        f"{what}; a binary for {made.binary}, and the sources." if made.binary else f"{what}; the sources alone: {made.why}."
+    ]
+    summary = {
+        "precision": request.precision,
+        "sample_period": period,
+        "fmi": fmi,
+        "token": made.token,
+        "binary": made.binary or None,
+        "variables": [dict(one._asdict()) for one in made.variables],
+    }
+    return Files({f"{name}.fmu": made.content}, summary, lines)
+
+
 _OF_CODE = "precision", "name"
 TARGETS: dict[str, Target] = {
     "c": Target("C99: observers, equivalent control and identifier, one source file and one header", _c, _OF_CODE),
     "st": Target("structured text (IEC 61131-3): the same as a function block", _st, _OF_CODE),
     "mjcf": Target("a MuJoCo model of the drive, its gap and its effects", _mjcf, ("linear",)),
+    "fmu": Target("the drive as a Functional Mock-up Unit for co-simulation", _fmu, (*_OF_CODE, "fmi"), "drive"),
 }
 """By the names of --target."""
 
@@ -121,17 +147,20 @@ def export(
     precision: str | None = None,
     name: str | None = None,
     linear: Sequence[str] = (),
+    fmi: int | None = None,
 ) -> Export:
     """Write a study for another system: as code what `jaxbl.simulate.step` does with a recorded input and measured
-    positions, or the drive as a model for a simulator.
+    positions, or the drive as a model for simulators.
 
     Args:
         config: the study.
         folder: new or empty, or one that holds an export of this target and name, which is written anew.
         target: one of `TARGETS`.
         precision: "double" or "float"; left out, that of the study.
-        name: of functions and files, a C identifier of small letters; left out, that of the study's file, or `observer`.
-        linear: of a model, the sides (`motor`, `load`) that move along a line: in kg, N, m.
+        name: of functions and files, a C identifier of small letters; left out, that of the study's file, or `observer`
+            (of an FMU: `drive`).
+        linear: of a MuJoCo model, the sides (`motor`, `load`) that move along a line: in kg, N, m.
+        fmi: version of an FMU, 2 or 3; left out, 3.
 
     Raises:
         InputError: of these, or the study has what the target cannot say.
@@ -140,14 +169,17 @@ def export(
     study = read_config(config)
     if target not in TARGETS:
         raise InputError(f"--target {target}: should be one of {', '.join(TARGETS)}")
-    given = {"precision": precision, "name": name, "linear": linear}
+    given = {"precision": precision, "name": name, "linear": linear, "fmi": fmi}
     for option, value in given.items():
-        if value and option not in TARGETS[target].options:
+        if value not in (None, (), []) and option not in TARGETS[target].options:
             raise InputError(f"--{option}: --target {target} has no such option; leave it out")
     chosen = {long: short for short, long in PRECISIONS.items()}[study.run.precision] if precision is None else precision
     if chosen not in PRECISIONS:
         raise InputError(f"--precision {chosen}: should be one of {', '.join(PRECISIONS)}")
-    request = Request(study, _name(file) if name is None else checked_name(name), chosen, tuple(linear), file)
+    if fmi is not None and fmi not in FMI:
+        raise InputError(f"--fmi {fmi}: should be one of {', '.join(map(str, FMI))}")
+    known = _name(file, TARGETS[target].unnamed) if name is None else checked_name(name)
+    request = Request(study, known, chosen, tuple(linear), fmi or max(FMI), file)
     try:
         made = TARGETS[target].make(request)
     except Unsupported as why:
@@ -159,16 +191,16 @@ def export(
         "study": file,
         "identity": identity(study, "simulate"),
         "jaxbl": version("jaxbl"),
-        "files": list(made.texts),
+        "files": list(made.contents),
     }
     summary = head | dict(made.summary)
     where = Path(folder)
     with removed_if_empty(where):
         _claim(where, request.name, target)
-        for file_name, text in made.texts.items():
-            write_atomic(where / file_name, text)
+        for file_name, content in made.contents.items():
+            write_atomic(where / file_name, content)
         write_atomic(where / SUMMARY, json_text(summary))
-    return Export(where, (*made.texts, SUMMARY), summary, made.lines)
+    return Export(where, (*made.contents, SUMMARY), summary, made.lines)
 
 
 def _claim(folder: Path, name: str, target: str) -> None:
@@ -203,11 +235,11 @@ def checked_name(name: str) -> str:
     return name
 
 
-def _name(file: str) -> str:
-    """A name from that of a file."""
+def _name(file: str, unnamed: str) -> str:
+    """A name from that of a file; the other one where there is none."""
     plain = re.sub(r"[^a-z0-9]+", "_", Path(file).stem.lower()).strip("_")
     plain = plain if plain[:1].isalpha() else f"study_{plain}"
-    plain = plain[:_LONGEST_NAME].strip("_") if file else "observer"
+    plain = plain[:_LONGEST_NAME].strip("_") if file else unnamed
     return f"{plain}_code" if plain in _RESERVED.split() else plain
 
 
@@ -225,12 +257,17 @@ def _precision(program: Program) -> str:
 
 def _about(request: Request, program: Program, call: list[str]) -> list[str]:
     """Lines for the beginning of a file."""
-    config, sides = request.config, [one.name.removesuffix("_position") for one in program.block.first]
+    sides = [one.name.removesuffix("_position") for one in program.block.first]
     parts = f"{'observers' if len(sides) > 1 else 'observer'} of {' and '.join(sides)}, equivalent control"
     identifier = ", identifier" if any(one.name.endswith("_identified") for one in program.block.outputs) else ""
+    return _head(request, f"{request.name}: {parts}{identifier}, from sample to sample.", call)
+
+
+def _head(request: Request, what: str, call: list[str]) -> list[str]:
+    config = request.config
     said = f" ({config.title})" if config.title else ""
     return [
-        f"{request.name}: {parts}{identifier}, from sample to sample.",
+        what,
         "",
         f"Made by jaxbl {version('jaxbl')} from {request.file or 'a study'}{said},",
         f"whose numbers have the hash {identity(config, 'simulate')}. To change one, change the study and export it again.",

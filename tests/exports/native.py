@@ -14,11 +14,13 @@ STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wdouble-promotion", "-W
 UNCONTRACTED = ("-ffp-contract=off",)
 _CTYPES = {"float64": ctypes.c_double, "float32": ctypes.c_float, "int32": ctypes.c_int32, "bool": ctypes.c_bool}
 
+_PACKAGES = {"arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi", "cc": "gcc"}
+
 
 def needs(*programs):
     """Skips a test where a program is missing."""
     missing = [one for one in programs if shutil.which(one) is None]
-    packages = " ".join({"arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi"}.get(one, one) for one in missing)
+    packages = " ".join(_PACKAGES.get(one, one) for one in missing)
     reason = f"compiles, runs or checks exported code by {', '.join(missing)} (Debian: apt-get install {packages})"
     return pytest.mark.skipif(bool(missing), reason=reason)
 

@@ -53,6 +53,7 @@ class Strict:
     def _made(self, closed, known, _):
         """A function of known numbers, which gives that of the others."""
         names = [f"a{i}" for i in range(len(closed.jaxpr.invars))]
+        self._within = False
         self._lines, self._number, self._constants = ([], []), 0, {}
         results = self._write(closed, [(one, i >= known) for i, one in enumerate(names)], "    ")
         outer, inner = self._lines
@@ -97,7 +98,7 @@ class Strict:
         return f"t{self._number}"
 
     def _put(self, varies, line, indent):
-        self._lines[varies].append(f"{indent}{line}")
+        self._lines[varies or self._within].append(f"{indent}{line}")
 
     def _equation(self, eqn, given, indent):
         name, dtype = eqn.primitive.name, np.dtype(eqn.invars[0].aval.dtype)
@@ -113,7 +114,7 @@ class Strict:
             self._put(varies, f"{', '.join(state)}, = {', '.join(texts[fixed:])},", indent)
             self._put(varies, f"for _ in range({times}):", indent)
             inside = [*((one, varies) for one in texts[:fixed]), *((one, varies) for one in state)]
-            made = self._write(body, inside, f"{indent}    ")
+            made = self._body(body, inside, varies, indent)
             self._put(varies, f"{', '.join(state)}, = {', '.join(one for one, _ in made)},", f"{indent}    ")
             return [(one, varies) for one in state]
         if name == "cond" and not eqn.outvars:
@@ -122,12 +123,19 @@ class Strict:
             outs = [self._new() for _ in eqn.outvars]
             for i, branch in enumerate(branches_of(eqn)):
                 self._put(varies, f"if {texts[0]} == {i}:", indent)
-                made = self._write(branch, [(one, varies) for one in texts[1:]], f"{indent}    ")
+                made = self._body(branch, [(one, varies) for one in texts[1:]], varies, indent)
                 self._put(varies, f"{', '.join(outs)}, = {', '.join(one for one, _ in made)},", f"{indent}    ")
             return [(one, varies) for one in outs]
         out = self._new()
         self._put(varies, f"{out} = {self._expression(eqn, name, dtype, texts)}", indent)
         return [(out, varies)]
+
+    def _body(self, closed, given, varies, indent):
+        """Lines of a loop or a choice: what stands in one that varies stays there."""
+        before, self._within = self._within, self._within or varies
+        made = self._write(closed, given, f"{indent}    ")
+        self._within = before
+        return made
 
     def _expression(self, eqn, name, dtype, x):
         one = self._constant(1.0, dtype) if dtype.kind == "f" else "1"

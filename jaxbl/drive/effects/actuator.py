@@ -130,6 +130,7 @@ class BackEmf(ActuatorEffect):
 
     kind: ClassVar[str] = "back_emf"
     rank: ClassVar[int] = 4
+    input_unit: ClassVar[str] = "V"
     velocity_dependent: ClassVar[bool] = True
     resistance: Scalar = parameter("ohm", "resistance R of the winding", above=0.0)
     torque_constant: Scalar = parameter("N m/A", "torque constant k_t, which is that of the back-EMF in V s/rad", above=0.0)

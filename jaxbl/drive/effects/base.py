@@ -313,10 +313,15 @@ class ActuatorEffect(AbstractEffect):
     off the motor's torque.
 
     Those that a config does not list are put in the order of `rank`.
+
+    Attributes:
+        rank: place in that order.
+        input_unit: of the input, if the effect decides it; "" otherwise.
     """
 
     places: ClassVar[tuple[str, ...]] = ("actuator",)
     rank: ClassVar[int] = 0
+    input_unit: ClassVar[str] = ""
 
 
 class EncoderEffect(AbstractEffect):

@@ -1,0 +1,473 @@
+"""Functional Mock-up Units: valid for another implementation of FMI, and the motion that `jaxbl.run` finds."""
+
+import shutil
+import zipfile
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from effect_values import ENCODERS, VALUES
+from native import COMPILERS, STRICT, bits, needs, ran
+from small_study import rigid, small
+from strict import Strict
+
+import jaxbl
+from jaxbl.config import read_config
+from jaxbl.drive.effects import EFFECTS
+from jaxbl.drive.transmission import LinearShaft
+from jaxbl.errors import InputError
+from jaxbl.exports.fmu import base_unit, unit_name
+from jaxbl.exports.plant import plant_program
+
+fmpy = pytest.importorskip("fmpy", reason="runs FMUs by FMPy (pip install 'jaxbl[fmu]')")
+from fmpy.fmi1 import FMICallException  # noqa: E402
+from fmpy.validation import validate_fmu  # noqa: E402
+
+VERSIONS = pytest.mark.parametrize("fmi", [2, 3])
+COMPILED = needs("cc")
+TOLERANCE = 1e-9
+"""Of each output's range: XLA and the fused loop round otherwise than the code."""
+
+# of the delay's own size, samples are shorter here
+NUMBERS = VALUES | ENCODERS | {"actuator.delay": {"delay": 2.3e-3}}
+EFFECT = [
+    {"kind": name, **{key: list(one) if isinstance(one, tuple) else one for key, one in numbers.items()}}
+    for name, numbers in NUMBERS.items()
+]
+EXCITATION = {"kind": "multisine", "amplitude": 5.0, "frequency": 0.7}
+GAP = {"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.1}
+MOVED = {"motor_position": 0.3, "motor_velocity": -1.0, "load_position": 0.02, "load_velocity": 0.4}
+
+
+def study(*places, base=small, **tables):
+    """A drive that swings for 1.5 s, with the effects of some places; encoders with noise and counts."""
+    effects = [one for one in EFFECT if one["kind"].startswith(places)] if places else []
+    given = {"effects": effects, "excitation": EXCITATION, "encoders": {"noise": 1e-3, "motor_resolution": 1e-3}}
+    return base({"run.duration": 1.5, "run.substeps": 4}, **given | tables)
+
+
+ALL = "all effects"
+STUDIES = {
+    "rigid": study(base=rigid),
+    "rigid with effects": study("motor.", "actuator.", "encoder.", base=rigid),
+    "shaft": study(transmission={"law": "linear_shaft", "stiffness": 1.0}),
+    "gap": study(transmission=GAP, initial=MOVED),
+    **{f"effects of {place}": study(place) for place in ("motor.", "load.", "transmission.", "actuator.", "encoder.")},
+    ALL: study("", initial=MOVED),
+}
+
+
+def written(data, folder, fmi=3, **options):
+    """The path of a study's FMU, and what `export.json` says."""
+    made = jaxbl.export(data, folder, "fmu", fmi=fmi, **options)
+    return str(made.folder / made.files[0]), made.summary
+
+
+def free_run(path, summary, trace, start=None, **options):
+    """By FMPy, under the trace's input."""
+    period = summary["sample_period"]
+    given = np.zeros(len(trace), [("time", float), ("u", float)])
+    given["time"], given["u"] = np.arange(len(trace)) * period, trace.u
+    times = {"stop_time": given["time"][-1], "step_size": period, "output_interval": period}
+    return fmpy.simulate_fmu(path, input=given, start_values=start or {}, **times, **options)
+
+
+def agrees(found, trace, tolerance=TOLERANCE):
+    """Outputs at the samples are the truth in a trace; means over the last sample are those of the sample before."""
+    two = "z" in found.dtype.names
+    expected = {name: trace[name].to_numpy() for name in found.dtype.names if name not in ("time", "z")}
+    assert len(expected) == (7 if two else 4) and len(found) == len(trace)
+    for name, values in expected.items():
+        own = np.asarray(found[name])
+        if name.endswith("acceleration") or (name == "torque" and not two):
+            assert own[0] == 0.0
+            own, values = own[1:], values[:-1]
+        assert np.ptp(values) > 0.0
+        assert np.max(np.abs(own - values)) <= tolerance * np.ptp(values), name
+    return True
+
+
+class Instance:
+    """One instance in either version of FMI, by names of its variables; `said` are the lines of its log."""
+
+    def __init__(self, path, token=None):
+        self.folder, self.said = fmpy.extract(path), []
+        self.about = fmpy.read_model_description(path)
+        self.two = self.about.fmiVersion == "2.0"
+        if token is not None:
+            self.about.guid = token
+        self._references = {one.name: one.valueReference for one in self.about.modelVariables}
+        logger = (lambda *given: self.said.append(given[-1].decode())) if self.two else self._logged
+        self.unit = fmpy.instantiate_fmu(self.folder, self.about, "CoSimulation", logger=logger)
+
+    def _logged(self, environment, status, category, message):
+        self.said.append(message.decode())
+
+    def begin(self, start=0.0):
+        if self.two:
+            self.unit.setupExperiment(startTime=start)
+            self.unit.enterInitializationMode()
+        else:
+            self.unit.enterInitializationMode(startTime=start)
+        self.unit.exitInitializationMode()
+        return self
+
+    def set(self, **values):
+        (self.unit.setReal if self.two else self.unit.setFloat64)(
+            [self._references[name.replace("__", ".")] for name in values], list(values.values())
+        )
+
+    def get(self, *names):
+        return (self.unit.getReal if self.two else self.unit.getFloat64)([self._references[name] for name in names])
+
+    def outputs(self):
+        return self.get(*(one.name for one in self.about.modelVariables if one.causality == "output"))
+
+    def time(self):
+        last_successful = 2
+        return self.unit.getRealStatus(last_successful) if self.two else self.get("time")[0]
+
+    def step(self, time, length):
+        self.unit.doStep(currentCommunicationPoint=time, communicationStepSize=length)
+
+    def run(self, torques, first=0, period=1e-3):
+        rows = []
+        for i, torque in enumerate(torques, first):
+            self.set(u=torque)
+            self.step(i * period, period)
+            rows.append(self.outputs())
+        return np.array(rows)
+
+    def state(self):
+        return self.unit.getFMUstate() if self.two else self.unit.getFMUState()
+
+    def restore(self, state):
+        (self.unit.setFMUstate if self.two else self.unit.setFMUState)(state)
+
+    def bytes_of(self, state):
+        return (self.unit.serializeFMUstate if self.two else self.unit.serializeFMUState)(state)
+
+    def state_of(self, found):
+        return (self.unit.deSerializeFMUstate if self.two else self.unit.deserializeFMUState)(found)
+
+    def release(self, state):
+        (self.unit.freeFMUstate if self.two else self.unit.freeFMUState)(state)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.unit.freeInstance()
+        shutil.rmtree(self.folder)
+
+
+@COMPILED
+@pytest.mark.parametrize(
+    "data", [pytest.param(data, id=name, marks=[pytest.mark.slow] * (name == ALL)) for name, data in STUDIES.items()]
+)
+def test_the_free_run_is_that_of_the_simulation(tmp_path, data):
+    trace = jaxbl.run(data).trace
+    for fmi in (3, 2) if data["effects"] == [] or len(data["effects"]) > 30 else (3,):
+        path, summary = written(data, tmp_path / str(fmi), fmi)
+        assert validate_fmu(path) == []
+        assert agrees(free_run(path, summary, trace), trace)
+
+
+def test_every_effect_of_the_package_can_be_said():
+    """Those of other packages, too, unless they have operations that code does not know."""
+    own = {name for name, cls in EFFECTS.items() if cls.__module__.startswith("jaxbl.")}
+    assert own == NUMBERS.keys()
+    for one in EFFECT:
+        program = plant_program(read_config(small(effects=[one])), "drive", np.dtype(np.float64))
+        numbers = {path for path in program.about if path.startswith("effects.")}
+        expected = {
+            f"effects.{one['kind']}.{key}"
+            for key, value in one.items()
+            if key != "kind" and not isinstance(value, list | bool) and not one["kind"].startswith("encoder.")
+        }
+        assert expected <= numbers
+        assert all(path in program.tunable for path in numbers)
+        if one["kind"].startswith("encoder."):
+            assert not numbers
+
+
+@COMPILED
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_the_motion_is_the_traced_step_bit_for_bit(tmp_path, precision):
+    """Over hard impacts in a gap, which amplify the last digit: there no two roundings agree for long."""
+    drive = {"kind": "two_inertia", "motor_inertia": 0.05, "motor_viscous": 0.01, "load_inertia": 0.5, "load_viscous": 0.02}
+    data = study("motor.cou", "load.pre", drive=drive | {"gear_ratio": 2.0}, transmission=GAP | {"stiffness": 30.0})
+    path, _ = written(data, tmp_path, precision=precision)
+    dtype = np.dtype(np.float32 if precision == "float" else np.float64)
+    torques = (5.0 * np.sin(8.0 * np.arange(3000) * 1e-3)).astype(dtype)
+    plant = plant_program(read_config(data), "drive", dtype)
+    block = Strict(plant.program.block)
+    given = {one: block.real(plant.about[path][0]) for one, path in plant.parameters.items()}
+    first, later = plant.program.block.first, plant.program.block.inputs[1:]
+    found = block.start([given[one.name] for one in first])
+    state, rows = found[: len(plant.program.block.state)], []
+    for torque in torques:
+        state, out = block.step(state, [block.real(torque), *(given[one.name] for one in later)])
+        rows.append(out)
+    with Instance(path) as one:
+        own = one.begin().run(torques.astype(float))
+    assert (bits(own) == bits(np.array(rows, dtype).astype(float))).all()
+
+
+@COMPILED
+def test_in_single_precision_it_is_near_the_simulation(tmp_path):
+    data = study(transmission=GAP) | {"run": {"duration": 1.5, "precision": "float32"}}
+    trace = jaxbl.run(data).trace
+    path, summary = written(data, tmp_path)
+    assert summary["precision"] == "float"
+    assert validate_fmu(path) == []
+    # 1e-7 of rounding; accelerations are differences over a sample, which make it a thousand times as large
+    assert agrees(free_run(path, summary, trace), trace, 2e-4)
+
+
+@COMPILED
+@VERSIONS
+def test_parameters_are_those_of_the_study(tmp_path, fmi):
+    """Set before the run they give the run of the changed study, set between steps they act from there on."""
+    data = study("load.gra", "motor.cou", transmission=GAP)
+    changed = {"drive.motor_inertia": 0.08, "transmission.half_gap": 0.05, "effects.load.gravity.phase": 1.1,
+               "initial.motor_velocity": 2.0}  # fmt: skip
+    path, summary = written(data, tmp_path, fmi)
+    other = study("load.gra", "motor.cou", transmission=GAP | {"half_gap": 0.05}, initial={"motor_velocity": 2.0})
+    other["drive"] |= {"motor_inertia": 0.08}
+    other["effects"] = [one | ({"phase": 1.1} if "phase" in one else {}) for one in other["effects"]]
+    trace = jaxbl.run(other).trace
+    assert agrees(free_run(path, summary, trace, changed), trace)
+    with Instance(path) as one:
+        one.begin()
+        before = one.run([1.0] * 5)
+        one.set(drive__motor_viscous=3.0)
+        slow = one.run([1.0], 5)
+        one.unit.reset()
+        one.begin()
+        assert (one.run([1.0] * 5) == before).all()
+        assert not (one.run([1.0], 5) == slow).all()
+
+
+@COMPILED
+@VERSIONS
+def test_states_are_kept_and_instances_are_apart(tmp_path, fmi):
+    path, _ = written(study("actuator.", "load.", transmission=GAP), tmp_path, fmi)
+    torques = 3.0 * np.sin(0.02 * np.arange(600))
+    with Instance(path) as one, Instance(path) as two:
+        one.begin(), two.begin()
+        one.run(torques[:300])
+        kept = one.state()
+        first = one.run(torques[300:], 300)
+        one.restore(kept)
+        assert (one.run(torques[300:], 300) == first).all()
+        # what the other one did changed nothing here
+        both = []
+        one.restore(kept)
+        for i, torque in enumerate(torques[300:], 300):
+            both.append(one.run([torque], i)[0])
+            two.run([-torque], i - 300)
+        assert (np.array(both) == first).all()
+        found = one.bytes_of(kept)
+        there = two.state_of(found)
+        two.restore(there)
+        assert (two.run(torques[300:], 300) == first).all()
+        with pytest.raises(FMICallException):
+            two.state_of(found[:-1])
+        with pytest.raises(FMICallException):
+            two.state_of(b"x" + found[1:])
+        assert two.said[-1] == f"these {len(found)} bytes are no state of this model"
+        one.release(kept), two.release(there)
+
+
+@COMPILED
+@VERSIONS
+def test_steps_are_multiples_of_the_sample_period(tmp_path, fmi):
+    path, _ = written(study(transmission=GAP, initial=MOVED), tmp_path, fmi)
+    # of several instances of FMI 2, FMPy gives the log to the last one
+    with Instance(path) as two, Instance(path) as one:
+        one.begin(10.0), two.begin()
+        assert one.get("motor.position", "load.velocity", "z") == [0.3, 0.4, 0.3 - 5.0 * 0.02]
+        assert one.time() == 10.0
+        one.set(u=1.5), two.set(u=1.5)
+        # as sums of decimal numbers give it
+        one.step(10.0, 0.1 + 0.2 - 0.29)
+        for i in range(10):
+            two.step(i * 1e-3, 1e-3)
+        assert one.outputs() == two.outputs()
+        assert one.time() == 10.01
+        before = one.outputs()
+        for time, length, message in (
+            (10.01, 1.5e-3, "the communication step size 0.0015 s should be a multiple of the sample period 0.001 s"),
+            (10.01, 5e-4, "should be a multiple"),
+            (10.01, 0.0, "should be a multiple"),
+            (10.01, -1e-3, "should be a multiple"),
+            (10.01, float("nan"), "should be a multiple"),
+            (0.01, 1e-3, "but the instance is at 10.01 s"),
+        ):
+            with pytest.raises(FMICallException, match="status 3"):
+                one.step(time, length)
+            assert message in one.said[-1]
+        assert one.outputs() == before
+        one.step(10.01, 1e-3)
+
+
+@COMPILED
+@VERSIONS
+def test_what_is_refused_has_a_line_in_the_log(tmp_path, fmi):
+    path, _ = written(study(transmission=GAP), tmp_path, fmi)
+    with Instance(path) as one:
+        with pytest.raises(FMICallException):
+            one.set(drive__motor_inertia=0.0)
+        assert one.said == ["drive.motor_inertia: 0 is out of range (min 0, exclusive, max inf)"]
+        with pytest.raises(FMICallException):
+            one.set(drive__motor_viscous=0.3, drive__load_viscous=-1.0)
+        assert one.get("drive.motor_viscous") == [0.15]
+        with pytest.raises(FMICallException):
+            one.set(u=float("nan"))
+        with pytest.raises(FMICallException):
+            one.step(0.0, 1e-3)
+        assert one.said[-1] == "a step needs an initialized instance"
+        one.begin()
+        for name in ("initial__motor_position", "motor__position", *(() if one.two else ("time",))):
+            with pytest.raises(FMICallException):
+                one.set(**{name: 1.0})
+            assert one.said[-1].startswith(f"{name.replace('__', '.')} cannot be set")
+        one.set(transmission__stiffness=1e12)
+        with pytest.raises(FMICallException):
+            one.run([1.0] * 300)
+        assert "the motion diverged" in one.said[-1]
+        one.unit.reset()
+        assert np.isfinite(one.begin().run([1.0] * 10)).all()
+    with pytest.raises(Exception, match="Failed to instantiate"):
+        Instance(path, token="another")
+
+
+def test_without_a_compiler_it_holds_the_sources_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr("jaxbl.exports.fmu.shutil.which", lambda name: None)
+    made = jaxbl.export(study(), tmp_path, "fmu", name="axis")
+    assert made.lines == [
+        "axis.fmu: FMI 3.0, co-simulation, steps of 0.001 s, 12 parameters; the sources alone: no C compiler (cc) was found."
+    ]
+    assert made.summary["binary"] is None
+    names = zipfile.ZipFile(tmp_path / "axis.fmu").namelist()
+    assert {"modelDescription.xml", "sources/buildDescription.xml", "sources/axis.c", "sources/fmi-3.c"} <= {*names}
+    assert not [one for one in names if one.startswith("binaries")]
+    assert validate_fmu(str(tmp_path / "axis.fmu")) == []
+
+
+@needs("cc")
+def test_a_compiler_that_fails_is_told(tmp_path, monkeypatch):
+    broken = tmp_path / "cc"
+    broken.write_text("#!/bin/sh\necho 'no headers' >&2\nexit 1\n")
+    broken.chmod(0o755)
+    monkeypatch.setattr("jaxbl.exports.fmu.shutil.which", lambda name: str(broken))
+    made = jaxbl.export(study(), tmp_path / "new", "fmu")
+    assert f"the sources alone: {broken} failed: no headers." in made.lines[0]
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+@VERSIONS
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_the_sources_compile_without_a_warning_or_a_global_number(tmp_path, compiler, fmi, precision):
+    path, _ = written(study("transmission.", "load.flex"), tmp_path, fmi, precision=precision)
+    zipfile.ZipFile(path).extractall(tmp_path / "there")
+    sources = tmp_path / "there" / "sources"
+    for file in sources.glob("*.c"):
+        ran(compiler, *STRICT, "-O2", "-c", file, "-o", file.with_suffix(".o"))
+    # kinds of symbols: of data that can be written there is none
+    found = [line[17:18] for line in ran("nm", *sources.glob("*.o")).stdout.splitlines()]
+    assert {"T", "r"} <= {*found}
+    assert not {*found} & {*"dDbBC"}
+
+
+@VERSIONS
+@needs("cc", "cmake")
+def test_another_tool_compiles_the_sources_from_what_the_fmu_says_of_them(tmp_path, monkeypatch, fmi):
+    """FMPy by CMake, which reads which files these are."""
+    build = pytest.importorskip("fmpy.build", reason="compiles FMUs by FMPy (pip install 'jaxbl[fmu]')")
+    data = study(transmission=GAP)
+    with monkeypatch.context() as without:
+        without.setattr("jaxbl.exports.fmu.shutil.which", lambda name: None)
+        path, summary = written(data, tmp_path, fmi)
+    folder = fmpy.extract(path, tmp_path / "there")
+    (tmp_path / "build").mkdir()
+    build.build_platform_binary(folder, tmp_path / "build")
+    trace = jaxbl.run(data).trace
+    assert agrees(free_run(folder, summary, trace), trace)
+
+
+def test_the_same_study_gives_the_same_bytes_and_another_one_another_token(tmp_path):
+    files, tokens = [], []
+    for name, data in (("a", study()), ("b", study()), ("c", study(transmission=GAP))):
+        path, summary = written(data, tmp_path / name)
+        files.append(Path(path).read_bytes())
+        tokens.append(summary["token"])
+    assert files[0] == files[1] != files[2]
+    assert tokens[0] == tokens[1] != tokens[2]
+    assert tokens[0].startswith(jaxbl.run(study()).summary["single_run"])
+
+
+def test_a_motor_fed_by_voltage_has_an_input_in_volts(tmp_path):
+    path, _ = written(study("actuator."), tmp_path)
+    units = {one.name: one.unit for one in fmpy.read_model_description(path).modelVariables}
+    assert (units["u"], units["torque"]) == ("V", "N.m")
+
+
+def test_two_effects_of_one_kind_have_names_of_their_own(tmp_path):
+    waves = [{"kind": "motor.cogging", "amplitude": 0.1, "harmonic": n} for n in (6.0, 12.0)]
+    path, summary = written(study() | {"effects": waves}, tmp_path)
+    names = [one["name"] for one in summary["variables"] if one["name"].startswith("effects")]
+    assert names[::3] == ["effects[0].amplitude", "effects[1].amplitude"]
+    assert validate_fmu(path) == []
+
+
+@COMPILED
+@pytest.mark.parametrize(
+    "name", ["model", "fmi_model", "fmi_instance", "fmi3", "set", "taken", "free", "u", "state", "variables", "z"]
+)
+def test_any_name_that_is_allowed_compiles(tmp_path, name):
+    path, summary = written(study(transmission=GAP), tmp_path, name=name)
+    assert summary["binary"]
+    with Instance(path) as one:
+        assert np.isfinite(one.begin().run([1.0] * 3)).all()
+
+
+@pytest.mark.parametrize(
+    ("unit", "name", "base"),
+    [
+        ("N m s²/rad²", "N.m.s2/rad2", {"kg": 1, "m": 2, "rad": -2}),
+        ("kg m²", "kg.m2", {"kg": 1, "m": 2}),
+        ("N m/A", "N.m/A", {"kg": 1, "m": 2, "s": -2, "A": -1}),
+        ("ohm", "ohm", {"kg": 1, "m": 2, "s": -3, "A": -2}),
+        ("1/rad", "1/rad", {"rad": -1}),
+        ("rad/s^2", "rad/s2", {"rad": 1, "s": -2}),
+        ("1/turn", "1/turn", None),
+    ],
+)
+def test_units_have_exponents_of_base_units(unit, name, base):
+    assert unit_name(unit) == name
+    assert base_unit(name) == base
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"target": "fmu", "fmi": 4}, "--fmi 4: should be one of 2, 3"),
+        ({"target": "fmu", "fmi": 0}, "--fmi 0: should be one of 2, 3"),
+        ({"target": "c", "fmi": 3}, "--fmi: --target c has no such option; leave it out"),
+        ({"target": "fmu", "linear": ["motor"]}, "--linear: --target fmu has no such option"),
+    ],
+)
+def test_wrong_requests_get_one_line(tmp_path, given, message):
+    with pytest.raises(InputError, match=message):
+        jaxbl.export(study(), tmp_path / "new", **given)
+    assert not (tmp_path / "new").exists()
+
+
+def test_an_operation_that_code_does_not_know_is_refused_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(LinearShaft, "torque", lambda self, deflection: self.stiffness * jnp.arctan(deflection))
+    data = study(transmission={"law": "linear_shaft", "stiffness": 1.0})
+    with pytest.raises(InputError, match="--target fmu: the study has what it cannot say: atan of float64"):
+        jaxbl.export(data, tmp_path / "new", "fmu")
