@@ -1,14 +1,25 @@
-"""Gains that `[verify]` marks in the atlas: each run once, and judged."""
+"""Gains that `[verify]` marks in the atlas: each run once, and judged; those that miss the exact condition also by what the
+run's own disturbance does to them."""
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 
-from jaxbl.config import Config
+from jaxbl.config import Config, read_config
 from jaxbl.observer.conditions import CONDITIONS, peak_ratio
+from jaxbl.observer.under_tuned import (
+    excursion,
+    least_cycle_frequency,
+    peak_law,
+    simulate_error,
+    sine_cycle,
+    sine_cycle_simulated,
+)
 from jaxbl.observer.worst_case import half_cycle
+from jaxbl.sweeps.trial import run
 
 from .stages import Stages
 
@@ -18,6 +29,8 @@ def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[dict[str,
     found = []
     base = ideal.resolved()
     drive = config.build().drive
+    # the observer does not act on the drive: one run has the disturbance of all gains
+    trace = run(read_config(base | {"axes": [], "sweep": {}})).trace if config.verify.marks else None
     for side in ("motor", "load"):
         marks = [given for given in config.verify.marks if given.side == side]
         if not marks:
@@ -37,6 +50,8 @@ def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[dict[str,
         with jax.enable_x64(True):
             given = (jnp.asarray(x, float) for x in (gains["lambda"], gains["alpha"], bounds))
             ratios = jax.jit(_ratios)(*given, jnp.asarray(friction, float), jnp.asarray(error, float))
+        assert trace is not None
+        disturbance = _disturbance(drive, side, trace)
         for i, (given, bound) in enumerate(zip(marks, bounds, strict=True)):
             row = {name.partition(".")[2]: frame[name].iloc[i] for name in frame.columns if name.startswith(side)}
             found.append(
@@ -54,9 +69,57 @@ def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[dict[str,
                     **{f"margin_{name}": row[f"margin_{name}"] for name in CONDITIONS},
                     "converged": bool(row["converged"]),
                     "convergence_time": row["convergence_time"],
+                    "on_this_disturbance": None
+                    if ratios["peak_ratio"][i] < 1.0
+                    else _explained(given.lambda_, given.alpha, trace["t"].to_numpy(), disturbance, friction, error),
                 }
             )
     return found
+
+
+def _disturbance(drive: Any, side: str, trace: pd.DataFrame) -> np.ndarray:
+    """The acceleration (rad/s^2) that the nominal model lacks at the true velocity: f^+ without the observer's own error."""
+    with jax.enable_x64(True):
+        nominal = drive.acceleration(side, *(jnp.asarray(trace[name].to_numpy()) for name in (f"{side}.velocity", "u")))
+    return trace[f"{side}.acceleration"].to_numpy() - np.asarray(nominal)
+
+
+_FEWER = 0.1
+"""Peak over the first one, whose time says how fast they fall."""
+
+
+def _explained(
+    lambda_: float, alpha: float, times: np.ndarray, disturbance: np.ndarray, friction: float, error: float
+) -> dict[str, Any]:
+    """What a disturbance does to gains that miss the exact condition, by :mod:`jaxbl.observer.under_tuned`: predicted, and
+    simulated in continuous time."""
+    largest = float(np.abs(disturbance).max())
+    # samples evenly over time
+    share = float(np.mean(np.abs(disturbance) > alpha))
+    given = {"times": times, "disturbance": disturbance, "damping": friction}
+    found: dict[str, Any] = {"largest_disturbance": largest, "share_above_alpha": share}
+    if share > 0.0:
+        found["excursion_predicted"] = excursion(alpha, **given)
+        found["excursion_simulated"] = simulate_error(lambda_, alpha, **given, velocity_error=0.0).largest
+    elif error > 0.0:
+        law = peak_law(lambda_, alpha, **given, peak=error)
+        path = simulate_error(lambda_, alpha, **given, velocity_error=error)
+        for name, at, peaks in (("predicted", times, law), ("simulated", path.times, path.peaks)):
+            found[f"largest_{name}"] = float(peaks.max())
+            # at the end of the run they may still be larger
+            fallen = np.flatnonzero(peaks > _FEWER * error)[-1] + 1
+            found[f"tenth_{name}"] = float(at[fallen]) if fallen < len(at) else None
+    least = least_cycle_frequency(lambda_, alpha, largest, friction)
+    cycle: dict[str, Any] = {"least_frequency": least}
+    if 0.0 < least < np.inf:
+        # well beyond where the cycle begins
+        frequency = 2.0 * least
+        predicted, simulated = (
+            of(lambda_, alpha, largest, frequency, friction) for of in (sine_cycle, sine_cycle_simulated)
+        )
+        cycle |= {"frequency": frequency, "predicted": predicted and predicted._asdict()}
+        cycle |= {"simulated": simulated and simulated._asdict()}
+    return found | {"sine_cycle": cycle}
 
 
 def _ratios(lambda_: Any, alpha: Any, f_plus: Any, friction: Any, error: Any) -> dict[str, Any]:

@@ -36,6 +36,7 @@ from .error_system import (
     simulate_error_system,
 )
 from .marks import judge_marks
+from .rules import judge_rules
 from .stages import Stages, stages_in
 
 _MOST_LISTED = 200
@@ -131,6 +132,7 @@ def _verified(config: Config, sides: list[str], stages: Stages) -> Verdict:
                 {"damping": damping, "alpha_ratio": normalised.alpha, "least_lambda_ratio": boundary}
                 for damping, boundary in normalised.damped.items()
             ],
+            "rules": judge_rules(normalised.alpha, normalised.lambda_, normalised.ratio),
             "marks": judge_marks(config, studies["drive"], stages),
             "counterexamples": true.head(_MOST_LISTED).to_dict("records"),
             "counterexamples_in_all": len(true),
