@@ -70,7 +70,7 @@ def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[dict[str,
                     "converged": bool(row["converged"]),
                     "convergence_time": row["convergence_time"],
                     "on_this_disturbance": None
-                    if ratios["peak_ratio"][i] < 1.0
+                    if float(ratios["peak_ratio"][i]) < 1.0 or not np.isfinite(disturbance).all()
                     else _explained(given.lambda_, given.alpha, trace["t"].to_numpy(), disturbance, friction, error),
                 }
             )

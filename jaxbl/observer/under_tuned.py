@@ -7,7 +7,7 @@ the losses of a half cycle (lambda, damping) and, for :func:`peak_law`, in the c
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid, solve_ivp
@@ -76,7 +76,7 @@ def excursion(alpha: float, times: np.ndarray, disturbance: np.ndarray, damping:
         kept = np.exp(-damping * step)
         gained = push * (step if damping == 0.0 else -np.expm1(-damping * step) / damping)
         speed = max(speed * kept + gained, 0.0)
-        largest = max(largest, speed)
+        largest = max(largest, float(speed))
     return largest
 
 
@@ -99,7 +99,7 @@ class ErrorPath(NamedTuple):
 def _half_cycle(
     lambda_: float,
     alpha: float,
-    disturbance: Callable[[float], float],
+    disturbance: Callable[[float], Any],
     damping: float,
     start: tuple[float, float, float],
     end: float,
@@ -182,21 +182,19 @@ def simulate_error(
             time, x2 = _off_zero(sign * disturbance[later[0] :] - alpha, times[later[0] :])
             y = x2 / max(lambda_, np.sqrt(alpha))
             scale, gone = max(scale, x2), np.inf
-        signed = sign
-
-        def pull(at: float, signed: float = signed) -> float:
-            return signed * float(np.interp(at, times, disturbance))
-
-        x2, time, most, came = _half_cycle(lambda_, alpha, pull, damping, (y, x2, time), end)
+        signed = sign * disturbance
+        x2, time, most, came = _half_cycle(
+            lambda_, alpha, lambda at, signed=signed: np.interp(at, times, signed), damping, (y, x2, time), end
+        )
         largest = max(largest, most)
-        if not came:
-            # the end of the run, or of the error along a ray
-            gone = min(gone, time) if time < end and abs(x2) <= 1e-3 * scale else gone
+        if came:
+            found.append(time)
+            peaks.append(abs(x2))
+        elif time >= end * (1.0 - 1e-12):
             break
-        found.append(time)
-        peaks.append(abs(x2))
-        y, x2, sign = 0.0, -x2, -sign
-    return ErrorPath(np.array(found), np.array(peaks), largest, gone)
+        # without a passage it has ended at the origin
+        y, x2, sign = 0.0, -x2 if came else 0.0, -sign
+    return ErrorPath(np.array(found), np.array(peaks), float(largest), float(gone))
 
 
 def _off_zero(excess: np.ndarray, times: np.ndarray) -> tuple[float, float]:
@@ -221,11 +219,14 @@ class SineCycle(NamedTuple):
     threshold: float
 
 
+SINE_LIMIT = 16.0 * 2.0**0.5 / np.pi**3
+"""lambda sqrt(alpha) / amplitude, up to which a sine upholds a limit cycle without damping: 0.730."""
+
+
 def _phase_sine(lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float) -> float:
     """Sine of the phase in which the disturbance makes up for the losses of a half cycle."""
     friction = damping * alpha * np.pi**3 / (24.0 * 2.0 * np.pi * frequency)
-    root_ = lambda_ * np.sqrt(0.5 * alpha) * np.pi**3 / 16.0
-    return float((friction + root_) / amplitude)
+    return float((friction + lambda_ * np.sqrt(alpha) / SINE_LIMIT) / amplitude)
 
 
 def sine_cycle(lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float = 0.0) -> SineCycle | None:
@@ -233,8 +234,8 @@ def sine_cycle(lambda_: float, alpha: float, amplitude: float, frequency: float,
 
     A half cycle takes half a period, in which x2 falls by 2 V = pi alpha / w - 2 (amplitude / w) cos(phase), with w = 2 pi
     frequency. The sine puts in the energy 2 alpha amplitude sin(phase) / w^2; damping and lambda take out what they take of
-    a parabola. The sine of the phase is at most 1: without damping there is a cycle where lambda < 0.730 amplitude /
-    sqrt(alpha), the number being 16 sqrt(2) / pi^3.
+    a parabola. The sine of the phase is at most 1: without damping there is a cycle where lambda sqrt(alpha) <
+    `SINE_LIMIT` times the amplitude.
     """
     sine = _phase_sine(lambda_, alpha, amplitude, frequency, damping)
     if sine > 1.0:
@@ -247,7 +248,7 @@ def sine_cycle(lambda_: float, alpha: float, amplitude: float, frequency: float,
 def least_cycle_frequency(lambda_: float, alpha: float, amplitude: float, damping: float) -> float:
     """Frequency (Hz) from which on a sine of this amplitude (rad/s^2) has a limit cycle, by :func:`sine_cycle`; 0 without
     damping, `inf` where lambda alone forbids one."""
-    left = amplitude - lambda_ * np.sqrt(0.5 * alpha) * np.pi**3 / 16.0
+    left = amplitude - lambda_ * np.sqrt(alpha) / SINE_LIMIT
     return float(damping * alpha * np.pi**2 / (48.0 * left)) if left > 0.0 else np.inf
 
 
