@@ -1,0 +1,62 @@
+"""Marked gains that miss the exact condition: what the run's own disturbance does to them."""
+
+import numpy as np
+import pytest
+from small_study import rigid
+
+from jaxbl.config import read_config
+from jaxbl.gains.marks import judge_marks
+from jaxbl.gains.stages import Stages
+from jaxbl.sweeps.trial import run
+
+MARKS = [
+    {"name": "good", "lambda": 6.0, "alpha": 9.0},
+    {"name": "small", "lambda": 0.02, "alpha": 2.3},
+    {"name": "below", "lambda": 3.0, "alpha": 1.9},
+]
+# friction that the observer does not know: 2 rad/s^2 where it slips, less where it sticks
+STUDY = read_config(
+    rigid(
+        {"observer.motor.velocity_error": 0.05, "encoders.noise": 0.0, "run.duration": 6.0, "run.sample_period": 1e-3},
+        effects=[{"kind": "motor.coulomb_friction", "torque": 0.1}],
+        verify={"marks": MARKS},
+    )
+)
+
+
+@pytest.fixture(scope="module")
+def marks():
+    return {one["name"]: one for one in judge_marks(STUDY, STUDY, Stages(STUDY, "verify"))}
+
+
+def test_gains_that_hold_the_exact_condition_need_no_explanation(marks):
+    assert marks["good"]["peak_ratio"] < 1.0
+    assert marks["good"]["on_this_disturbance"] is None
+
+
+def test_alpha_below_the_disturbance(marks):
+    trace = run(STUDY).trace
+    missing = np.abs(trace["motor.acceleration"] - (trace["u"] - 0.15 * trace["motor.velocity"]) / 0.05)
+    found = marks["below"]["on_this_disturbance"]
+    assert found["largest_disturbance"] == pytest.approx(missing.max())
+    assert found["share_above_alpha"] == pytest.approx((missing > 1.9).mean())
+    assert 0.05 < found["share_above_alpha"] < 0.5
+    assert found["excursion_predicted"] == pytest.approx(found["excursion_simulated"], rel=1e-4)
+    # friction takes some of what a pulse makes; two pulses are the largest of it
+    assert 0.0 < found["excursion_predicted"] < ((missing - 1.9).clip(lower=0.0) * 1e-3).sum()
+    # lambda alone is too large for the cycle of a sine
+    assert found["sine_cycle"] == {"least_frequency": np.inf}
+
+
+def test_alpha_above_the_disturbance_but_too_small_a_lambda(marks):
+    one = marks["small"]
+    found = one["on_this_disturbance"]
+    assert one["peak_ratio"] > 3.0 and one["converged"]
+    assert found["share_above_alpha"] == 0.0
+    # jumps of dry friction are no slow disturbance; a tenth is what they cost here
+    assert found["largest_predicted"] == pytest.approx(found["largest_simulated"], rel=0.1)
+    assert found["tenth_predicted"] == pytest.approx(found["tenth_simulated"], rel=0.05)
+    cycle = found["sine_cycle"]
+    assert cycle["frequency"] == 2.0 * cycle["least_frequency"]
+    for name in ("stable", "threshold"):
+        assert cycle["predicted"][name] == pytest.approx(cycle["simulated"][name], rel=0.15)
