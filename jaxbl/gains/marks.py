@@ -6,7 +6,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 
 from jaxbl.config import Config, read_config
 from jaxbl.observer.conditions import CONDITIONS, peak_ratio
@@ -21,6 +20,7 @@ from jaxbl.observer.under_tuned import (
 from jaxbl.observer.worst_case import half_cycle
 from jaxbl.sweeps.trial import run
 
+from .below_bound import disturbance, friction_of, share_above
 from .stages import Stages
 
 
@@ -45,13 +45,13 @@ def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[dict[str,
         frame = stages.rerun(base | {"axes": axes, "sweep": {}}, "marks", side)
         frame = frame.iloc[[points.index(pair) for pair in pairs]]
         error = abs(float(base["observer"][side]["velocity_error"]))
-        friction = float(drive.viscous(side)) / float(drive.inertia(side))
+        friction = friction_of(drive, side)
         bounds = frame[f"{side}.f_plus"].to_numpy(float)
         with jax.enable_x64(True):
             given = (jnp.asarray(x, float) for x in (gains["lambda"], gains["alpha"], bounds))
             ratios = jax.jit(_ratios)(*given, jnp.asarray(friction, float), jnp.asarray(error, float))
         assert trace is not None
-        disturbance = _disturbance(drive, side, trace)
+        missing = disturbance(drive, side, trace)
         for i, (given, bound) in enumerate(zip(marks, bounds, strict=True)):
             row = {name.partition(".")[2]: frame[name].iloc[i] for name in frame.columns if name.startswith(side)}
             found.append(
@@ -70,18 +70,11 @@ def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[dict[str,
                     "converged": bool(row["converged"]),
                     "convergence_time": row["convergence_time"],
                     "on_this_disturbance": None
-                    if float(ratios["peak_ratio"][i]) < 1.0 or not np.isfinite(disturbance).all()
-                    else _explained(given.lambda_, given.alpha, trace["t"].to_numpy(), disturbance, friction, error),
+                    if float(ratios["peak_ratio"][i]) < 1.0 or not np.isfinite(missing).all()
+                    else _explained(given.lambda_, given.alpha, trace["t"].to_numpy(), missing, friction, error),
                 }
             )
     return found
-
-
-def _disturbance(drive: Any, side: str, trace: pd.DataFrame) -> np.ndarray:
-    """The acceleration (rad/s^2) that the nominal model lacks at the true velocity: f^+ without the observer's own error."""
-    with jax.enable_x64(True):
-        nominal = drive.acceleration(side, *(jnp.asarray(trace[name].to_numpy()) for name in (f"{side}.velocity", "u")))
-    return trace[f"{side}.acceleration"].to_numpy() - np.asarray(nominal)
 
 
 _FEWER = 0.1
@@ -89,14 +82,13 @@ _FEWER = 0.1
 
 
 def _explained(
-    lambda_: float, alpha: float, times: np.ndarray, disturbance: np.ndarray, friction: float, error: float
+    lambda_: float, alpha: float, times: np.ndarray, missing: np.ndarray, friction: float, error: float
 ) -> dict[str, Any]:
     """What a disturbance does to gains that miss the exact condition, by :mod:`jaxbl.observer.under_tuned`: predicted, and
     simulated in continuous time."""
-    largest = float(np.abs(disturbance).max())
-    # samples evenly over time
-    share = float(np.mean(np.abs(disturbance) > alpha))
-    given = {"times": times, "disturbance": disturbance, "damping": friction}
+    largest = float(np.abs(missing).max())
+    share = share_above(alpha, missing)
+    given = {"times": times, "disturbance": missing, "damping": friction}
     found: dict[str, Any] = {"largest_disturbance": largest, "share_above_alpha": share}
     if share > 0.0:
         found["excursion_predicted"] = excursion(alpha, **given)

@@ -26,6 +26,7 @@ from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.programs import Backend
 from jaxbl.workers import Progress
 
+from .below_bound import converged_below
 from .counterexamples import explained, keys_of
 from .error_system import (
     SWITCHING_LIMIT,
@@ -114,6 +115,8 @@ def _verified(config: Config, sides: list[str], stages: Stages) -> Verdict:
                 counterexamples = explained(counterexamples, studies[level], level, side, stages)
                 runs = counterexamples.drop_duplicates(["bound", *keys_of(studies[level])])
                 summary["causes"] = {bound: part.cause.value_counts().to_dict() for bound, part in runs.groupby("bound")}
+            if level == "drive":
+                summary["below_f_plus"] = converged_below(studies[level], side, frame)
             summaries.append(summary)
             found.append(counterexamples)
     every = pd.concat(found, ignore_index=True)

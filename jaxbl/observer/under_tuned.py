@@ -64,19 +64,25 @@ def excursion(alpha: float, times: np.ndarray, disturbance: np.ndarray, damping:
     x1 keeps the sign of d while x2 does, so that x2' = |d| - alpha - damping x2 from the begin of a pulse on. Without
     damping that is the integral of |d| - alpha over the pulse.
     """
-    largest, speed, sign = 0.0, 0.0, 0.0
-    excess = np.abs(disturbance) - alpha
-    for i, step in enumerate(np.diff(times)):
+    steps = np.diff(times)
+    kept = np.exp(-damping * steps)
+    lasting = steps if damping == 0.0 else -np.expm1(-damping * steps) / damping
+    above = np.abs(disturbance) > alpha
+    begins = np.flatnonzero(above[:-1] | above[1:])
+    largest, speed, at = 0.0, 0.0, 0
+    while at < len(steps):
         if speed == 0.0:
-            sign = np.sign(disturbance[i])
+            # on to the next pulse
+            begin = int(np.searchsorted(begins, at))
+            if begin == len(begins):
+                break
+            at = int(begins[begin])
+            sign = np.sign(disturbance[at + 1] if above[at + 1] else disturbance[at])
+            push = sign * 0.5 * (disturbance[:-1] + disturbance[1:]) - alpha
         # the other sign of d pulls back
-        push = 0.5 * (sign * (disturbance[i] + disturbance[i + 1])) - alpha
-        if speed == 0.0 and max(excess[i], excess[i + 1]) <= 0.0:
-            continue
-        kept = np.exp(-damping * step)
-        gained = push * (step if damping == 0.0 else -np.expm1(-damping * step) / damping)
-        speed = max(speed * kept + gained, 0.0)
+        speed = max(speed * kept[at] + push[at] * lasting[at], 0.0)
         largest = max(largest, float(speed))
+        at += 1
     return largest
 
 
