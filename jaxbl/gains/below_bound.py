@@ -1,5 +1,5 @@
-"""Runs that converge though alpha is below their true f_plus: how long their disturbance exceeds alpha, and what that makes of
-an error that is zero."""
+"""Runs that converge though alpha is below their true f_plus: how long their disturbance exceeds alpha, and what that makes
+of an error that is zero."""
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
