@@ -45,6 +45,7 @@ def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[dict[str,
         frame = stages.rerun(base | {"axes": axes, "sweep": {}}, "marks", side)
         frame = frame.iloc[[points.index(pair) for pair in pairs]]
         error = abs(float(base["observer"][side]["velocity_error"]))
+        starts = tuple(float(base["observer"][side][f"{name}_error"]) for name in ("position", "velocity"))
         friction = friction_of(drive, side)
         bounds = frame[f"{side}.f_plus"].to_numpy(float)
         with jax.enable_x64(True):
@@ -70,8 +71,8 @@ def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[dict[str,
                     "converged": bool(row["converged"]),
                     "convergence_time": row["convergence_time"],
                     "on_this_disturbance": None
-                    if float(ratios["peak_ratio"][i]) < 1.0 or not np.isfinite(missing).all()
-                    else _explained(given.lambda_, given.alpha, trace["t"].to_numpy(), missing, friction, error),
+                    if float(ratios["peak_ratio"][i]) < 1.0 or given.alpha == 0.0 or not np.isfinite(missing).all()
+                    else _explained(given.lambda_, given.alpha, trace["t"].to_numpy(), missing, friction, starts),
                 }
             )
     return found
@@ -82,10 +83,16 @@ _FEWER = 0.1
 
 
 def _explained(
-    lambda_: float, alpha: float, times: np.ndarray, missing: np.ndarray, friction: float, error: float
+    lambda_: float,
+    alpha: float,
+    times: np.ndarray,
+    missing: np.ndarray,
+    friction: float,
+    starts: tuple[float, ...],
 ) -> dict[str, Any]:
-    """What a disturbance does to gains that miss the exact condition, by :mod:`jaxbl.observer.under_tuned`: predicted, and
-    simulated in continuous time."""
+    """What a disturbance (rad/s^2) does to gains that miss the exact condition, by :mod:`jaxbl.observer.under_tuned`:
+    predicted, and simulated in continuous time. `starts` are position error (rad) and velocity error (rad/s) at t = 0."""
+    position, velocity = starts
     largest = float(np.abs(missing).max())
     share = share_above(alpha, missing)
     given = {"times": times, "disturbance": missing, "damping": friction}
@@ -93,13 +100,17 @@ def _explained(
     if share > 0.0:
         found["excursion_predicted"] = excursion(alpha, **given)
         found["excursion_simulated"] = simulate_error(lambda_, alpha, **given, velocity_error=0.0).largest
-    elif error > 0.0:
-        law = peak_law(lambda_, alpha, **given, peak=error)
-        path = simulate_error(lambda_, alpha, **given, velocity_error=error)
-        for name, at, peaks in (("predicted", times, law), ("simulated", path.times, path.peaks)):
+    elif any(starts):
+        # what a position error comes to at its first passage through zero, less what is lost until then
+        peak = float(np.sqrt(velocity**2 + 2.0 * (alpha - missing[0] * np.sign(position)) * abs(position)))
+        law = peak_law(lambda_, alpha, **given, peak=peak)
+        path = simulate_error(lambda_, alpha, **given, position_error=position, velocity_error=velocity)
+        # an error may end without another passage
+        passed = np.r_[times[0], path.times, path.gone], np.r_[path.largest, path.peaks, 0.0]
+        for name, at, peaks in (("predicted", times, law), ("simulated", *passed)):
             found[f"largest_{name}"] = float(peaks.max())
-            # at the end of the run they may still be larger
-            fallen = np.flatnonzero(peaks > _FEWER * error)[-1] + 1
+            fallen = np.flatnonzero(peaks > _FEWER * peak)[-1] + 1
+            # inf or none: at the end of the run they are larger
             found[f"tenth_{name}"] = float(at[fallen]) if fallen < len(at) else None
     least = least_cycle_frequency(lambda_, alpha, largest, friction)
     cycle: dict[str, Any] = {"least_frequency": least}

@@ -49,8 +49,10 @@ def peak_law(
     depend on V, as a cycle takes 4 V alpha / (alpha^2 - d^2): V' = V (ln(alpha^2 - d^2))' / 3 - V damping / 3 - k(d), which
     ends at zero after a finite time.
     """
-    room = alpha**2 - disturbance**2
-    roots = sum(1.0 / np.sqrt(2.0 * (alpha + sign * disturbance)) for sign in (1.0, -1.0))
+    # at |d| = alpha itself there is no half cycle; beside it there is one
+    above, below = (np.maximum(alpha + sign * disturbance, 1e-9 * alpha) for sign in (1.0, -1.0))
+    room = above * below
+    roots = 1.0 / np.sqrt(2.0 * above) + 1.0 / np.sqrt(2.0 * below)
     rate = 0.125 * np.pi * lambda_ * roots * room / alpha
     shape = np.cbrt(room)
     decay = np.exp(-damping * (times - times[0]) / 3.0)

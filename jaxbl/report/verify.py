@@ -321,11 +321,9 @@ def _by_disturbance(one: dict[str, Any]) -> str:
     elif "tenth_predicted" in found:
         largest, times = ([found[f"{what}_{how}"] for how in ("predicted", "simulated")] for what in ("largest", "tenth"))
         # at the end of a run peaks may still be larger
-        when = "do not fall to a tenth" if None in times else f"fall to a tenth after {times[0]:.3g} s ({times[1]:.3g} s)"
-        said += (
-            f": it is slow, and peaks follow it. Predicted (simulated in continuous time), they are {largest[0]:.3g} rad/s "
-        )
-        said += f"at most ({largest[1]:.3g}) and {when}."
+        after = ["not in this run" if time is None else f"after {time:.3g} s" for time in times]
+        said += f". By the law of slow disturbances (simulated in continuous time) peaks are {largest[0]:.3g} rad/s at most "
+        said += f"({largest[1]:.3g}) and fall to a tenth {after[0]} ({after[1]})."
     else:
         said += "."
     cycle = found["sine_cycle"]
@@ -333,7 +331,7 @@ def _by_disturbance(one: dict[str, Any]) -> str:
         said += f" A sine of this size upholds a limit cycle from {cycle['least_frequency']:.3g} Hz on"
         if (known := cycle["predicted"]) and (exact := cycle["simulated"]):
             said += f": at {cycle['frequency']:.3g} Hz one of {known['stable']:.3g} rad/s predicted, {exact['stable']:.3g} "
-            said += f"rad/s simulated, beside one of {exact['threshold']:.3g} rad/s below which errors go to zero"
+            said += f"rad/s simulated, beside an unstable one of {exact['threshold']:.3g} rad/s"
         said += "."
     return said
 

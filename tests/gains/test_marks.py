@@ -60,3 +60,33 @@ def test_alpha_above_the_disturbance_but_too_small_a_lambda(marks):
     assert cycle["frequency"] == 2.0 * cycle["least_frequency"]
     for name in ("stable", "threshold"):
         assert cycle["predicted"][name] == pytest.approx(cycle["simulated"][name], rel=0.15)
+
+
+def moved(position_error):
+    """The explanation of the small gains from a position error."""
+    data = STUDY.resolved() | {"verify": {"marks": MARKS[1:2]}}
+    data["observer"]["motor"] |= {"position_error": position_error, "velocity_error": 0.0}
+    study = read_config(data)
+    (one,) = judge_marks(study, study, Stages(study, "verify"))
+    return one["on_this_disturbance"]
+
+
+def test_a_start_beside_its_place_counts_by_its_energy():
+    found = moved(-0.0008)
+    assert found["largest_predicted"] == pytest.approx(np.sqrt(2.0 * 2.3 * 0.0008), rel=0.05)
+    assert found["tenth_predicted"] == pytest.approx(found["tenth_simulated"], rel=0.1)
+
+
+@pytest.mark.slow
+def test_a_larger_start_ends_in_a_limit_cycle():
+    """Friction of this size under 2 Hz is no slow disturbance: only the simulation shows that."""
+    found = moved(-0.01)
+    assert found["sine_cycle"]["least_frequency"] < 2.0
+    assert found["largest_predicted"] > 0.2
+    assert found["tenth_simulated"] == np.inf
+
+
+def test_without_alpha_there_is_nothing_to_explain():
+    study = read_config(STUDY.resolved() | {"verify": {"marks": [{"name": "none", "lambda": 1.0, "alpha": 0.0}]}})
+    (one,) = judge_marks(study, study, Stages(study, "verify"))
+    assert one["on_this_disturbance"] is None

@@ -92,6 +92,12 @@ def test_without_losses_peaks_come_back_with_the_disturbance():
     assert np.interp(2.0 * np.pi, TIMES, law) == pytest.approx(0.02, rel=1e-5)
 
 
+def test_the_law_at_a_disturbance_that_touches_alpha():
+    law = peak_law(0.01, 1.5, TIMES, 1.5 * np.sin(TIMES), damping=1.0, peak=0.02)
+    assert np.isfinite(law).all()
+    assert (law >= 0.0).all()
+
+
 def test_the_law_ends_after_a_finite_time():
     law = peak_law(0.02, 1.8, TIMES, 0.0 * TIMES, damping=1.5, peak=0.1)
     # V' = -V b / 3 - k
