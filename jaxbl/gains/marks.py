@@ -12,6 +12,7 @@ from jaxbl.observer.conditions import CONDITIONS, peak_ratio
 from jaxbl.observer.under_tuned import (
     excursion,
     least_cycle_frequency,
+    least_cycle_frequency_simulated,
     peak_law,
     simulate_error,
     sine_cycle,
@@ -113,13 +114,14 @@ def _explained(
             # inf or none: at the end of the run they are larger
             found[f"tenth_{name}"] = float(at[fallen]) if fallen < len(at) else None
     least = least_cycle_frequency(lambda_, alpha, largest, friction)
-    cycle: dict[str, Any] = {"least_frequency": least}
+    cycle: dict[str, Any] = {"least_predicted": least, "least_simulated": None}
     if 0.0 < least < np.inf:
         # well beyond where the cycle begins
         frequency = 2.0 * least
         predicted, simulated = (
             of(lambda_, alpha, largest, frequency, friction) for of in (sine_cycle, sine_cycle_simulated)
         )
+        cycle["least_simulated"] = least_cycle_frequency_simulated(lambda_, alpha, largest, friction)
         cycle |= {"frequency": frequency, "predicted": predicted and predicted._asdict()}
         cycle |= {"simulated": simulated and simulated._asdict()}
     return found | {"sine_cycle": cycle}

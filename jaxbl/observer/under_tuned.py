@@ -255,33 +255,70 @@ def sine_cycle(lambda_: float, alpha: float, amplitude: float, frequency: float,
 
 def least_cycle_frequency(lambda_: float, alpha: float, amplitude: float, damping: float) -> float:
     """Frequency (Hz) from which on a sine of this amplitude (rad/s^2) has a limit cycle, by :func:`sine_cycle`; 0 without
-    damping, `inf` where lambda alone forbids one."""
+    damping, `inf` where lambda alone forbids one. It is too high where alpha is close to the amplitude."""
     left = amplitude - lambda_ * np.sqrt(alpha) / SINE_LIMIT
     return float(damping * alpha * np.pi**2 / (48.0 * left)) if left > 0.0 else np.inf
+
+
+def _cycle(
+    lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float, start: tuple[float, float]
+) -> tuple[float, float] | None:
+    """Peak (rad/s) and phase that come back after a simulated half cycle, by Newton's method from `start`; None without."""
+    circular = 2.0 * np.pi * frequency
+    unit = alpha / circular
+
+    def closed(at: np.ndarray) -> np.ndarray:
+        peak, phase = at[0] * unit, at[1]
+        if peak <= 0.0:
+            return np.array([1.0, 1.0])
+        x2, time, _, _ = _half_cycle(
+            lambda_, alpha, lambda t: amplitude * np.sin(circular * t + phase), damping, (0.0, peak, 0.0), np.inf
+        )
+        return np.array([(-x2 - peak) / unit, time * circular / np.pi - 1.0])
+
+    found = root(closed, (start[0] / unit, start[1]), method="hybr")
+    return (float(found.x[0]) * unit, float(found.x[1])) if found.success and np.abs(found.fun).max() < 1e-6 else None
 
 
 def sine_cycle_simulated(
     lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float = 0.0
 ) -> SineCycle | None:
-    """As :func:`sine_cycle`, without its approximation: peak and phase that come back after a simulated half cycle.
+    """As :func:`sine_cycle`, without its approximation, from which Newton's method starts.
 
-    By Newton's method from the balance of energy; None where that has no cycle, or the method finds none.
+    None where that has no cycle, or the method finds none.
     """
     known = sine_cycle(lambda_, alpha, amplitude, frequency, damping)
     if known is None:
         return None
-    circular = 2.0 * np.pi * frequency
     phase = float(np.arcsin(_phase_sine(lambda_, alpha, amplitude, frequency, damping)))
+    starts = (known.stable, np.pi - phase), (known.threshold, phase)
+    stable, threshold = (_cycle(lambda_, alpha, amplitude, frequency, damping, start) for start in starts)
+    return None if stable is None or threshold is None else SineCycle(stable[0], threshold[0])
 
-    def closed(at: np.ndarray) -> np.ndarray:
-        peak, phase = at * (known.stable, 1.0)
-        x2, time, _, _ = _half_cycle(
-            lambda_, alpha, lambda t: amplitude * np.sin(circular * t + phase), damping, (0.0, peak, 0.0), np.inf
-        )
-        return np.array([(-x2 - peak) / known.stable, time * circular / np.pi - 1.0])
 
-    starts = ((1.0, np.pi - phase), (known.threshold / known.stable, phase))
-    found = [root(closed, start, method="hybr") for start in starts]
-    if not all(one.success for one in found):
+_FREQUENCIES = 10
+"""Halvings of a factor of four, when a least frequency is sought: to 0.14 %."""
+
+
+def least_cycle_frequency_simulated(lambda_: float, alpha: float, amplitude: float, damping: float) -> float | None:
+    """As :func:`least_cycle_frequency`, without its approximation: the stable cycle is followed from twice that frequency
+    down to where Newton's method finds none. None where it finds none at all, or where the other one is 0 or `inf`."""
+    high = 2.0 * least_cycle_frequency(lambda_, alpha, amplitude, damping)
+    if not 0.0 < high < np.inf:
         return None
-    return SineCycle(*(float(one.x[0]) * known.stable for one in found))
+    known = sine_cycle(lambda_, alpha, amplitude, high, damping)
+    assert known is not None
+    phase = np.pi - float(np.arcsin(_phase_sine(lambda_, alpha, amplitude, high, damping)))
+    last = _cycle(lambda_, alpha, amplitude, high, damping, (known.stable, phase))
+    if last is None:
+        return None
+    low = 0.25 * high
+    for _ in range(_FREQUENCIES):
+        middle = float(np.sqrt(low * high))
+        # by homogeneity peaks go with the period
+        found = _cycle(lambda_, alpha, amplitude, middle, damping, (last[0] * high / middle, last[1]))
+        if found is None:
+            low = middle
+        else:
+            high, last = middle, found
+    return high

@@ -327,8 +327,8 @@ def _by_disturbance(one: dict[str, Any]) -> str:
     else:
         said += "."
     cycle = found["sine_cycle"]
-    if cycle["least_frequency"]:
-        said += f" A sine of this size upholds a limit cycle from {cycle['least_frequency']:.3g} Hz on"
+    if cycle["least_simulated"]:
+        said += f" A sine of this size upholds a limit cycle from {cycle['least_simulated']:.3g} Hz on"
         if (known := cycle["predicted"]) and (exact := cycle["simulated"]):
             said += f": at {cycle['frequency']:.3g} Hz one of {known['stable']:.3g} rad/s predicted, {exact['stable']:.3g} "
             said += f"rad/s simulated, beside an unstable one of {exact['threshold']:.3g} rad/s"

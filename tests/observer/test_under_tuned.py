@@ -11,6 +11,7 @@ from jaxbl.observer.under_tuned import (
     excursion,
     half_cycle_ratio,
     least_cycle_frequency,
+    least_cycle_frequency_simulated,
     peak_law,
     simulate_error,
     sine_cycle,
@@ -194,6 +195,23 @@ def test_least_frequency_of_a_cycle():
     assert cycles[1] is not None
     assert least_cycle_frequency(0.005, 1.8, 1.56, 0.0) == 0.0
     assert least_cycle_frequency(1.0, 1.8, 1.56, 3.0) == np.inf
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("alpha", "ratio"), [(1.15, 0.757), (2.0, 0.926)])
+def test_least_frequency_without_approximation(alpha, ratio):
+    """Below it errors of any size and phase go to zero; above it not."""
+    least = least_cycle_frequency_simulated(0.005, alpha, 1.0, 3.0)
+    assert least / least_cycle_frequency(0.005, alpha, 1.0, 3.0) == pytest.approx(ratio, rel=0.01)
+    ends = []
+    for frequency in (0.95 * least, 1.1 * least):
+        times = np.linspace(0.0, 15.0 / frequency, 3001)
+        for phase in (0.0, 0.7 * np.pi, 1.4 * np.pi):
+            sine = np.sin(2.0 * np.pi * frequency * times + phase)
+            path = simulate_error(0.005, alpha, times, sine, damping=3.0, velocity_error=0.4 * alpha / frequency)
+            ends.append(path.peaks[-1] / path.peaks[0])
+    assert max(ends[:3]) < 0.02
+    assert max(ends[3:]) > 0.2
 
 
 TABLE_1 = {
