@@ -1,4 +1,5 @@
-"""Gains that `[verify]` marks in the atlas: each run once, and judged."""
+"""Gains that `[verify]` marks in the atlas: each run once, and judged; those that miss the exact condition also by what the
+run's own disturbance does to them."""
 
 from typing import Any
 
@@ -6,10 +7,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.config import Config
+from jaxbl.config import Config, read_config
 from jaxbl.observer.conditions import CONDITIONS, peak_ratio
+from jaxbl.observer.under_tuned import (
+    excursion,
+    least_cycle_frequency,
+    least_cycle_frequency_simulated,
+    peak_law,
+    simulate_error,
+    sine_cycle,
+    sine_cycle_simulated,
+)
 from jaxbl.observer.worst_case import half_cycle
+from jaxbl.sweeps.trial import run
 
+from .below_bound import disturbance, friction_of, share_above
 from .stages import Stages
 
 
@@ -18,6 +30,8 @@ def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[dict[str,
     found = []
     base = ideal.resolved()
     drive = config.build().drive
+    # the observer does not act on the drive: one run has the disturbance of all gains
+    trace = run(read_config(base | {"axes": [], "sweep": {}})).trace if config.verify.marks else None
     for side in ("motor", "load"):
         marks = [given for given in config.verify.marks if given.side == side]
         if not marks:
@@ -32,11 +46,14 @@ def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[dict[str,
         frame = stages.rerun(base | {"axes": axes, "sweep": {}}, "marks", side)
         frame = frame.iloc[[points.index(pair) for pair in pairs]]
         error = abs(float(base["observer"][side]["velocity_error"]))
-        friction = float(drive.viscous(side)) / float(drive.inertia(side))
+        starts = tuple(float(base["observer"][side][f"{name}_error"]) for name in ("position", "velocity"))
+        friction = friction_of(drive, side)
         bounds = frame[f"{side}.f_plus"].to_numpy(float)
         with jax.enable_x64(True):
             given = (jnp.asarray(x, float) for x in (gains["lambda"], gains["alpha"], bounds))
             ratios = jax.jit(_ratios)(*given, jnp.asarray(friction, float), jnp.asarray(error, float))
+        assert trace is not None
+        missing = disturbance(drive, side, trace)
         for i, (given, bound) in enumerate(zip(marks, bounds, strict=True)):
             row = {name.partition(".")[2]: frame[name].iloc[i] for name in frame.columns if name.startswith(side)}
             found.append(
@@ -54,9 +71,60 @@ def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[dict[str,
                     **{f"margin_{name}": row[f"margin_{name}"] for name in CONDITIONS},
                     "converged": bool(row["converged"]),
                     "convergence_time": row["convergence_time"],
+                    "on_this_disturbance": None
+                    if float(ratios["peak_ratio"][i]) < 1.0 or given.alpha == 0.0 or not np.isfinite(missing).all()
+                    else _explained(given.lambda_, given.alpha, trace["t"].to_numpy(), missing, friction, starts),
                 }
             )
     return found
+
+
+_FEWER = 0.1
+"""Peak over the first one, whose time says how fast they fall."""
+
+
+def _explained(
+    lambda_: float,
+    alpha: float,
+    times: np.ndarray,
+    missing: np.ndarray,
+    friction: float,
+    starts: tuple[float, ...],
+) -> dict[str, Any]:
+    """What a disturbance (rad/s^2) does to gains that miss the exact condition, by :mod:`jaxbl.observer.under_tuned`:
+    predicted, and simulated in continuous time. `starts` are position error (rad) and velocity error (rad/s) at t = 0."""
+    position, velocity = starts
+    largest = float(np.abs(missing).max())
+    share = share_above(alpha, missing)
+    given = {"times": times, "disturbance": missing, "damping": friction}
+    found: dict[str, Any] = {"largest_disturbance": largest, "share_above_alpha": share}
+    if share > 0.0:
+        found["excursion_predicted"] = excursion(alpha, **given)
+        found["excursion_simulated"] = simulate_error(lambda_, alpha, **given, velocity_error=0.0).largest
+    elif any(starts):
+        # what a position error comes to at its first passage through zero, less what is lost until then
+        peak = float(np.sqrt(velocity**2 + 2.0 * (alpha - missing[0] * np.sign(position)) * abs(position)))
+        law = peak_law(lambda_, alpha, **given, peak=peak)
+        path = simulate_error(lambda_, alpha, **given, position_error=position, velocity_error=velocity)
+        # an error may end without another passage
+        passed = np.r_[times[0], path.times, path.gone], np.r_[path.largest, path.peaks, 0.0]
+        for name, at, peaks in (("predicted", times, law), ("simulated", *passed)):
+            found[f"largest_{name}"] = float(peaks.max())
+            fallen = np.flatnonzero(peaks > _FEWER * peak)[-1] + 1
+            # inf or none: at the end of the run they are larger
+            found[f"tenth_{name}"] = float(at[fallen]) if fallen < len(at) else None
+    least = least_cycle_frequency(lambda_, alpha, largest, friction)
+    cycle: dict[str, Any] = {"least_predicted": least, "least_simulated": None}
+    if 0.0 < least < np.inf:
+        # well beyond where the cycle begins
+        frequency = 2.0 * least
+        predicted, simulated = (
+            of(lambda_, alpha, largest, frequency, friction) for of in (sine_cycle, sine_cycle_simulated)
+        )
+        cycle["least_simulated"] = least_cycle_frequency_simulated(lambda_, alpha, largest, friction)
+        cycle |= {"frequency": frequency, "predicted": predicted and predicted._asdict()}
+        cycle |= {"simulated": simulated and simulated._asdict()}
+    return found | {"sine_cycle": cycle}
 
 
 def _ratios(lambda_: Any, alpha: Any, f_plus: Any, friction: Any, error: Any) -> dict[str, Any]:

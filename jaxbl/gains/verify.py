@@ -26,6 +26,7 @@ from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.programs import Backend
 from jaxbl.workers import Progress
 
+from .below_bound import converged_below
 from .counterexamples import explained, keys_of
 from .error_system import (
     SWITCHING_LIMIT,
@@ -36,6 +37,7 @@ from .error_system import (
     simulate_error_system,
 )
 from .marks import judge_marks
+from .rules import judge_rules
 from .stages import Stages, stages_in
 
 _MOST_LISTED = 200
@@ -113,6 +115,8 @@ def _verified(config: Config, sides: list[str], stages: Stages) -> Verdict:
                 counterexamples = explained(counterexamples, studies[level], level, side, stages)
                 runs = counterexamples.drop_duplicates(["bound", *keys_of(studies[level])])
                 summary["causes"] = {bound: part.cause.value_counts().to_dict() for bound, part in runs.groupby("bound")}
+            if level == "drive":
+                summary["below_f_plus"] = converged_below(studies[level], side, frame)
             summaries.append(summary)
             found.append(counterexamples)
     every = pd.concat(found, ignore_index=True)
@@ -131,6 +135,7 @@ def _verified(config: Config, sides: list[str], stages: Stages) -> Verdict:
                 {"damping": damping, "alpha_ratio": normalised.alpha, "least_lambda_ratio": boundary}
                 for damping, boundary in normalised.damped.items()
             ],
+            "rules": judge_rules(normalised.alpha, normalised.lambda_, normalised.ratio),
             "marks": judge_marks(config, studies["drive"], stages),
             "counterexamples": true.head(_MOST_LISTED).to_dict("records"),
             "counterexamples_in_all": len(true),

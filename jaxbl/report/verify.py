@@ -24,6 +24,7 @@ from .error_plane import draw_worst_planes
 from .figures import COLOURS, MAP, MISSING, Drawn, literal, mark, style, subplots
 from .maps import condition_curves
 from .page import PageTable, write_report
+from .tuning_rules import draw_rules, rule_lines, rule_table
 
 _USUAL = ("usual pair (1.5, 1.1)", 1.1, 1.5)
 _MARKERS = ("*", "P", "D", "^", "v", "X", "s")
@@ -39,6 +40,7 @@ def draw_verdict(verdict: Verdict) -> list[Drawn]:
     planes = draw_worst_planes(verdict.summary["marks"])
     return [
         _atlas(verdict),
+        draw_rules(verdict.summary["rules"]),
         *([] if planes is None else [planes]),
         *damping,
         *levels,
@@ -215,9 +217,11 @@ def _claimed(verdict: Verdict) -> Drawn:
 
 def write_verify_report(verdict: Verdict, folder: Path) -> list[str]:
     """Draw the figures of a verification and write `report.html` into its folder. Returns the lines for the terminal."""
-    lead, remarks = _headline(verdict), [*verdict.config.notes, *_mark_lines(verdict)]
+    lead = [*_headline(verdict), *rule_lines(verdict.summary["rules"])]
+    remarks = [*verdict.config.notes, *_mark_lines(verdict)]
     tables = [_level_table(level) for level in verdict.summary["levels"]]
     tables += [t for level in verdict.summary["levels"] for t in _claimed_tables(level)]
+    tables.append(rule_table(verdict.summary["rules"]))
     if verdict.summary["marks"]:
         tables.append(_mark_table(verdict))
     if len(verdict.counterexamples):
@@ -260,7 +264,20 @@ def _headline(verdict: Verdict) -> list[str]:
                 share = "is large enough in all converged runs"
             size = "" if most is None else f"; the true bound is up to {most:.3g} times as large"
             lines.append(f"{level['side']}: the bound f⁺ as twice the largest acceleration {share}{size}.")
+        if below := level.get("below_f_plus"):
+            lines.append(_below_line(verdict, level["side"], below))
     return lines
+
+
+def _below_line(verdict: Verdict, side: str, below: dict[str, Any]) -> str:
+    runs = "" if below["runs"] == below["converged_runs"] else f" {below['runs']} of them were looked at:"
+    return (
+        f"{side}: {below['converged_runs']} runs converge though α is below the true f⁺, where no condition can hold.{runs} "
+        f"In {below['disturbance_exceeds']} the disturbance itself exceeds α, {100.0 * below['share_above_alpha']:.3g} % of "
+        f"the time at most. The largest excursion from zero is {below['excursion_predicted']:.3g} rad/s predicted, "
+        f"{below['excursion_simulated']:.3g} rad/s simulated; the velocity tolerance is "
+        f"{verdict.config.run.velocity_tolerance:.3g} rad/s."
+    )
 
 
 def _mark_lines(verdict: Verdict) -> list[str]:
@@ -272,7 +289,7 @@ def _mark_lines(verdict: Verdict) -> list[str]:
             continue
         line = f"{one['name']}: α / f⁺ = {one['alpha_ratio']:.3g}, λ / √f⁺ = {one['lambda_ratio']:.3g}; "
         if rho is None:
-            line += "α is below the true f⁺: no condition can hold."
+            line += f"α is below the true f⁺: no condition can hold.{_by_disturbance(one)}"
         elif rho < 1.0:
             line += f"ρ = {rho:.3g}: any disturbance within f⁺ dies out in finite time."
         else:
@@ -283,9 +300,40 @@ def _mark_lines(verdict: Verdict) -> list[str]:
                 f"ρ = {rho:.3g}: the worst disturbance enlarges the velocity error to "
                 f"{one['upheld_velocity_error']:.3g} rad/s, where friction balances it. Under a constant disturbance each "
                 f"peak is {one['peak_ratio_constant']:.3g} times the last (friction number {one['damping']:.2g}){ended}"
+                f"{_by_disturbance(one)}"
             )
         lines.append(line)
     return lines
+
+
+def _by_disturbance(one: dict[str, Any]) -> str:
+    """What the run's own disturbance d does to gains that miss the exact condition, in sentences."""
+    found = one["on_this_disturbance"]
+    if found is None:
+        return ""
+    share = found["share_above_alpha"]
+    said = f" On this disturbance |d| exceeds α during {100.0 * share:.3g} % of the time"
+    if share > 0.0:
+        said += (
+            f"; its largest excursion from zero is {found['excursion_predicted']:.3g} rad/s predicted, "
+            f"{found['excursion_simulated']:.3g} rad/s simulated."
+        )
+    elif "tenth_predicted" in found:
+        largest, times = ([found[f"{what}_{how}"] for how in ("predicted", "simulated")] for what in ("largest", "tenth"))
+        # at the end of a run peaks may still be larger
+        after = ["not in this run" if time is None else f"after {time:.3g} s" for time in times]
+        said += f". By the law of slow disturbances (simulated in continuous time) peaks are {largest[0]:.3g} rad/s at most "
+        said += f"({largest[1]:.3g}) and fall to a tenth {after[0]} ({after[1]})."
+    else:
+        said += "."
+    cycle = found["sine_cycle"]
+    if cycle["least_simulated"]:
+        said += f" A sine of this size upholds a limit cycle from {cycle['least_simulated']:.3g} Hz on"
+        if (known := cycle["predicted"]) and (exact := cycle["simulated"]):
+            said += f": at {cycle['frequency']:.3g} Hz one of {known['stable']:.3g} rad/s predicted, {exact['stable']:.3g} "
+            said += f"rad/s simulated, beside an unstable one of {exact['threshold']:.3g} rad/s"
+        said += "."
+    return said
 
 
 def _level_table(level: dict[str, Any]) -> PageTable:

@@ -231,6 +231,11 @@ def test_verdict_on_disk(checked):
         for entry in level["conditions"]:
             assert isinstance(entry["holds"], int) and isinstance(entry["counterexamples"], int)
             assert {"median", "max"} <= set(entry["conservatism"])
+    rules = {one["name"]: one for one in found["rules"]}
+    for entry in found["levels"][0]["conditions"]:
+        # a rule that is a condition holds in the same cells, but for q
+        if entry["name"] in rules and entry["name"] != "davila_fridman":
+            assert rules[entry["name"]]["cells"] == {key: entry[key] for key in ("holds", "counterexamples")}
     kept = pd.read_parquet(folder / "counterexamples.parquet")
     pd.testing.assert_frame_equal(kept, verdict.counterexamples, check_dtype=False)
     true = verdict.counterexamples[verdict.counterexamples["bound"] == "true"]

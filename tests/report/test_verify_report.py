@@ -35,7 +35,15 @@ def checked(tmp_path_factory):
 def test_figures(checked):
     verdict, _, _ = checked
     drawn = {drawing.name: drawing for drawing in draw_verdict(verdict)}
-    assert list(drawn) == ["atlas", "error_planes", "friction", "levels_motor", "conservatism", "claimed_bound"]
+    assert list(drawn) == [
+        "atlas",
+        "tuning_rules",
+        "error_planes",
+        "friction",
+        "levels_motor",
+        "conservatism",
+        "claimed_bound",
+    ]
     assert all(drawing.caption for drawing in drawn.values())
     atlas = drawn["atlas"].figure
     legend = [text.get_text() for text in atlas.legends[0].get_texts()]
@@ -67,12 +75,34 @@ def test_page_and_lines(checked):
     assert any("failed although a condition held" in line and "Causes, by experiment" in line for line in lines)
     (marked,) = [line for line in lines if line.startswith("small gains")]
     assert "no condition can hold" in marked or "worst disturbance enlarges the velocity error" in marked
+    assert "On this disturbance |d| exceeds α during" in marked
     (marked,) = [line for line in lines if line.startswith("good gains")]
     assert "any disturbance within f⁺ dies out" in marked
-    assert len(list((folder / "figures").glob("*.png"))) == 6
+    assert len(list((folder / "figures").glob("*.png"))) == 7
+
+
+@pytest.mark.slow
+def test_tuning_rules_in_figure_page_and_lines(checked):
+    verdict, folder, lines = checked
+    rules = verdict.summary["rules"]
+    (drawn,) = [drawing for drawing in draw_verdict(verdict) if drawing.name == "tuning_rules"]
+    good, wrong = drawn.figure.axes
+    legends = [{text.get_text() for text in ax.get_legend().get_texts()} for ax in (good, wrong)]
+    for one in rules:
+        assert (one["title"] in legends[0]) == one["sufficient"]
+        assert (one["title"] in legends[1]) != one["sufficient"]
+    crosses = [line.get_xydata()[0] for line in wrong.lines if line.get_marker() == "x"]
+    failed = [one["counterexample"] for one in rules if not one["sufficient"]]
+    expected = [(found["alpha"] / found["f_plus"], found["lambda"] / found["f_plus"] ** 0.5) for found in failed]
+    np.testing.assert_allclose(crosses, expected)
+    page = (folder / "report.html").read_text()
+    assert all(one["source"].split(",")[0] in page for one in rules)
+    (counted,) = [line for line in lines if "public tuning rules are sufficient" in line]
+    assert counted.startswith(f"{len(rules) - len(failed)} of {len(rules)} ")
+    assert sum(line.startswith("Tuning rule ") for line in lines) == len(failed) > 0
 
 
 @needs_chromium
 def test_the_page_in_a_browser(checked):
     with opened(checked[1] / "report.html") as (page,):
-        check(page, 6)
+        check(page, 7)

@@ -1,0 +1,324 @@
+"""What gains do that miss the exact condition: the error under a disturbance that is known, in place of the worst one.
+
+The error system is x1' = x2 - lambda sqrt|x1| sign x1, x2' = d(t) - alpha sign x1 - damping x2. Between two passages through
+x1 = 0 it makes a half cycle; a peak V is |x2| at such a passage. Unless said to be exact, what follows is to first order in
+the losses of a half cycle (lambda, damping) and, for :func:`peak_law`, in the change of d over one. Derived for this project
+(docs/theory.md), and checked against :func:`simulate_error`, which takes no such approximation.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.integrate import cumulative_trapezoid, solve_ivp
+from scipy.optimize import root
+
+_TOLERANCE = 1e-9
+"""Relative, of the simulated half cycles."""
+_REST = 1e-4
+"""Peak over the first one, below which the error counts as gone."""
+_MOST_HALF_CYCLES = 20_000
+_LONGEST = 1e5
+"""Of a half cycle in tau, over 1 / sqrt(alpha); without disturbance it takes 4.4."""
+_BEGUN = 1e-3
+"""Part of the speed that a pulse makes, from which on an error that was zero is simulated."""
+
+
+def half_cycle_ratio(lambda_: float, alpha: float, disturbance: float) -> float:
+    """Ratio of a peak to the one before under a constant disturbance (rad/s^2), for x1 > 0; exact.
+
+    It is below 1 for any lambda > 0 and |disturbance| < alpha. For x1 < 0 the disturbance has the other sign.
+
+    With c = 2 (alpha - d) it is exp(-(lambda / 2) pi / sqrt(c - lambda^2 / 4)), as both arcs of the half cycle have the same
+    c; 0 where lambda^2 >= 4 c, `inf` where d >= alpha: the error does not come back.
+    """
+    c = 2.0 * (alpha - disturbance)
+    if c <= 0.0:
+        return np.inf
+    below = c - 0.25 * lambda_**2
+    return float(np.exp(-0.5 * np.pi * lambda_ / np.sqrt(below))) if below > 0.0 else 0.0
+
+
+def peak_law(
+    lambda_: float, alpha: float, times: np.ndarray, disturbance: np.ndarray, *, damping: float, peak: float
+) -> np.ndarray:
+    """Peaks (rad/s) over time under a slow disturbance below alpha; `times` (s), `disturbance` (rad/s^2) of one shape (n,).
+
+    Without losses the area of a cycle is kept, V^3 / (alpha^2 - d^2): the peaks follow the disturbance, and come back with
+    it. Damping shrinks them at a third of its rate, and lambda, by :func:`half_cycle_ratio`, at a rate k that does not
+    depend on V, as a cycle takes 4 V alpha / (alpha^2 - d^2): V' = V (ln(alpha^2 - d^2))' / 3 - V damping / 3 - k(d), which
+    ends at zero after a finite time.
+    """
+    # at |d| = alpha itself there is no half cycle; beside it there is one
+    above, below = (np.maximum(alpha + sign * disturbance, 1e-9 * alpha) for sign in (1.0, -1.0))
+    room = above * below
+    roots = 1.0 / np.sqrt(2.0 * above) + 1.0 / np.sqrt(2.0 * below)
+    rate = 0.125 * np.pi * lambda_ * roots * room / alpha
+    shape = np.cbrt(room)
+    decay = np.exp(-damping * (times - times[0]) / 3.0)
+    lost = cumulative_trapezoid(rate / (shape * decay), times, initial=0.0)
+    return shape * decay * np.maximum(peak / shape[0] - lost, 0.0)
+
+
+def excursion(alpha: float, times: np.ndarray, disturbance: np.ndarray, damping: float) -> float:
+    """Largest |x2| (rad/s) that the pulses of |d| above alpha make of an error that is zero before each of them; exact.
+
+    x1 keeps the sign of d while x2 does, so that x2' = |d| - alpha - damping x2 from the begin of a pulse on. Without
+    damping that is the integral of |d| - alpha over the pulse.
+    """
+    steps = np.diff(times)
+    kept = np.exp(-damping * steps)
+    lasting = steps if damping == 0.0 else -np.expm1(-damping * steps) / damping
+    above = np.abs(disturbance) > alpha
+    begins = np.flatnonzero(above[:-1] | above[1:])
+    largest, speed, at = 0.0, 0.0, 0
+    while at < len(steps):
+        if speed == 0.0:
+            # on to the next pulse
+            begin = int(np.searchsorted(begins, at))
+            if begin == len(begins):
+                break
+            at = int(begins[begin])
+            sign = np.sign(disturbance[at + 1] if above[at + 1] else disturbance[at])
+            push = sign * 0.5 * (disturbance[:-1] + disturbance[1:]) - alpha
+        # the other sign of d pulls back
+        speed = max(speed * kept[at] + push[at] * lasting[at], 0.0)
+        largest = max(largest, float(speed))
+        at += 1
+    return largest
+
+
+class ErrorPath(NamedTuple):
+    """A simulated error.
+
+    Attributes:
+        times: of passages through x1 = 0 (s), shape (n,).
+        peaks: |x2| there (rad/s), shape (n,).
+        largest: largest |x2| at any of them (rad/s); between two of them |x2| is largest at an end while |d| < alpha.
+        gone: time (s) from which on the error counts as zero; `inf` where it does not.
+    """
+
+    times: np.ndarray
+    peaks: np.ndarray
+    largest: float
+    gone: float
+
+
+def _half_cycle(
+    lambda_: float,
+    alpha: float,
+    disturbance: Callable[[float], Any],
+    damping: float,
+    start: tuple[float, float, float],
+    end: float,
+) -> tuple[float, float, float, bool]:
+    """x2 and time at the end of a half cycle, the largest |x2| in it, and whether x1 has come back to zero.
+
+    `start`: root of |x1|, x2 and time; both in the sign of x1. In tau with dt = 2 sqrt|x1| d(tau) all slopes are finite.
+    """
+
+    def slope(_: float, state: np.ndarray) -> tuple[float, float, float]:
+        y, x2, time = state
+        return x2 - lambda_ * y, 2.0 * y * (disturbance(time) - alpha - damping * x2), 2.0 * y
+
+    def back(_: float, state: np.ndarray) -> float:
+        return state[0]
+
+    def late(_: float, state: np.ndarray) -> float:
+        return state[2] - end
+
+    pace = 1.0 / np.sqrt(alpha)
+    scale = max(abs(start[1]), start[0] / pace)
+
+    def near(_: float, state: np.ndarray) -> float:
+        # along a ray to the origin a half cycle does not end
+        return abs(state[1]) + state[0] / pace - 1e-3 * _REST * scale
+
+    back.terminal, back.direction, late.terminal, near.terminal = True, -1, True, True  # type: ignore[attr-defined]
+    found = solve_ivp(
+        slope,
+        (0.0, _LONGEST * pace),
+        start,
+        method="DOP853",
+        events=(back, late, near),
+        rtol=_TOLERANCE,
+        atol=1e-3 * _TOLERANCE * scale * np.array([pace, 1.0, pace**2]),
+        max_step=pace,
+    )
+    y, x2, time = found.y[:, -1]
+    return x2, time, float(np.abs(found.y[1]).max()), len(found.t_events[0]) > 0 or y <= 0.0
+
+
+def simulate_error(
+    lambda_: float,
+    alpha: float,
+    times: np.ndarray,
+    disturbance: np.ndarray,
+    *,
+    damping: float = 0.0,
+    position_error: float = 0.0,
+    velocity_error: float,
+) -> ErrorPath:
+    """Simulate the error system in continuous time under a disturbance (rad/s^2) that is linear between its samples.
+
+    Half cycles by Runge-Kutta of order eight, relative tolerance 1e-9. An error that has fallen to 1e-4 of its first peak
+    counts as zero, and stays there until |d| exceeds alpha.
+
+    Args:
+        lambda_: gain, rad^0.5/s.
+        alpha: gain, rad/s^2.
+        times: of the samples (s), shape (n,).
+        disturbance: samples (rad/s^2), shape (n,).
+        damping: viscous damping of x2, 1/s.
+        position_error: x1 at the first sample (rad).
+        velocity_error: x2 there (rad/s).
+    """
+    time, end = float(times[0]), float(times[-1])
+    sign = np.sign(position_error) or np.sign(velocity_error) or 1.0
+    y, x2 = float(np.sqrt(abs(position_error))), float(sign * velocity_error)
+    scale = max(abs(x2), y * np.sqrt(2.0 * alpha))
+    found, peaks, largest, gone = [], [], abs(x2), np.inf
+    if y == 0.0 and x2 != 0.0:
+        found, peaks = [time], [x2]
+    for _ in range(_MOST_HALF_CYCLES):
+        if max(abs(x2), y) <= _REST * scale:
+            gone = min(gone, time)
+            later = np.flatnonzero((times >= time) & (np.abs(disturbance) > alpha))
+            if not len(later):
+                break
+            sign = float(np.sign(disturbance[later[0]]))
+            time, x2 = _off_zero(sign * disturbance[later[0] :] - alpha, times[later[0] :])
+            y = x2 / max(lambda_, np.sqrt(alpha))
+            scale, gone = max(scale, x2), np.inf
+        signed = sign * disturbance
+        x2, time, most, came = _half_cycle(
+            lambda_, alpha, lambda at, signed=signed: np.interp(at, times, signed), damping, (y, x2, time), end
+        )
+        largest = max(largest, most)
+        if came:
+            found.append(time)
+            peaks.append(abs(x2))
+        elif time >= end * (1.0 - 1e-12):
+            break
+        # without a passage it has ended at the origin
+        y, x2, sign = 0.0, -x2 if came else 0.0, -sign
+    return ErrorPath(np.array(found), np.array(peaks), float(largest), float(gone))
+
+
+def _off_zero(excess: np.ndarray, times: np.ndarray) -> tuple[float, float]:
+    """Time, and x2 (rad/s), at which a pulse of |d| - alpha has made an error that was zero just large enough to simulate.
+
+    x2 is the integral of the pulse, whatever x1 is, and x1 is soon forgotten.
+    """
+    pulse = excess[: int(np.argmax(excess <= 0.0)) or len(excess)]
+    speed = cumulative_trapezoid(pulse, times[: len(pulse)], initial=0.0)
+    at = int(np.argmax(speed >= _BEGUN * speed[-1]))
+    # a pulse of one sample has no area here
+    return float(times[at]), float(speed[at]) or 1e-12 * float(excess[0])
+
+
+class SineCycle(NamedTuple):
+    """Limit cycles under d = amplitude sin(2 pi frequency t), by their peaks V (rad/s).
+
+    Errors near `stable` come to it. `threshold` is the peak of the cycle that parts them from those that go to zero.
+    """
+
+    stable: float
+    threshold: float
+
+
+SINE_LIMIT = 16.0 * 2.0**0.5 / np.pi**3
+"""lambda sqrt(alpha) / amplitude, up to which a sine upholds a limit cycle without damping: 0.730."""
+
+
+def _phase_sine(lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float) -> float:
+    """Sine of the phase in which the disturbance makes up for the losses of a half cycle."""
+    friction = damping * alpha * np.pi**3 / (24.0 * 2.0 * np.pi * frequency)
+    return float((friction + lambda_ * np.sqrt(alpha) / SINE_LIMIT) / amplitude)
+
+
+def sine_cycle(lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float = 0.0) -> SineCycle | None:
+    """Limit cycles of the error under a sine (rad/s^2, Hz), by balance of energy; None where there is none.
+
+    A half cycle takes half a period, in which x2 falls by 2 V = pi alpha / w - 2 (amplitude / w) cos(phase), with w = 2 pi
+    frequency. The sine puts in the energy 2 alpha amplitude sin(phase) / w^2; damping and lambda take out what they take of
+    a parabola. The sine of the phase is at most 1: without damping there is a cycle where lambda sqrt(alpha) <
+    `SINE_LIMIT` times the amplitude.
+    """
+    sine = _phase_sine(lambda_, alpha, amplitude, frequency, damping)
+    if sine > 1.0:
+        return None
+    circular = 2.0 * np.pi * frequency
+    middle, half = 0.5 * np.pi * alpha / circular, amplitude * np.sqrt(1.0 - sine**2) / circular
+    return SineCycle(float(middle + half), float(middle - half))
+
+
+def least_cycle_frequency(lambda_: float, alpha: float, amplitude: float, damping: float) -> float:
+    """Frequency (Hz) from which on a sine of this amplitude (rad/s^2) has a limit cycle, by :func:`sine_cycle`; 0 without
+    damping, `inf` where lambda alone forbids one. It is too high where alpha is close to the amplitude."""
+    left = amplitude - lambda_ * np.sqrt(alpha) / SINE_LIMIT
+    return float(damping * alpha * np.pi**2 / (48.0 * left)) if left > 0.0 else np.inf
+
+
+def _cycle(
+    lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float, start: tuple[float, float]
+) -> tuple[float, float] | None:
+    """Peak (rad/s) and phase that come back after a simulated half cycle, by Newton's method from `start`; None without."""
+    circular = 2.0 * np.pi * frequency
+    unit = alpha / circular
+
+    def closed(at: np.ndarray) -> np.ndarray:
+        peak, phase = at[0] * unit, at[1]
+        if peak <= 0.0:
+            return np.array([1.0, 1.0])
+        x2, time, _, _ = _half_cycle(
+            lambda_, alpha, lambda t: amplitude * np.sin(circular * t + phase), damping, (0.0, peak, 0.0), np.inf
+        )
+        return np.array([(-x2 - peak) / unit, time * circular / np.pi - 1.0])
+
+    found = root(closed, (start[0] / unit, start[1]), method="hybr")
+    return (float(found.x[0]) * unit, float(found.x[1])) if found.success and np.abs(found.fun).max() < 1e-6 else None
+
+
+def sine_cycle_simulated(
+    lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float = 0.0
+) -> SineCycle | None:
+    """As :func:`sine_cycle`, without its approximation, from which Newton's method starts.
+
+    None where that has no cycle, or the method finds none.
+    """
+    known = sine_cycle(lambda_, alpha, amplitude, frequency, damping)
+    if known is None:
+        return None
+    phase = float(np.arcsin(_phase_sine(lambda_, alpha, amplitude, frequency, damping)))
+    starts = (known.stable, np.pi - phase), (known.threshold, phase)
+    stable, threshold = (_cycle(lambda_, alpha, amplitude, frequency, damping, start) for start in starts)
+    return None if stable is None or threshold is None else SineCycle(stable[0], threshold[0])
+
+
+_FREQUENCIES = 10
+"""Halvings of a factor of four, when a least frequency is sought: to 0.14 %."""
+
+
+def least_cycle_frequency_simulated(lambda_: float, alpha: float, amplitude: float, damping: float) -> float | None:
+    """As :func:`least_cycle_frequency`, without its approximation: the stable cycle is followed from twice that frequency
+    down to where Newton's method finds none. None where it finds none at all, or where the other one is 0 or `inf`."""
+    high = 2.0 * least_cycle_frequency(lambda_, alpha, amplitude, damping)
+    if not 0.0 < high < np.inf:
+        return None
+    known = sine_cycle(lambda_, alpha, amplitude, high, damping)
+    assert known is not None
+    phase = np.pi - float(np.arcsin(_phase_sine(lambda_, alpha, amplitude, high, damping)))
+    last = _cycle(lambda_, alpha, amplitude, high, damping, (known.stable, phase))
+    if last is None:
+        return None
+    low = 0.25 * high
+    for _ in range(_FREQUENCIES):
+        middle = float(np.sqrt(low * high))
+        # by homogeneity peaks go with the period
+        found = _cycle(lambda_, alpha, amplitude, middle, damping, (last[0] * high / middle, last[1]))
+        if found is None:
+            low = middle
+        else:
+            high, last = middle, found
+    return high
