@@ -10,8 +10,8 @@ import numpy as np
 from jaxbl.identification.compilation import jit
 from jaxbl.simulate import Experiment, Sample, State, initial_state, step
 
-BLOCKS = (512, 16_384)
-"""Samples of a call: few for rows as they come, many for a recording."""
+BLOCKS = (256, 2048, 16_384)
+"""Samples of a call: few for rows as they come, at 1 or 10 kHz, and many for a recording."""
 
 
 @jit
@@ -77,5 +77,6 @@ class LiveChain:
     def compile(self) -> None:
         """Compile what rows will need, before any come."""
         sides = self._experiment.sides
-        self.take(np.zeros(1), {side: np.zeros(1) for side in sides}, anew=True)
+        for size in BLOCKS[:-1]:
+            self.take(np.zeros(size), {side: np.zeros(size) for side in sides}, anew=True)
         self._state = None

@@ -207,7 +207,7 @@ def run_watch(
         InputError: as :func:`watch`.
     """
     with jax.enable_x64(True), one_blas_thread():
-        watcher = _Watcher(task, on_values or (lambda values: None))
+        watcher = Watcher(task, on_values or (lambda values: None))
         counts: Mapping[str, int] = {}
         if task.record is not None:
             for rows in _of_record(task.record):
@@ -263,8 +263,19 @@ def counted(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{number} {what}" for what, number in counts.items())
 
 
-class _Watcher:
-    """Takes rows, and makes values every so many seconds."""
+class Watcher:
+    """Takes rows, and makes values every so many seconds.
+
+    Args:
+        task: what is watched.
+        on_values: called with each row of values.
+
+    Attributes:
+        values: all rows of values.
+        columns: their names.
+        samples: how many were taken in.
+        start: time of the first one, s by the stamps; None before it.
+    """
 
     def __init__(self, task: WatchTask, on_values: Callable[[Values], None]):
         self._task, self._on_values = task, on_values
@@ -276,7 +287,7 @@ class _Watcher:
         by_side = [f"{side}.{name}" for side, name in itertools.product(experiment.sides, self._names)]
         chosen = [name for name in self._names if name in ("half_gap", "stiffness")]
         self.columns = ["t", "side", *(f"{name}{end}" for name in chosen for end in ("", "_from", "_to"))]
-        self.columns += ["alarm", "contradiction", *(f"{name}{end}" for name in by_side for end in ("", "_error"))]
+        self.columns += [*(["half_gap_least"] if "half_gap" in chosen else []), "alarm", "contradiction", *(f"{name}{end}" for name in by_side for end in ("", "_error"))]
         self._chosen = chosen
         self.values: list[Values] = []
         self.samples = 0
@@ -335,17 +346,19 @@ class _Watcher:
             ends = (number.value + sign * INTERVAL * number.error for sign in (-1.0, 1.0))
             values |= dict(zip((key, f"{key}_from", f"{key}_to"), (number.value, *ends), strict=True))
         bounds = {side: numbers[name].value - _BOUND * numbers[name].error for side, numbers in known.items()}
+        bound = bounds[side]
         if len(known) == 2:
             one, other = (numbers[name] for numbers in known.values())
             values["contradiction"] = abs(one.value - other.value) > _BOUND * math.hypot(one.error, other.error)
-        if task.alarm_gap is not None:
-            # where the sides contradict each other one of them is wrong: the smaller gap counts
-            bound = min(bounds.values()) if values.get("contradiction") else bounds[side]
-            values["alarm"] = bound > task.alarm_gap
+            if values["contradiction"]:
+                # one of them is wrong: the smaller gap counts
+                bound = min(bounds.values())
+        if name == "half_gap":
+            values |= {"half_gap_least": bound, "alarm": task.alarm_gap is not None and bound > task.alarm_gap}
         return values
 
 
-def _summary(task: WatchTask, watcher: _Watcher, counts: Mapping[str, int], notes: list[str]) -> dict[str, Any]:
+def _summary(task: WatchTask, watcher: Watcher, counts: Mapping[str, int], notes: list[str]) -> dict[str, Any]:
     known = [one for one in watcher.values if one["side"]]
     raised = [one for one in known if one["alarm"]]
 

@@ -373,6 +373,7 @@ class Datagrams:
         self.name, self.counts = address, Counter[str]()
         self.fault = ""
         self._fields = list(fields)
+        self._numbered = any(isinstance(one, int) for one in fields)
         self._form: TextForm | None = None
         self._header = ""
         host, port = _host(address)
@@ -399,60 +400,68 @@ class Datagrams:
                 break
             except OSError:  # what an earlier answer of another machine left behind
                 continue
-        parts = [part for one in received if len(part := self._rows(one))]
+        parts, lines = list[np.ndarray](), list[str]()
+        for one in received:
+            # lines of many datagrams are read at once: one by one it takes too long at 10 kHz
+            if one.translate(None, _PLAIN):
+                parts += [self._of_text(lines), self._of_bytes(one)]
+                lines = []
+            else:
+                lines += one.decode().splitlines()
+        parts = [part for part in (*parts, self._of_text(lines)) if len(part)]
         return (self._columns(), np.concatenate(parts)) if parts else None
 
     def _columns(self) -> Sequence[str | int]:
         if self._form is not None and self._form.names is not None:
             return self._form.names
-        numbered = any(isinstance(one, int) for one in self._fields)
-        return range(self._width()) if numbered else self._fields
+        return range(self._width() if self._form is None else self._form.count) if self._numbered else self._fields
 
     def _width(self) -> int:
-        """Columns of a row without a header."""
-        numbers = [one for one in self._fields if isinstance(one, int)]
-        return max([*(one + 1 for one in numbers), len(self._fields)])
+        """Columns of a row without a header, at least."""
+        return max([*(one + 1 for one in self._fields if isinstance(one, int)), len(self._fields)])
 
-    def _rows(self, datagram: bytes) -> np.ndarray:
-        if datagram.translate(None, _PLAIN):
-            width = self._width() if self._form is None or self._form.names is None else self._form.count
-            if not len(datagram) % (8 * width):
-                return np.frombuffer(datagram, "<f8").reshape(-1, width)
-            return self._unfit(f"{len(datagram)} bytes; rows of {width} float64 have a multiple of {8 * width}")
-        lines = [one for one in datagram.decode().splitlines() if one.strip() and one != self._header]
-        if not lines:
+    def _of_bytes(self, datagram: bytes) -> np.ndarray:
+        width = self._width() if self._form is None or self._form.names is None else self._form.count
+        if len(datagram) % (8 * width):
+            self._unfit(f"{len(datagram)} bytes; rows of {width} float64 have a multiple of {8 * width}")
+            return np.empty((0, width))
+        return np.frombuffer(datagram, "<f8").reshape(-1, width)
+
+    def _of_text(self, lines: list[str]) -> np.ndarray:
+        """Rows of text. Lines of another form are counted; until one has the form that is needed, those before it are."""
+        lines = [one for one in lines if one.strip() and not one.lstrip().startswith("#")]
+        while lines and self._form is None and not self._begin(lines):
+            lines = lines[1:]
+        if self._form is None:
             return np.empty((0, 0))
-        if self._form is None and not self._begin(lines):
-            return np.empty((0, 0))
-        assert self._form is not None
-        lines = [one for one in lines if one != self._header]
-        values = self._form.numbers(lines)
-        if len(values) < len(lines):
-            self.counts[MALFORMED] += len(lines) - len(values)
-            self.fault = f"; the last: a line should have {self._form.count} cells"
+        rows = [one for one in lines if one != self._header]
+        values = self._form.numbers(rows)
+        if len(values) < len(rows):
+            self.counts[MALFORMED] += len(rows) - len(values)
+            self.fault = f"; a line should have {self._form.count} cells"
         return values
 
     def _begin(self, lines: list[str]) -> bool:
-        """See how rows of text are written; False where these are none."""
+        """See from the first of some lines how rows of text are written; False where that is no row."""
         try:
             form = text_form(lines)
         except InputError as error:
-            return bool(len(self._unfit(str(error))))
+            return self._unfit(str(error))
         if form.names is not None:
             missing = [one for one in self._fields if isinstance(one, str) and one not in form.names]
             if missing:
-                return bool(len(self._unfit(f"no column {missing[0]!r} in {lines[0]!r}")))
+                return self._unfit(f"no column {missing[0]!r} in {lines[0]!r}")
             self._header = lines[0]
-        elif form.count != self._width() and not any(isinstance(one, int) for one in self._fields):
-            fields = ", ".join(map(str, self._fields))
-            return bool(len(self._unfit(f"{form.count} cells in {lines[0]!r}; there should be {self._width()}: {fields}")))
+        elif form.count < self._width() or (form.count > self._width() and not self._numbered):
+            fields = "" if self._numbered else f": {', '.join(map(str, self._fields))}"
+            return self._unfit(f"{form.count} cells in {lines[0]!r}; there should be {self._width()}{fields}")
         self._form = form
         return True
 
-    def _unfit(self, why: str) -> np.ndarray:
+    def _unfit(self, why: str) -> bool:
         self.counts[MALFORMED] += 1
         self.fault = f"; the last: {shortened(why, 200)}"
-        return np.empty((0, 0))
+        return False
 
     def close(self) -> None:
         self._socket.close()

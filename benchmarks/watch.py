@@ -1,0 +1,270 @@
+"""How far `jaxbl watch` can be trusted: false alarms, coverage of its intervals, and delay of the alarm on simulated drives
+whose gap stays or grows; and how many samples a second it takes.
+
+    python benchmarks/watch.py alarms [--runs 100]     # constant gaps, several noise levels
+    python benchmarks/watch.py growth [--runs 20]      # gaps that double, at several rates
+    python benchmarks/watch.py wrong [--runs 10]       # the model's inertias and frictions are off
+    taskset -c 0 python benchmarks/watch.py speed      # samples a second on one core, from memory and by UDP
+
+Drives: `sweeps/geared_axis.toml` (hard gap, dry friction on the load that the observers do not know) and
+`sweeps/dead_zone_noise.toml` (the paper's law). The plant is `jaxbl.simulate.step` with another gap at each sample.
+"""
+
+import argparse
+import socket
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbl.config import Config, prepare, read_config
+from jaxbl.drive.parameters import set_leaves
+from jaxbl.monitoring.watch import Watcher, read_watch_task, run_watch
+from jaxbl.records.live import Rows
+from jaxbl.simulate import Sample, initial_state, step, unit_noise
+
+SWEEPS = Path(__file__).parent.parent / "sweeps"
+STUDIES = {"hard gap": "geared_axis.toml", "law (3)": "dead_zone_noise.toml"}
+ADDRESS = "udp://127.0.0.1:0"
+"""Of a task without a log; nothing listens there."""
+
+
+def simulated(config: Config, gaps: np.ndarray, seeds: np.ndarray, noise: float) -> list[np.ndarray]:
+    """Input, motor and load position, each (runs, samples), of a drive whose gap is `gaps` times its own at each sample."""
+    with jax.enable_x64(True):
+        experiment = prepare(config)
+        ratio = experiment.drive.ratio("load")
+        experiment = set_leaves(
+            experiment, {"encoders.noise": jnp.asarray(noise), "encoders.load_noise": jnp.asarray(noise / ratio)}
+        )
+        law: Any = experiment.transmission
+        key = "dead_zone" if law.name == "sigmoid_backlash" else "half_gap"
+        size = getattr(law, key)
+        period = experiment.run.sample_period
+
+        def run(seed: jax.Array) -> Any:
+            indices = jnp.arange(len(gaps), dtype=jnp.int32)
+            noises = unit_noise(seed, indices, experiment.sides)
+
+            def sample(state: Any, given: Any) -> Any:
+                index, gap, noise = given
+                own = eqx.tree_at(lambda e: getattr(e.transmission, key), experiment, size * gap)
+                state, signals = step(own, state, Sample(index.astype(float) * period, noise=noise))
+                return state, (signals.input, signals.motor.measured, signals.load.measured)
+
+            return jax.lax.scan(sample, initial_state(experiment), (indices, jnp.asarray(gaps), noises))[1]
+
+        return [np.asarray(one) for one in jax.jit(jax.vmap(run))(jnp.asarray(seeds))]
+
+
+def watched(model: Config, rows: list[np.ndarray], window: float) -> Any:
+    """Values over time of one run."""
+    with jax.enable_x64(True):
+        watcher = Watcher(read_watch_task(ADDRESS, model, window=window), lambda values: None)
+        watcher.take(Rows(0.0, rows[0], {"motor": rows[1], "load": rows[2]}, True))
+    return {name: np.array([one[name] for one in watcher.values]) for name in watcher.columns}
+
+
+def half_gap_of(config: Config) -> float:
+    return float(config.build().transmission.half_gap)  # type: ignore[union-attr]
+
+
+def study(name: str, **tables: Any) -> Config:
+    data = read_config(SWEEPS / STUDIES[name]).resolved()
+    for table in ("axes", "figures", "sweep"):
+        data.pop(table, None)
+    for path, value in tables.items():
+        table, key = path.split("__")
+        data[table][key] = value
+    return read_config(data)
+
+
+def alarms(runs: int, duration: float = 60.0) -> None:
+    """Constant gaps: how often is a limit passed that the gap does not pass?"""
+    print("| drive | noise (rad) | window (s) | values | determined | gap: rms error | 95 % interval holds the gap | ", end="")
+    print("runs with an alarm, limit 1.00 | 1.02 | 1.05 | 1.25 times the gap |")
+    for name in STUDIES:
+        model = study(name)
+        true = half_gap_of(model)
+        for noise in (0.0, 1e-5, 1e-4, 3e-4):
+            count = round(duration / model.run.sample_period)
+            rows = simulated(model, np.ones(count), np.arange(runs), noise)
+            for window in (10.0, 20.0):
+                found = [watched(model, [one[i] for one in rows], window) for i in range(runs)]
+                gap, low, high, least = (
+                    np.stack([one[key] for one in found]) for key in ("half_gap", "half_gap_from", "half_gap_to", "half_gap_least")
+                )
+                known = np.isfinite(gap)
+                error = float(np.sqrt(np.mean((gap[known] / true - 1.0) ** 2)))
+                inside = float(np.mean((low[known] <= true) & (true <= high[known])))
+                raised = [int(np.sum(np.any(np.nan_to_num(least) > limit * true, axis=1))) for limit in (1.0, 1.02, 1.05, 1.25)]
+                print(
+                    f"| {name} | {noise:g} | {window:g} | {gap.size} | {100 * known.mean():.1f} % | {100 * error:.2g} % | "
+                    f"{100 * inside:.1f} % | " + " | ".join(f"{one} of {runs}" for one in raised) + " |",
+                    flush=True,
+                )
+
+
+def growth(runs: int, noise: float = 1e-4) -> None:
+    """Gaps that double: how late is the alarm at 1.5 times the gap, and how near are the values?"""
+    print("| drive | time to double (s) | window (s) | value - gap at the window's middle, rms | alarm after the gap passed ", end="")
+    print("the limit (s), median | worst | gap at the alarm over the limit, median | sums over all time: the same (s) |")
+    for name in STUDIES:
+        model = study(name)
+        true = half_gap_of(model)
+        for rise in (20.0, 60.0, 200.0):
+            period = model.run.sample_period
+            times = np.arange(round((rise + 60.0) / period)) * period
+            gaps = 1.0 + np.clip((times - 20.0) / rise, 0.0, 1.0)
+            passed = 20.0 + 0.5 * rise
+            rows = simulated(model, gaps, np.arange(runs), noise)
+            late_all = [sums_over_all_time(model, [one[i] for one in rows], 1.5 * true) - passed for i in range(runs)]
+            for window in (5.0, 10.0, 20.0):
+                delays, errors, sizes = [], [], []
+                for i in range(runs):
+                    found = watched(model, [one[i] for one in rows], window)
+                    raised = found["t"][np.nan_to_num(found["half_gap_least"]) > 1.5 * true]
+                    assert not len(raised) or raised[0] > passed, "an alarm before the gap has passed the limit"
+                    delays.append(raised[0] - passed if len(raised) else np.nan)
+                    sizes.append(np.interp(passed + delays[-1], times, gaps) / 1.5)
+                    middle = np.interp(found["t"] - 0.5 * window, times, gaps) * true
+                    errors.append((found["half_gap"] / middle - 1.0)[np.isfinite(found["half_gap"])])
+                rms = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+                print(
+                    f"| {name} | {rise:g} | {window:g} | {100 * rms:.2g} % | {np.nanmedian(delays):.0f} | "
+                    f"{np.max(np.nan_to_num(delays, nan=np.inf)):.0f} | {np.nanmedian(sizes):.3f} | {np.median(late_all):.0f} |",
+                    flush=True,
+                )
+
+
+def sums_over_all_time(model: Config, rows: list[np.ndarray], limit: float) -> float:
+    """When the identifier of the exported chain, which forgets nothing, finds a half gap beyond a limit on the motor's side;
+    inf for never."""
+    from jaxbl.simulate import replay
+
+    with jax.enable_x64(True):
+        experiment: Any = prepare(model)
+
+        def keep(state: Any, signals: Any) -> Any:
+            return experiment.identifier.estimate(state.identifier, experiment.transmission)["motor"]["half_gap"]
+
+        measured = {"motor": jnp.asarray(rows[1]), "load": jnp.asarray(rows[2])}
+        found = np.asarray(_replayed(experiment, jnp.asarray(rows[0]), measured, keep))
+    beyond = np.flatnonzero(found[round(10.0 / model.run.sample_period) :] > limit)
+    return 10.0 + float(beyond[0]) * model.run.sample_period if len(beyond) else np.inf
+
+
+def _replayed(experiment: Any, torque: Any, measured: Any, keep: Any) -> Any:
+    from jaxbl.simulate import replay
+
+    return jax.jit(lambda torque, measured: replay(experiment, torque, measured, record=keep)[1])(torque, measured)
+
+
+def wrong(runs: int, noise: float = 1e-4) -> None:
+    """What an error of the model's numbers makes of the gap, the stiffness and friction."""
+    print("| drive | wrong in the model | side chosen | half gap | stiffness | sides contradict | alarms, limit 1.1 times the gap |")
+    changes = {
+        "nothing": {},
+        "motor inertia + 10 %": {"drive__motor_inertia": 1.1},
+        "motor inertia - 10 %": {"drive__motor_inertia": 0.9},
+        "load inertia + 10 %": {"drive__load_inertia": 1.1},
+        "load inertia - 10 %": {"drive__load_inertia": 0.9},
+        "viscous frictions + 30 %": {"drive__motor_viscous": 1.3, "drive__load_viscous": 1.3},
+    }
+    for name in STUDIES:
+        own = study(name)
+        rows = simulated(own, np.ones(round(60.0 / own.run.sample_period)), np.arange(runs), noise)
+        data = own.resolved()
+        for what, factors in changes.items():
+            model = study(name, **{path: factor * data["drive"][path.split("__")[1]] for path, factor in factors.items()})
+            found = [watched(model, [one[i] for one in rows], 10.0) for i in range(runs)]
+            true, stiffness = half_gap_of(own), data["transmission"]["stiffness"]
+            gap, k, contrary, least, side = (
+                np.concatenate([one[key] for one in found])
+                for key in ("half_gap", "stiffness", "contradiction", "half_gap_least", "side")
+            )
+            motor = float(np.mean(side == "motor"))
+            print(
+                f"| {name} | {what} | motor {100 * motor:.0f} % | {100 * (np.nanmean(gap) / true - 1.0):+.2g} % | "
+                f"{100 * (np.nanmean(k) / stiffness - 1.0):+.2g} % | {100 * np.mean(contrary):.0f} % | "
+                f"{int(np.sum(np.nan_to_num(least) > 1.1 * true))} of {len(gap)} values |",
+                flush=True,
+            )
+
+
+def speed(seconds: float = 20.0) -> None:
+    """Samples a second on the cores that this process has: from memory, and by UDP from another thread at 10 kHz."""
+    model = study("hard gap", run__sample_period=1e-4, run__substeps=1, run__duration=seconds)
+    count = round(seconds / model.run.sample_period)
+    rows = [one[0] for one in simulated(model, np.ones(count), np.arange(1), 1e-4)]
+    watched(model, [one[: round(11.0 / model.run.sample_period)] for one in rows], 10.0)
+    start = time.process_time()
+    watched(model, rows, 10.0)
+    print(f"10 kHz from memory: {count / (time.process_time() - start):.3g} samples a second of processor time")
+    table = np.stack([np.arange(count) * model.run.sample_period, *rows], axis=1)
+    for form in ("float64", "text"):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        sent = threading.Event()
+        packed = [
+            one.astype("<f8").tobytes() if form == "float64" else ",".join(map(repr, one.tolist())).encode() + b"\n"
+            for one in table
+        ]
+
+        def send(port: int = port, packed: list[bytes] = packed, sent: threading.Event = sent) -> None:
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+                begin = time.perf_counter()
+                for i, one in enumerate(packed):
+                    if i % 20 == 0 and (wait := begin + i * model.run.sample_period - time.perf_counter()) > 0.0:
+                        time.sleep(wait)
+                    out.sendto(one, ("127.0.0.1", port))
+            time.sleep(0.5)
+            sent.set()
+
+        late: list[float] = []
+        task = read_watch_task(f"udp://127.0.0.1:{port}", model)
+        began: list[float] = []
+
+        def said(values: Any) -> None:
+            late.append(time.perf_counter() - began[0] - values["t"])
+
+        sender = threading.Thread(target=send)
+
+        def ended() -> bool:
+            # the first call comes once everything is compiled and the address is open
+            if not began:
+                began.append(time.perf_counter())
+                sender.start()
+            return sent.is_set()
+
+        start = time.process_time()
+        found = run_watch(task, on_values=said, ended=ended)
+        used = time.process_time() - start
+        sender.join()
+        print(
+            f"10 kHz by UDP, {form}, one row a datagram: {found.summary['samples']} of {count} samples, "
+            f"{used:.1f} s of processor time with sending and compiling for {seconds:g} s; values {1e3 * np.median(late):.0f} ms "
+            f"after their last sample (worst {1e3 * max(late):.0f} ms); left out: {found.summary['left_out'] or 'nothing'}"
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("alarms", "growth", "wrong", "speed"))
+    parser.add_argument("--runs", type=int, default=None)
+    given = parser.parse_args()
+    if given.what == "speed":
+        speed()
+    else:
+        function, runs = {"alarms": (alarms, 100), "growth": (growth, 20), "wrong": (wrong, 10)}[given.what]
+        function(given.runs or runs)
+
+
+if __name__ == "__main__":
+    main()
