@@ -30,7 +30,7 @@ FLOORS = [
     {"simulate"},
     {"config", "fused"},
     {"sweeps", "identification"},
-    {"gains", "diagnosis", "exports"},
+    {"gains", "diagnosis", "exports", "monitoring"},
     {"throughput"},
     {"report"},
     {"datasheet", "doctor"},

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 import pandas as pd
 from scipy import stats
 
@@ -42,7 +41,6 @@ _POLL = 0.1
 """Seconds for which rows are collected before they are processed: the latency of a stream, with the time that takes."""
 _QUIET = 10.0
 """Seconds between remarks on a stream from which nothing comes, or from which rows are left out."""
-_NUMBERS = ("half_gap", "stiffness", "coulomb", "viscous")
 
 Values = dict[str, Any]
 """What is known at a time; keys are the columns of `watch.csv`."""
@@ -142,8 +140,8 @@ def read_watch_task(
         raise InputError(f"{of}: drive.kind {config.drive.kind} has no gap to watch; it should be two_inertia")
     if lacking := [one for one in ("observer.motor", "observer.load") if one in missing]:
         raise InputError(
-            f"{of}: [{lacking[0]}] has no gains; jaxbl tune chooses some, and the model.toml of jaxbl identify has those that "
-            "it chose on its log"
+            f"{of}: [{lacking[0]}] has no gains; jaxbl tune chooses some, and the model.toml of jaxbl identify has those "
+            "that it chose on its log"
         )
     if config.build().identifier is None:
         raise InputError(f"{of}: the study has no identifier, which finds the gap; give it a [transmission]")
@@ -234,9 +232,7 @@ def _of_record(record: Record) -> Iterator[Rows]:
 
 
 def _stream(task: WatchTask) -> Stream:
-    source: Source = (
-        Datagrams(task.name, needed(task.config.log)) if "://" in task.name else FollowedFile(Path(task.name))
-    )
+    source: Source = Datagrams(task.name, needed(task.config.log)) if "://" in task.name else FollowedFile(Path(task.name))
     return Stream(source, task.config.log, float(task.experiment.run.sample_period))
 
 
@@ -263,6 +259,22 @@ def counted(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{number} {what}" for what, number in counts.items())
 
 
+def _names(experiment: Experiment) -> tuple[list[str], list[str]]:
+    """Numbers of each side, and those of them that the side which determines them best gives."""
+    assert experiment.transmission is not None
+    law = [name for name in ("half_gap", "stiffness") if name in experiment.transmission.truth()]
+    return [*law, "coulomb", "viscous"], law
+
+
+def columns_of(task: WatchTask) -> list[str]:
+    """Names of the values of a watch: the columns of `watch.csv`."""
+    names, law = _names(task.experiment)
+    found = ["t", "side", *(f"{name}{end}" for name in law for end in ("", "_from", "_to"))]
+    found += [*(["half_gap_least"] if "half_gap" in law else []), "alarm", "contradiction"]
+    by_side = itertools.product(task.experiment.sides, names, ("", "_error"))
+    return [*found, *(f"{side}.{name}{end}" for side, name, end in by_side)]
+
+
 class Watcher:
     """Takes rows, and makes values every so many seconds.
 
@@ -282,13 +294,8 @@ class Watcher:
         experiment = task.experiment
         self._period = float(experiment.run.sample_period)
         self.chain, self._window = LiveChain(experiment), Window(experiment, task.window)
-        assert experiment.transmission is not None
-        self._names = [name for name in _NUMBERS if name in ("coulomb", "viscous") or name in experiment.transmission.truth()]
-        by_side = [f"{side}.{name}" for side, name in itertools.product(experiment.sides, self._names)]
-        chosen = [name for name in self._names if name in ("half_gap", "stiffness")]
-        self.columns = ["t", "side", *(f"{name}{end}" for name in chosen for end in ("", "_from", "_to"))]
-        self.columns += [*(["half_gap_least"] if "half_gap" in chosen else []), "alarm", "contradiction", *(f"{name}{end}" for name in by_side for end in ("", "_error"))]
-        self._chosen = chosen
+        self._names, self._chosen = _names(experiment)
+        self.columns = columns_of(task)
         self.values: list[Values] = []
         self.samples = 0
         self.start: float | None = None
@@ -311,7 +318,8 @@ class Watcher:
             done, anew = end, False
             now = first + (end - 1) * self._period
             if now >= self._due - 0.5 * self._period:
-                self._due = self._task.every * (math.floor(now / self._task.every + 0.5 * self._period / self._task.every) + 1)
+                every = self._task.every
+                self._due = every * (math.floor((now + 0.5 * self._period) / every) + 1)
                 if self._window.full:
                     self._say(now)
 

@@ -152,17 +152,15 @@ class Window:
         return found
 
     def _of_side(self, side: str, rows: dict[str, np.ndarray]) -> Found | None:
-        experiment, drive = self._experiment, self._experiment.drive
-        gain = np.asarray(drive.torque_gain(side), float)
+        experiment = self._experiment
         matched = experiment.identifier is not None and experiment.identifier.regressor_filter == "matched"
         before = self._last.get(side)
         law, zero = (experiment.transmission, 0.0) if before is None else (before.law, before.zero)
         assert law is not None
         given = {name: jnp.asarray(values) for name, values in rows.items()}
+        period, gain = (jnp.asarray(one, float) for one in (self._period, experiment.drive.torque_gain(side)))
         for _ in range(_ITERATIONS):
-            sums = _sums(
-                law, experiment.equivalent_control, jnp.asarray(self._period), matched, jnp.asarray(gain), jnp.asarray(zero), given
-            )
+            sums = _sums(law, experiment.equivalent_control, period, matched, gain, jnp.asarray(zero), given)
             numbers = self._numbers(side, law, *map(np.asarray, sums))
             if numbers is None:
                 return None

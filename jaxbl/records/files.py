@@ -393,7 +393,7 @@ class TextForm(NamedTuple):
     count: int
     rows: int
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> Any:
         """Those of `pandas.read_csv`."""
         return {
             "sep": self.separator,

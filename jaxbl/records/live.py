@@ -109,8 +109,9 @@ def check_live(table: LogTable, name: str) -> None:
     channels = [("u", table.u or TorqueTable()), *((channel, one) for _, channel, one in ends)]
     open_ = [f"{channel}.{key}" for channel, one in channels for key in ("skew", "drift") if getattr(one, key, None)]
     open_ += [key for key in ("start", "stop", "resample") if getattr(table, key) is not None]
+    open_ += [f"where.{key}" for key, value in (table.where or {}).items() if isinstance(value, str)]
     if open_:
-        raise InputError(f"{name}: [log] {open_[0]} needs the whole log; leave it out for rows that arrive one by one")
+        raise InputError(f"{name}: [log] {open_[0]} is for whole logs; leave it out for rows that arrive one by one")
 
 
 class _Channels:
@@ -156,22 +157,20 @@ class _Channels:
         numbers = values[:, self._at[column]]
         return numbers if bits is None else signed(numbers, bits)
 
-    def _position(
-        self, side: str, table: PositionTable | SpeedTable, values: np.ndarray, stamps: np.ndarray
-    ) -> np.ndarray:
+    def _position(self, side: str, table: PositionTable | SpeedTable, values: np.ndarray, stamps: np.ndarray) -> np.ndarray:
         if not len(values):
             return values
         if isinstance(table, SpeedTable):
             speed = in_si(table, values)
-            before = [self._before.get(f"{side} {what}", first) for what, first in (("speed", speed[0]), ("time", stamps[0]))]
-            speeds, times = np.concatenate([[before[0]], speed]), np.concatenate([[before[1]], stamps])
-            # over a gap nothing is known of the speed
+            speeds = np.append(self._before.get(f"{side} speed", float(speed[0])), speed)
+            times = np.append(self._before.get(f"{side} time", float(stamps[0])), stamps)
+            # over a gap, too, as if the speed had gone straight from one end to the other
             steps = np.diff(times) * 0.5 * (speeds[1:] + speeds[:-1])
             position = self._before.get(side, 0.0) + np.cumsum(steps)
             self._before |= {side: position[-1], f"{side} speed": speed[-1], f"{side} time": stamps[-1]}
             return position
         if table.wrap is not None:
-            values = np.unwrap(np.concatenate([[self._before.get(side, values[0])], values]), period=table.wrap)[1:]
+            values = np.unwrap(np.append(self._before.get(side, float(values[0])), values), period=table.wrap)[1:]
             self._before[side] = values[-1]
         return in_si(table, values)
 
@@ -192,8 +191,10 @@ class Stream:
         self.source, self.counts = source, source.counts
         self._table, self._period = table, period
         self._channels: _Channels | None = None
+        self._columns: list[str | int] = []
         self._last: tuple[float, float, dict[str, float]] | None = None
-        self._judged: list[float] | None = []
+        self._first: list[float] = []
+        self._judged = False
 
     def poll(self, seconds: float) -> list[Rows]:
         """What has come within so many seconds.
@@ -205,8 +206,8 @@ class Stream:
         if found is None:
             return []
         columns, values = found
-        if self._channels is None:
-            self._channels = _Channels(self._table, self.source.name, columns)
+        if self._channels is None or list(columns) != self._columns:
+            self._channels, self._columns = _Channels(self._table, self.source.name, columns), list(columns)
         stamps, torque, positions, unreadable = self._channels.take(values)
         self._count(UNREADABLE, unreadable)
         self._judge(stamps)
@@ -218,13 +219,12 @@ class Stream:
 
     def _judge(self, stamps: np.ndarray) -> None:
         """Compare the period of the first rows with what it should be."""
-        if self._judged is None:
+        if self._judged:
             return
-        self._judged += stamps.tolist()
-        if len(self._judged) < _JUDGED:
+        self._first += stamps.tolist()
+        if len(self._first) < _JUDGED:
             return
-        times = np.array(self._judged)
-        self._judged = None
+        self._judged, times = True, np.array(self._first)
         found = float(np.median(times[_APART:] - times[:-_APART])) / _APART
         if not math.isclose(found, self._period, rel_tol=_TOLERANCE):
             raise wrong_period(self.source.name, found, self._period)
@@ -242,7 +242,9 @@ class Stream:
         if back.any():
             # a clock that was set back: rows from there on begin anew
             at = int(np.argmax(back))
-            before, after = ((stamps[p], torque[p], {s: x[p] for s, x in positions.items()}) for p in (slice(at), slice(at, None)))
+            before, after = (
+                (stamps[p], torque[p], {s: x[p] for s, x in positions.items()}) for p in (slice(at), slice(at, None))
+            )
             found = self._in_order(*before)
             self._count(RESTARTS, 1)
             self._last = None
@@ -343,7 +345,7 @@ class FollowedFile:
         read = self._file.read(_HEAD)
         if not read:
             try:
-                now = os.stat(self._path)
+                now = self._path.stat()
             except OSError:
                 return b""
             own = os.fstat(self._file.fileno())
@@ -409,7 +411,10 @@ class Datagrams:
             else:
                 lines += one.decode().splitlines()
         parts = [part for part in (*parts, self._of_text(lines)) if len(part)]
-        return (self._columns(), np.concatenate(parts)) if parts else None
+        columns = self._columns()
+        # what came before the form was known may have other columns
+        parts = [part for part in parts if part.shape[1] == len(columns)]
+        return (columns, np.concatenate(parts)) if parts else None
 
     def _columns(self) -> Sequence[str | int]:
         if self._form is not None and self._form.names is not None:
@@ -421,7 +426,7 @@ class Datagrams:
         return max([*(one + 1 for one in self._fields if isinstance(one, int)), len(self._fields)])
 
     def _of_bytes(self, datagram: bytes) -> np.ndarray:
-        width = self._width() if self._form is None or self._form.names is None else self._form.count
+        width = self._width() if self._form is None else self._form.count
         if len(datagram) % (8 * width):
             self._unfit(f"{len(datagram)} bytes; rows of {width} float64 have a multiple of {8 * width}")
             return np.empty((0, width))
