@@ -2,7 +2,7 @@
 whose gap stays or grows; and how many samples a second it takes.
 
     python benchmarks/watch.py alarms [--runs 100]     # constant gaps, several noise levels
-    python benchmarks/watch.py growth [--runs 20]      # gaps that double, at several rates
+    python benchmarks/watch.py growth [--runs 10]      # gaps that double, at several rates
     python benchmarks/watch.py wrong [--runs 10]       # the model's inertias and frictions are off
     taskset -c 0 python benchmarks/watch.py speed      # samples a second on one core, from memory and by UDP
 
@@ -26,7 +26,7 @@ from jaxbl.config import Config, prepare, read_config
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.monitoring.watch import INTERVAL, Watcher, read_watch_task, run_watch
 from jaxbl.records.live import Rows
-from jaxbl.simulate import Sample, initial_state, step, unit_noise
+from jaxbl.simulate import Sample, initial_state, replay, step, unit_noise
 
 SWEEPS = Path(__file__).parent.parent / "sweeps"
 STUDIES = {"hard gap": "geared_axis.toml", "law (3)": "dead_zone_noise.toml"}
@@ -84,96 +84,106 @@ def study(name: str, **tables: Any) -> Config:
     return read_config(data)
 
 
-def alarms(runs: int, duration: float = 60.0) -> None:
-    """Constant gaps: how often is a limit passed that the gap does not pass?"""
-    print(
-        "| drive | noise (rad) | window (s) | values | determined | gap: rms error | 95 % interval holds the gap | ", end=""
-    )
+def alarms(drives: list[str], runs: int, duration: float = 40.0, window: float = 10.0) -> None:
+    """Constant gaps: how often is a limit passed that the gap does not pass? And how good are the numbers?"""
+    print("| drive | noise (rad) | values | determined | gap: rms error | 95 % interval holds the gap | ", end="")
     print("runs with an alarm, limit 1.00 | 1.02 | 1.05 | 1.25 times the gap |")
-    for name in STUDIES:
+    friction: list[list[str]] = []
+    for name in drives:
         model = study(name)
         true = half_gap_of(model)
         for noise in (0.0, 1e-5, 1e-4, 3e-4):
             count = round(duration / model.run.sample_period)
             rows = simulated(model, np.ones(count), np.arange(runs), noise)
-            for window in (10.0, 20.0):
-                found = [watched(model, [one[i] for one in rows], window) for i in range(runs)]
-                gap, low, high, least = (
-                    np.stack([one[key] for one in found])
-                    for key in ("half_gap", "half_gap_from", "half_gap_to", "half_gap_least")
-                )
-                known = np.isfinite(gap)
-                error = float(np.sqrt(np.mean((gap[known] / true - 1.0) ** 2)))
-                inside = float(np.mean((low[known] <= true) & (true <= high[known])))
-                raised = [
-                    int(np.sum(np.any(np.nan_to_num(least) > limit * true, axis=1))) for limit in (1.0, 1.02, 1.05, 1.25)
-                ]
-                print(
-                    f"| {name} | {noise:g} | {window:g} | {gap.size} | {100 * known.mean():.1f} % | {100 * error:.2g} % | "
-                    f"{100 * inside:.1f} % | " + " | ".join(f"{one} of {runs}" for one in raised) + " |",
-                    flush=True,
-                )
+            found = [watched(model, [one[i] for one in rows], window) for i in range(runs)]
+            gap, low, high, least = (
+                np.stack([one[f"half_gap{end}"] for one in found]) for end in ("", "_from", "_to", "_least")
+            )
+            known = np.isfinite(gap)
+            error = float(np.sqrt(np.mean((gap[known] / true - 1.0) ** 2)))
+            inside = float(np.mean((low[known] <= true) & (true <= high[known])))
+            limits = (1.0, 1.02, 1.05, 1.25)
+            raised = [int(np.sum(np.any(np.nan_to_num(least) > limit * true, axis=1))) for limit in limits]
+            friction.append([name, f"{noise:g}", *frictions(found, model)])
+            print(
+                f"| {name} | {noise:g} | {gap.size} | {100 * known.mean():.1f} % | {100 * error:.2g} % | "
+                f"{100 * inside:.1f} % | " + " | ".join(f"{one} of {runs}" for one in raised) + " |",
+                flush=True,
+            )
+    print(
+        "\n| drive | noise (rad) | mean error of Coulomb friction, motor (N m) | load (N m) | of viscous, motor | load | ",
+        end="",
+    )
+    print("95 % intervals that hold the truth: Coulomb, motor | load | viscous, motor | load |")
+    for row in friction:
+        print("| " + " | ".join(row) + " |")
 
 
-def growth(runs: int, noise: float = 1e-4) -> None:
+def frictions(found: Any, model: Config) -> list[str]:
+    """Mean errors of friction, and how often its interval holds the truth."""
+    drive: Any = model.drive
+    dry = {one.kind: float(one.build().torque) for one in model.effects if one.kind.endswith("coulomb_friction")}  # type: ignore[attr-defined]
+    truths = {f"{side}.coulomb": dry.get(f"{side}.coulomb_friction", 0.0) for side in ("motor", "load")}
+    truths |= {f"{side}.viscous": getattr(drive, f"{side}_viscous") for side in ("motor", "load")}
+    errors, inside = [], []
+    for key, truth in truths.items():
+        value, error = (np.concatenate([one[f"{key}{end}"] for one in found]) for end in ("", "_error"))
+        known = np.isfinite(value)
+        mean = float(np.mean(value[known] - truth))
+        errors.append(f"{100 * mean / truth:+.2g} %" if key.endswith("viscous") else f"{mean:+.2g}")
+        inside.append(f"{100 * np.mean(np.abs(value[known] - truth) <= INTERVAL * error[known]):.0f} %")
+    return [*errors, *inside]
+
+
+def growth(drives: list[str], runs: int, noise: float = 1e-4) -> None:
     """Gaps that double: how late is the alarm at 1.5 times the gap, and how near are the values?"""
     print("| drive | time to double (s) | window (s) | value - gap at the window's middle, rms | ", end="")
     print("alarm after the gap passed the limit (s), median | worst | gap over the limit then, median | ", end="")
-    print("sums over all time pass it after (s) |")
-    for name in STUDIES:
+    print("alarms before | sums over all time pass it after (s), median |")
+    for name in drives:
         model = study(name)
         true = half_gap_of(model)
-        for rise in (20.0, 60.0, 200.0):
+        for rise in (20.0, 60.0, 180.0):
             period = model.run.sample_period
             times = np.arange(round((rise + 60.0) / period)) * period
             gaps = 1.0 + np.clip((times - 20.0) / rise, 0.0, 1.0)
             passed = 20.0 + 0.5 * rise
             rows = simulated(model, gaps, np.arange(runs), noise)
-            late_all = [sums_over_all_time(model, [one[i] for one in rows], 1.5 * true) - passed for i in range(runs)]
-            for window in (5.0, 10.0, 20.0):
-                delays, errors, sizes = [], [], []
+            of_sums = [sums_over_all_time(model, [one[i] for one in rows], 1.5 * true) - passed for i in range(runs)]
+            for window in (5.0, 10.0):
+                delays, errors = [], []
                 for i in range(runs):
                     found = watched(model, [one[i] for one in rows], window)
                     raised = found["t"][np.nan_to_num(found["half_gap_least"]) > 1.5 * true]
-                    assert not len(raised) or raised[0] > passed, "an alarm before the gap has passed the limit"
-                    delays.append(raised[0] - passed if len(raised) else np.nan)
-                    sizes.append(np.interp(passed + delays[-1], times, gaps) / 1.5)
+                    delays.append(raised[0] - passed if len(raised) else np.inf)
                     middle = np.interp(found["t"] - 0.5 * window, times, gaps) * true
                     errors.append((found["half_gap"] / middle - 1.0)[np.isfinite(found["half_gap"])])
                 rms = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
-                worst = np.max(np.nan_to_num(delays, nan=np.inf))
+                size = np.interp(passed + np.median(delays), times, gaps) / 1.5
                 print(
-                    f"| {name} | {rise:g} | {window:g} | {100 * rms:.2g} % | {np.nanmedian(delays):.0f} | "
-                    f"{worst:.0f} | {np.nanmedian(sizes):.3f} | {np.median(late_all):.0f} |",
+                    f"| {name} | {rise:g} | {window:g} | {100 * rms:.2g} % | {np.median(delays):.0f} | "
+                    f"{np.max(delays):.0f} | {size:.3f} | {np.sum(np.array(delays) < 0.0)} of {runs} | {np.median(of_sums):.0f} |",
                     flush=True,
                 )
 
 
 def sums_over_all_time(model: Config, rows: list[np.ndarray], limit: float) -> float:
-    """When the identifier of the exported chain, which forgets nothing, finds a half gap beyond a limit on the motor's side;
-    inf for never."""
-    from jaxbl.simulate import replay
-
+    """When the identifier of the exported chain, which forgets nothing, finds a half gap beyond a limit on the motor's side
+    after its first ten seconds; inf for never."""
     with jax.enable_x64(True):
         experiment: Any = prepare(model)
 
         def keep(state: Any, signals: Any) -> Any:
             return experiment.identifier.estimate(state.identifier, experiment.transmission)["motor"]["half_gap"]
 
-        measured = {"motor": jnp.asarray(rows[1]), "load": jnp.asarray(rows[2])}
-        found = np.asarray(_replayed(experiment, jnp.asarray(rows[0]), measured, keep))
+        given = jnp.asarray(rows[0]), {"motor": jnp.asarray(rows[1]), "load": jnp.asarray(rows[2])}
+        found = np.asarray(jax.jit(lambda torque, measured: replay(experiment, torque, measured, record=keep)[1])(*given))
     beyond = np.flatnonzero(found[round(10.0 / model.run.sample_period) :] > limit)
     return 10.0 + float(beyond[0]) * model.run.sample_period if len(beyond) else np.inf
 
 
-def _replayed(experiment: Any, torque: Any, measured: Any, keep: Any) -> Any:
-    from jaxbl.simulate import replay
-
-    return jax.jit(lambda torque, measured: replay(experiment, torque, measured, record=keep)[1])(torque, measured)
-
-
-def wrong(runs: int, noise: float = 1e-4) -> None:
-    """What an error of the model's numbers makes of the gap, the stiffness and friction."""
+def wrong(drives: list[str], runs: int, noise: float = 1e-4) -> None:
+    """What an error of the model's numbers makes of the gap and the stiffness."""
     print("| drive | wrong in the model | side chosen | half gap | stiffness | sides contradict | ", end="")
     print("alarms, limit 1.1 times the gap |")
     changes = {
@@ -183,24 +193,27 @@ def wrong(runs: int, noise: float = 1e-4) -> None:
         "load inertia + 10 %": {"drive__load_inertia": 1.1},
         "load inertia - 10 %": {"drive__load_inertia": 0.9},
         "viscous frictions + 30 %": {"drive__motor_viscous": 1.3, "drive__load_viscous": 1.3},
+        "half gap of the start half the true one": {"transmission__half_gap": 0.5},
     }
-    for name in STUDIES:
+    for name in drives:
         own = study(name)
-        rows = simulated(own, np.ones(round(60.0 / own.run.sample_period)), np.arange(runs), noise)
+        rows = simulated(own, np.ones(round(40.0 / own.run.sample_period)), np.arange(runs), noise)
         data = own.resolved()
         for what, factors in changes.items():
-            model = study(name, **{path: factor * data["drive"][path.split("__")[1]] for path, factor in factors.items()})
+            numbers = {path: data[path.split("__")[0]].get(path.split("__")[1]) for path in factors}
+            if None in numbers.values():
+                continue
+            model = study(name, **{path: factors[path] * number for path, number in numbers.items()})
             found = [watched(model, [one[i] for one in rows], 10.0) for i in range(runs)]
             true, stiffness = half_gap_of(own), data["transmission"]["stiffness"]
             gap, k, contrary, least, side = (
                 np.concatenate([one[key] for one in found])
                 for key in ("half_gap", "stiffness", "contradiction", "half_gap_least", "side")
             )
-            motor = float(np.mean(side == "motor"))
             print(
-                f"| {name} | {what} | motor {100 * motor:.0f} % | {100 * (np.nanmean(gap) / true - 1.0):+.2g} % | "
-                f"{100 * (np.nanmean(k) / stiffness - 1.0):+.2g} % | {100 * np.mean(contrary):.0f} % | "
-                f"{int(np.sum(np.nan_to_num(least) > 1.1 * true))} of {len(gap)} values |",
+                f"| {name} | {what} | motor {100 * np.mean(side == 'motor'):.0f} % | "
+                f"{100 * (np.nanmean(gap) / true - 1.0):+.2g} % | {100 * (np.nanmean(k) / stiffness - 1.0):+.2g} % | "
+                f"{100 * np.mean(contrary):.0f} % | {int(np.sum(np.nan_to_num(least) > 1.1 * true))} of {len(gap)} values |",
                 flush=True,
             )
 
@@ -264,12 +277,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("alarms", "growth", "wrong", "speed"))
     parser.add_argument("--runs", type=int, default=None)
+    parser.add_argument("--drive", choices=STUDIES, help="left out: both")
     given = parser.parse_args()
     if given.what == "speed":
         speed()
     else:
-        function, runs = {"alarms": (alarms, 100), "growth": (growth, 20), "wrong": (wrong, 10)}[given.what]
-        function(given.runs or runs)
+        function, runs = {"alarms": (alarms, 100), "growth": (growth, 10), "wrong": (wrong, 10)}[given.what]
+        function([given.drive] if given.drive else [*STUDIES], given.runs or runs)
 
 
 if __name__ == "__main__":

@@ -25,9 +25,7 @@ def _observed(
         # time matters to excitation and identifier alone
         new, signals = step(experiment, state, Sample(jnp.zeros_like(torque), input=torque, measured=measured))
         row = {"twist": jnp.asarray(signals.twist)}
-        for side in experiment.sides:
-            one = signals.side(side)
-            row |= {f"{side}.velocity": jnp.asarray(one.velocity_estimate), f"{side}.torque": one.torque_estimate}
+        row |= {f"{side}.torque": signals.side(side).torque_estimate for side in experiment.sides}
         return jax.tree.map(lambda new, old: jnp.where(index < count, new, old), new, state), row
 
     return jax.lax.scan(sample, state, (jnp.arange(len(torque)), torque, measured))
@@ -53,7 +51,8 @@ class LiveChain:
             anew: whether they do not continue those before.
 
         Returns:
-            `twist` (rad); by side the estimates `SIDE.velocity` (rad/s) and `SIDE.torque` (transmitted torque, N m).
+            `twist` (rad); by side `SIDE.position` (rad), as measured, and `SIDE.torque`, the observer's transmitted torque
+            (N m).
         """
         if self._state is None or anew:
             first = {side: jnp.asarray(values[0]) for side, values in measured.items()}
@@ -72,7 +71,8 @@ class LiveChain:
             self._state, rows = _observed(self._experiment, self._state, *given, jnp.asarray(count))
             found.append({name: np.asarray(values)[:count] for name, values in rows.items()})
             done += count
-        return {name: np.concatenate([one[name] for one in found]) for name in found[0]}
+        positions = {f"{side}.position": values for side, values in measured.items()}
+        return {name: np.concatenate([one[name] for one in found]) for name in found[0]} | positions
 
     def compile(self) -> None:
         """Compile what rows will need, before any come."""

@@ -5,7 +5,8 @@ same low-pass. A window takes the place of sums over all time, which would see a
 without which the numbers of a real drive would be wrong:
 
 - The observers' torque holds what the nominal model lacks beside the law. Columns sign(v), v and 1 take Coulomb friction, an
-  error of the viscous one, and a constant torque of the side.
+  error of the viscous one, and a constant torque of the side. Here v are slopes of cubics through the readings around each
+  sample (Savitzky-Golay): observers cannot look ahead, and the noise of their velocities makes friction look smaller.
 - A column -dC/dz takes the zero of the twist, as two encoders seldom count from the same one.
 - The law is taken at the numbers that the window itself gives, in a few iterations. With a hard dead zone,
   C = K (z - b sign z) in contact, its regression is the Gauss-Newton step of the least squares in K and b.
@@ -22,6 +23,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.signal import fftconvolve, savgol_coeffs
 
 from jaxbl.drive.transmission import AbstractTransmission
 from jaxbl.identification.compilation import jit
@@ -32,6 +34,8 @@ PARTS = 10
 """Blocks of a window, of which the jackknife leaves out one at a time."""
 SETTLING = 10.0
 """Time constants of the low-pass after which a filter has forgotten how it began."""
+_SLOPE = 2.0
+"""Time constants of the low-pass to each side over which a velocity is the slope of a cubic."""
 _TURNS = 0.9
 """Mean of sign(v) under the low-pass below which a side stands still or turns: its friction has no direction there."""
 _ITERATIONS, _CONVERGED = 20, 0.05
@@ -111,8 +115,10 @@ class Window:
         self._experiment = experiment
         self._period = float(experiment.run.sample_period)
         self.samples = PARTS * max(math.ceil(seconds / self._period / PARTS), 1)
-        constant = float(experiment.equivalent_control.time_constant)
+        self._constant = constant = float(experiment.equivalent_control.time_constant)
         self._settling = math.ceil(max(SETTLING * constant, float(experiment.identifier.start)) / self._period)
+        half = max(math.ceil(_SLOPE * constant / self._period), 2)
+        self._slope = savgol_coeffs(2 * half + 1, 3, deriv=1, delta=self._period, use="conv")
         self._rows: dict[str, np.ndarray] = {}
         self._unsettled = 0
         self._last: dict[str, Found] = {}
@@ -124,9 +130,11 @@ class Window:
 
     def add(self, rows: dict[str, np.ndarray], anew: bool) -> None:
         """Add what :meth:`LiveChain.take` gave; where it began anew, samples until the observers have settled do not
-        count."""
+        count, and neither do those before whose velocity would reach over the break."""
         if anew:
             self._unsettled = self._settling
+            if self._rows:
+                self._rows["counts"][-(len(self._slope) // 2) :] = 0.0
         count = len(rows["twist"])
         counts = (np.arange(count) >= self._unsettled).astype(float)
         self._unsettled = max(self._unsettled - count, 0)
@@ -140,12 +148,14 @@ class Window:
         if not self.full:
             return {}
         counts = self._rows["counts"].copy()
-        # the filter of the regressors begins with the window
-        counts[: math.ceil(SETTLING * float(self._experiment.equivalent_control.time_constant) / self._period)] = 0.0
+        # the filter of the regressors begins with the window; velocities at its end lack the readings after it
+        counts[: max(math.ceil(SETTLING * self._constant / self._period), len(self._slope))] = 0.0
+        counts[-(len(self._slope) // 2) :] = 0.0
         found = {}
         for side in self._experiment.sides:
-            rows = {name: self._rows[f"{side}.{name}"] for name in ("velocity", "torque")}
-            one = self._of_side(side, rows | {"twist": self._rows["twist"], "counts": counts})
+            velocity = fftconvolve(self._rows[f"{side}.position"], self._slope, mode="same")
+            rows = {"twist": self._rows["twist"], "torque": self._rows[f"{side}.torque"], "velocity": velocity}
+            one = self._of_side(side, rows | {"counts": counts})
             if one is not None:
                 found[side] = one
                 self._last[side] = one

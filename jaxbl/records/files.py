@@ -339,7 +339,7 @@ def _text(
 
     def rows(wanted: Collection[str | int]) -> tuple[list[str | int], dict[str | int, np.ndarray], int]:
         """Names of all columns, values of those that are wanted (all, if none is), and the number of rows."""
-        chunks = pd.read_csv(
+        chunks: Any = pd.read_csv(
             path,
             **form.options(),
             skiprows=form.rows,

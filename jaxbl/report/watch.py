@@ -109,14 +109,16 @@ def _left_out(summary: Mapping[str, Any]) -> list[str]:
 def draw_watch(found: Watch) -> list[Drawn]:
     """Gap, stiffness and friction over time."""
     values, task = found.values, found.task
-    shown = [name for name in _LABELS if f"motor.{name}" in values]
+    law = [name for name in ("half_gap", "stiffness") if f"motor.{name}" in values]
+    # friction of each side acts on a shaft of its own
+    panels = [(name, SIDES) for name in law] + [(name, (side,)) for name in ("coulomb", "viscous") for side in SIDES]
     if not len(values):
         return []
-    figure, axes = stacked(len(shown), 1.7)
+    figure, axes = stacked(len(panels), 1.3)
     time = values["t"].to_numpy(float)
-    for ax, name in zip(axes, shown, strict=True):
+    for ax, (name, sides) in zip(axes, panels, strict=True):
         ends, inner = [], []
-        for side in SIDES:
+        for side in sides:
             middle = values[f"{side}.{name}"].to_numpy(float)
             half = INTERVAL * values[f"{side}.{name}_error"].to_numpy(float)
             at = outline(middle)
@@ -124,10 +126,8 @@ def draw_watch(found: Watch) -> list[Drawn]:
             ax.plot(time[at], middle[at], color=SIDE_COLOURS[side], label=f"by the {side}'s observer")
             inner.append(middle)
             ends += [middle - half, middle + half]
-        unit = task.units["motor"][name]
-        if task.units["load"][name] != unit:
-            unit = f"{unit}, load {task.units['load'][name]}"
-        ax.set_ylabel(f"{_LABELS[name]}\n({unit})")
+        label = _LABELS[name] if len(sides) > 1 else f"{sides[0]},\n{_LABELS[name].split()[0]}"
+        ax.set_ylabel(f"{label}\n({task.units[sides[0]][name]})")
         beyond = task.alarm_gap if name == "half_gap" else None
         if beyond is not None:
             ax.axhline(beyond, color="black", ls="--", lw=1.2, label="limit")
