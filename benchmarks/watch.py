@@ -162,7 +162,8 @@ def growth(drives: list[str], runs: int, noise: float = 1e-4) -> None:
                 size = np.interp(passed + np.median(delays), times, gaps) / 1.5
                 print(
                     f"| {name} | {rise:g} | {window:g} | {100 * rms:.2g} % | {np.median(delays):.0f} | "
-                    f"{np.max(delays):.0f} | {size:.3f} | {np.sum(np.array(delays) < 0.0)} of {runs} | {np.median(of_sums):.0f} |",
+                    f"{np.max(delays):.0f} | {size:.3f} | {sum(one < 0.0 for one in delays)} of {runs} | "
+                    f"{np.median(of_sums):.0f} |",
                     flush=True,
                 )
 

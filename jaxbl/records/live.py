@@ -178,7 +178,7 @@ class _Channels:
 class Stream:
     """Rows of a source in SI units, one sampling period apart.
 
-    Up to three samples in a row that are lost are interpolated, as in a log: positions linearly, the input held. After a
+    Up to two samples in a row that are lost are interpolated, as in a log: positions linearly, the input held. After a
     longer gap rows begin anew.
 
     Args:

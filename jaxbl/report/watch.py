@@ -126,8 +126,8 @@ def draw_watch(found: Watch) -> list[Drawn]:
             ax.plot(time[at], middle[at], color=SIDE_COLOURS[side], label=f"by the {side}'s observer")
             inner.append(middle)
             ends += [middle - half, middle + half]
-        label = _LABELS[name] if len(sides) > 1 else f"{sides[0]},\n{_LABELS[name].split()[0]}"
-        ax.set_ylabel(f"{label}\n({task.units[sides[0]][name]})")
+        label = f"{_LABELS[name]}\n" if len(sides) > 1 else f"{_LABELS[name]}\n{sides[0]} "
+        ax.set_ylabel(f"{label}({task.units[sides[0]][name]})")
         beyond = task.alarm_gap if name == "half_gap" else None
         if beyond is not None:
             ax.axhline(beyond, color="black", ls="--", lw=1.2, label="limit")
