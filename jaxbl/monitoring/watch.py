@@ -25,7 +25,7 @@ from jaxbl.units import on_a_line
 from jaxbl.workers import one_blas_thread
 
 from .live_chain import LiveChain
-from .window import PARTS, SETTLING, Found, Window
+from .window import PARTS, SETTLING, Found, Number, Window
 
 SURE = 0.999
 """Probability at which the gap has to be beyond the limit."""
@@ -354,16 +354,18 @@ class Watcher:
             ends = (number.value + sign * INTERVAL * number.error for sign in (-1.0, 1.0))
             values |= dict(zip((key, f"{key}_from", f"{key}_to"), (number.value, *ends), strict=True))
         bounds = {side: numbers[name].value - _BOUND * numbers[name].error for side, numbers in known.items()}
-        bound = bounds[side]
-        if len(known) == 2:
-            one, other = (numbers[name] for numbers in known.values())
-            values["contradiction"] = abs(one.value - other.value) > _BOUND * math.hypot(one.error, other.error)
-            if values["contradiction"]:
-                # one of them is wrong: the smaller gap counts
-                bound = min(bounds.values())
+        apart = [key for key in self._chosen if len(known) == 2 and _apart(*(numbers[key] for numbers in known.values()))]
+        values["contradiction"] = bool(apart)
+        # where the gaps differ one of them is wrong: the smaller one counts
+        bound = min(bounds.values()) if name in apart else bounds[side]
         if name == "half_gap":
             values |= {"half_gap_least": bound, "alarm": task.alarm_gap is not None and bound > task.alarm_gap}
         return values
+
+
+def _apart(one: Number, other: Number) -> bool:
+    """Whether two numbers surely differ."""
+    return abs(one.value - other.value) > _BOUND * math.hypot(one.error, other.error)
 
 
 def _summary(task: WatchTask, watcher: Watcher, counts: Mapping[str, int], notes: list[str]) -> dict[str, Any]:
@@ -397,15 +399,15 @@ def _summary(task: WatchTask, watcher: Watcher, counts: Mapping[str, int], notes
 
 def value_line(values: Values, task: WatchTask) -> str:
     """Values as a line for the terminal."""
-    line = f"{values['t']:9.1f} s  "
+    line = f"{values['t']:8.1f} s  "
     side, units = values["side"], task.units["motor"]
     if not side:
-        return line + "not determined: too little motion, or too few turns through the gap"
+        return line + "not determined: too little motion, or too few ways through the gap"
     parts = []
     for name, label in (("half_gap", "half gap"), ("stiffness", "K")):
         if name in values:
             half = values[f"{name}_to"] - values[name]
-            parts.append(f"{label} {values[name]:.4g} ± {half:.1g} {units[name]}")
+            parts.append(f"{label} {values[name]:.4g}±{half:.1g} {units[name]}")
     friction = [f"{values[f'{one}.coulomb']:.2g}" for one in task.experiment.sides if f"{one}.coulomb" in values]
     parts.append(f"friction {'/'.join(friction)} {task.units['motor']['coulomb']}")
     return line + "  ".join(parts) + ("  ALARM" if values["alarm"] else "")

@@ -80,7 +80,7 @@ def watch_lines(summary: Mapping[str, Any]) -> list[str]:
         lines.append(f"No alarm: at none of {count} values was the half gap surely beyond {limit:g} {units['half_gap']}.")
     if last is None:
         lines.append(
-            f"Nothing was determined ({count} values): too little motion, too few turns through the gap, or less than the "
+            f"Nothing was determined ({count} values): too little motion, too few ways through the gap, or less than the "
             f"window of {summary['window']:g} s."
         )
         return [*lines, *_left_out(summary)]
@@ -95,8 +95,8 @@ def watch_lines(summary: Mapping[str, Any]) -> list[str]:
         lines.append(f"Not determined at {count - summary['determined']} of {count} values.")
     if summary["contradictions"]:
         lines.append(
-            f"Motor and load contradict each other at {summary['contradictions']} of {count} values: a number of the model "
-            "is wrong, or something acts on the load that it lacks. The smaller gap counted there."
+            f"Motor and load give different gaps or stiffnesses at {summary['contradictions']} of {count} values: an "
+            "inertia or a gain of the model is wrong, or something acts on one side that it lacks. The smaller gap counts."
         )
     return [*lines, *_left_out(summary)]
 

@@ -1,8 +1,6 @@
 """From gains to the drive and back: `tune`, `export`, a C compiler, and the log through the compiled code, beside the chain
 that `identify` runs on the same log."""
 
-import io
-
 import jax
 import numpy as np
 import pandas as pd

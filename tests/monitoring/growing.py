@@ -15,8 +15,9 @@ LAW = {"law": "dead_zone", "stiffness": STIFFNESS, "half_gap": HALF_GAP}
 
 
 def axis(duration=10.0, **tables):
-    """A geared axis with a hard gap, as a mapping."""
-    return swung(duration, transmission=LAW, **tables)
+    """A geared axis with a hard gap, as a mapping; gains above the bounds that its impacts ask for."""
+    observer = {"motor": {"lambda": 60.0, "alpha": 2000.0}, "load": {"lambda": 6.0, "alpha": 60.0}}
+    return swung(duration, **{"transmission": LAW, "observer": observer} | tables)
 
 
 def log_of(data, gaps, seed=0):

@@ -1,4 +1,4 @@
-"""Rows that arrive one by one: the same numbers as of a log that is read whole; what is unfit is counted, and kills nothing."""
+"""Rows that arrive one by one: the numbers of a log that is read whole. What is unfit is counted, and ends nothing."""
 
 import socket
 import threading
