@@ -5,9 +5,11 @@ is read whole; a row that is unfit is counted and left out, as nobody can mend i
 import math
 import os
 import socket
+import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple, Protocol
 from urllib.parse import urlsplit
@@ -30,7 +32,9 @@ _LONGEST_LINE = 1 << 20
 _LOOK = 0.02
 """Seconds between looks at a file."""
 _RECEIVED = 1 << 22
-"""Bytes that the system keeps while nobody takes datagrams: seconds at 10 kHz."""
+"""Bytes of datagrams that the system is asked to keep; it may keep fewer."""
+_ASKED = 0.1
+"""Seconds between looks whether a socket is to be closed."""
 _BACK = 1.0
 """Seconds that time goes back where the sender has begun anew; datagrams overtake one another by less."""
 _JUDGED, _APART, _TOLERANCE = 256, 8, 0.02
@@ -391,17 +395,21 @@ class Datagrams:
         except OSError as error:
             raise InputError(f"{address}: cannot listen there: {error.strerror or error}") from None
         self.port = self._socket.getsockname()[1]
+        # Linux may keep as few as some hundred datagrams, less than come at 10 kHz while values are computed
+        self._received, self._closed = deque[bytes](), threading.Event()
+        self._receiver = threading.Thread(target=self._receive, name="jaxbl-datagrams", daemon=True)
+        self._receiver.start()
+
+    def _receive(self) -> None:
+        self._socket.settimeout(_ASKED)
+        while not self._closed.is_set():
+            # nothing has come, or an error that concerns one datagram
+            with suppress(OSError):
+                self._received.append(self._socket.recv(1 << 16))
 
     def poll(self, seconds: float) -> tuple[Sequence[str | int], np.ndarray] | None:
-        received, end = list[bytes](), time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0.0:
-            self._socket.settimeout(left)
-            try:
-                received.append(self._socket.recv(1 << 16))
-            except TimeoutError:
-                break
-            except OSError:  # what an earlier answer of another machine left behind
-                continue
+        time.sleep(seconds)
+        received = [self._received.popleft() for _ in range(len(self._received))]
         parts, lines = list[np.ndarray](), list[str]()
         for one in received:
             # lines of many datagrams are read at once: one by one it takes too long at 10 kHz
@@ -469,6 +477,8 @@ class Datagrams:
         return False
 
     def close(self) -> None:
+        self._closed.set()
+        self._receiver.join()
         self._socket.close()
 
 
