@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import pandas as pd
-from scipy import stats
+from scipy.special import stdtrit
 
 from jaxbl.config import Config, prepare, read_model
 from jaxbl.errors import InputError
@@ -29,9 +29,9 @@ from .window import PARTS, SETTLING, Found, Number, Window
 
 SURE = 0.999
 """Probability at which the gap has to be beyond the limit."""
-_BOUND = float(stats.t.ppf(SURE, PARTS - 1))
+_BOUND = float(stdtrit(PARTS - 1, SURE))
 """Standard errors of a jackknife between a value and its one-sided bound."""
-INTERVAL = float(stats.t.ppf(0.975, PARTS - 1))
+INTERVAL = float(stdtrit(PARTS - 1, 0.975))
 """Standard errors between a value and each end of its 95 % interval."""
 _WIDEST = 0.25
 """Half width of the 95 % interval of a gap that counts as determined, over the gap or, where that is larger, the model's."""

@@ -129,7 +129,7 @@ class Window:
         return bool(self._rows) and len(self._rows["twist"]) == self.samples
 
     def add(self, rows: dict[str, np.ndarray], anew: bool) -> None:
-        """Add what :meth:`LiveChain.take` gave; where it began anew, samples until the observers have settled do not
+        """Add what :meth:`.live_chain.LiveChain.take` gave; where it began anew, samples until the observers have settled do not
         count, and neither do those before whose velocity would reach over the break."""
         if anew:
             self._unsettled = self._settling
