@@ -23,11 +23,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.signal import fftconvolve, savgol_coeffs
 
 from jaxbl.drive.transmission import AbstractTransmission
 from jaxbl.identification.compilation import jit
 from jaxbl.observer.equivalent_control import EquivalentControl
+from jaxbl.records.linear_filters import slopes
 from jaxbl.simulate import Experiment
 
 PARTS = 10
@@ -117,8 +117,7 @@ class Window:
         self.samples = PARTS * max(math.ceil(seconds / self._period / PARTS), 1)
         self._constant = constant = float(experiment.equivalent_control.time_constant)
         self._settling = math.ceil(max(SETTLING * constant, float(experiment.identifier.start)) / self._period)
-        half = max(math.ceil(_SLOPE * constant / self._period), 2)
-        self._slope = savgol_coeffs(2 * half + 1, 3, deriv=1, delta=self._period, use="conv")
+        self._half = max(math.ceil(_SLOPE * constant / self._period), 2)
         self._rows: dict[str, np.ndarray] = {}
         self._unsettled = 0
         self._last: dict[str, Found] = {}
@@ -129,12 +128,12 @@ class Window:
         return bool(self._rows) and len(self._rows["twist"]) == self.samples
 
     def add(self, rows: dict[str, np.ndarray], anew: bool) -> None:
-        """Add what :meth:`.live_chain.LiveChain.take` gave; where it began anew, samples until the observers have settled do not
-        count, and neither do those before whose velocity would reach over the break."""
+        """Add what :meth:`.live_chain.LiveChain.take` gave; where it began anew, samples do not count until the observers have
+        settled, and neither do those before whose velocity would reach over the break."""
         if anew:
             self._unsettled = self._settling
             if self._rows:
-                self._rows["counts"][-(len(self._slope) // 2) :] = 0.0
+                self._rows["counts"][-self._half :] = 0.0
         count = len(rows["twist"])
         counts = (np.arange(count) >= self._unsettled).astype(float)
         self._unsettled = max(self._unsettled - count, 0)
@@ -149,11 +148,11 @@ class Window:
             return {}
         counts = self._rows["counts"].copy()
         # the filter of the regressors begins with the window; velocities at its end lack the readings after it
-        counts[: max(math.ceil(SETTLING * self._constant / self._period), len(self._slope))] = 0.0
-        counts[-(len(self._slope) // 2) :] = 0.0
+        counts[: max(math.ceil(SETTLING * self._constant / self._period), self._half)] = 0.0
+        counts[-self._half :] = 0.0
         found = {}
         for side in self._experiment.sides:
-            velocity = fftconvolve(self._rows[f"{side}.position"], self._slope, mode="same")
+            velocity = slopes(self._rows[f"{side}.position"], self._half) / self._period
             rows = {"twist": self._rows["twist"], "torque": self._rows[f"{side}.torque"], "velocity": velocity}
             one = self._of_side(side, rows | {"counts": counts})
             if one is not None:
