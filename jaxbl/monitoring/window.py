@@ -128,8 +128,11 @@ class Window:
         return bool(self._rows) and len(self._rows["twist"]) == self.samples
 
     def add(self, rows: dict[str, np.ndarray], anew: bool) -> None:
-        """Add what :meth:`.live_chain.LiveChain.take` gave; where it began anew, samples do not count until the observers have
-        settled, and neither do those before whose velocity would reach over the break."""
+        """Add what :meth:`.live_chain.LiveChain.take` gave.
+
+        Where it began anew, samples do not count until the observers have settled, and neither do those before whose
+        velocity would reach over the break.
+        """
         if anew:
             self._unsettled = self._settling
             if self._rows:

@@ -72,8 +72,8 @@ def welch(values: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def slopes(values: np.ndarray, half: int) -> np.ndarray:
-    """Slope, a sample, of the cubic that fits best the values up to so many samples to each side of each one; those nearer to
-    an end than that are wrong. Shape (samples,)."""
+    """Slope, a sample, of the cubic that fits best the values up to so many samples to each side of each one, shape
+    (samples,); those nearer to an end than that are wrong."""
     at = np.arange(-half, half + 1)
     taps = np.linalg.pinv(np.vander(at / half, 4, increasing=True))[1] / half
     size = 1 << (len(values) + 2 * half).bit_length()
