@@ -345,6 +345,4 @@ def _watched(context: typer.Context, task: "WatchTask", folder: Path | None) -> 
             elif not quiet:
                 typer.echo(value_line(values, task))
 
-        if task.record is None:
-            remark(f"watching {task.name}; Ctrl+C ends it")
         return run_watch(task, on_values=show, on_remark=remark, ended=ended)

@@ -199,7 +199,8 @@ def run_watch(
     on_remark: Callable[[str], None] | None = None,
     ended: Callable[[], bool] | None = None,
 ) -> Watch:
-    """Do what :func:`read_watch_task` read; `on_remark` is told of rows left out, and where nothing comes.
+    """Do what :func:`read_watch_task` read; `on_remark` is told that a stream is open, of rows left out, and
+    where nothing comes.
 
     Raises:
         InputError: as :func:`watch`.
@@ -214,8 +215,10 @@ def run_watch(
         else:
             watcher.chain.compile()
             stream, notes = _stream(task), []
+            remark = on_remark or (lambda text: None)
             try:
-                for rows in _of_stream(stream, ended or (lambda: False), on_remark or (lambda text: None)):
+                remark(f"watching {task.name}; Ctrl+C ends it")
+                for rows in _of_stream(stream, ended or (lambda: False), remark):
                     watcher.take(rows)
             finally:
                 stream.source.close()

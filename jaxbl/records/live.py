@@ -17,9 +17,10 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from jaxbl.errors import InputError, shortened
+from jaxbl.validation import check_file, no_such_file
 
 from .channels import in_si, signed
-from .files import LogFile, TextForm, text_form
+from .files import LogFile, TextForm, log_endings, text_form
 from .table import POSITION_CHANNELS, LogTable, PositionTable, SpeedTable, TimeTable, TorqueTable
 from .time_stamps import GAP, ONE
 
@@ -311,9 +312,14 @@ class FollowedFile:
         self._path, self._form, self._header = path, None, ""
         self._rest, self._lines = b"", list[str]()
         try:
+            check_file(path)
             self._file = path.open("rb")
+        except FileNotFoundError:
+            raise InputError(f"{path}: {no_such_file(path, log_endings())}") from None
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
         except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
+            raise InputError(f"{path}: cannot be read: {error.strerror or error}; name a text file") from None
 
     def poll(self, seconds: float) -> tuple[Sequence[str | int], np.ndarray] | None:
         end = time.monotonic() + seconds
@@ -354,10 +360,12 @@ class FollowedFile:
                 return b""
             own = os.fstat(self._file.fileno())
             if now.st_ino != own.st_ino or now.st_size < self._file.tell():
-                # cut off, or another file in its place
-                self._file.close()
-                self._file, self._rest = self._path.open("rb"), b""
-                read = self._file.read(_HEAD)
+                # cut off, or another file in its place, which may be gone again
+                with suppress(FileNotFoundError):
+                    file = self._path.open("rb")
+                    self._file.close()
+                    self._file, self._rest = file, b""
+                    read = self._file.read(_HEAD)
         return read
 
     def close(self) -> None:
@@ -393,7 +401,9 @@ class Datagrams:
                 self._socket.close()
                 raise
         except OSError as error:
-            raise InputError(f"{address}: cannot listen there: {error.strerror or error}") from None
+            raise InputError(
+                f"{address}: cannot listen there: {error.strerror or error}; name an address of this machine"
+            ) from None
         self.port = self._socket.getsockname()[1]
         # Linux may keep as few as some hundred datagrams, less than come at 10 kHz while values are computed
         self._received, self._closed = deque[bytes](), threading.Event()

@@ -2,7 +2,7 @@
 
 import csv
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -51,16 +51,21 @@ def _at(values: Mapping[str, Any] | None, side: str, name: str) -> list[float | 
 
 @contextmanager
 def values_file(folder: Path, task: WatchTask) -> Iterator[Callable[[Mapping[str, Any]], None]]:
-    """`watch.csv` while it grows: a function that adds values, which others can read at once."""
-    with writing(folder), (folder / VALUES).open("w", newline="", encoding="utf-8") as file:
-        out = csv.DictWriter(file, columns_of(task))
-        out.writeheader()
-        file.flush()
+    """`watch.csv` while it grows, from the first values on: a function that adds values, which others can read at once."""
+    with ExitStack() as stack:
+        out: csv.DictWriter[str] | None = None
+        file: Any = None
 
         def add(values: Mapping[str, Any]) -> None:
+            nonlocal out, file
             nothing = {name: "" for name, value in values.items() if isinstance(value, float) and np.isnan(value)}
-            out.writerow(dict(values) | nothing)
-            file.flush()
+            with writing(folder):
+                if out is None:
+                    file = stack.enter_context((folder / VALUES).open("w", newline="", encoding="utf-8"))
+                    out = csv.DictWriter(file, columns_of(task))
+                    out.writeheader()
+                out.writerow(dict(values) | nothing)
+                file.flush()
 
         yield add
 

@@ -261,8 +261,11 @@ def test_what_is_no_text_is_not_followed(tmp_path):
     with pytest.raises(InputError, match="only text files are followed"):
         source.poll(0.0)
     source.close()
-    with pytest.raises(InputError, match="cannot be read"):
-        FollowedFile(tmp_path / "none.csv")
+    (tmp_path / "loge.csv").write_text("")
+    with pytest.raises(InputError, match=r"log\.csv: no such file; did you mean .*loge\.csv\?"):
+        FollowedFile(tmp_path / "log.csv")
+    with pytest.raises(InputError, match="cannot be read: Is a directory; name a text file"):
+        FollowedFile(tmp_path)
 
 
 @pytest.fixture
