@@ -92,10 +92,10 @@ def watch_lines(summary: Mapping[str, Any]) -> list[str]:
     for name in ("half_gap", "stiffness"):
         if name in last:
             said = ", ".join(
-                f"{one[name]:.4g} ({one[f'{name}_from']:.4g} to {one[f'{name}_to']:.4g}) at {one['t']:.1f} s"
+                f"{one[name]:.4g} {units[name]} ({one[f'{name}_from']:.4g} to {one[f'{name}_to']:.4g}) at {one['t']:.1f} s"
                 for one in ([first, last] if first["t"] < last["t"] else [last])
             )
-            lines.append(f"{_LABELS[name].capitalize()}: {said}, {units[name]}; 95 % intervals in brackets.")
+            lines.append(f"{_LABELS[name].capitalize()}: {said}; 95 % intervals in brackets.")
     if summary["determined"] < count:
         lines.append(f"Not determined at {count - summary['determined']} of {count} values.")
     if summary["contradictions"]:
@@ -119,7 +119,7 @@ def draw_watch(found: Watch) -> list[Drawn]:
     panels = [(name, SIDES) for name in law] + [(name, (side,)) for name in ("coulomb", "viscous") for side in SIDES]
     if not len(values):
         return []
-    figure, axes = stacked(len(panels), 1.3)
+    figure, axes = stacked(len(panels), 1.5)
     time = values["t"].to_numpy(float)
     for ax, (name, sides) in zip(axes, panels, strict=True):
         ends, inner = [], []
