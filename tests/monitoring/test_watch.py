@@ -17,6 +17,7 @@ import pandas as pd
 import pytest
 import tomli_w
 from growing import HALF_GAP, STIFFNESS, axis, log_of
+from hidden_log import FRICTIONS, GAP, geared
 from small_study import rigid, small, swung
 
 import jaxbl
@@ -368,3 +369,18 @@ def test_remarks_say_that_nothing_comes_and_what_is_left_out(logs, monkeypatch):
     run_watch(task, on_remark=heard.append, ended=ended)
     assert any("nothing that can be read has come for" in one for one in heard)
     assert any("1 malformed datagrams or lines; the last: 3 cells in '1,2,3'; there should be 4" in one for one in heard)
+
+
+def test_a_drive_by_another_simulator(tmp_path):
+    """One that shares nothing with the package: gap, stiffness and dry friction of both sides, which the model lacks."""
+    log, _ = geared()
+    log.write(tmp_path / "log.csv")
+    data = axis(4.0, transmission=GAP | {"half_gap": 0.06, "stiffness": 50.0})
+    data["run"]["sample_period"] = 2e-3
+    found = jaxbl.watch(tmp_path / "log.csv", data, window=3.0, every=0.5)
+    assert found.summary["determined"] == found.summary["values"] == 2
+    last = found.summary["last"]
+    assert last["half_gap"] == pytest.approx(GAP["half_gap"], rel=0.01)
+    assert last["stiffness"] == pytest.approx(GAP["stiffness"], rel=0.01)
+    for side, friction in zip(("motor", "load"), FRICTIONS, strict=True):
+        assert last[f"{side}.coulomb"] == pytest.approx(friction["torque"], rel=0.15)
