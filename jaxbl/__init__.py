@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from .identification.element import identify_element as identify_element
     from .identification.identify import Identification as Identification
     from .identification.identify import identify as identify
+    from .monitoring.watch import Watch as Watch
+    from .monitoring.watch import watch as watch
     from .records import Inspection as Inspection
     from .records import LogTable as LogTable
     from .records import Record as Record
@@ -58,6 +60,7 @@ _NAMES = {
     "gains.verify": ("Verdict", "verify"),
     "identification.element": ("ElementIdentification", "identify_element"),
     "identification.identify": ("Identification", "identify"),
+    "monitoring.watch": ("Watch", "watch"),
     "records": ("Inspection", "LogTable", "Record", "inspect", "read_record"),
     "report.results": ("draw", "write_report"),
     "sweeps.compare": ("Comparison", "compare"),

@@ -20,8 +20,8 @@ from .errors import InputError, NoResult
 if TYPE_CHECKING:
     import pandas as pd
 
-LOG_RESULTS = ("inspection.json", "identification.json", "diagnosis.json")
-"""What `inspect`, `identify` and `diagnose` write into a folder; each names the log that the results are of."""
+LOG_RESULTS = ("inspection.json", "identification.json", "diagnosis.json", "watch.json")
+"""What `inspect`, `identify`, `diagnose` and `watch` write into a folder; each names the log that the results are of."""
 
 
 def place(name: str | Path) -> Path:

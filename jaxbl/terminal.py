@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 """Exit code of an interrupted command: 128 and the signal's number."""
+_REQUESTS = (signal.SIGINT, signal.SIGTERM)
+"""Signals that ask a process to end."""
 _EVERY, _LOOK, _WINDOW = 10.0, 1.0, 60.0
 """Seconds between lines of progress in a pipe, between looks at what is done, and back to the look that gives the speed."""
 
@@ -85,14 +87,34 @@ def until_interrupted(run: Callable[[], object]) -> None:
     """Run until Ctrl+C or a request to end; a second one ends the process as it is."""
 
     def end(number: int, frame: FrameType | None) -> None:
-        for one in (signal.SIGINT, signal.SIGTERM):
+        for one in _REQUESTS:
             signal.signal(one, signal.SIG_DFL)
         raise KeyboardInterrupt
 
-    for one in (signal.SIGINT, signal.SIGTERM):
+    for one in _REQUESTS:
         signal.signal(one, end)
     with suppress(KeyboardInterrupt):
         run()
+
+
+@contextmanager
+def until_asked() -> Iterator[Callable[[], bool]]:
+    """Around what goes on until somebody asks it to end (Ctrl+C, or a request of the system): a function that says whether
+    somebody has. Asked a second time, the process ends as it is."""
+    asked = False
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        nonlocal asked
+        asked = True
+        for one in _REQUESTS:
+            signal.signal(one, signal.SIG_DFL)
+
+    before = {one: signal.signal(one, ask) for one in _REQUESTS}
+    try:
+        yield lambda: asked
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
 
 
 def call_again(context: typer.Context, folder: Path, *, kept: bool = True) -> list[str]:

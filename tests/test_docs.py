@@ -209,6 +209,15 @@ def imports_of(requirement):
     return {"pytest-xdist": "xdist"}.get(found := re.match(r"[\w-]+", requirement)[0], found)
 
 
+HIDING = """import sys
+class Hiding:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {hidden!r}:
+            raise ModuleNotFoundError("No module named '" + name + "'", name=name)
+sys.meta_path.insert(0, Hiding())
+"""
+
+
 def environment(folder, extra=None):
     """That of the README's `make demo`: what only tests and benchmarks need, or another extra, cannot be imported."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -218,7 +227,8 @@ def environment(folder, extra=None):
     hidden = sorted(set(map(imports_of, chain.from_iterable(optional.values()))) - shown - {"hatchling"})
     site = folder / "site"
     site.mkdir()
-    (site / "sitecustomize.py").write_text(f"import sys\nsys.modules.update(dict.fromkeys({hidden!r}))\n")
+    # a module of None would do for most, but SciPy looks whether sphinx is among those that are loaded
+    (site / "sitecustomize.py").write_text(HIDING.format(hidden=hidden))
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     # as on the command line, compiled programs are kept; here nothing changes the package while it runs
     programs = str(ROOT / ".cache" / "programs")

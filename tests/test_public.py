@@ -31,6 +31,7 @@ FLOORS = [
     {"config", "fused"},
     {"sweeps", "identification"},
     {"gains", "diagnosis", "exports"},
+    {"monitoring"},
     {"throughput"},
     {"report"},
     {"datasheet", "doctor"},

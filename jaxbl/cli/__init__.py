@@ -41,7 +41,7 @@ def _main(
 for _command in (
     *(setup.demo, setup.init),
     *(studies.simulate, studies.sweep, studies.status, studies.tune, studies.verify, exporting.export),
-    *(logs.inspect, logs.identify, logs.diagnose),
+    *(logs.inspect, logs.identify, logs.diagnose, logs.watch),
     *(studies.plot, studies.explore, studies.compare, studies.repair, setup.bench, setup.doctor),
 ):
     app.command()(told(_command))
@@ -50,7 +50,7 @@ app.command()(setup.schema)
 
 
 def main(run: Callable[[], object] = app) -> None:
-    """Run a command: exit 0 done, 1 failed, 2 bad input (one line), 130 interrupted."""
+    """Run a command: exit 0 done, 1 failed, 2 bad input (one line), 3 alarm of a watch, 130 interrupted."""
     try:
         run()
     except (InputError, NoResult) as error:

@@ -1,4 +1,4 @@
-"""Commands on measured logs: inspect, identify, diagnose."""
+"""Commands on measured logs: inspect, identify, diagnose, watch."""
 
 import math
 from collections.abc import Mapping
@@ -10,9 +10,9 @@ import typer
 from jaxbl import workers
 from jaxbl.errors import InputError
 from jaxbl.lines import Step
-from jaxbl.terminal import call_again, running
+from jaxbl.terminal import call_again, is_quiet, running, until_asked
 
-from .next_steps import LogCall, after_diagnosis, after_identification, after_proposal
+from .next_steps import LogCall, after_diagnosis, after_identification, after_proposal, after_watch
 from .options import (
     FORMATS,
     LogArgument,
@@ -27,7 +27,11 @@ from .options import (
 from .outcome import Outcome
 
 if TYPE_CHECKING:
+    from jaxbl.monitoring.watch import Watch, WatchTask
     from jaxbl.records import LogTable
+
+ALARM = 3
+"""Exit code of a watch with an alarm."""
 
 
 def inspect(
@@ -254,3 +258,91 @@ def _diagnose_batch(
     lines = [f"Skipped, by their names no logs: {', '.join(skipped)}"] if skipped else []
     code = 2 if all(row["refused"] for row in rows) else 0
     return Outcome([*lines, *batch_lines(rows)], out, "batch.csv", {"logs": rows, "skipped": skipped}, code)
+
+
+def watch(
+    context: typer.Context,
+    source: Annotated[
+        str, typer.Argument(metavar="LOG|udp://HOST:PORT", help=f"{FORMATS}, or where to listen", show_default=False)
+    ],
+    model: Annotated[
+        Path, typer.Option(metavar="TOML", help="study with the drive's numbers, observers and [log]", show_default=False)
+    ],
+    alarm_gap: Annotated[
+        float | None,
+        typer.Option(metavar="RAD", help="half gap beyond which there is an alarm: rad at the motor (m on a linear axis)"),
+    ] = None,
+    window: Annotated[float, typer.Option(metavar="S", help="seconds that each value is from")] = 10.0,
+    every: Annotated[float, typer.Option(metavar="S", help="seconds between values")] = 1.0,
+    follow: Annotated[
+        bool, typer.Option("--follow", help="wait for more rows at the end of a text file, until Ctrl+C")
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="folder for the results [default: results/<log name>; of a socket: none]"),
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="write into a folder that holds other results of a log or stream")
+    ] = False,
+) -> Outcome:
+    """Watch a drive's gap, stiffness and friction over a log or a stream; exit code 3 if there was an alarm."""
+    workers.start_jax()
+    from jaxbl.files import locked, removed_if_empty
+    from jaxbl.monitoring.watch import read_watch_task
+    from jaxbl.report.watch import watch_lines, write_watch_report
+
+    task = read_watch_task(source, model, alarm_gap=alarm_gap, window=window, every=every, follow=follow)
+    folder = out if "://" in source or out is not None else folder_of(Path(source), None)
+    if folder is None:
+        found = _watched(context, task, None)
+        code = ALARM if found.summary["alarm"] else 0
+        return Outcome(watch_lines(found.summary), summary=found.summary, code=code, compact=True)
+    with removed_if_empty(folder), locked(folder):
+        _claim_watch(folder, task, overwrite)
+        found = _watched(context, task, folder)
+        steps = after_watch(task, found.summary, model)
+        lines = write_watch_report(found, folder, steps)
+    code = ALARM if found.summary["alarm"] else 0
+    return Outcome(lines, folder, summary=found.summary, code=code, steps=steps, compact=True)
+
+
+def _claim_watch(folder: Path, task: "WatchTask", overwrite: bool) -> None:
+    from jaxbl.files import claim_log_folder
+    from jaxbl.report.watch import VALUES
+
+    if task.record is None and (folder / VALUES).exists() and not overwrite:
+        raise InputError(f"{folder}: holds values of another stream; choose another folder with --out, or --overwrite")
+    claim_log_folder(folder, Path(task.name), overwrite=overwrite)
+
+
+def _watched(context: typer.Context, task: "WatchTask", folder: Path | None) -> "Watch":
+    """Print values as they come; those of a stream are in the folder at once, as nobody can give them again."""
+    import json
+    from contextlib import ExitStack
+
+    from jaxbl.errors import printable
+    from jaxbl.files import plain
+    from jaxbl.monitoring.watch import run_watch, value_line
+    from jaxbl.report.watch import values_file
+
+    quiet, as_json = is_quiet(context), bool(context.params.get("json"))
+
+    def remark(text: str) -> None:
+        if not quiet:
+            typer.echo(printable(f"jaxbl: {text}"), err=True)
+
+    with ExitStack() as stack:
+        keep = None
+        if folder is not None and task.record is None:
+            keep = stack.enter_context(values_file(folder, task))
+        ended = None if task.record is not None else stack.enter_context(until_asked())
+
+        def show(values: dict[str, Any]) -> None:
+            if keep is not None:
+                keep(values)
+            if as_json:
+                typer.echo(json.dumps(plain(values), ensure_ascii=False))
+            elif not quiet:
+                typer.echo(value_line(values, task))
+
+        return run_watch(task, on_values=show, on_remark=remark, ended=ended)

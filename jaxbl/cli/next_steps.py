@@ -9,6 +9,7 @@ from jaxbl.lines import Step, command_line
 
 if TYPE_CHECKING:
     from jaxbl.identification.logs import LogTask
+    from jaxbl.monitoring.watch import WatchTask
     from jaxbl.sweeps.sweep import StudyResult
 
 
@@ -106,6 +107,17 @@ def after_diagnosis(
         words = ("simulate", model, "--out", f"{folder}_run")
         steps.append(Step(command_line(*words), "How does the drive move with what was found? The extended study, run."))
     return [*steps, _along_the_log(folder)]
+
+
+def after_watch(task: "WatchTask", summary: Mapping[str, Any], model: Path) -> list[Step]:
+    """What is open after a watch of a log, which can be read again."""
+    if task.record is None:
+        return []
+    if summary["contradictions"]:
+        return [Step(command_line("diagnose", task.name, "--model", model), "Which effect does the model lack?")]
+    if summary["alarm"]:
+        return [Step(command_line("identify", task.name, "--model", model), "How large are gap and stiffness, by a fit?")]
+    return []
 
 
 class LogCall(NamedTuple):

@@ -28,6 +28,7 @@ class Outcome(NamedTuple):
         summary: the same as data, or the file in the folder that has it.
         code: exit code.
         steps: what to try next.
+        compact: whether its JSON is one line, as lines of JSON came before it.
     """
 
     lines: list[str]
@@ -36,6 +37,7 @@ class Outcome(NamedTuple):
     summary: Mapping[str, Any] | str | None = None
     code: int = 0
     steps: Sequence[Step] = ()
+    compact: bool = False
 
     def text(self) -> list[str]:
         """The lines, what to try next, and what is to be opened."""
@@ -64,6 +66,7 @@ def told(command: Callable[..., Outcome]) -> Callable[..., None]:
     @functools.wraps(command)
     def run(*, quiet: bool, json: bool, **given: Any) -> None:
         said: dict[str, Any] = {}
+        indent: int | None = 1
         try:
             outcome = command(**given)
         except (InputError, NoResult) as error:
@@ -77,7 +80,7 @@ def told(command: Callable[..., Outcome]) -> Callable[..., None]:
             raise
         else:
             if json:
-                said = outcome.data()
+                said, indent = outcome.data(), None if outcome.compact else 1
             elif not quiet:
                 for line in outcome.text():
                     typer.echo(line)
@@ -85,7 +88,7 @@ def told(command: Callable[..., Outcome]) -> Callable[..., None]:
             if json and said:
                 from jaxbl.files import plain
 
-                typer.echo(json_format.dumps(plain({"command": command.__name__} | said), indent=1, ensure_ascii=False))
+                typer.echo(json_format.dumps(plain({"command": command.__name__} | said), indent=indent, ensure_ascii=False))
         if outcome.code:
             raise typer.Exit(outcome.code)
 

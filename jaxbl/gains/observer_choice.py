@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
 from jaxbl.config import Config, TuneTable, with_values
 from jaxbl.files import plain
@@ -284,7 +283,9 @@ def _observer(kind: str, own: Mapping[str, Any], columns: Mapping[str, Sequence[
 def _quasi_random(free: int, count: int, stage: int) -> np.ndarray:
     """Points `(count, free)` of the unit cube; other ones in each stage."""
     power = math.ceil(math.log2(count))
-    return stats.qmc.Sobol(free, rng=np.random.default_rng(stage)).random_base2(power)[:count]
+    from scipy.stats import qmc  # slow to load, as below
+
+    return qmc.Sobol(free, rng=np.random.default_rng(stage)).random_base2(power)[:count]
 
 
 def _groups(config: Config, table: TuneTable, stages: Stages) -> list[Group]:
@@ -331,7 +332,9 @@ def ranked(errors: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
         beside = logs[kind] - logs[order[0]]
         half = 0.0
         if len(beside) > 1:
-            quantile = float(stats.t.ppf(0.5 * (1.0 + _CONFIDENCE), len(beside) - 1))
+            from scipy.stats import t
+
+            quantile = float(t.ppf(0.5 * (1.0 + _CONFIDENCE), len(beside) - 1))
             half = quantile * float(beside.std(ddof=1)) / math.sqrt(len(beside))
         mean = float(beside.mean())
         found[kind] = {

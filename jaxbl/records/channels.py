@@ -92,15 +92,43 @@ def _numbers(file: LogFile, name: str, column: str | int, bits: int | None, stam
     file.check_length(file.name(column, f"{name}.column"), stamps.total)
     values = file.numbers(column, f"{name}.column")
     if bits is not None:
-        outside = (values != np.round(values)) | (values < -(2.0 ** (bits - 1))) | (values >= 2.0**bits)
+        words = signed(values, bits)
+        outside = np.isnan(words)
         if outside.any():
             row = int(np.argmax(outside))
             raise file.wrong(
                 f"column {column!r}, data row {row + 1}: {values[row]:g} is no word of {bits} bits; see [log] "
                 f"{name}.signed_bits"
             )
-        values = np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values)
+        values = words
     return values[stamps.rows]
+
+
+def signed(values: np.ndarray, bits: int) -> np.ndarray:
+    """Unsigned words as signed ones; NaN for what is no word of so many bits."""
+    word = (values == np.round(values)) & (values >= -(2.0 ** (bits - 1))) & (values < 2.0**bits)
+    return np.where(word, np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values), np.nan)
+
+
+def in_si(table: PositionTable | SpeedTable | TorqueTable, values: np.ndarray) -> np.ndarray:
+    """Numbers of a column, signed and unwrapped, in SI units as `[log]` says: rad (m), rad/s (m/s), N m (N)."""
+    if isinstance(table, TorqueTable):
+        one, factor = 1.0, 1.0 if table.factor is None else table.factor
+    elif isinstance(table, SpeedTable):
+        one, factor = _SPEED[table.unit], table.factor
+    else:
+        one, factor = _POSITION[table.unit] / (table.counts_per_turn or 1.0), table.factor
+    return table.sign * factor * one * values + (table.offset or 0.0)
+
+
+_POSITION = {
+    "rad": 1.0, "deg": math.pi / 180.0, "turn": 2.0 * math.pi, "counts": 2.0 * math.pi, "m": 1.0, "mm": 1e-3,
+}  # fmt: skip
+"""Unit of a position -> rad (m); of counts, those of a turn."""
+_SPEED = {
+    "rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0, "turn/s": 2.0 * math.pi, "m/s": 1.0, "mm/s": 1e-3,
+}  # fmt: skip
+"""Unit of a speed -> rad/s (m/s)."""
 
 
 def _position(file: LogFile, name: str, table: PositionTable, stamps: TimeStamps) -> RawChannel:
@@ -117,24 +145,10 @@ def _position(file: LogFile, name: str, table: PositionTable, stamps: TimeStamps
     else:
         values = _unwrapped(file, name, table, values)
     _check_unit(file, name, table, values)
-    one = {
-        "rad": 1.0,
-        "deg": math.pi / 180.0,
-        "turn": 2.0 * math.pi,
-        "counts": 2.0 * math.pi / (table.counts_per_turn or 1.0),
-        "m": 1.0,
-        "mm": 1e-3,
-    }[table.unit]
-    values = table.sign * table.factor * one * values + (table.offset or 0.0)
+    values = in_si(table, values)
     if np.ptp(values) < _LEAST_MOTION:
         raise file.wrong(f"{name} moves by only {np.ptp(values):.3g} {table.si_unit}; see its unit and factor in [log]")
     return RawChannel(values, table.si_unit, 0.0, table.skew or 0.0, held=False, drift=table.drift or 0.0)
-
-
-_SPEED = {
-    "rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0, "turn/s": 2.0 * math.pi, "m/s": 1.0, "mm/s": 1e-3,
-}  # fmt: skip
-"""Unit of a speed -> rad/s (m/s)."""
 
 
 def _integral(file: LogFile, name: str, table: SpeedTable, stamps: TimeStamps) -> RawChannel:
@@ -145,7 +159,7 @@ def _integral(file: LogFile, name: str, table: SpeedTable, stamps: TimeStamps) -
     if np.ptp(values) == 0.0:
         raise file.wrong(f"column {column!r} ({channel}) is {values[0]:g} in all rows; it should change")
     step = resolution(values)
-    speed = table.sign * table.factor * _SPEED[table.unit] * values + table.offset
+    speed = in_si(table, values)
     position = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(stamps.times))])
     coarse = f" in steps of {step * table.factor:.3g} {table.unit}" if step else ""
     file.warnings.append(
@@ -174,8 +188,7 @@ def _torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamps, *,
                 f"{table.saturation:g}; saturation should be the largest value that there can be"
             )
         saturated = float(np.mean(np.abs(values) >= table.saturation * (1.0 - 1e-9)))
-    factor = 1.0 if table.factor is None else table.factor
-    values = table.sign * factor * values + table.offset
+    values = in_si(table, values)
     if 0.0 < np.abs(values).max() < _LEAST_TORQUE:
         raise file.wrong(f"{name} is at most {np.abs(values).max():.3g}; see its unit and factor in [log]")
     return RawChannel(values, "N" if linear else "N m", saturated, table.skew, held=name == "u")

@@ -16,7 +16,7 @@ from codecs import BOM_UTF8
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -335,33 +335,14 @@ def _text(
         raise InputError(f"has no line break in its first {len(head)} characters; a log has a line for each row")
     if (block := _behind_remarks(lines, text)) is not None:
         return block
-    skipped = next((i for i, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), None)
-    if skipped is None:
-        raise InputError("holds only remarks; rows of numbers are needed")
-    first = lines[skipped]
-    separator = _separator(first)
-    cells = _cells(first, separator)
-    if len(cells) > _MOST_COLUMNS:
-        raise InputError(f"has {len(cells)} columns; at most {_MOST_COLUMNS} can be read")
-    header = not any(_NUMBER.fullmatch(cell) for cell in cells)
-    second = next((line for line in lines[skipped + 1 :] if line.strip()), "")
-    if header and len(_cells(second, separator)) == len(cells) + 1 and second.rstrip(" ").endswith(separator):
-        cells = [*cells, ""]  # a separator at the end of the rows
-    decimal = _decimal(lines[skipped + header :], separator)
-    names = _names(cells) if header else None
+    form = text_form(lines)
 
     def rows(wanted: Collection[str | int]) -> tuple[list[str | int], dict[str | int, np.ndarray], int]:
         """Names of all columns, values of those that are wanted (all, if none is), and the number of rows."""
-        chunks = pd.read_csv(
+        chunks: Any = pd.read_csv(
             path,
-            sep=separator,
-            header=None,
-            names=names,
-            skiprows=skipped + header,
-            comment="#",
-            skipinitialspace=True,
-            decimal=decimal,
-            index_col=False,
+            **form.options(),
+            skiprows=form.rows,
             low_memory=False,
             encoding=encoding,
             compression=None,
@@ -387,12 +368,75 @@ def _text(
         except pd.errors.EmptyDataError:
             raise InputError(_NO_ROWS) from None
         except pd.errors.ParserWarning:
-            raise InputError(f"rows have more columns than the header; they should have {len(cells)}") from None
+            raise InputError(f"rows have more columns than the header; they should have {form.count}") from None
     if not count:
         raise InputError(_NO_ROWS)
     return {
         name: values[name] if name in values else Column(lambda name=name: rows([name])[1][name], count) for name in every
     }
+
+
+class TextForm(NamedTuple):
+    """How rows of text are written.
+
+    Attributes:
+        separator: between cells; white space as a pattern.
+        decimal: sign of numbers.
+        names: of the columns, or None where there is no header.
+        count: of the columns.
+        rows: line in which the rows begin, counted from 0.
+    """
+
+    separator: str
+    decimal: str
+    names: list[str] | None
+    count: int
+    rows: int
+
+    def options(self) -> Any:
+        """Those of `pandas.read_csv`."""
+        return {
+            "sep": self.separator,
+            "header": None,
+            "names": self.names,
+            "comment": "#",
+            "skipinitialspace": True,
+            "decimal": self.decimal,
+            "index_col": False,
+        }
+
+    def numbers(self, lines: list[str]) -> np.ndarray:
+        """Rows as numbers, shape (rows, columns); NaN for a cell that holds none. Lines of another number of cells are
+        left out."""
+        lines = [line for line in lines if len(_cells(line, self.separator)) == self.count]
+        if not lines:
+            return np.empty((0, self.count))
+        options = self.options() | {"names": None}
+        frame = pd.read_csv(io.StringIO("\n".join(lines)), **options)
+        return np.stack([pd.to_numeric(frame[i], errors="coerce").to_numpy(float) for i in range(self.count)], axis=1)
+
+
+def text_form(lines: list[str]) -> TextForm:
+    """How the rows of a text are written, from its first lines.
+
+    Raises:
+        InputError: there are only remarks, too many columns, or two of one name; the message is without the path.
+    """
+    skipped = next((i for i, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), None)
+    if skipped is None:
+        raise InputError("holds only remarks; rows of numbers are needed")
+    first = lines[skipped]
+    separator = _separator(first)
+    cells = _cells(first, separator)
+    if len(cells) > _MOST_COLUMNS:
+        raise InputError(f"has {len(cells)} columns; at most {_MOST_COLUMNS} can be read")
+    header = not any(_NUMBER.fullmatch(cell) for cell in cells)
+    second = next((line for line in lines[skipped + 1 :] if line.strip()), "")
+    if header and len(_cells(second, separator)) == len(cells) + 1 and second.rstrip(" ").endswith(separator):
+        cells = [*cells, ""]  # a separator at the end of the rows
+    decimal = _decimal(lines[skipped + header :], separator)
+    names = _names(cells) if header else None
+    return TextForm(separator, decimal, names, len(cells), skipped + header)
 
 
 _SPACE = r"\s+"

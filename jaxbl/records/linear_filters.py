@@ -2,6 +2,7 @@
 
 References: A. V. Oppenheim, R. W. Schafer, Discrete-Time Signal Processing (2010), 7.2 (bilinear transform), 7.5 (windows);
 F. Gustafsson, Determining the initial states in forward-backward filtering, IEEE Trans. Signal Process. 44 (1996);
+A. Savitzky, M. J. E. Golay, Smoothing and differentiation of data, Anal. Chem. 36 (1964);
 P. D. Welch, The use of fast Fourier transform for the estimation of power spectra, IEEE Trans. Audio 15 (1967).
 """
 
@@ -68,6 +69,17 @@ def welch(values: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
     # frequencies other than 0 and half the sampling rate have a negative twin
     density[1 : len(density) - (length % 2 == 0)] *= 2.0
     return np.fft.rfftfreq(length), density
+
+
+def slopes(values: np.ndarray, half: int) -> np.ndarray:
+    """Slope, a sample, of the cubic that fits best the values up to so many samples to each side of each one, shape
+    (samples,); those nearer to an end than that are wrong."""
+    at = np.arange(-half, half + 1)
+    taps = np.linalg.pinv(np.vander(at / half, 4, increasing=True))[1] / half
+    size = 1 << (len(values) + 2 * half).bit_length()
+    # a cubic's slope does not change with a constant, which would cost digits
+    product = np.fft.rfft(values - values[0], size) * np.fft.rfft(taps[::-1], size)
+    return np.fft.irfft(product, size)[half : half + len(values)]
 
 
 def low_pass_taps(count: int, cutoff: float) -> np.ndarray:

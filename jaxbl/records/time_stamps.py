@@ -12,7 +12,7 @@ from .table import LogTable, TimeTable
 
 GAP = 3.5
 """Intervals longer than this many periods are gaps: up to three lost samples in a row are interpolated."""
-_ONE = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+ONE = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Unit of the stamps -> s."""
 _SLOW = 0.5
 """Period in s from which a remark asks for the unit of the stamps: drives are sampled much faster."""
@@ -108,7 +108,7 @@ def _stamps(file: LogFile, table: LogTable) -> np.ndarray:
         length = max(file.length(file.name(one)) for one in read or file.columns)
         stamps = np.arange(length, dtype=float) * time.period
     else:
-        stamps = file.seconds(time.column_or("t"), _ONE[time.unit], "t.column")
+        stamps = file.seconds(time.column_or("t"), ONE[time.unit], "t.column")
     if len(stamps) < SHORTEST:
         raise file.wrong(f"has {len(stamps)} rows; a log needs at least {SHORTEST}")
     back = np.diff(stamps) < 0.0

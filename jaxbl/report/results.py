@@ -13,6 +13,7 @@ from jaxbl.gains.tune import Tuning
 from jaxbl.gains.verify import Verdict
 from jaxbl.identification.element import ElementIdentification
 from jaxbl.identification.identify import Identification
+from jaxbl.monitoring.watch import Watch
 from jaxbl.records import Inspection
 from jaxbl.sweeps.sweep import StudyResult
 from jaxbl.sweeps.trial import Trial
@@ -31,6 +32,7 @@ from .simulate import draw_trial, write_trial_report
 from .sweep import write_sweep_report
 from .tune import draw_tuning, write_tune_report
 from .verify import draw_verdict, write_verify_report
+from .watch import draw_watch, write_watch_report
 
 _KINDS: dict[type, tuple[Callable[[Any], list[Drawn]], Callable[[Any, Path], list[str]]]] = {
     Trial: (draw_trial, write_trial_report),
@@ -42,6 +44,7 @@ _KINDS: dict[type, tuple[Callable[[Any], list[Drawn]], Callable[[Any, Path], lis
     Identification: (draw_identification, write_identification_report),
     ElementIdentification: (draw_element, write_element_report),
     Diagnosis: (draw_diagnosis, write_diagnosis_report),
+    Watch: (draw_watch, write_watch_report),
 }
 
 
@@ -66,7 +69,7 @@ def draw(result: Any, *names: str) -> Drawings:
 
     Args:
         result: what :func:`jaxbl.run`, :func:`jaxbl.sweep`, :func:`jaxbl.tune`, :func:`jaxbl.verify`, :func:`jaxbl.inspect`,
-            :func:`jaxbl.identify`, :func:`jaxbl.identify_element` or :func:`jaxbl.diagnose` returned.
+            :func:`jaxbl.identify`, :func:`jaxbl.identify_element`, :func:`jaxbl.diagnose` or :func:`jaxbl.watch` returned.
         names: those wanted, by the names of their files; left out, all.
 
     Raises:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from jaxbl.records.linear_filters import both_ways, butterworth, filtered, low_pass_taps, parzen, welch
+from jaxbl.records.linear_filters import both_ways, butterworth, filtered, low_pass_taps, parzen, slopes, welch
 
 RANDOM = np.random.default_rng(0)
 WALK = np.cumsum(RANDOM.standard_normal((3001, 2)), axis=0)
@@ -35,3 +35,11 @@ def test_spectrum_is_that_of_scipy(length):
 def test_windows_are_those_of_scipy():
     assert low_pass_taps(161, 1.0 / 8.0) == pytest.approx(signal.firwin(161, 1.0 / 8.0), rel=1e-12, abs=1e-15)
     assert parzen(40) == pytest.approx(signal.windows.parzen(79)[39:], rel=1e-12)
+
+
+@pytest.mark.parametrize("half", [2, 20, 201])
+def test_slopes_are_those_of_scipy_away_from_the_ends(half):
+    values = 1e4 + np.cumsum(np.random.default_rng(0).standard_normal(3001))
+    inside = slice(half, -half)
+    expected = signal.savgol_filter(values, 2 * half + 1, 3, deriv=1)[inside]
+    np.testing.assert_allclose(slopes(values, half)[inside], expected, atol=1e-10)

@@ -1,0 +1,82 @@
+"""The observers over rows as they come: `jaxbl.simulate.step` with recorded input and positions, in blocks of one size."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbl.identification.compilation import jit
+from jaxbl.simulate import Experiment, Sample, State, initial_state, step
+
+BLOCKS = (256, 2048, 16_384)
+"""Samples of a call: few for rows as they come, at 1 or 10 kHz, and many for a recording."""
+
+
+@jit
+def _observed(
+    experiment: Experiment, state: State, torque: jax.Array, measured: dict[str, jax.Array], count: jax.Array
+) -> tuple[State, dict[str, jax.Array]]:
+    """The state after `count` samples of a block, and what each sample gives."""
+
+    def sample(state: State, given: tuple[Any, ...]) -> tuple[State, dict[str, jax.Array]]:
+        index, torque, measured = given
+        # time matters to excitation and identifier alone
+        new, signals = step(experiment, state, Sample(jnp.zeros_like(torque), input=torque, measured=measured))
+        row = {"twist": jnp.asarray(signals.twist)}
+        row |= {f"{side}.torque": signals.side(side).torque_estimate for side in experiment.sides}
+        return jax.tree.map(lambda new, old: jnp.where(index < count, new, old), new, state), row
+
+    return jax.lax.scan(sample, state, (jnp.arange(len(torque)), torque, measured))
+
+
+class LiveChain:
+    """Observers and filter of a study; the identifier works on what they give (:mod:`.window`).
+
+    Args:
+        experiment: with leaves in float64.
+    """
+
+    def __init__(self, experiment: Experiment):
+        self._experiment = dataclasses.replace(experiment, identifier=None)
+        self._state: State | None = None
+
+    def take(self, torque: np.ndarray, measured: dict[str, np.ndarray], anew: bool) -> dict[str, np.ndarray]:
+        """Take in samples.
+
+        Args:
+            torque: input, N m, shape (samples,).
+            measured: positions of both sides, rad, shape (samples,).
+            anew: whether they do not continue those before.
+
+        Returns:
+            `twist` (rad); by side `SIDE.position` (rad), as measured, and `SIDE.torque`, the observer's transmitted torque
+            (N m).
+        """
+        if self._state is None or anew:
+            first = {side: jnp.asarray(values[0]) for side, values in measured.items()}
+            self._state = initial_state(self._experiment, first)
+        found: list[dict[str, np.ndarray]] = []
+        done = 0
+        while done < len(torque):
+            left = len(torque) - done
+            size = next((one for one in BLOCKS if left <= one), BLOCKS[-1])
+            part, count = slice(done, done + size), min(left, size)
+
+            def padded(values: np.ndarray, part: slice = part, room: int = size - count) -> jax.Array:
+                return jnp.asarray(np.pad(values[part], (0, room)))
+
+            given = padded(torque), {side: padded(values) for side, values in measured.items()}
+            self._state, rows = _observed(self._experiment, self._state, *given, jnp.asarray(count))
+            found.append({name: np.asarray(values)[:count] for name, values in rows.items()})
+            done += count
+        positions = {f"{side}.position": values for side, values in measured.items()}
+        return {name: np.concatenate([one[name] for one in found]) for name in found[0]} | positions
+
+    def compile(self) -> None:
+        """Compile what rows will need, before any come."""
+        sides = self._experiment.sides
+        for size in BLOCKS[:-1]:
+            self.take(np.zeros(size), {side: np.zeros(size) for side in sides}, anew=True)
+        self._state = None

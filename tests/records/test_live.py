@@ -1,0 +1,335 @@
+"""Rows that arrive one by one: the numbers of a log that is read whole. What is unfit is counted, and ends nothing."""
+
+import socket
+import threading
+import time
+from collections import Counter
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from jaxbl.errors import InputError
+from jaxbl.records import LogTable, read_record
+from jaxbl.records.live import (
+    DISORDERED,
+    GAPS,
+    LOST,
+    MALFORMED,
+    RESTARTS,
+    UNREADABLE,
+    Datagrams,
+    FollowedFile,
+    Stream,
+    check_live,
+    needed,
+)
+
+PERIOD = 1e-3
+NAMES = ["t", "u", "theta_e", "theta_s"]
+
+
+class Given:
+    """A source of what it is given, block by block."""
+
+    name, fault = "given", ""
+
+    def __init__(self, *blocks, columns=NAMES):
+        self.blocks, self.counts, self.columns = [*blocks], Counter(), columns
+
+    def poll(self, seconds):
+        return (self.columns, self.blocks.pop(0)) if self.blocks else None
+
+    def close(self):
+        pass
+
+
+def moved(count, start=0.0):
+    time = start + np.arange(count) * PERIOD
+    return np.stack([time, np.cos(time), np.sin(5.0 * time), np.sin(3.0 * time)], axis=1)
+
+
+def taken(*blocks, table=None, columns=NAMES):
+    """All rows of some blocks, and what was counted."""
+    source = Given(*blocks, columns=columns)
+    stream = Stream(source, table or LogTable(), PERIOD)
+    found = [rows for _ in blocks for rows in stream.poll(0.0)]
+    return found, dict(source.counts)
+
+
+def test_blocks_of_any_size_give_the_rows_as_they_are():
+    rows = moved(1000)
+    found, counts = taken(rows[:1], rows[1:300], rows[300:301], rows[301:])
+    assert [one.anew for one in found] == [True, False, False, False]
+    assert [one.time for one in found] == pytest.approx([0.0, 0.001, 0.3, 0.301])
+    np.testing.assert_array_equal(np.concatenate([one.torque for one in found]), rows[:, 1])
+    for i, side in enumerate(("motor", "load")):
+        np.testing.assert_array_equal(np.concatenate([one.positions[side] for one in found]), rows[:, 2 + i])
+    assert counts == {}
+
+
+@pytest.mark.parametrize("cut", [7, 500, 501])
+def test_lost_samples_are_interpolated_and_counted(cut):
+    """Two in a row, wherever blocks end; the input is held."""
+    rows = moved(1000)
+    left = np.delete(rows, [500, 501], axis=0)
+    found, counts = taken(left[:cut], left[cut:])
+    assert counts == {LOST: 2}
+    assert not any(one.anew for one in found[1:])
+    torque = np.concatenate([one.torque for one in found])
+    np.testing.assert_array_equal(torque[500:502], rows[499, 1])
+    motor = np.concatenate([one.positions["motor"] for one in found])
+    np.testing.assert_allclose(motor, rows[:, 2], atol=5e-5)
+
+
+def test_a_gap_in_time_begins_anew():
+    rows = moved(1000)
+    left = np.delete(rows, np.arange(500, 510), axis=0)
+    for blocks in ((left,), (left[:500], left[500:])):
+        found, counts = taken(*blocks)
+        assert counts == {GAPS: 1}
+        assert [(one.anew, len(one.torque)) for one in found] == [(True, 500), (True, 490)]
+        assert found[1].time == pytest.approx(0.51)
+
+
+def test_late_repeated_and_unreadable_rows_are_left_out():
+    rows = moved(400)
+    order = np.r_[0:100, 99, 98, 100:400]
+    mixed = rows[order]
+    mixed[250, 2] = np.nan
+    mixed[300, 0] = np.inf
+    found, counts = taken(mixed[:101], mixed[101:])
+    assert counts == {DISORDERED: 2, UNREADABLE: 2, LOST: 2}
+    assert sum(len(one.torque) for one in found) == 400
+
+
+def test_a_clock_that_is_set_back_begins_anew():
+    found, counts = taken(np.concatenate([moved(300, start=50.0), moved(200)]))
+    assert counts == {RESTARTS: 1}
+    assert [(one.time, len(one.torque), one.anew) for one in found] == [(50.0, 300, True), (0.0, 200, True)]
+
+
+def test_stamps_may_jitter():
+    rows = moved(2000)
+    rows[:, 0] += np.random.default_rng(0).uniform(-0.2, 0.2, 2000) * PERIOD
+    found, counts = taken(rows)
+    assert counts == {}
+    np.testing.assert_array_equal(found[0].torque, rows[:, 1])
+
+
+@pytest.mark.parametrize("factor", [2.0, 0.5, 1.05, 1e3])
+def test_another_period_than_the_models_is_one_line(factor):
+    rows = moved(300)
+    rows[:, 0] *= factor
+    with pytest.raises(InputError, match=r"given: samples are .* ms apart, \[run\] sample_period of the model is 1 ms"):
+        taken(rows)
+
+
+def test_stamps_rounded_to_more_than_a_period_are_refused():
+    rows = moved(400)
+    rows[:, 0] = np.floor(rows[:, 0] / (4 * PERIOD)) * 4 * PERIOD
+    with pytest.raises(InputError, match="most stamps are that of the row before"):
+        taken(rows)
+
+
+TABLES = {
+    "units": {
+        "t": {"column": "ms", "unit": "ms"},
+        "u": {"column": "amps", "unit": "A", "factor": 0.05, "sign": -1},
+        "theta_e": {"column": "counts", "unit": "counts", "counts_per_turn": 4096, "wrap": 65536},
+        "theta_s": {"column": "deg", "unit": "deg", "offset": 0.25},
+    },
+    "difference, words": {
+        "t": {"column": "ms", "unit": "ms"},
+        "u": {"column": "word", "factor": 0.01, "signed_bits": 16},
+        "theta_e": {"column": "sum", "minus": "deg", "unit": "deg"},
+        "theta_s": {"column": "deg", "unit": "deg"},
+    },
+    "numbers, without stamps": {"t": {"period": PERIOD}, "u": 1, "theta_e": {"column": 5, "unit": "deg"}, "theta_s": 3},
+    "speed": {
+        "t": {"column": "ms", "unit": "ms"},
+        "u": "amps",
+        "omega_e": {"column": "rpm", "unit": "rpm"},
+        "theta_s": {"column": "deg", "unit": "deg"},
+    },
+}
+
+
+def columns(count=2000):
+    time = np.arange(count) * PERIOD
+    motor, load = 40.0 * np.sin(3.0 * time), 8.0 * np.sin(3.0 * time + 0.05)
+    return pd.DataFrame(
+        {
+            "ms": 1e3 * time,
+            "amps": np.cos(3.0 * time),
+            "counts": np.round(motor * 4096 / (2 * np.pi)) % 65536,
+            "deg": np.rad2deg(load),
+            "word": np.round(100.0 * np.cos(3.0 * time)) % 65536,
+            "sum": np.rad2deg(motor + load),
+            "rpm": 120.0 * np.cos(3.0 * time) * 30.0 / np.pi,
+        }
+    )
+
+
+@pytest.mark.parametrize("table", TABLES.values(), ids=list(TABLES))
+def test_rows_are_what_the_reader_makes_of_the_whole_log(table, tmp_path):
+    log, table = tmp_path / "log.csv", LogTable.model_validate(table)
+    columns().to_csv(log, index=False)
+    whole = read_record(log, table)
+    check_live(table, "log")
+    stream = Stream(FollowedFile(log), table, PERIOD)
+    found = [rows for _ in range(100) for rows in stream.poll(0.0)]
+    stream.source.close()
+    assert stream.counts == {}
+    np.testing.assert_allclose(np.concatenate([one.torque for one in found]), whole.torque, atol=1e-12)
+    for side, positions in whole.positions.items():
+        np.testing.assert_allclose(np.concatenate([one.positions[side] for one in found]), positions, atol=1e-9)
+
+
+def test_only_rows_with_a_mode_are_read():
+    rows = np.c_[moved(600), np.ones(600)]
+    rows[200:300, 4] = 0.0
+    table = LogTable.model_validate({"where": {"on": True}})
+    found, counts = taken(rows, table=table, columns=[*NAMES, "on"])
+    assert counts == {GAPS: 1}
+    assert [len(one.torque) for one in found] == [200, 300]
+
+
+REFUSED = {
+    "theta_s.skew": {"theta_s": {"skew": 1e-3}},
+    "resample": {"resample": 1e-3},
+    "start": {"start": 1.0},
+    "where.mode": {"where": {"mode": "auto"}},
+    "absent: theta_s": {"absent": ["theta_s"]},
+}
+
+
+@pytest.mark.parametrize(("key", "table"), REFUSED.items(), ids=list(REFUSED))
+def test_what_needs_the_whole_log_is_refused(key, table):
+    with pytest.raises(InputError, match=rf"log.csv: \[log\] {key}"):
+        check_live(LogTable.model_validate(table), "log.csv")
+
+
+def test_a_file_is_followed_from_its_beginning_line_by_line(tmp_path):
+    """Written in pieces that end anywhere, with remarks, a line of another form, and a header that comes again."""
+    log, rows = tmp_path / "log.csv", moved(50)
+    lines = [",".join(map(repr, row)) for row in rows.tolist()]
+    text = "\n".join(["# a remark", ",".join(NAMES), *lines[:20], "1,2", ",".join(NAMES), *lines[20:]]) + "\n"
+    log.write_text("")
+    source, found = FollowedFile(log), []
+    with log.open("a") as file:
+        for i in range(0, len(text), 37):
+            file.write(text[i : i + 37])
+            file.flush()
+            read = source.poll(0.0)
+            found += [] if read is None else [read[1]]
+    np.testing.assert_array_equal(np.concatenate(found), rows)
+    assert source.counts == {MALFORMED: 1}
+    assert source.fault == "; a line should have 4 cells"
+    # cut off and written anew, as programs do that keep files short
+    log.write_text("\n".join([",".join(NAMES), *lines[:5]]) + "\n")
+    read = source.poll(0.0)
+    assert read is not None
+    np.testing.assert_array_equal(read[1], rows[:5])
+    assert source.poll(0.0) is None
+    source.close()
+
+
+def test_semicolons_and_decimal_commas_are_read(tmp_path):
+    log = tmp_path / "log.csv"
+    log.write_text("t;u;theta_e;theta_s\n0,001;-1,5;2e-3;0\n0,002;-1;x;0\n")
+    source = FollowedFile(log)
+    names, values = source.poll(0.0)
+    source.close()
+    assert names == NAMES
+    np.testing.assert_array_equal(values, [[0.001, -1.5, 2e-3, 0.0], [0.002, -1.0, np.nan, 0.0]])
+
+
+def test_a_missing_column_is_named(tmp_path):
+    log = tmp_path / "log.csv"
+    log.write_text("t,u,theta_e,thetas\n0,1,2,3\n")
+    stream = Stream(FollowedFile(log), LogTable(), PERIOD)
+    with pytest.raises(InputError, match=r"log.csv: no column 'theta_s'; did you mean 'thetas'\?; \[log\] theta_s can name"):
+        stream.poll(0.0)
+    stream.source.close()
+
+
+def test_what_is_no_text_is_not_followed(tmp_path):
+    log = tmp_path / "log.bin"
+    log.write_bytes(b"PAR1\0\0\0\0\n")
+    source = FollowedFile(log)
+    with pytest.raises(InputError, match="only text files are followed"):
+        source.poll(0.0)
+    source.close()
+    (tmp_path / "loge.csv").write_text("")
+    with pytest.raises(InputError, match=r"log\.csv: no such file; did you mean .*loge\.csv\?"):
+        FollowedFile(tmp_path / "log.csv")
+    with pytest.raises(InputError, match="cannot be read: Is a directory; name a text file"):
+        FollowedFile(tmp_path)
+
+
+@pytest.fixture
+def datagrams():
+    """A source, and a function that sends to it."""
+    source = Datagrams("udp://127.0.0.1:0", NAMES)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        yield source, lambda *data: [out.sendto(one, ("127.0.0.1", source.port)) for one in data]
+    source.close()
+
+
+def test_datagrams_are_rows_of_text_or_of_numbers(datagrams):
+    source, send = datagrams
+    send(b"0,1,2,3\n", np.arange(8.0).astype("<f8").tobytes(), b"4,5,6,7\n8,9,10,11")
+    names, values = source.poll(0.1)
+    assert names == NAMES
+    np.testing.assert_array_equal(values, [[0, 1, 2, 3], [0, 1, 2, 3], [4, 5, 6, 7], [4, 5, 6, 7], [8, 9, 10, 11]])
+    assert source.counts == {}
+    assert source.poll(0.01) is None
+
+
+def test_a_header_says_the_order_and_may_come_with_each_datagram(datagrams):
+    source, send = datagrams
+    send(b"theta_s,theta_e,u,t,more\n1,2,3,4,5\n", b"theta_s,theta_e,u,t,more\n6,7,8,9,10\n")
+    names, values = source.poll(0.1)
+    assert names == ["theta_s", "theta_e", "u", "t", "more"]
+    np.testing.assert_array_equal(values, [[1, 2, 3, 4, 5], [6, 7, 8, 9, 10]])
+    assert source.counts == {}
+
+
+def test_no_datagram_ends_a_stream(datagrams):
+    source, send = datagrams
+    bad = [b"", b"hello", b"t,u,x,y\n", b"1,2,3", b"\x00" * 9, b"\xff\xfe", bytes(range(256)) + b"!" * 5]
+    send(*bad)
+    assert source.poll(0.1) is None
+    assert source.counts == {MALFORMED: len(bad) - 1}  # nothing is in the first
+    assert source.fault.startswith("; the last: ")
+    send(b"0,1,2,3", b"4,5", b"6,7,8,nan")
+    np.testing.assert_array_equal(source.poll(0.1)[1], [[0, 1, 2, 3], [6, 7, 8, np.nan]])
+    assert source.counts == {MALFORMED: len(bad)}
+
+
+def test_addresses_are_checked():
+    for address in ("udp://", "udp://host", "tcp://127.0.0.1:9", "udp://127.0.0.1:99999", "udp://127.0.0.1:9/x"):
+        with pytest.raises(InputError, match="should be udp://HOST:PORT"):
+            Datagrams(address, NAMES)
+    first = Datagrams("udp://127.0.0.1:0", NAMES)
+    with pytest.raises(InputError, match="cannot listen there"):
+        Datagrams(f"udp://127.0.0.1:{first.port}", NAMES)
+    first.close()
+
+
+def test_fields_without_a_header_follow_the_table():
+    assert needed(LogTable()) == NAMES
+    table = LogTable.model_validate(TABLES["difference, words"] | {"where": {"on": 1}})
+    assert needed(table) == ["ms", "word", "sum", "deg", "on"]
+    assert needed(LogTable.model_validate(TABLES["numbers, without stamps"])) == [1, 5, 3]
+
+
+def test_polling_waits_no_longer_than_asked(datagrams):
+    source, send = datagrams
+    sender = threading.Timer(0.05, send, (b"0,1,2,3\n",))
+    sender.start()
+    begin = time.monotonic()
+    assert source.poll(0.3) is not None
+    assert time.monotonic() - begin < 30.0
+    sender.join()
