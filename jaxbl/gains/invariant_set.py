@@ -28,13 +28,15 @@ _ROWS = 40_000
 """Most rows of a set."""
 _FINEST = 0.02
 """Height of a row over sqrt(1 + N): the proven bound is then within some per cent of what its limit would be."""
+_FINER = 0.02
+"""What rows of half the height may be worth of alpha - f⁺."""
 _LATTICE = 0.25
 """Bounds of e are rounded up to multiples of this part of dg: sets are then finitely many, and images come to rest."""
 _SLACK = 1e-9
 """Of that lattice, for rounding errors of the arithmetic: at least a hundred times what double precision makes."""
 _STEPS = 100_000
-_TAIL = 2_000
-"""Samples after which a set that still shrinks is taken as it is."""
+_TAIL, _RESTS = 2_000, 1.001
+"""A set that still shrinks is taken as it is where the bound was at most so many times as large so many samples before."""
 _GROUP = 0.05
 """Change of u over sqrt(1 + N) that counts as one within the sliding set."""
 
@@ -85,9 +87,13 @@ class _Rows:
 
     def __init__(self, system: ErrorSystem, height: float, reach: float):
         self.system = system
-        # alpha is a whole number of rows; f⁺ is rounded up to one, and some heights do with less of that than others
+        # alpha is a whole number of rows, and f⁺ rounded up to one: by little of what alpha exceeds it
         least = max(2, math.ceil(system.alpha / height))
-        cost = {i: math.ceil(i / system.alpha) * system.alpha / i + 1e-3 * i / least for i in range(least, 2 * least + 1)}
+        margin = max(system.alpha - 1.0, 1e-9)
+        cost = {
+            i: (math.ceil(i / system.alpha) * system.alpha / i - 1.0) / margin + _FINER * i / least
+            for i in range(least, 16 * least)
+        }
         self.alpha = min(cost, key=cost.__getitem__)
         self.dg = system.alpha / self.alpha
         self.push = math.ceil(1.0 / self.dg)
@@ -168,7 +174,11 @@ class _Rows:
         z = (rows[0] - i + 1 + np.arange(n + 2 * i)) * self.dg
         # so many rows down at once: none, and groups that mirror each other, as rows do
         starts = range(1, i + 1, c)
-        down = [(0, 1), *((d, min(c, i - d + 1)) for d in starts), *((-min(d + c - 1, i), min(c, i - d + 1)) for d in starts)]
+        down = [
+            (0, 1),
+            *((d, min(c, i - d + 1)) for d in starts),
+            *((-min(d + c - 1, i), min(c, i - d + 1)) for d in starts),
+        ]
         for d, wide in down:
             low, up = max((d - 1) * self.dg, -a), min((d + wide) * self.dg, a)
             spread = np.full(n + wide - 1, -np.inf)
@@ -213,11 +223,11 @@ def _settled(rows: _Rows, position: float, velocity: float) -> Proof:
     for k in range(1, _STEPS + 1):
         new, bound = rows.image(upper)
         bounds.append(bound)
-        # a later set within an earlier one: so will be those that follow, and bounds recur or fall
-        period = 1 if (new <= upper).all() else k - at if (new <= earlier).all() else 0
-        inside = inside + 1 if period else 0
-        if period and ((new == (upper if period == 1 else earlier)).all() or inside > _TAIL):
-            bounds.append(rows.image(new)[1])
+        # an image within its set: all later ones are, too, and bounds only fall; a set of before: bounds recur
+        inside = inside + 1 if (new <= upper).all() else 0
+        rests = inside > _TAIL and bounds[-_TAIL] <= _RESTS * bound
+        period = 1 if inside and (rests or (new == upper).all()) else k - at if (new == earlier).all() else 0
+        if period:
             least = np.maximum.accumulate(np.array(bounds)[::-1])[::-1]
             return Proof(least[: k - period + 1], rows.dg, new)
         if k == 2 * at or k == 1:
