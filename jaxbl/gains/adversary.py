@@ -22,6 +22,8 @@ from .invariant_set import ErrorSystem, Proof, left_over
 _CELLS = 100, 60
 """Cells of the exploration from zero to the proven bounds of position and velocity."""
 _MOST_KEPT = 400_000
+_SIDE = 1e-6
+"""Innovation, over 1 + N, from which on its sign is sure."""
 _LANES = 1 << 14
 _LONGEST = 2_000
 """Most samples of the exploration's ways."""
@@ -55,7 +57,7 @@ class Search(NamedTuple):
         explored: states of the exploration, each at the end of a run of its own.
         worst: largest error of the velocity estimate from rest, f⁺ T.
         latest: last sample at which a run from the starting errors was above the settled bound; -1 if none was.
-        violations: runs with an error above the bound of its sample.
+        violations: runs with an error above the bound of its sample; the exploration counts as one.
         sequence: choices that lead from rest to the worst error of the exploration.
     """
 
@@ -96,7 +98,9 @@ def explore(system: ErrorSystem, extent: tuple[float, float], samples: int) -> t
         if not len(x) or kept > _MOST_KEPT:
             break
         n, a = system.noise, system.alpha
-        for noise in (np.full(len(x), -n), np.full(len(x), n), *(np.clip(at - x, -n, n) for at in (a, -a, 0.0))):
+        # the ends of the noise, and those of the sliding set; a switch of which rounding would decide is left out
+        ends = (a, -a, 0.0) if system.implicit else (_SIDE * (1.0 + n), -_SIDE * (1.0 + n))
+        for noise in (np.full(len(x), -n), np.full(len(x), n), *(np.clip(at - x, -n, n) for at in ends)):
             phi, u = _corrected(system, x + noise)
             error = np.abs(v - u if system.implicit else v)
             k = int(error.argmax())
@@ -267,7 +271,7 @@ def search(
     after = np.concatenate([bounds, rest])
     name = "implicit" if system.implicit else "explicit"
     rng, batches = np.random.default_rng(seed), max(1, math.ceil(runs / _LANES))
-    worst, latest, violations, best = reached, -1, 0, way
+    worst, latest, violations, best = reached, -1, int(reached > bounds[-1] * (1.0 + _ROUNDING)), way
     with jax.enable_x64(True):
         observer = DISCRETISATIONS[name](jnp.asarray(system.lambda_), jnp.asarray(system.alpha))
         bound, push = jnp.asarray(system.noise), jnp.asarray(system.push)

@@ -24,8 +24,8 @@ from jaxtyping import Float
 
 from jaxbl.errors import NoResult
 
-_ROWS = 40_000
-"""Most rows of a set."""
+_COARSE = 1_000
+"""Rows that the reach of the start is divided into at first; lower ones follow as the set shrinks."""
 _FINEST = 0.02
 """Height of a row over sqrt(1 + N): the proven bound is then within some per cent of what its limit would be."""
 _FINER = 0.02
@@ -86,7 +86,7 @@ class _Rows:
     """Rows of a height that divides alpha, and the image of a set; a set is the upper bounds of e, -inf where empty."""
 
     def __init__(self, system: ErrorSystem, height: float, reach: float):
-        self.system = system
+        self.system, self.height = system, height
         # alpha is a whole number of rows, and f⁺ rounded up to one: by little of what alpha exceeds it
         least = max(2, math.ceil(system.alpha / height))
         margin = max(system.alpha - 1.0, 1e-9)
@@ -111,6 +111,18 @@ class _Rows:
             raise _Left
         upper[self.half - rows : self.half + rows] = position
         return self._rounded(upper)
+
+    def cover(self, other: "_Rows", upper: np.ndarray) -> np.ndarray:
+        """A set of other rows in these."""
+        below = np.arange(-self.half, self.half) * self.dg / other.dg
+        # a row touches the other ones from that of its lower end to that of its upper end
+        ends = [np.floor(below - _SLACK), np.ceil(below + self.dg / other.dg + _SLACK) - 1.0]
+        found = np.full(2 * self.half, -np.inf)
+        for k in range(math.ceil(self.dg / other.dg) + 2):
+            row = np.minimum(ends[0] + k, ends[1]).astype(int) + other.half
+            inside = (row >= 0) & (row < len(upper))
+            np.maximum(found, np.where(inside, upper[np.clip(row, 0, len(upper) - 1)], -np.inf), out=found)
+        return self._rounded(found)
 
     def _rounded(self, upper: np.ndarray) -> np.ndarray:
         return np.ceil(upper / self.lattice + _SLACK) * self.lattice
@@ -208,17 +220,18 @@ def prove(system: ErrorSystem, position: float, velocity: float, *, finest: floa
     """
     reach = velocity + math.sqrt(2.0 * (system.alpha + 1.0) * position)
     reach += 10.0 * math.sqrt((system.alpha + 1.0) * (1.0 + system.noise + system.push)) + 4.0 * system.alpha
+    height = finest * math.sqrt(1.0 + system.noise)
     for more in (1.0, 4.0):
-        height = max(finest * math.sqrt(1.0 + system.noise), 2.0 * more * reach / _ROWS)
         try:
-            return _settled(_Rows(system, height, more * reach), position, velocity)
+            return _settled(system, height, (position, velocity), more * reach, _COARSE * more**2)
         except _Left:
             continue
     raise NoResult("no set of errors was found that noise and disturbance cannot leave: the sets grow without end")
 
 
-def _settled(rows: _Rows, position: float, velocity: float) -> Proof:
-    upper, bounds, inside = rows.box(position, velocity), [], 0
+def _settled(system: ErrorSystem, height: float, start: tuple[float, float], reach: float, coarsest: float) -> Proof:
+    rows = _Rows(system, max(height, reach / coarsest), reach)
+    upper, bounds, inside = rows.box(*start), [], 0
     earlier, at = upper, 0
     for k in range(1, _STEPS + 1):
         new, bound = rows.image(upper)
@@ -227,10 +240,16 @@ def _settled(rows: _Rows, position: float, velocity: float) -> Proof:
         inside = inside + 1 if (new <= upper).all() else 0
         rests = inside > _TAIL and bounds[-_TAIL] <= _RESTS * bound
         period = 1 if inside and (rests or (new == upper).all()) else k - at if (new == earlier).all() else 0
-        if period:
+        coarse = rows.height > height
+        if period and not coarse:
             least = np.maximum.accumulate(np.array(bounds)[::-1])[::-1]
             return Proof(least[: k - period + 1], rows.dg, new)
-        if k == 2 * at or k == 1:
-            earlier, at = new, k
         upper = new
+        if coarse and (period or bound < 0.25 * coarsest * rows.height):
+            # what is left is small: lower rows, down to those asked for
+            finer = _Rows(system, max(height, 0.25 * rows.height), reach)
+            upper, rows, inside = finer.cover(rows, upper), finer, 0
+            earlier, at = upper, k
+        elif k >= 2 * at:
+            earlier, at = upper, k
     raise NoResult(f"no set of errors came to rest within {_STEPS} samples")
