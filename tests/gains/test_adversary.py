@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from test_invariant_set import stepped
+from error_steps import stepped
 
 from jaxbl.gains.adversary import explore, search
 from jaxbl.gains.invariant_set import ErrorSystem, prove
@@ -36,10 +36,9 @@ def test_the_way_that_is_found_leads_there(system):
 @pytest.mark.parametrize("system", SYSTEMS, ids=str)
 def test_search_finds_at_least_what_all_sequences_of_a_short_horizon_show(system):
     proof = prove(system, system.noise, 0.0)
-    choices = np.array(list(itertools.product((-1.0, 1.0), ((1.0, 0.5), (-1.0, -0.5)), (-1.0, 1.0)[: 1 + (system.push > 0)])),
-                       dtype=object)  # fmt: skip
-    noise, nominal = (choices[:, i].astype(float) for i in (0, 2))
-    mean, moment = np.array(choices[:, 1].tolist()).T
+    choices = np.array(list(itertools.product((-1.0, 1.0), (-1.0, 1.0), (-1.0, 1.0)[: 1 + (system.push > 0)])))
+    noise, mean, nominal = choices.T
+    moment = 0.5 * mean
     e, g, largest = np.zeros(1), np.zeros(1), 0.0
     for _ in range(5):
         many = len(choices)

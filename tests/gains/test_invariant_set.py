@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from error_steps import stepped
 
 from jaxbl.errors import NoResult
 from jaxbl.gains.differentiation_bound import least_worst_error
 from jaxbl.gains.invariant_set import ErrorSystem, _Rows, prove
 from jaxbl.observer.conditions import convergence_time_worst
-from jaxbl.observer.super_twisting import DISCRETISATIONS
 
 SYSTEMS = [
     ErrorSystem(implicit, lambda_, alpha, noise, 0.0 if implicit else push)
@@ -23,17 +23,6 @@ SYSTEMS = [
         (8.0, 60.0, 3.0, 0.0),
     )
 ]
-
-
-def stepped(system, e, g, noise, mean, moment, nominal):
-    """One sample of the observer's own step on a double integrator: e, g of the next sample, and the estimate's error."""
-    observer = DISCRETISATIONS["implicit" if system.implicit else "explicit"](system.lambda_, system.alpha)
-    with jax.enable_x64(True):
-        zero = jnp.zeros_like(jnp.asarray(e))
-        start = observer.start(zero, zero, lambda v: 0.0 * v, 1.0)
-        state, estimate = observer.step(start, jnp.asarray(e) + noise, lambda _: jnp.asarray(nominal), 1.0)
-    e_next = e + g + moment + 0.5 * nominal - np.asarray(state.position)
-    return e_next, g + mean + nominal - np.asarray(state.velocity), np.abs(np.asarray(estimate.velocity) - g)
 
 
 def drawn_pushes(rng, n, parts=64):
