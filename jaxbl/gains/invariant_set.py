@@ -26,7 +26,7 @@ from jaxbl.errors import NoResult
 
 _COARSE = 1_000
 """Rows that the reach of the start is divided into at first; lower ones follow as the set shrinks."""
-_FINEST = 0.02
+_FINEST = 0.01
 """Height of a row over sqrt(1 + N): the proven bound is then within some per cent of what its limit would be."""
 _FINER = 0.02
 """What rows of half the height may be worth of alpha - f⁺."""
@@ -37,7 +37,7 @@ _SLACK = 1e-9
 _STEPS = 100_000
 _TAIL, _RESTS = 2_000, 1.001
 """A set that still shrinks is taken as it is where the bound was at most so many times as large so many samples before."""
-_GROUP = 0.05
+_GROUP = 0.02
 """Change of u over sqrt(1 + N) that counts as one within the sliding set."""
 
 
