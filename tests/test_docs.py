@@ -40,9 +40,10 @@ def test_reference_is_generated_from_this_code():
 
 def test_tutorial_configs_are_valid():
     blocks = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8"), re.S)
-    assert len(blocks) == 3
+    assert len(blocks) == 4
     config = read_config(tomllib.loads("".join(blocks)))
     assert [axis.num for axis in config.axes] == [32, 32]
+    assert config.tune.certificate.motor.accuracy == 0.5
 
 
 def test_gallery_studies_are_valid():

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxbl.config import SideCertificateTable
 from jaxbl.errors import InputError, NoResult
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 SETTLED = 1.05
 """Velocity bound that a reaching time leads to, over the bound of all later times; where no other one is asked for."""
+_POINTS = 200
+"""Of the curve that is kept of a bound over time."""
 _RMS = 5.0
 """Rms values of encoder noise that count as its bound, where none is given."""
 
@@ -69,9 +72,10 @@ def certify(
     Returns:
         Plain data: `gains`; `assumptions`; `accuracy` (rad/s), which holds at all samples from `reaching_time` (s) on, and
         `final_accuracy`, which holds in the end; `reaching_time_continuous` (s), the longest without noise in continuous
-        time; `resolution` (rad/s) of the proof; `search` with the numbers of `runs`, `explored` states and `violations`, the
-        `worst` error found (rad/s), the `ratio` of `final_accuracy` to it, and the largest `reaching_time` found (s);
-        `limits` that were asked for, and whether each is `met`; `certified`, and `why_none` if that is false.
+        time; `resolution` (rad/s) of the proof, and its `curve`, the bound (rad/s) over time (s); `search` with the numbers
+        of `runs`, `explored` states and `violations`, the `worst` error found (rad/s), the `ratio` of `final_accuracy` to it,
+        and the largest `reaching_time` found (s); `limits` that were asked for, and whether each is `met`; `certified`, and
+        `why_none` if that is false.
 
     Raises:
         InputError: a number that makes no sense.
@@ -85,6 +89,7 @@ def certify(
     with jax.enable_x64(True):
         numbers = (lambda_, alpha, f_plus, start[0] * speed * period, velocity_error)
         continuous = float(convergence_time_worst(*(jnp.asarray(float(x)) for x in numbers)))
+    kept = np.unique(np.linspace(0, len(proof.bounds) - 1, _POINTS).astype(int))
     why = None
     if found.violations:
         why = (
@@ -101,6 +106,7 @@ def certify(
         "final_accuracy": final * speed,
         "reaching_time_continuous": continuous,
         "resolution": proof.row * speed,
+        "curve": {"time": (kept * period).tolist(), "bound": (proof.bounds[kept] * speed).tolist()},
         "search": {
             "runs": found.runs,
             "explored": found.explored,

@@ -5,6 +5,7 @@ from typing import Any
 
 from jaxbl.files import json_text, remove, write_atomic
 
+from .figures import COLOURS, Drawn, style, subplots
 from .page import PageTable
 
 ASSUMPTIONS = (
@@ -83,3 +84,28 @@ def certificate_tables(summary: dict[str, Any]) -> list[PageTable]:
     ]  # fmt: skip
     table = PageTable("Certificates: proven for any noise and disturbance within the bounds", columns, rows)
     return [table, PageTable("What the certificates assume", ["assumption"], [[line] for line in ASSUMPTIONS])]
+
+
+@style()
+def draw_certificates(summary: dict[str, Any]) -> list[Drawn]:
+    """The proven bound over time on each side, and the worst that was found."""
+    return [_bounds(side, one) for side, one in summary.get("certificates", {}).items() if one["certified"]]
+
+
+def _bounds(side: str, found: dict[str, Any]) -> Drawn:
+    figure, (ax,) = subplots(6.6, 4.0)
+    curve, tried = found["curve"], found["search"]
+    # beyond its last point the bound stays as it is
+    end = max(1.3 * found["reaching_time"], curve["time"][-1], 20.0 * found["assumptions"]["period"])
+    ax.step(
+        [*curve["time"], end], [*curve["bound"], curve["bound"][-1]], where="post", color=COLOURS[0], label="proven bound"
+    )
+    ax.axhline(tried["worst"], color=COLOURS[1], ls="--", label="worst found, from rest")
+    ax.plot(found["reaching_time"], found["accuracy"], "o", ms=7, color=COLOURS[0], label="proven from here on")
+    ax.set(xlabel="time (s)", ylabel="velocity error (rad/s)", yscale="log", title=side, xlim=(0.0, end))
+    figure.legend(loc="outside lower center", ncols=3)
+    caption = (
+        f"{side}: bound of the error of the estimated velocity, whatever noise and missing acceleration do within what is "
+        f"assumed, and the worst of {tried['runs']} adversarial runs."
+    )
+    return Drawn(f"certificate_{side}", figure, caption)

@@ -20,7 +20,7 @@ from jaxbl.gains.tune_summary import called_gains
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
-from .certificate import certificate_lines, certificate_tables, refuted, write_certificates
+from .certificate import certificate_lines, certificate_tables, draw_certificates, refuted, write_certificates
 from .figures import COLOURS, MAP, MARKERS, MISSING, SIDES, Drawn, literal, mark, style, subplots, with_unit
 from .gain_plane import conditions_line, name_gains, name_ratio
 from .maps import cell_edges, color_norm, condition_curves, hatch_failures
@@ -34,7 +34,8 @@ def draw_tuning(tuning: Tuning) -> list[Drawn]:
     """All figures of a tuning."""
     sides = [side for side in SIDES if side in tuning.candidates]
     maps = [draw(tuning, side) for side in sides for draw in (_map, _limits)]
-    return [*maps, *(_front(tuning, side) for side in sides), _comparison(tuning, sides)]
+    fronts = [_front(tuning, side) for side in sides]
+    return [*maps, *fronts, _comparison(tuning, sides), *draw_certificates(tuning.summary)]
 
 
 def _label(tuning: Tuning) -> str:
