@@ -73,9 +73,9 @@ def certify(
         Plain data: `gains`; `assumptions`; `accuracy` (rad/s), which holds at all samples from `reaching_time` (s) on, and
         `final_accuracy`, which holds in the end; `reaching_time_continuous` (s), the longest without noise in continuous
         time; `resolution` (rad/s) of the proof, and its `curve`, the bound (rad/s) over time (s); `search` with the numbers
-        of `runs`, `explored` states and `violations`, the `worst` error found (rad/s), the `ratio` of `final_accuracy` to it,
-        and the largest `reaching_time` found (s); `limits` that were asked for, and whether each is `met`; `certified`, and
-        `why_none` if that is false.
+        of `runs`, `explored` states and `violations`, the `worst` error found (rad/s), the `ratio` of `final_accuracy` to
+        it, and the largest `reaching_time` found (s); `limits` that were asked for, and whether each is `met`; `certified`,
+        and `why_none` if that is false.
 
     Raises:
         InputError: a number that makes no sense.

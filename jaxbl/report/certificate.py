@@ -93,7 +93,7 @@ def draw_certificates(summary: dict[str, Any]) -> list[Drawn]:
 
 
 def _bounds(side: str, found: dict[str, Any]) -> Drawn:
-    figure, (ax,) = subplots(6.6, 4.0)
+    figure, (ax,) = subplots(6.6, 4.4, beside=True)
     curve, tried = found["curve"], found["search"]
     # beyond its last point the bound stays as it is
     end = max(1.3 * found["reaching_time"], curve["time"][-1], 20.0 * found["assumptions"]["period"])
