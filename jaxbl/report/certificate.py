@@ -9,8 +9,8 @@ from .figures import COLOURS, Drawn, style, subplots
 from .page import PageTable
 
 ASSUMPTIONS = (
-    "The acceleration that the nominal model lacks at the observer's own velocity (unknown torque over inertia, and what "
-    "friction makes of the velocity error) stays within ±f_plus at all times; it may change at any time.",
+    "The acceleration of the shaft less the nominal one that the observer takes for a period (unknown torque over inertia, "
+    "and what friction makes of the velocity error) stays within ±f_plus at all times; it may change at any time.",
     "The error of each reading, with its rounding to counts, stays within ±noise.",
     "The sampling period is fixed, and arithmetic is exact.",
     "At the first sample the errors are at most position_error and velocity_error.",
