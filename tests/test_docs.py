@@ -45,6 +45,7 @@ def test_tutorial_configs_are_valid():
     assert len(blocks) == 3
     config = read_config(tomllib.loads("".join(blocks)))
     assert [axis.num for axis in config.axes] == [32, 32]
+    assert config.tune.certificate.motor.accuracy == 0.5
 
 
 def test_gallery_studies_are_valid():

@@ -1,6 +1,7 @@
 """The TOML study: its tables, their validation, and the experiment that they describe."""
 
 from .gains import TUNE_NAMES as TUNE_NAMES
+from .gains import SideCertificateTable as SideCertificateTable
 from .gains import TuneTable as TuneTable
 from .reading import read_config as read_config
 from .reading import read_log_config as read_log_config

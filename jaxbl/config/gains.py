@@ -53,6 +53,46 @@ class CompareTable(Table):
     load: GainPairTable | None = Field(default=None, description="gains of the load observer; none on a rigid drive")
 
 
+class SideCertificateTable(Table):
+    """What a certificate of one observer assumes, and the limits that gains must provably keep."""
+
+    noise: float | None = Field(
+        default=None, ge=0.0, json_schema_extra={"unit": "rad"},
+        description="bound of the error of a reading; left out: half a count and five times the rms noise of [encoders]",
+    )  # fmt: skip
+    f_plus: float | None = Field(
+        default=None, gt=0.0, json_schema_extra={"unit": "rad/s²"},
+        description="bound of the acceleration that the nominal model lacks; left out: the f⁺ that tune finds",
+    )  # fmt: skip
+    velocity_error: float | None = Field(
+        default=None, ge=0.0, json_schema_extra={"unit": "rad/s"},
+        description="largest velocity error at the start; left out: that of tune's runs",
+    )  # fmt: skip
+    position_error: float | None = Field(
+        default=None, ge=0.0, json_schema_extra={"unit": "rad"},
+        description="largest position error at the start; left out: the study's, at least that of a reading",
+    )  # fmt: skip
+    acceleration: float | None = Field(
+        default=None, ge=0.0, json_schema_extra={"unit": "rad/s²"},
+        description="bound of the nominal acceleration, for the explicit form; left out: largest of the pilot run, and f⁺",
+    )  # fmt: skip
+    accuracy: float | None = Field(
+        default=None, gt=0.0, description="velocity error that must provably not be exceeded",
+        json_schema_extra={"unit": "rad/s"},
+    )  # fmt: skip
+    reaching_time: float | None = Field(
+        default=None, gt=0.0, description="time after which that must hold", json_schema_extra={"unit": "s"}
+    )
+
+
+class CertificateTable(Table):
+    """What gains provably hold, whatever noise and disturbance do within bounds; super-twisting observers only."""
+
+    motor: SideCertificateTable = Field(default_factory=SideCertificateTable)
+    load: SideCertificateTable | None = Field(default=None, description="as motor; none on a rigid drive")
+    runs: int = Field(default=1_000_000, ge=1, le=10**9, description="adversarial runs that look for a counterexample")
+
+
 TUNE_NAMES = ("tuned", "usual rule", "config")
 """What a comparison of gains always holds."""
 
@@ -91,7 +131,7 @@ class TuneTable(Table):
         default=[],
         max_length=50,
         description="kinds of observer to choose from: each is tuned by the same search on the same runs; margins, "
-        "alpha_ratio, lambda_ratio, num and compare do not apply",
+        "alpha_ratio, lambda_ratio, num, compare and certificate do not apply",
     )
     trials: int = Field(
         default=256,
@@ -101,6 +141,9 @@ class TuneTable(Table):
     )
     axes: list[AxisTable] = Field(
         default=[], max_length=10, description="of observers: [[axes]] of a grid over which the best kind is mapped"
+    )
+    certificate: CertificateTable | None = Field(
+        default=None, description="a table, which may be empty: prove bounds for the gains; left out: none"
     )
 
     @model_validator(mode="after")
@@ -132,7 +175,7 @@ class TuneTable(Table):
                 raise wrong(f"observers[{i}]: unknown kind '{kind}'; {nearest(kind, OBSERVERS)}")
             if kind in self.observers[:i]:
                 raise wrong(f"observers[{i}]: '{kind}' is listed already; each kind may be listed once")
-        for key in ("margin_exact", "margin_alpha", "alpha_ratio", "lambda_ratio", "num", "compare"):
+        for key in ("margin_exact", "margin_alpha", "alpha_ratio", "lambda_ratio", "num", "compare", "certificate"):
             if key in changed:
                 raise wrong(f"{key} does not go with observers; leave one of them out")
         for i, axis in enumerate(self.axes):

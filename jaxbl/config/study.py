@@ -155,6 +155,9 @@ def _check_sides(config: Config) -> None:
             raise wrong(f"{name}.load has no meaning on a rigid drive; remove it")
         if not rigid and table.load is None:
             raise wrong(f"{name}.load is missing: a two_inertia drive has a load observer; give its lambda and alpha")
+    certificate = None if config.tune is None else config.tune.certificate
+    if rigid and certificate is not None and certificate.load is not None:
+        raise wrong("tune.certificate.load has no meaning on a rigid drive; remove it")
     for i, mark in enumerate(config.verify.marks):
         if rigid and mark.side == "load":
             raise wrong(f"verify.marks[{i}].side: 'load' has no meaning on a rigid drive; it should be 'motor'")

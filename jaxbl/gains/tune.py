@@ -25,6 +25,7 @@ from jaxbl.sweeps.metrics import undisturbed
 from jaxbl.sweeps.programs import Backend
 from jaxbl.workers import Progress
 
+from .certificate import certificates, choose_certified
 from .observer_choice import ObserverChoice, choose_observer
 from .pilot import Scenarios, pilot, scenarios_of
 from .stages import Stages, stages_in
@@ -112,7 +113,11 @@ def _tuned(config: Config, table: TuneTable, scenarios: Scenarios, stages: Stage
     if found is None:
         stages.keep(pilot=search.pilot)
     search.run()
+    passed_over = {} if table.certificate is None else choose_certified(search)
     summary = Summary(search, search.compare(held_out=False), search.compare(held_out=True)).data()
+    if table.certificate is not None:
+        summary["certificates"] = certificates(search, stages.place("certificate.json"))
+        summary["passed_over"] = passed_over
     return Tuning(config, summary, search.candidates, stages.cost, tuple(stages.scanned))
 
 

@@ -20,6 +20,7 @@ from jaxbl.gains.tune_summary import called_gains
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
+from .certificate import certificate_lines, certificate_tables, draw_certificates, refuted, write_certificates
 from .figures import COLOURS, MAP, MARKERS, MISSING, SIDES, Drawn, literal, mark, style, subplots, with_unit
 from .gain_plane import conditions_line, name_gains, name_ratio
 from .maps import cell_edges, color_norm, condition_curves, hatch_failures
@@ -33,7 +34,8 @@ def draw_tuning(tuning: Tuning) -> list[Drawn]:
     """All figures of a tuning."""
     sides = [side for side in SIDES if side in tuning.candidates]
     maps = [draw(tuning, side) for side in sides for draw in (_map, _limits)]
-    return [*maps, *(_front(tuning, side) for side in sides), _comparison(tuning, sides)]
+    fronts = [_front(tuning, side) for side in sides]
+    return [*maps, *fronts, _comparison(tuning, sides), *draw_certificates(tuning.summary)]
 
 
 def _label(tuning: Tuning) -> str:
@@ -315,11 +317,14 @@ def _bars(ax: Axes, key: str, rows: list[dict[str, Any]]) -> None:
 def write_tune_report(tuning: Tuning, folder: Path) -> list[str]:
     """Write `gains.toml`, `tuning.json`, figures and report into a folder that exists. Returns lines for the terminal."""
     summary = tuning.summary
-    lead = tune_headline(summary)
+    certified = certificate_lines(summary)
+    lead = [*certified, *tune_headline(summary)] if refuted(summary) else [*tune_headline(summary), *certified]
     write_atomic(folder / "gains.toml", gains_toml(summary))
+    write_certificates(summary, folder)
     write_atomic(folder / "tuning.json", json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False))
     tables = [
         _gains_table(summary),
+        *certificate_tables(summary),
         _comparison_table(f"{_where(summary).capitalize()}, worst and median of all runs", summary["holdout"]["rows"]),
         _comparison_table("On the study's own excitation, worst and median of all runs", summary["named"]),
         *_pareto_tables(summary),

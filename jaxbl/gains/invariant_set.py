@@ -1,0 +1,255 @@
+"""Sets that the error of a super-twisting observer cannot leave, computed: what a certificate rests on.
+
+Error of the observer (:mod:`jaxbl.observer.super_twisting`) at a sample, before the measurement: position e and velocity g,
+in units of f⁺ T² and f⁺ T. Noise n and missing acceleration w, |n| <= N and |w(t)| <= 1, are chosen by an adversary. With
+b = e + n and z = g - u
+
+    e⁺ = e + phi(b) + g + q,   g⁺ = z + m
+
+where m is the mean of w over the period and q = ∫ (1 - s) w(s) ds, so that |q - m / 2| <= (1 - m²) / 4: both for w = ±1 with
+one switch. Implicit: u = clip(b, -a, a) and phi = -2 b within the sliding set, phi = ∓(l sqrt(r) + 2 a) outside, with
+r + l sqrt(r) + a = |b|. Explicit: u = a sign b and phi = -l sqrt|b| sign b.
+
+A set is a stack of rows: row k holds all g in [k, k + 1] dg and all e between bounds. At fixed b, e⁺ grows with e, so that a
+row's largest e⁺ follows from its upper bound in closed form; the lower ones are the mirror image. The image of a set is
+bounded by rows again, rounded outward: whatever the adversary does, the error lies in the image one sample later. An image
+inside of its set proves that the set is never left. The derivation is in docs/theory.md.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbl.errors import NoResult
+
+_COARSE = 1_000
+"""Rows that the reach of the start is divided into at first; lower ones follow as the set shrinks."""
+_FINEST = 0.01
+"""Height of a row over sqrt(1 + N): the proven bound is then within some per cent of what its limit would be."""
+_FINER = 0.02
+"""What rows of half the height may be worth of alpha - f⁺."""
+_LATTICE = 0.25
+"""Bounds of e are rounded up to multiples of this part of dg: sets are then finitely many, and images come to rest."""
+_SLACK = 1e-9
+"""Of that lattice, for rounding errors of the arithmetic: at least a hundred times what double precision makes."""
+_STEPS = 100_000
+_TAIL, _RESTS = 2_000, 1.001
+"""A set that still shrinks is taken as it is where the bound was at most so many times as large so many samples before."""
+_GROUP = 0.02
+"""Change of u over sqrt(1 + N) that counts as one within the sliding set."""
+
+
+class ErrorSystem(NamedTuple):
+    """The normalised error system: T = 1, f⁺ = 1.
+
+    Attributes:
+        implicit: backward Euler, else forward Euler.
+        lambda_: lambda / sqrt(f⁺).
+        alpha: alpha / f⁺.
+        noise: N / (f⁺ T²).
+        push: bound of the nominal acceleration over f⁺, which forward Euler leaves out of the position; else 0.
+    """
+
+    implicit: bool
+    lambda_: float
+    alpha: float
+    noise: float
+    push: float = 0.0
+
+
+class Proof(NamedTuple):
+    """What the sets show.
+
+    Attributes:
+        bounds: of the error of the velocity estimate at sample k, f⁺ T; at later samples the last one.
+        row: height dg of the rows, f⁺ T.
+        upper: bounds of e in the rows of the last set, which is never left, f⁺ T²; rows from -dg len(upper) / 2 on.
+    """
+
+    bounds: Float[np.ndarray, " samples"]
+    row: float
+    upper: Float[np.ndarray, " rows"]
+
+
+class _Left(Exception):
+    """A set is larger than the rows there are."""
+
+
+def left_over(system: ErrorSystem, beyond: np.ndarray) -> np.ndarray:
+    """sqrt(r) with r + l sqrt(r) = beyond >= 0: what is left of an innovation outside of the sliding set."""
+    return 2.0 * beyond / np.maximum(system.lambda_ + np.sqrt(system.lambda_**2 + 4.0 * beyond), np.finfo(float).tiny)
+
+
+class _Rows:
+    """Rows of a height that divides alpha, and the image of a set; a set is the upper bounds of e, -inf where empty."""
+
+    def __init__(self, system: ErrorSystem, height: float, reach: float):
+        self.system, self.height = system, height
+        # alpha is a whole number of rows, and f⁺ rounded up to one: by little of what alpha exceeds it
+        least = max(2, math.ceil(system.alpha / height))
+        margin = max(system.alpha - 1.0, 1e-9)
+        cost = {
+            i: (math.ceil(i / system.alpha) * system.alpha / i - 1.0) / margin + _FINER * i / least
+            for i in range(least, 16 * least)
+        }
+        self.alpha = min(cost, key=cost.__getitem__)
+        self.dg = system.alpha / self.alpha
+        self.push = math.ceil(1.0 / self.dg)
+        self.half = math.ceil(reach / self.dg) + self.alpha + self.push
+        self.lattice = _LATTICE * self.dg
+        f = self.push * self.dg
+        mean = np.minimum(f, (np.arange(-self.push, self.push + 1) + 1) * self.dg)
+        self.moments = 0.5 * mean + 0.25 * (f - mean * mean / f) + 0.5 * system.push
+        """Largest q of the m that lead so many rows up."""
+        self.group = max(1, int(_GROUP * math.sqrt(1.0 + system.noise) / self.dg))
+
+    def box(self, position: float, velocity: float) -> np.ndarray:
+        upper, rows = np.full(2 * self.half, -np.inf), max(1, math.ceil(velocity / self.dg))
+        if rows > self.half:
+            raise _Left
+        upper[self.half - rows : self.half + rows] = position
+        return self._rounded(upper)
+
+    def cover(self, other: "_Rows", upper: np.ndarray) -> np.ndarray:
+        """A set of other rows in these."""
+        below = np.arange(-self.half, self.half) * self.dg / other.dg
+        # a row touches the other ones from that of its lower end to that of its upper end
+        ends = [np.floor(below - _SLACK), np.ceil(below + self.dg / other.dg + _SLACK) - 1.0]
+        found = np.full(2 * self.half, -np.inf)
+        for k in range(math.ceil(self.dg / other.dg) + 2):
+            row = np.minimum(ends[0] + k, ends[1]).astype(int) + other.half
+            inside = (row >= 0) & (row < len(upper))
+            np.maximum(found, np.where(inside, upper[np.clip(row, 0, len(upper) - 1)], -np.inf), out=found)
+        return self._rounded(found)
+
+    def _rounded(self, upper: np.ndarray) -> np.ndarray:
+        return np.ceil(upper / self.lattice + _SLACK) * self.lattice
+
+    @np.errstate(invalid="ignore")  # empty rows
+    def image(self, upper: np.ndarray) -> tuple[np.ndarray, float]:
+        """The set one sample later, and the bound of the estimate's error at this sample."""
+        filled = np.flatnonzero(upper > -np.inf)
+        first, last = filled[0], filled[-1] + 1
+        margin = self.alpha + self.push
+        if first < margin or last + margin > len(upper):
+            raise _Left
+        rows = np.arange(first, last) - self.half
+        corrected = self._corrected(upper[first:last], rows)
+        reached = np.flatnonzero(corrected > -np.inf)
+        top = rows[0] - self.alpha + reached[-1] + 1 if self.system.implicit else rows[-1] + 1
+        moved = np.full(len(corrected) + 2 * self.push, -np.inf)
+        for shift, moment in enumerate(self.moments):
+            part = moved[shift : shift + len(corrected)]
+            np.maximum(part, corrected + moment, out=part)
+        new = np.full(len(upper), -np.inf)
+        new[first - margin : last + margin] = self._rounded(moved)
+        return new, float(top * self.dg)
+
+    def _corrected(self, high: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Largest e + phi(b) + g in the rows of z, `alpha` more on both sides; `high` mirrored is minus the lower bounds."""
+        system, low, n, i = self.system, -high[::-1], len(high), self.alpha
+        a, noise, top = system.alpha, system.noise, (rows + 1) * self.dg
+        new = np.full(n + 2 * i, -np.inf)
+        # b of this row: from the least e and noise to the largest
+        least, most = low - noise, high + noise
+
+        def take(above: int, there: np.ndarray, value: np.ndarray) -> None:
+            part = new[above : above + n]
+            np.maximum(part, np.where(there, value, -np.inf), out=part)
+
+        def at(b: np.ndarray, phi: np.ndarray) -> np.ndarray:
+            return np.minimum(high, b + noise) + phi + top
+
+        if system.implicit:
+            # e + phi(b) grows with b while e is b + N, and falls where e is the bound itself
+            b = np.clip(high - noise, np.maximum(least, a), np.maximum(most, a))
+            take(0, most >= a, at(b, -system.lambda_ * left_over(system, np.maximum(b - a, 0.0)) - 2.0 * a))
+            b = np.clip(high - noise, np.minimum(least, -a), np.minimum(most, -a))
+            take(2 * i, least <= -a, at(b, system.lambda_ * left_over(system, np.maximum(-b - a, 0.0)) + 2.0 * a))
+            self._slide(new, high, rows)
+            return new
+        # convex in b > 0 while e is b + N: largest at an end
+        for b in (np.maximum(least, 0.0), np.clip(high - noise, np.maximum(least, 0.0), np.maximum(most, 0.0))):
+            take(0, most >= 0.0, at(b, -system.lambda_ * np.sqrt(b)))
+        # concave in b < 0, largest at -lambda² / 4
+        b = np.clip(np.minimum(high - noise, -0.25 * system.lambda_**2), np.minimum(least, 0.0), np.minimum(most, 0.0))
+        take(2 * i, least <= 0.0, at(b, system.lambda_ * np.sqrt(-b)))
+        take(i, (least <= 0.0) & (most >= 0.0), at(np.zeros(n), np.zeros(n)))
+        return new
+
+    def _slide(self, new: np.ndarray, high: np.ndarray, rows: np.ndarray) -> None:
+        """The sliding set: b = g - z, e + phi(b) + g = e - b + z, and e - b is N or the bound less b, whichever is less."""
+        a, noise, n, i, c = self.system.alpha, self.system.noise, len(high), self.alpha, self.group
+        least, most, base = -high[::-1] - noise, high + noise, high - rows * self.dg
+        z = (rows[0] - i + 1 + np.arange(n + 2 * i)) * self.dg
+        # so many rows down at once: none, and groups that mirror each other, as rows do
+        starts = range(1, i + 1, c)
+        down = [
+            (0, 1),
+            *((d, min(c, i - d + 1)) for d in starts),
+            *((-min(d + c - 1, i), min(c, i - d + 1)) for d in starts),
+        ]
+        for d, wide in down:
+            low, up = max((d - 1) * self.dg, -a), min((d + wide) * self.dg, a)
+            spread = np.full(n + wide - 1, -np.inf)
+            spread[wide - 1 :] = np.where((most >= low) & (least <= up), base, -np.inf)
+            width = 1
+            while width < wide:
+                step = min(width, wide - width)
+                spread[:-step] = np.maximum(spread[:-step], spread[step:])
+                width += step
+            part = slice(i - d - wide + 1, i - d + n)
+            np.maximum(new[part], np.minimum(noise, spread + z[part]) + z[part], out=new[part])
+
+
+def prove(system: ErrorSystem, position: float, velocity: float, *, finest: float = _FINEST) -> Proof:
+    """Bounds of the velocity error at all samples, from all starting errors |e| <= position and |g| <= velocity.
+
+    The set of the start is mapped until it maps into itself. All in units of f⁺ T² and f⁺ T.
+
+    Args:
+        system: the error system.
+        position: largest position error at the start.
+        velocity: largest velocity error at the start.
+        finest: height of the rows over sqrt(1 + N); a bound that is twice as near takes about four times as long.
+
+    Raises:
+        NoResult: no set was found that is never left.
+    """
+    reach = velocity + math.sqrt(2.0 * (system.alpha + 1.0) * position)
+    reach += 10.0 * math.sqrt((system.alpha + 1.0) * (1.0 + system.noise + system.push)) + 4.0 * system.alpha
+    height = finest * math.sqrt(1.0 + system.noise)
+    for more in (1.0, 4.0):
+        try:
+            return _settled(system, height, (position, velocity), more * reach, _COARSE * more**2)
+        except _Left:
+            continue
+    raise NoResult("no set of errors was found that noise and disturbance cannot leave: the sets grow without end")
+
+
+def _settled(system: ErrorSystem, height: float, start: tuple[float, float], reach: float, coarsest: float) -> Proof:
+    rows = _Rows(system, max(height, reach / coarsest), reach)
+    upper, bounds, inside = rows.box(*start), [], 0
+    earlier, at = upper, 0
+    for k in range(1, _STEPS + 1):
+        new, bound = rows.image(upper)
+        bounds.append(bound)
+        # an image within its set: all later ones are, too, and bounds only fall; a set of before: bounds recur
+        inside = inside + 1 if (new <= upper).all() else 0
+        rests = inside > _TAIL and bounds[-_TAIL] <= _RESTS * bound
+        period = 1 if inside and (rests or (new == upper).all()) else k - at if (new == earlier).all() else 0
+        coarse = rows.height > height
+        if period and not coarse:
+            least = np.maximum.accumulate(np.array(bounds)[::-1])[::-1]
+            return Proof(least[: k - period + 1], rows.dg, new)
+        upper = new
+        if coarse and (period or bound < 0.25 * coarsest * rows.height):
+            # what is left is small: lower rows, down to those asked for
+            finer = _Rows(system, max(height, 0.25 * rows.height), reach)
+            upper, rows, inside = finer.cover(rows, upper), finer, 0
+            earlier, at = upper, k
+        elif k >= 2 * at:
+            earlier, at = upper, k
+    raise NoResult(f"no set of errors came to rest within {_STEPS} samples")

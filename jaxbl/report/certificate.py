@@ -1,0 +1,111 @@
+"""What a certificate of `jaxbl tune` says: sentences, a table, and `certificate.json` beside the gains."""
+
+from pathlib import Path
+from typing import Any
+
+from jaxbl.files import json_text, remove, write_atomic
+
+from .figures import COLOURS, Drawn, style, subplots
+from .page import PageTable
+
+ASSUMPTIONS = (
+    "The acceleration of the shaft less the nominal one that the observer takes for a period (unknown torque over inertia, "
+    "and what friction makes of the velocity error) stays within ±f_plus at all times; it may change at any time.",
+    "The error of each reading, with its rounding to counts, stays within ±noise.",
+    "The sampling period is fixed, and arithmetic is exact.",
+    "At the first sample the errors are at most position_error and velocity_error.",
+    "With the explicit discretisation the nominal acceleration stays within ±acceleration.",
+    "It is about the velocity that the super-twisting observer estimates, not about the torque behind the low-pass.",
+)
+"""Of every certificate, in words; the numbers are beside them."""
+
+
+def write_certificates(summary: dict[str, Any], folder: Path) -> None:
+    """Write `certificate.json` of the sides of which something is proven; where there is none, remove an earlier one."""
+    proven = {side: found for side, found in summary.get("certificates", {}).items() if found["certified"]}
+    if not proven:
+        remove(folder / "certificate.json")
+        return
+    data = {"title": summary["title"], "observer": "super_twisting", "assumptions": list(ASSUMPTIONS), "sides": proven}
+    write_atomic(folder / "certificate.json", json_text(data))
+
+
+def certificate_lines(summary: dict[str, Any]) -> list[str]:
+    """The certificates in sentences."""
+    found = summary.get("certificates", {})
+    return [line for side in found for line in _lines(side, found[side], summary["passed_over"][side])]
+
+
+def refuted(summary: dict[str, Any]) -> bool:
+    """Whether the search found an error above what was proven: that is said before all else."""
+    return any(found.get("search", {}).get("violations") for found in summary.get("certificates", {}).values())
+
+
+def _lines(side: str, found: dict[str, Any], passed_over: int) -> list[str]:
+    if not found["certified"]:
+        return [f"{side}: no certificate: {found['why_none']}."]
+    given, tried = found["assumptions"], found["search"]
+    against = "" if tried["ratio"] is None else f", the bound is {tried['ratio']:.3g} times that"
+    nominal = f", nominal acceleration of {given['acceleration']:.3g} rad/s²" if "acceleration" in given else ""
+    lines = [
+        f"{side}, proven: velocity error at most {found['accuracy']:.3g} rad/s from {found['reaching_time']:.3g} s on, and "
+        f"{found['final_accuracy']:.3g} rad/s in the end, for any noise within ±{given['noise']:.3g} rad and any missing "
+        f"acceleration within ±{given['f_plus']:.4g} rad/s²{nominal}, sampled every {given['period']:.3g} s, from errors of "
+        f"{given['velocity_error']:.3g} rad/s and {given['position_error']:.3g} rad.",
+        f"{side}, tried: the worst of {tried['runs']} adversarial runs errs by {tried['worst']:.3g} rad/s{against}; none "
+        "violates what is proven.",
+    ]
+    missed = [
+        f"{name.replace('_', ' ')} {limit['asked']:.3g} {'s' if name == 'reaching_time' else 'rad/s'}"
+        for name, limit in found["limits"].items()
+        if not limit["met"]
+    ]
+    if missed:
+        lines.insert(0, f"{side}, certificate: what was asked for is not proven: {', '.join(missed)}.")
+    elif found["limits"]:
+        gains = f"; {passed_over} gains with less error in the runs do not" if passed_over else ""
+        lines.append(f"{side}, certificate: the gains keep what was asked for{gains}.")
+    return lines
+
+
+def certificate_tables(summary: dict[str, Any]) -> list[PageTable]:
+    """The certificates' numbers and assumptions, if there are any."""
+    found = {side: one for side, one in summary.get("certificates", {}).items() if one["certified"]}
+    if not found:
+        return []
+    columns = ["side", "accuracy (rad/s)", "from (s)", "in the end (rad/s)", "worst found (rad/s)", "bound / found",
+               "found from (s)", "without noise, continuous (s)", "noise (rad)", "f⁺ (rad/s²)", "period (s)",
+               "velocity error at start (rad/s)", "position error at start (rad)"]  # fmt: skip
+    rows = [
+        [side, one["accuracy"], one["reaching_time"], one["final_accuracy"], one["search"]["worst"], one["search"]["ratio"],
+         one["search"]["reaching_time"], one["reaching_time_continuous"],
+         *(one["assumptions"][name] for name in ("noise", "f_plus", "period", "velocity_error", "position_error"))]
+        for side, one in found.items()
+    ]  # fmt: skip
+    table = PageTable("Certificates: proven for any noise and disturbance within the bounds", columns, rows)
+    return [table, PageTable("What the certificates assume", ["assumption"], [[line] for line in ASSUMPTIONS])]
+
+
+@style()
+def draw_certificates(summary: dict[str, Any]) -> list[Drawn]:
+    """The proven bound over time on each side, and the worst that was found."""
+    return [_bounds(side, one) for side, one in summary.get("certificates", {}).items() if one["certified"]]
+
+
+def _bounds(side: str, found: dict[str, Any]) -> Drawn:
+    figure, (ax,) = subplots(6.6, 4.4, beside=True)
+    curve, tried = found["curve"], found["search"]
+    # beyond its last point the bound stays as it is
+    end = max(1.3 * found["reaching_time"], curve["time"][-1], 20.0 * found["assumptions"]["period"])
+    ax.step(
+        [*curve["time"], end], [*curve["bound"], curve["bound"][-1]], where="post", color=COLOURS[0], label="proven bound"
+    )
+    ax.axhline(tried["worst"], color=COLOURS[1], ls="--", label="worst found, from rest")
+    ax.plot(found["reaching_time"], found["accuracy"], "o", ms=7, color=COLOURS[0], label="proven from here on")
+    ax.set(xlabel="time (s)", ylabel="velocity error (rad/s)", yscale="log", title=side, xlim=(0.0, end))
+    figure.legend(loc="outside lower center", ncols=3)
+    caption = (
+        f"{side}: bound of the error of the estimated velocity, whatever noise and missing acceleration do within what is "
+        f"assumed, and the worst of {tried['runs']} adversarial runs."
+    )
+    return Drawn(f"certificate_{side}", figure, caption)

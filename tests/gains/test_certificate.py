@@ -1,0 +1,221 @@
+"""Certificates in a drive's units: what is proven and asked for, what is refused, and those of tuned gains."""
+
+import dataclasses
+import json
+import math
+
+import jax
+import numpy as np
+import pytest
+from small_study import rigid
+
+import jaxbl
+from jaxbl.config import read_config
+from jaxbl.errors import InputError, NoResult
+from jaxbl.gains import certificate
+from jaxbl.gains.certificate import certify
+from jaxbl.gains.differentiation_bound import least_worst_error
+from jaxbl.gains.tune import tune
+from jaxbl.report.tune import write_tune_report
+
+GAINS = 2.2, 9.2
+BOUNDS = {"noise": 5e-5, "f_plus": 5.0, "period": 1e-3, "velocity_error": 0.1, "runs": 1}
+
+
+@pytest.fixture(scope="module")
+def proven():
+    return certify(*GAINS, **BOUNDS)
+
+
+def test_bounds_lie_between_what_is_found_and_little_more(proven):
+    worst = proven["search"]["worst"]
+    assert proven["certified"] and proven["why_none"] is None
+    assert worst < proven["final_accuracy"] < proven["accuracy"] <= 1.0501 * proven["final_accuracy"]
+    assert proven["search"]["ratio"] == pytest.approx(proven["final_accuracy"] / worst)
+    assert proven["search"]["ratio"] < 1.1
+    assert proven["search"]["reaching_time"] <= proven["reaching_time"]
+    assert proven["final_accuracy"] > least_worst_error(5e-5, 5.0, 1e-3)
+    assert proven["assumptions"] == {"discretisation": "implicit", "position_error": 5e-5} | {
+        name: BOUNDS[name] for name in ("noise", "f_plus", "period", "velocity_error")
+    }
+
+
+@pytest.mark.parametrize("discretisation", ["implicit", "explicit"])
+def test_other_units_of_time_and_angle_change_nothing(discretisation):
+    second, rad = 4.0, 0.25
+    given = {"discretisation": discretisation, "acceleration": 2.0}
+    one = certify(*GAINS, **BOUNDS | given)
+    lambda_, alpha = GAINS[0] * math.sqrt(rad) / second, GAINS[1] * rad / second**2
+    bounds = {
+        "noise": 5e-5 * rad, "f_plus": 5.0 * rad / second**2, "period": 1e-3 * second, "velocity_error": 0.1 * rad / second,
+        "acceleration": 2.0 * rad / second**2, "runs": 1,
+    }  # fmt: skip
+    other = certify(lambda_, alpha, **bounds, discretisation=discretisation)
+    assert other["reaching_time"] == pytest.approx(one["reaching_time"] * second)
+    for name in ("accuracy", "final_accuracy", "resolution"):
+        assert other[name] == pytest.approx(one[name] * rad / second)
+    assert ("acceleration" in one["assumptions"]) == (discretisation == "explicit")
+
+
+def test_worse_assumptions_prove_less(proven):
+    for name, value in (("noise", 1e-4), ("f_plus", 6.0)):
+        assert certify(*GAINS, **BOUNDS | {name: value})["final_accuracy"] > 1.05 * proven["final_accuracy"]
+    slower = certify(*GAINS, **BOUNDS | {"velocity_error": 0.3})
+    assert slower["reaching_time"] > 1.5 * proven["reaching_time"]
+    assert slower["final_accuracy"] == pytest.approx(proven["final_accuracy"], rel=0.02)
+
+
+def test_limits_are_met_or_not(proven):
+    final, time = proven["final_accuracy"], proven["reaching_time"]
+    wide = certify(*GAINS, **BOUNDS, accuracy=1.5 * final, reaching_time=time)
+    assert wide["accuracy"] == 1.5 * final
+    # a wider bound holds earlier
+    assert wide["reaching_time"] < time
+    assert wide["limits"] == {"accuracy": {"asked": 1.5 * final, "met": True}, "reaching_time": {"asked": time, "met": True}}
+    narrow = certify(*GAINS, **BOUNDS, accuracy=0.9 * final, reaching_time=0.5 * time)
+    assert narrow["accuracy"] == pytest.approx(proven["accuracy"])
+    assert not any(limit["met"] for limit in narrow["limits"].values())
+
+
+@pytest.mark.parametrize(
+    ("gains", "message"), [((2.2, 4.9), "does not exceed f⁺ = 5 rad/s²"), ((0.9, 9.2), "the exact condition fails")]
+)
+def test_gains_of_which_nothing_can_be_proven(gains, message):
+    with pytest.raises(NoResult, match=message):
+        certify(*gains, **BOUNDS)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"noise": -1e-5}, "noise: a certificate needs a finite number >= 0, not -1e-05"),
+        ({"velocity_error": math.nan}, "velocity_error: .* not nan"),
+        ({"position_error": math.inf}, "position_error: .* not inf"),
+        ({"f_plus": 0.0}, "f_plus: a certificate needs a finite number > 0, not 0.0"),
+        ({"period": 0.0}, "period: .* > 0"),
+        ({"discretisation": "exact"}, "discretisation: 'exact' is none; it should be one of implicit, explicit"),
+    ],
+)
+def test_bad_numbers_are_told(changes, message):
+    with pytest.raises(InputError, match=message):
+        certify(*GAINS, **BOUNDS | changes)
+
+
+def test_a_bound_that_runs_exceed_is_refused(monkeypatch):
+    prove = certificate.prove
+
+    def wrong(*given):
+        proof = prove(*given)
+        return proof._replace(bounds=0.9 * proof.bounds)
+
+    monkeypatch.setattr(certificate, "prove", wrong)
+    found = certify(*GAINS, **BOUNDS)
+    assert not found["certified"]
+    assert found["search"]["violations"] > 0
+    assert found["why_none"].startswith("refused: ")
+
+
+def test_single_precision_of_the_caller_does_not_matter(proven):
+    with jax.enable_x64(False):
+        assert certify(*GAINS, **BOUNDS) == proven
+
+
+TABLE = {"num": 4, "refine": 0, "alpha_ratio": {"start": 1.2, "stop": 10.0}, "lambda_ratio": {"start": 0.8, "stop": 6.0}}
+
+
+def study(**asked):
+    changes = {"observer.motor.velocity_error": 0.1, "run.velocity_tolerance": 0.05, "run.position_tolerance": 0.01,
+               "encoders.noise": 1e-5, "encoders.motor_resolution": 2e-5, "run.duration": 0.4}  # fmt: skip
+    torque = [{"kind": "motor.constant_torque", "torque": 0.05}]
+    return rigid(changes, effects=torque, tune=TABLE | {"certificate": {"runs": 1, "motor": asked}})
+
+
+@pytest.fixture(scope="module")
+def free():
+    return tune(study())
+
+
+@pytest.mark.slow
+def test_tuned_gains_are_certified_with_the_studys_own_bounds(tmp_path, free):
+    tuned = free
+    found, gains = tuned.summary["certificates"]["motor"], tuned.summary["gains"]["motor"]
+    assert found["gains"] == {name: gains[name] for name in ("lambda", "alpha")}
+    given = found["assumptions"]
+    assert given["noise"] == pytest.approx(1e-5 + 5.0 * 1e-5)
+    assert given["f_plus"] == max(tuned.summary["f_plus"]["motor"], tuned.summary["achieved"]["motor"]["f_plus"])
+    assert (given["velocity_error"], given["position_error"], given["period"]) == (0.1, given["noise"], 1e-3)
+    assert found == certify(gains["lambda"], gains["alpha"], **given, runs=1)
+    lines = write_tune_report(tuned, tmp_path)
+    assert any(line.startswith("motor, proven: velocity error at most ") for line in lines)
+    assert any("none violates what is proven" in line for line in lines)
+    written = json.loads((tmp_path / "certificate.json").read_text())
+    assert written["sides"] == {"motor": found}
+    # the runs that were certified stay below
+    data = study() | {"observer": {"motor": found["gains"] | {"velocity_error": 0.1}}}
+    data["run"]["duration"] = found["reaching_time"] + 0.5
+    run = jaxbl.run(data).trace
+    late = run["t"] >= found["reaching_time"]
+    error = np.abs(run["motor.velocity_estimate"] - run["motor.velocity"])
+    assert 0.0 < error[late].max() <= found["accuracy"]
+
+
+@pytest.mark.slow
+def test_a_finished_certificate_is_read_again(tmp_path, monkeypatch):
+    first = tune(study(), tmp_path)
+    monkeypatch.setattr(certificate, "certify", None)
+    assert tune(study(), tmp_path).summary["certificates"] == first.summary["certificates"]
+    kept = tmp_path / "tune" / "certificate.json"
+    kept.write_text(kept.read_text()[:-20])
+    monkeypatch.undo()
+    assert tune(study(), tmp_path).summary["certificates"] == first.summary["certificates"]
+
+
+@pytest.mark.slow
+def test_gains_are_chosen_that_keep_the_limits(tmp_path, free):
+    limit = 0.9 * free.summary["certificates"]["motor"]["final_accuracy"]
+    kept = tune(study(accuracy=limit))
+    found = kept.summary["certificates"]["motor"]
+    assert found["final_accuracy"] <= limit == found["accuracy"]
+    assert kept.summary["passed_over"]["motor"] > 0
+    # the best of those that do
+    better = kept.candidates["motor"].query("converged and margin_exact >= 1.1 and margin_alpha >= 1.1")
+    better = better[better["error"] < kept.summary["achieved"]["motor"]["velocity_rmse"]]
+    assert len(better) == kept.summary["passed_over"]["motor"]
+    bounds = {name: found["assumptions"][name] for name in ("noise", "velocity_error", "position_error", "period")}
+    for row in better.to_dict("records"):
+        f_plus = max(kept.summary["f_plus"]["motor"], row["f_plus"])
+        assert certify(row["lambda"], row["alpha"], **bounds, f_plus=f_plus, runs=1)["final_accuracy"] > limit
+    lines = write_tune_report(kept, tmp_path)
+    assert any(f"the gains keep what was asked for; {len(better)} gains with less error" in line for line in lines)
+
+
+@pytest.mark.slow
+def test_limits_that_no_gains_keep_are_said_to_be_missed(tmp_path, free):
+    tuned = tune(study(accuracy=1e-6))
+    assert tuned.summary["gains"] == free.summary["gains"]
+    assert tuned.summary["passed_over"] == {"motor": 0}
+    lines = write_tune_report(tuned, tmp_path)
+    assert "motor, certificate: what was asked for is not proven: accuracy 1e-06 rad/s." in lines
+
+
+def test_without_a_proof_there_is_no_file(tmp_path):
+    tuned = tune(study(f_plus=1e4))
+    (tmp_path / "certificate.json").write_text("{}")
+    lines = write_tune_report(tuned, tmp_path)
+    assert any(line.startswith("motor: no certificate: alpha = ") for line in lines)
+    assert not (tmp_path / "certificate.json").exists()
+
+
+def test_what_is_refuted_is_said_first(tmp_path, free):
+    found = free.summary["certificates"]["motor"]
+    found = found | {"certified": False, "why_none": "refused: 3 of 9", "search": found["search"] | {"violations": 3}}
+    tuned = dataclasses.replace(free, summary=free.summary | {"certificates": {"motor": found}})
+    assert write_tune_report(tuned, tmp_path)[0] == "motor: no certificate: refused: 3 of 9."
+    assert not (tmp_path / "certificate.json").exists()
+
+
+def test_a_rigid_drive_has_no_certificate_of_a_load():
+    data = study()
+    data["tune"]["certificate"]["load"] = {}
+    with pytest.raises(InputError, match=r"tune\.certificate\.load has no meaning on a rigid drive; remove it"):
+        read_config(data)
