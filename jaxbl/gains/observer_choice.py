@@ -141,11 +141,9 @@ class _Search:
         self.groups = _groups(config, table, stages)
         self.found: dict[str, list[list[dict[str, Side]]]] = {}
         """By kind: for each group and point, the sides' searches."""
-        places = sum(len(group.places) for group in self.groups)
         rows = sum(len(place.scenarios.names) for group in self.groups for place in group.places)
         runs = len(table.observers) * rows * len(self._shares())
         stages.total = runs * (table.trials * (1 + table.refine) * self.seeds + self.held_out_seeds)
-        self.points = places
 
     def _shares(self) -> list[tuple[str, ...]]:
         """Sides that are searched in the same runs: they share no gain but the low-pass on the equivalent control."""

@@ -411,6 +411,8 @@ def value_line(values: Values, task: WatchTask) -> str:
         if name in values:
             half = values[f"{name}_to"] - values[name]
             parts.append(f"{label} {values[name]:.4g}±{half:.1g} {units[name]}")
-    friction = [f"{values[f'{one}.coulomb']:.2g}" for one in task.experiment.sides if f"{one}.coulomb" in values]
-    parts.append(f"friction {'/'.join(friction)} {task.units['motor']['coulomb']}")
+    sides = [one for one in task.experiment.sides if f"{one}.coulomb" in values]
+    # a side that moves along a line has its friction in N
+    friction = [f"{one} {values[f'{one}.coulomb']:.2g} {task.units[one]['coulomb']}" for one in sides]
+    parts.append(f"friction {', '.join(friction)}")
     return line + "  ".join(parts) + ("  ALARM" if values["alarm"] else "")
