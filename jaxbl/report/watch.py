@@ -99,9 +99,11 @@ def watch_lines(summary: Mapping[str, Any]) -> list[str]:
     if summary["determined"] < count:
         lines.append(f"Not determined at {count - summary['determined']} of {count} values.")
     if summary["contradictions"]:
-        lines.append(
+        # before figures that it puts in doubt
+        lines.insert(
+            0,
             f"Motor and load give different gaps or stiffnesses at {summary['contradictions']} of {count} values: an "
-            "inertia or a gain of the model is wrong, or something acts on one side that it lacks. The smaller gap counts."
+            "inertia or a gain of the model is wrong, or something acts on one side that it lacks. The smaller gap counts.",
         )
     return [*lines, *_left_out(summary)]
 
