@@ -413,6 +413,6 @@ def value_line(values: Values, task: WatchTask) -> str:
             parts.append(f"{label} {values[name]:.4g}±{half:.1g} {units[name]}")
     sides = [one for one in task.experiment.sides if f"{one}.coulomb" in values]
     # a side that moves along a line has its friction in N
-    friction = [f"{one} {values[f'{one}.coulomb']:.2g} {task.units[one]['coulomb']}" for one in sides]
-    parts.append(f"friction {', '.join(friction)}")
+    friction = "/".join(f"{values[f'{one}.coulomb']:.2g}" for one in sides)
+    parts.append(f"friction {friction} {'/'.join(dict.fromkeys(task.units[one]['coulomb'] for one in sides))}")
     return line + "  ".join(parts) + ("  ALARM" if values["alarm"] else "")
