@@ -3,6 +3,7 @@
 Reference: Modelica Association, Functional Mock-up Interface Specification, versions 2.0.5 and 3.0.2.
 """
 
+import hashlib
 import io
 import platform
 import re
@@ -82,18 +83,15 @@ def fmu(config: Config, plant: PlantProgram, about: Sequence[str], fmi: int) -> 
     """
     block = plant.program.block
     name = block.name
-    precision = "double" if c_type(block.dtype) == "double" else "float"
-    token = f"{identity(config, 'simulate')}-{precision}-fmi{fmi}"
     variables = _variables(plant)
     code, here = c_code(plant.program, about), Path(__file__).parent / "fmi"
-    sources = {
-        f"{name}.c": code.source,
-        f"{name}.h": code.header,
-        "fmi-model.h": _model(plant, variables, token, config.run.sample_period),
-    }
     # a name has no hyphen: these files have their own
-    for file in ("fmi-instance.h", f"fmi-{fmi}.c"):
-        sources[file] = (here / file).read_text(encoding="utf-8")
+    own = {file: (here / file).read_text(encoding="utf-8") for file in ("fmi-instance.h", f"fmi-{fmi}.c")}
+    sources = {f"{name}.c": code.source, f"{name}.h": code.header} | own
+    # the same study need not have the same code: that of another version, or with an effect that was changed
+    content = hashlib.sha256(repr((sources, variables)).encode()).hexdigest()[:16]
+    token = f"{identity(config, 'simulate')}-{content}"
+    sources["fmi-model.h"] = _model(plant, variables, token, config.run.sample_period)
     compiled = [one for one in sources if one.endswith(".c")]
     files: dict[str, str | bytes] = {"modelDescription.xml": _description(config, plant, variables, token, fmi, compiled)}
     if fmi == 3:
@@ -126,7 +124,8 @@ def _place(fmi: int) -> tuple[str, str, str]:
     """Folder of the binary for this machine, its ending, and why there is none."""
     of_2, of_3, ending = _PLATFORMS.get((platform.system(), platform.machine()), (None, None, ""))
     place = of_2 if fmi == 2 else of_3
-    return (place, ending, "") if place else ("", "", f"FMI {FMI[fmi]} has no name for binaries of this machine")
+    why = f"for {platform.system()} on {platform.machine()} none is compiled in FMI {FMI[fmi]}"
+    return (place, ending, "") if place else ("", "", why)
 
 
 def _binary(name: str, ending: str, sources: Mapping[str, str]) -> tuple[bytes, str]:
@@ -234,8 +233,8 @@ def _description(
         "variableNamingConvention": "structured",
     }
     root = ET.Element("fmiModelDescription", about)
-    # FMI 2 cannot say that steps are multiples of a period: there it says that they are all alike
-    kind = {"modelIdentifier": name, "canHandleVariableCommunicationStepSize": "true" if fmi == 3 else "false"}
+    # FMI cannot say that steps have to be multiples of a period: of what it can, that they are all alike is nearest
+    kind = {"modelIdentifier": name, "canHandleVariableCommunicationStepSize": "false"}
     if fmi == 3:
         kind |= {"canGetAndSetFMUState": "true", "canSerializeFMUState": "true", "fixedInternalStepSize": period}
     else:

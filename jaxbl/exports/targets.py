@@ -220,9 +220,11 @@ _RESERVED = (
     "auto break case char const continue default do double else enum extern float for goto if inline int long register "
     "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while bool true false "
     "main and or not xor mod then elsif end_if to by repeat until exit function program var type array of at real lreal "
-    "dint udint lint ulint"
+    "dint udint lint ulint "
+    "assert complex ctype errno fenv inttypes limits locale math setjmp signal stdarg stdbool stddef stdint stdio stdlib "
+    "string tgmath time wchar wctype"
 )
-"""Keywords of the languages."""
+"""Keywords of the languages, and headers of C: a build may look for those where the code's own header is."""
 
 
 def checked_name(name: str) -> str:
@@ -230,7 +232,7 @@ def checked_name(name: str) -> str:
     if not re.fullmatch(r"[a-z](_?[a-z0-9])*", name) or len(name) > _LONGEST_NAME or name in _RESERVED.split():
         raise InputError(
             f"--name {name}: should be small letters, digits and single underscores, begin with a letter, have at most "
-            f"{_LONGEST_NAME} letters, and be no keyword"
+            f"{_LONGEST_NAME} letters, and be no keyword and no header of C"
         )
     return name
 

@@ -144,6 +144,7 @@ def test_code_without_allocation_and_with_no_more_of_libm_than_it_says(tmp_path)
         ({"target": "rust"}, r"--target rust: should be one of c, st, mjcf"),
         ({"precision": "half"}, r"--precision half: should be one of double, float"),
         ({"name": "For"}, r"--name For: should be small letters"),
+        ({"name": "math"}, r"--name math: should be .* no header of C"),
     ],
 )
 def test_wrong_requests_get_one_line_and_leave_nothing(tmp_path, given, message):

@@ -1,5 +1,6 @@
 """Functional Mock-up Units: valid for another implementation of FMI, and the motion that `jaxbl.run` finds."""
 
+import ctypes
 import shutil
 import zipfile
 from pathlib import Path
@@ -104,12 +105,12 @@ class Instance:
     def _logged(self, environment, status, category, message):
         self.said.append(message.decode())
 
-    def begin(self, start=0.0):
+    def begin(self, start=0.0, stop=None):
         if self.two:
-            self.unit.setupExperiment(startTime=start)
+            self.unit.setupExperiment(startTime=start, stopTime=stop)
             self.unit.enterInitializationMode()
         else:
-            self.unit.enterInitializationMode(startTime=start)
+            self.unit.enterInitializationMode(startTime=start, stopTime=stop)
         self.unit.exitInitializationMode()
         return self
 
@@ -273,10 +274,9 @@ def test_states_are_kept_and_instances_are_apart(tmp_path, fmi):
         there = two.state_of(found)
         two.restore(there)
         assert (two.run(torques[300:], 300) == first).all()
-        with pytest.raises(FMICallException):
-            two.state_of(found[:-1])
-        with pytest.raises(FMICallException):
-            two.state_of(b"x" + found[1:])
+        for other in (found[:-1], found + b"x", b"x" + found[1:]):
+            with pytest.raises(FMICallException):
+                two.state_of(other)
         assert two.said[-1] == f"these {len(found)} bytes are no state of this model"
         one.release(kept), two.release(there)
 
@@ -311,6 +311,89 @@ def test_steps_are_multiples_of_the_sample_period(tmp_path, fmi):
             assert message in one.said[-1]
         assert one.outputs() == before
         one.step(10.01, 1e-3)
+
+
+@COMPILED
+@VERSIONS
+def test_no_step_leads_past_the_stop_time(tmp_path, fmi):
+    """FMI 2.0 and 3.0: "if the environment tries to compute past stopTime", an error."""
+    path, _ = written(study(transmission=GAP), tmp_path, fmi)
+    with Instance(path) as one:
+        # as a sum of decimal numbers gives it
+        one.begin(0.1, stop=0.1 + 0.2 - 0.29 + 0.1)
+        one.step(0.1, 9e-3)
+        with pytest.raises(FMICallException, match="status 3"):
+            one.step(0.109, 2e-3)
+        assert one.said == ["a step to 0.111 s, past the stop time 0.11 s"]
+        one.step(0.109, 1e-3)
+        assert one.time() == pytest.approx(0.11)
+        with pytest.raises(FMICallException, match="status 3"):
+            one.step(0.11, 1e-3)
+        # the next run has a stop time of its own, or none
+        one.unit.reset()
+        one.begin().run([1.0] * 200)
+
+
+@COMPILED
+@VERSIONS
+def test_tools_are_told_that_steps_do_not_vary(tmp_path, fmi):
+    """FMPy ends before a stop time between samples, and does not stop at events of the input between them."""
+    path, _ = written(study(transmission=GAP), tmp_path, fmi)
+    given = np.array([(0.0, 0.0), (0.0105, 0.0), (0.0105, 1.0), (0.1, 1.0)], [("time", float), ("u", float)])
+    found = fmpy.simulate_fmu(path, input=given, stop_time=0.0995, output_interval=1e-3)
+    assert found["time"][-1] == pytest.approx(0.099) and found["motor.velocity"][-1] > 0.0
+
+
+@COMPILED
+@VERSIONS
+def test_what_a_phase_does_not_allow_is_refused(tmp_path, fmi):
+    path, _ = written(study(transmission=GAP), tmp_path, fmi)
+    with Instance(path) as one:
+        with pytest.raises(FMICallException):
+            one.unit.terminate()
+        assert one.said[-1] == "only what has been initialized can be terminated"
+        with pytest.raises(FMICallException):
+            one.unit.exitInitializationMode()
+        one.begin()
+        for again in (one.begin, one.unit.exitInitializationMode):
+            with pytest.raises(FMICallException):
+                again()
+        outputs = one.run([1.0] * 3)[-1]
+        one.unit.terminate()
+        with pytest.raises(FMICallException):
+            one.set(u=2.0)
+        assert one.said[-1] == "nothing can be set after termination"
+        for no_more in (one.unit.terminate, lambda: one.step(3e-3, 1e-3)):
+            with pytest.raises(FMICallException):
+                no_more()
+        assert one.outputs() == list(outputs)
+
+
+@COMPILED
+@VERSIONS
+def test_missing_arguments_are_refused(tmp_path, fmi):
+    path, _ = written(study(transmission=GAP), tmp_path, fmi)
+    state, number = ("FMUstate", "Real") if fmi == 2 else ("FMUState", "Float64")
+    values = [f"Get{number}", f"Set{number}"]
+    with Instance(path) as one:
+
+        def call(name, instance):
+            # items of a library, unlike its attributes, are not those that FMPy calls
+            given = instance, None, ctypes.c_size_t(1), None, ctypes.c_size_t(1)
+            return one.unit.dll[f"fmi{fmi}{name}"](*given)
+
+        for name in ("Reset", "Terminate", "ExitInitializationMode", f"Get{state}", f"Set{state}", *values):
+            assert call(name, None) == 3
+        for name in (f"Get{state}", f"Set{state}", *values):
+            assert call(name, ctypes.c_void_p(one.unit.component)) == 3
+        assert one.said[-1] == "1 values for 1 variables, or no place for them"
+
+
+@COMPILED
+def test_event_mode_is_refused(tmp_path):
+    path, _ = written(study(), tmp_path)
+    with Instance(path) as one, pytest.raises(Exception, match="Failed to instantiate"):
+        one.unit.instantiate(eventModeUsed=True)
 
 
 @COMPILED
@@ -355,6 +438,20 @@ def test_without_a_compiler_it_holds_the_sources_alone(tmp_path, monkeypatch):
     assert {"modelDescription.xml", "sources/buildDescription.xml", "sources/axis.c", "sources/fmi-3.c"} <= {*names}
     assert not [one for one in names if one.startswith("binaries")]
     assert validate_fmu(str(tmp_path / "axis.fmu")) == []
+
+
+@pytest.mark.parametrize(
+    ("machine", "fmi", "why"),
+    [
+        (("Windows", "AMD64"), 2, "for Windows on AMD64 none is compiled in FMI 2.0"),
+        (("Linux", "aarch64"), 2, "for Linux on aarch64 none is compiled in FMI 2.0"),
+        (("Linux", "riscv64"), 3, "for Linux on riscv64 none is compiled in FMI 3.0"),
+    ],
+)
+def test_on_other_machines_it_holds_the_sources_alone(tmp_path, monkeypatch, machine, fmi, why):
+    for name, value in zip(("system", "machine"), machine, strict=True):
+        monkeypatch.setattr(f"jaxbl.exports.fmu.platform.{name}", lambda value=value: value)
+    assert jaxbl.export(study(), tmp_path, "fmu", fmi=fmi).lines[0].endswith(f"; the sources alone: {why}.")
 
 
 @needs("cc")
@@ -407,6 +504,15 @@ def test_the_same_study_gives_the_same_bytes_and_another_one_another_token(tmp_p
     assert files[0] == files[1] != files[2]
     assert tokens[0] == tokens[1] != tokens[2]
     assert tokens[0].startswith(jaxbl.run(study()).summary["single_run"])
+
+
+def test_the_same_study_with_other_code_has_another_token(tmp_path, monkeypatch):
+    """A law that a later version, or another package, has changed: states and descriptions of the old one do not fit."""
+    data = study(transmission={"law": "linear_shaft", "stiffness": 1.0})
+    before = written(data, tmp_path / "a")[1]
+    monkeypatch.setattr(LinearShaft, "torque", lambda self, deflection: self.stiffness * deflection * deflection)
+    after = written(data, tmp_path / "b")[1]
+    assert before["identity"] == after["identity"] and before["token"] != after["token"]
 
 
 def test_a_motor_fed_by_voltage_has_an_input_in_volts(tmp_path):

@@ -98,23 +98,14 @@ FMI_EXPORT void NAME(fmi2FreeInstance)(void *instance)
 FMI_EXPORT int NAME(fmi2SetupExperiment)(void *instance, int has_tolerance, double tolerance, double start, int has_stop,
                                          double stop)
 {
-    Instance *one = (Instance *)instance;
     (void)has_tolerance;
     (void)tolerance;
-    (void)has_stop;
-    (void)stop;
-    if ((one->state.phase != (int32_t)INSTANTIATED) || !(fabs(start) <= DBL_MAX))
-    {
-        return failed(one, "the start time should be a number, set before initialization");
-    }
-    one->state.start = start;
-    return (int)OK;
+    return set_times((Instance *)instance, start, has_stop != 0, stop);
 }
 
 FMI_EXPORT int NAME(fmi2EnterInitializationMode)(void *instance)
 {
-    Instance *one = (Instance *)instance;
-    return enter_initialization(one, one->state.start);
+    return enter_initialization((Instance *)instance);
 }
 
 FMI_EXPORT int NAME(fmi2ExitInitializationMode)(void *instance)
@@ -129,8 +120,7 @@ FMI_EXPORT int NAME(fmi2Terminate)(void *instance)
 
 FMI_EXPORT int NAME(fmi2Reset)(void *instance)
 {
-    set_start_values((Instance *)instance);
-    return (int)OK;
+    return reset((Instance *)instance);
 }
 
 FMI_EXPORT int NAME(fmi2GetReal)(void *instance, const uint32_t references[], size_t count, double values[])
@@ -183,7 +173,7 @@ FMI_EXPORT int NAME(fmi2SerializedFMUstateSize)(void *instance, void *place, siz
 {
     (void)instance;
     (void)place;
-    *size = bytes_needed();
+    *size = BYTES;
     return (int)OK;
 }
 
@@ -241,13 +231,11 @@ FMI_EXPORT int NAME(fmi2CancelStep)(void *instance)
 
 FMI_EXPORT int NAME(fmi2GetRealStatus)(void *instance, int kind, double *value)
 {
-    Instance *one = (Instance *)instance;
-    if (kind != (int)LAST_SUCCESSFUL_TIME)
+    if ((instance == NULL) || (kind != (int)LAST_SUCCESSFUL_TIME))
     {
         return (int)DISCARD;
     }
-    begin(one);
-    *value = one->state.model.values[MODEL_TIME];
+    *value = time_of((const Instance *)instance);
     return (int)OK;
 }
 

@@ -53,11 +53,10 @@ FMI_EXPORT void *NAME(fmi3InstantiateCoSimulation)(const char *name, const char 
                                                    const uint32_t intermediate[], size_t intermediate_count,
                                                    void *environment, Logger logger, Callback intermediate_update)
 {
-    Instance *one = created(name, token);
+    Instance *one = events ? NULL : created(name, token);
     (void)resources;
     (void)visible;
     (void)logging;
-    (void)events;
     (void)early_return;
     (void)intermediate;
     (void)intermediate_count;
@@ -70,7 +69,9 @@ FMI_EXPORT void *NAME(fmi3InstantiateCoSimulation)(const char *name, const char 
     }
     else if (logger != NULL)
     {
-        logger(environment, (int)ERROR, "logStatusError", "the instantiation token is another one, or there is no memory");
+        logger(environment, (int)ERROR, "logStatusError",
+               events ? "the model has no event mode"
+                      : "the instantiation token is another one, or there is no memory");
     }
     return one;
 }
@@ -117,11 +118,11 @@ FMI_EXPORT void NAME(fmi3FreeInstance)(void *instance)
 FMI_EXPORT int NAME(fmi3EnterInitializationMode)(void *instance, bool has_tolerance, double tolerance, double start,
                                                  bool has_stop, double stop)
 {
+    Instance *one = (Instance *)instance;
+    const int status = set_times(one, start, has_stop, stop);
     (void)has_tolerance;
     (void)tolerance;
-    (void)has_stop;
-    (void)stop;
-    return enter_initialization((Instance *)instance, start);
+    return (status == (int)OK) ? enter_initialization(one) : status;
 }
 
 FMI_EXPORT int NAME(fmi3ExitInitializationMode)(void *instance)
@@ -156,8 +157,7 @@ FMI_EXPORT int NAME(fmi3Terminate)(void *instance)
 
 FMI_EXPORT int NAME(fmi3Reset)(void *instance)
 {
-    set_start_values((Instance *)instance);
-    return (int)OK;
+    return reset((Instance *)instance);
 }
 
 FMI_EXPORT int NAME(fmi3GetFloat64)(void *instance, const uint32_t references[], size_t count, double values[],
@@ -298,7 +298,7 @@ FMI_EXPORT int NAME(fmi3SerializedFMUStateSize)(void *instance, void *place, siz
 {
     (void)instance;
     (void)place;
-    *size = bytes_needed();
+    *size = BYTES;
     return (int)OK;
 }
 
@@ -416,6 +416,6 @@ FMI_EXPORT int NAME(fmi3DoStep)(void *instance, double time, double length, bool
     *event = false;
     *terminate = false;
     *early = false;
-    *reached = one->state.start + ((double)one->state.samples * MODEL_PERIOD);
+    *reached = (one == NULL) ? time : time_of(one);
     return status;
 }

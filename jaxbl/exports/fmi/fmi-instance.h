@@ -39,18 +39,21 @@ typedef enum
     ERROR = 3
 } Status;
 
-typedef enum
+/* Phases of an instance, and sets of them. */
+enum
 {
-    INSTANTIATED,
-    INITIALIZING,
-    STEPPING,
-    TERMINATED
-} Phase;
+    INSTANTIATED = 1,
+    INITIALIZING = 2,
+    STEPPING = 4,
+    TERMINATED = 8,
+    BEFORE = INSTANTIATED | INITIALIZING
+};
 
 /* All that changes: a plain block of bytes. */
 typedef struct
 {
     Model model;
+    double stop;     /* no step leads past it, s */
     double start;    /* of the simulation, s */
     int64_t samples; /* since then */
     int32_t phase;
@@ -66,12 +69,8 @@ typedef struct
     char *name;
 } Instance;
 
-/* What comes before the bytes of a serialised state. */
-typedef struct
-{
-    char token[sizeof(MODEL_TOKEN)];
-    uint64_t size;
-} Head;
+/* Of a serialised state: the token, and the state. */
+#define BYTES (sizeof(MODEL_TOKEN) + sizeof(State))
 
 /* An error with its line in the log. */
 static int failed(const Instance *one, const char *format, ...)
@@ -81,8 +80,22 @@ static int failed(const Instance *one, const char *format, ...)
     va_start(given, format);
     (void)vsnprintf(text, sizeof(text), format, given);
     va_end(given);
-    one->log(one, ERROR, text);
+    if (one != NULL)
+    {
+        one->log(one, ERROR, text);
+    }
     return (int)ERROR;
+}
+
+/* Whether there is an instance in one of some phases; if not, the log says why nothing is done. */
+static bool ready(const Instance *one, int32_t phases, const char *why)
+{
+    const bool yes = (one != NULL) && ((one->state.phase & phases) != 0);
+    if (!yes)
+    {
+        (void)failed(one, "%s", why);
+    }
+    return yes;
 }
 
 static void set_start_values(Instance *one)
@@ -93,7 +106,18 @@ static void set_start_values(Instance *one)
     {
         one->state.model.values[i] = variables[i].start;
     }
-    one->state.phase = (int32_t)INSTANTIATED;
+    one->state.phase = INSTANTIATED;
+    one->state.stop = ANY;
+}
+
+static int reset(Instance *one)
+{
+    if (one == NULL)
+    {
+        return (int)ERROR;
+    }
+    set_start_values(one);
+    return (int)OK;
 }
 
 static Instance *created(const char *name, const char *token)
@@ -127,23 +151,39 @@ static void freed(Instance *one)
     }
 }
 
+static double time_of(const Instance *one)
+{
+    return one->state.start + ((double)one->state.samples * MODEL_PERIOD);
+}
+
 /* What is read before the first step follows from the start values. */
 static void begin(Instance *one)
 {
-    if ((one->state.begun == 0) && (one->state.phase <= (int32_t)INITIALIZING))
+    if ((one->state.begun == 0) && ((one->state.phase & BEFORE) != 0))
     {
         model_begin(&one->state.model);
         one->state.begun = 1;
     }
-    one->state.model.values[MODEL_TIME] = one->state.start + ((double)one->state.samples * MODEL_PERIOD);
+    one->state.model.values[MODEL_TIME] = time_of(one);
+}
+
+/* Whether there is a place for a value of each variable. */
+static bool paired(const Instance *one, const uint32_t references[], size_t count, const double values[], size_t numbers)
+{
+    const bool yes = (count == numbers) && ((count == 0u) || ((references != NULL) && (values != NULL)));
+    if (!yes)
+    {
+        (void)failed(one, "%zu values for %zu variables, or no place for them", numbers, count);
+    }
+    return yes;
 }
 
 static int get_numbers(Instance *one, const uint32_t references[], size_t count, double values[], size_t numbers)
 {
     size_t i;
-    if (count != numbers)
+    if ((one == NULL) || !paired(one, references, count, values, numbers))
     {
-        return failed(one, "%zu values for %zu variables", numbers, count);
+        return (int)ERROR;
     }
     begin(one);
     for (i = 0u; i < count; i++)
@@ -161,7 +201,7 @@ static int get_numbers(Instance *one, const uint32_t references[], size_t count,
 static int checked(const Instance *one, uint32_t reference, double value)
 {
     const Variable *which = NULL;
-    const bool before = one->state.phase <= (int32_t)INITIALIZING;
+    const bool before = (one->state.phase & BEFORE) != 0;
     if (reference >= MODEL_VARIABLES)
     {
         return failed(one, "no variable has the value reference %lu", (unsigned long)reference);
@@ -184,9 +224,10 @@ static int checked(const Instance *one, uint32_t reference, double value)
 static int set_numbers(Instance *one, const uint32_t references[], size_t count, const double values[], size_t numbers)
 {
     size_t i;
-    if (count != numbers)
+    if (!ready(one, BEFORE | STEPPING, "nothing can be set after termination") ||
+        !paired(one, references, count, values, numbers))
     {
-        return failed(one, "%zu values for %zu variables", numbers, count);
+        return (int)ERROR;
     }
     for (i = 0u; i < count; i++)
     {
@@ -203,60 +244,74 @@ static int set_numbers(Instance *one, const uint32_t references[], size_t count,
     return (int)OK;
 }
 
-static int enter_initialization(Instance *one, double start)
+static int set_times(Instance *one, double start, bool has_stop, double stop)
 {
-    if (one->state.phase != (int32_t)INSTANTIATED)
+    if (!ready(one, INSTANTIATED, "initialization begins once, after the instance is made or reset"))
     {
-        return failed(one, "initialization begins once, after the instance is made or reset");
+        return (int)ERROR;
     }
     if (!(fabs(start) <= DBL_MAX))
     {
         return failed(one, "the start time should be a number");
     }
     one->state.start = start;
-    one->state.phase = (int32_t)INITIALIZING;
+    one->state.stop = has_stop ? stop : ANY;
     return (int)OK;
+}
+
+/* From one phase to the next. */
+static int entered(Instance *one, int32_t from, int32_t to, const char *why)
+{
+    if (!ready(one, from, why))
+    {
+        return (int)ERROR;
+    }
+    begin(one);
+    one->state.phase = to;
+    return (int)OK;
+}
+
+static int enter_initialization(Instance *one)
+{
+    return entered(one, INSTANTIATED, INITIALIZING, "initialization begins once, after the instance is made or reset");
 }
 
 static int exit_initialization(Instance *one)
 {
-    if (one->state.phase != (int32_t)INITIALIZING)
-    {
-        return failed(one, "initialization has not begun");
-    }
-    begin(one);
-    one->state.phase = (int32_t)STEPPING;
-    return (int)OK;
+    return entered(one, INITIALIZING, STEPPING, "initialization has not begun");
 }
 
 static int terminated(Instance *one)
 {
-    one->state.phase = (int32_t)TERMINATED;
-    return (int)OK;
+    return entered(one, STEPPING, TERMINATED, "only what has been initialized can be terminated");
 }
 
 static int do_step(Instance *one, double time, double length)
 {
-    State *state = &one->state;
-    const double now = state->start + ((double)state->samples * MODEL_PERIOD);
     /* the end is what the environment can say exactly: a step is a difference of rounded times */
     const double slack = (STEP_OFF * MODEL_PERIOD) + (4.0 * DBL_EPSILON * (fabs(time) + fabs(length)));
     const double ratio = length / MODEL_PERIOD;
     const int64_t samples = ((ratio > 0.0) && (ratio < MOST_SAMPLES)) ? (int64_t)(ratio + 0.5) : 0;
+    State *state = NULL;
     int64_t left;
     size_t i;
-    if (state->phase != (int32_t)STEPPING)
+    if (!ready(one, STEPPING, "a step needs an initialized instance"))
     {
-        return failed(one, "a step needs an initialized instance");
+        return (int)ERROR;
     }
+    state = &one->state;
     if ((samples < 1) || !(fabs(length - ((double)samples * MODEL_PERIOD)) <= slack))
     {
         return failed(one, "the communication step size %.17g s should be a multiple of the sample period %.17g s", length,
                       MODEL_PERIOD);
     }
-    if (!(fabs(time - now) <= (TIME_OFF * MODEL_PERIOD)))
+    if (!(fabs(time - time_of(one)) <= (TIME_OFF * MODEL_PERIOD)))
     {
-        return failed(one, "a step from %.17g s, but the instance is at %.17g s", time, now);
+        return failed(one, "a step from %.17g s, but the instance is at %.17g s", time, time_of(one));
+    }
+    if ((time_of(one) + length) > (state->stop + (TIME_OFF * MODEL_PERIOD)))
+    {
+        return failed(one, "a step to %.12g s, past the stop time %.12g s", time_of(one) + length, state->stop);
     }
     for (left = samples; left > 0; left--)
     {
@@ -276,8 +331,12 @@ static int do_step(Instance *one, double time, double length)
 }
 
 /* States of an instance: copies, in a place of the environment's or a new one. */
-static int kept(const Instance *one, void **place)
+static int copied(const Instance *one, const void *from, void **place)
 {
+    if (place == NULL)
+    {
+        return failed(one, "no place for a state is given");
+    }
     if (*place == NULL)
     {
         *place = malloc(sizeof(State));
@@ -286,13 +345,18 @@ static int kept(const Instance *one, void **place)
     {
         return failed(one, "no memory for a state");
     }
-    memcpy(*place, &one->state, sizeof(State));
+    memcpy(*place, from, sizeof(State));
     return (int)OK;
+}
+
+static int kept(const Instance *one, void **place)
+{
+    return (one == NULL) ? (int)ERROR : copied(one, &one->state, place);
 }
 
 static int taken_back(Instance *one, const void *place)
 {
-    if (place == NULL)
+    if ((one == NULL) || (place == NULL))
     {
         return failed(one, "no state is given");
     }
@@ -310,49 +374,24 @@ static int forgotten(void **place)
     return (int)OK;
 }
 
-static Head head(void)
-{
-    Head made;
-    memset(&made, 0, sizeof(made));
-    memcpy(made.token, MODEL_TOKEN, sizeof(MODEL_TOKEN));
-    made.size = (uint64_t)sizeof(State);
-    return made;
-}
-
-static size_t bytes_needed(void)
-{
-    return sizeof(Head) + sizeof(State);
-}
-
 static int serialise(const Instance *one, const void *place, unsigned char bytes[], size_t size)
 {
-    const Head first = head();
-    if ((place == NULL) || (size < bytes_needed()))
+    if ((place == NULL) || (bytes == NULL) || (size < BYTES))
     {
-        return failed(one, "a state needs %zu bytes, not %zu", bytes_needed(), size);
+        return failed(one, "a state needs %zu bytes, not %zu", BYTES, size);
     }
-    memcpy(bytes, &first, sizeof(Head));
-    memcpy(&bytes[sizeof(Head)], place, sizeof(State));
+    memcpy(bytes, MODEL_TOKEN, sizeof(MODEL_TOKEN));
+    memcpy(&bytes[sizeof(MODEL_TOKEN)], place, sizeof(State));
     return (int)OK;
 }
 
 static int deserialise(const Instance *one, const unsigned char bytes[], size_t size, void **place)
 {
-    const Head first = head();
-    if ((size < bytes_needed()) || (memcmp(bytes, &first, sizeof(Head)) != 0))
+    if ((bytes == NULL) || (size != BYTES) || (memcmp(bytes, MODEL_TOKEN, sizeof(MODEL_TOKEN)) != 0))
     {
         return failed(one, "these %zu bytes are no state of this model", size);
     }
-    if (*place == NULL)
-    {
-        *place = malloc(sizeof(State));
-    }
-    if (*place == NULL)
-    {
-        return failed(one, "no memory for a state");
-    }
-    memcpy(*place, &bytes[sizeof(Head)], sizeof(State));
-    return (int)OK;
+    return copied(one, &bytes[sizeof(MODEL_TOKEN)], place);
 }
 
 #endif /* FMI_INSTANCE_HEADER */
