@@ -239,6 +239,8 @@ class _C(Writer):
             if logical:
                 yes, no = (self.literal(Constant(np.asarray(value, one.out.dtype))) for value in (1, 0))
                 return f"{texts[0]} ? {yes} : {no}"
+            if (given[0].dtype, one.out.dtype) == (self.program.block.dtype, np.int32):
+                return self._helped(one, texts)
             return f"({c_type(one.out.dtype)}){texts[0]}"
         if name in ("shift_left", "shift_right_logical"):
             wide = c_type(np.dtype(f"uint{8 * one.out.dtype.itemsize}"))
@@ -252,7 +254,7 @@ class _C(Writer):
         self._needed[name] = types
         if one.name in ("ceil", "round_even", "round_away"):
             self._needed["floor"] = types
-        self.needs_math = self.needs_math or "floor" in self._needed
+        self.needs_math = self.needs_math or not self._needed.keys().isdisjoint(("floor", "convert"))
         return f"{_HELPER.get(one.name, name)}({texts[0]})"
 
     def helpers(self) -> list[str]:
@@ -264,6 +266,7 @@ class _C(Writer):
             "fabs": "fabsf" if single else "fabs",
             "integer": "int32_t" if single else "int64_t",
             "whole": "8388608.0f" if single else "4503599627370496.0",
+            "largest": "2147483648.0f" if single else "2147483648.0",
             **{f"n{key}": f"{value}{'f' if single else ''}" for key, value in
                {"0": "0.0", "1": "1.0", "2": "2.0", "half": "0.5"}.items()},
         }  # fmt: skip
@@ -293,8 +296,17 @@ _INFIX = {
     "ne": "!=", "and": "&", "or": "|", "xor": "^",
 }  # fmt: skip
 _LOGICAL = {"and": "&&", "or": "||", "xor": "!="}
-_HELPER = {"floor": "floor_of", "ceil": "ceil_of", "round_even": "nearest", "round_away": "nearest_away"}
+_HELPER = {
+    "floor": "floor_of", "ceil": "ceil_of", "round_even": "nearest", "round_away": "nearest_away", "convert": "integer_of",
+}  # fmt: skip
 _HELPERS = {
+    "convert": """
+/* x without its fraction; 0 where no integer is that large, or x is not a number: in C such a conversion is undefined. */
+static int32_t integer_of(%(real)s x)
+{
+    return (%(fabs)s(x) < %(largest)s) ? (int32_t)x : 0;
+}
+""",
     "floor": """
 /* The largest integer that is not above x. */
 static %(real)s floor_of(%(real)s x)

@@ -479,6 +479,66 @@ def test_the_sources_compile_without_a_warning_or_a_global_number(tmp_path, comp
     assert not {*found} & {*"dDbBC"}
 
 
+ODD_CALLS = """
+#include "fmi-3.c"
+
+static const double odd[] = {0.0, -1.0, 1e-320, 1e308, -1e308, (double)NAN, (double)INFINITY};
+static int lines = 0;
+
+static void count(void *environment, int status, const char *category, const char *message)
+{
+    (void)environment; (void)status; (void)category; (void)message;
+    lines++;
+}
+
+static void *make(void)
+{
+    return fmi3InstantiateCoSimulation("", MODEL_TOKEN, NULL, false, false, false, false, NULL, 0u, NULL, count, NULL);
+}
+
+int main(void)
+{
+    void *one = make(), *two = make(), *state = NULL, *again = NULL;
+    uint8_t bytes[BYTES];
+    uint32_t i, k, first = 1u;
+    double value, reached;
+    bool event, terminate, early;
+    int bad = 0;
+    for (i = 0u; i <= MODEL_VARIABLES; i++)
+        for (k = 0u; k < sizeof(odd) / sizeof(odd[0]); k++)
+        {
+            const int before = lines;
+            int refused = fmi3SetFloat64(one, &i, 1u, &odd[k], 1u) != 0;
+            refused += fmi3EnterInitializationMode(one, false, 0.0, odd[k], true, 1e9) != 0;
+            refused += fmi3ExitInitializationMode(one) != 0;
+            refused += fmi3SetFloat64(one, &first, 1u, &odd[k], 1u) != 0;
+            refused += fmi3DoStep(one, odd[k], 3.0 * MODEL_PERIOD, true, &event, &terminate, &early, &reached) != 0;
+            refused += fmi3DoStep(one, reached, odd[k], true, &event, &terminate, &early, &reached) != 0;
+            refused += fmi3GetFloat64(one, &i, 1u, &value, 1u) != 0;
+            bad += fmi3GetFMUState(one, &state) + fmi3SerializeFMUState(one, state, bytes, BYTES);
+            bad += fmi3DeserializeFMUState(two, bytes, BYTES, &again) + fmi3SetFMUState(two, again);
+            bad += (lines - before) != refused;
+            bad += fmi3Reset(one);
+        }
+    bad += fmi3FreeFMUState(one, &state) + fmi3FreeFMUState(one, &again);
+    fmi3FreeInstance(one);
+    fmi3FreeInstance(two);
+    return bad + (lines == 0);
+}
+"""
+
+
+@needs("gcc")
+def test_odd_calls_do_nothing_undefined(tmp_path):
+    """No memory that is another's or lost, no overflow; a line in the log for each call that is refused."""
+    path, _ = written(study("actuator.", "motor.pre", "load.flex", transmission=GAP), tmp_path)
+    zipfile.ZipFile(path).extractall(tmp_path)
+    (tmp_path / "sources" / "odd.c").write_text(ODD_CALLS)
+    checks = "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"
+    ran("gcc", "-std=c99", "-g", *checks, "odd.c", "drive.c", "-lm", "-o", "odd", cwd=tmp_path / "sources")
+    ran("./odd", cwd=tmp_path / "sources")
+
+
 @VERSIONS
 @needs("cc", "cmake")
 def test_another_tool_compiles_the_sources_from_what_the_fmu_says_of_them(tmp_path, monkeypatch, fmi):
