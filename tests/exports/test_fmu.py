@@ -528,6 +528,22 @@ int main(void)
 """
 
 
+@VERSIONS
+@needs("gcc")
+def test_many_are_linked_into_one_program_by_a_prefix(tmp_path, fmi):
+    names = "axis", "table"
+    for name in names:
+        path, _ = written(study(transmission=GAP), tmp_path / name, fmi, name=name)
+        zipfile.ZipFile(path).extractall(tmp_path / name)
+        files = f"fmi-{fmi}.c", f"{name}.c"
+        ran("gcc", "-std=c99", f"-DFMI{fmi}_FUNCTION_PREFIX={name}_", "-c", *files, cwd=tmp_path / name / "sources")
+    calls = [f"{name}_fmi{fmi}GetVersion" for name in names]
+    lines = [*(f"const char *{call}(void);" for call in calls), f"int main(void) {{ return *{calls[0]}() - *{calls[1]}(); }}"]
+    (tmp_path / "both.c").write_text("\n".join(lines))
+    ran("gcc", "both.c", *tmp_path.glob("*/sources/*.o"), "-lm", "-o", "both", cwd=tmp_path)
+    ran("./both", cwd=tmp_path)
+
+
 @needs("gcc")
 def test_odd_calls_do_nothing_undefined(tmp_path):
     """No memory that is another's or lost, no overflow; a line in the log for each call that is refused."""

@@ -32,20 +32,13 @@ enum
     LAST_SUCCESSFUL_TIME = 2
 };
 
-static void logged(const void *instance, Status status, const char *message)
+static void logged(const Instance *one, const char *message)
 {
-    const Instance *one = (const Instance *)instance;
     const Logger call = (Logger)one->callback;
     if (call != NULL)
     {
-        call(one->environment, one->name, (int)status, "logStatusError", "%s", message);
+        call(one->environment, one->name, (int)ERROR, "logStatusError", "%s", message);
     }
-}
-
-/* Of functions for variables of types that the model does not have, and for what it cannot do. */
-static int absent(void *instance, size_t count, const char *what)
-{
-    return (count == 0u) ? (int)OK : failed((const Instance *)instance, "the model has no %s", what);
 }
 
 FMI_EXPORT const char *NAME(fmi2GetTypesPlatform)(void)
@@ -77,7 +70,6 @@ FMI_EXPORT void *NAME(fmi2Instantiate)(const char *name, int kind, const char *t
     (void)logging;
     if (one != NULL)
     {
-        one->log = logged;
         one->callback = (void (*)(void))call;
         one->environment = (callbacks == NULL) ? NULL : callbacks->environment;
     }

@@ -18,20 +18,13 @@ typedef void (*Callback)(void);
 typedef const char *String;
 typedef const uint8_t *Binary;
 
-static void logged(const void *instance, Status status, const char *message)
+static void logged(const Instance *one, const char *message)
 {
-    const Instance *one = (const Instance *)instance;
     const Logger call = (Logger)one->callback;
     if (call != NULL)
     {
-        call(one->environment, (int)status, "logStatusError", message);
+        call(one->environment, (int)ERROR, "logStatusError", message);
     }
-}
-
-/* Of functions for variables of types that the model does not have, and for what it cannot do. */
-static int absent(void *instance, size_t count, const char *what)
-{
-    return (count == 0u) ? (int)OK : failed((const Instance *)instance, "the model has no %s", what);
 }
 
 FMI_EXPORT const char *NAME(fmi3GetVersion)(void)
@@ -63,7 +56,6 @@ FMI_EXPORT void *NAME(fmi3InstantiateCoSimulation)(const char *name, const char 
     (void)intermediate_update;
     if (one != NULL)
     {
-        one->log = logged;
         one->callback = (Callback)logger;
         one->environment = environment;
     }

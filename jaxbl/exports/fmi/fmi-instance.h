@@ -33,11 +33,11 @@
 #define MOST_SAMPLES 1e9
 
 /* Numbers of FMI's status, the same in both versions. */
-typedef enum
+enum
 {
     OK = 0,
     ERROR = 3
-} Status;
+};
 
 /* Phases of an instance, and sets of them. */
 enum
@@ -64,10 +64,12 @@ typedef struct
 {
     State state;
     void *environment;
-    void (*log)(const void *instance, Status status, const char *message);
-    void (*callback)(void); /* the environment's function for log, as another type */
+    void (*callback)(void); /* the environment's function for the log, as another type */
     char *name;
 } Instance;
+
+/* A line in the log: what each version of FMI does with it. */
+static void logged(const Instance *one, const char *message);
 
 /* Of a serialised state: the token, and the state. */
 #define BYTES (sizeof(MODEL_TOKEN) + sizeof(State))
@@ -82,9 +84,15 @@ static int failed(const Instance *one, const char *format, ...)
     va_end(given);
     if (one != NULL)
     {
-        one->log(one, ERROR, text);
+        logged(one, text);
     }
     return (int)ERROR;
+}
+
+/* Of functions for variables of types that the model does not have, and for what it cannot do. */
+static int absent(void *instance, size_t count, const char *what)
+{
+    return (count == 0u) ? (int)OK : failed((const Instance *)instance, "the model has no %s", what);
 }
 
 /* Whether there is an instance in one of some phases; if not, the log says why nothing is done. */
