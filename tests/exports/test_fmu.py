@@ -538,8 +538,8 @@ def test_many_are_linked_into_one_program_by_a_prefix(tmp_path, fmi):
         files = f"fmi-{fmi}.c", f"{name}.c"
         ran("gcc", "-std=c99", f"-DFMI{fmi}_FUNCTION_PREFIX={name}_", "-c", *files, cwd=tmp_path / name / "sources")
     calls = [f"{name}_fmi{fmi}GetVersion" for name in names]
-    lines = [*(f"const char *{call}(void);" for call in calls), f"int main(void) {{ return *{calls[0]}() - *{calls[1]}(); }}"]
-    (tmp_path / "both.c").write_text("\n".join(lines))
+    known = "".join(f"const char *{call}(void);\n" for call in calls)
+    (tmp_path / "both.c").write_text(f"{known}int main(void) {{ return *{calls[0]}() - *{calls[1]}(); }}\n")
     ran("gcc", "both.c", *tmp_path.glob("*/sources/*.o"), "-lm", "-o", "both", cwd=tmp_path)
     ran("./both", cwd=tmp_path)
 
