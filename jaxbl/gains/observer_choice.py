@@ -352,6 +352,11 @@ def not_told_apart(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return [kind for kind, one in list(found.items())[1:] if one["low"] is not None and one["low"] <= 1.0]
 
 
+def runs_are_equal(one: Mapping[str, Any]) -> bool:
+    """Whether a kind's ratio (:func:`ranked`) is the same in all runs, but for rounding: no noise, and no interval."""
+    return one["high"] - one["low"] < 1e-9 * one["ratio"]
+
+
 def _summary(search: _Search, held_out: Mapping[str, list[list[dict[str, np.ndarray]]]]) -> dict[str, Any]:
     """What `tuning.json` holds."""
     config, table, places = search.config, search.table, []
@@ -423,10 +428,15 @@ def _remarks(search: _Search, places: Sequence[Mapping[str, Any]]) -> list[str]:
         lines.append(f"tune.worst_over_uncertainty: {drives}: {'; '.join(names)}.")
     if table.holdout is None:
         lines.append("No tune.holdout is given: kinds are compared on the study's own excitation, under other noise.")
-    lines.append(
-        f"Intervals ({100 * _CONFIDENCE:g} %) are over {search.held_out_seeds} noise seeds of the held-out runs, kinds "
-        "compared under the same noise. Another input or drive may rank otherwise."
-    )
+    kinds = [one for place in places for side in place["sides"].values() for one in side["kinds"].values()]
+    if all(one["ratio"] is None or runs_are_equal(one) for one in kinds):
+        how = "Without noise the runs of all seeds are the same: ratios have no interval."
+    else:
+        how = (
+            f"Intervals ({100 * _CONFIDENCE:g} %) are over {search.held_out_seeds} noise seeds of the held-out runs, kinds "
+            "compared under the same noise."
+        )
+    lines.append(f"{how} Another input or drive may rank otherwise.")
     for side in search.sides:
         ends: dict[tuple[str, str], int] = {}
         unfinished: dict[str, tuple[int, float]] = {}

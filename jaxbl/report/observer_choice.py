@@ -15,10 +15,11 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator
 
 from jaxbl.config import Config, numeric_paths
 from jaxbl.files import write_atomic
-from jaxbl.gains.observer_choice import TIME_CONSTANT, ObserverChoice
+from jaxbl.gains.observer_choice import TIME_CONSTANT, ObserverChoice, runs_are_equal
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
 from .figures import COLOURS, MISSING, SIDE_COLOURS, Drawn, style, subplots, with_unit
@@ -79,19 +80,22 @@ def _bars(summary: Mapping[str, Any], sides: Sequence[str]) -> Drawn:
             ax.annotate("diverged, or too slow", (0.02, i), xycoords=("axes fraction", "data"), va="center", color="#555555")
         ax.axvline(1.0, color="black", lw=0.8)
         ax.set(xscale="log", xlim=(0.9, 1.2 * (2.0 + highest) ** 1.5), title=side, xlabel="times the best one's error")
+        ax.xaxis.set_major_locator(LogLocator(numticks=5))
         ax.xaxis.set_major_formatter("{x:g}")
         ax.set_yticks(range(count), list(found))
         ax.set_ylim(count - 0.5, -0.5)
         ax.grid(axis="y", visible=False)
     caption = (
         f"{_error(summary)} of each kind over the best one's, {_where(summary)}: geometric mean over noise seeds, with its "
-        "95 % interval."
+        "95 % interval where they differ."
     )
     return Drawn("observers", figure, caption)
 
 
 def _ratio(one: Mapping[str, Any]) -> str:
-    return f"{one['ratio']:.3g} ({one['low']:.3g} to {one['high']:.3g})"
+    """The ratio, with its interval if runs differ; more digits where it would read as one."""
+    ratio, low, high = (f"{x:.{3 if abs(x - 1.0) > 0.005 else 6}g}" for x in (one["ratio"], one["low"], one["high"]))
+    return ratio if runs_are_equal(one) else f"{ratio} ({low} to {high})"
 
 
 def _varied(config: Config, summary: Mapping[str, Any], side: str) -> dict[str, list[Any]]:

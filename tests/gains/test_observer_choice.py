@@ -10,7 +10,7 @@ from small_study import listed, rigid, small
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
-from jaxbl.gains.observer_choice import Side, not_told_apart, ranked
+from jaxbl.gains.observer_choice import Side, not_told_apart, ranked, runs_are_equal
 from jaxbl.gains.tune import tune
 from jaxbl.report.observer_choice import observer_toml
 from jaxbl.sweeps.sweep import sweep
@@ -45,6 +45,15 @@ def test_ratios_have_the_interval_of_a_paired_test():
     assert [found["b"][key] for key in ("ratio", "low", "high")] == [1.0] * 3
     assert set(found["c"].values()) == {None}
     assert not_told_apart(found) == []
+
+
+def test_equal_runs_have_no_interval():
+    errors = {kind: np.full(8, 0.1 + 1e-6 * i) for i, kind in enumerate("ab")}
+    found = ranked(errors)
+    assert not_told_apart(found) == []
+    assert all(map(runs_are_equal, found.values()))
+    errors["b"][3] *= 1.01
+    assert not runs_are_equal(ranked(errors)["b"])
 
 
 def test_kinds_that_noise_alone_parts_are_not_told_apart():
