@@ -136,7 +136,8 @@ def rule_table(rules: list[dict[str, Any]]) -> PageTable:
     rows = [
         [
             one["title"],
-            one["states"],
+            # lines break between conditions
+            one["states"].replace(" ", "\u00a0").replace(",\u00a0", ", "),
             one["sufficient"],
             one["margin"],
             _covers(one) if one["kind"] == "region" else None,
