@@ -249,20 +249,26 @@ def arrays(values: Mapping[str, float]) -> dict[str, np.ndarray]:
     return {path: np.asarray(value, float) for path, value in values.items()}
 
 
-def on_record(config: Config, record: Record) -> Experiment:
-    """The study's experiment at the record's period, with plant steps no longer than the study's."""
+def run_of(config: Config, record: Record) -> dict[str, float]:
+    """`sample_period` and `substeps` of the record: its period, and plant steps no longer than the study's."""
     step = config.run.sample_period / config.run.substeps
     substeps = max(int(np.ceil(record.sample_period / step * (1.0 - 1e-9))), 1)
+    return {"sample_period": record.sample_period, "substeps": substeps}
+
+
+def on_record(config: Config, record: Record) -> Experiment:
+    """The study's experiment at the record's period, with plant steps no longer than the study's."""
+    run = run_of(config, record)
     experiment = prepare(config.model_copy(update={"run": config.run.model_copy(update={"precision": "float64"})}))
     return eqx.tree_at(
         lambda e: e.run,
         experiment,
         dataclasses.replace(
             experiment.run,
-            sample_period=np.asarray(record.sample_period, float),
+            sample_period=np.asarray(run["sample_period"], float),
             # along a log nothing asks for it; programs are compiled for one
             steps=1,
-            substeps=substeps,
+            substeps=run["substeps"],
         ),
     )
 

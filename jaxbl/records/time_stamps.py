@@ -11,7 +11,7 @@ from .signal_quality import SHORTEST, longest, resolution
 from .table import LogTable, TimeTable
 
 GAP = 3.5
-"""Intervals longer than this many periods are gaps: up to three lost samples in a row are interpolated."""
+"""Intervals longer than this many periods are gaps: up to two lost samples in a row are interpolated."""
 ONE = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Unit of the stamps -> s."""
 _SLOW = 0.5

@@ -121,9 +121,12 @@ def write_results(
 
 
 def _model_text(found: "Identification | Diagnosis") -> str:
-    """The fitted study as TOML; where the log has no gaps, its excitation is the torque of `trace.parquet` beside it."""
+    """The fitted study as TOML; for want of an excitation with the torque of `trace.parquet` beside it, at its period."""
+    from jaxbl.identification.logs import run_of
+
     data = found.model.resolved()
     if found.replays:
+        data["run"] |= run_of(found.model, found.record)
         data["excitation"] = {"kind": "recorded", "file": "trace.parquet", "time_column": "t", "torque_column": "u"}
     return tomli_w.dumps(data)
 
