@@ -1,7 +1,5 @@
 """Exported C: bit for bit the traced step, on this machine's compilers at all levels, and near the replay in JAX."""
 
-import re
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -158,21 +156,3 @@ def test_another_folder_is_not_overwritten(tmp_path):
     with pytest.raises(InputError, match="is not empty and holds no export"):
         jaxbl.export(study(), tmp_path, name="drive")
     assert [one.name for one in tmp_path.iterdir()] == ["mine.txt"]
-
-
-@pytest.mark.parametrize("precision", ["double", "float"])
-def test_structured_text_is_a_function_block_of_the_standards_functions(tmp_path, precision):
-    """Not compiled: no compiler for it can be installed. Its functions are those of the standard."""
-    for kind in OBSERVERS:
-        jaxbl.export(study(kind), tmp_path / kind, "st", precision=precision, name="drive")
-        text = re.sub(r"\(\*.*?\*\)", "", (tmp_path / kind / "drive.st").read_text(), flags=re.DOTALL)
-        whole = text.partition("FUNCTION_BLOCK drive")[2]
-        declarations, _, body = whole.rpartition("END_VAR")
-        # of what is declared as one type there is no literal of the other
-        assert ("LREAL#" in text) == (precision == "double")
-        declared = set(re.findall(r"^\s*(\w+)\s*:", declarations, re.MULTILINE))
-        assert len(declared) > 50
-        calls = set(re.findall(r"\b([A-Za-z_]\w*)\s*\(", body)) - {"IF", "ELSIF", "AND", "OR", "NOT", "XOR", "MOD"}
-        assert {one for one in calls if "_TO_" not in one} <= {"SQRT", "ABS", "MIN", "MAX", "SEL"}
-        assert body.count("IF ") - body.count("ELSIF ") == body.count("END_IF") > 0
-        assert text.count("FUNCTION_BLOCK drive") == text.count("END_FUNCTION_BLOCK")
