@@ -32,8 +32,8 @@ _FINER = 0.02
 """What rows of half the height may be worth of alpha - f⁺."""
 _LATTICE = 0.25
 """Bounds of e are rounded up to multiples of this part of dg: sets are then finitely many, and images come to rest."""
-_SLACK = 1e-9
-"""Of that lattice, for rounding errors of the arithmetic: at least a hundred times what double precision makes."""
+_SLACK, _ULPS = 1e-9, 16.0 * np.finfo(float).eps
+"""For rounding errors of the arithmetic: parts of that lattice, and of the numbers that are added up."""
 _STEPS = 100_000
 _TAIL, _RESTS = 2_000, 1.001
 """A set that still shrinks is taken as it is where the bound was at most so many times as large so many samples before."""
@@ -124,8 +124,10 @@ class _Rows:
             np.maximum(found, np.where(inside, upper[np.clip(row, 0, len(upper) - 1)], -np.inf), out=found)
         return self._rounded(found)
 
-    def _rounded(self, upper: np.ndarray) -> np.ndarray:
-        return np.ceil(upper / self.lattice + _SLACK) * self.lattice
+    def _rounded(self, upper: np.ndarray, size: float = 0.0) -> np.ndarray:
+        """Bounds on the lattice; `size` of the terms that they are sums of, where these are larger."""
+        size = max(size, float(np.abs(upper[upper > -np.inf]).max(initial=0.0)))
+        return np.ceil(upper / self.lattice + _SLACK + _ULPS * size / self.lattice) * self.lattice
 
     @np.errstate(invalid="ignore")  # empty rows
     def image(self, upper: np.ndarray) -> tuple[np.ndarray, float]:
@@ -143,8 +145,11 @@ class _Rows:
         for shift, moment in enumerate(self.moments):
             part = moved[shift : shift + len(corrected)]
             np.maximum(part, corrected + moment, out=part)
+        far = float(np.abs(upper[filled]).max()) + self.system.noise
+        size = far + self.system.lambda_ * math.sqrt(far) + 2.0 * self.system.alpha + (last - self.half) * self.dg
+        size += float(self.moments[-1])
         new = np.full(len(upper), -np.inf)
-        new[first - margin : last + margin] = self._rounded(moved)
+        new[first - margin : last + margin] = self._rounded(moved, size)
         return new, float(top * self.dg)
 
     def _corrected(self, high: np.ndarray, rows: np.ndarray) -> np.ndarray:

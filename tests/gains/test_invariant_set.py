@@ -1,6 +1,7 @@
 """Sets that are never left: against the observer's own step, all sequences of a short horizon, and known bounds."""
 
 import itertools
+from decimal import Decimal
 
 import jax
 import jax.numpy as jnp
@@ -63,6 +64,22 @@ def test_image_holds_whatever_the_adversary_does(system):
         near = (other == row) | on_end
         inside |= near & (e <= image[other] + 1e-9) & (e >= -image[::-1][other] - 1e-9)
     assert inside.all()
+
+
+def test_rounding_errors_of_large_numbers_stay_inside():
+    """Of the lattice, double precision has hundredths at 1e14: the exact successors are still in the image."""
+    system, rng = ErrorSystem(False, 2.0, 4.0, 20.0), np.random.default_rng(5)
+    rows = _Rows(system, 0.25, 400.0)
+    assert rows.dg == 0.25
+    upper = np.full(2 * rows.half, -np.inf)
+    k = np.arange(rows.half - 1500, rows.half + 1500)
+    upper[k] = rng.uniform(0.5e14, 1.5e14, len(k)).round() * rows.lattice
+    image = rows.image(upper)[0]
+    for row in k:
+        # from the upper end of the row, by the least noise and the largest acceleration: u = a
+        e, g = Decimal(upper[row]), Decimal(float(row - rows.half + 1) * rows.dg)
+        exact = e - 2 * (e - 20).sqrt() + g + Decimal("0.5")
+        assert Decimal(image[row - rows.alpha + rows.push]) >= exact
 
 
 @pytest.mark.parametrize("system", SYSTEMS, ids=str)
