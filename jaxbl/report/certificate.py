@@ -65,8 +65,8 @@ def _lines(side: str, found: dict[str, Any], passed_over: int) -> list[str]:
     lines = [
         f"{side}, proven: velocity error at most {_above(found['accuracy']):.4g} rad/s from "
         f"{_above(found['reaching_time']):.4g} s on, and {_above(found['final_accuracy']):.4g} rad/s in the end, for any "
-        f"noise within ±{given['noise']:.4g} rad and any missing acceleration within ±{given['f_plus']:.4g} rad/s²{nominal}, "
-        f"sampled every {found['assumptions']['period']:.4g} s, from errors of {given['velocity_error']:.4g} rad/s and "
+        f"noise within ±{given['noise']:.4g} rad and any missing acceleration within ±{given['f_plus']:.4g} rad/s²{nominal}"
+        f", sampled every {found['assumptions']['period']:.4g} s, from errors of {given['velocity_error']:.4g} rad/s and "
         f"{given['position_error']:.4g} rad.",
         f"{side}, tried: the worst of {tried['runs']} adversarial runs errs by {tried['worst']:.3g} rad/s{against}; none "
         "violates what is proven.",
