@@ -60,7 +60,10 @@ def _stepped(observer: AbstractObserver, states: Any, noise: Any) -> Any:
 
 
 def step_of(observer: AbstractObserver) -> Step:
-    """The observer's own step at a period of 1, without nominal acceleration, on errors; for use with x64 enabled."""
+    """The observer's own step at a period of 1, without nominal acceleration, on errors; for use with x64 enabled.
+
+    Of observers that carry nothing at rest: super-twisting ones and differentiators.
+    """
 
     def step(states: States, noise: Float[np.ndarray, " many"]) -> tuple[States, Float[np.ndarray, " many"]]:
         many = len(noise)
