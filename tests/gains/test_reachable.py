@@ -67,7 +67,7 @@ def test_it_finds_at_least_what_all_sequences_of_a_short_horizon_do(kind, gains)
     assert found.worst >= np.abs(jax.vmap(lambda n, d: errors_of(observer, rest, n, d))(*pairs)).max()
 
 
-@pytest.mark.parametrize(("gains", "share"), [((0.4, 0.7), 0.99), ((0.15, 1.0), 0.97), ((0.1, 0.3), 0.97)])
+@pytest.mark.parametrize(("gains", "share"), [((0.4, 0.7), 0.999), ((0.15, 1.0), 0.995), ((0.1, 0.3), 0.998)])
 def test_the_worst_case_of_a_linear_observer_is_almost_reached(gains, share):
     """That is the sum of absolute sensitivities."""
     one, unit = jnp.ones(()), np.eye(3)
