@@ -65,12 +65,10 @@ class Proof(NamedTuple):
     Attributes:
         bounds: of the error of the velocity estimate at sample k, f⁺ T; at later samples the last one.
         row: height dg of the rows, f⁺ T.
-        upper: bounds of e in the rows of the last set, which is never left, f⁺ T²; rows from -dg len(upper) / 2 on.
     """
 
     bounds: Float[np.ndarray, " samples"]
     row: float
-    upper: Float[np.ndarray, " rows"]
 
 
 class _Left(Exception):
@@ -248,7 +246,7 @@ def _settled(system: ErrorSystem, height: float, start: tuple[float, float], rea
         coarse = rows.height > height
         if period and not coarse:
             least = np.maximum.accumulate(np.array(bounds)[::-1])[::-1]
-            return Proof(least[: k - period + 1], rows.dg, new)
+            return Proof(least[: k - period + 1], rows.dg)
         upper = new
         if coarse and (period or bound < 0.25 * coarsest * rows.height):
             # what is left is small: lower rows, down to those asked for
