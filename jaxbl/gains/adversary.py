@@ -23,8 +23,8 @@ from .reachable import Reached
 _SIDE = 1e-6
 """Innovation, over 1 + N, from which on its sign is sure."""
 _LANES = 1 << 14
-_LEAST = 100
-"""Samples of a run from rest; more where the longest way found is near that."""
+_LEAST, _MOST = 100, 2_000
+"""Samples of a run from rest: by the length of the way that the exploration found."""
 _FROM_START = 0.1
 """Part of the runs that begin with starting errors, and last until the errors have settled."""
 _RATES = (1e-3, 0.5)
@@ -218,7 +218,7 @@ def search(
     with jax.enable_x64(True):
         observer = DISCRETISATIONS[name](jnp.asarray(system.lambda_), jnp.asarray(system.alpha))
         explored, best = explore(observer, system)
-        rest = np.full(max(_LEAST, math.ceil(1.2 * len(best.noise))), proof.bounds[-1])
+        rest = np.full(min(max(_LEAST, math.ceil(1.2 * len(best.noise))), _MOST), proof.bounds[-1])
         after = np.concatenate([proof.bounds, rest])
         worst, latest, violations = explored.worst, -1, int(explored.worst > rest[0] * (1.0 + _ROUNDING))
         bound, push = jnp.asarray(system.noise), jnp.asarray(system.push)
