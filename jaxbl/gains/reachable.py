@@ -35,6 +35,9 @@ _LANES = 4096
 class Reached(NamedTuple):
     """What a search found.
 
+    Choices lead there under the rounding of the search. An adversary who sees the errors gets there under any: where noise
+    puts an innovation beside a switch, it must be the innovation that is repeated.
+
     Attributes:
         worst: largest velocity error.
         kept: errors that were kept.
