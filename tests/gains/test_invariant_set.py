@@ -10,8 +10,10 @@ import pytest
 from error_steps import stepped
 
 from jaxbl.errors import NoResult
+from jaxbl.gains.adversary import explore
 from jaxbl.gains.differentiation_bound import least_worst_error
 from jaxbl.gains.invariant_set import ErrorSystem, _Rows, prove
+from jaxbl.observer import ExplicitSuperTwisting
 from jaxbl.observer.conditions import convergence_time_worst
 
 SYSTEMS = [
@@ -134,6 +136,15 @@ def test_reaching_time_without_noise_is_that_of_continuous_time(lambda_, alpha, 
         time = float(convergence_time_worst(*(jnp.asarray(x) for x in (lambda_, alpha, 1.0, 0.0, speed))))
     reached = int((proof.bounds <= 1.05 * proof.bounds[-1]).argmax())
     assert reached == pytest.approx(time, rel=within)
+
+
+def test_forward_euler_with_a_large_lambda_has_a_set():
+    """It swings between ±lambda² / 4, far beyond what the start makes of it."""
+    system = ErrorSystem(False, 20.0, 1.5, 0.0)
+    bound = prove(system, 1.0, 0.0, finest=0.05).bounds[-1]
+    with jax.enable_x64(True):
+        found, _ = explore(ExplicitSuperTwisting(jnp.asarray(20.0), jnp.asarray(1.5)), system)
+    assert 50.0 < found.worst <= bound <= 1.1 * found.worst
 
 
 @pytest.mark.parametrize("implicit", [True, False])
