@@ -8,9 +8,7 @@ Under noise: a double integrator under an unknown acceleration |d| <= L, read ev
 velocity error beside the least one that any causal differentiator can have. For linear observers that is the sum of absolute
 sensitivities. For switching ones it is the largest of those that adversaries find, a lower bound of the worst case:
 
-- a search over reachable errors: the error obeys equations of its own, and of all errors reached so far those are kept that
-  are farthest in each of many directions, over all sides of d and many values of eta. No gradient is needed, and the horizon
-  costs nothing but time. The path that it found is simulated again.
+- the search over reachable errors of jaxbl.gains.reachable, over both sides of d and many values of eta.
 - the two pairs of signals behind the bounds of jaxbl.gains.differentiation_bound.
 
 Units there: T = 1, L = 1.
@@ -24,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.gains.differentiation_bound import best_samples, least_exact_error, least_worst_error, worst_signal
+from jaxbl.gains.reachable import explore, step_of
 from jaxbl.observer import (
     COEFFICIENTS,
     DIFFERENTIATORS,
@@ -184,71 +183,20 @@ def worst_linear(kind, gains, noise, samples):
     return jnp.abs(sensitivity).sum()
 
 
-NEAR = np.array([0.0, 1.0, 4.0])
+NEAR = np.array([-4.0, -1.0, 0.0, 1.0, 4.0])
 """Innovations (T² L) to try beside noises from -N to N: those near zero decide what a switching term does."""
 
 
-@functools.partial(jax.jit, static_argnums=(0, 3, 4, 5, 6))
-def reached(kind, gains, noise, samples, width, levels, cells):
-    """Largest velocity error after each sample, its candidate and noise; the candidates kept and their noise."""
-    observer, zero = kind(*gains), jnp.zeros(())
-    first = observer.start(zero, zero, free, jnp.ones(()))
-    size = 2 + len(first.further)
-    sides = round(cells ** (1.0 / size))
-    angles = 2.0 * np.pi * (np.arange(width) + 0.5) / width
-    random = np.random.default_rng(0).normal(size=(width, size))
-    directions = np.stack([np.cos(angles), np.sin(angles)], 1) if size == 2 else random
-    directions = jnp.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
-    # the true position and velocity stay zero: what d adds to them is taken from the observer's
-    shift = np.array([0.5, 1.0] + [0.0] * (size - 2))
-    sides_of_d = jnp.asarray(np.outer([-1.0, 1.0], shift)[None, None])
-    spaced, near = noise * jnp.linspace(-1.0, 1.0, levels), jnp.asarray([*-NEAR[:0:-1], *NEAR])
+def searched(kind, gains, noise, most=1_200_000):
+    """The largest velocity error that the search finds."""
 
-    def step(x):
-        etas = jnp.concatenate([spaced, jnp.clip(x[0] + near, -noise, noise)])
+    def noises(states):
+        spaced = np.repeat(np.linspace(-noise, noise, 5)[:, None], len(states), axis=1)
+        return np.concatenate([spaced, np.clip(NEAR[:, None] - states[:, 0], -noise, noise)])
 
-        def under(eta):
-            new, estimate = observer.step(ObserverState(x[0], x[1], tuple(x[2:])), eta, free, jnp.ones(()))
-            return jnp.stack([new.position, new.velocity, *new.further]), jnp.abs(estimate.velocity)
-
-        return *jax.vmap(under)(etas), etas
-
-    def one(x, _):
-        new, miss, etas = jax.vmap(step)(x)
-        # two candidates for each, one for either side of d
-        candidates = (new[:, :, None, :] - sides_of_d).reshape(-1, size)
-        # in coordinates in which they spread alike on all sides
-        scaled = candidates / jnp.maximum(jnp.abs(candidates).max(axis=0, keepdims=True), 1e-300)
-        spread, turn = jnp.linalg.eigh(scaled.T @ scaled / scaled.shape[0])
-        scaled = scaled @ (turn / jnp.sqrt(jnp.maximum(spread, 1e-12 * spread[-1]))[None])
-        support = (scaled @ directions.T).argmax(axis=0)
-        # the set is not convex: one of each cell of a grid over it, too, the one farthest from zero
-        places = scaled / jnp.abs(scaled).max(axis=0, keepdims=True)
-        cell = ((0.5 * places + 0.5) * sides * (1.0 - 1e-12)).astype(int) @ sides ** np.arange(size)
-        radius = jnp.linalg.norm(scaled, axis=1)
-        most = jax.ops.segment_max(radius, cell, sides**size)
-        inner = jnp.where(radius >= most[cell], jnp.arange(radius.size), -1)
-        inner = jax.ops.segment_max(inner, cell, sides**size)
-        kept = jnp.concatenate([support, jnp.where(inner < 0, support[0], inner)])
-        best = miss.argmax()
-        return candidates[kept], (miss.max(), best, etas.ravel()[best], kept, etas.ravel()[kept // 2])
-
-    start = jnp.tile(jnp.stack([first.position, first.velocity, *first.further]), (width + sides**size, 1))
-    return jax.lax.scan(one, start, None, length=samples)[1]
-
-
-def searched(kind, gains, noise, samples, width=64, levels=5, cells=500):
-    """The shares of d and eta that lead to the largest velocity error of the search, shape (2, samples)."""
-    found = (np.asarray(x) for x in reached(kind, gains, noise, samples, width, levels, cells))
-    largest, best, best_eta, kept, kept_eta = found
-    each = levels + 2 * NEAR.size - 1
-    last = int(largest.argmax())
-    d, eta = np.zeros(last + 1), np.zeros(last + 1)
-    eta[last], at = best_eta[last], best[last] // each
-    for i in range(last - 1, -1, -1):
-        before, side = divmod(int(kept[i][at]), 2)
-        d[i], eta[i], at = 2.0 * side - 1.0, kept_eta[i][at], before // each
-    return np.stack([d, eta / max(noise, 1e-300)])
+    observer, zero = kind(*map(jnp.asarray, gains)), jnp.zeros(())
+    further = len(observer.start(zero, zero, free, jnp.ones(())).further)
+    return explore(step_of(observer), noises, np.array([[0.5, 1.0] + [0.0] * further]), most).worst
 
 
 @functools.cache
@@ -266,8 +214,7 @@ def worst(kind, gains, noise, samples):
     """The largest velocity error found."""
     if kind in (Luenberger, ExtendedState):
         return float(worst_linear(kind, gains, noise, samples))
-    paths = [jnp.asarray(searched(kind, gains, noise, samples)), *pairs(noise, samples)]
-    return max(float(simulated(kind, gains, noise, path)) for path in paths)
+    return max(searched(kind, gains, noise), *(float(simulated(kind, gains, noise, x)) for x in pairs(noise, samples)))
 
 
 def chatter(observer):

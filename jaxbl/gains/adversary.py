@@ -1,9 +1,8 @@
 """Noise and disturbance that make a super-twisting observer's velocity error large: a search, for what proofs allow.
 
 The error system is that of :mod:`.invariant_set`, in its units; every error found here is one that bounded noise and a
-bounded missing acceleration do cause. The best adversaries come from an exploration: of all states reached so far one is
-kept in each cell of the phase plane, with the choices that led to it, and each is carried on by the extreme choices. Runs
-then try these sequences with parts flipped, steady and random switching, and feedback by regions of the phase plane.
+bounded missing acceleration do cause. The best adversaries come from an exploration (:mod:`.reachable`). Runs then try what
+it found with parts flipped, steady and random switching, and feedback by regions of the phase plane.
 """
 
 import functools
@@ -17,18 +16,15 @@ from jaxtyping import Array
 
 from jaxbl.observer.super_twisting import DISCRETISATIONS, AbstractSuperTwisting
 
-from .invariant_set import ErrorSystem, Proof, left_over
+from . import reachable
+from .invariant_set import ErrorSystem, Proof
+from .reachable import Reached
 
-_CELLS = 100, 60
-"""Cells of the exploration from zero to the proven bounds of position and velocity."""
-_MOST_KEPT = 400_000
 _SIDE = 1e-6
 """Innovation, over 1 + N, from which on its sign is sure."""
 _LANES = 1 << 14
-_LONGEST = 2_000
-"""Most samples of the exploration's ways."""
-_LEAST = 100
-"""Samples of a run from rest; more where the longest way found is near that."""
+_LEAST, _MOST = 100, 2_000
+"""Samples of a run from rest: by the length of the way that the exploration found."""
 _FROM_START = 0.1
 """Part of the runs that begin with starting errors, and last until the errors have settled."""
 _RATES = (1e-3, 0.5)
@@ -69,70 +65,23 @@ class Search(NamedTuple):
     sequence: Sequence
 
 
-def _corrected(system: ErrorSystem, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """phi(b) and u."""
-    if not system.implicit:
-        return -system.lambda_ * np.sign(b) * np.sqrt(np.abs(b)), system.alpha * np.sign(b)
-    u = np.clip(b, -system.alpha, system.alpha)
-    return np.sign(b) * left_over(system, np.abs(b - u)) ** 2 - b - u, u
+def explore(observer: AbstractSuperTwisting, system: ErrorSystem) -> tuple[Reached, Sequence]:
+    """Errors of this observer that can be reached from rest, and the way to the worst one; for use with x64 enabled."""
+    n, a = system.noise, system.alpha
+    # the ends of the sliding set; a switch of which rounding would decide is left out
+    ends = np.array([a, -a, 0.0] if system.implicit else [_SIDE * (1.0 + n), -_SIDE * (1.0 + n)])
+    # of one sign, and with a switch in the middle of the period; the nominal acceleration with it or against it
+    signs = (1.0, -1.0) if system.push else (1.0,)
+    mean, moment, nominal = np.array([(*one, sign) for one in ((1.0, 0.5), (0.0, 0.25)) for sign in signs]).T
 
+    def noises(states: np.ndarray) -> np.ndarray:
+        extreme = np.clip(ends[:, None] - states[:, 0], -n, n)
+        return np.concatenate([extreme, np.full((1, len(states)), n), np.full((1, len(states)), -n)])
 
-_PUSHES = ((1.0, 0.5), (-1.0, -0.5), (0.0, 0.25), (0.0, -0.25))
-"""Extreme m and q: of one sign, and with a switch in the middle of the period."""
-
-
-def explore(system: ErrorSystem, extent: tuple[float, float], samples: int) -> tuple[float, int, Sequence]:
-    """The largest velocity error from rest that the exploration reaches, how many states it kept, and the way there.
-
-    Args:
-        system: the error system.
-        extent: about how large e and g become, f⁺ T² and f⁺ T.
-        samples: most samples of a way.
-    """
-    size = extent[0] / _CELLS[0], extent[1] / _CELLS[1]
-    e, g = np.zeros(1), np.zeros(1)
-    last, parent, chosen = np.zeros(1, int), [np.full(1, -1)], [np.zeros((1, 4))]
-    fresh, kept, worst = np.ones(1, bool), 1, (0.0, 0, 0.0)
-    for _ in range(samples):
-        x, v, ways = e[fresh], g[fresh], []
-        if not len(x) or kept > _MOST_KEPT:
-            break
-        n, a = system.noise, system.alpha
-        # the ends of the noise, and those of the sliding set; a switch of which rounding would decide is left out
-        ends = (a, -a, 0.0) if system.implicit else (_SIDE * (1.0 + n), -_SIDE * (1.0 + n))
-        for noise in (np.full(len(x), -n), np.full(len(x), n), *(np.clip(at - x, -n, n) for at in ends)):
-            phi, u = _corrected(system, x + noise)
-            error = np.abs(v - u if system.implicit else v)
-            k = int(error.argmax())
-            if error[k] > worst[0]:
-                worst = float(error[k]), int(last[fresh][k]), float(noise[k])
-            for mean, moment in _PUSHES:
-                sign = 1.0 if moment > 0.0 else -1.0
-                choice = np.column_stack([noise, *(np.full(len(x), one) for one in (mean, moment, sign))])
-                ways.append((x + phi + v + moment + 0.5 * system.push * sign, v - u + mean, last[fresh], choice))
-        new_e, new_g, come, choices = (np.concatenate(part) for part in zip(*ways, strict=True))
-        all_e, all_g = np.concatenate([e, new_e]), np.concatenate([g, new_g])
-        cells = np.round(all_e / size[0]).astype(np.int64) * 2**31 + np.round(all_g / size[1]).astype(np.int64)
-        # one state a cell, the outermost; the one that is there, of equals
-        far = np.abs(all_e) / extent[0] + (all_g / extent[1]) ** 2
-        far[: len(e)] += 1e-9
-        order = np.lexsort((-far, cells))
-        first = order[np.concatenate([[True], np.diff(cells[order]) != 0])]
-        old, new = first[first < len(e)], first[first >= len(e)] - len(e)
-        parent.append(come[new])
-        chosen.append(choices[new])
-        last = np.concatenate([last[old], kept + np.arange(len(new))])
-        e, g = np.concatenate([e[old], new_e[new]]), np.concatenate([g[old], new_g[new]])
-        fresh = np.arange(len(e)) >= len(old)
-        kept += len(new)
-    parents, choices = np.concatenate(parent), np.concatenate(chosen)
-    # the worst error shows after the noise of its own sample; what is pushed then does not count
-    way = [np.array([worst[2], 1.0, 0.5, 1.0])]
-    k = worst[1]
-    while parents[k] >= 0:
-        way.append(choices[k])
-        k = parents[k]
-    return worst[0], kept, Sequence(*np.array(way[::-1]).T)
+    found = reachable.explore(
+        reachable.step_of(observer), noises, np.column_stack([moment + 0.5 * system.push * nominal, mean])
+    )
+    return found, Sequence(found.noise, *(found.sign * x[found.push] for x in (mean, moment, nominal)))
 
 
 class _Lanes(NamedTuple):
@@ -264,16 +213,14 @@ def search(
         runs: at least so many are simulated; rounded up to whole batches.
         seed: of what is drawn at random.
     """
-    bounds = proof.bounds
-    reached, explored, way = explore(system, (float(proof.upper.max()), bounds[-1]), _LONGEST)
-    length = max(_LEAST, math.ceil(1.2 * len(way.noise)))
-    rest = np.full(length, bounds[-1])
-    after = np.concatenate([bounds, rest])
     name = "implicit" if system.implicit else "explicit"
     rng, batches = np.random.default_rng(seed), max(1, math.ceil(runs / _LANES))
-    worst, latest, violations, best = reached, -1, int(reached > bounds[-1] * (1.0 + _ROUNDING)), way
     with jax.enable_x64(True):
         observer = DISCRETISATIONS[name](jnp.asarray(system.lambda_), jnp.asarray(system.alpha))
+        explored, best = explore(observer, system)
+        rest = np.full(min(max(_LEAST, math.ceil(1.2 * len(best.noise))), _MOST), proof.bounds[-1])
+        after = np.concatenate([proof.bounds, rest])
+        worst, latest, violations = explored.worst, -1, int(explored.worst > rest[0] * (1.0 + _ROUNDING))
         bound, push = jnp.asarray(system.noise), jnp.asarray(system.push)
 
         def run(lanes: _Lanes, limits: np.ndarray, keep: bool = False) -> tuple[Any, ...]:
@@ -296,7 +243,7 @@ def search(
                 kept = run(alone, limits, keep=True)[3]
                 best = Sequence(*(x[:, 0] for x in kept))
             worst = max(worst, float(most.max()))
-    return Search(batches * _LANES, explored, worst, latest, violations, best)
+    return Search(batches * _LANES, explored.kept, worst, latest, violations, best)
 
 
 def _extended(sequence: Sequence, samples: int) -> Sequence:

@@ -83,13 +83,13 @@ def certify(
     """
     inputs = Inputs(discretisation, period, f_plus, noise, velocity_error, position_error, acceleration)
     proven = _prove(lambda_, alpha, inputs, accuracy)
-    system, start, proof, settled, reached = proven
-    speed, final = f_plus * period, float(proof.bounds[-1])
-    found = search(system, *start, proof, settled, runs, seed)
+    system, start, proof, bounds, settled, reached = proven
+    speed, final = f_plus * period, float(bounds[-1])
+    found = search(system, *start, proof, settled / speed, runs, seed)
     with jax.enable_x64(True):
         numbers = (lambda_, alpha, f_plus, start[0] * speed * period, velocity_error)
         continuous = float(convergence_time_worst(*(jnp.asarray(float(x)) for x in numbers)))
-    kept = np.unique(np.linspace(0, len(proof.bounds) - 1, _POINTS).astype(int))
+    kept = np.unique(np.linspace(0, len(bounds) - 1, _POINTS).astype(int))
     why = None
     if found.violations:
         why = (
@@ -101,17 +101,17 @@ def certify(
         "why_none": why,
         "gains": {"lambda": lambda_, "alpha": alpha},
         "assumptions": inputs.data(),
-        "accuracy": settled * speed,
+        "accuracy": settled,
         "reaching_time": reached * period,
-        "final_accuracy": final * speed,
+        "final_accuracy": final,
         "reaching_time_continuous": continuous,
         "resolution": proof.row * speed,
-        "curve": {"time": (kept * period).tolist(), "bound": (proof.bounds[kept] * speed).tolist()},
+        "curve": {"time": (kept * period).tolist(), "bound": bounds[kept].tolist()},
         "search": {
             "runs": found.runs,
             "explored": found.explored,
             "worst": found.worst * speed,
-            "ratio": final / found.worst if found.worst else None,
+            "ratio": proof.bounds[-1] / found.worst if found.worst else None,
             "reaching_time": (found.latest + 1) * period,
             "violations": found.violations,
         },
@@ -144,12 +144,13 @@ class Inputs(NamedTuple):
 
 
 class _Proven(NamedTuple):
-    """A proof, in units of f⁺ T² and f⁺ T: the system, its starting errors, the bound that counts and the sample from which
-    it holds."""
+    """A proof: the system, its starting errors and its sets in units of f⁺ T² and f⁺ T; bounds by sample and the one that
+    counts (rad/s), and the sample from which the latter holds."""
 
     system: ErrorSystem
     start: tuple[float, float]
     proof: Proof
+    bounds: np.ndarray
     settled: float
     reached: int
 
@@ -160,14 +161,17 @@ def _prove(lambda_: float, alpha: float, inputs: Inputs, accuracy: float | None)
         raise InputError(
             f"discretisation: '{inputs.discretisation}' is none; it should be one of {', '.join(DISCRETISATIONS)}"
         )
-    numbers = {"lambda": lambda_, "alpha": alpha, "position_error": inputs.start} | inputs._asdict()
+    numbers = inputs._asdict() | {
+        "lambda": lambda_, "alpha": alpha, "position_error": inputs.start, "accuracy": accuracy,
+    }  # fmt: skip
     for name in ("lambda", "alpha", "noise", "velocity_error", "position_error", "acceleration"):
-        value = inputs.start if name == "position_error" else numbers[name]
+        value = numbers[name]
         if not (math.isfinite(value) and value >= 0.0):
             raise InputError(f"{name}: a certificate needs a finite number >= 0, not {value}")
-    for name in ("f_plus", "period"):
-        if not (math.isfinite(numbers[name]) and numbers[name] > 0.0):
-            raise InputError(f"{name}: a certificate needs a finite number > 0, not {numbers[name]}")
+    for name in ("f_plus", "period", "accuracy"):
+        value = numbers[name]
+        if value is not None and not (math.isfinite(value) and value > 0.0):
+            raise InputError(f"{name}: a certificate needs a finite number > 0, not {value}")
     with jax.enable_x64(True):
         ratio = float(peak_ratio(*(jnp.asarray(float(x)) for x in (lambda_, alpha, f_plus))))
     if alpha <= f_plus:
@@ -183,17 +187,17 @@ def _prove(lambda_: float, alpha: float, inputs: Inputs, accuracy: float | None)
     system = ErrorSystem(implicit, lambda_ / math.sqrt(f_plus), alpha / f_plus, inputs.noise / length, push)
     start = inputs.start / length, inputs.velocity_error / speed
     proof = prove(system, *start)
-    final = float(proof.bounds[-1])
-    settled = SETTLED * final if accuracy is None or accuracy < final * speed else accuracy / speed
-    return _Proven(system, start, proof, settled, int((proof.bounds <= settled).argmax()))
+    bounds = proof.bounds * speed
+    # in the units of what is asked for: a quotient could come out below the last bound, which none then keeps
+    settled = SETTLED * float(bounds[-1]) if accuracy is None or accuracy < bounds[-1] else accuracy
+    return _Proven(system, start, proof, bounds, settled, int((bounds <= settled).argmax()))
 
 
 def _limits(inputs: Inputs, proven: _Proven, accuracy: float | None, reaching_time: float | None) -> dict[str, Any]:
     """What was asked for, and whether it is met; the time is that to the accuracy asked for, if that is met."""
     found: dict[str, Any] = {}
     if accuracy is not None:
-        final = proven.proof.bounds[-1] * inputs.f_plus * inputs.period
-        found["accuracy"] = {"asked": accuracy, "met": bool(final <= accuracy)}
+        found["accuracy"] = {"asked": accuracy, "met": bool(proven.bounds[-1] <= accuracy)}
     if reaching_time is not None:
         found["reaching_time"] = {"asked": reaching_time, "met": proven.reached * inputs.period <= reaching_time}
     return found

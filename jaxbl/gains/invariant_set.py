@@ -32,11 +32,13 @@ _FINER = 0.02
 """What rows of half the height may be worth of alpha - f⁺."""
 _LATTICE = 0.25
 """Bounds of e are rounded up to multiples of this part of dg: sets are then finitely many, and images come to rest."""
-_SLACK = 1e-9
-"""Of that lattice, for rounding errors of the arithmetic: at least a hundred times what double precision makes."""
+_SLACK, _ULPS = 1e-9, 16.0 * np.finfo(float).eps
+"""For rounding errors of the arithmetic: parts of that lattice, and of the numbers that are added up."""
 _STEPS = 100_000
 _TAIL, _RESTS = 2_000, 1.001
 """A set that still shrinks is taken as it is where the bound was at most so many times as large so many samples before."""
+_SWING = 1e5
+"""Most that is added to the reach of the start for the chatter of forward Euler, f⁺ T: what memory allows."""
 _GROUP = 0.02
 """Change of u over sqrt(1 + N) that counts as one within the sliding set."""
 
@@ -65,12 +67,10 @@ class Proof(NamedTuple):
     Attributes:
         bounds: of the error of the velocity estimate at sample k, f⁺ T; at later samples the last one.
         row: height dg of the rows, f⁺ T.
-        upper: bounds of e in the rows of the last set, which is never left, f⁺ T²; rows from -dg len(upper) / 2 on.
     """
 
     bounds: Float[np.ndarray, " samples"]
     row: float
-    upper: Float[np.ndarray, " rows"]
 
 
 class _Left(Exception):
@@ -124,8 +124,10 @@ class _Rows:
             np.maximum(found, np.where(inside, upper[np.clip(row, 0, len(upper) - 1)], -np.inf), out=found)
         return self._rounded(found)
 
-    def _rounded(self, upper: np.ndarray) -> np.ndarray:
-        return np.ceil(upper / self.lattice + _SLACK) * self.lattice
+    def _rounded(self, upper: np.ndarray, size: float = 0.0) -> np.ndarray:
+        """Bounds on the lattice; `size` of the terms that they are sums of, where these are larger."""
+        size = max(size, float(np.abs(upper[upper > -np.inf]).max(initial=0.0)))
+        return np.ceil(upper / self.lattice + _SLACK + _ULPS * size / self.lattice) * self.lattice
 
     @np.errstate(invalid="ignore")  # empty rows
     def image(self, upper: np.ndarray) -> tuple[np.ndarray, float]:
@@ -143,8 +145,11 @@ class _Rows:
         for shift, moment in enumerate(self.moments):
             part = moved[shift : shift + len(corrected)]
             np.maximum(part, corrected + moment, out=part)
+        far = float(np.abs(upper[filled]).max()) + self.system.noise
+        size = far + self.system.lambda_ * math.sqrt(far) + 2.0 * self.system.alpha + (last - self.half) * self.dg
+        size += float(self.moments[-1])
         new = np.full(len(upper), -np.inf)
-        new[first - margin : last + margin] = self._rounded(moved)
+        new[first - margin : last + margin] = self._rounded(moved, size)
         return new, float(top * self.dg)
 
     def _corrected(self, high: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -221,9 +226,11 @@ def prove(system: ErrorSystem, position: float, velocity: float, *, finest: floa
     reach = velocity + math.sqrt(2.0 * (system.alpha + 1.0) * position)
     reach += 10.0 * math.sqrt((system.alpha + 1.0) * (1.0 + system.noise + system.push)) + 4.0 * system.alpha
     height = finest * math.sqrt(1.0 + system.noise)
-    for more in (1.0, 4.0):
+    # forward Euler with a large lambda swings to and fro by lambda² / 2
+    swing = 0.0 if system.implicit else min(system.lambda_**2, _SWING)
+    for more, wider in ((1.0, 0.0), (4.0, swing)):
         try:
-            return _settled(system, height, (position, velocity), more * reach, _COARSE * more**2)
+            return _settled(system, height, (position, velocity), more * reach + wider, _COARSE * more**2)
         except _Left:
             continue
     raise NoResult("no set of errors was found that noise and disturbance cannot leave: the sets grow without end")
@@ -243,7 +250,7 @@ def _settled(system: ErrorSystem, height: float, start: tuple[float, float], rea
         coarse = rows.height > height
         if period and not coarse:
             least = np.maximum.accumulate(np.array(bounds)[::-1])[::-1]
-            return Proof(least[: k - period + 1], rows.dg, new)
+            return Proof(least[: k - period + 1], rows.dg)
         upper = new
         if coarse and (period or bound < 0.25 * coarsest * rows.height):
             # what is left is small: lower rows, down to those asked for

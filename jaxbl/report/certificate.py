@@ -1,5 +1,6 @@
 """What a certificate of `jaxbl tune` says: sentences, a table, and `certificate.json` beside the gains."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -41,17 +42,32 @@ def refuted(summary: dict[str, Any]) -> bool:
     return any(found.get("search", {}).get("violations") for found in summary.get("certificates", {}).values())
 
 
+def _above(value: float, sign: float = 1.0) -> float:
+    """Rounded up to four digits (to rounding errors): what is printed as proven must not say more than the proof."""
+    if value == 0.0:
+        return value
+    unit = 10.0 ** (math.floor(math.log10(value)) - 3)
+    return float(f"{sign * math.ceil(sign * value / unit - 1e-9) * unit:.4g}")
+
+
+def _below(value: float) -> float:
+    """Rounded down, for what is assumed."""
+    return _above(value, -1.0)
+
+
 def _lines(side: str, found: dict[str, Any], passed_over: int) -> list[str]:
     if not found["certified"]:
         return [f"{side}: no certificate: {found['why_none']}."]
-    given, tried = found["assumptions"], found["search"]
+    given = {name: _below(value) for name, value in found["assumptions"].items() if name != "discretisation"}
+    tried = found["search"]
     against = "" if tried["ratio"] is None else f", the bound is {tried['ratio']:.3g} times that"
-    nominal = f", nominal acceleration of {given['acceleration']:.3g} rad/s²" if "acceleration" in given else ""
+    nominal = f", nominal acceleration of {given['acceleration']:.4g} rad/s²" if "acceleration" in given else ""
     lines = [
-        f"{side}, proven: velocity error at most {found['accuracy']:.3g} rad/s from {found['reaching_time']:.3g} s on, and "
-        f"{found['final_accuracy']:.3g} rad/s in the end, for any noise within ±{given['noise']:.3g} rad and any missing "
-        f"acceleration within ±{given['f_plus']:.4g} rad/s²{nominal}, sampled every {given['period']:.3g} s, from errors of "
-        f"{given['velocity_error']:.3g} rad/s and {given['position_error']:.3g} rad.",
+        f"{side}, proven: velocity error at most {_above(found['accuracy']):.4g} rad/s from "
+        f"{_above(found['reaching_time']):.4g} s on, and {_above(found['final_accuracy']):.4g} rad/s in the end, for any "
+        f"noise within ±{given['noise']:.4g} rad and any missing acceleration within ±{given['f_plus']:.4g} rad/s²{nominal}"
+        f", sampled every {found['assumptions']['period']:.4g} s, from errors of {given['velocity_error']:.4g} rad/s and "
+        f"{given['position_error']:.4g} rad.",
         f"{side}, tried: the worst of {tried['runs']} adversarial runs errs by {tried['worst']:.3g} rad/s{against}; none "
         "violates what is proven.",
     ]
@@ -77,9 +93,10 @@ def certificate_tables(summary: dict[str, Any]) -> list[PageTable]:
              "found from (s)", "without noise, continuous (s)", "noise (rad)", "f⁺ (rad/s²)", "period (s)",
              "velocity error at start (rad/s)", "position error at start (rad)"]  # fmt: skip
     sides = [
-        [one["accuracy"], one["reaching_time"], one["final_accuracy"], one["search"]["worst"], one["search"]["ratio"],
-         one["search"]["reaching_time"], one["reaching_time_continuous"],
-         *(one["assumptions"][name] for name in ("noise", "f_plus", "period", "velocity_error", "position_error"))]
+        [*(_above(one[name]) for name in ("accuracy", "reaching_time", "final_accuracy")), one["search"]["worst"],
+         one["search"]["ratio"], one["search"]["reaching_time"], one["reaching_time_continuous"],
+         *(one["assumptions"][name] if name == "period" else _below(one["assumptions"][name])
+           for name in ("noise", "f_plus", "period", "velocity_error", "position_error"))]
         for one in found.values()
     ]  # fmt: skip
     columns, rows = ["", *found], list(zip(names, *sides, strict=True))

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 
 import jax
 import numpy as np
@@ -16,6 +17,7 @@ from jaxbl.gains import certificate
 from jaxbl.gains.certificate import certify
 from jaxbl.gains.differentiation_bound import least_worst_error
 from jaxbl.gains.tune import tune
+from jaxbl.report.certificate import certificate_lines, certificate_tables
 from jaxbl.report.tune import write_tune_report
 
 GAINS = 2.2, 9.2
@@ -77,6 +79,50 @@ def test_limits_are_met_or_not(proven):
     assert not any(limit["met"] for limit in narrow["limits"].values())
 
 
+@pytest.mark.parametrize(("f_plus", "period"), [(14.08, 1e-4), (6.89, 1e-4), (7.8, 1e-4), (2.6, 5e-4)])
+def test_the_final_accuracy_itself_can_be_asked_for(f_plus, period):
+    """In units of f⁺ T it may come out below the last bound by rounding; no bound is then as small."""
+    gains = 2.5 * math.sqrt(f_plus), 3.0 * f_plus
+    bounds = {"noise": 0.5 * f_plus * period**2, "f_plus": f_plus, "period": period, "velocity_error": 2.0 * f_plus * period}
+    free = certify(*gains, **bounds, runs=1)
+    asked = certify(*gains, **bounds, runs=1, accuracy=free["final_accuracy"])
+    assert asked["accuracy"] == free["final_accuracy"]
+    assert asked["limits"]["accuracy"]["met"]
+    assert asked["reaching_time"] >= free["reaching_time"] > 0.0
+    curve = free["curve"]
+    assert np.interp(asked["reaching_time"], curve["time"], curve["bound"]) == asked["accuracy"]
+
+
+@pytest.mark.parametrize("change", [1.0, 1.00004, 0.99996])
+def test_what_is_printed_is_proven(proven, change):
+    """Bounds are rounded up, and what they assume is rounded down."""
+    scaled = ("accuracy", "final_accuracy", "reaching_time")
+    found = proven | {name: change * proven[name] for name in scaled}
+    given = {name: change * proven["assumptions"][name] for name in ("noise", "f_plus", "velocity_error", "position_error")}
+    found["assumptions"] = proven["assumptions"] | given
+    summary = {"certificates": {"motor": found}, "passed_over": {"motor": 0}}
+    line = certificate_lines(summary)[0]
+    accuracy, time, final, noise, f_plus, period, velocity, position = map(
+        float, re.findall(r"[\d.]+(?:e-\d+)?(?= |\.$)", line)
+    )
+    assert period == proven["assumptions"]["period"]
+    table = certificate_tables(summary)[0]
+    row = dict(zip(table.columns, table.rows[0], strict=True))
+    for value, other, printed in (
+        (found["accuracy"], "accuracy (rad/s)", accuracy),
+        (found["reaching_time"], "from (s)", time),
+        (found["final_accuracy"], "in the end (rad/s)", final),
+    ):
+        assert value * (1.0 - 1e-12) <= printed == float(f"{row[other]:.4g}") <= 1.001 * value
+    for name, other, printed in (
+        ("noise", "noise (rad)", noise),
+        ("f_plus", "f⁺ (rad/s²)", f_plus),
+        ("velocity_error", "velocity error at start (rad/s)", velocity),
+        ("position_error", "position error at start (rad)", position),
+    ):
+        assert given[name] * (1.0 + 1e-12) >= printed == float(f"{row[other]:.4g}") >= 0.999 * given[name]
+
+
 @pytest.mark.parametrize(
     ("gains", "message"), [((2.2, 4.9), "does not exceed f⁺ = 5 rad/s²"), ((0.9, 9.2), "the exact condition fails")]
 )
@@ -93,6 +139,7 @@ def test_gains_of_which_nothing_can_be_proven(gains, message):
         ({"position_error": math.inf}, "position_error: .* not inf"),
         ({"f_plus": 0.0}, "f_plus: a certificate needs a finite number > 0, not 0.0"),
         ({"period": 0.0}, "period: .* > 0"),
+        ({"accuracy": math.nan}, "accuracy: a certificate needs a finite number > 0, not nan"),
         ({"discretisation": "exact"}, "discretisation: 'exact' is none; it should be one of implicit, explicit"),
     ],
 )

@@ -1,6 +1,7 @@
 """Sets that are never left: against the observer's own step, all sequences of a short horizon, and known bounds."""
 
 import itertools
+from decimal import Decimal
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +10,10 @@ import pytest
 from error_steps import stepped
 
 from jaxbl.errors import NoResult
+from jaxbl.gains.adversary import explore
 from jaxbl.gains.differentiation_bound import least_worst_error
 from jaxbl.gains.invariant_set import ErrorSystem, _Rows, prove
+from jaxbl.observer import ExplicitSuperTwisting
 from jaxbl.observer.conditions import convergence_time_worst
 
 SYSTEMS = [
@@ -65,6 +68,22 @@ def test_image_holds_whatever_the_adversary_does(system):
     assert inside.all()
 
 
+def test_rounding_errors_of_large_numbers_stay_inside():
+    """Of the lattice, double precision has hundredths at 1e14: the exact successors are still in the image."""
+    system, rng = ErrorSystem(False, 2.0, 4.0, 20.0), np.random.default_rng(5)
+    rows = _Rows(system, 0.25, 400.0)
+    assert rows.dg == 0.25
+    upper = np.full(2 * rows.half, -np.inf)
+    k = np.arange(rows.half - 1500, rows.half + 1500)
+    upper[k] = rng.uniform(0.5e14, 1.5e14, len(k)).round() * rows.lattice
+    image = rows.image(upper)[0]
+    for row in k:
+        # from the upper end of the row, by the least noise and the largest acceleration: u = a
+        e, g = Decimal(upper[row]), Decimal(float(row - rows.half + 1) * rows.dg)
+        exact = e - 2 * (e - 20).sqrt() + g + Decimal("0.5")
+        assert Decimal(image[row - rows.alpha + rows.push]) >= exact
+
+
 @pytest.mark.parametrize("system", SYSTEMS, ids=str)
 def test_no_sequence_of_a_short_horizon_exceeds_the_bounds(system):
     proof = prove(system, 2.0, 5.0)
@@ -117,6 +136,15 @@ def test_reaching_time_without_noise_is_that_of_continuous_time(lambda_, alpha, 
         time = float(convergence_time_worst(*(jnp.asarray(x) for x in (lambda_, alpha, 1.0, 0.0, speed))))
     reached = int((proof.bounds <= 1.05 * proof.bounds[-1]).argmax())
     assert reached == pytest.approx(time, rel=within)
+
+
+def test_forward_euler_with_a_large_lambda_has_a_set():
+    """It swings between ±lambda² / 4, far beyond what the start makes of it."""
+    system = ErrorSystem(False, 20.0, 1.5, 0.0)
+    bound = prove(system, 1.0, 0.0, finest=0.05).bounds[-1]
+    with jax.enable_x64(True):
+        found, _ = explore(ExplicitSuperTwisting(jnp.asarray(20.0), jnp.asarray(1.5)), system)
+    assert 50.0 < found.worst <= bound <= 1.1 * found.worst
 
 
 @pytest.mark.parametrize("implicit", [True, False])

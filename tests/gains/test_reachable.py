@@ -1,0 +1,91 @@
+"""The search over reachable errors: against a linear worst case, all sequences of a short horizon, and simulation."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxbl.gains.reachable import explore, step_of
+from jaxbl.observer import DIFFERENTIATORS, ExplicitSuperTwisting, ImplicitSuperTwisting, Luenberger, ObserverState
+
+KINDS = [(ImplicitSuperTwisting, (1.5, 1.1)), (ExplicitSuperTwisting, (1.5, 1.1)), (DIFFERENTIATORS[2], (1.0,)),
+         (DIFFERENTIATORS[3], (1.0,))]  # fmt: skip
+NOISE = 3.0
+
+
+@pytest.fixture(autouse=True)
+def _double():
+    with jax.enable_x64(True):
+        yield
+
+
+def noises(states):
+    spaced = NOISE * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+    return np.concatenate([
+        np.repeat(spaced[:, None], len(states), axis=1),
+        np.clip(np.array([-1.1, 0.0, 1.1])[:, None] - states[:, 0], -NOISE, NOISE),
+    ])  # fmt: skip
+
+
+def searched(kind, gains, most=50_000):
+    observer, zero = kind(*map(jnp.asarray, gains)), jnp.zeros(())
+    rest = observer.start(zero, zero, lambda v: v, jnp.ones(()))
+    return observer, rest, explore(step_of(observer), noises, np.array([[0.5, 1.0] + [0.0] * len(rest.further)]), most)
+
+
+def errors_of(observer, rest, noise, push):
+    """Velocity errors at the samples of a double integrator: its own simulation, with true motion."""
+
+    def one(carry, given):
+        state, position, velocity = carry
+        eta, d = given
+        state, estimate = observer.step(state, position + eta, lambda v: 0.0 * v, jnp.ones(()))
+        return (state, position + velocity + 0.5 * d, velocity + d), estimate.velocity - velocity
+
+    zero = jnp.zeros(())
+    return jax.lax.scan(one, (rest, zero, zero), (jnp.asarray(noise), jnp.asarray(push)))[1]
+
+
+@pytest.mark.parametrize(("kind", "gains"), KINDS)
+def test_the_way_leads_to_the_error_that_is_found(kind, gains):
+    observer, rest, found = searched(kind, gains)
+    assert np.abs(found.noise).max() <= NOISE
+    assert set(found.sign) <= {-1.0, 1.0} and not found.push.any()
+    errors = errors_of(observer, rest, found.noise, found.sign)
+    assert abs(errors[-1]) == pytest.approx(found.worst, rel=1e-9)
+    assert len(errors) <= found.kept <= 50_000
+
+
+@pytest.mark.parametrize(("kind", "gains"), KINDS)
+def test_it_finds_at_least_what_all_sequences_of_a_short_horizon_do(kind, gains):
+    observer, rest, found = searched(kind, gains)
+    push = np.array(list(itertools.product([-1.0, 1.0], repeat=4)))
+    noise = NOISE * np.array([(1.0, *one) for one in itertools.product([-1.0, 0.0, 1.0], repeat=4)])
+    pairs = np.repeat(noise, len(push), axis=0), np.tile(np.column_stack([push, push[:, -1]]), (len(noise), 1))
+    assert found.worst >= np.abs(jax.vmap(lambda n, d: errors_of(observer, rest, n, d))(*pairs)).max()
+
+
+@pytest.mark.parametrize(("gains", "share"), [((0.4, 0.7), 0.999), ((0.15, 1.0), 0.995), ((0.1, 0.3), 0.998)])
+def test_the_worst_case_of_a_linear_observer_is_almost_reached(gains, share):
+    """That is the sum of absolute sensitivities."""
+    one, unit = jnp.ones(()), np.eye(3)
+    observer = Luenberger(*map(jnp.asarray, gains))
+    further = np.zeros(3), *observer.correction(lambda v: 0.0 * v, one)
+    new, estimate = observer.step(ObserverState(-unit[0], -unit[1], further), unit[2], lambda v: 0.0 * v, one)
+    moved, seen, push = -np.column_stack([new.position, new.velocity]), np.asarray(estimate.velocity), np.array([0.5, 1.0])
+
+    def step(states, noise):
+        given = np.column_stack([states, noise])
+        return given @ moved, np.abs(given @ seen)
+
+    found, worst, left = explore(step, noises, push[None]), NOISE * abs(seen[2]), seen[:2]
+    for _ in range(400):
+        worst, left = worst + NOISE * abs(moved[2] @ left) + abs(push @ left), moved[:2] @ left
+    assert share * worst <= found.worst <= worst * (1.0 + 1e-9)
+
+
+def test_more_errors_kept_find_more():
+    worst = [searched(ImplicitSuperTwisting, (1.5, 1.1), most)[2].worst for most in (2_000, 100_000)]
+    assert worst[0] < worst[1]
