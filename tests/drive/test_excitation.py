@@ -134,6 +134,6 @@ def test_steps_are_independent_of_encoder_noise():
     from jaxbl.simulate import unit_noise
 
     steps = Steps(1.0, 1.0, seed=3)
-    levels = np.array([float(steps(jnp.asarray(i + 0.5))) for i in range(40)])
+    levels = sampled(steps, np.arange(40) + 0.5)
     for noise in unit_noise(jnp.asarray(3), jnp.arange(40), ("motor", "load")).values():
         assert abs(np.corrcoef(levels, 2.0 * norm.cdf(np.asarray(noise)) - 1.0)[0, 1]) < 0.5

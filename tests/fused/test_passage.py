@@ -75,7 +75,8 @@ class Parts(Passage):
 @functools.cache
 def parts(half, precision):
     """Parts of a short run with half of the effects."""
-    whole = experiment(*((HALF, DeadZone(60.0, 0.05)) if half else (OTHERS, LinearShaft(60.0))), precision=precision)
+    names, law = (HALF, DeadZone(60.0, 0.05)) if half else (OTHERS, LinearShaft(60.0))
+    whole = experiment(names, law, steps=200, precision=precision)
     return Parts(whole, (METRICS,), tuple(path for path in leaf_paths(whole) if path.startswith("effects.")), 5, LANES)
 
 
@@ -100,11 +101,16 @@ def test_figures_are_those_of_the_scan(names, law, options):
     for name, figure in fused.items():
         np.testing.assert_allclose(figure, expected[name], rtol=1e-7, err_msg=name)
         np.testing.assert_allclose(device[name], figure, rtol=1e-6, err_msg=name)
-    # what is computed alone is to the bit what it is beside the others
-    some = HostPassage(whole, (metrics(("chatter", "f_plus", "torque_rmse")),), tuple(values), 37, 2)(values, 3)
-    assert len(some) < len(fused)
+
+
+def test_a_figure_computed_alone_is_to_the_bit_what_it_is_beside_the_others():
+    whole = experiment(["motor.coulomb_friction", "load.gravity", "actuator.lag"], DeadZone(60.0, 0.05))
+    values = spread(whole, [path for path in leaf_paths(whole) if path.startswith("effects.")], 37)
+    asked = METRICS, metrics(("chatter", "f_plus", "torque_rmse"))
+    every, some = (HostPassage(whole, (one,), tuple(values), 37, 2)(values, 3) for one in asked)
+    assert len(some) < len(every)
     for name, figure in some.items():
-        np.testing.assert_array_equal(figure, fused[name], err_msg=name)
+        np.testing.assert_array_equal(figure, every[name], err_msg=name)
 
 
 @pytest.mark.slow
@@ -173,9 +179,12 @@ def test_the_kernel_can_be_written_for_a_gpu(half, precision):
         with use_abstract_mesh(AbstractMesh((), (), abstract_device=device)):
             written = jax.jit(kernel.run).trace(*kernel.arguments).lower(lowering_platforms=("cuda",)).as_text()
     assert "fma.rn" in written
-    if jax.default_backend() == "cpu":
-        with pytest.raises(Unsupported, match="how to compile for this device"):
-            kernel.compiled()
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="another device may have a kernel")
+def test_a_processor_has_no_kernel_of_accelerators():
+    with pytest.raises(Unsupported, match="how to compile for this device"):
+        DevicePassage(experiment([], LinearShaft(60.0)), (METRICS,), ("transmission.stiffness",), 5)
 
 
 @pytest.mark.parametrize("half", [True, False], ids=["half", "others"])
