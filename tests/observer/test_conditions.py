@@ -99,9 +99,23 @@ def test_peak_ratio_is_that_of_quadrature_and_of_the_simulated_worst_case(case):
     np.testing.assert_allclose(closed, ratio_by_simulation(*case), rtol=1e-3)
 
 
-# compiled once for the many cases below
-RATIO, BOUND = jax.jit(conditions.peak_ratio), jax.jit(conditions.convergence_time_bound)
-LEAST = {name: jax.jit(least) for name, (_, least) in conditions.CONDITIONS.items()}
+LANES = 300
+
+
+def compiled(function):
+    """For up to so many cases, of whatever shape: one program of each precision."""
+    wide = jax.jit(function)
+
+    def call(*given):
+        given = np.broadcast_arrays(*given)
+        shape, size = given[0].shape, given[0].size
+        return np.asarray(wide(*(np.resize(x, LANES) for x in given)))[:size].reshape(shape)
+
+    return call
+
+
+RATIO, BOUND = compiled(conditions.peak_ratio), compiled(conditions.convergence_time_bound)
+LEAST = {name: compiled(least) for name, (_, least) in conditions.CONDITIONS.items()}
 POSITIVE = st.floats(0.1, 10.0)
 
 
@@ -337,11 +351,7 @@ def test_bound_is_infinite_where_32_fails():
     assert conditions.convergence_time_bound(4.3, 2.0, 1.0, 0.0, 1.0) < jnp.inf
 
 
-WORST, SLOWEST = jax.jit(conditions.convergence_time_worst), jax.jit(conditions.slowest_ray)
-
-
-# one shape, compiled once
-LANES = 300
+WORST, SLOWEST = compiled(conditions.convergence_time_worst), compiled(conditions.slowest_ray)
 
 
 def convergent_gains(seed, nearest=1.02, farthest=40.0):
