@@ -31,7 +31,7 @@ HALF = ["motor.coulomb_friction", "load.stribeck_friction", "load.gravity", "mot
 OTHERS = [*(name for name in VALUES if name not in HALF), *ENCODERS]
 
 
-def experiment(names, law=None, observer="implicit", rigid=False, substeps=2, steps=700, precision="float64"):
+def experiment(names, law=None, observer="implicit", rigid=False, substeps=2, steps=701, precision="float64"):
     kind = DISCRETISATIONS[observer]
     motor = kind(10.0, 90.0, velocity_error=0.5)
     return as_arrays(
@@ -74,10 +74,12 @@ class Parts(Passage):
 
 @functools.cache
 def parts(half, precision):
-    """Parts of a short run with half of the effects."""
-    names, law = (HALF, DeadZone(60.0, 0.05)) if half else (OTHERS, LinearShaft(60.0))
+    """Parts of a short run with half of the effects, and with all metrics or one."""
+    names, law, asked = (HALF, DeadZone(60.0, 0.05), None) if half else (OTHERS, LinearShaft(60.0), ("torque_rmse",))
     whole = experiment(names, law, steps=200, precision=precision)
-    return Parts(whole, (METRICS,), tuple(path for path in leaf_paths(whole) if path.startswith("effects.")), 5, LANES)
+    return Parts(
+        whole, (metrics(asked),), tuple(path for path in leaf_paths(whole) if path.startswith("effects.")), 5, LANES
+    )
 
 
 @pytest.mark.slow
@@ -91,12 +93,13 @@ def parts(half, precision):
     ids=["half", "others", "rigid"],
 )
 def test_figures_are_those_of_the_scan(names, law, options):
-    """By threads that get different numbers of lanes, and in the kernel of accelerators."""
+    """By threads that get different numbers of lanes, and in the kernel of accelerators, interpreted: two programs of the
+    grid, the last lanes filled up, blocks of samples with a rest."""
     whole = experiment(names, law, **options)
     effects = [path for path in leaf_paths(whole) if path.startswith("effects.")]
-    values = spread(whole, [*effects, "observer.motor.alpha", "encoders.noise"], 37)
-    fused, expected = HostPassage(whole, (METRICS,), tuple(values), 37, 2)(values, 3), scanned(whole, values, METRICS, 3)
-    device = DevicePassage(whole, (METRICS,), tuple(values), 37, interpret=True)(values, 3)
+    values = spread(whole, [*effects, "observer.motor.alpha", "encoders.noise"], 150)
+    fused, expected = HostPassage(whole, (METRICS,), tuple(values), 150, 2)(values, 3), scanned(whole, values, METRICS, 3)
+    device = DevicePassage(whole, (METRICS,), tuple(values), 150, interpret=True)(values, 3)
     assert set(fused) == set(device) == set(expected)
     for name, figure in fused.items():
         np.testing.assert_allclose(figure, expected[name], rtol=1e-7, err_msg=name)
@@ -147,11 +150,9 @@ def test_the_benchmarks_work_in_both_precisions(precision):
             assert np.median(apart) < 1e-3
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_the_kernel_of_accelerators_interpreted(precision):
-    """The same lanes by Pallas: two programs of the grid, the last lanes filled up, blocks of samples with a rest."""
-    work = Workload(150, 263, precision)
-    with jax.enable_x64(precision == "float64"):
+def test_the_kernel_of_accelerators_in_single_precision():
+    work = Workload(150, 263, "float32")
+    with jax.enable_x64(False):
         whole = work.experiment()
         passages = [
             HostPassage(whole, (METRICS,), tuple(RANGES), work.lanes, 1),
@@ -159,10 +160,8 @@ def test_the_kernel_of_accelerators_interpreted(precision):
         ]
         host, device = (passage(work.values(), SEED) for passage in passages)
     for name, figure in device.items():
-        assert figure.dtype in (precision, bool)
-        if precision == "float64" and "error" not in name:
-            np.testing.assert_allclose(figure, host[name], rtol=1e-6, err_msg=name)
-        elif name.endswith("_rmse"):
+        assert figure.dtype in (np.float32, bool)
+        if name.endswith("_rmse"):
             assert np.median(np.abs(figure / host[name] - 1.0)) < 1e-3, name
 
 
@@ -231,8 +230,8 @@ def test_an_error_of_a_thread_reaches_the_caller(monkeypatch):
     assert np.isfinite(passage(work.values(), SEED)["motor.velocity_rmse"]).all()
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precision):
+@pytest.mark.parametrize(("precision", "threads"), [("float32", 2), ("float64", 1)])
+def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precision, threads):
     """Lanes with a shaft too stiff for the plant's step overflow, some at once, some later, some on one side alone; one
     after the other, and mixed."""
     monkeypatch.setattr(module, "_CALL", 1)
@@ -246,30 +245,29 @@ def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precisi
         staying = METRICS._replace(done=None)
         expected = HostPassage(whole, (staying,), tuple(values), lanes, 1)(values, 3)
         assert 0 < np.count_nonzero(expected["finite"]) < lanes
-        for threads in (1, 2):
-            passage = HostPassage(whole, (METRICS,), tuple(values), lanes, threads)
-            assert len(passage._threads) == threads
-            loop = passage._loop
+        passage = HostPassage(whole, (METRICS,), tuple(values), lanes, threads)
+        assert len(passage._threads) == threads
+        loop = passage._loop
 
-            def counted(arrays, upto, first, last, loop=loop, **options):
-                samples.append((upto - options.get("start", 0)) * last)
-                loop(arrays, upto, first, last, **options)
+        def counted(arrays, upto, first, last, loop=loop, **options):
+            samples.append((upto - options.get("start", 0)) * last)
+            loop(arrays, upto, first, last, **options)
 
-            counted.signature, counted.lanes = loop.signature, loop.lanes
-            monkeypatch.setattr(passage, "_loop", counted)
-            for order in orders:
-                samples.clear()
-                found = passage({"transmission.stiffness": stiffness[order]}, 3)
-                assert set(found) == set(expected)
-                for name, figure in found.items():
-                    assert figure.dtype == expected[name].dtype
-                    np.testing.assert_array_equal(figure, expected[name][order], err_msg=name)
-                # some two thirds of the lanes leave; the last of a thread's vectors need not be full
-                assert sum(samples) < (0.6 * lanes + threads * loop.lanes) * whole.run.steps
+        counted.signature, counted.lanes = loop.signature, loop.lanes
+        monkeypatch.setattr(passage, "_loop", counted)
+        for order in orders:
+            samples.clear()
+            found = passage({"transmission.stiffness": stiffness[order]}, 3)
+            assert set(found) == set(expected)
+            for name, figure in found.items():
+                assert figure.dtype == expected[name].dtype
+                np.testing.assert_array_equal(figure, expected[name][order], err_msg=name)
+            # some two thirds of the lanes leave; the last of a thread's vectors need not be full
+            assert sum(samples) < (0.6 * lanes + threads * loop.lanes) * whole.run.steps
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_lanes_whose_answer_is_known_leave(monkeypatch, precision):
+@pytest.mark.parametrize(("precision", "threads"), [("float32", 1), ("float64", 2)])
+def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
     """Some keep the tolerance, some never do, and of both some overflow, early or in the last quarter."""
     monkeypatch.setattr(module, "_CALL", 1)
     monkeypatch.setattr(module, "_SHARE", 1)
@@ -293,26 +291,25 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision):
         # a side is not followed once its answer is known: what overflows later is not seen
         assert (stayed["finite"] >= expected["finite"]).all()
         assert np.count_nonzero(stayed["finite"]) > np.count_nonzero(expected["finite"])
-        for threads in (1, 2):
-            passage = HostPassage(whole, (asked,), tuple(values), lanes, threads)
-            loop = passage._loop
+        passage = HostPassage(whole, (asked,), tuple(values), lanes, threads)
+        loop = passage._loop
 
-            def counted(arrays, upto, first, last, loop=loop, **options):
-                if upto > options.get("start", 0):
-                    samples.append(last)
-                loop(arrays, upto, first, last, **options)
+        def counted(arrays, upto, first, last, loop=loop, **options):
+            if upto > options.get("start", 0):
+                samples.append(last)
+            loop(arrays, upto, first, last, **options)
 
-            counted.signature, counted.lanes = loop.signature, loop.lanes
-            monkeypatch.setattr(passage, "_loop", counted)
-            samples.clear()
-            found = passage(values, 3)
-            # in the last block, those are left that keep the tolerance
-            assert samples[-1] < lanes // 4
-            assert set(found) == set(stayed)
-            for name, figure in found.items():
-                np.testing.assert_array_equal(figure, stayed[name], err_msg=name)
-                if name != "finite":
-                    np.testing.assert_array_equal(figure, expected[name], err_msg=name)
+        counted.signature, counted.lanes = loop.signature, loop.lanes
+        monkeypatch.setattr(passage, "_loop", counted)
+        samples.clear()
+        found = passage(values, 3)
+        # in the last block, those are left that keep the tolerance
+        assert samples[-1] < lanes // 4
+        assert set(found) == set(stayed)
+        for name, figure in found.items():
+            np.testing.assert_array_equal(figure, stayed[name], err_msg=name)
+            if name != "finite":
+                np.testing.assert_array_equal(figure, expected[name], err_msg=name)
 
 
 def test_all_lanes_may_leave(monkeypatch):

@@ -33,9 +33,7 @@ def experiment(names, rigid=False, substeps=1, extra=()):
 MODELS = {
     "most": lambda: experiment([name for name in VALUES if name not in OTHERS], substeps=5),
     "others": lambda: experiment(OTHERS),
-    "rigid": lambda: experiment(
-        [name for name in VALUES if not name.startswith(("transmission", "load")) and name not in OTHERS], rigid=True
-    ),
+    "rigid": lambda: experiment(["motor.presliding_friction", "motor.cogging", "motor.inertia", "actuator.lag"], rigid=True),
 }
 
 
