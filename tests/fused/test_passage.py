@@ -103,6 +103,7 @@ def test_figures_are_those_of_the_scan(names, law, options):
     assert set(fused) == set(device) == set(expected)
     for name, figure in fused.items():
         np.testing.assert_allclose(figure, expected[name], rtol=1e-7, err_msg=name)
+        assert device[name].dtype == figure.dtype
         np.testing.assert_allclose(device[name], figure, rtol=1e-6, err_msg=name)
 
 
