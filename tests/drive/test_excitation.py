@@ -55,18 +55,20 @@ def test_chirp_against_scipy_and_steady_afterwards():
     np.testing.assert_allclose(sampled(excitation, after), 2.0 * np.sin(2.0 * np.pi * turns), atol=1e-12)
 
 
+@pytest.fixture(scope="module")
+def bits():
+    """That repeat only after the run: each tells its own index."""
+    return sampled(Prbs(amplitude=1.0, hold=1.0, order=16), np.arange(60_000))
+
+
 @DTYPES
 @PERIODS
 @pytest.mark.parametrize("samples_per_hold", [1, 7, 50])
-def test_levels_change_at_the_sample_of_the_edge(dtype, period, samples_per_hold):
+def test_levels_change_at_the_sample_of_the_edge(bits, dtype, period, samples_per_hold):
     """Whatever the precision rounds to, over a minute of samples."""
-    samples = 60_000
-    indices = np.arange(samples) // samples_per_hold
-    hold = samples_per_hold * period
-    # a bit that repeats only after the run tells its own index
-    bits = sampled(Prbs(amplitude=1.0, hold=1.0, order=16), np.arange(indices[-1] + 1))
-    times = sample_times(samples, period, dtype)
-    np.testing.assert_array_equal(sampled(Prbs(amplitude=1.0, hold=hold, order=16), times, dtype), bits[indices])
+    expected = bits[np.arange(bits.size) // samples_per_hold]
+    prbs = Prbs(amplitude=1.0, hold=samples_per_hold * period, order=16)
+    np.testing.assert_array_equal(sampled(prbs, sample_times(bits.size, period, dtype), dtype), expected)
 
 
 @pytest.mark.parametrize("order", [2, 5, 10])
@@ -134,6 +136,6 @@ def test_steps_are_independent_of_encoder_noise():
     from jaxbl.simulate import unit_noise
 
     steps = Steps(1.0, 1.0, seed=3)
-    levels = np.array([float(steps(jnp.asarray(i + 0.5))) for i in range(40)])
+    levels = sampled(steps, np.arange(40) + 0.5)
     for noise in unit_noise(jnp.asarray(3), jnp.arange(40), ("motor", "load")).values():
         assert abs(np.corrcoef(levels, 2.0 * norm.cdf(np.asarray(noise)) - 1.0)[0, 1]) < 0.5

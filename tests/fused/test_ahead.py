@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxbl.drive import Encoders, Initial, LinearShaft, TwoInertia, as_arrays
-from jaxbl.drive.excitation import Multisine, Sine
+from jaxbl.drive.excitation import Multisine
 from jaxbl.fused import ahead as module
 from jaxbl.fused.ahead import Looped, Scanned
 from jaxbl.fused.passage import HostPassage
@@ -34,11 +34,10 @@ def experiment(excitation, dtype):
 @pytest.mark.parametrize(
     ("excitation", "path", "states"),
     [
-        (Sine(5.0, 0.8), "observer.motor.alpha", True),
         (Multisine(5.0, 0.8, 6), "observer.motor.alpha", True),
         (Multisine(5.0, 0.8, 6), "drive.motor_inertia", False),
     ],
-    ids=["shared plant", "tables", "plants of their own"],
+    ids=["shared plant", "plants of their own"],
 )
 def test_the_loop_does_what_the_scan_does(monkeypatch, precision, excitation, path, states):
     made = []

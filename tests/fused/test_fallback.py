@@ -53,32 +53,44 @@ def unknown(request, monkeypatch):
     single_plant._path_loop.cache_clear()
 
 
-def test_a_sweep_is_scanned(unknown, caplog):
-    study = small({"run.substeps": 2}, axes=[listed(ALPHA, 5.0, 9.0, 20.0)])
-    expected, said = jaxbl.sweep(study, backend="scan").frame, unknown()
-    result = jaxbl.sweep(study)
+STUDY = small({"run.substeps": 2})
+SWEPT = small({"run.substeps": 2}, axes=[listed(ALPHA, 5.0, 9.0, 20.0)])
+
+
+@pytest.fixture(scope="module")
+def swept():
+    return jaxbl.sweep(SWEPT, backend="scan").frame
+
+
+@pytest.fixture(scope="module")
+def looped():
+    return jaxbl.run(STUDY, every=7)
+
+
+def test_a_sweep_is_scanned(swept, unknown, caplog):
+    said = unknown()
+    result = jaxbl.sweep(SWEPT)
     (why,) = result.scanned
-    np.testing.assert_array_equal(result.frame[NAME], expected[NAME])
+    np.testing.assert_array_equal(result.frame[NAME], swept[NAME])
     assert re.fullmatch(said, why)
     with pytest.raises(jaxbl.InputError, match=f"^--backend fused: the fused loop does not know {said}; use --backend scan"):
-        jaxbl.sweep(study, backend="fused")
+        jaxbl.sweep(SWEPT, backend="fused")
     assert not caplog.messages
 
 
-def test_a_run_is_scanned(unknown, caplog):
-    study = small({"run.substeps": 2})
-    expected, said = jaxbl.run(study, every=7), unknown()
-    found = [jaxbl.run(study, every=7) for _ in range(2)]
+def test_a_run_is_scanned(looped, unknown, caplog):
+    said = unknown()
+    found = [jaxbl.run(STUDY, every=7) for _ in range(2)]
     for one in found:
-        assert one.summary["metrics"][NAME] == pytest.approx(expected.summary["metrics"][NAME], rel=1e-6)
-        np.testing.assert_allclose(one.trace["theta_e"], expected.trace["theta_e"], rtol=1e-6, atol=1e-9)
+        assert one.summary["metrics"][NAME] == pytest.approx(looped.summary["metrics"][NAME], rel=1e-6)
+        np.testing.assert_allclose(one.trace["theta_e"], looped.trace["theta_e"], rtol=1e-6, atol=1e-9)
     (line,) = caplog.messages
     assert re.fullmatch(fused.SCANNED % said, line)
 
 
 def test_a_plant_is_scanned(unknown, caplog):
     with jax.enable_x64(True):
-        one = prepare(jaxbl.read_config(small({"run.substeps": 2})))
+        one = prepare(jaxbl.read_config(STUDY))
         start, torque = one.plant.init(one.initial), np.ones(50)
         expected, said = single_plant.path(one, start, torque), unknown()
         single_plant._path_loop.cache_clear()

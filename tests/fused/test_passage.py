@@ -1,5 +1,7 @@
 """The fused loop does what the scan does: all laws, effects and observers, both precisions."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +20,7 @@ from jaxbl.fused import passage as module
 from jaxbl.fused.ahead import Looped
 from jaxbl.fused.jaxprs import contracted, substituted
 from jaxbl.fused.pallas import LANES, Kernel
-from jaxbl.fused.passage import DevicePassage, HostPassage
+from jaxbl.fused.passage import DevicePassage, HostPassage, Passage
 from jaxbl.observer import DISCRETISATIONS, EquivalentControl, Identifier, Observers
 from jaxbl.simulate import Experiment, Reducer, Run, scan
 from jaxbl.sweeps.metrics import METRICS, metrics
@@ -29,7 +31,7 @@ HALF = ["motor.coulomb_friction", "load.stribeck_friction", "load.gravity", "mot
 OTHERS = [*(name for name in VALUES if name not in HALF), *ENCODERS]
 
 
-def experiment(names, law=None, observer="implicit", rigid=False, substeps=2, steps=700, precision="float64"):
+def experiment(names, law=None, observer="implicit", rigid=False, substeps=2, steps=701, precision="float64"):
     kind = DISCRETISATIONS[observer]
     motor = kind(10.0, 90.0, velocity_error=0.5)
     return as_arrays(
@@ -49,15 +51,35 @@ def experiment(names, law=None, observer="implicit", rigid=False, substeps=2, st
     )
 
 
-def both(experiment, paths, reducers, lanes=7, seed=3):
-    """Figures of the fused loop, with threads that get different numbers of lanes, and of the scan."""
-    values = {path: np.asarray(get_leaf(experiment, path)) * np.linspace(0.6, 1.4, lanes) for path in paths}
-    fused = HostPassage(experiment, reducers, tuple(paths), lanes, threads=2)(values, seed)
+def spread(experiment, paths, lanes):
+    """Numbers of so many lanes about those of the experiment."""
+    return {path: np.asarray(get_leaf(experiment, path)) * np.linspace(0.6, 1.4, lanes) for path in paths}
+
+
+def scanned(experiment, values, reducer, seed):
+    """Figures of the scan."""
 
     def lane(values):
-        return scan(set_leaves(experiment, values), jnp.asarray(seed), reducers)[0]
+        return scan(set_leaves(experiment, values), jnp.asarray(seed), (reducer,))[0]
 
-    return fused, jax.jit(jax.vmap(lane))(values)
+    return jax.jit(jax.vmap(lane))(values)
+
+
+class Parts(Passage):
+    """What the loop or the kernel is made of, not compiled."""
+
+    def _march(self, given, stretches):
+        raise NotImplementedError
+
+
+@functools.cache
+def parts(half, precision):
+    """Parts of a short run with half of the effects, and with all metrics or one."""
+    names, law, asked = (HALF, DeadZone(60.0, 0.05), None) if half else (OTHERS, LinearShaft(60.0), ("torque_rmse",))
+    whole = experiment(names, law, steps=200, precision=precision)
+    return Parts(
+        whole, (metrics(asked),), tuple(path for path in leaf_paths(whole) if path.startswith("effects.")), 5, LANES
+    )
 
 
 @pytest.mark.slow
@@ -71,18 +93,25 @@ def both(experiment, paths, reducers, lanes=7, seed=3):
     ids=["half", "others", "rigid"],
 )
 def test_figures_are_those_of_the_scan(names, law, options):
+    """By threads that get different numbers of lanes, and in the kernel of accelerators, interpreted: two programs of the
+    grid, the last lanes filled up, blocks of samples with a rest."""
     whole = experiment(names, law, **options)
     effects = [path for path in leaf_paths(whole) if path.startswith("effects.")]
-    fused, scanned = both(whole, [*effects, "observer.motor.alpha", "encoders.noise"], (METRICS,), lanes=37)
-    assert set(fused) == set(scanned)
+    values = spread(whole, [*effects, "observer.motor.alpha", "encoders.noise"], 150)
+    fused, expected = HostPassage(whole, (METRICS,), tuple(values), 150, 2)(values, 3), scanned(whole, values, METRICS, 3)
+    device = DevicePassage(whole, (METRICS,), tuple(values), 150, interpret=True)(values, 3)
+    assert set(fused) == set(device) == set(expected)
     for name, figure in fused.items():
-        np.testing.assert_allclose(figure, scanned[name], rtol=1e-7, err_msg=name)
-    # what is computed alone is to the bit what it is beside the others
-    values = {path: np.asarray(get_leaf(whole, path)) * np.linspace(0.6, 1.4, 37) for path in effects}
-    every, some = (
-        HostPassage(whole, (metrics(n),), tuple(values), 37, 2) for n in (None, ("chatter", "f_plus", "torque_rmse"))
-    )
-    every, some = every(values, 3), some(values, 3)
+        np.testing.assert_allclose(figure, expected[name], rtol=1e-7, err_msg=name)
+        assert device[name].dtype == figure.dtype
+        np.testing.assert_allclose(device[name], figure, rtol=1e-6, err_msg=name)
+
+
+def test_a_figure_computed_alone_is_to_the_bit_what_it_is_beside_the_others():
+    whole = experiment(["motor.coulomb_friction", "load.gravity", "actuator.lag"], DeadZone(60.0, 0.05))
+    values = spread(whole, [path for path in leaf_paths(whole) if path.startswith("effects.")], 37)
+    asked = METRICS, metrics(("chatter", "f_plus", "torque_rmse"))
+    every, some = (HostPassage(whole, (one,), tuple(values), 37, 2)(values, 3) for one in asked)
     assert len(some) < len(every)
     for name, figure in some.items():
         np.testing.assert_array_equal(figure, every[name], err_msg=name)
@@ -92,15 +121,16 @@ def test_figures_are_those_of_the_scan(names, law, options):
 def test_what_no_axis_touches_is_computed_once():
     """Axes on gains alone leave the plant to the shared part: no law is evaluated in a lane."""
     whole = experiment([], DeadZone(60.0, 0.05))
-    passage = HostPassage(whole, (METRICS,), ("observer.motor.alpha",), 9, 1)
-    varied = HostPassage(whole, (METRICS,), ("transmission.half_gap",), 9, 1)
+    values = spread(whole, ["observer.motor.alpha", "observer.motor.lambda"], 7)
+    passage = HostPassage(whole, (METRICS,), tuple(values), 7, 1)
+    varied = Parts(whole, (METRICS,), ("transmission.half_gap",), 7, 1)
     assert passage.carried < varied.carried
     # the plant's states are stepped by a loop of scalars, ahead of the lanes
     assert isinstance(passage._ahead, Looped)
     assert passage._ahead._loop is not None
-    fused, scanned = both(whole, ["observer.motor.alpha", "observer.motor.lambda"], (METRICS,))
-    for name, figure in fused.items():
-        np.testing.assert_allclose(figure, scanned[name], rtol=1e-9, err_msg=name)
+    expected = scanned(whole, values, METRICS, 3)
+    for name, figure in passage(values, 3).items():
+        np.testing.assert_allclose(figure, expected[name], rtol=1e-9, err_msg=name)
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
@@ -110,89 +140,67 @@ def test_the_benchmarks_work_in_both_precisions(precision):
     with jax.enable_x64(precision == "float64"):
         whole = work.experiment()
         fused = HostPassage(whole, (FIGURES,), tuple(RANGES), work.lanes, 2)(values, SEED)
-        scanned = jax.jit(jax.vmap(lambda v: scan(set_leaves(whole, v), jnp.asarray(SEED), (FIGURES,))[0]))(values)
+        expected = scanned(whole, values, FIGURES, SEED)
     for name, figure in fused.items():
         assert figure.dtype == precision
         if precision == "float64":
-            np.testing.assert_allclose(figure, scanned[name], rtol=1e-6)
+            np.testing.assert_allclose(figure, expected[name], rtol=1e-6)
         elif "rmse" in name:
             # a switching term makes an error of rounding one of a sample
-            apart = np.abs(figure / np.asarray(scanned[name]) - 1.0)
+            apart = np.abs(figure / np.asarray(expected[name]) - 1.0)
             assert np.median(apart) < 1e-3
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_the_kernel_of_accelerators_interpreted(precision):
-    """The same lanes by Pallas: two programs of the grid, the last lanes filled up, blocks of samples with a rest."""
-    work = Workload(150, 263, precision)
-    with jax.enable_x64(precision == "float64"):
+def test_the_kernel_of_accelerators_in_single_precision():
+    work = Workload(150, 263, "float32")
+    with jax.enable_x64(False):
         whole = work.experiment()
         passages = [
             HostPassage(whole, (METRICS,), tuple(RANGES), work.lanes, 1),
             DevicePassage(whole, (METRICS,), tuple(RANGES), work.lanes, interpret=True),
         ]
         host, device = (passage(work.values(), SEED) for passage in passages)
-        scanned = jax.jit(jax.vmap(lambda v: scan(set_leaves(whole, v), jnp.asarray(SEED), (METRICS,))[0]))(work.values())
     for name, figure in device.items():
-        assert figure.dtype in (precision, bool)
-        for other in (host[name], np.asarray(scanned[name])):
-            if precision == "float64" and "error" not in name:
-                np.testing.assert_allclose(figure, other, rtol=1e-6, err_msg=name)
-            elif name.endswith("_rmse"):
-                assert np.median(np.abs(figure / other - 1.0)) < 1e-3, name
+        assert figure.dtype in (np.float32, bool)
+        if name.endswith("_rmse"):
+            assert np.median(np.abs(figure / host[name] - 1.0)) < 1e-3, name
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("names", [HALF, OTHERS], ids=["half", "others"])
-def test_every_effect_in_the_kernel_of_accelerators(names):
-    law = DeadZone(60.0, 0.05) if names is HALF else LinearShaft(60.0)
-    whole = experiment(names, law, steps=200)
-    paths = tuple(path for path in leaf_paths(whole) if path.startswith("effects."))
-    values = {path: np.asarray(get_leaf(whole, path)) * np.linspace(0.6, 1.4, 5) for path in paths}
-    host = HostPassage(whole, (METRICS,), paths, 5, 1)(values, 0)
-    device = DevicePassage(whole, (METRICS,), paths, 5, interpret=True)(values, 0)
-    for name, figure in device.items():
-        np.testing.assert_allclose(figure, host[name], rtol=1e-6, err_msg=name)
-
-
-@pytest.mark.parametrize("names", [HALF, OTHERS], ids=["half", "others"])
+@pytest.mark.parametrize("half", [True, False], ids=["half", "others"])
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
-def test_the_kernel_can_be_written_for_a_gpu(names, precision):
+def test_the_kernel_can_be_written_for_a_gpu(half, precision):
     """No GPU is needed for that: every operation is one that Triton knows, products are joined with sums."""
-    law = DeadZone(60.0, 0.05) if names is HALF else LinearShaft(60.0)
     with jax.enable_x64(precision == "float64"):
-        whole = experiment(names, law, steps=200, precision=precision)
-        paths = tuple(path for path in leaf_paths(whole) if path.startswith("effects."))
-        parts = DevicePassage(whole, (METRICS,), paths, 5, interpret=True)
-        kernel = Kernel(parts._body, parts._around, len(paths), 2 * LANES, 200, 64)
+        made = parts(half, precision)
+        kernel = Kernel(made._body, made._around, len(made._paths), 2 * LANES, 200, 64)
         # from JAX 0.11 on it has to be told which GPU
         device = AbstractDevice("NVIDIA H100", None, "gpu")
         with use_abstract_mesh(AbstractMesh((), (), abstract_device=device)):
             written = jax.jit(kernel.run).trace(*kernel.arguments).lower(lowering_platforms=("cuda",)).as_text()
     assert "fma.rn" in written
-    if jax.default_backend() == "cpu":
-        with pytest.raises(Unsupported, match="how to compile for this device"):
-            kernel.compiled()
 
 
-@pytest.mark.parametrize("names", [HALF, OTHERS], ids=["half", "others"])
-def test_what_is_joined_for_a_gpu_computes_the_same(names):
-    law = DeadZone(60.0, 0.05) if names is HALF else LinearShaft(60.0)
-    whole = experiment(names, law, steps=200)
-    paths = tuple(path for path in leaf_paths(whole) if path.startswith("effects."))
-    parts = HostPassage(whole, (METRICS,), paths, 5, 1)
-    joined = []
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="another device may have a kernel")
+def test_a_processor_has_no_kernel_of_accelerators():
+    with pytest.raises(Unsupported, match="how to compile for this device"):
+        DevicePassage(experiment([], LinearShaft(60.0)), (METRICS,), ("transmission.stiffness",), 5)
+
+
+@pytest.mark.parametrize("half", [True, False], ids=["half", "others"])
+def test_what_is_joined_for_a_gpu_computes_the_same(half):
+    made, joined = parts(half, "float64"), []
 
     def multiply_add(a, b, c, *, minus_product, minus_rest):
         joined.append(a)
         return (-a if minus_product else a) * b + (-c if minus_rest else c)
 
     random = np.random.default_rng(1)
-    for part in (parts._body, *parts._around):
+    for part in (made._body, *made._around):
         given = [random.uniform(0.5, 1.5, aval.shape).astype(aval.dtype) for aval in part.in_avals]
-        found = jaxpr_as_fun(contracted(substituted(part, {}), multiply_add))(*given)
-        for one, expected in zip(found, jaxpr_as_fun(part)(*given), strict=True):
+        other = contracted(substituted(part, {}), multiply_add)
+        pairs = jax.jit(lambda *x, ways=(other, part): [jaxpr_as_fun(way)(*x) for way in ways])(*given)
+        for one, expected in zip(*pairs, strict=True):
             np.testing.assert_allclose(one, expected, rtol=1e-12)
     assert len(joined) > 50
 
@@ -223,45 +231,44 @@ def test_an_error_of_a_thread_reaches_the_caller(monkeypatch):
     assert np.isfinite(passage(work.values(), SEED)["motor.velocity_rmse"]).all()
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize("order", ["one after the other", "mixed"])
-def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precision, order):
-    """Lanes with a shaft too stiff for the plant's step overflow, some at once, some later, some on one side alone."""
+@pytest.mark.parametrize(("precision", "threads"), [("float32", 2), ("float64", 1)])
+def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precision, threads):
+    """Lanes with a shaft too stiff for the plant's step overflow, some at once, some later, some on one side alone; one
+    after the other, and mixed."""
     monkeypatch.setattr(module, "_CALL", 1)
     monkeypatch.setattr(module, "_SHARE", 1)
     lanes, samples = 300, []
     stiffness = np.concatenate([np.full(100, 60.0), np.geomspace(1e5, 1e7, 200)])
-    if order == "mixed":
-        stiffness = np.random.default_rng(0).permutation(stiffness)
+    orders = np.arange(lanes), np.random.default_rng(0).permutation(lanes)
     with jax.enable_x64(precision == "float64"):
         whole = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41, precision=precision)
         values = {"transmission.stiffness": stiffness}
         staying = METRICS._replace(done=None)
         expected = HostPassage(whole, (staying,), tuple(values), lanes, 1)(values, 3)
         assert 0 < np.count_nonzero(expected["finite"]) < lanes
-        for threads in (1, 2):
-            passage = HostPassage(whole, (METRICS,), tuple(values), lanes, threads)
-            assert len(passage._threads) == threads
-            loop = passage._loop
+        passage = HostPassage(whole, (METRICS,), tuple(values), lanes, threads)
+        assert len(passage._threads) == threads
+        loop = passage._loop
 
-            def counted(arrays, upto, first, last, loop=loop, **options):
-                samples.append((upto - options.get("start", 0)) * last)
-                loop(arrays, upto, first, last, **options)
+        def counted(arrays, upto, first, last, loop=loop, **options):
+            samples.append((upto - options.get("start", 0)) * last)
+            loop(arrays, upto, first, last, **options)
 
-            counted.signature, counted.lanes = loop.signature, loop.lanes
-            monkeypatch.setattr(passage, "_loop", counted)
+        counted.signature, counted.lanes = loop.signature, loop.lanes
+        monkeypatch.setattr(passage, "_loop", counted)
+        for order in orders:
             samples.clear()
-            found = passage(values, 3)
+            found = passage({"transmission.stiffness": stiffness[order]}, 3)
             assert set(found) == set(expected)
             for name, figure in found.items():
                 assert figure.dtype == expected[name].dtype
-                np.testing.assert_array_equal(figure, expected[name], err_msg=name)
+                np.testing.assert_array_equal(figure, expected[name][order], err_msg=name)
             # some two thirds of the lanes leave; the last of a thread's vectors need not be full
             assert sum(samples) < (0.6 * lanes + threads * loop.lanes) * whole.run.steps
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_lanes_whose_answer_is_known_leave(monkeypatch, precision):
+@pytest.mark.parametrize(("precision", "threads"), [("float32", 1), ("float64", 2)])
+def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
     """Some keep the tolerance, some never do, and of both some overflow, early or in the last quarter."""
     monkeypatch.setattr(module, "_CALL", 1)
     monkeypatch.setattr(module, "_SHARE", 1)
@@ -285,26 +292,25 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision):
         # a side is not followed once its answer is known: what overflows later is not seen
         assert (stayed["finite"] >= expected["finite"]).all()
         assert np.count_nonzero(stayed["finite"]) > np.count_nonzero(expected["finite"])
-        for threads in (1, 2):
-            passage = HostPassage(whole, (asked,), tuple(values), lanes, threads)
-            loop = passage._loop
+        passage = HostPassage(whole, (asked,), tuple(values), lanes, threads)
+        loop = passage._loop
 
-            def counted(arrays, upto, first, last, loop=loop, **options):
-                if upto > options.get("start", 0):
-                    samples.append(last)
-                loop(arrays, upto, first, last, **options)
+        def counted(arrays, upto, first, last, loop=loop, **options):
+            if upto > options.get("start", 0):
+                samples.append(last)
+            loop(arrays, upto, first, last, **options)
 
-            counted.signature, counted.lanes = loop.signature, loop.lanes
-            monkeypatch.setattr(passage, "_loop", counted)
-            samples.clear()
-            found = passage(values, 3)
-            # in the last block, those are left that keep the tolerance
-            assert samples[-1] < lanes // 4
-            assert set(found) == set(stayed)
-            for name, figure in found.items():
-                np.testing.assert_array_equal(figure, stayed[name], err_msg=name)
-                if name != "finite":
-                    np.testing.assert_array_equal(figure, expected[name], err_msg=name)
+        counted.signature, counted.lanes = loop.signature, loop.lanes
+        monkeypatch.setattr(passage, "_loop", counted)
+        samples.clear()
+        found = passage(values, 3)
+        # in the last block, those are left that keep the tolerance
+        assert samples[-1] < lanes // 4
+        assert set(found) == set(stayed)
+        for name, figure in found.items():
+            np.testing.assert_array_equal(figure, stayed[name], err_msg=name)
+            if name != "finite":
+                np.testing.assert_array_equal(figure, expected[name], err_msg=name)
 
 
 def test_all_lanes_may_leave(monkeypatch):

@@ -1,5 +1,7 @@
 """One run with a record by loops is what the scan gives."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,22 +48,28 @@ def row(state, signals):
     return {"u": signals.input, "torque": signals.torque, "moving": signals.load.true.velocity > 0.0, "t": signals.time}
 
 
+@functools.cache
+def scanned(excitation):
+    """An experiment, and figures and record of it by the scan."""
+    whole = experiment(excitation, 523, "float64")
+    return whole, *jax.jit(lambda seed: scan(whole, seed, (METRICS, ODD), row, 1))(jnp.asarray(3))
+
+
 @pytest.mark.parametrize(
-    ("excitation", "steps", "every", "reducers"),
+    ("excitation", "every", "reducers"),
     [
-        (Multisine(5.0, 0.8), 700, 1, (METRICS,)),
-        (Prbs(5.0, 0.05), 523, 7, (METRICS,)),  # blocks with a rest, none a multiple of what is kept
-        (Prbs(5.0, 0.05), 300, 400, (METRICS,)),
-        (Multisine(5.0, 0.8), 263, 3, (METRICS, ODD)),  # what no loop can do
+        (Multisine(5.0, 0.8), 1, (METRICS,)),
+        (Prbs(5.0, 0.05), 7, (METRICS,)),  # blocks with a rest, none a multiple of what is kept
+        (Prbs(5.0, 0.05), 600, (METRICS,)),
+        (Multisine(5.0, 0.8), 3, (METRICS, ODD)),  # what no loop can do
     ],
     ids=["whole", "every seventh", "the first alone", "by XLA"],
 )
-def test_figures_and_record_are_those_of_the_scan(excitation, steps, every, reducers):
-    whole = experiment(excitation, steps, "float64")
+def test_figures_and_record_are_those_of_the_scan(excitation, every, reducers):
+    whole, figures, record = scanned(excitation)
     found, kept = recorded(whole, 3, reducers, row, every)
-    figures, record = jax.jit(lambda seed: scan(whole, seed, reducers, row, 1))(jnp.asarray(3))
     assert list(kept) == ["u", "torque", "moving", "t"]
-    assert set(found) == set(figures)
+    assert set(found) == set(figures) - (set() if ODD in reducers else {"odd", "sum"})
     for name, column in kept.items():
         assert column.dtype == record[name].dtype
         np.testing.assert_allclose(column, record[name][::every], rtol=1e-8, atol=1e-12, err_msg=name)

@@ -47,6 +47,26 @@ def logs(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def grown(logs):
+    """The watch of the gap that grows, and the values it told of."""
+    heard = []
+    found = jaxbl.watch(logs / "grown.csv", logs / "axis.toml", alarm_gap=LIMIT, on_values=heard.append, **WINDOW)
+    return found, heard
+
+
+@pytest.fixture(scope="module")
+def same(logs):
+    """The watch of the gap that stays."""
+    return jaxbl.watch(logs / "same.csv", logs / "axis.toml", alarm_gap=1.02 * HALF_GAP, **WINDOW)
+
+
+def looks(count):
+    """Ends a stream after so many looks at it, more than it takes to read its file."""
+    left = iter(range(count))
+    return lambda: next(left, None) is None
+
+
 def command(*words):
     """The exit code of a command."""
     with pytest.raises(SystemExit) as end:
@@ -54,9 +74,8 @@ def command(*words):
     return end.value.code or 0
 
 
-def test_a_gap_that_grows_is_followed_and_raises_an_alarm(logs):
-    heard = []
-    found = jaxbl.watch(logs / "grown.csv", logs / "axis.toml", alarm_gap=LIMIT, on_values=heard.append, **WINDOW)
+def test_a_gap_that_grows_is_followed_and_raises_an_alarm(grown):
+    found, heard = grown
     values = found.values
     assert list(values.columns) == columns_of(found.task)
     assert [one["t"] for one in heard] == values["t"].tolist() == pytest.approx(np.arange(4.0, SECONDS, 0.5))
@@ -77,16 +96,15 @@ def test_a_gap_that_grows_is_followed_and_raises_an_alarm(logs):
     assert found.summary["alarm"]["half_gap"] > LIMIT
 
 
-def test_a_gap_that_stays_raises_none(logs):
-    found = jaxbl.watch(logs / "same.csv", logs / "axis.toml", alarm_gap=1.02 * HALF_GAP, **WINDOW)
-    assert found.summary["alarm"] is None
-    assert found.summary["determined"] == found.summary["values"] == 12
-    assert found.summary["samples"] == 10_000
-    assert found.summary["contradictions"] == 0
-    last = found.summary["last"]
+def test_a_gap_that_stays_raises_none(same):
+    assert same.summary["alarm"] is None
+    assert same.summary["determined"] == same.summary["values"] == 12
+    assert same.summary["samples"] == 10_000
+    assert same.summary["contradictions"] == 0
+    last = same.summary["last"]
     assert last["half_gap_from"] < HALF_GAP * 1.001
     assert last["half_gap_to"] > HALF_GAP * 0.999
-    assert found.summary["units"]["load"] == {
+    assert same.summary["units"]["load"] == {
         "half_gap": "rad", "stiffness": "N m/rad", "coulomb": "N m", "viscous": "N m s/rad",
     }  # fmt: skip
 
@@ -150,28 +168,16 @@ def test_of_two_gaps_that_differ_the_smaller_one_counts(logs):
         assert values["half_gap"] == motor
 
 
-def followed(logs, name, ended=None, **given):
-    """A file that is followed from its beginning until nothing more comes."""
-    task = read_watch_task(logs / name, logs / "axis.toml", follow=True, **WINDOW, **given)
-    seen = []
-
-    def finished():
-        seen.append(time.monotonic())
-        return len(seen) > 30
-
-    return run_watch(task, ended=ended or finished)
-
-
-def test_a_file_that_is_followed_gives_what_it_gives_as_a_log(logs):
-    log = jaxbl.watch(logs / "grown.csv", logs / "axis.toml", alarm_gap=LIMIT, **WINDOW)
-    live = followed(logs, "grown.csv", alarm_gap=LIMIT)
+def test_a_file_that_is_followed_gives_what_it_gives_as_a_log(logs, grown):
+    log, _ = grown
+    task = read_watch_task(logs / "grown.csv", logs / "axis.toml", follow=True, alarm_gap=LIMIT, **WINDOW)
+    live = run_watch(task, ended=looks(12))
     assert live.summary["samples"] == log.summary["samples"]
     assert live.summary["left_out"] == {}
     pd.testing.assert_frame_equal(live.values, log.values, rtol=1e-6, atol=1e-9)
 
 
-def test_datagrams_give_what_the_log_gives_and_bad_ones_end_nothing(logs):
-    log = jaxbl.watch(logs / "same.csv", logs / "axis.toml", **WINDOW)
+def test_datagrams_give_what_the_log_gives_and_bad_ones_end_nothing(logs, same):
     rows = pd.read_csv(logs / "same.csv").to_numpy()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
@@ -195,10 +201,10 @@ def test_datagrams_give_what_the_log_gives_and_bad_ones_end_nothing(logs):
             sender[0].start()
         return sent.is_set()
 
-    live = jaxbl.watch(f"udp://127.0.0.1:{port}", logs / "axis.toml", ended=ended, **WINDOW)
+    live = jaxbl.watch(f"udp://127.0.0.1:{port}", logs / "axis.toml", alarm_gap=1.02 * HALF_GAP, ended=ended, **WINDOW)
     sender[0].join()
     assert live.summary["left_out"] == {"malformed datagrams or lines": 101}
-    pd.testing.assert_frame_equal(live.values, log.values, rtol=1e-6, atol=1e-9)
+    pd.testing.assert_frame_equal(live.values, same.values, rtol=1e-6, atol=1e-9)
 
 
 def test_values_are_the_same_whatever_pieces_rows_come_in(logs):
@@ -223,9 +229,8 @@ def test_a_drive_that_stands_still_determines_nothing(logs, tmp_path):
     still[["u", "theta_e", "theta_s"]] = [0.0, 0.3, 0.05]
     log = tmp_path / "log.csv"
     still.to_csv(log, index=False)
-    seen = []
     task = read_watch_task(log, logs / "axis.toml", follow=True, alarm_gap=LIMIT, **WINDOW)
-    found = run_watch(task, ended=lambda: seen.append(0) or len(seen) > 20)
+    found = run_watch(task, ended=looks(8))
     assert (found.summary["values"], found.summary["determined"], found.summary["alarm"]) == (12, 0, None)
     assert jaxbl.write_report(found, tmp_path)[0].startswith("Nothing was determined (12 values)")
 
@@ -264,7 +269,7 @@ def test_json_is_a_line_for_each_row_of_values_and_one_for_the_end(logs, tmp_pat
 
 
 @pytest.mark.parametrize(("number", "alarm"), [(signal.SIGINT, False), (signal.SIGTERM, True)], ids=["Ctrl+C", "kill"])
-def test_a_file_that_grows_is_watched_until_it_is_interrupted(logs, tmp_path, number, alarm):
+def test_a_file_that_grows_is_watched_until_it_is_interrupted(logs, tmp_path, capsys, number, alarm):
     """As a user sees it: values while the file grows, a summary at the end, and what came is kept."""
     log, rows = tmp_path / "log.csv", (logs / "same.csv").read_text().splitlines(keepends=True)
     log.write_text("".join(rows[:6000]))
@@ -291,10 +296,8 @@ def test_a_file_that_grows_is_watched_until_it_is_interrupted(logs, tmp_path, nu
     assert errors == f"jaxbl: watching {log}; Ctrl+C ends it\n"
     assert read_json(tmp_path / "out" / "watch.json")["values"] == 12
     # a stream can't be had again: nothing of it is overwritten
-    done = subprocess.run(
-        [sys.executable, "-m", "jaxbl", *map(str, words)], capture_output=True, text=True, check=False, timeout=120
-    )
-    assert (done.returncode, "holds values of another stream" in done.stderr) == (2, True)
+    assert command(*words) == 2
+    assert "holds values of another stream" in capsys.readouterr().err
 
 
 def without(data, *tables):

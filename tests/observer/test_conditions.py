@@ -23,16 +23,15 @@ TABLE = {
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-@pytest.mark.parametrize("ratio", TABLE)
-def test_table_of_the_design(ratio, dtype):
-    alpha, one = jnp.asarray(ratio, dtype), jnp.asarray(1.0, dtype)
-    exact, davila_fridman, seeber_horn, levant = TABLE[ratio]
-    np.testing.assert_allclose(conditions.least_lambda_exact(alpha, one), exact, atol=6e-4)
-    np.testing.assert_allclose(conditions.least_lambda_davila_fridman(alpha, one), davila_fridman, atol=6e-3)
-    np.testing.assert_allclose(conditions.least_lambda_seeber_horn(alpha, one), seeber_horn, atol=6e-4)
-    np.testing.assert_allclose(conditions.least_lambda_levant(alpha, one), levant, atol=6e-3)
-    for least in LEAST.values():
-        assert least(alpha, one).dtype == dtype
+def test_table_of_the_design(dtype):
+    alpha, one = jnp.asarray(list(TABLE), dtype), jnp.ones(len(TABLE), dtype)
+    found = {name: least(alpha, one) for name, least in LEAST.items()}
+    assert {column.dtype for column in found.values()} == {jnp.dtype(dtype)}
+    exact, davila_fridman, seeber_horn, levant = np.transpose(list(TABLE.values()))
+    np.testing.assert_allclose(found["exact"], exact, atol=6e-4)
+    np.testing.assert_allclose(found["davila_fridman"], davila_fridman, atol=6e-3)
+    np.testing.assert_allclose(found["seeber_horn"], seeber_horn, atol=6e-4)
+    np.testing.assert_allclose(found["levant"], levant, atol=6e-3)
 
 
 def test_davila_fridman_grows_with_q():
@@ -100,9 +99,23 @@ def test_peak_ratio_is_that_of_quadrature_and_of_the_simulated_worst_case(case):
     np.testing.assert_allclose(closed, ratio_by_simulation(*case), rtol=1e-3)
 
 
-# compiled once for the many cases below
-RATIO, BOUND = jax.jit(conditions.peak_ratio), jax.jit(conditions.convergence_time_bound)
-LEAST = {name: jax.jit(least) for name, (_, least) in conditions.CONDITIONS.items()}
+LANES = 300
+
+
+def compiled(function):
+    """For up to so many cases, of whatever shape: one program of each precision."""
+    wide = jax.jit(function)
+
+    def call(*given):
+        given = np.broadcast_arrays(*given)
+        shape, size = given[0].shape, given[0].size
+        return np.asarray(wide(*(np.resize(x, LANES) for x in given)))[:size].reshape(shape)
+
+    return call
+
+
+RATIO, BOUND = compiled(conditions.peak_ratio), compiled(conditions.convergence_time_bound)
+LEAST = {name: compiled(least) for name, (_, least) in conditions.CONDITIONS.items()}
 POSITIVE = st.floats(0.1, 10.0)
 
 
@@ -129,14 +142,12 @@ def test_least_lambda_exact_is_where_the_ratio_is_one(ratio, f_plus):
     np.testing.assert_allclose(RATIO(least, ratio * f_plus, f_plus), 1.0, rtol=1e-9)
 
 
-@pytest.mark.parametrize("alpha", [1.1, 3.0, 80.0])
-def test_largest_bound_of_the_exact_condition_is_where_it_is_just_met(alpha):
-    with jax.enable_x64(True):
-        least = conditions.least_lambda_exact(jnp.asarray(alpha), jnp.asarray(1.0))
-        np.testing.assert_allclose(conditions.largest_f_plus_exact(least, jnp.asarray(alpha)), 1.0, rtol=1e-9)
-        # with a large lambda it is alpha that limits, with none nothing is withstood
-        found = conditions.largest_f_plus_exact(jnp.asarray([0.0, 1e3]), jnp.asarray(alpha))
-        np.testing.assert_allclose(found, [0.0, alpha], rtol=1e-9, atol=1e-12)
+def test_largest_bound_of_the_exact_condition_is_where_it_is_just_met():
+    alpha = np.array([1.1, 3.0, 80.0])
+    lambdas = np.stack([LEAST["exact"](alpha, np.ones(3)), np.zeros(3), np.full(3, 1e3)])
+    found = conditions.largest_f_plus_exact(jnp.asarray(lambdas), jnp.stack([alpha] * 3))
+    # with a large lambda it is alpha that limits, with none nothing is withstood
+    np.testing.assert_allclose(found, [np.ones(3), np.zeros(3), alpha], rtol=1e-9, atol=1e-12)
 
 
 def test_gains_are_judged_by_every_condition():
@@ -340,11 +351,7 @@ def test_bound_is_infinite_where_32_fails():
     assert conditions.convergence_time_bound(4.3, 2.0, 1.0, 0.0, 1.0) < jnp.inf
 
 
-WORST, SLOWEST = jax.jit(conditions.convergence_time_worst), jax.jit(conditions.slowest_ray)
-
-
-# one shape, compiled once
-LANES = 300
+WORST, SLOWEST = compiled(conditions.convergence_time_worst), compiled(conditions.slowest_ray)
 
 
 def convergent_gains(seed, nearest=1.02, farthest=40.0):

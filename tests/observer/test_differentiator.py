@@ -1,5 +1,6 @@
 """Differentiators of orders 1 to 5: their set-valued equation, exactness, no chatter, and the accuracy laws."""
 
+from functools import partial
 from math import factorial
 
 import jax
@@ -20,6 +21,7 @@ def free(velocity):
     return 0.0 * velocity
 
 
+@partial(jax.jit, static_argnames="acceleration")
 def observed(observer, measured, h, acceleration=free, velocity=0.0, further=None):
     """Estimates, and states predicted from them, along measured positions; `further` states at the start."""
 
@@ -28,21 +30,28 @@ def observed(observer, measured, h, acceleration=free, velocity=0.0, further=Non
         return state, (estimate, state)
 
     dtype = measured.dtype
-    start = observer.start(jnp.asarray(measured[0]), jnp.asarray(velocity, dtype), acceleration, jnp.asarray(h, dtype))
+    start = observer.start(measured[0], jnp.asarray(velocity, dtype), acceleration, jnp.asarray(h, dtype))
     if further is not None:
         start = start._replace(further=tuple(jnp.asarray(x, dtype) for x in further))
-    return jax.jit(lambda y: jax.lax.scan(one, start, y)[1])(jnp.asarray(measured))
+    return jax.lax.scan(one, start, measured)[1]
 
 
 @pytest.mark.parametrize(("dtype", "few"), [(np.float64, 1e-14), (np.float32, 5e-6)])
 @pytest.mark.parametrize("order", ORDERS[1:])
 def test_root_of_the_correction(order, dtype, few):
     reach = 20 if dtype == np.float64 else 12
-    value = 10.0 ** np.linspace(-reach, reach, 4001)
-    rho = np.asarray(solve_correction(COEFFICIENTS[order], jnp.asarray(value, dtype)), float)
+    value = np.append(0.0, 10.0 ** np.linspace(-reach, reach, 4001))
+    rho = np.asarray(jax.jit(partial(solve_correction, COEFFICIENTS[order]))(jnp.asarray(value, dtype)), float)
     assert (rho >= 0.0).all()
     np.testing.assert_allclose(np.polyval([1.0, *COEFFICIENTS[order][:order], 0.0], rho), value, rtol=few)
-    assert float(solve_correction(COEFFICIENTS[order], jnp.asarray(dtype(0.0)))) == 0.0
+    assert rho[0] == 0.0
+
+
+@jax.jit
+def estimate_of_zero(observer, position, h):
+    """The estimate of a position measured to be zero, after one step from another position at rest."""
+    zero = jnp.zeros(())
+    return observer.step(observer.start(position, zero, free, h), zero, free, h)[1].position
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -57,12 +66,7 @@ def test_a_step_solves_its_set_valued_equation(order, innovation, sign, lipschit
     """e + sum_j h^j k_j L^(j/(n+1)) |e|^((n+1-j)/(n+1)) s = b with s in sign e."""
     n, k = order, COEFFICIENTS[order]
     b = sign * innovation * h ** (n + 1) * lipschitz
-    observer = DIFFERENTIATORS[order](jnp.asarray(lipschitz))
-    zero = jnp.zeros(())
-    start = observer.start(jnp.asarray(-b), zero, free, jnp.asarray(h))
-    _, estimate = observer.step(start, zero, free, jnp.asarray(h))
-    # a measurement of zero: the estimate is -e
-    e = -float(estimate.position)
+    e = -float(estimate_of_zero(DIFFERENTIATORS[order](jnp.asarray(lipschitz)), jnp.asarray(-b), jnp.asarray(h)))
 
     def powers(size):
         terms = (h**j * k[j - 1] * lipschitz ** (j / (n + 1)) * size ** ((n + 1 - j) / (n + 1)) for j in range(1, n + 1))
@@ -224,27 +228,26 @@ def test_errors_grow_with_the_noise_as_theory_says(order):
     Noise is scaled with time as the differentiator is homogeneous: the worst of many signs of noise that changes slowly
     enough for the sampling period to play no part.
     """
-    n, lipschitz = order, 1.0
+    n, observer = order, DIFFERENTIATORS[order](1.0)
     sizes = 10.0 ** np.linspace(-8.0, -3.0, 6)
-    errors = []
-    for size in sizes:
-        pace = size ** (1.0 / (n + 1))
-        h = pace / 400.0
-        t = h * np.arange(40_000)
-        rng = np.random.default_rng(5)
-        # square waves of several lengths about the differentiator's own time
-        noise = size * np.sign(np.sin(2.0 * np.pi * t / (pace * 6.0) + rng.uniform(0.0, 6.0)))
-        true = [np.sin(0.9 * t + i * np.pi / 2) * 0.9**i for i in range(n + 1)]
-        estimate, state = observed(
-            DIFFERENTIATORS[n](lipschitz), true[0] + noise, h, velocity=0.9, further=[x[0] for x in true[2:]]
-        )
-        late = slice(-20_000, None)
-        found = [estimate.position, estimate.velocity]
-        if n >= 2:
-            found.append(estimate.control)
-        # further states are predicted for the coming sample, a period that is short beside their own time
-        found += [np.append(0.0, x[:-1]) for x in state.further[1:]]
-        errors.append([np.abs(x - y)[late].max() for x, y in zip(found, true, strict=False)])
-    slopes = [np.polyfit(np.log(sizes), np.log(column), 1)[0] for column in np.transpose(errors)]
+    pace = sizes ** (1.0 / (n + 1))
+    h = pace / 400.0
+    t = h[:, None] * np.arange(40_000)
+    # square waves about the differentiator's own time
+    waves = np.sign(np.sin(2.0 * np.pi * t / (pace[:, None] * 6.0) + np.random.default_rng(5).uniform(0.0, 6.0)))
+    true = [np.sin(0.9 * t + i * np.pi / 2) * 0.9**i for i in range(n + 1)]
+
+    def one(y, h, *further):
+        return observed(observer, y, h, velocity=0.9, further=further)
+
+    estimate, state = jax.vmap(one)(true[0] + sizes[:, None] * waves, h, *(x[:, 0] for x in true[2:]))
+    found = [estimate.position, estimate.velocity]
+    if n >= 2:
+        found.append(estimate.control)
+    # further states are predicted for the coming sample, a period that is short beside their own time
+    found += [np.roll(x, 1, axis=1) for x in state.further[1:]]
+    late = slice(-20_000, None)
+    errors = [np.abs(x - y)[:, late].max(axis=1) for x, y in zip(found, true, strict=False)]
+    slopes = [np.polyfit(np.log(sizes), np.log(column), 1)[0] for column in errors]
     expected = [(n + 1 - i) / (n + 1) for i in range(len(slopes))]
     np.testing.assert_allclose(slopes, expected, atol=0.05)

@@ -100,15 +100,17 @@ def test_extended_state_has_three_poles_at_one_place():
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-7), (np.float32, 3e-3)])
 def test_kalman_shares_are_those_of_scipys_riccati_equation(dtype, tolerance):
     rng = np.random.default_rng(0)
+
+    @jax.jit
+    def correction(observer, friction, h):
+        return observer.correction(lambda velocity: dtype(0.3) - friction * velocity, h)
+
     for _ in range(20):
         h, noise, friction = 10.0 ** rng.uniform([-4, -6, -2], [-2, -3, 2])
         width = 10.0 ** rng.uniform(-3.0, 0.3) / h
         slow, fast = noise * h**0.5 * width**3, noise * h**0.5 * width**2 * rng.integers(2)
 
-        def acceleration(velocity, friction=friction):
-            return dtype(0.3) - dtype(friction) * velocity
-
-        own = Kalman(*map(dtype, (noise, slow, fast))).correction(acceleration, jnp.asarray(dtype(h)))
+        own = correction(Kalman(*map(dtype, (noise, slow, fast))), dtype(friction), dtype(h))
         still = np.array([*predicted(0.0, 0.0, lambda v, f=friction: -f * v, h), 0.0])
         assert not still.any()
         a = np.stack([[*predicted(x, v, lambda v, f=friction: -f * v, h, held=d), d] for x, v, d in np.eye(3)], axis=1)

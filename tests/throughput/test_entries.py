@@ -55,21 +55,25 @@ def test_a_wrong_result_is_not_timed():
         _check(entry, "float64", missing, true)
 
 
-@pytest.mark.slow
 def test_the_whole_benchmark_uses_the_cores_there_are(monkeypatch):
-    used = []
+    used, parts, asked, curve = [], [], [], run._curve
 
     def only_ours(folder, count, devices):
         used.append(count)
-        return [entry for entry in entries(folder, count, devices) if entry.name == run.OURS]
+        return [entry._replace(lanes=2**13) for entry in entries(folder, count, devices) if entry.name == run.OURS]
+
+    def few(able, lanes, *rest):
+        asked.append(lanes)
+        return curve(able, min(lanes, 512), *rest)
 
     monkeypatch.setattr(run, "entries", only_ours)
-    parts = []
+    monkeypatch.setattr(run, "_curve", few)
     result = run.bench(quick=True, progress=lambda done, all_: parts.append((done, all_)))
     assert set(used) == {result.machine["cores"]} == {cores()}
     assert parts[-1][0] == parts[-1][1]
     assert all(row.lane_steps_per_second >= row.median_lane_steps_per_second > 0 for row in result.rows)
-    assert [point["lanes"] for point in result.curve] == [2**k for k in range(6, 19, 3)]
+    assert asked == [2**k for k in range(6, 19, 3)]
+    assert [point["lanes"] for point in result.curve] == [min(lanes, 512) for lanes in asked]
     assert len(result.study) == 1
 
 
