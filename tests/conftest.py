@@ -17,10 +17,12 @@ os.environ |= {
 }
 
 import jax
+import numpy as np
 import pytest
 from hypothesis import settings
 from progress_lines import without_progress
 
+from jaxbl.sweeps import engine
 from jaxbl.workers import collect_rarely, forget_programs
 
 collect_rarely()
@@ -46,6 +48,24 @@ def _few_programs():
     """Over a thousand tests, compiled programs would use up what the system lets a process map into memory."""
     yield
     forget_programs()
+
+
+@pytest.fixture(scope="module")
+def compiled_once():
+    """Chunks of studies that are the same share their program throughout a file."""
+    programs, compiled = {}, engine.compile_program
+
+    def shared(experiment, layout, devices, backend, columns, **how):
+        leaves, structure = jax.tree.flatten(experiment)
+        numbers = b"".join(np.asarray(leaf).tobytes() for leaf in leaves)
+        key = structure, numbers, layout, *devices, backend, *columns, *how.items()
+        if key not in programs:
+            programs[key] = compiled(experiment, layout, devices, backend, columns, **how)
+        return programs[key]
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(engine, "compile_program", shared)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -13,6 +13,9 @@ from jaxbl.sweeps.status import status
 from jaxbl.sweeps.sweep import open_study, repair, share, sweep
 
 
+pytestmark = pytest.mark.usefixtures("compiled_once")
+
+
 @pytest.fixture(scope="module")
 def bucket():
     """Address of an empty one, in a store of this process."""

@@ -21,6 +21,8 @@ from jaxbl.sweeps.programs import BACKENDS
 from jaxbl.sweeps.refine import CellGrid, Criterion, refine
 from jaxbl.sweeps.sweep import StudyResult, dry_run, open_study, sweep
 
+pytestmark = pytest.mark.usefixtures("compiled_once")
+
 # ---------------------------------------------------------------- geometry, on functions instead of runs
 
 
