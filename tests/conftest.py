@@ -22,7 +22,7 @@ import pytest
 from hypothesis import settings
 from progress_lines import without_progress
 
-from jaxbl.sweeps import engine
+from jaxbl.sweeps import programs
 from jaxbl.workers import collect_rarely, forget_programs
 
 collect_rarely()
@@ -53,18 +53,23 @@ def _few_programs():
 @pytest.fixture(scope="module")
 def compiled_once():
     """Chunks of studies that are the same share their program throughout a file."""
-    programs, compiled = {}, engine.compile_program
 
-    def shared(experiment, layout, devices, backend, columns, **how):
-        leaves, structure = jax.tree.flatten(experiment)
-        numbers = b"".join(np.asarray(leaf).tobytes() for leaf in leaves)
-        key = structure, numbers, layout, *devices, backend, *columns, *how.items()
-        if key not in programs:
-            programs[key] = compiled(experiment, layout, devices, backend, columns, **how)
-        return programs[key]
+    def remembered(compiled):
+        known = {}
+
+        def program(experiment, layout, devices, paths, *names):
+            leaves, structure = jax.tree.flatten(experiment)
+            numbers = tuple((leaf.dtype, leaf.tobytes()) for leaf in map(np.asarray, leaves))
+            key = structure, numbers, layout, *devices, *paths, *names
+            if key not in known:
+                known[key] = compiled(experiment, layout, devices, paths, *names)
+            return known[key]
+
+        return program
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(engine, "compile_program", shared)
+        for name in ("_fused", "_scanned"):
+            patched.setattr(programs, name, remembered(getattr(programs, name)))
         yield
 
 
