@@ -309,7 +309,7 @@ def test_structural_axes_end_to_end(tmp_path):
 
 @pytest.mark.slow
 def test_float32_and_float64_agree_on_what_converges_in_the_demo():
-    """In at least 99.5 % of the demo's runs.
+    """In at least 99.5 % of the demo's runs, of one of its seeds.
 
     The others lie where seeds and neighbouring gains do not agree either: the largest error of the last quarter is about
     the tolerance, and the noisy observer is chaotic. A relative change of the input by 1e-13 in float64 flips as many.
@@ -324,7 +324,7 @@ def test_float32_and_float64_agree_on_what_converges_in_the_demo():
 
 def with_precision(config, precision):
     data = config.resolved()
-    data["run"]["precision"] = precision
+    data["run"]["precision"], data["sweep"]["seeds"] = precision, 1
     return read_config(data)
 
 
