@@ -22,7 +22,7 @@ import pytest
 from hypothesis import settings
 from progress_lines import without_progress
 
-from jaxbl.sweeps import programs
+from jaxbl.sweeps import costs, programs
 from jaxbl.workers import collect_rarely, forget_programs
 
 collect_rarely()
@@ -52,24 +52,24 @@ def _few_programs():
 
 @pytest.fixture(scope="module")
 def compiled_once():
-    """Chunks of studies that are the same share their program throughout a file."""
+    """Studies that are the same throughout a file share the program of their chunks, and the count of its work."""
 
-    def remembered(compiled):
+    def remembered(function):
         known = {}
 
-        def program(experiment, layout, devices, paths, *names):
+        def found(experiment, *given):
             leaves, structure = jax.tree.flatten(experiment)
-            numbers = tuple((leaf.dtype, leaf.tobytes()) for leaf in map(np.asarray, leaves))
-            key = structure, numbers, layout, *devices, *paths, *names
+            numbers = [(leaf.dtype, leaf.tobytes()) for leaf in map(np.asarray, leaves)]
+            key = structure, *numbers, *(tuple(one) if isinstance(one, list | dict) else one for one in given)
             if key not in known:
-                known[key] = compiled(experiment, layout, devices, paths, *names)
+                known[key] = function(experiment, *given)
             return known[key]
 
-        return program
+        return found
 
     with pytest.MonkeyPatch.context() as patched:
-        for name in ("_fused", "_scanned"):
-            patched.setattr(programs, name, remembered(getattr(programs, name)))
+        for module, name in ((programs, "_fused"), (programs, "_scanned"), (costs, "_counted")):
+            patched.setattr(module, name, remembered(getattr(module, name)))
         yield
 
 

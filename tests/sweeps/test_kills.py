@@ -35,7 +35,7 @@ def study(points=120):
 
 def _sweep(folder, scheduler=None):
     try:
-        sweep(study(), folder, scheduler=scheduler)
+        sweep(study(), folder, scheduler=scheduler, backend="fused")
     except NoResult:
         sys.exit(1)
 

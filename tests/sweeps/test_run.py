@@ -12,7 +12,6 @@ from jaxbl.sweeps.engine import Engine
 from jaxbl.sweeps.status import status, statuses
 from jaxbl.sweeps.sweep import share, sweep
 
-
 pytestmark = pytest.mark.usefixtures("compiled_once")
 
 
