@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import tomli_w
-from small_study import rigid, small
+from small_study import listed, rigid, small
 
 import jaxbl
 from jaxbl.config import numeric_paths, read_config
@@ -28,13 +28,15 @@ def study(**more):
     return small(observer={"motor": GAINS, "load": GAINS}, encoders={"noise": 1e-5}) | more
 
 
+def over_kinds(kinds, backend):
+    axes = [listed("observer.kind", *kinds), listed("drive.motor_inertia", 0.05, 0.06)]
+    return jaxbl.sweep(rigid(observer={"motor": GAINS}, encoders={"noise": 1e-5}, axes=axes), backend=backend).frame
+
+
 def test_a_sweep_over_the_kind_by_both_loops():
-    axes = [
-        {"path": "observer.kind", "values": list(OBSERVERS)},
-        {"path": "drive.motor_inertia", "values": [0.05, 0.06]},
-    ]
-    alone = rigid(observer={"motor": GAINS}, encoders={"noise": 1e-5}, axes=axes)
-    fused, scanned = (jaxbl.sweep(alone, backend=backend).frame for backend in ("fused", "scan"))
+    fused = over_kinds(OBSERVERS, "fused")
+    # differentiators of order 5 take all operations that those of order 2 to 4 do
+    scanned = over_kinds([kind for kind in OBSERVERS if kind[-1] not in "234"], "scan")
     assert list(fused["observer.kind"].unique()) == list(OBSERVERS)
     conditions = [name for name in fused if "margin" in name or "bound" in name or "worst" in name]
     usual = fused["observer.kind"] == "super_twisting"
@@ -44,7 +46,8 @@ def test_a_sweep_over_the_kind_by_both_loops():
     assert fused.loc[~usual, conditions].isna().all(axis=None)
     numbers = [name for name in fused if name not in (*conditions, "observer.kind", "motor.convergence_time")]
     assert fused["finite"].all()
-    np.testing.assert_allclose(fused[numbers].astype(float), scanned[numbers].astype(float), rtol=1e-5, atol=1e-9)
+    same = fused[fused["observer.kind"].isin(scanned["observer.kind"])]
+    np.testing.assert_allclose(same[numbers].astype(float), scanned[numbers].astype(float), rtol=1e-5, atol=1e-9)
     # each kind does something of its own
     assert fused["motor.velocity_rmse"].nunique() == len(fused)
 
