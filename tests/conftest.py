@@ -22,7 +22,6 @@ import pytest
 from hypothesis import settings
 from progress_lines import without_progress
 
-from jaxbl.sweeps import costs, programs
 from jaxbl.workers import collect_rarely, forget_programs
 
 collect_rarely()
@@ -53,6 +52,7 @@ def _few_programs():
 @pytest.fixture(scope="module")
 def compiled_once():
     """Studies that are the same throughout a file share the program of their chunks, and the count of its work."""
+    from jaxbl.sweeps import costs, programs
 
     def remembered(function):
         known = {}
