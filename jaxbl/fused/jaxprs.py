@@ -122,10 +122,16 @@ def source_of(eqn: JaxprEqn) -> str:
     not say. Functions of the drive and the export itself only pass it on."""
     frames = getattr(getattr(eqn.source_info, "traceback", None), "frames", ())
     for frame in frames:
-        where = PurePath(frame.file_name).parts
-        if "jaxbl" in where and (inside := "/".join(where[len(where) - where[::-1].index("jaxbl") :])):
+        if inside := _inside(frame.file_name):
             return f"{inside}: {frame.function_name}"
     return ""
+
+
+@lru_cache(1024)
+def _inside(file: str) -> str:
+    """A file's path in the package; "" for one of others. Asked for each frame of each equation, of which there are few."""
+    where = PurePath(file).parts
+    return "/".join(where[len(where) - where[::-1].index("jaxbl") :]) if "jaxbl" in where else ""
 
 
 def _inlined(closed: ClosedJaxpr, functions: Mapping[str, Callable[..., Any]], *arguments: Any) -> list[Any]:

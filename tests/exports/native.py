@@ -3,6 +3,7 @@
 import ctypes
 import shutil
 import subprocess
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -64,8 +65,7 @@ class Native:
     def __init__(self, folder: Path, compiler="gcc", flags=("-O2", *UNCONTRACTED)):
         self.summary = read_json(folder / "export.json")
         name = self.summary["name"]
-        build = folder / f"build_{compiler}_{'_'.join(flags)}".replace("=", "_")
-        build.mkdir(exist_ok=True)
+        build = Path(tempfile.mkdtemp(dir=folder))
         (build / "harness.c").write_text(harness(self.summary))
         objects = ["-I", folder, folder / f"{name}.c", build / "harness.c"]
         ran(compiler, *STRICT, *flags, "-fPIC", "-shared", *objects, "-o", build / "code.so", "-lm")

@@ -1,5 +1,7 @@
 """Exported C: bit for bit the traced step, on this machine's compilers at all levels, and near the replay in JAX."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,6 +35,18 @@ def exported(tmp_path, data, precision="double", **flags):
     return Native(tmp_path, **flags)
 
 
+@pytest.fixture(scope="module")
+def code(tmp_path_factory):
+    """Folder of the code of a kind of observer in a precision, and the code compiled without optimisation."""
+
+    @functools.cache
+    def made(precision, kind="super_twisting"):
+        folder = tmp_path_factory.mktemp("code")
+        return folder, exported(folder, study(kind), precision, flags=("-O0", *UNCONTRACTED))
+
+    return made
+
+
 def outputs(native, inputs):
     native.start(inputs[0, 1:])
     return native.run(inputs)
@@ -41,10 +55,10 @@ def outputs(native, inputs):
 @pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize("level", ["-O0", "-O1", "-O2", "-O3"])
 @pytest.mark.parametrize("precision", ["double", "float"])
-def test_all_compilers_and_levels_give_the_same_bits(tmp_path, compiler, level, precision):
-    inputs = samples(3000, 2)
-    first = outputs(exported(tmp_path / "a", study(), precision, compiler="gcc", flags=("-O0", *UNCONTRACTED)), inputs)
-    found = outputs(exported(tmp_path / "b", study(), precision, compiler=compiler, flags=(level, *UNCONTRACTED)), inputs)
+def test_all_compilers_and_levels_give_the_same_bits(code, compiler, level, precision):
+    inputs, (folder, plain) = samples(3000, 2), code(precision)
+    first = outputs(plain, inputs)
+    found = outputs(Native(folder, compiler=compiler, flags=(level, *UNCONTRACTED)), inputs)
     assert np.isfinite(found).all()
     assert (bits(found) == bits(first)).all()
 
@@ -62,9 +76,9 @@ def strictly(data, precision, inputs):
 @needs("gcc")
 @pytest.mark.parametrize("kind", OBSERVERS)
 @pytest.mark.parametrize("precision", ["double", "float"])
-def test_every_kind_is_the_traced_step_bit_for_bit(tmp_path, kind, precision):
+def test_every_kind_is_the_traced_step_bit_for_bit(code, kind, precision):
     inputs = samples(1500, 2)
-    native = exported(tmp_path, study(kind), precision, flags=("-O0", *UNCONTRACTED))
+    _, native = code(precision, kind)
     assert native.size == native.summary["state_bytes"]
     found, expected = outputs(native, inputs), strictly(study(kind), precision, inputs)
     assert (bits(found) == bits(expected)).all()
@@ -72,9 +86,9 @@ def test_every_kind_is_the_traced_step_bit_for_bit(tmp_path, kind, precision):
 
 @pytest.mark.slow
 @needs("gcc")
-def test_a_million_steps_are_the_traced_step_bit_for_bit(tmp_path):
+def test_a_million_steps_are_the_traced_step_bit_for_bit(code):
     inputs = samples(1_000_000, 2)
-    native = exported(tmp_path, study(), flags=("-O0", *UNCONTRACTED))
+    _, native = code("double")
     assert (bits(outputs(native, inputs)) == bits(strictly(study(), "double", inputs))).all()
 
 

@@ -69,7 +69,7 @@ def test_a_cortex_m4s_compiler_has_nothing_to_say(tmp_path):
 
 @pytest.mark.slow
 @needs("cppcheck")
-@pytest.mark.parametrize(("kind", "precision"), [("super_twisting", "double"), ("differentiator_2", "float")])
+@pytest.mark.parametrize(("kind", "precision"), [("super_twisting", "double"), ("differentiator_1", "float")])
 def test_cppchecks_misra_rules_find_nothing(tmp_path, kind, precision):
     (tmp_path / "wrong.c").write_text("int f(int a) { if (a) return 1; else return 2; }\n")
     check = ("cppcheck", "--addon=misra", "--std=c99", "--quiet")

@@ -104,11 +104,9 @@ def test_accelerations_are_those_of_the_plant(case):
 
 @pytest.mark.parametrize("kind", bench.KINDS)
 def test_free_runs_over_ten_seconds(kind):
-    # fifty drives, and two with a friction that is only near
-    count = 2 if kind == bench.COARSE else 5
-    found, _ = bench.free_runs(kind, count)
-    assert len(found) == count
-    assert max(found) < (0.03 if kind == bench.COARSE else 0.01)
+    # one drive reaches what the exporter has of its kind; benchmarks/mjcf.py has fifty
+    (found,), _ = bench.free_runs(kind, 1)
+    assert found < (0.03 if kind == bench.COARSE else 0.01)
 
 
 def test_smooth_gap_by_chords_is_as_near_as_said():

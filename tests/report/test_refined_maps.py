@@ -126,7 +126,7 @@ def test_filling_is_exact_where_every_vertex_is_known():
 
 
 def test_a_map_shows_no_more_places_than_can_be_seen():
-    result = made(lambda frame: frame[ALPHA] > 3.3, depth=12)
+    result = made(lambda frame: frame[ALPHA] > 3.3, depth=10)
     drawing = draw(result)[0]
     assert shown(panels(drawing)[0]).shape == (2049, 2049)
 

@@ -18,6 +18,8 @@ from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult, dry_run, sweep
 from jaxbl.sweeps.trial import run
 
+pytestmark = pytest.mark.usefixtures("compiled_once")
+
 # 2 x 3 x 2 = 12 points; with noise and weak gains rounding is amplified, so that equal here is equal anywhere
 AXES = [listed(NOISE, 0.0, 1e-3), spaced(ALPHA, 2.0, 40.0, 3), listed(LAMBDA, 0.3, 5.0)]
 # the only figure whose rounding depends on whether a chunk holds one seed or several
@@ -307,7 +309,7 @@ def test_structural_axes_end_to_end(tmp_path):
 
 @pytest.mark.slow
 def test_float32_and_float64_agree_on_what_converges_in_the_demo():
-    """In at least 99.5 % of the demo's runs.
+    """In at least 99.5 % of the demo's runs, of one of its seeds.
 
     The others lie where seeds and neighbouring gains do not agree either: the largest error of the last quarter is about
     the tolerance, and the noisy observer is chaotic. A relative change of the input by 1e-13 in float64 flips as many.
@@ -322,13 +324,13 @@ def test_float32_and_float64_agree_on_what_converges_in_the_demo():
 
 def with_precision(config, precision):
     data = config.resolved()
-    data["run"]["precision"] = precision
+    data["run"]["precision"], data["sweep"]["seeds"] = precision, 1
     return read_config(data)
 
 
 @pytest.mark.parametrize("backend", ["scan", "fused"])
 def test_some_metrics_are_to_the_bit_those_of_a_study_of_all(backend):
-    data = small({"run.substeps": 2}, axes=AXES, sweep={"seeds": 3})
+    data = rigid({"run.substeps": 2}, axes=AXES)
 
     def run(**keys):
         engine = Engine(read_config(data | {"sweep": {"seeds": 3, **keys}}), Layout(3, 12), jax.devices()[:1], backend)
@@ -336,12 +338,12 @@ def test_some_metrics_are_to_the_bit_those_of_a_study_of_all(backend):
 
     _, full = run()
     _, found = run(metrics=["margin_alpha", "converged", "velocity_rmse"])
-    columns = [f"{side}.{name}" for side in ("motor", "load") for name in ("converged", "velocity_rmse", "margin_alpha")]
+    columns = [f"motor.{name}" for name in ("converged", "velocity_rmse", "margin_alpha")]
     assert list(found) == [NOISE, ALPHA, LAMBDA, "seed", "finite", *columns]
     assert_equal(found, full[list(found)])
     # none of these follows from gains
     engine, alone = run(metrics=["converged"])
-    assert list(alone)[4:] == ["finite", "motor.converged", "load.converged"]
+    assert list(alone)[4:] == ["finite", "motor.converged"]
     assert_equal(alone, full[list(alone)])
     assert engine._judging == set()
     # the scan computes the others all the same

@@ -136,10 +136,10 @@ def test_columns_against_numpy_on_the_whole_trace(case):
 
 def test_converged_needs_the_whole_last_quarter():
     """A tolerance that the velocity error leaves for the last time within the last quarter."""
-    experiment = paper(time_constant=0.01, steps=800, noise=1e-4)
+    experiment = paper(time_constant=0.01, start=0.3, steps=1023, noise=1e-4)
     _, (signals, _) = run(experiment)
     error = np.abs(np.asarray(signals.motor.true.velocity - signals.motor.velocity_estimate))
-    peak = 600 + int(np.argmax(error[600:]))
+    peak = 768 + int(np.argmax(error[768:]))
     for factor, converged in ((0.999, False), (1.001, True)):
         tight = eqx.tree_at(lambda e: e.run.velocity_tolerance, experiment, jnp.asarray(factor * error[peak]))
         figures, _ = run(tight)

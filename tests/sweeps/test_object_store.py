@@ -12,6 +12,8 @@ from jaxbl.report.sweep import write_sweep_report
 from jaxbl.sweeps.status import status
 from jaxbl.sweeps.sweep import open_study, repair, share, sweep
 
+pytestmark = pytest.mark.usefixtures("compiled_once")
+
 
 @pytest.fixture(scope="module")
 def bucket():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import tomli_w
-from small_study import small
+from small_study import listed, rigid, small
 
 import jaxbl
 from jaxbl.config import numeric_paths, read_config
@@ -28,22 +28,26 @@ def study(**more):
     return small(observer={"motor": GAINS, "load": GAINS}, encoders={"noise": 1e-5}) | more
 
 
+def over_kinds(kinds, backend):
+    axes = [listed("observer.kind", *kinds), listed("drive.motor_inertia", 0.05, 0.06)]
+    return jaxbl.sweep(rigid(observer={"motor": GAINS}, encoders={"noise": 1e-5}, axes=axes), backend=backend).frame
+
+
 def test_a_sweep_over_the_kind_by_both_loops():
-    axes = [
-        {"path": "observer.kind", "values": list(OBSERVERS)},
-        {"path": "transmission.stiffness", "values": [1.0, 1.4]},
-    ]
-    fused, scanned = (jaxbl.sweep(study(axes=axes), backend=backend).frame for backend in ("fused", "scan"))
+    fused = over_kinds(OBSERVERS, "fused")
+    # differentiators of order 5 take all operations that those of order 2 to 4 do
+    scanned = over_kinds([kind for kind in OBSERVERS if kind[-1] not in "234"], "scan")
     assert list(fused["observer.kind"].unique()) == list(OBSERVERS)
     conditions = [name for name in fused if "margin" in name or "bound" in name or "worst" in name]
     usual = fused["observer.kind"] == "super_twisting"
-    assert len(conditions) == 2 * 8
+    assert len(conditions) == 8
     # conditions on lambda and alpha are not for the others
     assert fused.loc[usual, conditions].notna().all(axis=None)
     assert fused.loc[~usual, conditions].isna().all(axis=None)
     numbers = [name for name in fused if name not in (*conditions, "observer.kind", "motor.convergence_time")]
     assert fused["finite"].all()
-    np.testing.assert_allclose(fused[numbers].astype(float), scanned[numbers].astype(float), rtol=1e-5, atol=1e-9)
+    same = fused[fused["observer.kind"].isin(scanned["observer.kind"])]
+    np.testing.assert_allclose(same[numbers].astype(float), scanned[numbers].astype(float), rtol=1e-5, atol=1e-9)
     # each kind does something of its own
     assert fused["motor.velocity_rmse"].nunique() == len(fused)
 

@@ -12,6 +12,8 @@ from jaxbl.sweeps.engine import Engine
 from jaxbl.sweeps.status import status, statuses
 from jaxbl.sweeps.sweep import share, sweep
 
+pytestmark = pytest.mark.usefixtures("compiled_once")
+
 
 def test_shares_are_the_whole_study(tmp_path, computed):
     alone = sweep(thirty(), tmp_path / "alone")

@@ -22,6 +22,8 @@ from jaxbl.sweeps.parts import file_checksum
 from jaxbl.sweeps.store import Store, claim, identity
 from jaxbl.sweeps.sweep import StudyResult, open_study, repair, sweep
 
+pytestmark = pytest.mark.usefixtures("compiled_once")
+
 FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
 
 
