@@ -11,7 +11,7 @@ from jaxbl.identification.logs import default_paths, on_record
 from jaxbl.identification.segments import segments_of
 from jaxbl.identification.trajectory import free_parameters
 
-SEED, DURATION = 21, 6.0
+SEED, DURATION = 21, 4.0
 _SIZES = {"torque", "drag", "inertia", "viscous", "relative", "amplitude", "damping", "half_gap", "limit", "time_constant"}
 
 
