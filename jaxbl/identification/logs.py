@@ -12,12 +12,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 
 from jaxbl.config import Config, prepare
 from jaxbl.drive.effects import EFFECTS, EncoderEffect
-from jaxbl.drive.parameters import get_leaf, leaf_paths
+from jaxbl.drive.excitation import Sine
+from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths
 from jaxbl.errors import InputError
 from jaxbl.records import POSITION_CHANNELS, Record, TurningLog, check_positions, join, read_record, turned
 from jaxbl.simulate import Experiment
@@ -250,19 +250,17 @@ def arrays(values: Mapping[str, float]) -> dict[str, np.ndarray]:
 
 
 def on_record(config: Config, record: Record) -> Experiment:
-    """The study's experiment at the record's period, with plant steps no longer than the study's."""
+    """The study's experiment at the record's period, with plant steps no longer than the study's, and without excitation:
+    the input is the record's."""
     step = config.run.sample_period / config.run.substeps
     substeps = max(int(np.ceil(record.sample_period / step * (1.0 - 1e-9))), 1)
     experiment = prepare(config.model_copy(update={"run": config.run.model_copy(update={"precision": "float64"})}))
-    return eqx.tree_at(
-        lambda e: e.run,
+    return dataclasses.replace(
         experiment,
-        dataclasses.replace(
-            experiment.run,
-            sample_period=np.asarray(record.sample_period, float),
-            # along a log nothing asks for it; programs are compiled for one
-            steps=1,
-            substeps=substeps,
+        # along a log nothing asks for these; programs are compiled for one
+        excitation=as_arrays(Sine(0.0, 1.0), float),
+        run=dataclasses.replace(
+            experiment.run, sample_period=np.asarray(record.sample_period, float), steps=1, substeps=substeps
         ),
     )
 

@@ -25,7 +25,6 @@ from jaxbl.files import read_json
 from jaxbl.records import read_record
 from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
 
-
 FIRST, LAST = slice(1500), slice(1500 - KEPT, 2000)
 
 
