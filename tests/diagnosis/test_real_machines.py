@@ -22,8 +22,7 @@ def emps(*effects):
     study = rigid(
         {"drive.motor_inertia": 95.0, "drive.motor_viscous": 0.0, "run.substeps": 2},
         effects=[*effects],
-        # every other sample, which halves the time
-        log=EMPS | {"resample": 2e-3},
+        log=EMPS,
         uncertainty={"relative": 0.02},
     )
     return {key: table for key, table in study.items() if key not in ("observer", "excitation")}
