@@ -60,6 +60,11 @@ def driven(torque: np.ndarray, effects: list[dict[str, Any]], noise: float, seed
     return Log(trace.t, trace.u, trace.theta_e, None)
 
 
+def part(log: Log, rows: Any) -> Log:
+    """Some samples of a log of a motor."""
+    return replace(log, t=log.t[rows], u=log.u[rows], theta_e=log.theta_e[rows])
+
+
 @cache
 def geared() -> tuple[Log, dict[str, np.ndarray]]:
     """4 s of a drive with a gap and hidden frictions, a small part of what is transmitted; and its true speeds, rad/s."""

@@ -50,8 +50,9 @@ def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[dict[str,
         friction = friction_of(drive, side)
         bounds = frame[f"{side}.f_plus"].to_numpy(float)
         with jax.enable_x64(True):
-            given = (jnp.asarray(x, float) for x in (gains["lambda"], gains["alpha"], bounds))
-            ratios = jax.jit(_ratios)(*given, jnp.asarray(friction, float), jnp.asarray(error, float))
+            # one by one, by one program for any number of them
+            given = ((*pair, bound, friction, error) for pair, bound in zip(pairs, bounds, strict=True))
+            ratios = [_ratios(*map(np.float64, one)) for one in given]
         assert trace is not None
         missing = disturbance(drive, side, trace)
         for i, (given, bound) in enumerate(zip(marks, bounds, strict=True)):
@@ -67,12 +68,12 @@ def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[dict[str,
                     "lambda_ratio": given.lambda_ / np.sqrt(bound),
                     "velocity_error": error,
                     "damping": friction * error / bound,
-                    **{name: np.asarray(values)[i] for name, values in ratios.items()},
+                    **{name: float(one) for name, one in ratios[i].items()},
                     **{f"margin_{name}": row[f"margin_{name}"] for name in CONDITIONS},
                     "converged": bool(row["converged"]),
                     "convergence_time": row["convergence_time"],
                     "on_this_disturbance": None
-                    if float(ratios["peak_ratio"][i]) < 1.0 or given.alpha == 0.0 or not np.isfinite(missing).all()
+                    if float(ratios[i]["peak_ratio"]) < 1.0 or given.alpha == 0.0 or not np.isfinite(missing).all()
                     else _explained(given.lambda_, given.alpha, trace["t"].to_numpy(), missing, friction, starts),
                 }
             )
@@ -127,8 +128,9 @@ def _explained(
     return found | {"sine_cycle": cycle}
 
 
+@jax.jit
 def _ratios(lambda_: Any, alpha: Any, f_plus: Any, friction: Any, error: Any) -> dict[str, Any]:
-    """Peak ratios of some gains: in closed form, with the drive's friction at the starting error, and under a disturbance
+    """Peak ratios of gains: in closed form, with the drive's friction at the starting error, and under a disturbance
     that never changes; and the velocity error (rad/s) that the worst disturbance upholds against friction."""
 
     def damped(speed: Any) -> Any:

@@ -12,7 +12,7 @@ from jaxbl.config import Config
 from jaxbl.errors import InputError
 from jaxbl.files import json_text, locked, make_folder, place, read_json, removed_if_empty, write_atomic
 from jaxbl.sweeps import parts
-from jaxbl.sweeps.programs import Backend, backend_of
+from jaxbl.sweeps.programs import Backend, backend_of, sharing
 from jaxbl.sweeps.store import claim, manifest_head
 from jaxbl.sweeps.sweep import StudyResult, sweep
 from jaxbl.workers import Progress
@@ -31,6 +31,7 @@ def stages_in(
         if out is not None:
             held.enter_context(removed_if_empty(place(out)))
             held.enter_context(locked(place(out)))
+        held.enter_context(sharing())
         yield Stages(config, command, out, cluster=held.enter_context(connected(scheduler)), **given)
 
 

@@ -12,12 +12,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 
 from jaxbl.config import Config, prepare
 from jaxbl.drive.effects import EFFECTS, EncoderEffect
-from jaxbl.drive.parameters import get_leaf, leaf_paths
+from jaxbl.drive.excitation import Sine
+from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths
 from jaxbl.errors import InputError
 from jaxbl.records import POSITION_CHANNELS, Record, TurningLog, check_positions, join, read_record, turned
 from jaxbl.simulate import Experiment
@@ -257,18 +257,16 @@ def run_of(config: Config, record: Record) -> dict[str, float]:
 
 
 def on_record(config: Config, record: Record) -> Experiment:
-    """The study's experiment at the record's period, with plant steps no longer than the study's."""
+    """The study's experiment at the record's period, with plant steps no longer than the study's, and without excitation:
+    the input is the record's."""
     run = run_of(config, record)
     experiment = prepare(config.model_copy(update={"run": config.run.model_copy(update={"precision": "float64"})}))
-    return eqx.tree_at(
-        lambda e: e.run,
+    return dataclasses.replace(
         experiment,
-        dataclasses.replace(
-            experiment.run,
-            sample_period=np.asarray(run["sample_period"], float),
-            # along a log nothing asks for it; programs are compiled for one
-            steps=1,
-            substeps=run["substeps"],
+        # along a log nothing asks for these; programs are compiled for one
+        excitation=as_arrays(Sine(0.0, 1.0), float),
+        run=dataclasses.replace(
+            experiment.run, sample_period=np.asarray(run["sample_period"], float), steps=1, substeps=run["substeps"]
         ),
     )
 

@@ -499,10 +499,12 @@ def fits(
     as long as the slowest. Arguments as of :func:`fit`, starts and held numbers of shape (fits, parameters).
     """
     held = np.zeros(thetas.shape, bool) if held is None else held
+    # numbers as arguments: other nominal ones need no other program
+    numbers: Any = jax.tree.map(lambda one: np.asarray(one) if isinstance(one, float) else one, tuple(free))
 
     def fitted(which: Any, program: Callable[..., Fit]) -> Fit:
         start, still = jnp.asarray(thetas[which]), jnp.asarray(held[which])
-        return program(experiment, tuple(free), windows, start, jnp.asarray(most_steps), still, jnp.asarray(rounds))
+        return program(experiment, numbers, windows, start, jnp.asarray(most_steps), still, jnp.asarray(rounds))
 
     count = len(thetas)
     if jax.default_backend() == "cpu":

@@ -175,15 +175,13 @@ def _states(cells: _Cells) -> np.ndarray | None:
     count = len(cells.twist)
     plain = cells.centred(cells.twist)
     # one change: the step, less its mean in each place and direction, that goes along best
-    best, late = 0.0, None
-    for change in range(2, count - 1, max(count // 400, 1)):
-        step = cells.centred((np.arange(count) >= change).astype(float))
-        size = float(step @ step)
-        gain = float(step @ plain) ** 2 / size if size > 1e-9 else 0.0
-        if gain > best:
-            best, late = gain, np.arange(count) >= change
-    starts = [] if late is None else [late]
-    smooth = np.array([np.median(plain[max(i - 4, 0) : i + 5]) for i in range(count)])
+    changes = np.arange(2, count - 1, max(count // 400, 1))
+    before = np.cumsum(np.arange(2 * BINS) == cells.group[:, None], axis=0)[changes - 1]
+    crossed = np.bincount(cells.group, minlength=2 * BINS)
+    size = np.sum(before * (1.0 - before / np.maximum(crossed, 1)), axis=1)
+    gain = np.where(size > 1e-9, np.cumsum(plain)[changes - 1] ** 2 / np.maximum(size, 1e-9), 0.0)
+    starts = [np.arange(count) >= changes[np.argmax(gain)]] if gain.max(initial=0.0) > 0.0 else []
+    smooth = np.nanmedian(np.lib.stride_tricks.sliding_window_view(np.pad(plain, 4, constant_values=np.nan), 9), axis=1)
     starts.append(smooth > 0.5 * (smooth.min() + smooth.max()))
     chosen = None
     for state in starts:

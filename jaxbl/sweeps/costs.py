@@ -22,7 +22,7 @@ from jaxbl.simulate import Experiment, scan
 from jaxbl.workers import doing
 
 from .metrics import Names, metrics
-from .programs import BACKENDS, Backend, Layout, compile_program, not_put_into_cache
+from .programs import BACKENDS, Backend, Layout, compile_program, not_put_into_cache, shared
 
 
 class Work(NamedTuple):
@@ -144,7 +144,7 @@ def work_of(config: Config, paths: Sequence[str], names: Names = None) -> Work:
         key = kept.key_of("work", experiment, tuple(paths), names)
         found = kept.load(key)
         if found is None:
-            found = _counted(experiment, paths, names)
+            found = shared(experiment, paths, names, lambda: _counted(experiment, paths, names))
             kept.save(key, found)
     return found
 

@@ -1,9 +1,11 @@
 """Compiled programs for the chunks of a study: the scan by XLA, or the fused loop."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from contextvars import ContextVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar, get_args
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +37,41 @@ def computed(backend: Backend, names: Names) -> Names:
     """The metrics that a backend computes where some are asked for. XLA rounds otherwise where it computes less: the scan
     computes all, so that those asked for are to the bit what they are beside the others."""
     return names if backend == "fused" else None
+
+
+Made = TypeVar("Made")
+
+_MOST = 16
+"""Programs that studies share, at most, with what was counted for them."""
+_shared: ContextVar[OrderedDict[Any, Any] | None] = ContextVar("shared", default=None)
+
+
+@contextmanager
+def sharing() -> Iterator[None]:
+    """Studies that are run inside share their programs, as those of the stages of one search: what differs in nothing but
+    the values of its lanes is compiled once."""
+    before = _shared.set(OrderedDict())
+    try:
+        yield
+    finally:
+        _shared.reset(before)
+
+
+def shared(experiment: Experiment, paths: Iterable[str], given: Any, make: Callable[[], Made]) -> Made:
+    """What `make` makes of an experiment whose leaves at `paths` may have any values, and of other hashable arguments
+    `given`; inside :func:`sharing`, what it has made of them before."""
+    known = _shared.get()
+    if known is None:
+        return make()
+    leaves, structure = jax.tree.flatten(set_leaves(experiment, dict.fromkeys(paths, np.zeros(()))))
+    arrays = [np.asarray(leaf) for leaf in leaves]
+    key = given, tuple(paths), structure, tuple((one.dtype, one.shape, one.tobytes()) for one in arrays)
+    if key not in known:
+        known[key] = make()
+    known.move_to_end(key)
+    while len(known) > _MOST:
+        known.popitem(last=False)
+    return known[key]
 
 
 class Layout(NamedTuple):
@@ -77,8 +114,8 @@ def compile_program(
     names: Names = None,
     insist: bool = False,
 ) -> Program:
-    """Compile one, inside :func:`jaxbl.config.precision`; `columns` is an example of the values, `(points,)` by path;
-    `names` are the metrics asked for: its figures have these, and perhaps others.
+    """Compile one, inside :func:`jaxbl.config.precision`, or take a :func:`shared` one; `columns` is an example of the
+    values, `(points,)` by path; `names` are the metrics asked for: its figures have these, and perhaps others.
 
     Where the fused loop cannot run the step, or no lane differs from another, the scan takes its place; with `insist` that
     is refused.
@@ -86,15 +123,20 @@ def compile_program(
     Raises:
         InputError: the fused loop was insisted on and cannot be had.
     """
-    if backend == "fused":
-        try:
-            with attempted():
-                return _fused(experiment, layout, devices, tuple(columns), names)
-        except Unsupported as why:
-            if insist:
-                raise InputError(f"--backend fused: the fused loop does not know {why}; use --backend scan") from None
-            return _scanned(experiment, layout, devices, columns)._replace(instead=str(why))
-    return _scanned(experiment, layout, devices, columns)
+
+    def compiled() -> Program:
+        if backend == "fused":
+            try:
+                with attempted():
+                    return _fused(experiment, layout, devices, tuple(columns), names)
+            except Unsupported as why:
+                if insist:
+                    raise InputError(f"--backend fused: the fused loop does not know {why}; use --backend scan") from None
+                return _scanned(experiment, layout, devices, columns)._replace(instead=str(why))
+        return _scanned(experiment, layout, devices, columns)
+
+    dtypes = tuple(column.dtype for column in columns.values())
+    return shared(experiment, columns, (layout, tuple(devices), backend, dtypes, names, insist), compiled)
 
 
 def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tuple[str, ...], names: Names) -> Program:

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 from browser import check, needs_chromium, opened
-from hidden_log import FRICTION, driven, logged, model
+from hidden_log import FRICTION, driven, logged, model, part
 
 import jaxbl.diagnosis.diagnosis_summary as summary_module
 import jaxbl.diagnosis.effect_search as explain
@@ -25,11 +25,16 @@ from jaxbl.files import read_json
 from jaxbl.records import read_record
 from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
 
+FIRST, LAST = slice(1500), slice(1500 - KEPT, 2000)
+
 
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("logs")
     logged().write(folder / "axis.csv")
+    # parts as long as those that are split off the whole
+    part(logged(), FIRST).write(folder / "first.csv")
+    part(logged(), LAST).write(folder / "last.csv")
     logged(seed=2).write(folder / "other.csv")
     return folder
 
@@ -219,7 +224,7 @@ def test_an_effect_that_does_not_earn_its_place_is_withdrawn(logs, monkeypatch):
         return found._replace(experiment=wrong)
 
     monkeypatch.setattr(explain, "refined", spoilt)
-    task = read_diagnosis_task(logs / "axis.csv", model(), holdout=logs / "other.csv")
+    task = read_diagnosis_task(logs / "first.csv", model(), holdout=logs / "last.csv")
     stages = []
     found = run_diagnosis(task, lambda *at: stages.append(at))
     assert stages == [(i, 6) for i in range(1, 7)]
@@ -266,8 +271,8 @@ def test_what_is_tied_is_parted_by_the_experiment_that_is_asked_for(tmp_path):
     friction = {"kind": "motor.coulomb_friction", "torque": 0.004}
     fast = 0.3 * np.sin(2.0 * np.pi * 5.0 * 2e-3 * np.arange(2000))
     log, other, holdout = (tmp_path / name for name in ("log.csv", "next_log.csv", "holdout.csv"))
-    driven(fast, [friction], 1e-3, 1).write(log)
-    driven(0.8 * fast, [friction], 1e-3, 2).write(holdout)
+    part(driven(fast, [friction], 1e-3, 1), FIRST).write(log)
+    part(driven(0.8 * fast, [friction], 1e-3, 2), LAST).write(holdout)
     task = read_diagnosis_task(log, model(), holdout=holdout)
     found = run_diagnosis(task)
     pair = tied(found.summary)
@@ -315,9 +320,7 @@ def test_a_holdout_of_another_machine_is_refused(logs, tmp_path):
 
 
 def test_a_log_that_is_too_short_is_refused(logs, tmp_path):
-    log = logged()
-    short = dataclasses.replace(log, **{name: getattr(log, name)[:150] for name in ("t", "u", "theta_e")})
-    short.write(tmp_path / "short.csv")
+    part(logged(), slice(150)).write(tmp_path / "short.csv")
     assert "too few to hold a quarter of them out" in refused(logs, tmp_path / "short.csv", model())
 
 

@@ -1,6 +1,5 @@
 """A model with all effects at neutral numbers moves as the model without them does."""
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.neutral_effects import bucket, candidates, complete, has_state
 from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.parameters import as_arrays, parameters
+from jaxbl.identification.compilation import jit
 from jaxbl.simulate import trajectory
 
 GIVEN_ONLY = {"actuator.back_emf", "motor.tabulated", "load.tabulated"} | {
@@ -33,7 +33,7 @@ def test_neutral_effects_do_nothing(sides):
     runs = []
     for one in (bare, every):
         start = one.plant.init(one.initial)
-        runs.append(eqx.filter_jit(trajectory)(one, start, torque))
+        runs.append(jit(trajectory)(one, start, torque))
     for side in bare.sides:
         assert np.ptp(runs[0].position[side]) > 0.0
         for name in ("position", "velocity"):

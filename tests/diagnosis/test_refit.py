@@ -1,6 +1,5 @@
 """Refined numbers are those of least prediction errors: against an optimiser that knows nothing of the linearisation."""
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from jaxbl.diagnosis.linearised_model import Linear
 from jaxbl.diagnosis.neutral_effects import complete
 from jaxbl.diagnosis.refit import _Refiner, refined
 from jaxbl.drive.plant import PlantState
+from jaxbl.identification.compilation import jit
 from jaxbl.identification.logs import default_paths, on_record
 from jaxbl.identification.regression import settled
 from jaxbl.identification.segments import segments_of
@@ -44,7 +44,7 @@ def test_prediction_errors_are_least(setting):
     gain = {"motor": Linear.gain_of(found.smoothness, segment.period)[0]}
     torque, reading = jnp.asarray(segment.torque), jnp.asarray(segment.readings["motor"])
 
-    @eqx.filter_jit
+    @jit
     def predicted(given):
         one = with_fitted(experiment, free, given[2:] * 0.01)
         start = PlantState({"motor": given[0]}, {"motor": given[1]}, settled(one, torque[0]))

@@ -1,12 +1,14 @@
-"""Folders of commands that run several studies: damage to their manifests and tables, and folders of others."""
+"""Commands that run several studies: damage to manifests and tables, folders of others, programs that studies share."""
 
 import pandas as pd
 import pytest
-from small_study import parts, thirty
+from small_study import ALPHA, LAMBDA, listed, parts, rigid, thirty
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
 from jaxbl.gains.stages import stages_in
+from jaxbl.sweeps import programs
+from jaxbl.sweeps.sweep import sweep
 
 
 def stage(folder, changes=None, **given):
@@ -57,3 +59,18 @@ def test_a_damaged_table_is_computed_anew(tmp_path):
     content[len(content) // 3] ^= 1
     path.write_bytes(content)
     assert list(stage(tmp_path)[2]["x"]) == [1.0, 2.0]
+
+
+def test_stages_share_programs_where_values_of_lanes_alone_differ(monkeypatch):
+    """The third one has another drive, and figures of all are those of studies by themselves."""
+    compiled = []
+    monkeypatch.setattr(programs, "_fused", lambda *given, real=programs._fused: compiled.append(given) or real(*given))
+    axes = [[listed(ALPHA, *alphas), listed(LAMBDA, 1.0)] for alphas in ((5.0, 20.0), (7.0, 30.0), (5.0, 20.0))]
+    inertias = 0.05, 0.05, 0.06
+    studies = [rigid({"drive.motor_inertia": one}, axes=each) for one, each in zip(inertias, axes, strict=True)]
+    with stages_in(read_config(studies[0]), "tune", None, None, backend="fused") as stages:
+        found = [stages.run(study, str(i)).frame for i, study in enumerate(studies)]
+    assert len(compiled) == 2
+    for frame, study in zip(found, studies, strict=True):
+        pd.testing.assert_frame_equal(frame, sweep(study, backend="fused").frame, check_exact=True)
+    assert len(compiled) == 5

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import equinox as eqx
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,7 +10,7 @@ from measured import NOMINAL, axis
 
 from jaxbl.config import read_model
 from jaxbl.errors import InputError
-from jaxbl.identification.logs import read_logs, read_with_holdout
+from jaxbl.identification.logs import on_record, read_logs, read_with_holdout
 from jaxbl.records import Record, read_record
 
 MODEL = {"drive": {"kind": "rigid", "motor_inertia": 4e-5, "motor_viscous": 1e-4}}
@@ -60,6 +61,15 @@ def test_a_model_of_a_log_has_no_effects_of_encoders(paths: list[Path]):
     config, _ = read_model(MODEL | {"effects": [{"kind": "encoder.offset", "offset": 0.1}]})
     with pytest.raises(InputError, match=r"0\.csv: encoder\.offset has no place in a model of a log: .* theta_e\.offset"):
         read_logs(config, paths[0])
+
+
+def test_a_model_along_a_log_has_no_excitation(paths: list[Path]):
+    """Programs that are compiled for it are those of any other excitation."""
+    sweeping = {"kind": "chirp", "amplitude": 0.1, "start_frequency": 1.0, "stop_frequency": 2.0, "sweep_time": 1.0}
+    configs = [read_model(MODEL | more)[0] for more in ({}, {"excitation": sweeping})]
+    one, other = (on_record(config, read_logs(config, paths[0])) for config in configs)
+    assert eqx.tree_equal(one, other)
+    assert one.excitation(np.linspace(0.0, 1.0, 9)).tolist() == [0.0] * 9
 
 
 GEARED = {

@@ -11,7 +11,7 @@ from jaxbl.identification.compilation import jit
 from jaxbl.identification.intervals import spread
 from jaxbl.identification.prediction import kalman_gain, predictor
 from jaxbl.identification.smoother import smooth
-from jaxbl.identification.trajectory import cut, fit, free_parameters, with_fitted
+from jaxbl.identification.trajectory import cut, fit, free_parameters
 
 PERIOD, SAMPLES = 2e-3, 3000
 
@@ -52,6 +52,11 @@ def experiment_and_free():
     return experiment, free_parameters(experiment, ["drive.motor_inertia", "drive.motor_viscous"], 1.0)
 
 
+@jit
+def fitted(experiment, free, windows):
+    return fit(experiment, free, windows, jnp.zeros(2))
+
+
 def windows_of(torque, readings, samples):
     smoothed = smooth(jnp.asarray(readings["motor"]), PERIOD)
     start = PlantState({"motor": smoothed.position}, {"motor": smoothed.velocity}, ())
@@ -61,7 +66,6 @@ def windows_of(torque, readings, samples):
 @pytest.mark.slow
 def test_with_a_disturbance_prediction_errors_tell_more_than_free_runs():
     experiment, free = experiment_and_free()
-    fitted = jit(lambda windows: fit(experiment, free, windows, jnp.zeros(2)))
     errors, widths = {"free": [], "predicted": []}, {"free": [], "predicted": []}
     force = 1e-4
     for seed in range(8):
@@ -70,7 +74,7 @@ def test_with_a_disturbance_prediction_errors_tell_more_than_free_runs():
         predicted, smoothness = predictor(experiment, windows)
         np.testing.assert_allclose(smoothness["motor"], force / 0.05**2 * PERIOD**3 / 1e-8, rtol=9.0)
         for name, one in (("free", windows), ("predicted", predicted)):
-            found = fitted(one)
+            found = fitted(experiment, free, one)
             errors[name].append(found.theta)
             widths[name].append(np.sqrt(np.diag(spread(found).covariance)))
     size = {name: np.sqrt(np.mean(np.square(values), axis=0)) for name, values in errors.items()}
@@ -86,5 +90,5 @@ def test_without_a_disturbance_the_predictor_runs_freely():
     predicted, smoothness = predictor(experiment, windows)
     assert smoothness["motor"] < 1e-9
     assert float(predicted.noise["motor"]) == pytest.approx(1e-4, rel=0.05)
-    found = fit(with_fitted(experiment, free, jnp.zeros(2)), free, predicted, jnp.zeros(2))
+    found = fitted(experiment, free, predicted)
     np.testing.assert_allclose(found.theta, 0.0, atol=0.005)

@@ -1,5 +1,8 @@
 """Trajectory fits against truth from another integrator, and against one joint least-squares problem by SciPy."""
 
+import dataclasses
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -71,20 +74,44 @@ def noisy(states, noise, key):
     }
 
 
+def realisations(torque, states, noise, keys, samples, period=PERIOD):
+    """Windows of one motion under several realisations of the noise, with a leading axis."""
+    seen = {side: np.asarray(x) for side, x in jax.vmap(lambda key: noisy(states, noise, key))(keys).items()}
+    # initial states are guessed by the first
+    one = windows_of(torque, {side: x[0] for side, x in seen.items()}, noise, samples, period)
+    each = jax.tree.map(lambda x: np.broadcast_to(x, (len(keys), *np.shape(x))), one)
+    return dataclasses.replace(each, measured={side: x.reshape(len(keys), -1, samples) for side, x in seen.items()})
+
+
+@jit
+def _fits(experiment, free, windows, starts, steps):
+    return jax.vmap(lambda one, start: fit(experiment, free, one, start, steps))(windows, starts)
+
+
+@functools.cache
+def fitted(kind):
+    """Model, numbers, and 200 noise realisations with their fits in one vmapped run; the truth has a hard gap and another
+    integrator."""
+    experiment = drive(3)
+    torque, states = map(jnp.asarray, recorded(kind, 600))
+    free = free_parameters(experiment, list(TRUE), 1.0)
+    keys = jax.random.split(jax.random.key(7), 200)
+    windows = realisations(torque, states, {"motor": 3e-4, "load": 6e-5}, keys, 300)
+    starts = 0.03 * jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, 1), (len(free),)))(keys)
+    return experiment, free, windows, _fits(experiment, free, windows, starts, 25)
+
+
 def test_agrees_with_one_least_squares_problem_over_parameters_and_states():
     """SciPy's own over the parameters and the states of all windows at once, derivatives by JAX."""
-    noise = {"motor": 1e-3, "load": 2e-4}
-    torque, states = recorded("multisine", 400)
-    experiment = drive(2)
-    free = free_parameters(experiment, list(TRUE), 1.0)
-    windows = windows_of(torque, noisy(states, noise, jax.random.key(0)), noise, 100)
-    found = jit(lambda t: fit(experiment, free, windows, t))(0.1 * jnp.ones(len(free)))
+    experiment, free, *each = fitted("multisine")
+    windows, found = (jax.tree.map(lambda x: x[0], one) for one in each)
+    noise = windows.noise
     assert bool(found.converged)
 
     @jit
     def residual(both):
         at = with_fitted(experiment, free, both[:6])
-        starts = both[6:].reshape(4, 4)
+        starts = both[6:].reshape(2, 4)
 
         def one(x, u, motor, load):
             start = PlantState({"motor": x[0], "load": x[1]}, {"motor": x[2], "load": x[3]}, ())
@@ -107,29 +134,10 @@ def test_agrees_with_one_least_squares_problem_over_parameters_and_states():
     np.testing.assert_allclose(np.sqrt(np.diag(plain)), deviation, rtol=0.02)
 
 
-def realisations(torque, states, noise, keys, samples, period=PERIOD):
-    """Windows of one motion under several realisations of the noise, with a leading axis."""
-    seen = jax.vmap(lambda key: noisy(states, noise, key))(keys)
-    each = [windows_of(torque, {s: x[i] for s, x in seen.items()}, noise, samples, period) for i in range(len(keys))]
-    return jax.tree.map(lambda *x: np.stack(x), *each)
-
-
-@jit
-def _fits(experiment, free, windows, starts, steps):
-    return jax.vmap(lambda one, start: fit(experiment, free, one, start, steps))(windows, starts)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["multisine", "steps"])
 def test_intervals_cover_the_truth_as_often_as_they_say(kind):
-    """200 noise realisations in one vmapped run; the truth has a hard gap and another integrator."""
-    experiment = drive(6)
-    torque, states = map(jnp.asarray, recorded(kind, 600))
-    free = free_parameters(experiment, list(TRUE), 1.0)
-    keys = jax.random.split(jax.random.key(7), 200)
-    windows = realisations(torque, states, {"motor": 3e-4, "load": 6e-5}, keys, 300)
-    starts = 0.03 * jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, 1), (len(free),)))(keys)
-    found = _fits(experiment, free, windows, starts, 25)
+    *_, found = fitted(kind)
     theta, covariance = (
         found.theta,
         np.stack([spread(jax.tree.map(lambda x, i=i: x[i], found)).covariance for i in range(200)]),

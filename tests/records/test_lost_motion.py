@@ -37,10 +37,10 @@ def load_driven(seed, *, gap=0.02, drift=0.0, changes=(61.0,), around=False):
     [(0.1, {"noise": 1e-2}), (0.5, {"noise": 1e-3, "skew": 1.3e-3}), (0.05, {"noise": 1e-3, "resolution": 5e-3})],
 )
 def test_intervals_by_the_direction_of_motion_cover_the_gap(gap, quality):
-    found = [geared(made(gap=gap, seed=seed, **quality)) for seed in range(100)]
+    found = [geared(made(gap=gap, seed=seed, **quality)) for seed in range(50)]
     assert all(f.flank == "motion" and f.flank_changes >= 2 for f in found)
     covered = sum(f.lost_motion_interval[0] <= gap <= f.lost_motion_interval[1] for f in found)
-    assert 90 <= covered <= 100
+    assert covered >= 45
     # not by being wide
     spread = np.std([f.lost_motion for f in found])
     assert np.mean([f.lost_motion_error for f in found]) < 1.6 * spread + 2e-4 * gap
@@ -49,10 +49,10 @@ def test_intervals_by_the_direction_of_motion_cover_the_gap(gap, quality):
 
 @pytest.mark.parametrize("options", [{}, {"changes": (31.0, 63.0, 100.0)}, {"around": True}])
 def test_intervals_by_the_side_of_the_load_cover_the_gap(options):
-    found = [geared(load_driven(seed, **options), 1.0) for seed in range(50)]
+    found = [geared(load_driven(seed, **options), 1.0) for seed in range(30)]
     assert all(f.flank == "load" and f.flank_changes == len(options.get("changes", (61.0,))) for f in found)
     covered = sum(f.lost_motion_interval[0] <= 0.02 <= f.lost_motion_interval[1] for f in found)
-    assert covered >= 45
+    assert covered >= 27
     spread = np.std([f.lost_motion for f in found])
     assert np.mean([f.lost_motion_error for f in found]) < 2.0 * spread
     times = np.array([f.flank_times for f in found])
@@ -61,7 +61,7 @@ def test_intervals_by_the_side_of_the_load_cover_the_gap(options):
 
 @pytest.mark.parametrize("around", [False, True])
 def test_a_load_that_stays_on_one_side_and_a_drift_show_no_lost_motion(around):
-    for seed in range(20):
+    for seed in range(10):
         for options in ({"gap": 0.0}, {"gap": 0.0, "drift": 1e-4}):
             found = geared(load_driven(seed, around=around, **options), 1.0)
             assert found.flank == "motion", (seed, options)
