@@ -17,7 +17,6 @@ os.environ |= {
 }
 
 import jax
-import numpy as np
 import pytest
 from hypothesis import settings
 from progress_lines import without_progress
@@ -52,24 +51,9 @@ def _few_programs():
 @pytest.fixture(scope="module")
 def compiled_once():
     """Studies that are the same throughout a file share the program of their chunks, and the count of its work."""
-    from jaxbl.sweeps import costs, programs
+    from jaxbl.sweeps.programs import sharing
 
-    def remembered(function):
-        known = {}
-
-        def found(experiment, *given):
-            leaves, structure = jax.tree.flatten(experiment)
-            numbers = [(leaf.dtype, leaf.tobytes()) for leaf in map(np.asarray, leaves)]
-            key = structure, *numbers, *(tuple(one) if isinstance(one, list | dict) else one for one in given)
-            if key not in known:
-                known[key] = function(experiment, *given)
-            return known[key]
-
-        return found
-
-    with pytest.MonkeyPatch.context() as patched:
-        for module, name in ((programs, "_fused"), (programs, "_scanned"), (costs, "_counted")):
-            patched.setattr(module, name, remembered(getattr(module, name)))
+    with sharing():
         yield
 
 
