@@ -71,7 +71,7 @@ def test_it_is_simulated_and_swept_over(installed, tmp_path):
 
 def test_its_numbers_are_identified(installed, tmp_path):
     log, _ = logs(tmp_path)
-    known = model(effects=[{"kind": NAME, "torque": 0.04, "length": 0.15}], identify={"starts": 2})
+    known = model(effects=[{"kind": NAME, "torque": 0.04, "length": 0.15}], identify={"starts": 1})
     (tmp_path / "model.toml").write_text(tomli_w.dumps(known), encoding="utf-8")
     jaxbl(installed, "identify", log, "--model", tmp_path / "model.toml", "--out", tmp_path / "found")
     found = json.loads((tmp_path / "found" / "identification.json").read_text(encoding="utf-8"))["parameters"]

@@ -79,8 +79,11 @@ def _version() -> str:
 
 def key_of(what: str, *given: Any) -> str | None:
     """Name of a program, `what` it is and what it is given; None where none are kept, or its arguments are unknown."""
-    if keeping() is None:
-        return None
+    return None if keeping() is None else name_of(what, *given)
+
+
+def name_of(what: str, *given: Any) -> str | None:
+    """As :func:`key_of`, whether programs are kept or not."""
     try:
         text = f"{what} {len(jax.local_devices())} {jax.config.read('jax_enable_x64')} {_described(given)}"
     except Unknown:

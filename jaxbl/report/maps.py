@@ -10,7 +10,6 @@ from collections.abc import Container, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import matplotlib.patheffects as path_effects
 import numpy as np
 import pandas as pd
@@ -25,6 +24,7 @@ from jaxbl.config import Config, FigureTable, is_boolean, numeric_paths
 from jaxbl.gains.accuracy_laws import Law, accuracy_laws, fixed_values, selected
 from jaxbl.observer.conditions import CONDITIONS, Condition
 from jaxbl.sweeps.metrics import is_magnitude, metric_of
+from jaxbl.sweeps.pieces import in_pieces
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 
@@ -473,7 +473,7 @@ def condition_curves(
     for name, condition in conditions.items():
         dashes, colour = _CURVES[name]
         with jax.enable_x64(True):
-            least = np.asarray(condition.least_lambda(jnp.asarray(fine), jnp.asarray(bound))) if fine.size else fine
+            least = in_pieces(condition.least_lambda, [fine, np.full_like(fine, bound)]) if fine.size else fine
         line = (fine, least) if alpha_is_x else (least, fine)
         outlined = [path_effects.Stroke(linewidth=3.6, foreground="black"), path_effects.Normal()]
         # the label is what the pointer says on a page

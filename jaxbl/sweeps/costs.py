@@ -22,7 +22,7 @@ from jaxbl.simulate import Experiment, scan
 from jaxbl.workers import doing
 
 from .metrics import Names, metrics
-from .programs import BACKENDS, Backend, Layout, compile_program, not_put_into_cache, shared
+from .programs import BACKENDS, Backend, Layout, compile_program, not_put_into_cache
 
 
 class Work(NamedTuple):
@@ -141,12 +141,18 @@ def work_of(config: Config, paths: Sequence[str], names: Names = None) -> Work:
     """Count what a sample takes where these paths differ from lane to lane, and some metrics are computed, or all."""
     with precision(config):
         experiment = prepare(config)
-        key = kept.key_of("work", experiment, tuple(paths), names)
-        found = kept.load(key)
+        key = kept.name_of("work", experiment, tuple(paths), names)
+        # a study of many sweeps asks for the same one, also where nothing is kept on disk
+        found = _works.get(key) or kept.load(key)
         if found is None:
-            found = shared(experiment, paths, names, lambda: _counted(experiment, paths, names))
+            found = _counted(experiment, paths, names)
             kept.save(key, found)
+        if key is not None:
+            _works[key] = found
     return found
+
+
+_works: dict[str | None, Work] = {}
 
 
 _COUNTED = 1009
