@@ -41,9 +41,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: -slow[item.path])
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope="module")
 def _few_programs():
-    """Over a thousand tests, compiled programs would use up what the system lets a process map into memory."""
+    """Over many files, compiled programs would use up what the system lets a process map into memory."""
     yield
     forget_programs()
 

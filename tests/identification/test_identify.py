@@ -158,6 +158,8 @@ def measured(tmp_path_factory):
 def everything(measured):
     """All that can be asked for at once: no excitation, no gains, measured torque, prediction errors, profiles, hold-out."""
     study = open_ended(NOMINAL)
+    # the log is sampled twice as often
+    study["run"] = {key: 2 * value if key in ("sample_period", "substeps") else value for key, value in study["run"].items()}
     study["log"] = {"transmitted": "sensor", "initial_state": "rest"}
     study["identify"] = {"starts": 2, "window": 0.5, "method": "prediction_error", "parameters": list(TRUTH)[4:]}
     study["drive"] = geared()["drive"]
