@@ -35,6 +35,19 @@ GROWN = 1.0 + np.clip((np.arange(0.0, SECONDS, 1e-3) - 5.0) / 4.0, 0.0, 1.0)
 """The half gap over its size at the start: it doubles from 5 s to 9 s."""
 
 
+def wrote_mcap(path, log):
+    """A log as messages in JSON of one topic, at their times of recording."""
+    library = pytest.importorskip("mcap.writer", reason="the extra logs is not installed")
+    with path.open("wb") as file:
+        writer = library.Writer(file)
+        writer.start()
+        channel = writer.register_channel("/axis", "json", writer.register_schema("axis", "jsonschema", b"{}"))
+        for row in log.to_dict("records"):
+            time = round(1e9 * row.pop("t")) + 1_700_000_000_000_000_000
+            writer.add_message(channel, time, json.dumps(row).encode(), time)
+        writer.finish()
+
+
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory):
     """A model, and logs of its drive whose gap stays, and whose gap grows."""
@@ -387,3 +400,13 @@ def test_a_drive_by_another_simulator(tmp_path):
     assert last["stiffness"] == pytest.approx(GAP["stiffness"], rel=0.01)
     for side, friction in zip(("motor", "load"), FRICTIONS, strict=True):
         assert last[f"{side}.coulomb"] == pytest.approx(friction["torque"], rel=0.15)
+
+
+def test_a_recording_in_mcap_is_watched_as_the_same_log_in_csv(grown, logs, tmp_path):
+    wrote_mcap(tmp_path / "grown.mcap", pd.read_csv(logs / "grown.csv"))
+    columns = {name: f"/axis.{name}" for name in ("u", "theta_e", "theta_s")}
+    data = axis(log=columns)
+    found = jaxbl.watch(tmp_path / "grown.mcap", data, alarm_gap=LIMIT, **WINDOW)
+    pd.testing.assert_frame_equal(found.values, grown[0].values, rtol=1e-6)
+    with pytest.raises(InputError, match=r"grown\.mcap: .*follow"):
+        jaxbl.watch(tmp_path / "grown.mcap", data, follow=True, **WINDOW)
