@@ -50,7 +50,7 @@ def _few_programs():
 
 @pytest.fixture(scope="module")
 def compiled_once():
-    """Studies that are the same throughout a file share the program of their chunks, and the count of its work."""
+    """Studies of a file that differ in values of lanes alone share the program of their chunks."""
     from jaxbl.sweeps.programs import sharing
 
     with sharing():

@@ -42,7 +42,7 @@ def computed(backend: Backend, names: Names) -> Names:
 Made = TypeVar("Made")
 
 _MOST = 16
-"""Programs that studies share, at most, with what was counted for them."""
+"""Programs that studies share, at most."""
 _shared: ContextVar[OrderedDict[Any, Any] | None] = ContextVar("shared", default=None)
 
 

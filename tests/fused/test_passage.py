@@ -181,7 +181,9 @@ def test_the_kernel_can_be_written_for_a_gpu(half, precision):
     assert "fma.rn" in written
 
 
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="another device may have a kernel")
+@pytest.mark.skipif(
+    jax.default_backend() != "cpu", reason="that only a processor lacks a kernel: this device may compile one"
+)
 def test_a_processor_has_no_kernel_of_accelerators():
     with pytest.raises(Unsupported, match="how to compile for this device"):
         DevicePassage(experiment([], LinearShaft(60.0)), (METRICS,), ("transmission.stiffness",), 5)

@@ -18,6 +18,7 @@ import pytest
 import tomli_w
 from growing import HALF_GAP, STIFFNESS, axis, log_of
 from hidden_log import FRICTIONS, GAP, geared
+from mcap_log import write_mcap
 from small_study import rigid, small, swung
 
 import jaxbl
@@ -33,19 +34,6 @@ OPTIONS = ("--window", "4", "--every", "0.5")
 SECONDS = 16.0
 GROWN = 1.0 + np.clip((np.arange(0.0, SECONDS, 1e-3) - 5.0) / 4.0, 0.0, 1.0)
 """The half gap over its size at the start: it doubles from 5 s to 9 s."""
-
-
-def wrote_mcap(path, log):
-    """A log as messages in JSON of one topic, at their times of recording."""
-    library = pytest.importorskip("mcap.writer", reason="the extra logs is not installed")
-    with path.open("wb") as file:
-        writer = library.Writer(file)
-        writer.start()
-        channel = writer.register_channel("/axis", "json", writer.register_schema("axis", "jsonschema", b"{}"))
-        for row in log.to_dict("records"):
-            time = round(1e9 * row.pop("t")) + 1_700_000_000_000_000_000
-            writer.add_message(channel, time, json.dumps(row).encode(), time)
-        writer.finish()
 
 
 @pytest.fixture(scope="module")
@@ -403,7 +391,8 @@ def test_a_drive_by_another_simulator(tmp_path):
 
 
 def test_a_recording_in_mcap_is_watched_as_the_same_log_in_csv(grown, logs, tmp_path):
-    wrote_mcap(tmp_path / "grown.mcap", pd.read_csv(logs / "grown.csv"))
+    log = pd.read_csv(logs / "grown.csv")
+    write_mcap(tmp_path / "grown.mcap", {"axis": zip(log.pop("t"), log.to_dict("records"), strict=True)})
     columns = {name: f"/axis.{name}" for name in ("u", "theta_e", "theta_s")}
     data = axis(log=columns)
     found = jaxbl.watch(tmp_path / "grown.mcap", data, alarm_gap=LIMIT, **WINDOW)

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap_log import write_mcap
 from scipy.io import savemat
 
 from jaxbl.errors import InputError
@@ -275,18 +276,8 @@ def test_mdf_by_its_library(tmp_path):
 
 def wrote_mcap(path):
     """A topic in JSON at times of recording, another, slower one."""
-    library = pytest.importorskip("mcap.writer", reason="the extra logs is not installed")
-    with path.open("wb") as file:
-        writer = library.Writer(file)
-        writer.start()
-        schema = writer.register_schema("state", "jsonschema", b"{}")
-        channels = {name: writer.register_channel(f"/{name}", "json", schema) for name in ("axis", "slow")}
-        for i, (t, u) in enumerate(zip(T.tolist(), U.tolist(), strict=True)):
-            time = int(1e9 * t) + 1_700_000_000_000_000_000
-            data = {"axis": {"u": u, "angles": [t, u], "name": "x"}} | ({"slow": {"v": 10.0 * t}} if i in (0, 4) else {})
-            for name, message in data.items():
-                writer.add_message(channels[name], time, json.dumps(message).encode(), time)
-        writer.finish()
+    axis = [(t, {"u": u, "angles": [t, u], "name": "x"}) for t, u in zip(T.tolist(), U.tolist(), strict=True)]
+    write_mcap(path, {"axis": axis, "slow": [(t, {"v": 10.0 * t}) for t in T[[0, 4]].tolist()]})
 
 
 def wrote_bag(path):
