@@ -157,3 +157,17 @@ def test_a_user_without_a_home_keeps_no_programs(home, monkeypatch):
     monkeypatch.delenv("HOME")
     monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("no home")))
     assert _cache() is None
+
+
+def test_a_program_that_another_process_is_still_writing_is_compiled_in_silence(tmp_path):
+    program = "from jaxbl.workers import start_jax; start_jax(); import jax; print(jax.jit(lambda x: 3 * x)(2.0))"
+    command = [sys.executable, "-W", "error", "-c", program]
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path)}
+    subprocess.run(command, env=environment, check=True, capture_output=True)
+    entries = list(tmp_path.glob("*-cache"))
+    assert entries
+    for entry in entries:
+        entry.write_bytes(entry.read_bytes()[:100])
+    again = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+    assert again.stdout == "6.0\n"
+    assert not again.stderr
