@@ -27,14 +27,30 @@ from .writer import plain_text
 
 FMI = {2: "2.0", 3: "3.0"}
 """Versions by their numbers in options."""
-_FLAGS = "-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-fvisibility=hidden", "-shared"
-_PLATFORMS = {
-    ("Linux", "x86_64"): ("linux64", "x86_64-linux", "so"),
-    ("Linux", "aarch64"): (None, "aarch64-linux", "so"),
-    ("Darwin", "x86_64"): ("darwin64", "x86_64-darwin", "dylib"),
-    ("Darwin", "arm64"): ("darwin64", "aarch64-darwin", "dylib"),
+_FLAGS = "-std=c99", "-O2", "-ffp-contract=off", "-shared"
+
+
+class Platform(NamedTuple):
+    """Its names in FMI 2 (None: it has none) and 3, the ending of its binaries, compiler, and flags."""
+
+    of_2: str | None
+    of_3: str
+    ending: str
+    compiler: str = "cc"
+    flags: tuple[str, ...] = ("-fPIC", "-fvisibility=hidden")
+
+
+# the same bytes for the same sources; nothing but Windows needed where it runs
+_OF_WINDOWS = "-s", "-static-libgcc", "-Wl,--no-insert-timestamp"
+_WINDOWS = Platform("win64", "x86_64-windows", "dll", "x86_64-w64-mingw32-gcc", _OF_WINDOWS)
+_HERE = {
+    ("Linux", "x86_64"): Platform("linux64", "x86_64-linux", "so"),
+    ("Linux", "aarch64"): Platform(None, "aarch64-linux", "so"),
+    ("Darwin", "x86_64"): Platform("darwin64", "x86_64-darwin", "dylib"),
+    ("Darwin", "arm64"): Platform("darwin64", "aarch64-darwin", "dylib"),
+    ("Windows", "AMD64"): _WINDOWS,
 }
-"""Names of platforms in FMI 2 and 3, and ending of binaries. FMI 2 has none for Linux on ARM."""
+"""This machine's platform by its system and processor."""
 _LONGEST_COMPILATION = 300.0
 """s."""
 
@@ -61,15 +77,15 @@ class Archive(NamedTuple):
         content: of the file.
         variables: in the order of their value references.
         token: instantiation token (FMI 2: guid).
-        binary: platform of the binary in it, or "".
-        why: there is none, or "".
+        binaries: platforms of those in it.
+        why: there is none for this machine, or for Windows, in a line each.
     """
 
     content: bytes
     variables: list[Scalar]
     token: str
-    binary: str
-    why: str
+    binaries: list[str]
+    why: list[str]
 
 
 def fmu(config: Config, plant: PlantProgram, about: Sequence[str], fmi: int) -> Archive:
@@ -97,12 +113,9 @@ def fmu(config: Config, plant: PlantProgram, about: Sequence[str], fmi: int) -> 
     if fmi == 3:
         files["sources/buildDescription.xml"] = _build_description(name, compiled)
     files |= {f"sources/{file}": text for file, text in sources.items()}
-    place, ending, why = _place(fmi)
-    if place:
-        binary, why = _binary(name, ending, sources)
-        if binary:
-            files[f"binaries/{place}/{name}.{ending}"] = binary
-    return Archive(_archive(files), variables, token, place if not why else "", why)
+    binaries, why = _binaries(name, fmi, sources)
+    files |= {f"binaries/{place}/{file}": content for place, (file, content) in binaries.items()}
+    return Archive(_archive(files), variables, token, [*binaries], why)
 
 
 def _archive(files: Mapping[str, str | bytes]) -> bytes:
@@ -117,30 +130,43 @@ def _archive(files: Mapping[str, str | bytes]) -> bytes:
     return made.getvalue()
 
 
-# the binary
+# binaries
 
 
-def _place(fmi: int) -> tuple[str, str, str]:
-    """Folder of the binary for this machine, its ending, and why there is none."""
-    of_2, of_3, ending = _PLATFORMS.get((platform.system(), platform.machine()), (None, None, ""))
-    place = of_2 if fmi == 2 else of_3
-    why = f"for {platform.system()} on {platform.machine()} none is compiled in FMI {FMI[fmi]}"
-    return (place, ending, "") if place else ("", "", why)
+def _binaries(name: str, fmi: int, sources: Mapping[str, str]) -> tuple[dict[str, tuple[str, bytes]], list[str]]:
+    """By platform, name and content of its binary; and why there are not more.
+
+    One is for this machine, and one for Windows if a compiler for it is here.
+    """
+    system = platform.system(), platform.machine()
+    found, why = {}, []
+    across = [_WINDOWS] if shutil.which(_WINDOWS.compiler) else []
+    for one in dict.fromkeys([_HERE.get(system), *across]):
+        place = one and (one.of_2 if fmi == 2 else one.of_3)
+        if one is None or place is None:
+            why.append(f"for {' on '.join(system)} none is compiled in FMI {FMI[fmi]}")
+            continue
+        content, fault = _binary(name, one, sources)
+        if fault:
+            why.append(fault)
+        else:
+            found[place] = f"{name}.{one.ending}", content
+    return found, why
 
 
-def _binary(name: str, ending: str, sources: Mapping[str, str]) -> tuple[bytes, str]:
-    """The sources compiled for this machine, or why they are not."""
-    compiler = shutil.which("cc")
+def _binary(name: str, of: Platform, sources: Mapping[str, str]) -> tuple[bytes, str]:
+    """The sources compiled for a platform, or why they are not."""
+    compiler = shutil.which(of.compiler)
     if compiler is None:
-        return b"", "no C compiler (cc) was found"
+        return b"", f"no C compiler ({of.compiler}) was found"
     with TemporaryDirectory() as folder:
         for file, text in sources.items():
             (Path(folder) / file).write_text(text, encoding="utf-8")
         names = [file for file in sources if file.endswith(".c")]
-        made = f"{name}.{ending}"
+        made = f"{name}.{of.ending}"
         try:
             done = subprocess.run(
-                [compiler, *_FLAGS, *names, "-o", made, "-lm"],
+                [compiler, *_FLAGS, *of.flags, *names, "-o", made, "-lm"],
                 cwd=folder,
                 capture_output=True,
                 text=True,

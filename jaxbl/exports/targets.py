@@ -115,15 +115,18 @@ def _fmu(request: Request) -> Files:
     made = fmu(request.config, plant, _head(request, f"{name}: the drive, from sample to sample.", call), request.fmi)
     period, count = request.config.run.sample_period, sum(one.causality == "parameter" for one in made.variables)
     what = f"{name}.fmu: FMI {fmi}, co-simulation, steps of {period:g} s, {count} parameters"
-    lines = [
-        f"{what}; a binary for {made.binary}, and the sources." if made.binary else f"{what}; the sources alone: {made.why}."
-    ]
+    places, why = " and ".join(made.binaries), "; ".join(made.why)
+    if made.binaries:
+        lines = [f"{what}; {'binaries' if made.binaries[1:] else 'a binary'} for {places}, and the sources."]
+        lines += [f"One more binary is missing: {why}."] if why else []
+    else:
+        lines = [f"{what}; the sources alone: {why}."]
     summary = {
         "precision": request.precision,
         "sample_period": period,
         "fmi": fmi,
         "token": made.token,
-        "binary": made.binary or None,
+        "binaries": made.binaries,
         "variables": [dict(one._asdict()) for one in made.variables],
     }
     return Files({f"{name}.fmu": made.content}, summary, lines)

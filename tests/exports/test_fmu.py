@@ -1,6 +1,7 @@
 """Functional Mock-up Units: valid for another implementation of FMI, and the motion that `jaxbl.run` finds."""
 
 import ctypes
+import os
 import shutil
 import zipfile
 from pathlib import Path
@@ -18,7 +19,7 @@ from jaxbl.config import read_config
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.transmission import LinearShaft
 from jaxbl.errors import InputError
-from jaxbl.exports.fmu import base_unit, unit_name
+from jaxbl.exports.fmu import _WINDOWS, base_unit, unit_name
 from jaxbl.exports.plant import plant_program
 
 fmpy = pytest.importorskip("fmpy", reason="runs FMUs by FMPy (pip install 'jaxbl[fmu]')")
@@ -57,6 +58,13 @@ STUDIES = {
     **{f"effects of {place}": study(place) for place in ("motor.", "load.", "transmission.", "actuator.", "encoder.")},
     ALL: study("", initial=MOVED),
 }
+
+
+@pytest.fixture(autouse=True)
+def _for_this_machine(request, monkeypatch):
+    """Tests of binaries for Windows alone compile them: it takes half a second each."""
+    if "windows" not in request.node.name:
+        monkeypatch.setattr("jaxbl.exports.fmu._WINDOWS", _WINDOWS._replace(compiler="not here"))
 
 
 def written(data, folder, fmi=3, **options):
@@ -214,6 +222,39 @@ def test_the_motion_is_the_traced_step_bit_for_bit(tmp_path, precision):
     with Instance(path) as one:
         own = one.begin().run(torques.astype(float))
     assert (bits(own) == bits(np.array(rows, dtype).astype(float))).all()
+
+
+@pytest.fixture(scope="module")
+def wine(tmp_path_factory):
+    """What Wine needs in its environment: a folder for its Windows, which it makes once."""
+    return os.environ | {
+        "WINEPREFIX": str(tmp_path_factory.mktemp("wine")),
+        "WINEDEBUG": "-all",
+        "WINEDLLOVERRIDES": "mscoree,mshtml=",
+    }
+
+
+@COMPILED
+@VERSIONS
+@needs("x86_64-w64-mingw32-gcc", "wine")
+def test_on_windows_it_runs_with_the_same_bits(tmp_path, wine, fmi):
+    """By a program for Windows under Wine; a step of part of a period is refused with the same words."""
+    path, summary = written(study("motor.cou", "load.pre", transmission=GAP), tmp_path, fmi, name="axis")
+    assert summary["binaries"] == (["linux64", "win64"] if fmi == 2 else ["x86_64-linux", "x86_64-windows"])
+    library = zipfile.ZipFile(path).extract(f"binaries/{summary['binaries'][1]}/axis.dll", tmp_path)
+    ran("x86_64-w64-mingw32-gcc", "-O1", Path(__file__).parent / "run_on_windows.c", "-o", "run.exe", cwd=tmp_path)
+    torques = [5.0 * np.sin(8.0 * i * 1e-3) for i in range(1000)]
+    with Instance(path) as one:
+        expected = one.begin().run(torques)
+        with pytest.raises(FMICallException):
+            one.step(1.0, 0.3e-3)
+    arguments = library, fmi, summary["token"], summary["sample_period"], expected.shape[1]
+    given = "\n".join(repr(float(one)) for one in torques)
+    said = ran("wine", "run.exe", *arguments, cwd=tmp_path, env=wine, input=given).stdout
+    *rows, refusal = said.splitlines()
+    assert refusal == one.said[-1]
+    found = np.array([[int(word, 16) for word in row.split()] for row in rows], np.uint64)
+    assert (found.view(np.int64) == bits(expected)).all()
 
 
 @COMPILED
@@ -428,38 +469,52 @@ def test_what_is_refused_has_a_line_in_the_log(tmp_path, fmi):
 
 
 def test_without_a_compiler_it_holds_the_sources_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxbl.exports.fmu.shutil.which", lambda name: None)
+    only(monkeypatch)
     made = jaxbl.export(study(), tmp_path, "fmu", name="axis")
     assert made.lines == [
         "axis.fmu: FMI 3.0, co-simulation, steps of 0.001 s, 12 parameters; the sources alone: no C compiler (cc) was found."
     ]
-    assert made.summary["binary"] is None
+    assert made.summary["binaries"] == []
     names = zipfile.ZipFile(tmp_path / "axis.fmu").namelist()
     assert {"modelDescription.xml", "sources/buildDescription.xml", "sources/axis.c", "sources/fmi-3.c"} <= {*names}
     assert not [one for one in names if one.startswith("binaries")]
     assert validate_fmu(str(tmp_path / "axis.fmu")) == []
 
 
+def only(monkeypatch, *programs):
+    """No other programs are found."""
+    monkeypatch.setattr("jaxbl.exports.fmu.shutil.which", {one: shutil.which(one) or one for one in programs}.get)
+
+
 @pytest.mark.parametrize(
     ("machine", "fmi", "why"),
     [
-        (("Windows", "AMD64"), 2, "for Windows on AMD64 none is compiled in FMI 2.0"),
+        (("Windows", "AMD64"), 2, "no C compiler (x86_64-w64-mingw32-gcc) was found"),
         (("Linux", "aarch64"), 2, "for Linux on aarch64 none is compiled in FMI 2.0"),
         (("Linux", "riscv64"), 3, "for Linux on riscv64 none is compiled in FMI 3.0"),
     ],
 )
 def test_on_other_machines_it_holds_the_sources_alone(tmp_path, monkeypatch, machine, fmi, why):
+    only(monkeypatch, "cc")
     for name, value in zip(("system", "machine"), machine, strict=True):
         monkeypatch.setattr(f"jaxbl.exports.fmu.platform.{name}", lambda value=value: value)
     assert jaxbl.export(study(), tmp_path, "fmu", fmi=fmi).lines[0].endswith(f"; the sources alone: {why}.")
 
 
-@needs("cc")
+@needs("x86_64-w64-mingw32-gcc")
+def test_with_a_compiler_for_windows_alone_it_says_which_binary_is_missing(tmp_path, monkeypatch):
+    only(monkeypatch, "x86_64-w64-mingw32-gcc")
+    made = jaxbl.export(study(), tmp_path, "fmu")
+    assert made.lines[0].endswith("; a binary for x86_64-windows, and the sources.")
+    assert made.lines[1:] == ["One more binary is missing: no C compiler (cc) was found."]
+    assert made.summary["binaries"] == ["x86_64-windows"]
+
+
 def test_a_compiler_that_fails_is_told(tmp_path, monkeypatch):
     broken = tmp_path / "cc"
     broken.write_text("#!/bin/sh\necho 'no headers' >&2\nexit 1\n")
     broken.chmod(0o755)
-    monkeypatch.setattr("jaxbl.exports.fmu.shutil.which", lambda name: str(broken))
+    monkeypatch.setattr("jaxbl.exports.fmu.shutil.which", {"cc": str(broken)}.get)
     made = jaxbl.export(study(), tmp_path / "new", "fmu")
     assert f"the sources alone: {broken} failed: no headers." in made.lines[0]
 
@@ -562,7 +617,7 @@ def test_another_tool_compiles_the_sources_from_what_the_fmu_says_of_them(tmp_pa
     build = pytest.importorskip("fmpy.build", reason="compiles FMUs by FMPy (pip install 'jaxbl[fmu]')")
     data = study(transmission=GAP)
     with monkeypatch.context() as without:
-        without.setattr("jaxbl.exports.fmu.shutil.which", lambda name: None)
+        only(without)
         path, summary = written(data, tmp_path, fmi)
     folder = fmpy.extract(path, tmp_path / "there")
     (tmp_path / "build").mkdir()
@@ -611,7 +666,7 @@ def test_two_effects_of_one_kind_have_names_of_their_own(tmp_path):
 )
 def test_any_name_that_is_allowed_compiles(tmp_path, name):
     path, summary = written(study(transmission=GAP), tmp_path, name=name)
-    assert summary["binary"]
+    assert summary["binaries"]
     with Instance(path) as one:
         assert np.isfinite(one.begin().run([1.0] * 3)).all()
 
