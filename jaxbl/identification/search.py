@@ -72,7 +72,7 @@ class Found(Fitted):
         refused: directions that the record does not show.
         held: numbers that were left at their nominal values therefore.
         condition: of the information about all numbers asked for.
-        starts: cost and theta of each start, and whether it agrees with the best.
+        starts: cost and theta of each start, and whether it agrees with the best: 1 % more at most, or no more than noise leaves.
     """
 
     refused: list[Refusal]
@@ -162,9 +162,10 @@ class ParameterSearch:
         if not np.isfinite(cost).any():
             raise InputError(f"{self.name}: the model diverges from every start; its nominal numbers should be nearer")
         best = int(np.argmin(cost))
+        # fits end where residuals are small beside the noise: below it, they need not have the same
+        same = 1.01 * max(cost[best], tries[best].residual.size / 2)
         starts = [
-            {"cost": float(c), "agrees": bool(c <= cost[best] * 1.01), "theta": t.tolist()}
-            for c, t in zip(cost, found, strict=True)
+            {"cost": float(c), "agrees": bool(c <= same), "theta": t.tolist()} for c, t in zip(cost, found, strict=True)
         ]
         return _nearest_turn(free, found[best]), starts
 

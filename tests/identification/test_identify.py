@@ -266,6 +266,16 @@ def test_bad_input_is_one_line(case, log):
     assert "\n" not in str(error.value)
 
 
+def test_starts_agree_that_end_where_there_is_no_noise_to_tell_them_apart(tmp_path):
+    multisine = {"kind": "multisine", "amplitude": 1.0, "frequency": 0.5}
+    study = rigid({"run.duration": 2.0, "encoders.noise": 0.0}, excitation=multisine)
+    file = tmp_path / "axis.csv"
+    run(study).trace[["t", "u", "theta_e"]].to_csv(file, index=False)
+    fit = identify(file, study | {"identify": {"starts": 4}}).summary["method"]["trajectory"]
+    assert fit["variance_over_noise"] < 0.5
+    assert fit["starts_agreeing"] == 4
+
+
 @pytest.mark.slow
 def test_emps_agrees_with_what_was_published():
     """A real axis in closed loop, by a rigid model; values of Janot, Gautier, Brunot (2019)."""
