@@ -72,7 +72,7 @@ class Found(Fitted):
         refused: directions that the record does not show.
         held: numbers that were left at their nominal values therefore.
         condition: of the information about all numbers asked for.
-        starts: cost and theta of each start, and whether it agrees with the best: 1 % more at most, or no more than noise leaves.
+        starts: cost and theta of each start, and whether it agrees with the best: at most 1 % more, or no more than noise.
     """
 
     refused: list[Refusal]
