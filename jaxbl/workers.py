@@ -126,7 +126,7 @@ def start_jax(devices: int | None = None) -> None:
     import jax
 
     collect_rarely()
-    _compile_what_cannot_be_read()
+    _ignore_cache_warnings()
     if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
         # it has begun already: a later job of one worker
         with suppress(RuntimeError):
@@ -189,8 +189,8 @@ def collect_rarely() -> None:
     gc.set_threshold(200_000, 50, 100)
 
 
-def _compile_what_cannot_be_read() -> None:
-    """Say nothing of a kept program that another process is still writing: JAX compiles it, and would warn."""
+def _ignore_cache_warnings() -> None:
+    """JAX warns of a kept program that another process is still writing, and compiles it."""
     warnings.filterwarnings("ignore", "Error reading persistent compilation cache entry", UserWarning)
 
 
@@ -198,7 +198,7 @@ def _prepare(cache: str | None, least: float) -> None:
     import jax
 
     collect_rarely()
-    _compile_what_cannot_be_read()
+    _ignore_cache_warnings()
     signal.signal(signal.SIGINT, _interrupted)
     # nothing else tells a process that the one it works for was killed
     threading.Thread(target=_end_with_parent, daemon=True).start()
