@@ -72,7 +72,7 @@ class Found(Fitted):
         refused: directions that the record does not show.
         held: numbers that were left at their nominal values therefore.
         condition: of the information about all numbers asked for.
-        starts: cost and theta of each start, and whether it agrees with the best: at most 1 % more, or no more than noise.
+        starts: cost and theta of each start, and whether it agrees with the best.
     """
 
     refused: list[Refusal]
@@ -146,7 +146,10 @@ class ParameterSearch:
         return windows_of(self.segments, self.experiment, samples, self.rest)
 
     def _coarse(self, free: tuple[Free, ...]) -> tuple[np.ndarray, list[dict[str, Any]]]:
-        """Best of several starts, on short windows from all over the record."""
+        """Best of several starts, on short windows from all over the record.
+
+        Starts agree with it whose costs are at most 1 % larger; of the cost of noise alone, if that is more.
+        """
         windows, _ = self._cut(self.lengths[0])
         count = len(windows.time)
         if count > _MOST_COARSE:
@@ -162,8 +165,8 @@ class ParameterSearch:
         if not np.isfinite(cost).any():
             raise InputError(f"{self.name}: the model diverges from every start; its nominal numbers should be nearer")
         best = int(np.argmin(cost))
-        # fits end where residuals are small beside the noise: below it, they need not have the same
-        same = 1.01 * max(cost[best], tries[best].residual.size / 2)
+        # fits end where they change residuals by little beside the noise: without noise, costs may be any times one another
+        same = cost[best] + 0.01 * max(cost[best], tries[best].residual.size / 2)
         starts = [
             {"cost": float(c), "agrees": bool(c <= same), "theta": t.tolist()} for c, t in zip(cost, found, strict=True)
         ]

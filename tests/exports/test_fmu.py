@@ -61,10 +61,14 @@ STUDIES = {
 
 
 @pytest.fixture(autouse=True)
-def _for_this_machine(request, monkeypatch):
-    """Tests of binaries for Windows alone compile them: it takes half a second each."""
-    if "windows" not in request.node.name:
-        monkeypatch.setattr("jaxbl.exports.fmu._WINDOWS", _WINDOWS._replace(compiler="not here"))
+def _for_this_machine(monkeypatch):
+    """To compile for Windows, too, takes half a second each."""
+    monkeypatch.setattr("jaxbl.exports.fmu._WINDOWS", _WINDOWS._replace(compiler="not here"))
+
+
+@pytest.fixture
+def windows_too(_for_this_machine, monkeypatch):
+    monkeypatch.setattr("jaxbl.exports.fmu._WINDOWS", _WINDOWS)
 
 
 def written(data, folder, fmi=3, **options):
@@ -237,6 +241,7 @@ def wine(tmp_path_factory):
 @COMPILED
 @VERSIONS
 @needs("x86_64-w64-mingw32-gcc", "wine")
+@pytest.mark.usefixtures("windows_too")
 def test_on_windows_it_runs_with_the_same_bits(tmp_path, wine, fmi):
     """By a program for Windows under Wine; a step of part of a period is refused with the same words."""
     path, summary = written(study("motor.cou", "load.pre", transmission=GAP), tmp_path, fmi, name="axis")
@@ -505,6 +510,7 @@ def test_on_other_machines_it_holds_the_sources_alone(tmp_path, monkeypatch, mac
 
 
 @needs("x86_64-w64-mingw32-gcc")
+@pytest.mark.usefixtures("windows_too")
 def test_with_a_compiler_for_windows_alone_it_says_which_binary_is_missing(tmp_path, monkeypatch):
     only(monkeypatch, "x86_64-w64-mingw32-gcc")
     made = jaxbl.export(study(), tmp_path, "fmu")
