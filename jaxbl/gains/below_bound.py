@@ -12,8 +12,9 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config, with_values
-from jaxbl.observer.under_tuned import excursion, simulate_error
 from jaxbl.sweeps.trial import run
+
+from .under_tuned import excursion, simulate_error
 
 _MOST_INPUTS = 32
 """Combinations of what drives the plant that are run once more, for their disturbance; spread evenly."""

@@ -13,10 +13,10 @@ import pandas as pd
 
 from jaxbl.config import Config
 from jaxbl.observer.conditions import CONDITIONS, Condition, least_lambda_davila_fridman, peak_ratio
-from jaxbl.observer.worst_case import half_cycle, least_lambda_simulated
 from jaxbl.sweeps.pieces import in_pieces
 
 from .stages import Stages
+from .worst_case import half_cycle, least_lambda_simulated
 
 SWITCHING_LIMIT = 0.02
 """Relative distance from lambda^2 = 4 c2, the switching limit of the closed form, within which the two are not compared."""

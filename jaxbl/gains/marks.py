@@ -9,7 +9,11 @@ import numpy as np
 
 from jaxbl.config import Config, read_config
 from jaxbl.observer.conditions import CONDITIONS, peak_ratio
-from jaxbl.observer.under_tuned import (
+from jaxbl.sweeps.trial import run
+
+from .below_bound import disturbance, friction_of, share_above
+from .stages import Stages
+from .under_tuned import (
     excursion,
     least_cycle_frequency,
     least_cycle_frequency_simulated,
@@ -18,11 +22,7 @@ from jaxbl.observer.under_tuned import (
     sine_cycle,
     sine_cycle_simulated,
 )
-from jaxbl.observer.worst_case import half_cycle
-from jaxbl.sweeps.trial import run
-
-from .below_bound import disturbance, friction_of, share_above
-from .stages import Stages
+from .worst_case import half_cycle
 
 
 def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[dict[str, Any]]:
@@ -92,7 +92,7 @@ def _explained(
     friction: float,
     starts: tuple[float, ...],
 ) -> dict[str, Any]:
-    """What a disturbance (rad/s^2) does to gains that miss the exact condition, by :mod:`jaxbl.observer.under_tuned`:
+    """What a disturbance (rad/s^2) does to gains that miss the exact condition, by :mod:`.under_tuned`:
     predicted, and simulated in continuous time. `starts` are position error (rad) and velocity error (rad/s) at t = 0."""
     position, velocity = starts
     largest = float(np.abs(missing).max())

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.observer.conditions import CONDITIONS, Condition, least_lambda_exact, peak_ratio
-from jaxbl.observer.worst_case import half_cycle
+
+from .worst_case import half_cycle
 
 Spans = list[tuple[np.ndarray, np.ndarray]]
 """Intervals of lambda (rad^0.5/s), ends left out, for each alpha; empty where the first end is not below the second."""

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from jaxbl.observer.phase_plane import error_peaks, error_slope, majorant, worst_half_cycle
+from jaxbl.gains.phase_plane import error_peaks, error_slope, majorant, worst_half_cycle
 
 from .figures import COLOURS, Drawn, legend, literal, style, subplots
 

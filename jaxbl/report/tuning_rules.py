@@ -9,8 +9,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jaxbl.gains.rules import RULES, Spans, holds
+from jaxbl.gains.under_tuned import SINE_LIMIT
 from jaxbl.observer.conditions import least_lambda_exact
-from jaxbl.observer.under_tuned import SINE_LIMIT
 from jaxbl.sweeps.pieces import in_pieces
 
 from .figures import COLOURS, FAINT, MISSING, Drawn, decades, style, subplots

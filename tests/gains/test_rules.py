@@ -5,8 +5,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from jaxbl.gains.rules import RULES, holds, judge_rules
+from jaxbl.gains.worst_case import half_cycle
 from jaxbl.observer.conditions import least_lambda_exact, peak_ratio
-from jaxbl.observer.worst_case import half_cycle
 
 ALPHA, LAMBDA = np.geomspace(1.02, 20.0, 96), np.geomspace(0.02, 25.0, 96)
 

@@ -10,8 +10,8 @@ from scipy.integrate import quad, solve_ivp
 from scipy.linalg import solve_continuous_are
 
 from jaxbl.errors import InputError
+from jaxbl.gains.worst_case import half_cycle
 from jaxbl.observer import conditions
-from jaxbl.observer.worst_case import half_cycle
 
 # alpha / f: least lambda / sqrt(f) by the exact condition, (32) with q -> 0, Seeber and Horn, Levant
 TABLE = {

@@ -6,8 +6,7 @@ from scipy.integrate import quad, solve_ivp
 from small_study import small
 
 from jaxbl.config import read_config
-from jaxbl.observer.conditions import least_lambda_exact
-from jaxbl.observer.under_tuned import (
+from jaxbl.gains.under_tuned import (
     SINE_LIMIT,
     excursion,
     half_cycle_ratio,
@@ -18,6 +17,7 @@ from jaxbl.observer.under_tuned import (
     sine_cycle,
     sine_cycle_simulated,
 )
+from jaxbl.observer.conditions import least_lambda_exact
 from jaxbl.sweeps.trial import run
 
 
@@ -204,7 +204,7 @@ def test_least_frequency_of_a_cycle():
 def test_least_frequency_without_approximation(monkeypatch, alpha, ratio):
     """Below it errors of any size and phase go to zero; above it not."""
     # a hundredth is small enough: the many half cycles of smaller errors would take long
-    monkeypatch.setattr("jaxbl.observer.under_tuned._REST", 0.01)
+    monkeypatch.setattr("jaxbl.gains.under_tuned._REST", 0.01)
     least = least_cycle_frequency_simulated(0.005, alpha, 1.0, 3.0)
     assert least / least_cycle_frequency(0.005, alpha, 1.0, 3.0) == pytest.approx(ratio, rel=0.01)
     ends = []

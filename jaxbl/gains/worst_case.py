@@ -1,8 +1,8 @@
 """The error system (34) of the super-twisting observer under the worst disturbance, simulated.
 
 x1' = x2 - lambda sqrt|x1| sign x1, x2' = d - alpha sign x1 - damping x2, with d in [-f_plus, f_plus]. Unlike the closed
-forms of :mod:`.conditions` this goes with viscous damping (viscous friction over inertia of the drive), where no closed form
-is known. A half cycle begins and ends at x1 = 0; the next one is its mirror image.
+forms of :mod:`jaxbl.observer.conditions` the simulation allows viscous damping (viscous friction over inertia of the drive),
+for which no closed form is known. A half cycle begins and ends at x1 = 0; the next one is its mirror image.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from .conditions import Values, bisect
+from jaxbl.observer.conditions import Values, bisect
 
 _STEP = 0.1
 """Part of the fastest time constant that a step takes: the peak ratio is then good to about 1e-7."""

@@ -6,8 +6,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+from jaxbl.gains.worst_case import HalfCycle, half_cycle, least_lambda_simulated
 from jaxbl.observer import conditions
-from jaxbl.observer.worst_case import HalfCycle, half_cycle, least_lambda_simulated
 
 HALF, LEAST = jax.jit(half_cycle), jax.jit(least_lambda_simulated)
 RATIO, EXACT = jax.jit(conditions.peak_ratio), jax.jit(conditions.least_lambda_exact)

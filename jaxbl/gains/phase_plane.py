@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .conditions import arc_of, least_lambda_davila_fridman
+from jaxbl.observer.conditions import arc_of, least_lambda_davila_fridman
 
 
 def error_slope(error: np.ndarray, rate: np.ndarray, lambda_: float) -> np.ndarray:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from jaxbl.gains.phase_plane import error_peaks, error_slope, majorant, worst_half_cycle
 from jaxbl.observer.conditions import least_lambda_davila_fridman, peak_ratio
-from jaxbl.observer.phase_plane import error_peaks, error_slope, majorant, worst_half_cycle
 
 
 def test_peaks_of_a_damped_error_and_none_of_its_chatter():
