@@ -13,7 +13,7 @@ import pandas as pd
 
 from jaxbl.config import Config
 from jaxbl.observer.conditions import CONDITIONS, Condition, least_lambda_davila_fridman, peak_ratio
-from jaxbl.sweeps.pieces import in_pieces
+from jaxbl.sweeps.elementwise import apply_elementwise
 
 from .stages import Stages
 from .worst_case import half_cycle, least_lambda_simulated
@@ -70,13 +70,13 @@ def simulate_error_system(config: Config, stages: Stages) -> Normalised:
     dampings = [0.0, *settings.damping]
 
     def plane() -> pd.DataFrame:
-        ratio, closed = in_pieces(_plane, cells, stages.devices)
+        ratio, closed = apply_elementwise(_plane, cells, stages.devices)
         return pd.DataFrame({"lambda_ratio": cells[0], "alpha_ratio": cells[1], "ratio": ratio, "closed_form": closed})
 
     def borders() -> pd.DataFrame:
         # by bisection: as sharp on a coarse map as on a fine one
         columns = [np.tile(alpha, len(dampings)), np.repeat(dampings, len(alpha))]
-        least = in_pieces(_border, columns, stages.devices)
+        least = apply_elementwise(_border, columns, stages.devices)
         return pd.DataFrame({"alpha_ratio": columns[0], "damping": columns[1], "least_lambda_ratio": least})
 
     with jax.enable_x64(True):
@@ -109,7 +109,7 @@ def _demands(q: float | None) -> Callable[..., Any]:
 def demanded_lambda(config: Config, alpha: np.ndarray, f_plus: np.ndarray) -> dict[str, np.ndarray]:
     """Least lambda (rad^0.5/s) that each condition asks for at alpha and f_plus (rad/s^2), with the study's q in (32)."""
     with jax.enable_x64(True):
-        found = in_pieces(_demands(config.verify.q), [np.asarray(alpha, float), np.asarray(f_plus, float)])
+        found = apply_elementwise(_demands(config.verify.q), [np.asarray(alpha, float), np.asarray(f_plus, float)])
     return {name: found[name] for name in conditions_of(config)}
 
 

@@ -23,8 +23,8 @@ from matplotlib.patches import Patch
 from jaxbl.config import Config, FigureTable, is_boolean, numeric_paths
 from jaxbl.gains.accuracy_laws import Law, accuracy_laws, fixed_values, selected
 from jaxbl.observer.conditions import CONDITIONS, Condition
+from jaxbl.sweeps.elementwise import apply_elementwise
 from jaxbl.sweeps.metrics import is_magnitude, metric_of
-from jaxbl.sweeps.pieces import in_pieces
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 
@@ -473,7 +473,7 @@ def condition_curves(
     for name, condition in conditions.items():
         dashes, colour = _CURVES[name]
         with jax.enable_x64(True):
-            least = in_pieces(condition.least_lambda, [fine, np.full_like(fine, bound)]) if fine.size else fine
+            least = apply_elementwise(condition.least_lambda, [fine, np.full_like(fine, bound)]) if fine.size else fine
         line = (fine, least) if alpha_is_x else (least, fine)
         outlined = [path_effects.Stroke(linewidth=3.6, foreground="black"), path_effects.Normal()]
         # the label is what the pointer says on a page

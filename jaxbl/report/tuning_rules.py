@@ -11,7 +11,7 @@ from matplotlib.patches import Patch
 from jaxbl.gains.rules import RULES, Spans, holds
 from jaxbl.gains.under_tuned import SINE_LIMIT
 from jaxbl.observer.conditions import least_lambda_exact
-from jaxbl.sweeps.pieces import in_pieces
+from jaxbl.sweeps.elementwise import apply_elementwise
 
 from .figures import COLOURS, FAINT, MISSING, Drawn, decades, style, subplots
 from .page import PageTable
@@ -56,7 +56,7 @@ def _plane(ax: Axes) -> list[Any]:
     """Exact border, what does not converge, and where a sine upholds a cycle. Returns the legend's handles."""
     alpha = np.geomspace(1.0001, _ALPHA[1], 400)
     with jax.enable_x64(True):
-        exact = in_pieces(least_lambda_exact, [alpha, np.ones_like(alpha)])
+        exact = apply_elementwise(least_lambda_exact, [alpha, np.ones_like(alpha)])
     ax.grid(False)
     ax.set(xscale="log", yscale="log", xlim=_ALPHA, ylim=_LAMBDA, xlabel="α / f⁺")
     decades(ax)
@@ -89,7 +89,7 @@ def _region(ax: Axes, one: dict[str, Any], colour: str, dashes: Any) -> Line2D:
     if (wrong := one["counterexample"]) is not None:
         lambda_ = np.geomspace(*_LAMBDA, 401)
         with jax.enable_x64(True):
-            exact = in_pieces(least_lambda_exact, [alpha, np.ones_like(alpha)])
+            exact = apply_elementwise(least_lambda_exact, [alpha, np.ones_like(alpha)])
         fails = holds(RULES[one["name"]], lambda_[:, None], alpha[None, :], 1.0) & (lambda_[:, None] <= exact)
         ax.contourf(alpha, lambda_, fails, levels=[0.5, 1.5], colors=[colour], alpha=0.25)
         place = wrong["alpha"] / wrong["f_plus"], wrong["lambda"] / np.sqrt(wrong["f_plus"])

@@ -24,7 +24,7 @@ from jaxbl.registry import Registry, check_subclass, check_text
 from jaxbl.simulate import Experiment, Number, Reducer, Signals, State, TrueSide
 from jaxbl.validation import nearest
 
-from .pieces import in_pieces
+from .elementwise import apply_elementwise
 
 
 class Metric(abc.ABC):
@@ -509,7 +509,7 @@ def with_conditions(figures: Mapping[str, Any], gains: dict[str, ObserverGains])
         rows = np.stack([np.broadcast_to(one, f_plus.shape[1:]).ravel() for one in given], axis=1)
         different, which = _different(rows)
         # the program that the study's chunks have compiled, however few of the lanes differ
-        judged = in_pieces(_judged, list(different.T), most=f_plus[0].size)
+        judged = apply_elementwise(_judged, list(different.T), largest=f_plus[0].size)
         found |= {f"{side}.{name}": value[which].reshape(f_plus.shape[1:]) for name, value in judged.items()}
     return found
 
@@ -523,7 +523,7 @@ def _different(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def compile_conditions(dtype: str, lanes: int) -> None:
     """Compile what :func:`with_conditions` computes of so many lanes, for all studies of a precision."""
-    in_pieces(_judged, [np.ones(lanes, dtype)] * (len(ObserverGains._fields) + 1))
+    apply_elementwise(_judged, [np.ones(lanes, dtype)] * (len(ObserverGains._fields) + 1))
 
 
 @jax.jit

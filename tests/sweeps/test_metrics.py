@@ -193,13 +193,13 @@ def test_metrics_that_cannot_be_had(names, message):
 
 def test_conditions_are_computed_once_for_lanes_that_share_them(monkeypatch):
     counts = []
-    pieces = under_test.in_pieces
+    pieces = under_test.apply_elementwise
 
     def counted(function, columns, **keys):
         counts.append((len(columns[0]), keys))
         return pieces(function, columns, **keys)
 
-    monkeypatch.setattr(under_test, "in_pieces", counted)
+    monkeypatch.setattr(under_test, "apply_elementwise", counted)
     # two seeds of three lanes: the load's gains and f_plus are the same for all lanes of a seed
     f_plus = {
         "motor.f_plus": np.array([[1.0, 2.0, 3.0], [1.0, 2.5, np.nan]]),
@@ -211,7 +211,7 @@ def test_conditions_are_computed_once_for_lanes_that_share_them(monkeypatch):
     }
     found = with_conditions(f_plus, gains)
     # both sides by the program of six lanes
-    assert counts == [(5, {"most": 6}), (2, {"most": 6})]
+    assert counts == [(5, {"largest": 6}), (2, {"largest": 6})]
     for seed, lane in np.ndindex(2, 3):
         alone = {name: np.asarray(values[seed, lane]) for name, values in f_plus.items()}
         of_lane = {side: ObserverGains(*(one if one.ndim == 0 else one[lane] for one in g)) for side, g in gains.items()}
