@@ -196,4 +196,4 @@ def bench(
         raise InputError(f"{out}: is not empty and holds no benchmark; choose another folder with --out")
     with removed_if_empty(out), running(context, out, out, unit="parts", kept=False) as progress:
         result = run_bench(quick=quick, progress=progress)
-    return Outcome(write_bench_report(result, out), out, "", "bench.json")
+    return Outcome(write_bench_report(result, out), out, "", "bench.json", code=1 if result.failures else 0)

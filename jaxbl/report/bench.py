@@ -77,11 +77,16 @@ def throughput_lines(result: BenchResult) -> list[str]:
     lines = ["Lane-steps/s, best and median of the calls; time of the first call; deviation of the results."]
     for precision in PRECISIONS:
         lines += ["", *table(_table(result, precision), numbers=True)]
-    machine, study = result.machine, result.study[0]
+    machine = result.machine
     on = f"{machine['processor']}, {machine['cores']} cores; jax {machine['versions']['jax']}"
     lines.insert(0, f"{on}; {result.rows[0].steps} samples a run")
-    lines += ["", f"A small study from nothing, {study['lanes']} lanes of {study['steps']} samples, {study['precision']}:"]
-    lines += table([(f"  {row['name']}", f"{row['seconds']:.2f} s") for row in result.study], numbers=True)
+    if result.study:
+        study = result.study[0]
+        lines += [
+            "",
+            f"A small study from nothing, {study['lanes']} lanes of {study['steps']} samples, {study['precision']}:",
+        ]
+        lines += table([(f"  {row['name']}", f"{row['seconds']:.2f} s") for row in result.study], numbers=True)
     if result.studies:
         lines += ["", "Studies as they stand, float64, every metric, all cores; lane-steps/s:"]
     for row in result.studies:
@@ -89,7 +94,7 @@ def throughput_lines(result: BenchResult) -> list[str]:
         share = f"{row['jaxbl'] / row['c++']:.2g}"
         lines.append(f"  {about}: jaxbl {row['jaxbl']:.3g}, C++ {row['c++']:.3g}, {share} of it")
     lines += [f"{name}: left out, {why}" for name, why in result.left_out.items()]
-    return lines
+    return lines + result.failures
 
 
 def write_bench_report(result: BenchResult, folder: Path) -> list[str]:

@@ -2,6 +2,7 @@
 
 import functools
 import importlib.util
+import json
 from pathlib import Path
 
 import jax
@@ -20,6 +21,10 @@ STEPS = 1500
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("kernel")
+
+
+def _short_curve(curve, able, lanes, *rest):
+    return curve(able, min(lanes, 64), *rest)
 
 
 @functools.cache
@@ -75,6 +80,43 @@ def test_the_whole_benchmark_uses_the_cores_there_are(monkeypatch):
     assert asked == [2**k for k in range(6, 19, 3)]
     assert [point["lanes"] for point in result.curve] == [min(lanes, 512) for lanes in asked]
     assert len(result.study) == 1
+
+
+def test_a_failing_check_leaves_table_and_file(monkeypatch, call, tmp_path):
+    def wrong(workload):
+        return lambda: {name: np.zeros(workload.lanes) for name in NAMES}
+
+    def ours_and_a_wrong_one(folder, count, devices):
+        ours = next(entry for entry in entries(folder, count, devices) if entry.name == run.OURS)
+        return [ours._replace(lanes=2**10), Entry(run.CEILING, wrong, 2**10)]
+
+    def compare(name, *_):
+        if name == "gain_map":
+            raise NoResult("gain_map: motor.velocity_rmse is off by 0.1 of it")
+        return {"name": name, "lanes": 4, "seeds": 2, "steps": 10, "deviation": 0.0, "jaxbl": 1e8, "c++": 1e8}
+
+    monkeypatch.setattr(run, "entries", ours_and_a_wrong_one)
+    monkeypatch.setattr(run, "compare", compare)
+    monkeypatch.setattr(run, "_curve", functools.partial(_short_curve, run._curve))
+    monkeypatch.setattr("jax.config.update", lambda *_: None)
+    code, lines, _ = call("bench", "--quick")
+    saved = json.loads((tmp_path / "results" / "bench" / "bench.json").read_text())
+    assert code == 1
+    assert {row["name"] for row in saved["rows"]} == {point["name"] for point in saved["curve"]} == {run.OURS}
+    assert [row["name"] for row in saved["studies"]] == ["dead_zone_noise"]
+    assert len(saved["failures"]) == 3
+    assert all(
+        f"{run.CEILING}, {precision}: " in failure for precision, failure in zip(PRECISIONS, saved["failures"], strict=False)
+    )
+    assert any(line.startswith(run.OURS) for line in lines)
+    assert lines[-3:] == saved["failures"]
+
+
+def test_no_right_result_is_an_error(monkeypatch):
+    entry = Entry("someone", lambda workload: lambda: {name: np.zeros(workload.lanes) for name in NAMES}, 64)
+    monkeypatch.setattr(run, "entries", lambda *_: [entry])
+    with pytest.raises(NoResult, match="someone, float32"):
+        run.bench(quick=True)
 
 
 def test_who_cannot_run_is_left_out_with_a_reason(monkeypatch, folder):
