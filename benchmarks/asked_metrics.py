@@ -45,7 +45,7 @@ def main() -> None:
 
 def seconds(config: Config, names: tuple[str, ...], lanes: int, rounds: int) -> None:
     points, threads = Points(config), len(jax.local_devices())
-    chosen = np.linspace(0, points.lanes - 1, min(lanes, points.lanes)).round().astype(int)
+    chosen = np.linspace(0, points.group_size - 1, min(lanes, points.group_size)).round().astype(int)
     with precision(config):
         experiment, columns = prepare(config), points.columns(chosen)
         asked = metrics(names)

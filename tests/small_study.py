@@ -101,9 +101,9 @@ def made(data: dict[str, Any], **columns: Any) -> StudyResult:
     points, seeds = Points(config), config.sweep.seeds
     rows = []
     for group in points.groups:
-        lanes = points.columns(np.arange(points.lanes))
-        values = {path: lanes.get(path, np.full(points.lanes, group.structural.get(path))) for path in points.paths}
-        rows += [pd.DataFrame(values | {"seed": np.full(points.lanes, seed)}) for seed in range(seeds)]
+        lanes = points.columns(np.arange(points.group_size))
+        values = {path: lanes.get(path, np.full(points.group_size, group.structural.get(path))) for path in points.paths}
+        rows += [pd.DataFrame(values | {"seed": np.full(points.group_size, seed)}) for seed in range(seeds)]
     frame = pd.concat(rows, ignore_index=True)
     for name in metric_columns(config.build(), config.sweep.metrics):
         frame[name] = True if name.endswith(("finite", "converged")) else 1.0

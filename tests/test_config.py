@@ -226,7 +226,10 @@ BAD = {
         small(axes=[listed(A, 1.0, 2.0, zip="g"), listed(LAMBDA, 1.0, zip="g")]),
         "'observer.motor.lambda' has 1 values, the others zipped as 'g' have 2",
     ),
-    "zip alone": (small(axes=[listed(A, 1.0), listed(LAMBDA, 1.0, zip=A)]), "zip = 'observer.motor.alpha' should be a word"),
+    "zip alone": (
+        small(axes=[listed(A, 1.0), listed(LAMBDA, 1.0, zip=A)]),
+        "zip = 'observer.motor.alpha' should stand on two axes",
+    ),
     "zipped point twice": (
         small(axes=[listed(A, 1.0, 1.0, zip="g"), listed(LAMBDA, 2.0, 2.0, zip="g")]),
         "the axes zipped as 'g' list a point twice",

@@ -293,9 +293,9 @@ def _groups(config: Config, table: TuneTable, stages: Stages) -> list[Group]:
     known: dict[str, Any] = dict(stages.found.get("pilots", {}))
     groups, pilots = [], {}
     for group in points.groups:
-        columns = points.columns(np.arange(points.lanes))
+        columns = points.columns(np.arange(points.group_size))
         places, lanes = [], []
-        for i in range(points.lanes):
+        for i in range(points.group_size):
             lane = {path: plain(column[i]) for path, column in columns.items()}
             at = with_values(group.config, lane)
             scenarios = scenarios_of(at, table)

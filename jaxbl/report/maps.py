@@ -130,7 +130,7 @@ def _dots(result: StudyResult, figure: FigureTable) -> pd.Series | None:
     dotted = bool(sampled) and (figure.kind == "heatmap" or {figure.x, figure.facet, figure.series} & set(sampled))
     if not dotted or figure.theory is not None or result.runs <= _MOST_DOTS:
         return None
-    values = Points(config).values(sampled[0])
+    values = Points(config).axis_values(sampled[0])
     # the first points of a design cover its ranges evenly, too
     return pd.Series(values[: max(len(values) * _MOST_DOTS // result.runs, 1)], name=sampled[0])
 
@@ -282,7 +282,7 @@ def _bounds(rows: Iterable[pd.DataFrame], spec: FigureTable, points: Points | No
 
     def known(frame: pd.DataFrame) -> np.ndarray:
         # most points of a refined study lie at its boundary: the median is that of the coarse grid
-        kept = np.ones(len(frame), bool) if points is None else points.always_simulated(frame)
+        kept = np.ones(len(frame), bool) if points is None else points.on_coarse_grid(frame)
         return kept & frame[bound].notna().to_numpy()
 
     def good(frame: pd.DataFrame) -> np.ndarray:

@@ -47,7 +47,7 @@ class Filling:
         self.axes = []
         for path in (y, x):
             if path in points.refinement.paths:
-                self.axes.append(_Axis(path, points.values(path), [1 << depth - level for level in range(depth + 1)]))
+                self.axes.append(_Axis(path, points.axis_values(path), [1 << depth - level for level in range(depth + 1)]))
             else:
                 self.axes.append(_Axis(path, np.unique(frame[path].to_numpy(float)), [1] * (depth + 1)))
         self.levels = depth + 1
@@ -106,5 +106,5 @@ def on_coarse_values(points: Points, frame: pd.DataFrame, drawn: list[str]) -> p
     kept = np.ones(len(frame), bool)
     for path in points.refinement.paths:
         if path not in drawn:
-            kept &= np.isin(frame[path], points.values(path)[::stride])
+            kept &= np.isin(frame[path], points.axis_values(path)[::stride])
     return frame.loc[kept]

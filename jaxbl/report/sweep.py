@@ -94,7 +94,7 @@ class _Survey:
         self.best: dict[str, pd.Series] = {}
         distinct = {path: Distinct() for path in paths}
         for frame in result.batches([*paths, "seed", "finite", *figures]):
-            even = frame if points is None else frame[points.always_simulated(frame)]
+            even = frame if points is None else frame[points.on_coarse_grid(frame)]
             self.runs += len(frame)
             self.even += len(even)
             self.diverged += int((~frame["finite"].astype(bool)).sum())

@@ -51,13 +51,13 @@ def layout_for(config: Config, points: Points, count: int, capacity: int) -> Lay
         seeds = min(config.sweep.seeds, max(capacity // (64 * count), 1))
         return Layout(seeds, max(math.ceil(capacity / seeds / count), 2) * count)
     # chunks of equal size waste no padding on the last one; a multiple of the devices, along the longer side, suits them
-    per_chunk = math.ceil(points.lanes / math.ceil(points.lanes / capacity))
-    if points.lanes >= count and points.lanes > 1:
+    per_chunk = math.ceil(points.group_size / math.ceil(points.group_size / capacity))
+    if points.group_size >= count and points.group_size > 1:
         per_chunk = max(math.ceil(per_chunk / count), 2) * count
     seeds = min(config.sweep.seeds, max(capacity // per_chunk, 1))
-    if points.lanes == 1:
+    if points.group_size == 1:
         seeds = max(math.ceil(seeds / count), 2) * count
-    elif points.lanes < count:
+    elif points.group_size < count:
         seeds = math.ceil(seeds / count) * count
     return Layout(seeds, per_chunk)
 
@@ -125,7 +125,7 @@ class Engine:
         layouts: dict[Backend, Layout] = {backend: self._layout(backend, None) for backend in BACKENDS}
         steps = sum(group.config.run.steps for group in self.points.groups)
         samples: dict[Backend, int] = {
-            b: steps * self._chunks(layout, self.points.coarse_lanes) for b, layout in layouts.items()
+            b: steps * self._chunks(layout, self.points.coarse_size) for b, layout in layouts.items()
         }
         return faster(self.devices, self._works, layouts, samples, len(self.points.groups))
 
@@ -151,7 +151,7 @@ class Engine:
 
     def __len__(self) -> int:
         """Number of chunks; of a refined study, those of its coarse grid."""
-        return len(self.points.groups) * self.chunks_for(self.points.coarse_lanes)
+        return len(self.points.groups) * self.chunks_for(self.points.coarse_size)
 
     def chunks_for(self, points: int) -> int:
         """Number of chunks that some points of a group take."""
@@ -162,12 +162,12 @@ class Engine:
 
     def chunk(self, index: int) -> Chunk:
         """A chunk by its index; of a refined study, one of its coarse grid."""
-        blocks = math.ceil(self.points.coarse_lanes / self.layout.points)
+        blocks = math.ceil(self.points.coarse_size / self.layout.points)
         group, rest = divmod(index, len(self._seeds) * blocks)
         seeds, block = divmod(rest, blocks)
         first = block * self.layout.points
-        last = min(first + self.layout.points, self.points.coarse_lanes)
-        return Chunk(index, group, self._seeds[seeds], self.points.coarse(np.arange(first, last)))
+        last = min(first + self.layout.points, self.points.coarse_size)
+        return Chunk(index, group, self._seeds[seeds], self.points.coarse_points(np.arange(first, last)))
 
     def lanes(self, index: int) -> int:
         """Lanes of a chunk."""
@@ -177,7 +177,7 @@ class Engine:
     def order(self) -> list[int]:
         """Indices of all chunks, those first that cover the grid coarsely: the first seeds of every second block of points,
         of those between, and so on, then the next seeds. Groups take turns where their programs can all be kept."""
-        blocks = math.ceil(self.points.coarse_lanes / self.layout.points)
+        blocks = math.ceil(self.points.coarse_size / self.layout.points)
         shape = len(self.points.groups), len(self._seeds), blocks
         group, seeds, block = np.unravel_index(np.arange(math.prod(shape)), shape)
         place, level = _coarse_first(blocks)
@@ -207,7 +207,7 @@ class Engine:
     @property
     def rows(self) -> int:
         """Rows of all chunks: points times seeds."""
-        return len(self.points.groups) * self.points.coarse_lanes * self.config.sweep.seeds
+        return len(self.points.groups) * self.points.coarse_size * self.config.sweep.seeds
 
     def run(self, chunk: Chunk) -> pd.DataFrame:
         """Compute one chunk: a frame of one row for each seed and point, padding taken off."""
@@ -322,7 +322,7 @@ class Engine:
         chunks, lanes = len(self) // len(groups), math.prod(self.layout)
         run_seconds = chunks * (a_chunk + statistics.median(judging) * len(groups))
         return SweepEstimate(
-            points=len(groups) * self.points.coarse_lanes,
+            points=len(groups) * self.points.coarse_size,
             rows=self.rows,
             most_points=len(self.points),
             chunks=len(self),

@@ -1,9 +1,10 @@
-"""The points of a study: axes crossed, zipped or sampled quasi-randomly, computed a slice at a time.
+"""The points of a study: its axes are crossed, zipped or sampled quasi-randomly.
 
-Axes over leaves of the experiment become lanes of one compiled program. Axes over what is fixed at compile time (sampling
-period, substeps, discretisation, ...) are outermost and split the study into groups, each compiled once.
+Axes over leaves of the experiment vary the lanes of one compiled program. Structural axes, over numbers that are fixed at
+compile time (sampling period, substeps, discretisation, ...), are outermost and split the study into groups; each group is
+compiled once.
 
-A refined study has the points of its fine grid; those of the coarse grid, where it begins, are among them.
+A refined study has the points of its fine grid, which include those of the coarse grid where it begins.
 """
 
 import math
@@ -23,23 +24,23 @@ from .metrics import metric_columns, no_metric
 from .refine import CellGrid, Criterion
 
 AxisColumns = dict[str, np.ndarray]
-"""Values by axis path, columns of equal length: of axes that advance together, or of points."""
+"""Values by axis path, columns of equal length: a row is a point, or a step of axes that advance together."""
 
-_MOST_RUNS = 1e10
-"""A day of computing on two cores, of runs of 20 000 samples (docs/speed.md): more is a slip in the axes."""
-_MOST_VALUES = 10_000_000
-"""Of one axis: its values are kept."""
+_MAX_RUNS = 1e10
+"""A day of computing on two cores, for runs of 20 000 samples (docs/speed.md): more is a mistake in the axes."""
+_MAX_AXIS_VALUES = 10_000_000
+"""All values of an axis are held in memory."""
 
 
 class Group(NamedTuple):
-    """Points that share one compiled program: the config with its structural values set, and those values."""
+    """Points that share a compiled program: the config with their structural values, and these values by path."""
 
     config: Config
     structural: dict[str, Any]
 
 
 class Refinement(NamedTuple):
-    """How a study is refined: the axes, their grid with all lane axes, and when neighbours disagree."""
+    """The refined axes of a study, the grid of all leaf axes, and the criterion by which neighbours disagree."""
 
     paths: list[str]
     grid: CellGrid
@@ -49,10 +50,15 @@ class Refinement(NamedTuple):
 class Points:
     """All points of a study, first axis slowest, structural axes outermost.
 
-    Each group, one for each combination of structural values, has `lanes` points. `coarse_lanes` of them are always
-    simulated: all, or the coarse grid of a refined study. `blocks` has the values of each axis in the order of the config,
-    those that advance together as one.
-    `metrics` are the columns of all groups: one that does not apply to the observers of a group is NaN there.
+    Attributes:
+        paths: paths of all axes, in the order of the config.
+        leaves: paths of all leaves of the experiment.
+        metrics: metric columns of all groups; a metric that does not apply to the observers of a group is NaN there.
+        dimensions: values of each axis in the order of the config; axes that advance together share a dimension.
+        groups: one for each combination of structural values.
+        group_size: number of points of a group.
+        coarse_size: number of these that are always simulated: all, or the coarse grid of a refined study.
+        refinement: None unless the study is refined.
     """
 
     def __init__(self, config: Config):
@@ -60,60 +66,60 @@ class Points:
         for i, path in enumerate(self.paths):
             if path in self.paths[:i]:
                 raise InputError(f"axes[{i}]: path '{path}' has an axis already; each path may have one")
-        base, self.leaves = self._check(config)
-        self.metrics = metrics = metric_columns(base.build(), config.sweep.metrics, self._kinds(config, base))
-        refined = self._refined(config)
+        base, self.leaves = self._take_first_values(config)
+        self.metrics = metrics = metric_columns(base.build(), config.sweep.metrics, self._build_kinds(config, base))
+        refined = self._refined_paths(config)
         depth = config.sweep.refine or 0
-        self.blocks = blocks = self._blocks(config, dict.fromkeys(refined, depth))
-        structural = [b for b in blocks if not all(path in self.leaves for path in b)]
-        self._blocks_of_leaves = [b for b in blocks if all(path in self.leaves for path in b)]
-        self.lanes = _points_of(self._blocks_of_leaves)
+        self.dimensions = dimensions = self._build_dimensions(config, dict.fromkeys(refined, depth))
+        structural = [columns for columns in dimensions if not all(path in self.leaves for path in columns)]
+        self._leaf_dimensions = [columns for columns in dimensions if all(path in self.leaves for path in columns)]
+        self.group_size = _count_points(self._leaf_dimensions)
         self.refinement: Refinement | None = None
-        self.coarse_lanes = self.lanes
+        self.coarse_size = self.group_size
         if refined:
-            halved = [next(iter(b)) in refined for b in self._blocks_of_leaves]
-            fine = [_length(b) for b in self._blocks_of_leaves]
-            sizes = [(n - 1 >> depth) + 1 if h else n for n, h in zip(fine, halved, strict=True)]
-            self.coarse_lanes = math.prod(sizes)
-            self.refinement = Refinement(refined, CellGrid(sizes, halved, depth), _criterion(config, base, metrics, refined))
-        outside = _points_of(structural) * config.sweep.seeds
-        if (runs := outside * self.coarse_lanes) > _MOST_RUNS:
-            raise InputError(f"axes: {runs:.2g} runs are more than {_MOST_RUNS:.0e}; fewer values, or a quasi-random design")
-        if (runs := outside * self.lanes) > _MOST_RUNS:
+            is_refined = [next(iter(columns)) in refined for columns in self._leaf_dimensions]
+            fine_sizes = [_length(columns) for columns in self._leaf_dimensions]
+            sizes = [(n - 1 >> depth) + 1 if halved else n for n, halved in zip(fine_sizes, is_refined, strict=True)]
+            self.coarse_size = math.prod(sizes)
+            criterion = _build_criterion(config, base, metrics, refined)
+            self.refinement = Refinement(refined, CellGrid(sizes, is_refined, depth), criterion)
+        runs_per_point = _count_points(structural) * config.sweep.seeds
+        if (runs := runs_per_point * self.coarse_size) > _MAX_RUNS:
+            raise InputError(f"axes: {runs:.2g} runs are more than {_MAX_RUNS:.0e}; fewer values, or a quasi-random design")
+        if (runs := runs_per_point * self.group_size) > _MAX_RUNS:
             raise InputError(
-                f"sweep.refine: {depth} makes a fine grid of {runs:.2g} runs, more than {_MOST_RUNS:.0e}; "
+                f"sweep.refine: {depth} makes a fine grid of {runs:.2g} runs, more than {_MAX_RUNS:.0e}; "
                 "it should be less, or the axes should have fewer values"
             )
         self.groups = []
-        for index in range(_points_of(structural)):
-            values = {path: column[0] for path, column in _take(structural, np.array([index])).items()}
-            values = {path: plain(v) for path, v in values.items()}
+        for index in range(_count_points(structural)):
+            values = {path: plain(column[0]) for path, column in _take_points(structural, np.array([index])).items()}
             self.groups.append(Group(with_values(base, values), values))
 
     def __len__(self) -> int:
-        return len(self.groups) * self.lanes
+        return len(self.groups) * self.group_size
 
     def columns(self, indices: np.ndarray) -> AxisColumns:
-        """Values of the lane axes at some points of a group, by path; float64 arrays of the shape of `indices`."""
-        return _take(self._blocks_of_leaves, indices)
+        """Values of the leaf axes at some points of a group, by path; float64 arrays of the shape of `indices`."""
+        return _take_points(self._leaf_dimensions, indices)
 
-    def coarse(self, positions: np.ndarray) -> np.ndarray:
-        """Points of a group that are always simulated, by their positions 0 ... coarse_lanes - 1 among these."""
-        return positions if self.refinement is None else self.refinement.grid.coarse(positions)
+    def coarse_points(self, positions: np.ndarray) -> np.ndarray:
+        """Indices of points of a group that are always simulated, by their positions 0 ... coarse_size - 1 among these."""
+        return positions if self.refinement is None else self.refinement.grid.coarse_indices(positions)
 
-    def values(self, path: str) -> np.ndarray:
-        """All values of a lane axis in their order, those of the fine grid if it is refined."""
-        return next(block[path] for block in self._blocks_of_leaves if path in block)
+    def axis_values(self, path: str) -> np.ndarray:
+        """All values of a leaf axis in their order; those of the fine grid if it is refined."""
+        return next(columns[path] for columns in self._leaf_dimensions if path in columns)
 
-    def always_simulated(self, columns: Mapping[str, Any]) -> np.ndarray:
-        """Which rows of a frame, or of its columns by name, are on points that are always simulated."""
+    def on_coarse_grid(self, columns: Mapping[str, Any]) -> np.ndarray:
+        """True for rows of a frame, or of its columns by name, at points that are always simulated."""
         if self.refinement is None:
             return np.ones(len(columns["seed"]), bool)
         stride = 1 << self.refinement.grid.depth
-        on_axes = [np.isin(columns[path], self.values(path)[::stride]) for path in self.refinement.paths]
+        on_axes = [np.isin(columns[path], self.axis_values(path)[::stride]) for path in self.refinement.paths]
         return np.logical_and.reduce(on_axes)
 
-    def _refined(self, config: Config) -> list[str]:
+    def _refined_paths(self, config: Config) -> list[str]:
         """Paths of the refined axes."""
         depth = config.sweep.refine
         if depth is None:
@@ -121,39 +127,42 @@ class Points:
         axes = [axis for axis in config.axes if axis.num and axis.zip is None and axis.path in self.leaves]
         if not axes:
             raise InputError(
-                "sweep.refine: no axis can be refined; one is needed with start, stop and num, not zipped, and not fixed at "
-                "compile time"
+                "sweep.refine: no axis can be refined; an axis is needed with start, stop and num, not zipped and not "
+                "fixed at compile time"
             )
         for axis in axes:
             assert axis.num is not None
-            most = ((_MOST_VALUES - 1) // (axis.num - 1)).bit_length() - 1
-            if depth > most:
-                limit = f"should be at most {most}" if most > 0 else "does not fit here: num is too large"
+            max_depth = ((_MAX_AXIS_VALUES - 1) // (axis.num - 1)).bit_length() - 1
+            if depth > max_depth:
+                limit = f"should be at most {max_depth}" if max_depth > 0 else "does not fit here: num is too large"
                 raise InputError(
-                    f"sweep.refine: {depth} makes more than {_MOST_VALUES:.0e} values of '{axis.path}'; it {limit}"
+                    f"sweep.refine: {depth} makes more than {_MAX_AXIS_VALUES:.0e} values of '{axis.path}'; it {limit}"
                 )
         return [axis.path for axis in axes]
 
     @staticmethod
-    def _kinds(config: Config, base: Config) -> list[Experiment]:
-        """An experiment with each kind of observer, where that is an axis; each has the gains that other axes vary."""
+    def _build_kinds(config: Config, base: Config) -> list[Experiment]:
+        """An experiment with each kind of observer, where that is an axis; all must have the gains that other axes vary."""
         kinds = [axis.values or [] for axis in config.axes if axis.path == KIND]
-        found = [with_values(base, {KIND: kind}) for kind in (kinds[0] if kinds else ())]
-        for one in found:
-            known = numeric_paths(one)
+        variants = [with_values(base, {KIND: kind}) for kind in (kinds[0] if kinds else ())]
+        for variant in variants:
+            valid = numeric_paths(variant)
             for i, axis in enumerate(config.axes):
-                if axis.path not in known:
+                if axis.path not in valid:
                     raise InputError(
-                        f"axes[{i}]: '{axis.path}' is no gain of kind '{one.observer.kind}', which is among the values of "
-                        f"{KIND}; an axis over it needs gains that all kinds listed have, or a study of its own"
+                        f"axes[{i}]: '{axis.path}' is no gain of kind '{variant.observer.kind}', a value of {KIND}; "
+                        "vary a gain that all these kinds have, or make a study of its own for it"
                     )
-        return [one.build() for one in found]
+        return [variant.build() for variant in variants]
 
     @staticmethod
-    def _check(config: Config) -> tuple[Config, set[str]]:
-        """The config with every axis at its first value (so that optional numbers exist), and the paths that are leaves."""
+    def _take_first_values(config: Config) -> tuple[Config, set[str]]:
+        """The config with each axis at its first value (so that optional numbers exist), and the paths of its leaves.
+
+        The values of all axes are checked on the way.
+        """
         first = {}
-        # what gains there are depends on it
+        # the kind of observer first: it decides which gains exist
         kind = {axis.path: axis.values[0] for axis in config.axes if axis.path == KIND and axis.values}
         with suppress(InputError):
             config = with_values(config, kind)
@@ -168,7 +177,7 @@ class Points:
         base = with_values(config, first)
         return base, set(leaf_paths(base.build()))
 
-    def _blocks(self, config: Config, depths: Mapping[str, int]) -> list[AxisColumns]:
+    def _build_dimensions(self, config: Config, depths: Mapping[str, int]) -> list[AxisColumns]:
         sampled = [axis for axis in config.axes if axis.values is None and axis.num is None]
         if sampled and config.sweep.design == "grid":
             i = config.axes.index(sampled[0])
@@ -189,65 +198,65 @@ class Points:
                 raise InputError(
                     f"axes: '{axis.path}' is sampled quasi-randomly and cannot be zipped; leave zip out, or list its values"
                 )
-        blocks: list[AxisColumns] = []
-        labels: dict[str, int] = {}
+        dimensions: list[AxisColumns] = []
+        zipped: dict[str, AxisColumns] = {}
         for axis in config.axes:
             if axis in sampled:
                 if axis is sampled[0]:
-                    blocks.append(_quasi_random(sampled, config))
+                    dimensions.append(_sample_points(sampled, config))
             elif axis.zip is None:
-                blocks.append({axis.path: axis.grid(depths.get(axis.path, 0))})
-            elif axis.zip not in labels:
-                labels[axis.zip] = len(blocks)
-                blocks.append({axis.path: axis.grid()})
+                dimensions.append({axis.path: axis.grid(depths.get(axis.path, 0))})
+            elif axis.zip not in zipped:
+                zipped[axis.zip] = {axis.path: axis.grid()}
+                dimensions.append(zipped[axis.zip])
             else:
-                block, values = blocks[labels[axis.zip]], axis.grid()
-                if len(values) != (others := _length(block)):
+                columns, values = zipped[axis.zip], axis.grid()
+                if len(values) != (length := _length(columns)):
                     raise InputError(
-                        f"axes: '{axis.path}' has {len(values)} values, the others zipped as '{axis.zip}' have {others}; "
+                        f"axes: '{axis.path}' has {len(values)} values, the others zipped as '{axis.zip}' have {length}; "
                         "they should have equally many"
                     )
-                block[axis.path] = values
-        for label, index in labels.items():
-            columns = blocks[index]
+                columns[axis.path] = values
+        for label, columns in zipped.items():
             if len(columns) < 2 or label in (*self.paths, "seed"):
-                raise InputError(
-                    f"axes: zip = '{label}' should be a word of its own, the same on all axes that advance together"
-                )
+                raise InputError(f"axes: zip = '{label}' should stand on two axes or more, and be neither a path nor 'seed'")
             if len(set(zip(*(column.tolist() for column in columns.values()), strict=True))) < _length(columns):
                 raise InputError(f"axes: the axes zipped as '{label}' list a point twice; their points should differ")
-        return blocks
+        return dimensions
 
 
 def _extremes(values: list[Any]) -> list[Any]:
-    """The first, least and largest of many numbers: what a key may be is an interval. Other lists as they are."""
-    # each check builds a config, some milliseconds
+    """Values of an axis to check: of many numbers the first, least and largest, since a key's range is an interval."""
+    # each check builds a config, which takes milliseconds
     if len(values) <= 16 or any(isinstance(value, str) for value in values):
         return values
     return [values[0], min(values), max(values)]
 
 
-def _length(block: AxisColumns) -> int:
-    return len(next(iter(block.values())))
+def _length(columns: AxisColumns) -> int:
+    return len(next(iter(columns.values())))
 
 
-def _points_of(blocks: list[AxisColumns]) -> int:
-    """Points of a product of blocks."""
-    return math.prod(_length(block) for block in blocks)
+def _count_points(dimensions: list[AxisColumns]) -> int:
+    """Number of points of a product of dimensions."""
+    return math.prod(_length(columns) for columns in dimensions)
 
 
-def _take(blocks: list[AxisColumns], indices: np.ndarray) -> AxisColumns:
-    """Values of a product of blocks at some flat indices, last block fastest."""
+def _take_points(dimensions: list[AxisColumns], indices: np.ndarray) -> AxisColumns:
+    """Values of a product of dimensions at flat indices, last dimension fastest."""
     out: AxisColumns = {}
     remaining = indices
-    for block in reversed(blocks):
-        out |= {path: column[remaining % _length(block)] for path, column in block.items()}
-        remaining = remaining // _length(block)
+    for columns in reversed(dimensions):
+        out |= {path: column[remaining % _length(columns)] for path, column in columns.items()}
+        remaining = remaining // _length(columns)
     return out
 
 
-def _criterion(config: Config, base: Config, metrics: list[str], refined: list[str]) -> Criterion:
-    """When neighbours disagree: in the metric that the study names, or in what converges; `metrics` are its columns."""
+def _build_criterion(config: Config, base: Config, metrics: list[str], refined: list[str]) -> Criterion:
+    """Compare neighbours in the metric that the study names, or in convergence.
+
+    Without a name these are the observers whose gains are refined, or else both observers.
+    """
     metric, tolerance = config.sweep.refine_metric, config.sweep.refine_tolerance
     if metric is None:
         converged = [name for name in metrics if name.endswith(".converged")]
@@ -265,9 +274,9 @@ def _criterion(config: Config, base: Config, metrics: list[str], refined: list[s
     return Criterion.of([metric], TOLERANCE if tolerance is None else tolerance)
 
 
-def _quasi_random(axes: list[AxisTable], config: Config) -> AxisColumns:
-    """Sobol or Latin hypercube points over the ranges of some axes, uniform in their scale."""
-    from scipy.stats import qmc  # a third of a second that only these designs need
+def _sample_points(axes: list[AxisTable], config: Config) -> AxisColumns:
+    """Sample Sobol or Latin hypercube points over the ranges of axes, uniform in their scale."""
+    from scipy.stats import qmc  # its import takes 0.3 s, which only these designs need
 
     assert config.sweep.points is not None
     rng = np.random.default_rng(config.sweep.design_seed)

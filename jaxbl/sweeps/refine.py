@@ -1,14 +1,14 @@
-"""Boundary refinement: a coarse grid first, then only the cells whose corners disagree, halved again and again.
+"""Boundary refinement: simulate a coarse grid, then halve only the cells whose corners disagree, again and again.
 
-A level's cells are the halves of the cells of the level before; level 0 is the coarse grid. An edge of a cell is hot where
-its two ends disagree. Two rules decide what is simulated, a batch at a time:
+The cells of a level are the halves of cells of the level before; level 0 is the coarse grid. An edge of a cell is hot if
+its two ends disagree. Two rules decide which vertices are simulated, a batch at a time:
 
-- a cell with a hot edge is halved as soon as the next level is due;
-- every cell around a hot edge has to exist. Where a halved cell has a neighbour that is not, the neighbour is halved too,
-  with those that it came from if need be: the boundary is followed where it leaves the cells that were expected to hold it.
+- a cell with a hot edge is halved when the next level begins;
+- all cells around a hot edge must exist. If a halved cell has a neighbour that is not halved, the neighbour is halved too,
+  and its ancestors if needed: so the boundary is followed where it leaves the cells in which it was expected.
 
-At the finest level the second rule alone traces each piece of the boundary that was found from end to end, exactly as on
-the full grid. Nothing of the fine grid's size is kept: vertices and cells are sorted arrays of flat indices.
+At the finest level the second rule traces each piece of the boundary from end to end, exactly as on the full grid. No array
+has the size of the fine grid: vertices and cells are sorted arrays of flat indices.
 """
 
 import itertools
@@ -24,160 +24,170 @@ Indices = np.ndarray
 
 
 class Criterion(NamedTuple):
-    """When two neighbours disagree: in which metric columns, by more than which relative difference each (0 for columns that
-    are true or false)."""
+    """Neighbours disagree if a metric column differs by more than its relative tolerance (0 for boolean columns)."""
 
     columns: tuple[str, ...]
     tolerances: tuple[float, ...]
 
     @classmethod
     def of(cls, columns: Sequence[str], tolerance: float) -> "Criterion":
-        """Compare some columns, and whether the runs stayed finite."""
+        """Compare columns with one tolerance, and `finite` as well."""
         names = tuple(dict.fromkeys((*columns, "finite")))
         return cls(names, tuple(0.0 if is_boolean(name) else tolerance for name in names))
 
-    def differ(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Whether ends of edges disagree in any seed: `(edges, seeds, columns)` twice to `(edges,)`.
+    def disagree(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """True for edges `(edges,)` whose ends disagree in any seed; `a` and `b` are `(edges, seeds, columns)`.
 
-        A number disagrees with NaN and with infinity; those agree with their like.
+        A finite number disagrees with NaN and with infinity; NaN agrees with NaN, infinity with equal infinity.
         """
-        numbers = np.isfinite(a) & np.isfinite(b)
+        finite = np.isfinite(a) & np.isfinite(b)
         with np.errstate(invalid="ignore"):
             far = np.abs(a - b) > np.array(self.tolerances) * np.maximum(np.abs(a), np.abs(b))
-        apart = np.where(numbers, far, (a != b) & ~(np.isnan(a) & np.isnan(b)))
-        return np.logical_or.reduce(apart, axis=(1, 2))
+        different = np.where(finite, far, (a != b) & ~(np.isnan(a) & np.isnan(b)))
+        return np.logical_or.reduce(different, axis=(1, 2))
 
 
 class CellGrid:
-    """A fine grid of vertices, some of whose axes are refined: every 2^depth-th vertex along them is on the coarse grid.
+    """A fine grid of vertices; along its refined axes every 2^depth-th vertex is on the coarse grid.
 
-    Cells span the refined axes; along the others every value has a grid of its own. A cell is known by its lower corner.
-    `sizes` are those of the coarse grid, last axis fastest; `depth` says how often the cells of refined axes are halved.
+    Cells span the refined axes; each combination of values of the other axes has cells of its own. The index of a cell is
+    that of its lower corner.
+
+    Args:
+        sizes: vertices of the coarse grid along each axis, last axis fastest.
+        is_refined: for each axis, True if its cells are halved.
+        depth: number of times that they are halved.
     """
 
-    def __init__(self, sizes: Sequence[int], refined: Sequence[bool], depth: int):
+    def __init__(self, sizes: Sequence[int], is_refined: Sequence[bool], depth: int):
         self.depth = depth
         self.coarse_sizes = tuple(sizes)
-        self.sizes = tuple((n - 1 << depth) + 1 if halved else n for n, halved in zip(sizes, refined, strict=True))
+        self.sizes = tuple((n - 1 << depth) + 1 if halved else n for n, halved in zip(sizes, is_refined, strict=True))
         steps = np.cumprod([1, *self.sizes[:0:-1]], dtype=np.int64)[::-1] if sizes else np.array([], np.int64)
-        self._refined = list(refined)
-        # of the coarse grid: distance of neighbours along each axis
-        self._strides = [int(step) << depth if halved else int(step) for step, halved in zip(steps, refined, strict=True)]
-        # of the refined axes alone: distance of neighbours as flat indices, and vertices
-        self._steps = [int(step) for step, halved in zip(steps, refined, strict=True) if halved]
-        self._sizes = [size for size, halved in zip(self.sizes, refined, strict=True) if halved]
+        self._is_refined = list(is_refined)
+        # flat distance of neighbours on the coarse grid, along each axis
+        self._strides = [int(step) << depth if halved else int(step) for step, halved in zip(steps, is_refined, strict=True)]
+        # of the refined axes alone: flat distance of neighbours on the fine grid, and number of vertices
+        self._steps = [int(step) for step, halved in zip(steps, is_refined, strict=True) if halved]
+        self._sizes = [size for size, halved in zip(self.sizes, is_refined, strict=True) if halved]
 
-    def coarse(self, positions: np.ndarray) -> Indices:
-        """Flat indices of vertices of the coarse grid, given by their positions in it."""
-        places = np.unravel_index(np.asarray(positions, np.int64), self.coarse_sizes)
-        return np.stack(places, axis=-1) @ np.array(self._strides, np.int64)
+    def coarse_indices(self, positions: np.ndarray) -> Indices:
+        """Flat indices of vertices of the coarse grid by their positions in it."""
+        coordinates = np.unravel_index(np.asarray(positions, np.int64), self.coarse_sizes)
+        return np.stack(coordinates, axis=-1) @ np.array(self._strides, np.int64)
 
     def coarse_vertices(self) -> Indices:
         """All vertices of the coarse grid."""
-        return self._product(self.coarse_sizes)
+        return self._lattice(self.coarse_sizes)
 
     def coarse_cells(self) -> Indices:
         """All cells of level 0."""
-        return self._product([n - 1 if halved else n for n, halved in zip(self.coarse_sizes, self._refined, strict=True)])
+        return self._lattice([n - 1 if halved else n for n, halved in zip(self.coarse_sizes, self._is_refined, strict=True)])
 
-    def _product(self, counts: Sequence[int]) -> Indices:
+    def _lattice(self, counts: Sequence[int]) -> Indices:
+        """The first vertices of the coarse grid along each axis, so many as `counts` says."""
         out = np.zeros(1, np.int64)
         for count, stride in zip(counts, self._strides, strict=True):
             out = (out[:, None] + stride * np.arange(count)).ravel()
         return out
 
     def children(self, cells: Indices, level: int) -> Indices:
-        """The cells of `level` that halving some cells of the level before makes."""
-        return self._around(cells, level, (0, 1))
+        """The cells of `level` into which cells of the level before are halved."""
+        return self._shift_cells(cells, level, (0, 1))
 
-    def vertices(self, cells: Indices, level: int) -> Indices:
-        """The corners of those."""
-        return self._around(cells, level, (0, 1, 2))
+    def child_vertices(self, cells: Indices, level: int) -> Indices:
+        """The corners of the :meth:`children` of cells."""
+        return self._shift_cells(cells, level, (0, 1, 2))
 
-    def _around(self, cells: Indices, level: int, choices: tuple[int, ...]) -> Indices:
+    def _shift_cells(self, cells: Indices, level: int, shifts: tuple[int, ...]) -> Indices:
+        """Cells moved by all combinations of shifts along the refined axes, in units of cells of `level`."""
         offsets = [
-            sum(step * choice for step, choice in zip(self._steps, chosen, strict=True))
-            for chosen in itertools.product(choices, repeat=len(self._steps))
+            sum(step * shift for step, shift in zip(self._steps, combination, strict=True))
+            for combination in itertools.product(shifts, repeat=len(self._steps))
         ]
         stride = 1 << self.depth - level
         return np.unique(cells[:, None] + stride * np.array(offsets, np.int64))
 
     def parents(self, cells: Indices, level: int) -> Indices:
-        """The cells of the level before whose halves some cells of `level` are."""
+        """The cells of the level before that contain cells of `level`."""
         out = cells.copy()
         for step, size in zip(self._steps, self._sizes, strict=True):
             out -= step * (cells // step % size % (2 << self.depth - level))
         return np.unique(out)
 
     def edges(self, cells: Indices, level: int) -> Iterator[tuple[int, Indices, Indices]]:
-        """Edges of some cells of `level`, axis by axis: the axis, lower ends, upper ends."""
+        """Yield the edges of cells of `level`, axis by axis: the axis, lower ends, upper ends."""
         stride = 1 << self.depth - level
         for axis, step in enumerate(self._steps):
-            starts = np.unique(cells[:, None] + stride * np.array(self._across(axis), np.int64))
+            starts = np.unique(cells[:, None] + stride * np.array(self._edge_offsets(axis), np.int64))
             yield axis, starts, starts + stride * step
 
-    def _across(self, axis: int) -> list[int]:
-        """Offsets of the corners of a unit cell that do not lie along an axis."""
-        others = [step for a, step in enumerate(self._steps) if a != axis]
-        return [sum(chosen) for chosen in itertools.product(*((0, step) for step in others))]
+    def _edge_offsets(self, axis: int) -> list[int]:
+        """Offsets of the lower ends of a unit cell's edges along an axis."""
+        steps_across = [step for a, step in enumerate(self._steps) if a != axis]
+        return [sum(offsets) for offsets in itertools.product(*((0, step) for step in steps_across))]
 
-    def around(self, axis: int, starts: Indices, level: int) -> Indices:
-        """The cells of `level` around some of its edges."""
+    def cells_around(self, axis: int, starts: Indices, level: int) -> Indices:
+        """The cells of `level` that share edges along an axis, by the lower ends of these edges."""
         stride = 1 << self.depth - level
         cells = starts
         for other, (step, size) in enumerate(zip(self._steps, self._sizes, strict=True)):
             if other != axis:
-                place = cells // step % size
-                above, below = cells[place + stride < size], cells[place >= stride] - stride * step
+                coordinate = cells // step % size
+                above, below = cells[coordinate + stride < size], cells[coordinate >= stride] - stride * step
                 cells = np.concatenate([above, below])
         return np.unique(cells)
 
 
-def refine(
+def refine_boundary(
     grid: CellGrid,
     evaluate: Callable[[Indices], np.ndarray],
-    differ: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    disagree: Callable[[np.ndarray, np.ndarray], np.ndarray],
 ) -> tuple[Indices, np.ndarray]:
-    """Simulate a coarse grid and then, a batch at a time, what its boundaries need.
+    """Evaluate a coarse grid and then, a batch at a time, the vertices that refine its boundaries.
 
-    `evaluate` gives the values of a batch of vertices, `(vertices, ...)`; it is called with the coarse grid first, and never
-    twice with a vertex. `differ` says whether the values of two ends disagree, for many edges at once.
+    Args:
+        grid: coarse and fine grid.
+        evaluate: gives the values `(vertices, ...)` of a batch of vertices; called with the coarse grid first, and with no
+            vertex twice.
+        disagree: takes the values of the lower and upper ends of edges, and is True `(edges,)` where they disagree.
 
     Returns:
-        The vertices that were simulated, sorted, and their values.
+        The vertices that were evaluated, sorted, and their values.
     """
     vertices = grid.coarse_vertices()
     values = evaluate(vertices)
 
-    def at(some: Indices) -> np.ndarray:
-        return values[np.searchsorted(vertices, some)]
+    def values_of(indices: Indices) -> np.ndarray:
+        return values[np.searchsorted(vertices, indices)]
 
-    def around_hot_edges(cells: Indices, level: int) -> Indices:
-        found = [
-            grid.around(axis, starts[differ(at(starts), at(ends))], level) for axis, starts, ends in grid.edges(cells, level)
-        ]
-        return np.unique(np.concatenate(found))
+    def cells_around_hot_edges(cells: Indices, level: int) -> Indices:
+        around = []
+        for axis, starts, ends in grid.edges(cells, level):
+            hot_starts = starts[disagree(values_of(starts), values_of(ends))]
+            around.append(grid.cells_around(axis, hot_starts, level))
+        return np.unique(np.concatenate(around))
 
-    none = np.array([], np.int64)
-    # of each level: cells around hot edges, and cells that were halved
-    hot = [around_hot_edges(grid.coarse_cells(), 0), *[none] * grid.depth]
-    halved = [none] * grid.depth
+    no_cells = np.array([], np.int64)
+    # by level: cells around hot edges, and cells that were halved
+    hot = [cells_around_hot_edges(grid.coarse_cells(), 0), *[no_cells] * grid.depth]
+    halved = [no_cells] * grid.depth
     for target in range(1, grid.depth + 1):
         while True:
             # from the finest level down: a cell that has to exist needs its parent halved
-            to_halve = [none] * target
+            to_halve = [no_cells] * target
             needed = hot[target]
             for level in range(target, 0, -1):
-                wanted = np.union1d(hot[level - 1], grid.parents(needed, level))
-                needed = to_halve[level - 1] = np.setdiff1d(wanted, halved[level - 1], assume_unique=True)
+                due = np.union1d(hot[level - 1], grid.parents(needed, level))
+                needed = to_halve[level - 1] = np.setdiff1d(due, halved[level - 1], assume_unique=True)
             if not any(len(cells) for cells in to_halve):
                 break
-            batch = np.unique(np.concatenate([grid.vertices(cells, i + 1) for i, cells in enumerate(to_halve)]))
+            batch = np.unique(np.concatenate([grid.child_vertices(cells, i + 1) for i, cells in enumerate(to_halve)]))
             batch = np.setdiff1d(batch, vertices, assume_unique=True)
             if len(batch):
-                new, places = evaluate(batch), np.searchsorted(vertices, batch)
-                vertices, values = np.insert(vertices, places, batch), np.insert(values, places, new, axis=0)
+                batch_values, positions = evaluate(batch), np.searchsorted(vertices, batch)
+                vertices, values = np.insert(vertices, positions, batch), np.insert(values, positions, batch_values, axis=0)
             for level, cells in enumerate(to_halve, 1):
                 halved[level - 1] = np.union1d(halved[level - 1], cells)
-                hot[level] = np.union1d(hot[level], around_hot_edges(grid.children(cells, level), level))
+                hot[level] = np.union1d(hot[level], cells_around_hot_edges(grid.children(cells, level), level))
     return vertices, values

@@ -15,7 +15,7 @@ from jaxbl.files import Busy, locked
 from jaxbl.workers import Progress
 
 from .engine import Chunk, Engine
-from .refine import refine
+from .refine import refine_boundary
 from .store import Store, claim
 
 _PREPARED = 60.0
@@ -152,7 +152,7 @@ class Run:
         assert self.engine.points.refinement is not None
         _, grid, criterion = self.engine.points.refinement
         columns, seeds = list(criterion.columns), self.engine.config.sweep.seeds
-        expected = self.engine.points.coarse_lanes
+        expected = self.engine.points.coarse_size
 
         def evaluate(points: np.ndarray) -> np.ndarray:
             nonlocal expected
@@ -176,7 +176,7 @@ class Run:
                     row, column = row + shape[0], 0
             return values.swapaxes(0, 1)
 
-        refine(grid, evaluate, criterion.differ)
+        refine_boundary(grid, evaluate, criterion.disagree)
 
     def ensure(self, chunks: Iterable[Chunk]) -> None:
         """Have chunks computed that are not there; one is written while the next one is computed. What was computed is

@@ -95,7 +95,11 @@ def study(name: str, steps: int, lanes: int | None = None, start: float | None =
     config = config.model_copy(update=shortened)
     points = Points(config)
     with precision(config):
-        chosen = np.arange(points.lanes) if lanes is None else np.linspace(0, points.lanes - 1, lanes).round().astype(int)
+        chosen = (
+            np.arange(points.group_size)
+            if lanes is None
+            else np.linspace(0, points.group_size - 1, lanes).round().astype(int)
+        )
         return Study(name, config, prepare(config), points.columns(chosen))
 
 

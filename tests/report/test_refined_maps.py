@@ -14,7 +14,7 @@ from jaxbl.report.refined_maps import Filling
 from jaxbl.report.sweep import headline
 from jaxbl.sweeps.metrics import metric_columns
 from jaxbl.sweeps.points import Points
-from jaxbl.sweeps.refine import refine
+from jaxbl.sweeps.refine import refine_boundary
 from jaxbl.sweeps.sweep import StudyResult
 
 RMSE = "motor.velocity_rmse"
@@ -31,7 +31,7 @@ def made(function, *axes, figures=(MAP,), depth=3, seeds=1):
         frame = pd.DataFrame(points.columns(vertices))
         return frame.assign(**dict.fromkeys(metric_columns(config.build()), 1.0) | {"seed": 0, "finite": True})
 
-    vertices, _ = refine(points.refinement.grid, lambda v: function(rows(v)).to_numpy(float), lambda a, b: a != b)
+    vertices, _ = refine_boundary(points.refinement.grid, lambda v: function(rows(v)).to_numpy(float), lambda a, b: a != b)
     frame = rows(vertices)
     frame["motor.converged"] = function(frame)
     frame[RMSE] = frame[LAMBDA]
@@ -117,12 +117,12 @@ def test_panels_medians_and_lines_over_what_is_not_drawn():
 def test_filling_is_exact_where_every_vertex_is_known():
     result = made(lambda frame: frame[ALPHA] > 0.0)
     points = Points(result.config)
-    frame = pd.DataFrame(points.columns(np.arange(points.lanes)))
+    frame = pd.DataFrame(points.columns(np.arange(points.group_size)))
     table = frame.assign(value=np.arange(len(frame))).set_index([LAMBDA, ALPHA])["value"]
     xs, ys, grid = Filling(points, frame, ALPHA, LAMBDA).dense(table)
     np.testing.assert_array_equal(grid, np.arange(33**2).reshape(33, 33))
-    np.testing.assert_array_equal(xs, points.values(ALPHA))
-    np.testing.assert_array_equal(ys, points.values(LAMBDA))
+    np.testing.assert_array_equal(xs, points.axis_values(ALPHA))
+    np.testing.assert_array_equal(ys, points.axis_values(LAMBDA))
 
 
 def test_a_map_shows_no_more_places_than_can_be_seen():
@@ -135,7 +135,7 @@ def test_a_map_shows_no_more_places_than_can_be_seen():
 def test_headline_counts_points_and_takes_shares_from_the_coarse_grid(seeds):
     result = made(disc, seeds=seeds)
     points = Points(result.config)
-    coarse = disc(pd.DataFrame(points.columns(points.coarse(np.arange(25))))).mean()
+    coarse = disc(pd.DataFrame(points.columns(points.coarse_points(np.arange(25))))).mean()
     simulated = len(result.frame) // seeds
     assert headline(result)[0] == (
         f"{simulated} of 1089 grid points simulated ({100 * simulated / 1089:.2g} %), {len(result.frame)} runs. "

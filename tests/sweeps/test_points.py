@@ -13,13 +13,13 @@ def points(*axes, **sweep):
 
 
 def columns(study):
-    return study.columns(np.arange(study.lanes))
+    return study.columns(np.arange(study.group_size))
 
 
 def test_grid_has_the_last_axis_fastest():
     study = points(listed(NOISE, 1e-5, 1e-4), spaced(ALPHA, 1.0, 100.0, 3), spaced(LAMBDA, 1.0, 2.0, 3, "linear"))
     assert study.paths == [NOISE, ALPHA, LAMBDA]
-    assert len(study) == study.lanes == 18
+    assert len(study) == study.group_size == 18
     expected = np.meshgrid([1e-5, 1e-4], [1.0, 10.0, 100.0], [1.0, 1.5, 2.0], indexing="ij")
     for path, values in zip(study.paths, expected, strict=True):
         np.testing.assert_allclose(columns(study)[path], values.ravel(), rtol=1e-14)
@@ -36,8 +36,8 @@ def test_zipped_axes_advance_together_and_may_repeat_a_value():
 def test_slices_are_parts_of_the_whole():
     study = points(listed(NOISE, 1e-5, 1e-4), spaced(ALPHA, 1.0, 100.0, 7), spaced(LAMBDA, 1.0, 2.0, 5))
     whole = columns(study)
-    for first in range(0, study.lanes, 11):
-        part = study.columns(np.arange(first, min(first + 11, study.lanes)))
+    for first in range(0, study.group_size, 11):
+        part = study.columns(np.arange(first, min(first + 11, study.group_size)))
         for path, values in part.items():
             np.testing.assert_array_equal(values, whole[path][first : first + 11])
 
@@ -80,7 +80,7 @@ def test_axes_over_structure_are_groups_outside_of_the_lanes():
         listed("run.sample_period", 1e-3, 2e-3),
         listed("observer.discretisation", "explicit", "implicit"),
     )
-    assert (len(study.groups), study.lanes, len(study)) == (4, 3, 12)
+    assert (len(study.groups), study.group_size, len(study)) == (4, 3, 12)
     assert list(columns(study)) == [ALPHA]
     chosen = [(g.config.run.sample_period, g.config.observer.discretisation) for g in study.groups]
     assert chosen == [(1e-3, "explicit"), (1e-3, "implicit"), (2e-3, "explicit"), (2e-3, "implicit")]
@@ -89,7 +89,7 @@ def test_axes_over_structure_are_groups_outside_of_the_lanes():
 
 def test_a_leaf_zipped_with_structure_goes_with_its_group():
     study = points(listed(ALPHA, 1.0, 2.0, zip="g"), spaced("run.substeps", 1, 3, 2, "linear", zip="g"))
-    assert (len(study.groups), study.lanes) == (2, 1)
+    assert (len(study.groups), study.group_size) == (2, 1)
     assert [(g.config.observer.motor.alpha, g.config.run.substeps) for g in study.groups] == [(1.0, 1), (2.0, 3)]
 
 

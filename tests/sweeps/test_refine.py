@@ -18,7 +18,7 @@ from jaxbl.report.sweep import headline
 from jaxbl.sweeps.engine import Engine, Layout
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.programs import BACKENDS
-from jaxbl.sweeps.refine import CellGrid, Criterion, refine
+from jaxbl.sweeps.refine import CellGrid, Criterion, refine_boundary
 from jaxbl.sweeps.sweep import StudyResult, dry_run, open_study, sweep
 
 pytestmark = pytest.mark.usefixtures("compiled_once")
@@ -38,7 +38,7 @@ def traced(function, grid):
         asked.append(vertices)
         return full.ravel()[vertices]
 
-    vertices, values = refine(grid, evaluate, lambda a, b: a != b)
+    vertices, values = refine_boundary(grid, evaluate, lambda a, b: a != b)
     every = np.concatenate(asked)
     assert len(np.unique(every)) == len(every)
     np.testing.assert_array_equal(vertices, np.sort(every))
@@ -241,14 +241,14 @@ def test_numbers_that_disagree(a, b, differ):
     assert criterion.columns == ("motor.velocity_rmse", "finite")
     for first, second in ((a, b), (b, a)):
         ends = (np.array([[[1.0, 1.0], [value, 1.0]]]) for value in (first, second))
-        assert criterion.differ(*ends).tolist() == [differ]
+        assert criterion.disagree(*ends).tolist() == [differ]
 
 
 def test_true_and_false_disagree_whatever_the_tolerance():
     criterion = Criterion.of(["motor.converged", "finite"], 5.0)
     assert criterion.columns == ("motor.converged", "finite")
     ends = np.array([[[1.0, 1.0]], [[0.0, 1.0]], [[0.0, 0.0]]])
-    assert criterion.differ(ends, ends[[0, 0, 1]]).tolist() == [False, True, True]
+    assert criterion.disagree(ends, ends[[0, 0, 1]]).tolist() == [False, True, True]
 
 
 # ---------------------------------------------------------------- points
@@ -264,16 +264,16 @@ def test_coarse_values_are_the_same_to_the_bit_with_and_without_refinement():
     for num, depth in ((33, 5), (7, 4), (2, 9)):
         axes = [spaced(LAMBDA, 0.1, 37.0, num), spaced(ALPHA, 0.3, 91.7, num, "linear")]
         plain, fine = (Points(read_config(small(axes=axes, sweep=s))) for s in ({}, {"refine": depth}))
-        assert fine.coarse_lanes == plain.lanes
-        every = np.arange(plain.lanes)
+        assert fine.coarse_size == plain.group_size
+        every = np.arange(plain.group_size)
         expected = plain.columns(every)
-        for path, values in fine.columns(fine.coarse(every)).items():
+        for path, values in fine.columns(fine.coarse_points(every)).items():
             np.testing.assert_array_equal(values, expected[path])
         # and all values are those of a grid that is as fine
         axes = [axis | {"num": (num - 1 << depth) + 1} for axis in axes]
         whole = Points(read_config(small(axes=axes)))
         for path in (LAMBDA, ALPHA):
-            np.testing.assert_array_equal(fine.values(path), whole.values(path))
+            np.testing.assert_array_equal(fine.axis_values(path), whole.axis_values(path))
 
 
 def test_what_is_refined():
@@ -287,11 +287,11 @@ def test_what_is_refined():
     refinement = study.refinement
     assert refinement.paths == [LAMBDA, ALPHA]
     assert refinement.grid.sizes == (2, 17, 9, 2)
-    assert (len(study.groups), study.lanes, study.coarse_lanes) == (2, 2 * 17 * 9 * 2, 2 * 5 * 3 * 2)
+    assert (len(study.groups), study.group_size, study.coarse_size) == (2, 2 * 17 * 9 * 2, 2 * 5 * 3 * 2)
     assert refinement.criterion.columns == ("motor.converged", "finite")
-    coarse = study.columns(study.coarse(np.arange(study.coarse_lanes)))
-    assert study.always_simulated(coarse).all()
-    assert study.always_simulated(study.columns(np.arange(study.lanes))).sum() == study.coarse_lanes
+    coarse = study.columns(study.coarse_points(np.arange(study.coarse_size)))
+    assert study.on_coarse_grid(coarse).all()
+    assert study.on_coarse_grid(study.columns(np.arange(study.group_size))).sum() == study.coarse_size
 
 
 def test_what_is_compared():
@@ -340,7 +340,11 @@ BAD = {
         [spaced(ALPHA, 1.0, 2.0)],
         "sweep: refine needs design = 'grid'; points of a sobol design have no neighbours",
     ),
-    "listed values": ({"refine": 1}, [listed(ALPHA, 1.0, 2.0)], "sweep.refine: no axis can be refined; one is needed with"),
+    "listed values": (
+        {"refine": 1},
+        [listed(ALPHA, 1.0, 2.0)],
+        "sweep.refine: no axis can be refined; an axis is needed with start",
+    ),
     "structural": ({"refine": 1}, [spaced("run.substeps", 1, 2, 2, "linear")], "sweep.refine: no axis can be refined"),
     "zipped": ({"refine": 1}, [spaced(p, 1.0, 2.0, 3, zip="g") for p in (ALPHA, LAMBDA)], "sweep.refine: no axis can be"),
     "no axes": ({"refine": 1}, [], "sweep.refine: no axis can be refined"),
@@ -388,7 +392,7 @@ def study(changes=None, refine=3, num=5, seeds=1, axes=None, **sweep_keys):
 def whole_grid(data):
     """All points of the fine grid, by the engine that a refined study has."""
     engine = Engine(read_config(data), Layout(read_config(data).sweep.seeds, 2048))
-    every = np.arange(engine.points.lanes)
+    every = np.arange(engine.points.group_size)
     return pd.concat(
         [engine.run(chunk) for g in range(len(engine.points.groups)) for chunk in engine.split(g, every)], ignore_index=True
     )
@@ -408,7 +412,7 @@ def masks(data, frame, whole):
     """Simulated points and convergence on the whole grid, two axes."""
     config = Points(read_config(data))
     shape = config.refinement.grid.sizes
-    rows = np.ravel_multi_index([np.searchsorted(config.values(p), frame[p]) for p in config.paths], shape)
+    rows = np.ravel_multi_index([np.searchsorted(config.axis_values(p), frame[p]) for p in config.paths], shape)
     mask = np.zeros(shape, bool)
     mask.ravel()[rows] = True
     return mask, whole.sort_values(config.paths)["motor.converged"].to_numpy().reshape(shape)
@@ -440,7 +444,7 @@ def test_values_are_those_of_the_whole_grid_and_of_the_plain_study():
     # a study without refinement has the coarse points, to the bit
     plain = sweep(study(refine=None)).frame
     points = Points(result.config)
-    coarse = result.frame[points.always_simulated(result.frame)].reset_index(drop=True)
+    coarse = result.frame[points.on_coarse_grid(result.frame)].reset_index(drop=True)
     exact = [name for name in plain if not name.endswith("convergence_time_bound")]
     keys = [LAMBDA, ALPHA]
     shared = coarse.merge(plain[keys], on=keys)
@@ -615,7 +619,7 @@ def test_as_a_dataset(finished):
 
 def test_a_dataset_that_would_be_mostly_empty_and_large():
     config = read_config(study(refine=12))
-    values = Points(config).values(ALPHA)
+    values = Points(config).axis_values(ALPHA)
     frame = pd.DataFrame({LAMBDA: values[:9000], ALPHA: values[:9000], "seed": 0, "motor.velocity_rmse": 1.0})
     with pytest.raises(ValueError, match="most of them NaN; use the frame"):
         StudyResult(config, frame).to_xarray()

@@ -35,7 +35,7 @@ def dimensions(config: Config) -> list[AxisColumns] | None:
     if config.sweep.refine is not None or config.sweep.design != "grid":
         return None
     first = config.sweep.first_seed
-    dims = [*Points(config).blocks, {"seed": np.arange(first, first + config.sweep.seeds)}]
+    dims = [*Points(config).dimensions, {"seed": np.arange(first, first + config.sweep.seeds)}]
     return dims if sum(_length(one) > 1 for one in dims[:-1]) >= 2 else None
 
 
