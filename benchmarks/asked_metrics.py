@@ -21,7 +21,7 @@ import jax
 import numpy as np
 
 from jaxbl.config import Config, precision, prepare, read_config
-from jaxbl.fused.passage import HostPassage
+from jaxbl.fused.lane_simulator import HostPassage
 from jaxbl.sweeps.metrics import metrics
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import sweep

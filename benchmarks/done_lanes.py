@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxbl.drive import Encoders, Initial, LinearShaft, TwoInertia, as_arrays
 from jaxbl.drive.excitation import Sine
-from jaxbl.fused.passage import HostPassage
+from jaxbl.fused.lane_simulator import HostPassage
 from jaxbl.observer import EquivalentControl, Identifier, ImplicitSuperTwisting, Observers
 from jaxbl.simulate import Experiment, Reducer, Run
 from jaxbl.sweeps.metrics import METRICS

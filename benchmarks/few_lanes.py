@@ -21,8 +21,8 @@ start_jax()
 
 import jax  # noqa: E402
 
-from jaxbl.throughput.ours import Fused  # noqa: E402
-from jaxbl.throughput.rivals.native import Native  # noqa: E402
+from jaxbl.throughput.jaxbl_chain import Fused  # noqa: E402
+from jaxbl.throughput.rivals.cpp_chain import Native  # noqa: E402
 from jaxbl.throughput.workload import SEED, Workload  # noqa: E402
 
 

@@ -27,8 +27,8 @@ from jax.extend.core import jaxpr_as_fun
 
 from jaxbl.drive import set_leaves
 from jaxbl.fused.jaxprs import contracted, flat
+from jaxbl.fused.lane_simulator import DevicePassage
 from jaxbl.fused.pallas import multiply_add
-from jaxbl.fused.passage import DevicePassage
 from jaxbl.simulate import scan
 from jaxbl.throughput.workload import FIGURES, NAMES, RANGES, SEED, Workload, constants, identified_figures
 

@@ -115,8 +115,8 @@ def _interrupted(number: int, frame: object) -> None:
 
 
 PROGRAMS = "JAXBL_PROGRAMS"
-"""Name of the environment variable with the folder of compiled programs (:mod:`jaxbl.fused.kept`); without one, or where it
-is empty, none are kept."""
+"""Name of the environment variable with the folder of compiled programs (:mod:`jaxbl.fused.program_cache`). Without it, or
+where it is empty, no program is kept."""
 
 
 def start_jax(devices: int | None = None) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.fused.steps import stepped
+from jaxbl.fused.signal_scan import stepped
 
 from .candidates import Candidate, MotionTorques, Torques
 

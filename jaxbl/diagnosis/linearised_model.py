@@ -25,9 +25,9 @@ from jaxbl.drive.effects import EFFECTS, Scales
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused import in_threads
-from jaxbl.fused.recursion import Recursion
+from jaxbl.fused.linear_predictor import Recursion
+from jaxbl.fused.signal_scan import stepped
 from jaxbl.fused.single_plant import Direction, slopes
-from jaxbl.fused.steps import stepped
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.prediction import kalman_gain
 from jaxbl.identification.regression import Path, effect_states

@@ -16,9 +16,9 @@ import numpy as np
 from llvmlite import binding, ir
 
 from . import Unsupported
+from .dependence import Around
 from .elementary import FUNCTIONS
 from .jaxprs import ClosedJaxpr, JaxprEqn, Literal, Var, callee, parameter_of, repetition, traced_of_one
-from .split import Around
 
 _INT, _BIT, _POINTER = ir.IntType(64), ir.IntType(1), ir.PointerType()
 _KINDS = {

@@ -16,9 +16,9 @@ from jax.experimental.pallas import triton
 from jaxtyping import Array
 
 from . import attempted
+from .dependence import Around
 from .elementary import rounded
 from .jaxprs import ClosedJaxpr, contracted, flat, jaxpr_as_fun, substituted
-from .split import Around
 
 _ABSENT = {"round": rounded}
 """What Triton's lowering lacks."""

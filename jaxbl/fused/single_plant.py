@@ -18,7 +18,7 @@ from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.drive.plant import PlantState
 from jaxbl.simulate import Experiment, corrected, move
 
-from . import Unsupported, attempted, in_threads, kept, say_scanned
+from . import Unsupported, attempted, in_threads, program_cache, say_scanned
 
 _FLOAT = np.dtype(float)
 _NUMBER = jax.ShapeDtypeStruct((), _FLOAT)
@@ -303,11 +303,11 @@ def _places(plant: _Plant, paths: tuple[str, ...]) -> tuple[int, ...]:
 @lru_cache(maxsize=64)
 def _read(plant: _Plant) -> tuple[int, ...]:
     """Places of the experiment's leaves that a step reads. Raises `Unsupported` if one of them is no number."""
-    key = kept.key_of("numbers read", *plant.described)
-    found = kept.load(key)
+    key = program_cache.key_of("numbers read", *plant.described)
+    found = program_cache.load(key)
     if found is None:
         found = _found_read(plant)
-        kept.save(key, found)
+        program_cache.save(key, found)
     return found
 
 
@@ -333,8 +333,8 @@ def _or_none(written: Callable[..., tuple[Callable[..., Any], tuple[Any, ...], d
     @lru_cache(maxsize=64)
     @wraps(written)
     def found(plant: _Plant, *given: Any) -> Any:
-        key = kept.key_of(f"loop of {written.__qualname__}", *plant.described, given)
-        if (loop := kept.load(key)) is not None:
+        key = program_cache.key_of(f"loop of {written.__qualname__}", *plant.described, given)
+        if (loop := program_cache.load(key)) is not None:
             return loop
         try:
             with attempted():
@@ -343,7 +343,7 @@ def _or_none(written: Callable[..., tuple[Callable[..., Any], tuple[Any, ...], d
 
                 sample, examples, numbers = written(plant, *given)
                 loop = Loop(traced(sample, *examples), _FLOAT, **numbers)
-                kept.save(key, loop)
+                program_cache.save(key, loop)
                 return loop
         except Unsupported as why:
             say_scanned(str(why))

@@ -14,10 +14,10 @@ import numpy as np
 from jaxbl.simulate import Experiment, Reducer, Signals, State, advance, begin, block_length, end_of_block, figures
 
 from . import Unsupported
-from .ahead import Shared, ahead_of_lanes
 from .jaxprs import flat
 from .llvm import Loop
 from .noise import host
+from .shared_part import Shared, ahead_of_lanes
 
 
 def recorded(

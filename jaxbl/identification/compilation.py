@@ -1,7 +1,8 @@
 """Compilation of programs that run only a few times, as those of identification and diagnosis do.
 
 They compile for longer than they run: options under which XLA compiles fast are worth more here than its fastest code, and
-where programs are kept (:mod:`jaxbl.fused.kept`) they are not even traced again. The engine of sweeps does not use them.
+where programs are kept (:mod:`jaxbl.fused.program_cache`) they are not even traced again. The engine of sweeps does not use
+them.
 """
 
 import functools
@@ -20,7 +21,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
-from jaxbl.fused import kept
+from jaxbl.fused import program_cache
 
 Result = TypeVar("Result")
 
@@ -56,7 +57,7 @@ def jit(function: Callable[..., Result]) -> Callable[..., Result]:
         leaves, structure = jax.tree.flatten((args, kwargs))
         if any(isinstance(leaf, Tracer) for leaf in leaves):
             return function(*args, **kwargs)
-        if kept.keeping() is None:
+        if program_cache.keeping() is None:
             return compiled()(*args, **kwargs)
         arrays = [_plain(leaf) for leaf in leaves if eqx.is_array(leaf)]
         rest = tuple(_Array() if eqx.is_array(leaf) else leaf for leaf in leaves)
@@ -118,8 +119,8 @@ _programs: OrderedDict[Any, _Program] = OrderedDict()
 
 def _program(function: Callable[..., Any], args: tuple, kwargs: dict[str, Any], arrays: list[jax.Array]) -> _Program:
     """A program from disk, or compiled and put there."""
-    key = kept.key_of("program", function, args, kwargs)
-    found = kept.load(key)
+    key = program_cache.key_of("program", function, args, kwargs)
+    found = program_cache.load(key)
     if found is not None:
         _initialise()
         code, count, devices, result = found
@@ -155,5 +156,5 @@ def _program(function: Callable[..., Any], args: tuple, kwargs: dict[str, Any], 
     shardings = jax.tree.leaves(compiled.output_shardings)
     if shardings:
         with suppress(Exception):  # JAX cannot write it: it is compiled anew next time
-            kept.save(key, (serialize(compiled)[0], len(shardings), len(shardings[0].device_set), results[-1]))
+            program_cache.save(key, (serialize(compiled)[0], len(shardings), len(shardings[0].device_set), results[-1]))
     return _Program(compiled, results[-1])

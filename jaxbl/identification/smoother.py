@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbl.fused.steps import stepped
+from jaxbl.fused.signal_scan import stepped
 
 _SMOOTHNESS = 1e-14, 1e4
 """Range of q h^5 / sigma^2 that is searched: time constants of the smoother from 200 periods to a fraction of one."""

@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxbl.config import Config, precision, prepare, read_config
 from jaxbl.drive.parameters import get_leaf, set_leaves
-from jaxbl.fused import kept
+from jaxbl.fused import program_cache
 from jaxbl.simulate import Experiment, scan
 from jaxbl.workers import doing
 
@@ -99,14 +99,14 @@ def costs(devices: Sequence[Any]) -> Costs:
     programs are kept."""
     if devices[0].platform != "cpu":
         return _GPU
-    key = kept.key_of("costs", len(devices))
+    key = program_cache.key_of("costs", len(devices))
     if key is None:
         return _CPU
-    found = kept.load(key)
+    found = program_cache.load(key)
     if found is None:
         doing("measuring this machine")
         found = measured(list(devices))
-        kept.save(key, found)
+        program_cache.save(key, found)
         doing("running")
     return found
 
@@ -141,12 +141,12 @@ def work_of(config: Config, paths: Sequence[str], names: Names = None) -> Work:
     """Count what a sample takes where these paths differ from lane to lane, and some metrics are computed, or all."""
     with precision(config):
         experiment = prepare(config)
-        key = kept.name_of("work", experiment, tuple(paths), names)
+        key = program_cache.name_of("work", experiment, tuple(paths), names)
         # a study of many sweeps asks for the same one, also where nothing is kept on disk
-        found = _works.get(key) or kept.load(key)
+        found = _works.get(key) or program_cache.load(key)
         if found is None:
             found = _counted(experiment, paths, names)
-            kept.save(key, found)
+            program_cache.save(key, found)
         if key is not None:
             _works[key] = found
     return found

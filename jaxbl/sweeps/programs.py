@@ -20,7 +20,7 @@ from jaxbl.simulate import Experiment, scan
 from .metrics import METRICS, Names, ObserverGains, metric_columns, metrics, observer_gains
 
 if TYPE_CHECKING:
-    from jaxbl.fused.passage import Passage
+    from jaxbl.fused.lane_simulator import Passage
 
 Backend = Literal["fused", "scan"]
 BACKENDS: tuple[Backend, ...] = get_args(Backend)
@@ -142,7 +142,7 @@ def compile_program(
 def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tuple[str, ...], names: Names) -> Program:
     if not paths:
         raise Unsupported("lanes that differ in nothing but their seed")
-    from jaxbl.fused.passage import DevicePassage, HostPassage
+    from jaxbl.fused.lane_simulator import DevicePassage, HostPassage
 
     if devices[0].platform == "cpu":
         passage: Passage = HostPassage(experiment, (metrics(names),), paths, layout.points, len(devices))

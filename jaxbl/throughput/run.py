@@ -20,12 +20,12 @@ import numpy as np
 from jaxbl.errors import NoResult
 from jaxbl.workers import Progress, cores
 
-from .ours import Fused, Scan
-from .rivals.compiled import Compiled, forget
-from .rivals.diffrax_euler import Diffrax
-from .rivals.native import Native, NoCompiler, compiler, library
-from .rivals.native_studies import NativeStudy
-from .rivals.plain import Plain
+from .jaxbl_chain import Fused, Scan
+from .rivals.cpp_chain import Native, NoCompiler, compiler, library
+from .rivals.cpp_studies import NativeStudy
+from .rivals.diffrax_chain import Diffrax
+from .rivals.numba_chain import Compiled, forget
+from .rivals.python_chain import Plain
 from .studies import STUDIES, OwnStudy, study
 from .workload import Workload
 

@@ -6,8 +6,8 @@ import gpu
 import jax
 import numpy as np
 
-from jaxbl.fused.passage import DevicePassage
-from jaxbl.throughput.ours import Fused
+from jaxbl.fused.lane_simulator import DevicePassage
+from jaxbl.throughput.jaxbl_chain import Fused
 from jaxbl.throughput.workload import Workload
 
 

@@ -32,7 +32,7 @@ def unread(monkeypatch):
 
 
 def moved(monkeypatch):
-    for name in ("passage", "single_run", "llvm"):
+    for name in ("lane_simulator", "single_run", "llvm"):
         monkeypatch.setitem(sys.modules, f"jaxbl.fused.{name}", None)
 
 

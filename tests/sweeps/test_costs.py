@@ -9,7 +9,7 @@ from small_study import ALPHA, LAMBDA, NOISE, small
 
 import jaxbl.sweeps.costs as under_test
 from jaxbl.config import read_config
-from jaxbl.fused import kept
+from jaxbl.fused import program_cache
 from jaxbl.sweeps.costs import Cost, Costs, Work, faster, measured, work_of
 from jaxbl.sweeps.programs import Layout
 
@@ -64,7 +64,7 @@ def test_measured_once_where_programs_are_kept(monkeypatch, tmp_path):
     devices = jax.devices()
     assert under_test.costs(devices) == under_test._CPU
     assert not calls
-    monkeypatch.setenv(kept.PROGRAMS, str(tmp_path))
+    monkeypatch.setenv(program_cache.PROGRAMS, str(tmp_path))
     assert [under_test.costs(devices) for _ in range(2)] == [KNOWN, KNOWN]
     assert calls == [devices]
 

@@ -5,7 +5,7 @@ import pytest
 
 from jaxbl.config import read_config
 from jaxbl.errors import NoResult
-from jaxbl.throughput.rivals.native import compiler
+from jaxbl.throughput.rivals.cpp_chain import compiler
 from jaxbl.throughput.run import _NAN_SHARE, check_medians, check_study, compare
 from jaxbl.throughput.studies import STUDIES
 

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from . import Unsupported, attempted, in_threads, kept, say_scanned
+from . import Unsupported, attempted, in_threads, program_cache, say_scanned
 
 _NUMBER = jax.ShapeDtypeStruct((), np.dtype(float))
 _NOTHING = 1e-60
@@ -97,8 +97,8 @@ def _sample(states: int, sides: int) -> Any:
 
 @lru_cache(maxsize=64)
 def _loop(states: int, sides: int) -> Any:
-    key = kept.key_of("recursion", states, sides)
-    if (found := kept.load(key)) is not None:
+    key = program_cache.key_of("recursion", states, sides)
+    if (found := program_cache.load(key)) is not None:
         return found
     try:
         with attempted():
@@ -109,7 +109,7 @@ def _loop(states: int, sides: int) -> Any:
             with jax.enable_x64(True):
                 body = traced(_sample(states, sides), *([_NUMBER] * size for size in sizes))
             loop = Loop(body, np.dtype(float), carry=states, fixed=2 * sides, beside=states + sides)
-            kept.save(key, loop)
+            program_cache.save(key, loop)
             return loop
     except Unsupported as why:
         say_scanned(str(why))

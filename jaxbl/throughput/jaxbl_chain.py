@@ -9,7 +9,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxbl.drive import set_leaves
-from jaxbl.fused.passage import HostPassage
+from jaxbl.fused.lane_simulator import HostPassage
 from jaxbl.simulate import scan
 
 from .workload import FIGURES, RANGES, SEED, Chunked, Workload

@@ -14,10 +14,10 @@ import numpy as np
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.simulate import Experiment, Reducer, advance, begin, block_length, done, end_of_block, figures
 
-from .ahead import Shared, ahead_of_lanes
+from .dependence import Around, Kind, carry_kinds, split
 from .llvm import Arrays, Loop, Placed, Rows, vector_lanes
 from .noise import host
-from .split import Around, Kind, carry_kinds, split
+from .shared_part import Shared, ahead_of_lanes
 
 _KEPT = 2**24
 """Bytes of what lanes share, of some seeds, that a program keeps for the next lanes."""

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import Unsupported, attempted, kept, say_scanned
+from . import Unsupported, attempted, program_cache, say_scanned
 
 Sample = Callable[[list[Any], list[Any], list[Any]], tuple[list[Any], list[Any]]]
 """From numbers that stay the same, what is carried and a sample's inputs, to what is carried on and what is kept."""
@@ -47,8 +47,8 @@ def stepped(
 def _loop(sample: Sample, values: int, carry: int, inputs: int, alone: bool, own: bool) -> Any:
     """`alone`: for one lane; `own`: each lane has inputs of its own."""
     sizes, lanes, beside = (values, carry, inputs), 1 if alone else None, inputs if own else 0
-    key = kept.key_of("steps", sample, *sizes, lanes, beside)
-    if (found := kept.load(key)) is not None:
+    key = program_cache.key_of("steps", sample, *sizes, lanes, beside)
+    if (found := program_cache.load(key)) is not None:
         return found
     try:
         with attempted():
@@ -58,7 +58,7 @@ def _loop(sample: Sample, values: int, carry: int, inputs: int, alone: bool, own
             with jax.enable_x64(True):
                 body = traced(sample, *([_NUMBER] * size for size in sizes))
             loop = Loop(body, np.dtype(float), values=values, carry=carry, beside=beside, lanes=lanes)
-            kept.save(key, loop)
+            program_cache.save(key, loop)
             return loop
     except Unsupported as why:
         say_scanned(str(why))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbl.fused.split import Kind, carry_kinds, recursion, split
+from jaxbl.fused.dependence import Kind, carry_kinds, recursion, split
 
 
 def begin(values):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from jaxbl.fused import recursion as module
-from jaxbl.fused.recursion import Recursion
+from jaxbl.fused import linear_predictor as module
+from jaxbl.fused.linear_predictor import Recursion
 
 
 @pytest.mark.parametrize("machine_code", [True, False])

@@ -16,11 +16,11 @@ from jaxbl.drive.excitation import Chirp, Sine
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.drive.transmission import DeadZone
 from jaxbl.fused import Unsupported
-from jaxbl.fused import passage as module
-from jaxbl.fused.ahead import Looped
+from jaxbl.fused import lane_simulator as module
 from jaxbl.fused.jaxprs import contracted, substituted
+from jaxbl.fused.lane_simulator import DevicePassage, HostPassage, Passage
 from jaxbl.fused.pallas import LANES, Kernel
-from jaxbl.fused.passage import DevicePassage, HostPassage, Passage
+from jaxbl.fused.shared_part import Looped
 from jaxbl.observer import DISCRETISATIONS, EquivalentControl, Identifier, Observers
 from jaxbl.simulate import Experiment, Reducer, Run, scan
 from jaxbl.sweeps.metrics import METRICS, metrics

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import Unsupported
+from .dependence import recursion
 from .jaxprs import flat
 from .llvm import Loop
 from .noise import LONGEST_STRETCH, draw
-from .split import recursion
 
 Shares = tuple[list[Any], list[Any], list[Any]]
 """Next state of what lanes share, what follows each block of a stretch of samples reads of it `(blocks,)`, and what each

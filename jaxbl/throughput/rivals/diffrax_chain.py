@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxbl.drive import set_leaves
 from jaxbl.simulate import advance, begin, figures
 
-from ..ours import LANES
+from ..jaxbl_chain import LANES
 from ..workload import FIGURES, Chunked, Workload
 
 

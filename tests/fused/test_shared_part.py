@@ -6,9 +6,9 @@ import pytest
 
 from jaxbl.drive import Encoders, Initial, LinearShaft, TwoInertia, as_arrays
 from jaxbl.drive.excitation import Multisine
-from jaxbl.fused import ahead as module
-from jaxbl.fused.ahead import Looped, Scanned
-from jaxbl.fused.passage import HostPassage
+from jaxbl.fused import shared_part as module
+from jaxbl.fused.lane_simulator import HostPassage
+from jaxbl.fused.shared_part import Looped, Scanned
 from jaxbl.observer import EquivalentControl, ImplicitSuperTwisting, Observers
 from jaxbl.simulate import Experiment, Run
 from jaxbl.sweeps.metrics import METRICS

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxbl.drive.effects import make_effect
-from jaxbl.fused import kept
+from jaxbl.fused import program_cache
 
 SCRIPT = """
 import sys
@@ -39,7 +39,7 @@ print(len(traced), repr(float(np.sum(needed))), repr(float(np.sum(states.positio
 
 
 def test_another_process_does_not_trace(tmp_path, monkeypatch):
-    monkeypatch.setenv(kept.PROGRAMS, str(tmp_path))
+    monkeypatch.setenv(program_cache.PROGRAMS, str(tmp_path))
     said = []
     for _ in range(2):
         done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)
@@ -49,7 +49,7 @@ def test_another_process_does_not_trace(tmp_path, monkeypatch):
 
 
 def test_names_tell_structures_apart(tmp_path, monkeypatch):
-    monkeypatch.setenv(kept.PROGRAMS, str(tmp_path))
+    monkeypatch.setenv(program_cache.PROGRAMS, str(tmp_path))
     drag, lag = make_effect("motor.quadratic_drag", drag=1.0), make_effect("actuator.lag", time_constant=1.0)
     given = [
         drag,
@@ -61,44 +61,44 @@ def test_names_tell_structures_apart(tmp_path, monkeypatch):
         1,
         1.0,
     ]
-    keys = [kept.key_of("program", one) for one in given]
+    keys = [program_cache.key_of("program", one) for one in given]
     assert None not in keys and len(set(keys)) == len(keys)
     # of arrays what they are, not what they hold
-    assert kept.key_of("program", jnp.ones(3)) == kept.key_of("program", jnp.zeros(3))
-    assert kept.key_of("program", make_effect("motor.quadratic_drag", drag=jnp.ones(()))) == kept.key_of(
+    assert program_cache.key_of("program", jnp.ones(3)) == program_cache.key_of("program", jnp.zeros(3))
+    assert program_cache.key_of("program", make_effect("motor.quadratic_drag", drag=jnp.ones(()))) == program_cache.key_of(
         "program", make_effect("motor.quadratic_drag", drag=jnp.zeros(()))
     )
     with jax.enable_x64(False):
-        assert kept.key_of("program", 1) != kept.key_of("program", 1.0) != keys[-1]
+        assert program_cache.key_of("program", 1) != program_cache.key_of("program", 1.0) != keys[-1]
 
 
 def test_what_is_not_known_by_its_text_is_not_kept(tmp_path, monkeypatch):
-    monkeypatch.setenv(kept.PROGRAMS, str(tmp_path))
-    assert kept.key_of("program", lambda x: x) is None
-    assert kept.key_of("program", np.random.default_rng(0)) is None
-    monkeypatch.setenv(kept.PROGRAMS, "")
-    assert kept.key_of("program", 1) is None
+    monkeypatch.setenv(program_cache.PROGRAMS, str(tmp_path))
+    assert program_cache.key_of("program", lambda x: x) is None
+    assert program_cache.key_of("program", np.random.default_rng(0)) is None
+    monkeypatch.setenv(program_cache.PROGRAMS, "")
+    assert program_cache.key_of("program", 1) is None
 
 
 @pytest.mark.parametrize("content", [b"", b"half a pickle"])
 def test_a_broken_file_is_no_program(tmp_path, monkeypatch, content):
-    monkeypatch.setenv(kept.PROGRAMS, str(tmp_path))
-    key = kept.key_of("program", 1)
-    kept.save(key, [1, 2])
-    assert kept.load(key) == [1, 2]
-    folder = kept.keeping()
+    monkeypatch.setenv(program_cache.PROGRAMS, str(tmp_path))
+    key = program_cache.key_of("program", 1)
+    program_cache.save(key, [1, 2])
+    assert program_cache.load(key) == [1, 2]
+    folder = program_cache.keeping()
     assert folder is not None and key is not None
     (folder / key).write_bytes(content)
-    assert kept.load(key) is None
+    assert program_cache.load(key) is None
 
 
 def test_programs_in_a_folder_that_others_can_write_to_are_not_loaded(tmp_path, monkeypatch):
     """They are pickled: to load one is to run it."""
-    monkeypatch.setenv(kept.PROGRAMS, str(tmp_path / "programs"))
-    kept._folder.cache_clear()
-    kept.save("key", 3)
-    assert kept.load("key") == 3
+    monkeypatch.setenv(program_cache.PROGRAMS, str(tmp_path / "programs"))
+    program_cache._folder.cache_clear()
+    program_cache.save("key", 3)
+    assert program_cache.load("key") == 3
     (tmp_path / "programs").chmod(0o777)
-    kept._folder.cache_clear()
-    assert kept.load("key") is None
-    kept._folder.cache_clear()
+    program_cache._folder.cache_clear()
+    assert program_cache.load("key") is None
+    program_cache._folder.cache_clear()

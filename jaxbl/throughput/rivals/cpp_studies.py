@@ -15,7 +15,7 @@ from jaxbl.sweeps.metrics import window_start
 
 from ..studies import Study
 from ..workload import SIDES
-from .native import WHOLE, library, pointers
+from .cpp_chain import WHOLE, library, pointers
 
 _NUMBERS = (
     "period", "motor_inertia", "motor_viscous", "load_inertia", "load_viscous", "gear_ratio", "stiffness", "slope", "share",

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 
 from ..workload import Workload, identified_figures
-from .plain import chain, moreau, numbers_of, super_twisting
+from .python_chain import chain, moreau, numbers_of, super_twisting
 
 WIDTH = 64
 """Lanes of a block: several registers of the widest vectors, and a state that stays in the first cache."""
