@@ -21,7 +21,7 @@ import jax
 import numpy as np
 
 from jaxbl.config import Config, precision, prepare, read_config
-from jaxbl.fused.lane_simulator import HostPassage
+from jaxbl.fused.lane_simulator import HostSimulator
 from jaxbl.sweeps.metrics import metrics
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import sweep
@@ -55,7 +55,7 @@ def seconds(config: Config, names: tuple[str, ...], lanes: int, rounds: int) -> 
             f"{', '.join(names)}, none may leave": asked._replace(done=None),
         }
         passages = {
-            name: HostPassage(experiment, (one,), tuple(columns), len(chosen), threads) for name, one in reducers.items()
+            name: HostSimulator(experiment, (one,), tuple(columns), len(chosen), threads) for name, one in reducers.items()
         }
         found = {name: passage(columns, 0) for name, passage in passages.items()}
         whole = found["all metrics"]

@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxbl.drive import Encoders, Initial, LinearShaft, TwoInertia, as_arrays
 from jaxbl.drive.excitation import Sine
-from jaxbl.fused.lane_simulator import HostPassage
+from jaxbl.fused.lane_simulator import HostSimulator
 from jaxbl.observer import EquivalentControl, Identifier, ImplicitSuperTwisting, Observers
 from jaxbl.simulate import Experiment, Reducer, Run
 from jaxbl.sweeps.metrics import METRICS
@@ -63,7 +63,7 @@ LASTED = Reducer(
 
 def limit(whole: Experiment, steps: int) -> float:
     """The least stiffness at which a lane is done before so many samples."""
-    passage, low, high = HostPassage(whole, (LASTED,), (PATH,), 256, 1), SANE, 1e9
+    passage, low, high = HostSimulator(whole, (LASTED,), (PATH,), 256, 1), SANE, 1e9
     for _ in range(4):
         tried = np.linspace(low, high, 256)
         last = int(np.flatnonzero(passage({PATH: tried}, 0)["samples"] >= steps)[-1])
@@ -86,8 +86,8 @@ def measure(lanes: int, steps: int, dtype: np.dtype, rounds: int) -> None:
     whole = experiment(steps, dtype)
     least = limit(whole, int(TIME * steps))
     threads = len(jax.local_devices())
-    leaving = HostPassage(whole, (METRICS,), (PATH,), lanes, threads)
-    staying = HostPassage(whole, (METRICS._replace(done=None),), (PATH,), lanes, threads)
+    leaving = HostSimulator(whole, (METRICS,), (PATH,), lanes, threads)
+    staying = HostSimulator(whole, (METRICS._replace(done=None),), (PATH,), lanes, threads)
     sane, gone = SANE * np.linspace(1.0, 1.1, lanes), np.arange(lanes) < SHARE * lanes
     mixed = np.random.default_rng(0).permutation(gone)
     cases = {

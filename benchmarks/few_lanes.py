@@ -21,12 +21,12 @@ start_jax()
 
 import jax  # noqa: E402
 
-from jaxbl.throughput.jaxbl_chain import Fused  # noqa: E402
-from jaxbl.throughput.rivals.cpp_chain import Native  # noqa: E402
+from jaxbl.throughput.jaxbl_chain import FusedChain  # noqa: E402
+from jaxbl.throughput.rivals.cpp_chain import CppChain  # noqa: E402
 from jaxbl.throughput.workload import SEED, Workload  # noqa: E402
 
 
-class Kept(Fused):
+class Kept(FusedChain):
     """The same lanes of one seed again."""
 
     def __call__(self):
@@ -57,9 +57,9 @@ def main() -> None:
 def measured(work: Workload, folder: Path, given: argparse.Namespace) -> list[float]:
     """Least time of each, us."""
     runners = [
-        Native(work, given.threads, folder, own=True),
-        Fused(work, given.threads),
-        Native(work, given.threads, folder),
+        CppChain(work, given.threads, folder, own=True),
+        FusedChain(work, given.threads),
+        CppChain(work, given.threads, folder),
         Kept(work, given.threads),
     ]
     best = [float("inf")] * len(runners)

@@ -26,8 +26,8 @@ from jax.experimental.pallas import triton
 from jax.extend.core import jaxpr_as_fun
 
 from jaxbl.drive import set_leaves
-from jaxbl.fused.jaxprs import contracted, flat
-from jaxbl.fused.lane_simulator import DevicePassage
+from jaxbl.fused.jaxprs import join_multiply_add, trace_inlined
+from jaxbl.fused.lane_simulator import DeviceSimulator
 from jaxbl.fused.pallas import multiply_add
 from jaxbl.simulate import scan
 from jaxbl.throughput.workload import FIGURES, NAMES, RANGES, SEED, Workload, constants, identified_figures
@@ -77,13 +77,13 @@ def chain_scanned(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
 
 def chain_fused(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
     """The chain by the fused kernel."""
-    passage, values = DevicePassage(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes), work.values()
+    passage, values = DeviceSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes), work.values()
     return lambda: passage(values, SEED)
 
 
 def chain_kernel(work: Workload) -> Callable[[], dict[str, np.ndarray]]:
     """The fused kernel alone, as the CUDA kernel is timed: input and noise lie on the device."""
-    passage = DevicePassage(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes)
+    passage = DeviceSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes)
     given = jax.device_put((passage.filled_up(work.values()), passage.inputs(passage.stretches(SEED))))
     names = sorted(NAMES)
     return lambda: {name: np.asarray(x)[: work.lanes] for name, x in zip(names, passage.kernel(*given), strict=True)}
@@ -123,7 +123,7 @@ def lorenz_fused(lanes: int, steps: int, step: float, interpret: bool = False) -
         return _lorenz_step(step, r, state)
 
     if not interpret:
-        advance = jaxpr_as_fun(contracted(flat(advance, *[lane] * 4), multiply_add))
+        advance = jaxpr_as_fun(join_multiply_add(trace_inlined(advance, *[lane] * 4), multiply_add))
     rho = jnp.pad(jnp.linspace(0.0, 21.0, lanes, dtype=jnp.float32), (0, padded - lanes))
 
     def kernel(rho: Any, *out: Any) -> None:

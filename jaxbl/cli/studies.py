@@ -264,7 +264,7 @@ def compute(
     folder = folder_of(config, out)
     with running(context, config, folder) as progress:
         result = run(study, folder, progress=progress, overwrite=overwrite, backend=backend)
-    from jaxbl.fused import SCANNED
+    from jaxbl.fused import SCAN_MESSAGE
 
     with working(context, "drawing"):
         # what draws is loaded when there is something to be drawn
@@ -276,7 +276,7 @@ def compute(
     if cost and cost["lanes"]:
         compiling, computing = duration(cost["compile_seconds"]), duration(cost["run_seconds"])
         lines.append(f"Compiled in {compiling}, ran {cost['lanes']:.0f} lanes in {computing}.")
-    lines += (SCANNED % what for what in result.scanned)
+    lines += (SCAN_MESSAGE % what for what in result.scanned)
     lines += (f"Damaged, and computed anew: {what}" for what in getattr(result, "damaged", ()))
     return Outcome(lines, folder, summary=_SUMMARIES.get(command) or _extent(result), steps=following)
 

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from jaxbl.drive.plant import PlantState
-from jaxbl.fused.single_plant import Direction, paths, slopes
+from jaxbl.fused.single_plant import Direction, simulate_plants, step_derivatives
 from jaxbl.identification.trajectory import INFLUENCE, RIDGE, Windows
 from jaxbl.simulate import Experiment
 
@@ -48,7 +48,7 @@ class _Model(NamedTuple):
         start = jax.tree.structure(self.windows.start).unflatten(list(starts.T))
         torque, time = self.windows.torque[which], self.windows.time[which]
         varying = {path: values[which] for path, values in self.varying.items()}
-        return jax.tree.leaves(paths(self.experiment, start, torque, time, varying=varying))  # type: ignore[arg-type]
+        return jax.tree.leaves(simulate_plants(self.experiment, start, torque, time, varying=varying))  # type: ignore[arg-type]
 
     def residual(self, states: list[np.ndarray], which: np.ndarray) -> np.ndarray:
         w = self.windows
@@ -64,7 +64,9 @@ class _Model(NamedTuple):
         time = w.time[which][:, None] + float(self.experiment.run.sample_period) * np.arange(samples)
         flat = shape.unflatten([one.ravel() for one in states])
         varying = {path: values[which].ravel() for path, values in self.varying.items()}
-        changes, _ = slopes(self.experiment, flat, np.asarray(w.torque[which]).ravel(), time.ravel(), ways, varying)
+        changes, _ = step_derivatives(
+            self.experiment, flat, np.asarray(w.torque[which]).ravel(), time.ravel(), ways, varying
+        )
         steps = changes.reshape(count, count, runs, samples).transpose(3, 2, 1, 0)
         places: Any = shape.unflatten(range(count))
         rows = [places.position[side] for side in self.experiment.sides]

@@ -25,9 +25,9 @@ from jaxbl.drive.effects import EFFECTS, Scales
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused import in_threads
-from jaxbl.fused.linear_predictor import Recursion
-from jaxbl.fused.signal_scan import stepped
-from jaxbl.fused.single_plant import Direction, slopes
+from jaxbl.fused.linear_predictor import LinearPredictor
+from jaxbl.fused.signal_scan import scan_signal
+from jaxbl.fused.single_plant import Direction, step_derivatives
 from jaxbl.identification.compilation import jit
 from jaxbl.identification.prediction import kalman_gain
 from jaxbl.identification.regression import Path, effect_states
@@ -79,7 +79,7 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
     # as they may differ from sample to sample elsewhere, where the same loop serves
     none = {path: np.zeros(size) for path in added.values()}
     ways = _directions(free, theta, at, order, list(added.values()))
-    slope, value = slopes(experiment, motion, torque, time, ways, none)
+    slope, value = step_derivatives(experiment, motion, torque, time, ways, none)
     slope, value = slope[:, order].transpose(2, 1, 0), value[order].T
     vectors = np.stack(jax.tree.leaves(motion), axis=1)[:, order]
     defect = np.zeros_like(value)
@@ -134,7 +134,7 @@ class _Columns:
         self.forces = forces
         self.states = self.defect.shape[1]
         self.width = 1 + self.own.shape[2] + forces.width + self.states
-        self.recursion = Recursion.of(self.states, self.readings.shape[1], self.width)
+        self.recursion = LinearPredictor.of(self.states, self.readings.shape[1], self.width)
 
     def along(self, gains: Sequence[np.ndarray]) -> Iterator[tuple[slice, list[np.ndarray]]]:
         """Rows of some samples after the others, and the prediction errors there under each gain, rad, shape
@@ -191,7 +191,7 @@ def _gradient(part: Part, gain: np.ndarray, left: np.ndarray) -> np.ndarray:
     closed, added = _closed(part, gain_matrix(gain, states)), np.zeros((len(left), states))
     added[:, :sides] = -left * np.asarray(part.weight)[:, None]
     inputs = [*closed.reshape(len(left), -1).T, *added.T]
-    found = stepped(_backwards, [], [np.zeros(1)] * states, [one[::-1] for one in inputs])
+    found = scan_signal(_backwards, [], [np.zeros(1)] * states, [one[::-1] for one in inputs])
     adjoints = np.stack([one[::-1, 0] for one in found], axis=1)
     return np.einsum("tij,ti->tj", part.force, adjoints)
 

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from jaxbl.drive.plant import PlantState
-from jaxbl.fused.single_plant import paths
+from jaxbl.fused.single_plant import simulate_plants
 from jaxbl.identification.segments import Segment, reading_noise, white_noise, windows_of
 from jaxbl.identification.smoother import smooth
 from jaxbl.identification.trajectory import Windows
@@ -289,7 +289,7 @@ def _run(experiment: Experiment, windows: Windows, start: PlantState, added: Map
     # none are: the same loop serves
     none = {path: np.zeros(windows.torque.shape) for path in added.values()}
     experiment, start = lean(experiment, start)
-    return paths(experiment, start, np.asarray(windows.torque), np.asarray(windows.time), varying=none)
+    return simulate_plants(experiment, start, np.asarray(windows.torque), np.asarray(windows.time), varying=none)
 
 
 def _all_rms(samples: Mapping[str, np.ndarray]) -> dict[str, float]:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxbl.drive.plant import PlantState
-from jaxbl.fused.single_plant import path
+from jaxbl.fused.single_plant import simulate_plant
 from jaxbl.identification.intervals import spread_of
 from jaxbl.identification.regression import begun
 from jaxbl.identification.segments import Segment
@@ -100,7 +100,7 @@ class _Refiner:
             position, velocity = (dict(zip(sides, half, strict=True)) for half in np.split(first, 2))
             effects = begun(experiment, segment.torque[:1], segment.before)
             state = PlantState(position, velocity, effects)
-            states = path(*lean(experiment, state), segment.torque, segment.time[0], segment.readings, gains)
+            states = simulate_plant(*lean(experiment, state), segment.torque, segment.time[0], segment.readings, gains)
             filtered = {}
             for side in sides:
                 own = segment.smoothed[side]

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxbl.fused.jaxprs import ClosedJaxpr, traced
+from jaxbl.fused.jaxprs import ClosedJaxpr, trace
 
 from .lowering import Constant, Routine, Value, Variable, alike, lowered, read_by, with_x64, without_unread
 
@@ -109,8 +109,8 @@ def traced_block(
             return [*jax.tree.leaves(new), *(value for value, _, _ in out.values())]
 
         leaves = jax.tree.leaves(state)
-        started = traced(flat_start, list(numbers.values()), list(begin.values()))
-        stepped = traced(flat_step, list(numbers.values()), leaves, list(sample.values()))
+        started = trace(flat_start, list(numbers.values()), list(begin.values()))
+        stepped = trace(flat_step, list(numbers.values()), leaves, list(sample.values()))
     dtypes = [np.dtype(aval.dtype) for aval in stepped.out_avals]
     found = [Quantity(name, *said[name], dtype) for name, dtype in zip(said, dtypes[len(leaves) :], strict=True)]
     names = [_identifier(path) for path, _ in jax.tree_util.tree_flatten_with_path(state)[0]]

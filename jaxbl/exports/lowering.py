@@ -23,12 +23,12 @@ from jaxbl.fused.jaxprs import (
     JaxprEqn,
     Literal,
     Var,
-    branches_of,
     callee,
-    parameter_of,
-    repetition,
-    source_of,
-    traced_of_one,
+    cond_branches,
+    equation_parameter,
+    equation_source,
+    scan_parameters,
+    trace_scalar_function,
 )
 
 TYPES = ("float32", "float64", "int32", "uint32", "int64", "uint64", "bool")
@@ -260,7 +260,7 @@ class _Lowering:
 
         for eqn in jaxpr.eqns:
             if outside:
-                self._source = source_of(eqn)
+                self._source = equation_source(eqn)
             values = [read(v) for v in eqn.invars]
             results = self.equation(eqn, values, outside)
             if all(isinstance(value, Constant) for value in values):
@@ -275,9 +275,9 @@ class _Lowering:
                 return self._bound(eqn, given)
             raise Unsupported(f"{name} of arrays: what runs in real time should be made of scalars")
         if name == "scan":
-            return self._repeated(*repetition(eqn), given, outside)
+            return self._repeated(*scan_parameters(eqn), given, outside)
         if name == "cond":
-            return self._chosen(branches_of(eqn), given, outside)
+            return self._chosen(cond_branches(eqn), given, outside)
         if (called := callee(eqn)) is not None:
             return self.run(called, given, False)
         dtype = _type(eqn.invars[0]) if given else np.dtype(bool)
@@ -285,7 +285,7 @@ class _Lowering:
             raise Unsupported(f"numbers of type {dtype}")
         real = jnp.issubdtype(dtype, jnp.floating)
         if name in FUNCTIONS and real:
-            return self.run(traced_of_one(FUNCTIONS[name], dtype), given, False)
+            return self.run(trace_scalar_function(FUNCTIONS[name], dtype), given, False)
         rule = (_OF_FLOATS if real else _OF_INTEGERS).get(name) or _OF_ALL.get(name)
         if rule is None:
             if known:
@@ -485,7 +485,7 @@ def _clamp(w: _Lowering, eqn: JaxprEqn, low: Value, a: Value, high: Value) -> Va
 
 
 def _power(w: _Lowering, eqn: JaxprEqn, a: Value) -> Value:
-    power = parameter_of(eqn, "y")
+    power = equation_parameter(eqn, "y")
     if not 1 <= abs(power) <= 8:
         raise Unsupported(f"integer_pow by {power}")
     result = reduce(lambda x, y: w.emit("mul", a.dtype, x, y), [a] * abs(power))
@@ -541,7 +541,9 @@ _OF_FLOATS: dict[str, Rule] = {
     "one_minus_square": _one_minus_square,
     "integer_pow": _power,
     # lax.RoundingMethod: away from zero, to nearest even
-    "round": lambda w, eqn, a: w.emit(("round_away", "round_even")[int(parameter_of(eqn, "rounding_method"))], a.dtype, a),
+    "round": lambda w, eqn, a: w.emit(
+        ("round_away", "round_even")[int(equation_parameter(eqn, "rounding_method"))], a.dtype, a
+    ),
     "is_finite": _finite,
 }
 _OF_INTEGERS: dict[str, Rule] = {

@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 
-SCANNED = "Scanned, and slower for it: the fused loop does not know %s."
+SCAN_MESSAGE = "Scanned, and slower for it: the fused loop does not know %s."
 """Said of what is left to XLA."""
 
 
@@ -24,7 +24,7 @@ class Unsupported(Exception):
 
 
 @contextmanager
-def attempted(what: str = f"how to compile with JAX {jax.__version__}") -> Iterator[None]:
+def raising_unsupported(what: str = f"how to compile with JAX {jax.__version__}") -> Iterator[None]:
     """Around the making of a loop: whatever goes wrong is `Unsupported`, as JAX and LLVM change from version to version."""
     try:
         yield
@@ -36,9 +36,9 @@ def attempted(what: str = f"how to compile with JAX {jax.__version__}") -> Itera
 
 
 @cache
-def say_scanned(why: str) -> None:
+def warn_of_scan(why: str) -> None:
     """On stderr, once; for what has no report that could say it."""
-    logging.getLogger(__name__).warning(SCANNED, why)
+    logging.getLogger(__name__).warning(SCAN_MESSAGE, why)
 
 
 def in_threads(function: Callable[..., Any], *jobs: Iterable[Any]) -> list[Any]:

@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import Unsupported
-from .jaxprs import ClosedJaxpr, JaxprEqn, Literal, Var, evaluate, flat, jaxpr_as_fun, value_of
+from .jaxprs import ClosedJaxpr, JaxprEqn, Literal, Var, evaluate_equations, jaxpr_as_fun, read_variable, trace_inlined
 
 NUMBERS = ("float32", "float64", "int32", "uint32", "int64", "bool")
 """Types that lanes may read."""
 
 
-class Kind(enum.IntFlag):
+class Dependence(enum.IntFlag):
     """What a value depends on."""
 
     FIXED = 0
@@ -28,7 +28,7 @@ class Kind(enum.IntFlag):
     LANE = 2
 
 
-class Parts(NamedTuple):
+class LaneSplit(NamedTuple):
     """A function `f(values, carry, given) -> results` of one lane in two parts, and which results are the lanes'.
 
     `shared`: its part of the carry, `given` -> its results, and what the lanes' part reads of it.
@@ -40,7 +40,7 @@ class Parts(NamedTuple):
     of_lane: list[bool]
 
 
-class Around(NamedTuple):
+class LoopHooks(NamedTuple):
     """What is done around the loop over a block of samples, jaxprs of scalars of one lane: before the first block (values ->
     carry), after each (values, carry, inputs -> carry, and marks that are kept of each block), and to finish (values, carry,
     inputs -> results)."""
@@ -50,71 +50,73 @@ class Around(NamedTuple):
     finish: ClosedJaxpr
 
 
-def carry_kinds(start: Callable[..., Any], functions: Iterable[tuple[Callable[..., Any], Any]], values: Any) -> list[Kind]:
+def carry_dependences(
+    start: Callable[..., Any], functions: Iterable[tuple[Callable[..., Any], Any]], values: Any
+) -> list[Dependence]:
     """Kinds of the leaves of a carry that `start(values)` begins and `functions`, each with an example of what it is given,
     take further: `f(values, carry, given)`."""
-    made = flat(start, values)
-    kinds = _kinds(made.jaxpr, [Kind.LANE] * len(made.jaxpr.invars))
+    made = trace_inlined(start, values)
+    kinds = _kinds(made.jaxpr, [Dependence.LANE] * len(made.jaxpr.invars))
     found = [_kind(kinds, out) for out in made.jaxpr.outvars]
     count = len(jax.tree.leaves(values))
     example = jax.eval_shape(start, values)
-    traced = [(flat(f, values, example, given), len(jax.tree.leaves(given))) for f, given in functions]
+    traced = [(trace_inlined(f, values, example, given), len(jax.tree.leaves(given))) for f, given in functions]
     while True:
         before = list(found)
         for closed, shared in traced:
             jaxpr = closed.jaxpr
-            kinds = _kinds(jaxpr, [Kind.LANE] * count + found + [Kind.SHARED] * shared)
+            kinds = _kinds(jaxpr, [Dependence.LANE] * count + found + [Dependence.SHARED] * shared)
             for i, (old, new) in enumerate(zip(jaxpr.invars[count:], jaxpr.outvars, strict=False)):
                 if new is not old:
-                    found[i] |= _kind(kinds, new) | Kind.SHARED
+                    found[i] |= _kind(kinds, new) | Dependence.SHARED
         if found == before:
-            return [Kind.LANE if kind & Kind.LANE else Kind.SHARED for kind in found]
+            return [Dependence.LANE if kind & Dependence.LANE else Dependence.SHARED for kind in found]
 
 
-def split(
+def split_by_lane(
     function: Callable[..., Any],
     values: Any,
     carry: Any,
     given: Any,
-    kinds: Sequence[Kind],
-    results: Sequence[Kind] | None = None,
-) -> Parts:
+    kinds: Sequence[Dependence],
+    results: Sequence[Dependence] | None = None,
+) -> LaneSplit:
     """The two parts of a function of one lane, from examples of its arguments and the kinds of the carry's leaves.
 
     `results` are the kinds that the results are to have; left out, those that they come to have. `Unsupported` where lanes
     read something that is no number: an array, or the state of a random number generator.
     """
-    closed = flat(function, values, carry, given)
+    closed = trace_inlined(function, values, carry, given)
     jaxpr = closed.jaxpr
     count = len(jax.tree.leaves(values))
     carried, rest = jaxpr.invars[count : count + len(kinds)], jaxpr.invars[count + len(kinds) :]
-    carried_by_lane = [kind == Kind.LANE for kind in kinds]
-    known = _kinds(jaxpr, [Kind.LANE] * count + list(kinds) + [Kind.SHARED] * len(rest))
+    carried_by_lane = [kind == Dependence.LANE for kind in kinds]
+    known = _kinds(jaxpr, [Dependence.LANE] * count + list(kinds) + [Dependence.SHARED] * len(rest))
     live = _live(jaxpr)
-    lanes = [eqn for eqn in live if any(known[out] & Kind.LANE for out in eqn.outvars)]
-    others = [eqn for eqn in live if not any(known[out] & Kind.LANE for out in eqn.outvars)]
+    lanes = [eqn for eqn in live if any(known[out] & Dependence.LANE for out in eqn.outvars)]
+    others = [eqn for eqn in live if not any(known[out] & Dependence.LANE for out in eqn.outvars)]
     constants = dict(zip(jaxpr.constvars, closed.consts, strict=True))
 
-    of_lane = [bool(kind & Kind.LANE) for kind in results or [_kind(known, out) for out in jaxpr.outvars]]
+    of_lane = [bool(kind & Dependence.LANE) for kind in results or [_kind(known, out) for out in jaxpr.outvars]]
     own = [out for out, lane in zip(jaxpr.outvars, of_lane, strict=True) if lane]
     read = dict.fromkeys(v for eqn in lanes for v in eqn.invars if isinstance(v, Var))
     read |= dict.fromkeys(v for v in own if isinstance(v, Var))
-    outside = [v for v in read if not known[v] & Kind.LANE]
-    fixed = [v for v in outside if known[v] == Kind.FIXED]
-    crossing = [v for v in outside if known[v] == Kind.SHARED]
+    outside = [v for v in read if not known[v] & Dependence.LANE]
+    fixed = [v for v in outside if known[v] == Dependence.FIXED]
+    crossing = [v for v in outside if known[v] == Dependence.SHARED]
     lane_in = [*jaxpr.invars[:count], *(v for v, lane in zip(carried, carried_by_lane, strict=True) if lane)]
     shared_in = [v for v, lane in zip(carried, carried_by_lane, strict=True) if not lane]
 
     def shared(state: Sequence[Any], given: Any) -> tuple[list[Any], list[Any]]:
         env = constants | dict(zip(shared_in, state, strict=True))
         env |= dict(zip(rest, jax.tree.leaves(given), strict=True))
-        evaluate(others, env)
-        new = [value_of(env, out) for out, lane in zip(jaxpr.outvars, of_lane, strict=True) if not lane]
+        evaluate_equations(others, env)
+        new = [read_variable(env, out) for out, lane in zip(jaxpr.outvars, of_lane, strict=True) if not lane]
         return new, [env[v] for v in crossing]
 
     def once() -> list[Any]:
         env = dict(constants)
-        evaluate([eqn for eqn in others if all(known[out] == Kind.FIXED for out in eqn.outvars)], env)
+        evaluate_equations([eqn for eqn in others if all(known[out] == Dependence.FIXED for out in eqn.outvars)], env)
         return [env[v] for v in fixed]
 
     for v in [*lane_in, *fixed, *crossing]:
@@ -124,14 +126,14 @@ def split(
 
     def lane(*arguments: Any) -> list[Any]:
         env = dict(zip([*fixed, *lane_in, *crossing], [*numbers, *arguments], strict=True))
-        evaluate(lanes, env)
-        return [value_of(env, out) for out in own]
+        evaluate_equations(lanes, env)
+        return [read_variable(env, out) for out in own]
 
     examples = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in [*lane_in, *crossing]]
-    return Parts(shared, jax.make_jaxpr(lane)(*examples), of_lane)
+    return LaneSplit(shared, jax.make_jaxpr(lane)(*examples), of_lane)
 
 
-class Recursion(NamedTuple):
+class StateSplit(NamedTuple):
     """A function `f(state, given) -> (state, handed)` of one sample in two parts.
 
     `direct` says of each number handed over whether it needs no state. `ahead`: `given` -> these, and what `step` reads.
@@ -143,14 +145,14 @@ class Recursion(NamedTuple):
     step: ClosedJaxpr
 
 
-def recursion(function: Callable[..., tuple[list[Any], list[Any]]], state: Sequence[Any], given: Any) -> Recursion:
+def split_by_state(function: Callable[..., tuple[list[Any], list[Any]]], state: Sequence[Any], given: Any) -> StateSplit:
     """What needs the state of the sample before, and what may be computed for all samples at once. `Unsupported` where the
     former reads something that is no number."""
     count = len(state)
-    jaxpr = flat(function, list(state), given).jaxpr
-    known = _kinds(jaxpr, [Kind.LANE] * count + [Kind.SHARED] * (len(jaxpr.invars) - count))
-    direct = [not _kind(known, out) & Kind.LANE for out in jaxpr.outvars[count:]]
-    kinds = [Kind.LANE] * count + [Kind.SHARED if one else Kind.LANE for one in direct]
+    jaxpr = trace_inlined(function, list(state), given).jaxpr
+    known = _kinds(jaxpr, [Dependence.LANE] * count + [Dependence.SHARED] * (len(jaxpr.invars) - count))
+    direct = [not _kind(known, out) & Dependence.LANE for out in jaxpr.outvars[count:]]
+    kinds = [Dependence.LANE] * count + [Dependence.SHARED if one else Dependence.LANE for one in direct]
 
     def joined(values: Any, carry: list[Any], given: Any) -> list[Any]:
         new, handed = function(carry[:count], given)
@@ -158,7 +160,7 @@ def recursion(function: Callable[..., tuple[list[Any], list[Any]]], state: Seque
 
     # what is handed over stands among the carry, which nothing reads it from
     spare = [jax.ShapeDtypeStruct(out.aval.shape, out.aval.dtype) for out in jaxpr.outvars[count:]]
-    parts = split(joined, [], [*state, *spare], given, kinds, kinds)
+    parts = split_by_lane(joined, [], [*state, *spare], given, kinds, kinds)
     unread = [jnp.zeros(one.shape, one.dtype) for one, alone in zip(spare, direct, strict=True) if not alone]
 
     def step(state: list[Any], read: list[Any]) -> list[Any]:
@@ -166,20 +168,20 @@ def recursion(function: Callable[..., tuple[list[Any], list[Any]]], state: Seque
 
     read = parts.lane.jaxpr.invars[count + len(unread) :]
     examples = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in read]
-    return Recursion(direct, partial(parts.shared, [None] * sum(direct)), flat(step, list(state), examples))
+    return StateSplit(direct, partial(parts.shared, [None] * sum(direct)), trace_inlined(step, list(state), examples))
 
 
-def _kind(kinds: dict[Var, Kind], v: Var | Literal) -> Kind:
-    return Kind.FIXED if isinstance(v, Literal) else kinds[v]
+def _kind(kinds: dict[Var, Dependence], v: Var | Literal) -> Dependence:
+    return Dependence.FIXED if isinstance(v, Literal) else kinds[v]
 
 
-def _kinds(jaxpr: Any, given: Sequence[Kind]) -> dict[Var, Kind]:
-    kinds = dict.fromkeys(jaxpr.constvars, Kind.FIXED) | dict(zip(jaxpr.invars, given, strict=True))
+def _kinds(jaxpr: Any, given: Sequence[Dependence]) -> dict[Var, Dependence]:
+    kinds = dict.fromkeys(jaxpr.constvars, Dependence.FIXED) | dict(zip(jaxpr.invars, given, strict=True))
     for eqn in jaxpr.eqns:
-        kind = Kind.FIXED
+        kind = Dependence.FIXED
         for v in eqn.invars:
             kind |= _kind(kinds, v)
-        kinds |= dict.fromkeys(eqn.outvars, Kind.LANE if kind & Kind.LANE else kind)
+        kinds |= dict.fromkeys(eqn.outvars, Dependence.LANE if kind & Dependence.LANE else kind)
     return kinds
 
 

@@ -146,7 +146,7 @@ def logistic(x: Number) -> Number:
     return 1.0 / (1.0 + exp(-x))
 
 
-def rounded(x: Number) -> Number:
+def round_half_even(x: Number) -> Number:
     """The nearest integer, the even one of two."""
     below = lax.floor(x)
     odd = below - 2.0 * lax.floor(0.5 * below)

@@ -25,20 +25,20 @@ class UnknownForm(Exception):
     """JAX writes an equation in a way that is not known here."""
 
 
-def flat(function: Callable[..., Any], *examples: Any) -> ClosedJaxpr:
+def trace_inlined(function: Callable[..., Any], *examples: Any) -> ClosedJaxpr:
     """Trace a function of pytrees, without calls inside."""
-    return substituted(jax.make_jaxpr(function)(*examples), {})
+    return replace_primitives(jax.make_jaxpr(function)(*examples), {})
 
 
-def substituted(closed: ClosedJaxpr, functions: Mapping[str, Callable[..., Any]]) -> ClosedJaxpr:
+def replace_primitives(closed: ClosedJaxpr, functions: Mapping[str, Callable[..., Any]]) -> ClosedJaxpr:
     """The same without calls, and with functions in place of primitives of floating-point numbers, by their names."""
     leaves = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in closed.in_avals]
     found = jax.make_jaxpr(partial(_inlined, closed, functions))(*leaves)
     # a function may itself call others
-    return found if not any(callee(eqn) for eqn in found.jaxpr.eqns) else substituted(found, functions)
+    return found if not any(callee(eqn) for eqn in found.jaxpr.eqns) else replace_primitives(found, functions)
 
 
-def contracted(closed: ClosedJaxpr, multiply_add: Callable[..., Any]) -> ClosedJaxpr:
+def join_multiply_add(closed: ClosedJaxpr, multiply_add: Callable[..., Any]) -> ClosedJaxpr:
     """The same with a product that one sum or difference alone reads joined with it.
 
     `multiply_add(a, b, c, minus_product=..., minus_rest=...)` is a * b + c, the product or the rest with the other sign.
@@ -64,35 +64,35 @@ def contracted(closed: ClosedJaxpr, multiply_add: Callable[..., Any]) -> ClosedJ
         for eqn in jaxpr.eqns:
             out = next(iter(eqn.outvars), None)
             if out in joined:
-                a, b = (value_of(env, v) for v in products[joined[out]].invars)
+                a, b = (read_variable(env, v) for v in products[joined[out]].invars)
                 first = eqn.invars[0] is joined[out]
-                c = value_of(env, eqn.invars[1 if first else 0])
+                c = read_variable(env, eqn.invars[1 if first else 0])
                 minus = eqn.primitive.name == "sub"
                 env[out] = multiply_add(a, b, c, minus_product=minus and not first, minus_rest=minus and first)
             elif out not in inside:
-                evaluate([eqn], env, lambda body: contracted(body, multiply_add))
-        return [value_of(env, v) for v in jaxpr.outvars]
+                evaluate_equations([eqn], env, lambda body: join_multiply_add(body, multiply_add))
+        return [read_variable(env, v) for v in jaxpr.outvars]
 
     return jax.make_jaxpr(evaluated)(*(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in closed.in_avals))
 
 
-def traced(function: Callable[..., Any], *examples: Any) -> ClosedJaxpr:
+def trace(function: Callable[..., Any], *examples: Any) -> ClosedJaxpr:
     """Trace a function of pytrees; calls inside stay calls, which takes half the time of opening them."""
     return jax.make_jaxpr(function)(*examples)
 
 
 @lru_cache(maxsize=64)
-def traced_of_one(function: Callable[[Any], Any], dtype: Any) -> ClosedJaxpr:
+def trace_scalar_function(function: Callable[[Any], Any], dtype: Any) -> ClosedJaxpr:
     """The same of a function of one number, once."""
-    return traced(function, jax.ShapeDtypeStruct((), dtype))
+    return trace(function, jax.ShapeDtypeStruct((), dtype))
 
 
 def callee(eqn: JaxprEqn) -> ClosedJaxpr | None:
     """What an equation calls, if it does nothing else."""
-    return parameter_of(eqn, "jaxpr", "call_jaxpr") if eqn.primitive.name in _CALLS else None
+    return equation_parameter(eqn, "jaxpr", "call_jaxpr") if eqn.primitive.name in _CALLS else None
 
 
-def parameter_of(eqn: JaxprEqn, *names: str) -> Any:
+def equation_parameter(eqn: JaxprEqn, *names: str) -> Any:
     """Of an equation, by the first of these names that it has."""
     for name in names:
         if name in eqn.params:
@@ -100,24 +100,24 @@ def parameter_of(eqn: JaxprEqn, *names: str) -> Any:
     raise UnknownForm(f"{eqn.primitive.name} without {' or '.join(names)}")
 
 
-def repetition(eqn: JaxprEqn) -> tuple[int, ClosedJaxpr, int]:
+def scan_parameters(eqn: JaxprEqn) -> tuple[int, ClosedJaxpr, int]:
     """Of a scan of scalars: how often it does what, and how many of those that it reads stay the same.
 
     What a scan reads or writes once a step has an axis outside; scalars alone are fixed or carried. So nothing depends on
     how JAX counts them, which is not the same in 0.10 and 0.11.
     """
-    body, fixed = parameter_of(eqn, "jaxpr"), len(eqn.invars) - len(eqn.outvars)
+    body, fixed = equation_parameter(eqn, "jaxpr"), len(eqn.invars) - len(eqn.outvars)
     if fixed < 0 or (len(body.in_avals), len(body.out_avals)) != (len(eqn.invars), len(eqn.outvars)):
         raise UnknownForm("scan that reads or makes others than its body")
-    return parameter_of(eqn, "length"), body, fixed
+    return equation_parameter(eqn, "length"), body, fixed
 
 
-def branches_of(eqn: JaxprEqn) -> Sequence[ClosedJaxpr]:
+def cond_branches(eqn: JaxprEqn) -> Sequence[ClosedJaxpr]:
     """Of a choice (`jax.lax.cond`), what it does where its index is 0, 1, ..."""
-    return parameter_of(eqn, "branches")
+    return equation_parameter(eqn, "branches")
 
 
-def source_of(eqn: JaxprEqn) -> str:
+def equation_source(eqn: JaxprEqn) -> str:
     """File and function of the package that asked for an equation, such as `observer/recursive.py: step`; "" where JAX does
     not say. Functions of the drive and the export itself only pass it on."""
     frames = getattr(getattr(eqn.source_info, "traceback", None), "frames", ())
@@ -138,15 +138,15 @@ def _inlined(closed: ClosedJaxpr, functions: Mapping[str, Callable[..., Any]], *
     jaxpr = closed.jaxpr
     env = _given(closed, arguments)
     for eqn in jaxpr.eqns:
-        given = [value_of(env, v) for v in eqn.invars]
+        given = [read_variable(env, v) for v in eqn.invars]
         called, name = callee(eqn), eqn.primitive.name
         if called is not None:
             env |= dict(zip(eqn.outvars, _inlined(called, functions, *given), strict=True))
         elif name in functions and jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
             env[eqn.outvars[0]] = functions[name](*given)
         else:
-            evaluate([eqn], env, lambda body: substituted(body, functions))
-    return [value_of(env, v) for v in jaxpr.outvars]
+            evaluate_equations([eqn], env, lambda body: replace_primitives(body, functions))
+    return [read_variable(env, v) for v in jaxpr.outvars]
 
 
 def _given(closed: ClosedJaxpr, arguments: Sequence[Any]) -> dict[Var, Any]:
@@ -154,7 +154,7 @@ def _given(closed: ClosedJaxpr, arguments: Sequence[Any]) -> dict[Var, Any]:
     return dict(zip([*closed.jaxpr.constvars, *closed.jaxpr.invars], [*closed.consts, *arguments], strict=True))
 
 
-def evaluate(
+def evaluate_equations(
     eqns: Iterable[JaxprEqn], env: dict[Var, Any], rewritten: Callable[[ClosedJaxpr], ClosedJaxpr] | None = None
 ) -> None:
     """Evaluate equations one after the other; `env` has what they read, and gets what they make.
@@ -164,11 +164,11 @@ def evaluate(
     for eqn in eqns:
         params = eqn.params
         if rewritten is not None and eqn.primitive.name == "scan":
-            params = params | {"jaxpr": rewritten(parameter_of(eqn, "jaxpr"))}
-        results = eqn.primitive.bind(*[value_of(env, v) for v in eqn.invars], **params)
+            params = params | {"jaxpr": rewritten(equation_parameter(eqn, "jaxpr"))}
+        results = eqn.primitive.bind(*[read_variable(env, v) for v in eqn.invars], **params)
         env |= dict(zip(eqn.outvars, results if eqn.primitive.multiple_results else [results], strict=True))
 
 
-def value_of(env: dict[Var, Any], v: Var | Literal) -> Any:
+def read_variable(env: dict[Var, Any], v: Var | Literal) -> Any:
     """A value of an equation."""
     return v.val if isinstance(v, Literal) else env[v]

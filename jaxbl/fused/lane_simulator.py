@@ -14,10 +14,10 @@ import numpy as np
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.simulate import Experiment, Reducer, advance, begin, block_length, done, end_of_block, figures
 
-from .dependence import Around, Kind, carry_kinds, split
-from .llvm import Arrays, Loop, Placed, Rows, vector_lanes
-from .noise import host
-from .shared_part import Shared, ahead_of_lanes
+from .dependence import Dependence, LoopHooks, carry_dependences, split_by_lane
+from .llvm import AddressedArrays, ArrayRows, Loop, LoopArrays, vector_lanes
+from .noise import host_device
+from .shared_part import SharedPart, compile_shared_part
 
 _KEPT = 2**24
 """Bytes of what lanes share, of some seeds, that a program keeps for the next lanes."""
@@ -29,13 +29,13 @@ _CALL = 2**20
 """Samples of lanes that a call of the loop takes, some 1 ms: after it, lanes that are done leave."""
 
 
-class Stretch(NamedTuple):
+class SharedInputs(NamedTuple):
     """What lanes need for a stretch of samples, in whole blocks: inputs of each sample `(samples,)` and of what follows each
     block `(blocks,)`; of the last stretch those of a lane's figures `()`, and the figures that lanes share `()`."""
 
     length: int
-    handed: Placed
-    last: Placed
+    handed: AddressedArrays
+    last: AddressedArrays
     ends: list[np.ndarray] | None
     figures: list[np.ndarray]
 
@@ -45,7 +45,7 @@ class Stretch(NamedTuple):
         return sum(one.nbytes for part in (self.handed, self.last) for one in part.arrays)
 
 
-class Passage(abc.ABC):
+class LaneSimulator(abc.ABC):
     """Simulates lanes of an experiment; made and called in its precision (`jax.enable_x64`).
 
     Args:
@@ -85,19 +85,25 @@ class Passage(abc.ABC):
         values = [jax.ShapeDtypeStruct((), dtype)] * len(paths)
         given = jax.ShapeDtypeStruct((), jnp.int32), dict.fromkeys(experiment.sides, jax.ShapeDtypeStruct((), jnp.float32))
         carry = jax.eval_shape(start, values)
-        kinds = carry_kinds(start, ((sample, given), (settle, ())), values)
-        one = [leaf for leaf, kind in zip(jax.tree.leaves(carry), kinds, strict=True) if kind != Kind.LANE]
+        kinds = carry_dependences(start, ((sample, given), (settle, ())), values)
+        one = [leaf for leaf, kind in zip(jax.tree.leaves(carry), kinds, strict=True) if kind != Dependence.LANE]
         # by each lane; what all share is not among them
         self.carried = len(kinds) - len(one)
-        begins, inner = split(start, values, (), (), [], kinds), split(sample, values, carry, given, kinds, kinds)
+        begins, inner = (
+            split_by_lane(start, values, (), (), [], kinds),
+            split_by_lane(sample, values, carry, given, kinds, kinds),
+        )
         # whether a lane is done, where that can be known
-        marks = [Kind.LANE] * (len(jax.tree.leaves(jax.eval_shape(settle, values, carry, ()))) - len(kinds))
-        outer, ends = split(settle, values, carry, (), kinds, [*kinds, *marks]), split(result, values, carry, (), kinds)
-        self._body, self._around = inner.lane, Around(begins.lane, outer.lane, ends.lane)
+        marks = [Dependence.LANE] * (len(jax.tree.leaves(jax.eval_shape(settle, values, carry, ()))) - len(kinds))
+        outer, ends = (
+            split_by_lane(settle, values, carry, (), kinds, [*kinds, *marks]),
+            split_by_lane(result, values, carry, (), kinds),
+        )
+        self._body, self._around = inner.lane, LoopHooks(begins.lane, outer.lane, ends.lane)
         # compiled now, so that a call only runs
-        shared = Shared(inner.shared, outer.shared, one, experiment.sides, self._steps, self._length)
-        self._ahead, self._stretch = ahead_of_lanes(shared), shared.stretch
-        self._kept: dict[int, list[Stretch]] = {}
+        shared = SharedPart(inner.shared, outer.shared, one, experiment.sides, self._steps, self._length)
+        self._ahead, self._stretch = compile_shared_part(shared), shared.stretch
+        self._kept: dict[int, list[SharedInputs]] = {}
         self._first = [np.asarray(leaf) for leaf in jax.jit(lambda: begins.shared([], ())[0])()]
         self._closing = jax.jit(lambda state: ends.shared(state, ())).lower(one).compile()
         names = sorted(jax.eval_shape(result, values, carry, ()))
@@ -117,7 +123,7 @@ class Passage(abc.ABC):
         """What lanes share is kept for the next lanes of these seeds, as far as there is room, and of no others."""
         self._kept = {seed: run for seed, run in self._kept.items() if seed in seeds}
 
-    def _run(self, seed: int) -> Iterator[Stretch]:
+    def _run(self, seed: int) -> Iterator[SharedInputs]:
         if seed in self._kept:
             yield from self._kept[seed]
             return
@@ -138,7 +144,7 @@ class Passage(abc.ABC):
         more = (0, self._filled - self._lanes)
         return [np.pad(one, more, "edge") for one in given] if any(more) else given
 
-    def stretches(self, seed: int) -> Iterator[Stretch]:
+    def stretches(self, seed: int) -> Iterator[SharedInputs]:
         """Stretch after stretch of a run."""
         state = self._first
         for first in range(0, self._steps, self._stretch):
@@ -147,15 +153,17 @@ class Passage(abc.ABC):
             ends, figures = None, []
             if first + length == self._steps:
                 figures, ends = ([np.asarray(x) for x in some] for some in self._closing(state))
-            each, blocks = (Placed([np.asarray(x) for x in part]) for part in (handed, last))
-            yield Stretch(length, each, blocks, ends, figures)
+            each, blocks = (AddressedArrays([np.asarray(x) for x in part]) for part in (handed, last))
+            yield SharedInputs(length, each, blocks, ends, figures)
 
     @abc.abstractmethod
-    def _march(self, given: list[np.ndarray], stretches: Iterator[Stretch]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    def _march(
+        self, given: list[np.ndarray], stretches: Iterator[SharedInputs]
+    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """The lanes' figures `(lanes,)` each, and those that they share `()`."""
 
 
-class HostPassage(Passage):
+class HostSimulator(LaneSimulator):
     """By code for this machine's processor; threads share the lanes."""
 
     def __init__(
@@ -184,7 +192,7 @@ class HostPassage(Passage):
         count = len(self._threads)
         rows = np.stack(given) if given else np.empty((0, self._filled), self._dtype)
         dealt = [rows.reshape(len(given), -1, self._together)[:, i::count].reshape(len(given), -1) for i in range(count)]
-        shares = [_Share(self._loop, self._of, values, self.carried, self._length) for values in dealt]
+        shares = [_ThreadLanes(self._loop, self._of, values, self.carried, self._length) for values in dealt]
         running: deque[list[Future[None]]] = deque()
         stretch = None
         for stretch in stretches:
@@ -217,7 +225,7 @@ def _wait(futures: Iterable[Future[None]]) -> None:
         one.result()
 
 
-class _Share:
+class _ThreadLanes:
     """Lanes of one thread on their way, with `values` `(paths, lanes)`. Those that are done leave, with what they carry
     then, and the others move together."""
 
@@ -227,11 +235,11 @@ class _Share:
         self._lanes = np.arange(values.shape[1])
         self._own = np.empty((len(values) + carried, values.shape[1]), values.dtype)
         self._own[: len(values)] = values
-        self._given: tuple[list[np.ndarray], list[np.ndarray], Arrays] | None = None
+        self._given: tuple[list[np.ndarray], list[np.ndarray], LoopArrays] | None = None
         self._left: list[tuple[np.ndarray, np.ndarray]] = []
         self._results: list[tuple[np.ndarray, list[np.ndarray]]] = []
 
-    def run(self, stretch: Stretch) -> None:
+    def run(self, stretch: SharedInputs) -> None:
         """Take lanes through a stretch, in calls of so many blocks as are worth one."""
         at = 0
         while at < stretch.length and len(self._lanes):
@@ -253,15 +261,15 @@ class _Share:
             self._loop(arrays, 0, 0, self._own.shape[1], block=self._block, ends=True)
             self._results.append((self._lanes, results))
 
-    def prepare(self, stretch: Stretch) -> tuple[list[np.ndarray], list[np.ndarray], Arrays]:
+    def prepare(self, stretch: SharedInputs) -> tuple[list[np.ndarray], list[np.ndarray], LoopArrays]:
         """Marks of a stretch, results `(figures of one type, lanes)`, and all that the loop is given."""
         size = self._own.shape[1]
         marks = [np.empty((-(-stretch.length // self._block), size), dtype) for dtype in self._of["mark of a block"]]
         found = [np.empty((len(list(some)), size), dtype) for dtype, some in groupby(self._of["result"])]
         unread = [np.zeros((), dtype) for dtype in self._of["input at the end"]]
         ends = unread if stretch.ends is None else stretch.ends
-        every = [Rows(self._own), stretch.handed, stretch.last, *ends, *marks, *map(Rows, found)]
-        arrays = Arrays(self._loop.signature, every, stretch.length, size, self._block)
+        every = [ArrayRows(self._own), stretch.handed, stretch.last, *ends, *marks, *map(ArrayRows, found)]
+        arrays = LoopArrays(self._loop.signature, every, stretch.length, size, self._block)
         self._given = marks, found, arrays
         return self._given
 
@@ -293,7 +301,7 @@ class _Share:
         self._lanes, self._own, self._given = self._lanes[lanes], np.take(self._own, filled, axis=1), None
 
 
-class DevicePassage(Passage):
+class DeviceSimulator(LaneSimulator):
     """By one kernel of an accelerator, which takes its lanes through the whole run; `interpret` runs it anywhere, slowly.
 
     `kernel`, compiled, gives the lanes' figures from values `(lanes,)`, lanes filled up, and :meth:`inputs`.
@@ -312,7 +320,7 @@ class DevicePassage(Passage):
         from .pallas import LANES, Kernel
 
         # a loop of scalars is the work of a processor; a GPU would start a kernel for each of its steps
-        with jax.default_device(host()):
+        with jax.default_device(host_device()):
             super().__init__(experiment, reducers, paths, lanes, LANES)
         kernel = Kernel(self._body, self._around, len(paths), self._filled, self._steps, self._length, interpret=interpret)
         self.kernel = kernel.compiled()
@@ -322,7 +330,7 @@ class DevicePassage(Passage):
         return [np.asarray(figure) for figure in self.kernel(given, self.inputs(every))], every[-1].figures
 
     @staticmethod
-    def inputs(stretches: Iterable[Stretch]) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    def inputs(stretches: Iterable[SharedInputs]) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
         """What the kernel reads of all stretches: each sample's, each block's, and the figures' own."""
         every = list(stretches)
         handed = [np.concatenate(column) for column in zip(*(one.handed.arrays for one in every), strict=True)]

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from . import Unsupported, attempted, in_threads, program_cache, say_scanned
+from . import Unsupported, in_threads, program_cache, raising_unsupported, warn_of_scan
 
 _NUMBER = jax.ShapeDtypeStruct((), np.dtype(float))
 _NOTHING = 1e-60
@@ -21,7 +21,7 @@ _NOTHING = 1e-60
 Processors take many times as long for numbers below 1e-308, which squares are from 1e-154 on."""
 
 
-class Recursion:
+class LinearPredictor:
     """The recursion for so many states, sides that are read, and columns."""
 
     def __init__(self, states: int, sides: int, width: int):
@@ -32,7 +32,7 @@ class Recursion:
 
     @classmethod
     @lru_cache(maxsize=256)
-    def of(cls, states: int, sides: int, width: int) -> "Recursion":
+    def of(cls, states: int, sides: int, width: int) -> "LinearPredictor":
         return cls(states, sides, width)
 
     def __call__(
@@ -68,10 +68,10 @@ class Recursion:
             if self.loop is None:
                 _slowly(carry, gains, step, driven, read, errors)
             else:
-                from .llvm import Rows
+                from .llvm import ArrayRows
 
                 given = carry, np.array(gains), steps, driven, read, errors
-                self.loop([Rows(one) for one in given], count, 0, self.whole)
+                self.loop([ArrayRows(one) for one in given], count, 0, self.whole)
             return carry[:, : self.width], errors[:, :, : self.width]
 
         found = [one(changes[0], gains[0])] if len(gains) == 1 else in_threads(one, changes, gains)
@@ -97,22 +97,22 @@ def _sample(states: int, sides: int) -> Any:
 
 @lru_cache(maxsize=64)
 def _loop(states: int, sides: int) -> Any:
-    key = program_cache.key_of("recursion", states, sides)
+    key = program_cache.program_key("recursion", states, sides)
     if (found := program_cache.load(key)) is not None:
         return found
     try:
-        with attempted():
-            from .jaxprs import traced
+        with raising_unsupported():
+            from .jaxprs import trace
             from .llvm import Loop
 
             sizes = states, 2 * sides, states * states, states, sides
             with jax.enable_x64(True):
-                body = traced(_sample(states, sides), *([_NUMBER] * size for size in sizes))
+                body = trace(_sample(states, sides), *([_NUMBER] * size for size in sizes))
             loop = Loop(body, np.dtype(float), carry=states, fixed=2 * sides, beside=states + sides)
             program_cache.save(key, loop)
             return loop
     except Unsupported as why:
-        say_scanned(str(why))
+        warn_of_scan(str(why))
         return None
 
 

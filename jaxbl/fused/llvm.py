@@ -16,9 +16,9 @@ import numpy as np
 from llvmlite import binding, ir
 
 from . import Unsupported
-from .dependence import Around
+from .dependence import LoopHooks
 from .elementary import FUNCTIONS
-from .jaxprs import ClosedJaxpr, JaxprEqn, Literal, Var, callee, parameter_of, repetition, traced_of_one
+from .jaxprs import ClosedJaxpr, JaxprEqn, Literal, Var, callee, equation_parameter, scan_parameters, trace_scalar_function
 
 _INT, _BIT, _POINTER = ir.IntType(64), ir.IntType(1), ir.PointerType()
 _KINDS = {
@@ -66,7 +66,7 @@ def vector_lanes(dtype: np.dtype) -> int:
     return 2 * size // dtype.itemsize
 
 
-class Argument(NamedTuple):
+class ArraySpec(NamedTuple):
     """An array that a loop reads or writes where it lies: its group and place there (`input 2`), type, and how many numbers
     it holds: "one", one for each of "lanes", of "samples" or of "blocks" of samples, or "both": one for each sample of each
     lane; "marks": for each block of each lane. So many, from this one on, are of one type and hold as many."""
@@ -84,7 +84,7 @@ class Argument(NamedTuple):
             raise ValueError(f"{self.name} of a loop needs {count} contiguous numbers of type {self.dtype}, {wrong}")
 
 
-def signature_of(
+def loop_signature(
     body: ClosedJaxpr,
     after: ClosedJaxpr | None,
     finish: ClosedJaxpr | None,
@@ -92,8 +92,8 @@ def signature_of(
     carry: int,
     fixed: int,
     beside: int = 0,
-) -> list[Argument]:
-    """The arrays of a loop in their order; arguments as of :class:`Loop` and :class:`Around`."""
+) -> list[ArraySpec]:
+    """The arrays of a loop in their order; arguments as of :class:`Loop` and :class:`LoopHooks`."""
     own, read = values + carry, body.jaxpr.invars
     groups: list[tuple[str, str, Sequence[Any]]] = [
         ("value", "lanes", read[:values]),
@@ -107,10 +107,10 @@ def signature_of(
         ("mark of a block", "marks", after.jaxpr.outvars[carry:] if after else []),
         ("result", "lanes", finish.jaxpr.outvars if finish else []),
     ]
-    found: list[Argument] = []
+    found: list[ArraySpec] = []
     every = [(f"{name} {i}", _dtype(v), holds) for name, holds, some in groups for i, v in enumerate(some)]
     for one in reversed(every):
-        found.append(Argument(*one, 1 + found[-1].alike if found and found[-1][1:3] == one[1:] else 1))
+        found.append(ArraySpec(*one, 1 + found[-1].alike if found and found[-1][1:3] == one[1:] else 1))
     return found[::-1]
 
 
@@ -139,13 +139,13 @@ class Loop:
         carry: int = 0,
         fixed: int = 0,
         beside: int = 0,
-        around: Around | None = None,
+        around: LoopHooks | None = None,
         after: ClosedJaxpr | None = None,
         lanes: int | None = None,
     ):
         self.lanes = lanes or vector_lanes(dtype)
         after = around.after if around else after
-        self.signature = signature_of(body, after, around and around.finish, values, carry, fixed, beside)
+        self.signature = loop_signature(body, after, around and around.finish, values, carry, fixed, beside)
         module = ir.Module("loop")
         _Writer(module, self.lanes).loop(body, around, after, self.signature)
         parsed = binding.parse_assembly(str(module))
@@ -162,16 +162,16 @@ class Loop:
         address = self._engine.get_function_address("loop")
         self._call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, *[ctypes.c_int64] * _NUMBERS)(address)
 
-    def __getstate__(self) -> tuple[int, list[Argument], bytes]:
+    def __getstate__(self) -> tuple[int, list[ArraySpec], bytes]:
         return self.lanes, self.signature, self._code
 
-    def __setstate__(self, state: tuple[int, list[Argument], bytes]) -> None:
+    def __setstate__(self, state: tuple[int, list[ArraySpec], bytes]) -> None:
         self.lanes, self.signature, code = state
         self._load(code)
 
     def __call__(
         self,
-        arrays: "Arrays | Given",
+        arrays: "LoopArrays | ArrayGroups",
         steps: int,
         first: int,
         last: int,
@@ -188,7 +188,7 @@ class Loop:
         `steps` that are run. What `begins` a run does not read the carry; what `ends` it writes results in its place.
         `ValueError` for arrays that do not fit the signature.
         """
-        given = arrays if isinstance(arrays, Arrays) else Arrays(self.signature, arrays, steps, last, block)
+        given = arrays if isinstance(arrays, LoopArrays) else LoopArrays(self.signature, arrays, steps, last, block)
         if steps > given.steps or last > given.lanes:
             raise ValueError(f"{steps} samples of lanes up to {last}: arrays were made for {given.steps} and {given.lanes}")
         if start % given.block:
@@ -196,27 +196,29 @@ class Loop:
         self._call(given.table, start, steps, given.block, first, last, begins, ends)
 
 
-class Rows(NamedTuple):
+class ArrayRows(NamedTuple):
     """In the place of several arrays for a loop: the rows of one, which lie one behind the other."""
 
     array: np.ndarray
 
 
-class Placed:
+class AddressedArrays:
     """In the place of several arrays for a loop: these, and where they lie, which takes NumPy long to say."""
 
     def __init__(self, arrays: Sequence[np.ndarray]):
         self.arrays, self.addresses = arrays, [_address(one) for one in arrays]
 
 
-Given = Sequence[np.ndarray | Rows | Placed]
+ArrayGroups = Sequence[np.ndarray | ArrayRows | AddressedArrays]
 
 
-class Arrays:
+class LoopArrays:
     """Arrays for a loop, which reads where they lie: checked against its signature for so many samples, in blocks of so
     many, and lanes."""
 
-    def __init__(self, signature: Sequence[Argument], arrays: Given, steps: int, lanes: int, block: int | None = None):
+    def __init__(
+        self, signature: Sequence[ArraySpec], arrays: ArrayGroups, steps: int, lanes: int, block: int | None = None
+    ):
         self.steps, self.lanes, self.block = steps, lanes, block or max(steps, 1)
         blocks = -(-steps // self.block)
         counts = {
@@ -228,11 +230,11 @@ class Arrays:
         addresses: list[int] = []
         for one in arrays:
             each = signature[len(addresses) : len(addresses) + _count(one)]
-            if isinstance(one, Placed):
+            if isinstance(one, AddressedArrays):
                 for argument, own in zip(each, one.arrays, strict=True):
                     argument.check(own, counts)
                 addresses += one.addresses
-            elif not isinstance(one, Rows):
+            elif not isinstance(one, ArrayRows):
                 each[0].check(one, counts)
                 addresses.append(_address(one))
             elif each:
@@ -247,8 +249,8 @@ class Arrays:
         self.table = self._table.buffer_info()[0]
 
 
-def _count(one: np.ndarray | Rows | Placed) -> int:
-    return len(one.array) if isinstance(one, Rows) else len(one.arrays) if isinstance(one, Placed) else 1
+def _count(one: np.ndarray | ArrayRows | AddressedArrays) -> int:
+    return len(one.array) if isinstance(one, ArrayRows) else len(one.arrays) if isinstance(one, AddressedArrays) else 1
 
 
 def _address(one: np.ndarray) -> int:
@@ -264,7 +266,7 @@ class _Writer:
         """Those that do not change in the loop over time."""
 
     def loop(
-        self, body: ClosedJaxpr, around: Around | None, after: ClosedJaxpr | None, signature: Sequence[Argument]
+        self, body: ClosedJaxpr, around: LoopHooks | None, after: ClosedJaxpr | None, signature: Sequence[ArraySpec]
     ) -> None:
         function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [_POINTER, *[_INT] * _NUMBERS]), "loop")
         # what registers have no room for lies on the stack: no vector of it over two lines of the cache
@@ -414,14 +416,14 @@ class _Writer:
         name = eqn.primitive.name
         if name == "scan":
             # a loop of fixed length that carries a state: the substeps of a plant
-            length, inner, fixed = repetition(eqn)
+            length, inner, fixed = scan_parameters(eqn)
             still, state = given[:fixed], given[fixed:]
             return self.count(_INT(0), _INT(length), state, lambda _, state: self.run(inner, [*still, *state]))
         if (called := callee(eqn)) is not None:
             return self.run(called, given)
         dtype = _dtype(eqn.invars[0])
         if name in FUNCTIONS and jnp.issubdtype(dtype, jnp.floating):
-            return self.run(traced_of_one(FUNCTIONS[name], dtype), given)
+            return self.run(trace_scalar_function(FUNCTIONS[name], dtype), given)
         rule = (_OF_FLOATS if jnp.issubdtype(dtype, jnp.floating) else _OF_INTEGERS).get(name) or _OF_ALL.get(name)
         if rule is None:
             raise Unsupported(f"{name} of {dtype}")
@@ -482,7 +484,7 @@ def _clamp(w: _Writer, eqn: JaxprEqn, low: Vector, a: Vector, high: Vector) -> V
 
 
 def _power(w: _Writer, eqn: JaxprEqn, a: Vector) -> Vector:
-    power = parameter_of(eqn, "y")
+    power = equation_parameter(eqn, "y")
     if not 1 <= abs(power) <= 8:
         raise Unsupported(f"integer_pow by {power}")
     result = reduce(lambda x, y: w.build.fmul(x, y, flags=_FLAGS), [a] * abs(power))
@@ -548,7 +550,7 @@ _OF_FLOATS: dict[str, Callable[..., Vector]] = {
     "abs": _intrinsic("fabs"),
     **{name: _intrinsic(name) for name in ("sqrt", "floor", "ceil")},
     # lax.RoundingMethod: away from zero, to nearest even
-    "round": lambda w, eqn, a: w.intrinsic(("round", "rint")[int(parameter_of(eqn, "rounding_method"))], a),
+    "round": lambda w, eqn, a: w.intrinsic(("round", "rint")[int(equation_parameter(eqn, "rounding_method"))], a),
     "sign": _sign,
     "max": _LARGER,
     "min": _SMALLER,

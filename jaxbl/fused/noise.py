@@ -15,11 +15,11 @@ from jax.extend.random import define_prng_impl
 
 from jaxbl.simulate import LONGEST_BLOCK, unit_noise
 
-from . import Unsupported, attempted
-from .jaxprs import traced
+from . import Unsupported, raising_unsupported
+from .jaxprs import trace
 from .llvm import Loop
 
-LONGEST_STRETCH = 4 * LONGEST_BLOCK
+LONGEST_SPAN = 4 * LONGEST_BLOCK
 """Samples whose noise is drawn at once, at most: a call of XLA takes some 30 us, whatever their number."""
 SIDES = ("motor", "load")
 _TURNS = (13, 15, 26, 6), (17, 29, 16, 24)
@@ -28,7 +28,7 @@ _PARITY = 0x1BD11BDA
 _WORD = jax.ShapeDtypeStruct((), jnp.uint32)
 
 
-def host() -> Any:
+def host_device() -> Any:
     """This machine's processor; where JAX has been told to leave it alone, the device that there is."""
     try:
         return jax.local_devices(backend="cpu")[0]
@@ -36,16 +36,16 @@ def host() -> Any:
         return jax.local_devices()[0]
 
 
-def draw(seed: int, first: int, count: int) -> dict[str, np.ndarray]:
+def draw_noise(seed: int, first: int, count: int) -> dict[str, np.ndarray]:
     """Noise of each side `(count,)`, of at most `LONGEST_STRETCH` samples from `first` on."""
-    size = max(LONGEST_STRETCH // 4, 1 << (count - 1).bit_length())
+    size = max(LONGEST_SPAN // 4, 1 << (count - 1).bit_length())
     return dict(zip(SIDES, np.asarray(_drawing(size)(seed, first, count))[:, :count], strict=True))
 
 
 @cache
 def _drawing(size: int) -> Callable[[int, int, int], Any]:
     """For at most so many samples; compiled once for all studies."""
-    with jax.default_device(host()):
+    with jax.default_device(host_device()):
         try:
             return _by_loop(size)
         except Unsupported:
@@ -66,7 +66,7 @@ def _by_loop(size: int) -> Callable[[int, int, int], Any]:
     settings: Any = jax.config
     if settings.jax_default_prng_impl != "threefry2x32" or not settings.jax_threefry_partitionable:
         raise Unsupported("random bits by another generator")
-    with attempted():
+    with raising_unsupported():
         loop = _random()
         bits = jax.ShapeDtypeStruct((2, size), jnp.uint32)
         program = jax.jit(jax.vmap(jax.vmap(_normal))).lower(bits).compile()
@@ -83,7 +83,7 @@ def _by_loop(size: int) -> Callable[[int, int, int], Any]:
 
 @cache
 def _random() -> Loop:
-    return Loop(traced(_bits, _WORD, _WORD), np.dtype(np.float32), fixed=1, beside=1)
+    return Loop(trace(_bits, _WORD, _WORD), np.dtype(np.float32), fixed=1, beside=1)
 
 
 def _bits(seed: Any, index: Any) -> tuple[Any, Any]:

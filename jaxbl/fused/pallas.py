@@ -15,12 +15,12 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 from jaxtyping import Array
 
-from . import attempted
-from .dependence import Around
-from .elementary import rounded
-from .jaxprs import ClosedJaxpr, contracted, flat, jaxpr_as_fun, substituted
+from . import raising_unsupported
+from .dependence import LoopHooks
+from .elementary import round_half_even
+from .jaxprs import ClosedJaxpr, jaxpr_as_fun, join_multiply_add, replace_primitives, trace_inlined
 
-_ABSENT = {"round": rounded}
+_ABSENT = {"round": round_half_even}
 """What Triton's lowering lacks."""
 LANES = 128
 """Lanes of a program: four warps, a lane a thread."""
@@ -36,7 +36,15 @@ class Kernel:
     """
 
     def __init__(
-        self, body: ClosedJaxpr, around: Around, values: int, size: int, steps: int, length: int, *, interpret: bool = False
+        self,
+        body: ClosedJaxpr,
+        around: LoopHooks,
+        values: int,
+        size: int,
+        steps: int,
+        length: int,
+        *,
+        interpret: bool = False,
     ):
         self._values, self._steps, self._length, self._interpret = values, steps, length, interpret
         own = values + len(body.out_avals)
@@ -54,16 +62,16 @@ class Kernel:
 
     def _side_by_side(self, part: ClosedJaxpr, own: int) -> Callable[..., list[Array]]:
         """For a block of lanes; what they share stays a scalar."""
-        part = substituted(part, _ABSENT)
+        part = replace_primitives(part, _ABSENT)
         many = jax.vmap(jaxpr_as_fun(part), (*(0,) * own, *[None] * (len(part.in_avals) - own)), axis_size=LANES)
         if self._interpret:
             return many
         block = [jax.ShapeDtypeStruct((LANES,) * (i < own), aval.dtype) for i, aval in enumerate(part.in_avals)]
-        return jaxpr_as_fun(contracted(flat(many, *block), multiply_add))
+        return jaxpr_as_fun(join_multiply_add(trace_inlined(many, *block), multiply_add))
 
     def compiled(self) -> Callable[..., list[Array]]:
         """For the device at hand. Raises `Unsupported` where there is no such kernel."""
-        with attempted("how to compile for this device"):
+        with raising_unsupported("how to compile for this device"):
             return jax.jit(self.run).lower(*self.arguments).compile()
 
     def run(self, values: list[Array], inputs: tuple[list[Array], list[Array], list[Array]]) -> list[Array]:

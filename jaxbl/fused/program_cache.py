@@ -32,11 +32,11 @@ _OLD = 30.0
 """Days after which programs of another version of the package are deleted, if nothing has used them."""
 
 
-class Unknown(Exception):
+class UnknownArgument(Exception):
     """An argument whose meaning is not known by its text."""
 
 
-def keeping() -> Path | None:
+def cache_folder() -> Path | None:
     """The folder, if programs are kept: as :data:`PROGRAMS` says. Whoever sets it must not change the package while it runs,
     as tests do."""
     name = os.environ.get(PROGRAMS)
@@ -77,23 +77,23 @@ def _version() -> str:
     return found.hexdigest()[:16]
 
 
-def key_of(what: str, *given: Any) -> str | None:
+def program_key(what: str, *given: Any) -> str | None:
     """Name of a program, `what` it is and what it is given; None where none are kept, or its arguments are unknown."""
-    return None if keeping() is None else name_of(what, *given)
+    return None if cache_folder() is None else hash_program(what, *given)
 
 
-def name_of(what: str, *given: Any) -> str | None:
-    """As :func:`key_of`, whether programs are kept or not."""
+def hash_program(what: str, *given: Any) -> str | None:
+    """As :func:`program_key`, whether programs are kept or not."""
     try:
         text = f"{what} {len(jax.local_devices())} {jax.config.read('jax_enable_x64')} {_described(given)}"
-    except Unknown:
+    except UnknownArgument:
         return None
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 def load(key: str | None) -> Any:
     """What is kept under a name; None if nothing is, or it cannot be read."""
-    folder = keeping()
+    folder = cache_folder()
     if key is None or folder is None:
         return None
     with suppress(Exception):  # of any kind: written by another version, half a file, another machine's
@@ -103,7 +103,7 @@ def load(key: str | None) -> Any:
 
 def save(key: str | None, value: Any) -> None:
     """Keep a value that can be pickled; without a word where that is not possible."""
-    folder = keeping()
+    folder = cache_folder()
     if key is None or folder is None:
         return
     with suppress(Exception):  # a full disk, a value that cannot be pickled: the program is made anew next time
@@ -122,7 +122,7 @@ def _described(value: Any) -> str:
         return "{" + ",".join(f"{key!r}:{_described(one)}" for key, one in sorted(value.items())) + "}"
     if isinstance(value, FunctionType):
         if value.__closure__ is not None:
-            raise Unknown(value.__qualname__)
+            raise UnknownArgument(value.__qualname__)
         return _named(value)
     if isinstance(value, tuple | list):
         named = "" if type(value) in (tuple, list) else _named(type(value))
@@ -130,11 +130,11 @@ def _described(value: Any) -> str:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         each = (f"{field.name}={_described(getattr(value, field.name))}" for field in dataclasses.fields(value))
         return f"{_named(type(value))}({','.join(each)})"
-    raise Unknown(str(type(value)))
+    raise UnknownArgument(str(type(value)))
 
 
 def _named(thing: Any) -> str:
     """Module and name of a class or function of this package."""
     if thing.__module__.partition(".")[0] != __name__.partition(".")[0]:
-        raise Unknown(f"{thing.__module__}.{thing.__qualname__}")
+        raise UnknownArgument(f"{thing.__module__}.{thing.__qualname__}")
     return f"{thing.__module__}.{thing.__qualname__}"

@@ -8,17 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import Unsupported
-from .dependence import recursion
-from .jaxprs import flat
+from .dependence import split_by_state
+from .jaxprs import trace_inlined
 from .llvm import Loop
-from .noise import LONGEST_STRETCH, draw
+from .noise import LONGEST_SPAN, draw_noise
 
-Shares = tuple[list[Any], list[Any], list[Any]]
+SharedValues = tuple[list[Any], list[Any], list[Any]]
 """Next state of what lanes share, what follows each block of a stretch of samples reads of it `(blocks,)`, and what each
 sample does `(samples,)`."""
 
 
-class Shared(NamedTuple):
+class SharedPart(NamedTuple):
     """What lanes share: from its state and a sample to the next one and what lanes read; the same at the end of a block of
     `length` of a run's `steps`. Samples are computed in stretches of whole blocks."""
 
@@ -32,11 +32,11 @@ class Shared(NamedTuple):
     @property
     def stretch(self) -> int:
         """Samples of a stretch, but the last one."""
-        return min(LONGEST_STRETCH // self.length * self.length, self.steps)
+        return min(LONGEST_SPAN // self.length * self.length, self.steps)
 
     def given(self, seed: int, first: int, count: int) -> tuple[Any, Any]:
         """Indices and noise of some samples."""
-        noise = draw(seed, first, count)
+        noise = draw_noise(seed, first, count)
         return np.arange(first, first + count, dtype=np.int32), {side: noise[side] for side in self.sides}
 
     def shapes(self, *length: int) -> tuple[Any, Any]:
@@ -45,15 +45,15 @@ class Shared(NamedTuple):
         return jax.ShapeDtypeStruct(length, jnp.int32), dict.fromkeys(self.sides, noise)
 
 
-Ahead = Callable[[list[Any], int, int, int], Shares]
+SharedPartRunner = Callable[[list[Any], int, int, int], SharedValues]
 """From the state of what lanes share, seed, first sample and number of samples of a stretch."""
 
 
-class Scanned:
+class SharedPartScan:
     """By XLA, sample by sample."""
 
-    def __init__(self, shared: Shared):
-        def block(state: list[Any], given: Any) -> Shares:
+    def __init__(self, shared: SharedPart):
+        def block(state: list[Any], given: Any) -> SharedValues:
             state, handed = jax.lax.scan(shared.inner, state, given)
             return *shared.outer(state, ()), handed
 
@@ -61,7 +61,7 @@ class Scanned:
         lengths = {min(shared.length, shared.steps), shared.steps % shared.length} - {0}
         self._blocks = {n: jax.jit(block).lower(shared.state, shared.shapes(n)).compile() for n in lengths}
 
-    def __call__(self, state: list[Any], seed: int, first: int, count: int) -> Shares:
+    def __call__(self, state: list[Any], seed: int, first: int, count: int) -> SharedValues:
         parts = []
         for begin in range(0, count, self._shared.length):
             length = min(self._shared.length, count - begin)
@@ -71,12 +71,12 @@ class Scanned:
         return state, last, [np.concatenate(column) for column in zip(*(handed for _, handed in parts), strict=True)]
 
 
-class Looped:
+class SharedPartLoop:
     """By XLA what needs no state, for all samples of a stretch at once; by a loop of scalars the rest. `Unsupported` where
     there can be no such loop."""
 
-    def __init__(self, shared: Shared):
-        parts = recursion(shared.inner, shared.state, shared.shapes())
+    def __init__(self, shared: SharedPart):
+        parts = split_by_state(shared.inner, shared.state, shared.shapes())
         self._shared, self._direct = shared, parts.direct
         # one program for all stretches, what it computes beyond the last sample is left unread; and few arrays, as each
         # takes XLA and NumPy some microseconds
@@ -92,12 +92,12 @@ class Looped:
         self._loop = None
         self._dtypes: list[list[np.dtype]] = [[], []]
         if shared.state:
-            after = flat(lambda *state: jax.tree.leaves(shared.outer(state, ())), *shared.state)
+            after = trace_inlined(lambda *state: jax.tree.leaves(shared.outer(state, ())), *shared.state)
             count = len(shared.state)
             self._dtypes = [[out.dtype for out in part.out_avals[count:]] for part in (after, parts.step)]
             self._loop = Loop(parts.step, np.dtype(float), carry=count, lanes=1, after=after)
 
-    def __call__(self, state: list[Any], seed: int, first: int, count: int) -> Shares:
+    def __call__(self, state: list[Any], seed: int, first: int, count: int) -> SharedValues:
         shared = self._shared
         made: dict[int, np.ndarray] = {}
         for group, rows in zip(self._groups, self._parallel(shared.given(seed, first, shared.stretch)), strict=True):
@@ -113,9 +113,9 @@ class Looped:
         return [leaf[0] for leaf in state], last, [next(own) if one else next(rest) for one in self._direct]
 
 
-def ahead_of_lanes(shared: Shared) -> Ahead:
+def compile_shared_part(shared: SharedPart) -> SharedPartRunner:
     """By the loop if there can be one."""
     try:
-        return Looped(shared)
+        return SharedPartLoop(shared)
     except Unsupported:
-        return Scanned(shared)
+        return SharedPartScan(shared)

@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import Unsupported, attempted, program_cache, say_scanned
+from . import Unsupported, program_cache, raising_unsupported, warn_of_scan
 
-Sample = Callable[[list[Any], list[Any], list[Any]], tuple[list[Any], list[Any]]]
+SampleFunction = Callable[[list[Any], list[Any], list[Any]], tuple[list[Any], list[Any]]]
 """From numbers that stay the same, what is carried and a sample's inputs, to what is carried on and what is kept."""
 _NUMBER = jax.ShapeDtypeStruct((), np.dtype(float))
 
 
-def stepped(
-    sample: Sample, values: Sequence[np.ndarray], carry: Sequence[np.ndarray], inputs: Sequence[np.ndarray]
+def scan_signal(
+    sample: SampleFunction, values: Sequence[np.ndarray], carry: Sequence[np.ndarray], inputs: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
     """What a function of a module keeps along a signal, each of shape (samples, lanes); by XLA where it
     cannot be compiled otherwise.
@@ -44,27 +44,29 @@ def stepped(
 
 
 @lru_cache(maxsize=64)
-def _loop(sample: Sample, values: int, carry: int, inputs: int, alone: bool, own: bool) -> Any:
+def _loop(sample: SampleFunction, values: int, carry: int, inputs: int, alone: bool, own: bool) -> Any:
     """`alone`: for one lane; `own`: each lane has inputs of its own."""
     sizes, lanes, beside = (values, carry, inputs), 1 if alone else None, inputs if own else 0
-    key = program_cache.key_of("steps", sample, *sizes, lanes, beside)
+    key = program_cache.program_key("steps", sample, *sizes, lanes, beside)
     if (found := program_cache.load(key)) is not None:
         return found
     try:
-        with attempted():
-            from .jaxprs import traced
+        with raising_unsupported():
+            from .jaxprs import trace
             from .llvm import Loop
 
             with jax.enable_x64(True):
-                body = traced(sample, *([_NUMBER] * size for size in sizes))
+                body = trace(sample, *([_NUMBER] * size for size in sizes))
             loop = Loop(body, np.dtype(float), values=values, carry=carry, beside=beside, lanes=lanes)
             program_cache.save(key, loop)
             return loop
     except Unsupported as why:
-        say_scanned(str(why))
+        warn_of_scan(str(why))
         return None
 
 
 @partial(jax.jit, static_argnums=0)
-def _scanned(sample: Sample, values: list[jax.Array], carry: list[jax.Array], inputs: list[jax.Array]) -> list[jax.Array]:
+def _scanned(
+    sample: SampleFunction, values: list[jax.Array], carry: list[jax.Array], inputs: list[jax.Array]
+) -> list[jax.Array]:
     return jax.lax.scan(lambda carry, inputs: sample(values, carry, inputs), carry, inputs)[1]

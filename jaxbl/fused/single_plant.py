@@ -18,7 +18,7 @@ from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.drive.plant import PlantState
 from jaxbl.simulate import Experiment, corrected, move
 
-from . import Unsupported, attempted, in_threads, program_cache, say_scanned
+from . import Unsupported, in_threads, program_cache, raising_unsupported, warn_of_scan
 
 _FLOAT = np.dtype(float)
 _NUMBER = jax.ShapeDtypeStruct((), _FLOAT)
@@ -33,7 +33,7 @@ class Direction(NamedTuple):
     torque: float = 0.0
 
 
-def path(
+def simulate_plant(
     experiment: Experiment,
     start: PlantState,
     torque: np.ndarray,
@@ -43,11 +43,11 @@ def path(
 ) -> PlantState:
     """The plant's states at the samples, with a leading time axis; arguments as of :func:`jaxbl.simulate.trajectory`."""
     starts, torques, readings = jax.tree.map(lambda x: np.asarray(x)[None], (start, torque, measured or {}))
-    found = paths(experiment, starts, torques, np.array([time], float), readings, gain)
+    found = simulate_plants(experiment, starts, torques, np.array([time], float), readings, gain)
     return jax.tree.map(lambda x: x[0], found)
 
 
-def paths(
+def simulate_plants(
     experiment: Experiment,
     starts: PlantState,
     torque: np.ndarray,
@@ -60,7 +60,7 @@ def paths(
 
     Numbers of the experiment that differ from sample to sample are `varying`, by dotted paths, `(runs, samples)`.
     """
-    plant, varying = _Plant.of(experiment, starts), varying or {}
+    plant, varying = _PlantStructure.of(experiment, starts), varying or {}
     sides = () if gain is None else tuple(sorted(gain))
     loop = _path_loop(plant, sides, plant.places(tuple(varying)))
     if loop is None:
@@ -84,7 +84,7 @@ def _run(
     gains: Sequence[float],
 ) -> PlantState:
     """Several runs of a loop; `others`: what there is of each sample beside its torque, `(runs, samples)` each."""
-    from .llvm import Rows
+    from .llvm import ArrayRows
 
     runs, samples = torque.shape
     columns = [np.ascontiguousarray(column, float) for column in (torque, *others)]
@@ -96,14 +96,14 @@ def _run(
     def one(i: int) -> None:
         carry, own = [np.array([leaf[i]]) for leaf in leaves], fixed.copy()
         own[at] = time[i]
-        given = Rows(own), index, *(column[i] for column in columns), *(rows[i] for rows in kept)
+        given = ArrayRows(own), index, *(column[i] for column in columns), *(rows[i] for rows in kept)
         loop([*carry, *given], samples, 0, 1)
 
     in_threads(one, range(runs))
     return shape.unflatten(kept)
 
 
-class Runs:
+class PlantSimulator:
     """:func:`paths` of experiments that differ in a few numbers, many times: what is the same is found once.
 
     Args:
@@ -115,7 +115,7 @@ class Runs:
 
     def __init__(self, experiment: Experiment, state: PlantState, varied: Sequence[str], sides: Sequence[str]):
         self.experiment, self.varied, self.sides = experiment, tuple(varied), tuple(sorted(sides))
-        plant = _Plant.of(experiment, state)
+        plant = _PlantStructure.of(experiment, state)
         self.shape = plant.shape
         self.loop = _path_loop(plant, self.sides, ())
         if self.loop is not None:
@@ -134,7 +134,7 @@ class Runs:
         """With these values of the varied numbers; other arguments as of :func:`paths`."""
         if self.loop is None:
             experiment = set_leaves(self.experiment, {path: np.asarray(values[path], float) for path in self.varied})
-            return paths(experiment, starts, torque, time, measured, gain)
+            return simulate_plants(experiment, starts, torque, time, measured, gain)
         numbers = self.numbers.copy()
         for place, path in zip(self.places, self.varied, strict=True):
             if place >= 0:
@@ -143,7 +143,7 @@ class Runs:
                     [float(value) for side in self.sides for value in gain[side]])  # fmt: skip
 
 
-def slopes(
+def step_derivatives(
     experiment: Experiment,
     states: PlantState,
     torque: np.ndarray,
@@ -163,7 +163,7 @@ def slopes(
         Change of the state along each direction `(directions, states, samples)`, in the order of the state's leaves, and the
         state after the step `(states, samples)`.
     """
-    plant, varying = _Plant.of(experiment, states), varying or {}
+    plant, varying = _PlantStructure.of(experiment, states), varying or {}
     leaves = jax.tree.leaves(states)
     loop = _slopes_loop(plant, plant.places(tuple(varying)))
     if loop is None:
@@ -176,7 +176,7 @@ def slopes(
             found.append(_pushed(experiment, *jax.tree.map(jnp.asarray, (*given, ways))))  # pyright: ignore[reportCallIssue]
         changes, new = [jax.tree.leaves(change) for change, _ in found], jax.tree.leaves(found[0][1])
         return np.array(changes, float), np.array(new, float)
-    from .llvm import Rows
+    from .llvm import ArrayRows
 
     count = len(torque)
     whole = -(-count // loop.lanes) * loop.lanes
@@ -189,7 +189,7 @@ def slopes(
 
     def along(way: np.ndarray, change: np.ndarray) -> None:
         # all find the same new state
-        loop([*values, Rows(numbers), Rows(way), Rows(change), Rows(new)], 1, 0, whole)
+        loop([*values, ArrayRows(numbers), ArrayRows(way), ArrayRows(change), ArrayRows(new)], 1, 0, whole)
 
     in_threads(along, ways, changes)
     return changes[:, :, :count], new[:, :count]
@@ -239,7 +239,7 @@ def _pushed(
     return jax.vmap(step)(states, torque, time, varying)
 
 
-class _Plant(NamedTuple):
+class _PlantStructure(NamedTuple):
     """What loops are compiled for: experiments of one structure, shapes and types of their leaves, structure of a state."""
 
     structure: Any
@@ -247,7 +247,7 @@ class _Plant(NamedTuple):
     shape: Any
 
     @classmethod
-    def of(cls, experiment: Experiment, state: PlantState) -> "_Plant":
+    def of(cls, experiment: Experiment, state: PlantState) -> "_PlantStructure":
         leaves, structure = jax.tree.flatten(experiment)
         kinds = tuple((np.shape(leaf), getattr(leaf, "dtype", None) or np.dtype(jnp.result_type(leaf))) for leaf in leaves)
         return cls(structure, kinds, jax.tree.structure(state))
@@ -295,15 +295,15 @@ class _Plant(NamedTuple):
 
 
 @lru_cache(maxsize=256)
-def _places(plant: _Plant, paths: tuple[str, ...]) -> tuple[int, ...]:
+def _places(plant: _PlantStructure, paths: tuple[str, ...]) -> tuple[int, ...]:
     order = plant.structure.unflatten(range(len(plant.kinds)))
     return tuple(get_leaf(order, path) for path in paths)
 
 
 @lru_cache(maxsize=64)
-def _read(plant: _Plant) -> tuple[int, ...]:
+def _read(plant: _PlantStructure) -> tuple[int, ...]:
     """Places of the experiment's leaves that a step reads. Raises `Unsupported` if one of them is no number."""
-    key = program_cache.key_of("numbers read", *plant.described)
+    key = program_cache.program_key("numbers read", *plant.described)
     found = program_cache.load(key)
     if found is None:
         found = _found_read(plant)
@@ -311,14 +311,14 @@ def _read(plant: _Plant) -> tuple[int, ...]:
     return found
 
 
-def _found_read(plant: _Plant) -> tuple[int, ...]:
-    from .jaxprs import flat
+def _found_read(plant: _PlantStructure) -> tuple[int, ...]:
+    from .jaxprs import trace_inlined
 
     def step(leaves: list[Any], state: list[Any], torque: Any, time: Any) -> list[Any]:
         return plant.step(plant.structure.unflatten(leaves), state, torque, time)
 
     leaves = [jax.ShapeDtypeStruct(size, dtype) for size, dtype in plant.kinds]
-    closed = flat(step, leaves, [_NUMBER] * plant.shape.num_leaves, _NUMBER, _NUMBER)
+    closed = trace_inlined(step, leaves, [_NUMBER] * plant.shape.num_leaves, _NUMBER, _NUMBER)
     used = {id(v) for eqn in closed.jaxpr.eqns for v in eqn.invars} | {id(v) for v in closed.jaxpr.outvars}
     read = tuple(i for i, v in enumerate(closed.jaxpr.invars[: len(leaves)]) if id(v) in used)
     for i in read:
@@ -332,28 +332,28 @@ def _or_none(written: Callable[..., tuple[Callable[..., Any], tuple[Any, ...], d
 
     @lru_cache(maxsize=64)
     @wraps(written)
-    def found(plant: _Plant, *given: Any) -> Any:
-        key = program_cache.key_of(f"loop of {written.__qualname__}", *plant.described, given)
+    def found(plant: _PlantStructure, *given: Any) -> Any:
+        key = program_cache.program_key(f"loop of {written.__qualname__}", *plant.described, given)
         if (loop := program_cache.load(key)) is not None:
             return loop
         try:
-            with attempted():
-                from .jaxprs import traced
+            with raising_unsupported():
+                from .jaxprs import trace
                 from .llvm import Loop
 
                 sample, examples, numbers = written(plant, *given)
-                loop = Loop(traced(sample, *examples), _FLOAT, **numbers)
+                loop = Loop(trace(sample, *examples), _FLOAT, **numbers)
                 program_cache.save(key, loop)
                 return loop
         except Unsupported as why:
-            say_scanned(str(why))
+            warn_of_scan(str(why))
             return None
 
     return found
 
 
 @_or_none
-def _path_loop(plant: _Plant, sides: tuple[str, ...] = (), varying: tuple[int, ...] = ()) -> Any:
+def _path_loop(plant: _PlantStructure, sides: tuple[str, ...] = (), varying: tuple[int, ...] = ()) -> Any:
     """From state, numbers, first time and gains, and a sample's index, torque, readings and varying numbers."""
 
     def sample(state: list[Any], numbers: list[Any], first: Any, gains: list[Any], index: Any, inputs: list[Any]) -> Any:
@@ -372,7 +372,7 @@ def _path_loop(plant: _Plant, sides: tuple[str, ...] = (), varying: tuple[int, .
 
 
 @_or_none
-def _slopes_loop(plant: _Plant, varying: tuple[int, ...] = ()) -> Any:
+def _slopes_loop(plant: _PlantStructure, varying: tuple[int, ...] = ()) -> Any:
     """From state, torque, time and varying numbers of a lane, numbers, and changes of numbers, state and torque."""
 
     def slope(state: list[Any], torque: Any, time: Any, own: list[Any], numbers: list[Any], changes: tuple[Any, ...]) -> Any:

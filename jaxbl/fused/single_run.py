@@ -14,13 +14,13 @@ import numpy as np
 from jaxbl.simulate import Experiment, Reducer, Signals, State, advance, begin, block_length, end_of_block, figures
 
 from . import Unsupported
-from .jaxprs import flat
+from .jaxprs import trace_inlined
 from .llvm import Loop
-from .noise import host
-from .shared_part import Shared, ahead_of_lanes
+from .noise import host_device
+from .shared_part import SharedPart, compile_shared_part
 
 
-def recorded(
+def record_run(
     experiment: Experiment,
     seed: int,
     reducers: tuple[Reducer, ...],
@@ -29,7 +29,7 @@ def recorded(
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Simulate one experiment, in its precision: the reducers' figures `()` and the record `(samples,)`, both by name.
     Arguments as of :func:`jaxbl.simulate.scan`."""
-    with jax.default_device(host()):
+    with jax.default_device(host_device()):
         start = jax.eval_shape(lambda: begin(experiment, reducers))
         tree, leaves = jax.tree.structure(start), jax.tree.leaves(start)
         names: list[str] = []
@@ -47,8 +47,8 @@ def recorded(
             return figures(experiment, reducers, tree.unflatten(state))
 
         steps = experiment.run.steps
-        shared = Shared(sample, settle, leaves, experiment.sides, steps, block_length(steps))
-        ahead = ahead_of_lanes(shared)
+        shared = SharedPart(sample, settle, leaves, experiment.sides, steps, block_length(steps))
+        ahead = compile_shared_part(shared)
         state, columns = _once(lambda: jax.tree.leaves(begin(experiment, reducers))), [[] for _ in names]
         for first in range(0, steps, shared.stretch):
             state, _, handed = ahead(state, seed, first, min(shared.stretch, steps - first))
@@ -61,7 +61,7 @@ def recorded(
 
 def _once(function: Callable[..., Any], *numbers: Any) -> list[Any]:
     """Leaves of a function of numbers."""
-    closed = flat(function, *(jax.ShapeDtypeStruct((), jnp.result_type(number)) for number in numbers))
+    closed = trace_inlined(function, *(jax.ShapeDtypeStruct((), jnp.result_type(number)) for number in numbers))
     try:
         loop = Loop(closed, np.dtype(float), values=len(numbers), lanes=1)
     except Unsupported:

@@ -57,7 +57,7 @@ def jit(function: Callable[..., Result]) -> Callable[..., Result]:
         leaves, structure = jax.tree.flatten((args, kwargs))
         if any(isinstance(leaf, Tracer) for leaf in leaves):
             return function(*args, **kwargs)
-        if program_cache.keeping() is None:
+        if program_cache.cache_folder() is None:
             return compiled()(*args, **kwargs)
         arrays = [_plain(leaf) for leaf in leaves if eqx.is_array(leaf)]
         rest = tuple(_Array() if eqx.is_array(leaf) else leaf for leaf in leaves)
@@ -119,7 +119,7 @@ _programs: OrderedDict[Any, _Program] = OrderedDict()
 
 def _program(function: Callable[..., Any], args: tuple, kwargs: dict[str, Any], arrays: list[jax.Array]) -> _Program:
     """A program from disk, or compiled and put there."""
-    key = program_cache.key_of("program", function, args, kwargs)
+    key = program_cache.program_key("program", function, args, kwargs)
     found = program_cache.load(key)
     if found is not None:
         _initialise()

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbl.fused.signal_scan import stepped
+from jaxbl.fused.signal_scan import scan_signal
 
 _SMOOTHNESS = 1e-14, 1e4
 """Range of q h^5 / sigma^2 that is searched: time constants of the smoother from 200 periods to a fraction of one."""
@@ -139,7 +139,7 @@ def _corrected(values: list[Any], carry: list[Any], inputs: list[Any]) -> tuple[
 
 def _along(sample: Any, values: list[Any], carry: list[Any], inputs: list[Any]) -> list[np.ndarray]:
     """What a function of a sample keeps along a signal, or along several side by side; numbers are one lane."""
-    found = stepped(sample, [np.ravel(one) for one in values], [np.ravel(one) for one in carry], inputs)
+    found = scan_signal(sample, [np.ravel(one) for one in values], [np.ravel(one) for one in carry], inputs)
     return [one if np.ndim(carry[0]) else one[:, 0] for one in found]
 
 

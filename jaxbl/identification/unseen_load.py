@@ -26,7 +26,7 @@ from scipy.special import chdtri
 from jaxbl.drive.effects import AbstractEffect
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.drive.plant import PlantState, States
-from jaxbl.fused.single_plant import Runs
+from jaxbl.fused.single_plant import PlantSimulator
 from jaxbl.simulate import Experiment
 from jaxbl.workers import doing
 
@@ -231,9 +231,11 @@ class UnseenLoad:
         return jax.tree.map(float, found)
 
     @cached_property
-    def _model(self) -> Runs:
+    def _model(self) -> PlantSimulator:
         zero: Any = dict.fromkeys(("motor", "load"), 0.0)
-        return Runs(self.experiment, PlantState(zero, zero, self._settled[0]), [one.path for one in self.free], ["motor"])
+        return PlantSimulator(
+            self.experiment, PlantState(zero, zero, self._settled[0]), [one.path for one in self.free], ["motor"]
+        )
 
     @cached_property
     def _own(self) -> dict[str, float]:

@@ -99,7 +99,7 @@ def costs(devices: Sequence[Any]) -> Costs:
     programs are kept."""
     if devices[0].platform != "cpu":
         return _GPU
-    key = program_cache.key_of("costs", len(devices))
+    key = program_cache.program_key("costs", len(devices))
     if key is None:
         return _CPU
     found = program_cache.load(key)
@@ -141,7 +141,7 @@ def work_of(config: Config, paths: Sequence[str], names: Names = None) -> Work:
     """Count what a sample takes where these paths differ from lane to lane, and some metrics are computed, or all."""
     with precision(config):
         experiment = prepare(config)
-        key = program_cache.name_of("work", experiment, tuple(paths), names)
+        key = program_cache.hash_program("work", experiment, tuple(paths), names)
         # a study of many sweeps asks for the same one, also where nothing is kept on disk
         found = _works.get(key) or program_cache.load(key)
         if found is None:

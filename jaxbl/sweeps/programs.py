@@ -14,13 +14,13 @@ from jax.sharding import Mesh, PartitionSpec
 
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
-from jaxbl.fused import Unsupported, attempted
+from jaxbl.fused import Unsupported, raising_unsupported
 from jaxbl.simulate import Experiment, scan
 
 from .metrics import METRICS, Names, ObserverGains, metric_columns, metrics, observer_gains
 
 if TYPE_CHECKING:
-    from jaxbl.fused.lane_simulator import Passage
+    from jaxbl.fused.lane_simulator import LaneSimulator
 
 Backend = Literal["fused", "scan"]
 BACKENDS: tuple[Backend, ...] = get_args(Backend)
@@ -127,7 +127,7 @@ def compile_program(
     def compiled() -> Program:
         if backend == "fused":
             try:
-                with attempted():
+                with raising_unsupported():
                     return _fused(experiment, layout, devices, tuple(columns), names)
             except Unsupported as why:
                 if insist:
@@ -142,13 +142,13 @@ def compile_program(
 def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tuple[str, ...], names: Names) -> Program:
     if not paths:
         raise Unsupported("lanes that differ in nothing but their seed")
-    from jaxbl.fused.lane_simulator import DevicePassage, HostPassage
+    from jaxbl.fused.lane_simulator import DeviceSimulator, HostSimulator
 
     if devices[0].platform == "cpu":
-        passage: Passage = HostPassage(experiment, (metrics(names),), paths, layout.points, len(devices))
+        passage: LaneSimulator = HostSimulator(experiment, (metrics(names),), paths, layout.points, len(devices))
     elif devices[0].platform == "gpu" and len(devices) == 1:
         with jax.default_device(devices[0]):
-            passage = DevicePassage(experiment, (metrics(names),), paths, layout.points)
+            passage = DeviceSimulator(experiment, (metrics(names),), paths, layout.points)
     else:
         raise Unsupported(f"{len(devices)} devices of platform {devices[0].platform}")
 

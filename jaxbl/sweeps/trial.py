@@ -14,7 +14,7 @@ import pandas as pd
 from jaxbl.config import Config, precision, prepare, read_config, with_values
 from jaxbl.errors import InputError
 from jaxbl.files import plain
-from jaxbl.fused import Unsupported, attempted, say_scanned
+from jaxbl.fused import Unsupported, raising_unsupported, warn_of_scan
 from jaxbl.observer.conditions import CONDITIONS, judge_gains
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.simulate import Experiment, Reducer, Signals, State, scan
@@ -85,14 +85,14 @@ def neighbours(study: Config, seed: int, count: int) -> list[dict[str, Any]]:
 def _recorded(experiment: Experiment, seed: int, every: int, *, insist: bool) -> tuple[dict[str, Any], Any]:
     """By the fused loop; if that cannot, by XLA's own, unless one insists."""
     try:
-        with attempted():
-            from jaxbl.fused.single_run import recorded
+        with raising_unsupported():
+            from jaxbl.fused.single_run import record_run
 
-            return recorded(experiment, seed, _REDUCERS, partial(_row, experiment), every)
+            return record_run(experiment, seed, _REDUCERS, partial(_row, experiment), every)
     except Unsupported as why:
         if insist:
             raise InputError(f"backend: the fused loop does not know {why}; use 'scan', or leave it out") from None
-        say_scanned(str(why))
+        warn_of_scan(str(why))
         return _scanned(experiment, seed, every)
 
 

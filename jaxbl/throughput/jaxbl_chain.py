@@ -9,7 +9,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxbl.drive import set_leaves
-from jaxbl.fused.lane_simulator import HostPassage
+from jaxbl.fused.lane_simulator import HostSimulator
 from jaxbl.simulate import scan
 
 from .workload import FIGURES, RANGES, SEED, Chunked, Workload
@@ -18,7 +18,7 @@ LANES = 2**12
 """That a device scans at once: what they carry then stays in a core's cache (benchmarks/NOTES.md)."""
 
 
-class Scan(Chunked):
+class ScanChain(Chunked):
     """`lax.scan` and `vmap`, in chunks that stay in the caches, devices side by side."""
 
     def __init__(self, workload: Workload, devices: int):
@@ -35,11 +35,11 @@ class Scan(Chunked):
         super().__init__(sweep, workload, chunk, jnp.asarray(SEED))
 
 
-class Fused:
+class FusedChain:
     """The loop over time in registers, threads side by side; input and noise by itself, of another seed each time."""
 
     def __init__(self, workload: Workload, threads: int):
-        self._passage = HostPassage(workload.experiment(), (FIGURES,), tuple(RANGES), workload.lanes, threads)
+        self._passage = HostSimulator(workload.experiment(), (FIGURES,), tuple(RANGES), workload.lanes, threads)
         self._values, self._seeds = workload.values(), count(SEED)
 
     def __call__(self) -> dict[str, np.ndarray]:

@@ -20,13 +20,13 @@ import numpy as np
 from jaxbl.errors import NoResult
 from jaxbl.workers import Progress, cores
 
-from .jaxbl_chain import Fused, Scan
-from .rivals.cpp_chain import Native, NoCompiler, compiler, library
-from .rivals.cpp_studies import NativeStudy
-from .rivals.diffrax_chain import Diffrax
-from .rivals.numba_chain import Compiled, forget
-from .rivals.python_chain import Plain
-from .studies import STUDIES, OwnStudy, study
+from .jaxbl_chain import FusedChain, ScanChain
+from .rivals.cpp_chain import CppChain, NoCompiler, compiler, library
+from .rivals.cpp_studies import CppStudy
+from .rivals.diffrax_chain import DiffraxChain
+from .rivals.numba_chain import NumbaChain, forget
+from .rivals.python_chain import PythonChain
+from .studies import STUDIES, FusedStudy, study
 from .workload import Workload
 
 Runner = Callable[[], dict[str, np.ndarray]]
@@ -57,21 +57,21 @@ def entries(folder: Path, count: int, devices: int) -> list[Entry]:
     """All of them; `folder` keeps the compiled kernel, `count` are cores, `devices` JAX's."""
     many, few = 2**17, 2**14
     return [
-        Entry(CEILING, lambda w: Native(w, count, folder), many),
-        Entry("c++, one core", lambda w: Native(w, 1, folder), many),
-        Entry(OURS, lambda w: Fused(w, count), many),
-        Entry("jaxbl fused, one core", lambda w: Fused(w, 1), many),
-        Entry(SCAN, lambda w: Scan(w, devices), few),
-        Entry("jaxbl scan, one device", lambda w: Scan(w, 1), few),
-        Entry("numba, blocks of lanes", lambda w: Compiled(w, count, blocked=True), many, "numba"),
-        Entry("numba, prange", lambda w: Compiled(w, count, blocked=False), few, "numba"),
-        Entry("diffrax, Euler, one device", Diffrax, few, "diffrax"),
-        Entry("NumPy, lane arrays", Plain, 2**12),
-        Entry("NumPy, one lane", Plain, 1),
-        Entry("Python numbers, one lane", partial(Plain, numbers=True), 1),
-        Entry("OpenSMC, one lane", partial(Plain, numbers=True, library=True), 1, "opensmc"),
-        Entry("SciPy RK45, one lane", partial(Plain, numbers=True, solver="RK45"), 1, tolerance=1e-3),
-        Entry("SciPy LSODA, one lane", partial(Plain, numbers=True, solver="LSODA"), 1, tolerance=1e-3),
+        Entry(CEILING, lambda w: CppChain(w, count, folder), many),
+        Entry("c++, one core", lambda w: CppChain(w, 1, folder), many),
+        Entry(OURS, lambda w: FusedChain(w, count), many),
+        Entry("jaxbl fused, one core", lambda w: FusedChain(w, 1), many),
+        Entry(SCAN, lambda w: ScanChain(w, devices), few),
+        Entry("jaxbl scan, one device", lambda w: ScanChain(w, 1), few),
+        Entry("numba, blocks of lanes", lambda w: NumbaChain(w, count, blocked=True), many, "numba"),
+        Entry("numba, prange", lambda w: NumbaChain(w, count, blocked=False), few, "numba"),
+        Entry("diffrax, Euler, one device", DiffraxChain, few, "diffrax"),
+        Entry("NumPy, lane arrays", PythonChain, 2**12),
+        Entry("NumPy, one lane", PythonChain, 1),
+        Entry("Python numbers, one lane", partial(PythonChain, numbers=True), 1),
+        Entry("OpenSMC, one lane", partial(PythonChain, numbers=True, library=True), 1, "opensmc"),
+        Entry("SciPy RK45, one lane", partial(PythonChain, numbers=True, solver="RK45"), 1, tolerance=1e-3),
+        Entry("SciPy LSODA, one lane", partial(PythonChain, numbers=True, solver="LSODA"), 1, tolerance=1e-3),
     ]
 
 
@@ -254,7 +254,7 @@ def _spread(lanes: int) -> np.ndarray:
 def _reference(lanes: int, steps: int) -> dict[str, np.ndarray]:
     """Figures of some of so many lanes by the plainest entry, in float64."""
     with _in("float64"):
-        return Plain(Workload(lanes, steps, "float64"), chosen=_spread(lanes))()
+        return PythonChain(Workload(lanes, steps, "float64"), chosen=_spread(lanes))()
 
 
 def _check(entry: Entry, precision: str, figures: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> float:
@@ -323,9 +323,9 @@ def compare(name: str, folder: Path, count: int, steps: int, rounds: int, lanes:
     """
     # a noisy observer amplifies rounding: number by number the figures are the same only over a short run
     short = study(name, _SHORT, lanes, start=0.1)
-    deviation = check_study(name, OwnStudy(short)(), NativeStudy(short, count, folder, own=False)())
+    deviation = check_study(name, FusedStudy(short)(), CppStudy(short, count, folder, own=False)())
     work = study(name, steps, lanes)
-    runners = [OwnStudy(work), *(NativeStudy(work, count, folder, vectors) for vectors in _VECTORS)]
+    runners = [FusedStudy(work), *(CppStudy(work, count, folder, vectors) for vectors in _VECTORS)]
     check_medians(name, *(runner() for runner in runners[:2]))
     least = [float("inf")] * len(runners)
     for _ in range(rounds):

@@ -103,7 +103,7 @@ def study(name: str, steps: int, lanes: int | None = None, start: float | None =
         return Study(name, config, prepare(config), points.columns(chosen))
 
 
-class OwnStudy:
+class FusedStudy:
     """By the program of a sweep on all cores, all of a study in one chunk; other seeds at each call."""
 
     def __init__(self, of: Study):

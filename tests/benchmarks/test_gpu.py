@@ -6,8 +6,8 @@ import gpu
 import jax
 import numpy as np
 
-from jaxbl.fused.lane_simulator import DevicePassage
-from jaxbl.throughput.jaxbl_chain import Fused
+from jaxbl.fused.lane_simulator import DeviceSimulator
+from jaxbl.throughput.jaxbl_chain import FusedChain
 from jaxbl.throughput.workload import Workload
 
 
@@ -20,9 +20,9 @@ def test_lorenz_by_the_kernel_and_by_the_scan():
 
 
 def test_the_kernel_alone_gives_the_figures_of_a_run(monkeypatch):
-    monkeypatch.setattr(gpu, "DevicePassage", partial(DevicePassage, interpret=True))
+    monkeypatch.setattr(gpu, "DeviceSimulator", partial(DeviceSimulator, interpret=True))
     work = Workload(130, 150, "float64")
-    found, whole, expected = (run() for run in (gpu.chain_kernel(work), gpu.chain_fused(work), Fused(work, 1)))
+    found, whole, expected = (run() for run in (gpu.chain_kernel(work), gpu.chain_fused(work), FusedChain(work, 1)))
     assert set(found) == set(whole) == set(expected)
     for name, figure in expected.items():
         assert found[name].shape == (130,)

@@ -7,7 +7,7 @@ import numpy as np
 from jax.extend.core import Literal
 
 from jaxbl.fused.elementary import FUNCTIONS
-from jaxbl.fused.jaxprs import branches_of, callee, parameter_of, repetition, traced_of_one
+from jaxbl.fused.jaxprs import callee, cond_branches, equation_parameter, scan_parameters, trace_scalar_function
 
 _CODES = {"float32": "f", "float64": "d", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q"}
 
@@ -107,9 +107,9 @@ class Strict:
         if (called := callee(eqn)) is not None:
             return self._write(called, given, indent)
         if name in FUNCTIONS and dtype.kind == "f":
-            return self._write(traced_of_one(FUNCTIONS[name], dtype), given, indent)
+            return self._write(trace_scalar_function(FUNCTIONS[name], dtype), given, indent)
         if name == "scan":
-            times, body, fixed = repetition(eqn)
+            times, body, fixed = scan_parameters(eqn)
             state = [self._new() for _ in texts[fixed:]]
             self._put(varies, f"{', '.join(state)}, = {', '.join(texts[fixed:])},", indent)
             self._put(varies, f"for _ in range({times}):", indent)
@@ -121,7 +121,7 @@ class Strict:
             return []
         if name == "cond":
             outs = [self._new() for _ in eqn.outvars]
-            for i, branch in enumerate(branches_of(eqn)):
+            for i, branch in enumerate(cond_branches(eqn)):
                 self._put(varies, f"if {texts[0]} == {i}:", indent)
                 made = self._body(branch, [(one, varies) for one in texts[1:]], varies, indent)
                 self._put(varies, f"{', '.join(outs)}, = {', '.join(one for one, _ in made)},", f"{indent}    ")
@@ -146,7 +146,7 @@ class Strict:
                 f"{x[0]} / {x[1]} if {x[1]} else over_zero({x[0]}, {x[1]})" if dtype.kind == "f" else f"int({x[0]} / {x[1]})"
             )
         if name == "integer_pow":
-            power = parameter_of(eqn, "y")
+            power = equation_parameter(eqn, "y")
             product = " * ".join([x[0]] * abs(power))
             return product if power > 0 else f"{one} / ({product})"
         if name == "select_n":
@@ -162,7 +162,7 @@ class Strict:
         if name == "round":
             found = (
                 "nearest({})"
-                if int(parameter_of(eqn, "rounding_method"))
+                if int(equation_parameter(eqn, "rounding_method"))
                 else "math.copysign(math.floor(abs({0}) + 0.5), {0})"
             )
             return f"f32({found.format(x[0])})" if self.single else found.format(x[0])

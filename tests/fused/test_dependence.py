@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbl.fused.dependence import Kind, carry_kinds, recursion, split
+from jaxbl.fused.dependence import Dependence, carry_dependences, split_by_lane, split_by_state
 
 
 def begin(values):
@@ -22,29 +22,29 @@ def step(values, carry, given):
 @pytest.fixture
 def parts():
     values = [jnp.asarray(1.0), jnp.asarray(3.0)]
-    kinds = carry_kinds(begin, ((step, jnp.asarray(0.0)),), values)
-    return kinds, split(step, values, begin(values), jnp.asarray(0.0), kinds, kinds)
+    kinds = carry_dependences(begin, ((step, jnp.asarray(0.0)),), values)
+    return kinds, split_by_lane(step, values, begin(values), jnp.asarray(0.0), kinds, kinds)
 
 
 def test_kinds_of_a_carry(parts):
     names = sorted(begin([jnp.asarray(1.0)]))
-    assert [name for name, kind in zip(names, parts[0], strict=True) if kind == Kind.LANE] == ["led", "own"]
+    assert [name for name, kind in zip(names, parts[0], strict=True) if kind == Dependence.LANE] == ["led", "own"]
 
 
 def test_parts_make_the_whole(parts):
     kinds, (shared, lane, of_lane) = parts
-    assert of_lane == [kind == Kind.LANE for kind in kinds]
+    assert of_lane == [kind == Dependence.LANE for kind in kinds]
     values = [jnp.asarray(0.3), jnp.asarray(-1.2)]
     carry = begin(values)
     leaves, tree = jax.tree.flatten(carry)
-    own = [leaf for leaf, kind in zip(leaves, kinds, strict=True) if kind == Kind.LANE]
-    state = [leaf for leaf, kind in zip(leaves, kinds, strict=True) if kind != Kind.LANE]
+    own = [leaf for leaf, kind in zip(leaves, kinds, strict=True) if kind == Dependence.LANE]
+    state = [leaf for leaf, kind in zip(leaves, kinds, strict=True) if kind != Dependence.LANE]
     for given in jnp.linspace(0.1, 2.0, 5):
         carry = step(values, carry, given)
         state, handed = shared(state, given)
         own = jax.core.eval_jaxpr(lane.jaxpr, lane.consts, *values, *own, *handed)
     found = iter(own), iter(state)
-    together = tree.unflatten([next(found[0] if kind == Kind.LANE else found[1]) for kind in kinds])
+    together = tree.unflatten([next(found[0] if kind == Dependence.LANE else found[1]) for kind in kinds])
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14), together, carry)
 
 
@@ -64,7 +64,7 @@ def test_a_recursion_leaves_what_needs_no_state_to_be_done_at_once():
 
     state = [jnp.asarray(0.2), jnp.asarray(-0.1)]
     given = jnp.arange(9), jnp.linspace(-0.5, 0.5, 9)
-    parts = recursion(sample, state, jax.tree.map(lambda x: x[0], given))
+    parts = split_by_state(sample, state, jax.tree.map(lambda x: x[0], given))
     assert parts.direct == [True, False, True, False]
     # neither the table nor a sine is left to the loop
     assert not {eqn.primitive.name for eqn in parts.step.jaxpr.eqns} & {"sin", "gather", "rem"}

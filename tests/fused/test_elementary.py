@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbl.fused.elementary import FUNCTIONS, LIMIT, rounded
+from jaxbl.fused.elementary import FUNCTIONS, LIMIT, round_half_even
 
 TRUE = {
     "exp": np.exp,
@@ -43,4 +43,4 @@ def test_edges(dtype):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_rounded_to_the_even_one_of_two(dtype):
     x = np.array([0.5, 1.5, 2.5, -0.5, -1.5, 0.49999, 1e6 + 0.5, 3e9, -7.7], dtype)
-    np.testing.assert_array_equal(jax.jit(rounded)(jnp.asarray(x)), np.round(x))
+    np.testing.assert_array_equal(jax.jit(round_half_even)(jnp.asarray(x)), np.round(x))

@@ -20,8 +20,8 @@ def renamed(monkeypatch):
     def parameter(eqn, *names):
         return parameters(eqn, *(f"new_{name}" for name in names))
 
-    parameters = jaxprs.parameter_of
-    monkeypatch.setattr(jaxprs, "parameter_of", parameter)
+    parameters = jaxprs.equation_parameter
+    monkeypatch.setattr(jaxprs, "equation_parameter", parameter)
 
 
 def unread(monkeypatch):
@@ -46,7 +46,7 @@ UNKNOWN = {
 @pytest.fixture(params=UNKNOWN, ids=lambda change: change.__name__)
 def unknown(request, monkeypatch):
     """Makes it so; returns what is said of it."""
-    fused.say_scanned.cache_clear()
+    fused.warn_of_scan.cache_clear()
     single_plant._path_loop.cache_clear()
     yield lambda: request.param(monkeypatch) or UNKNOWN[request.param]
     # loops that could not be had are not kept
@@ -85,17 +85,17 @@ def test_a_run_is_scanned(looped, unknown, caplog):
         assert one.summary["metrics"][NAME] == pytest.approx(looped.summary["metrics"][NAME], rel=1e-6)
         np.testing.assert_allclose(one.trace["theta_e"], looped.trace["theta_e"], rtol=1e-6, atol=1e-9)
     (line,) = caplog.messages
-    assert re.fullmatch(fused.SCANNED % said, line)
+    assert re.fullmatch(fused.SCAN_MESSAGE % said, line)
 
 
 def test_a_plant_is_scanned(unknown, caplog):
     with jax.enable_x64(True):
         one = prepare(jaxbl.read_config(STUDY))
         start, torque = one.plant.init(one.initial), np.ones(50)
-        expected, said = single_plant.path(one, start, torque), unknown()
+        expected, said = single_plant.simulate_plant(one, start, torque), unknown()
         single_plant._path_loop.cache_clear()
-        found = [single_plant.path(one, start, torque) for _ in range(2)]
+        found = [single_plant.simulate_plant(one, start, torque) for _ in range(2)]
     for path in found:
         np.testing.assert_allclose(path.position["motor"], expected.position["motor"], rtol=1e-9, atol=1e-12)
     (line,) = caplog.messages
-    assert re.fullmatch(fused.SCANNED % said, line)
+    assert re.fullmatch(fused.SCAN_MESSAGE % said, line)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
-from jaxbl.fused.jaxprs import contracted, flat, substituted
+from jaxbl.fused.jaxprs import join_multiply_add, replace_primitives, trace_inlined
 
 
 def function(x, y, z):
@@ -31,8 +31,8 @@ def test_products_are_joined_with_sums():
         seen.append((minus_product, minus_rest))
         return (-1 if minus_product else 1) * a * b + (-1 if minus_rest else 1) * c
 
-    closed = flat(function, *given)
-    found = jaxpr_as_fun(contracted(closed, multiply_add))(*given)
+    closed = trace_inlined(function, *given)
+    found = jaxpr_as_fun(join_multiply_add(closed, multiply_add))(*given)
     np.testing.assert_allclose(found, function(*given), rtol=1e-14)
     plain, turned, rest = (False, False), (True, False), (False, True)
     assert seen == [plain, turned, rest, plain, plain]
@@ -40,7 +40,7 @@ def test_products_are_joined_with_sums():
 
 def test_operations_are_replaced_inside_of_calls_and_loops():
     given = [jnp.asarray(value) for value in (0.7, -1.3, 2.1)]
-    replaced = substituted(flat(function, *given), {"tanh": lambda x: 10.0 * x, "add": lambda a, b: a - b})
+    replaced = replace_primitives(trace_inlined(function, *given), {"tanh": lambda x: 10.0 * x, "add": lambda a, b: a - b})
     found = jaxpr_as_fun(replaced)(*given)
     x, y, z = map(float, given)
     assert not {"jit", "pjit", "add", "tanh"} & {eqn.primitive.name for eqn in replaced.jaxpr.eqns}

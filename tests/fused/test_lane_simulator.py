@@ -17,10 +17,10 @@ from jaxbl.drive.parameters import leaf_paths
 from jaxbl.drive.transmission import DeadZone
 from jaxbl.fused import Unsupported
 from jaxbl.fused import lane_simulator as module
-from jaxbl.fused.jaxprs import contracted, substituted
-from jaxbl.fused.lane_simulator import DevicePassage, HostPassage, Passage
+from jaxbl.fused.jaxprs import join_multiply_add, replace_primitives
+from jaxbl.fused.lane_simulator import DeviceSimulator, HostSimulator, LaneSimulator
 from jaxbl.fused.pallas import LANES, Kernel
-from jaxbl.fused.shared_part import Looped
+from jaxbl.fused.shared_part import SharedPartLoop
 from jaxbl.observer import DISCRETISATIONS, EquivalentControl, Identifier, Observers
 from jaxbl.simulate import Experiment, Reducer, Run, scan
 from jaxbl.sweeps.metrics import METRICS, metrics
@@ -65,7 +65,7 @@ def scanned(experiment, values, reducer, seed):
     return jax.jit(jax.vmap(lane))(values)
 
 
-class Parts(Passage):
+class Parts(LaneSimulator):
     """What the loop or the kernel is made of, not compiled."""
 
     def _march(self, given, stretches):
@@ -98,8 +98,8 @@ def test_figures_are_those_of_the_scan(names, law, options):
     whole = experiment(names, law, **options)
     effects = [path for path in leaf_paths(whole) if path.startswith("effects.")]
     values = spread(whole, [*effects, "observer.motor.alpha", "encoders.noise"], 150)
-    fused, expected = HostPassage(whole, (METRICS,), tuple(values), 150, 2)(values, 3), scanned(whole, values, METRICS, 3)
-    device = DevicePassage(whole, (METRICS,), tuple(values), 150, interpret=True)(values, 3)
+    fused, expected = HostSimulator(whole, (METRICS,), tuple(values), 150, 2)(values, 3), scanned(whole, values, METRICS, 3)
+    device = DeviceSimulator(whole, (METRICS,), tuple(values), 150, interpret=True)(values, 3)
     assert set(fused) == set(device) == set(expected)
     for name, figure in fused.items():
         np.testing.assert_allclose(figure, expected[name], rtol=1e-7, err_msg=name)
@@ -111,7 +111,7 @@ def test_a_figure_computed_alone_is_to_the_bit_what_it_is_beside_the_others():
     whole = experiment(["motor.coulomb_friction", "load.gravity", "actuator.lag"], DeadZone(60.0, 0.05))
     values = spread(whole, [path for path in leaf_paths(whole) if path.startswith("effects.")], 37)
     asked = METRICS, metrics(("chatter", "f_plus", "torque_rmse"))
-    every, some = (HostPassage(whole, (one,), tuple(values), 37, 2)(values, 3) for one in asked)
+    every, some = (HostSimulator(whole, (one,), tuple(values), 37, 2)(values, 3) for one in asked)
     assert len(some) < len(every)
     for name, figure in some.items():
         np.testing.assert_array_equal(figure, every[name], err_msg=name)
@@ -122,11 +122,11 @@ def test_what_no_axis_touches_is_computed_once():
     """Axes on gains alone leave the plant to the shared part: no law is evaluated in a lane."""
     whole = experiment([], DeadZone(60.0, 0.05))
     values = spread(whole, ["observer.motor.alpha", "observer.motor.lambda"], 7)
-    passage = HostPassage(whole, (METRICS,), tuple(values), 7, 1)
+    passage = HostSimulator(whole, (METRICS,), tuple(values), 7, 1)
     varied = Parts(whole, (METRICS,), ("transmission.half_gap",), 7, 1)
     assert passage.carried < varied.carried
     # the plant's states are stepped by a loop of scalars, ahead of the lanes
-    assert isinstance(passage._ahead, Looped)
+    assert isinstance(passage._ahead, SharedPartLoop)
     assert passage._ahead._loop is not None
     expected = scanned(whole, values, METRICS, 3)
     for name, figure in passage(values, 3).items():
@@ -139,7 +139,7 @@ def test_the_benchmarks_work_in_both_precisions(precision):
     values = work.values()
     with jax.enable_x64(precision == "float64"):
         whole = work.experiment()
-        fused = HostPassage(whole, (FIGURES,), tuple(RANGES), work.lanes, 2)(values, SEED)
+        fused = HostSimulator(whole, (FIGURES,), tuple(RANGES), work.lanes, 2)(values, SEED)
         expected = scanned(whole, values, FIGURES, SEED)
     for name, figure in fused.items():
         assert figure.dtype == precision
@@ -156,8 +156,8 @@ def test_the_kernel_of_accelerators_in_single_precision():
     with jax.enable_x64(False):
         whole = work.experiment()
         passages = [
-            HostPassage(whole, (METRICS,), tuple(RANGES), work.lanes, 1),
-            DevicePassage(whole, (METRICS,), tuple(RANGES), work.lanes, interpret=True),
+            HostSimulator(whole, (METRICS,), tuple(RANGES), work.lanes, 1),
+            DeviceSimulator(whole, (METRICS,), tuple(RANGES), work.lanes, interpret=True),
         ]
         host, device = (passage(work.values(), SEED) for passage in passages)
     for name, figure in device.items():
@@ -186,7 +186,7 @@ def test_the_kernel_can_be_written_for_a_gpu(half, precision):
 )
 def test_a_processor_has_no_kernel_of_accelerators():
     with pytest.raises(Unsupported, match="how to compile for this device"):
-        DevicePassage(experiment([], LinearShaft(60.0)), (METRICS,), ("transmission.stiffness",), 5)
+        DeviceSimulator(experiment([], LinearShaft(60.0)), (METRICS,), ("transmission.stiffness",), 5)
 
 
 @pytest.mark.parametrize("half", [True, False], ids=["half", "others"])
@@ -200,7 +200,7 @@ def test_what_is_joined_for_a_gpu_computes_the_same(half):
     random = np.random.default_rng(1)
     for part in (made._body, *made._around):
         given = [random.uniform(0.5, 1.5, aval.shape).astype(aval.dtype) for aval in part.in_avals]
-        other = contracted(substituted(part, {}), multiply_add)
+        other = join_multiply_add(replace_primitives(part, {}), multiply_add)
         pairs = jax.jit(lambda *x, ways=(other, part): [jaxpr_as_fun(way)(*x) for way in ways])(*given)
         for one, expected in zip(*pairs, strict=True):
             np.testing.assert_allclose(one, expected, rtol=1e-12)
@@ -209,14 +209,14 @@ def test_what_is_joined_for_a_gpu_computes_the_same(half):
 
 def test_values_of_another_number_of_lanes_are_refused():
     work = Workload(40, 70, "float64")
-    passage = HostPassage(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
+    passage = HostSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
     with pytest.raises(ValueError, match=r"encoders\.noise: 40 lanes need as many values, not an array of shape \(3,\)"):
         passage(work.values() | {"encoders.noise": np.ones(3)}, SEED)
 
 
 def test_an_error_of_a_thread_reaches_the_caller(monkeypatch):
     work = Workload(4000, 3000, "float64")
-    passage = HostPassage(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
+    passage = HostSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
     loop, calls = passage._loop, []
 
     def failing(*arguments, **options):
@@ -246,9 +246,9 @@ def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precisi
         whole = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41, precision=precision)
         values = {"transmission.stiffness": stiffness}
         staying = METRICS._replace(done=None)
-        expected = HostPassage(whole, (staying,), tuple(values), lanes, 1)(values, 3)
+        expected = HostSimulator(whole, (staying,), tuple(values), lanes, 1)(values, 3)
         assert 0 < np.count_nonzero(expected["finite"]) < lanes
-        passage = HostPassage(whole, (METRICS,), tuple(values), lanes, threads)
+        passage = HostSimulator(whole, (METRICS,), tuple(values), lanes, threads)
         assert len(passage._threads) == threads
         loop = passage._loop
 
@@ -285,7 +285,7 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
         values["run.position_tolerance"] = np.where(tolerance > 1.0, 1e3, 1e-12)
         asked = metrics(("converged", "convergence_time"))
         every, staying = (
-            HostPassage(whole, (one,), tuple(values), lanes, 1) for one in (METRICS, asked._replace(done=None))
+            HostSimulator(whole, (one,), tuple(values), lanes, 1) for one in (METRICS, asked._replace(done=None))
         )
         assert staying.carried < every.carried
         expected, stayed = every(values, 3), staying(values, 3)
@@ -294,7 +294,7 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
         # a side is not followed once its answer is known: what overflows later is not seen
         assert (stayed["finite"] >= expected["finite"]).all()
         assert np.count_nonzero(stayed["finite"]) > np.count_nonzero(expected["finite"])
-        passage = HostPassage(whole, (asked,), tuple(values), lanes, threads)
+        passage = HostSimulator(whole, (asked,), tuple(values), lanes, threads)
         loop = passage._loop
 
         def counted(arrays, upto, first, last, loop=loop, **options):
@@ -318,7 +318,7 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
 def test_all_lanes_may_leave(monkeypatch):
     monkeypatch.setattr(module, "_CALL", 1)
     whole = experiment([], LinearShaft(60.0), substeps=1, steps=64 * 41)
-    passage = HostPassage(whole, (METRICS,), ("transmission.stiffness",), 5, 1)
+    passage = HostSimulator(whole, (METRICS,), ("transmission.stiffness",), 5, 1)
     found = passage({"transmission.stiffness": np.full(5, 1e8)}, 3)
     assert not found["finite"].any()
     assert not found["load.converged"].any()
@@ -327,7 +327,7 @@ def test_all_lanes_may_leave(monkeypatch):
 
 def test_what_lanes_share_is_kept_for_the_same_seeds_alone(monkeypatch):
     work = Workload(40, 300, "float64")
-    passage = HostPassage(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
+    passage = HostSimulator(work.experiment(), (FIGURES,), tuple(RANGES), work.lanes, 2)
     drawn = []
     ahead = passage._ahead
     monkeypatch.setattr(passage, "_ahead", lambda state, seed, *rest: drawn.append(seed) or ahead(state, seed, *rest))
@@ -357,11 +357,11 @@ def test_an_unknown_operation_is_refused_by_name():
         lambda e, total, state: {"odd": total},
     )
     with pytest.raises(Unsupported, match="erf"):
-        HostPassage(whole, (odd,), ("transmission.half_gap",), 9, 1)
+        HostSimulator(whole, (odd,), ("transmission.half_gap",), 9, 1)
     truth = Reducer(
         lambda e: jnp.asarray(False),
         lambda e, total, index, signals: total | (signals.motor.measured > 1.0),
         lambda e, total, state: {"truth": total},
     )
     with pytest.raises(Unsupported, match="carry other numbers"):
-        HostPassage(whole, (truth,), ("transmission.half_gap",), 9, 1)
+        HostSimulator(whole, (truth,), ("transmission.half_gap",), 9, 1)

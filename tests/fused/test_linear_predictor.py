@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxbl.fused import linear_predictor as module
-from jaxbl.fused.linear_predictor import Recursion
+from jaxbl.fused.linear_predictor import LinearPredictor
 
 
 @pytest.mark.parametrize("machine_code", [True, False])
@@ -14,7 +14,7 @@ def test_errors_follow_the_definition(states, sides, width, machine_code, monkey
     step = 0.3 * rng.normal(size=(60, states, states))
     known, readings = rng.normal(size=(states, 60, width)), rng.normal(size=(60, sides))
     begun, gains = rng.normal(size=(states, width)), [rng.normal(0.3, 0.1, (sides, 2)) for _ in range(3)]
-    recursion = Recursion(states, sides, width)
+    recursion = LinearPredictor(states, sides, width)
     assert recursion.loop is not None
     if not machine_code:
         monkeypatch.setattr(recursion, "loop", None)
@@ -38,7 +38,7 @@ def test_errors_follow_the_definition(states, sides, width, machine_code, monkey
 def test_one_loop_serves_all_widths():
     before = module._loop.cache_info().misses
     for width in (3, 17, 90):
-        Recursion(3, 1, width)
+        LinearPredictor(3, 1, width)
     assert module._loop.cache_info().misses <= before + 1
 
 
@@ -46,7 +46,7 @@ def test_what_has_decayed_is_zero():
     """Numbers of less than the smallest normal one would take many times as long."""
     count = 3000
     step, known = np.tile(0.5 * np.eye(2), (count, 1, 1)), np.zeros((2, count, 3))
-    (end,), (errors,) = Recursion(2, 1, 3)([np.ones((2, 3))], [np.zeros((1, 2))], step, known, np.zeros((count, 1)))
+    (end,), (errors,) = LinearPredictor(2, 1, 3)([np.ones((2, 3))], [np.zeros((1, 2))], step, known, np.zeros((count, 1)))
     assert not end.any()
     small = np.abs(errors[errors != 0.0])
     assert 1e-80 < np.min(small) < 1e-50

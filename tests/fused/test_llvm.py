@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbl.fused.jaxprs import flat
-from jaxbl.fused.llvm import Arrays, Loop, Rows
+from jaxbl.fused.jaxprs import trace_inlined
+from jaxbl.fused.llvm import ArrayRows, Loop, LoopArrays
 
 NUMBER, INDEX = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((), np.int32)
 
@@ -19,7 +19,9 @@ def loop():
         total = total + factor * value + first * index.astype(jnp.float64)
         return total, total
 
-    return Loop(flat(sample, NUMBER, NUMBER, NUMBER, INDEX, NUMBER), np.dtype(float), values=1, carry=1, fixed=1, lanes=2)
+    return Loop(
+        trace_inlined(sample, NUMBER, NUMBER, NUMBER, INDEX, NUMBER), np.dtype(float), values=1, carry=1, fixed=1, lanes=2
+    )
 
 
 def arrays():
@@ -60,7 +62,7 @@ def test_what_does_not_fit_is_refused(loop, name, wrong):
 
 
 def test_arrays_serve_no_more_samples_and_lanes_than_they_were_made_for(loop):
-    made = Arrays(loop.signature, list(arrays().values()), 5, 2)
+    made = LoopArrays(loop.signature, list(arrays().values()), 5, 2)
     with pytest.raises(ValueError, match="arrays were made for 5 and 2"):
         loop(made, 6, 0, 2)
     with pytest.raises(ValueError, match="arrays were made for 5 and 2"):
@@ -73,13 +75,13 @@ def test_rows_of_one_array_stand_for_several(loop):
     given = arrays()
     both = np.array([given["value 0"], given["carry 0"]])
     rest = list(given.values())[2:]
-    loop([Rows(both), *rest], 5, 0, 2)
+    loop([ArrayRows(both), *rest], 5, 0, 2)
     np.testing.assert_array_equal(both, [[1.0, 2.0], [110.0, 120.0]])
     with pytest.raises(ValueError, match="input 0 of a loop needs 5 contiguous numbers of type int32"):
-        loop([Rows(both), rest[0], Rows(np.zeros((2, 5))), rest[3]], 5, 0, 2)
+        loop([ArrayRows(both), rest[0], ArrayRows(np.zeros((2, 5))), rest[3]], 5, 0, 2)
     with pytest.raises(ValueError, match="fixed number 0 of a loop is no row of one array"):
-        loop([Rows(np.zeros((3, 2))), *rest[1:]], 5, 0, 2)
+        loop([ArrayRows(np.zeros((3, 2))), *rest[1:]], 5, 0, 2)
     with pytest.raises(ValueError, match="value 0 of a loop is no row of one array"):
-        loop([Rows(np.zeros((4, 2))[::2]), *rest], 5, 0, 2)
+        loop([ArrayRows(np.zeros((4, 2))[::2]), *rest], 5, 0, 2)
     with pytest.raises(ValueError, match="needs 6 arrays, not 7"):
-        loop([Rows(np.zeros((3, 2))), *rest], 5, 0, 2)
+        loop([ArrayRows(np.zeros((3, 2))), *rest], 5, 0, 2)

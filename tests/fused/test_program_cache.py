@@ -19,7 +19,7 @@ import jax.numpy as jnp
 jax.config.update("jax_enable_x64", True)
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.parameters import as_arrays
-from jaxbl.fused.single_plant import path
+from jaxbl.fused.single_plant import simulate_plant
 from jaxbl.diagnosis import candidates
 
 traced = []
@@ -30,7 +30,7 @@ study = {"title": "t", "drive": {"kind": "rigid", "motor_inertia": 0.05, "motor_
          "observer": {"motor": {"lambda": 9.0, "alpha": 90.0}},
          "run": {"duration": 1.0}}
 model = as_arrays(prepare(read_config(study)), float)
-states = path(model, model.plant.init(model.initial), np.sin(5.0 * time))
+states = simulate_plant(model, model.plant.init(model.initial), np.sin(5.0 * time))
 motion = [{"motor": np.sin(9.0 * time)}] * 3
 part = candidates.Part(time, time, None, *motion, None, None, None, None, None, None, None, None)
 needed = candidates._needed(model, part)["motor"]
@@ -61,32 +61,32 @@ def test_names_tell_structures_apart(tmp_path, monkeypatch):
         1,
         1.0,
     ]
-    keys = [program_cache.key_of("program", one) for one in given]
+    keys = [program_cache.program_key("program", one) for one in given]
     assert None not in keys and len(set(keys)) == len(keys)
     # of arrays what they are, not what they hold
-    assert program_cache.key_of("program", jnp.ones(3)) == program_cache.key_of("program", jnp.zeros(3))
-    assert program_cache.key_of("program", make_effect("motor.quadratic_drag", drag=jnp.ones(()))) == program_cache.key_of(
-        "program", make_effect("motor.quadratic_drag", drag=jnp.zeros(()))
-    )
+    assert program_cache.program_key("program", jnp.ones(3)) == program_cache.program_key("program", jnp.zeros(3))
+    assert program_cache.program_key(
+        "program", make_effect("motor.quadratic_drag", drag=jnp.ones(()))
+    ) == program_cache.program_key("program", make_effect("motor.quadratic_drag", drag=jnp.zeros(())))
     with jax.enable_x64(False):
-        assert program_cache.key_of("program", 1) != program_cache.key_of("program", 1.0) != keys[-1]
+        assert program_cache.program_key("program", 1) != program_cache.program_key("program", 1.0) != keys[-1]
 
 
 def test_what_is_not_known_by_its_text_is_not_kept(tmp_path, monkeypatch):
     monkeypatch.setenv(program_cache.PROGRAMS, str(tmp_path))
-    assert program_cache.key_of("program", lambda x: x) is None
-    assert program_cache.key_of("program", np.random.default_rng(0)) is None
+    assert program_cache.program_key("program", lambda x: x) is None
+    assert program_cache.program_key("program", np.random.default_rng(0)) is None
     monkeypatch.setenv(program_cache.PROGRAMS, "")
-    assert program_cache.key_of("program", 1) is None
+    assert program_cache.program_key("program", 1) is None
 
 
 @pytest.mark.parametrize("content", [b"", b"half a pickle"])
 def test_a_broken_file_is_no_program(tmp_path, monkeypatch, content):
     monkeypatch.setenv(program_cache.PROGRAMS, str(tmp_path))
-    key = program_cache.key_of("program", 1)
+    key = program_cache.program_key("program", 1)
     program_cache.save(key, [1, 2])
     assert program_cache.load(key) == [1, 2]
-    folder = program_cache.keeping()
+    folder = program_cache.cache_folder()
     assert folder is not None and key is not None
     (folder / key).write_bytes(content)
     assert program_cache.load(key) is None

@@ -7,8 +7,8 @@ import pytest
 from jaxbl.drive import Encoders, Initial, LinearShaft, TwoInertia, as_arrays
 from jaxbl.drive.excitation import Multisine
 from jaxbl.fused import shared_part as module
-from jaxbl.fused.lane_simulator import HostPassage
-from jaxbl.fused.shared_part import Looped, Scanned
+from jaxbl.fused.lane_simulator import HostSimulator
+from jaxbl.fused.shared_part import SharedPartLoop, SharedPartScan
 from jaxbl.observer import EquivalentControl, ImplicitSuperTwisting, Observers
 from jaxbl.simulate import Experiment, Run
 from jaxbl.sweeps.metrics import METRICS
@@ -42,14 +42,14 @@ def experiment(excitation, dtype):
 def test_the_loop_does_what_the_scan_does(monkeypatch, precision, excitation, path, states):
     made = []
 
-    class Noted(Looped):
+    class Noted(SharedPartLoop):
         def __init__(self, shared):
             super().__init__(shared)
-            made.append((self, Scanned(shared), shared))
+            made.append((self, SharedPartScan(shared), shared))
 
-    monkeypatch.setattr(module, "Looped", Noted)
+    monkeypatch.setattr(module, "SharedPartLoop", Noted)
     with jax.enable_x64(precision == "float64"):
-        length = HostPassage(experiment(excitation, precision), (METRICS,), (path,), 16, 1)._length
+        length = HostSimulator(experiment(excitation, precision), (METRICS,), (path,), 16, 1)._length
         ((looped, scanned, shared),) = made
         assert (looped._loop is not None) >= states
         # the plant's four states are not carried by each lane

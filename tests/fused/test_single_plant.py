@@ -13,7 +13,7 @@ from jaxbl.drive import Initial, LinearShaft, Rigid, SigmoidBacklash, TwoInertia
 from jaxbl.drive.effects import SideEffect, make_effect
 from jaxbl.drive.excitation import Recorded, Sine
 from jaxbl.fused import single_plant as module
-from jaxbl.fused.single_plant import Direction, path, slopes
+from jaxbl.fused.single_plant import Direction, simulate_plant, step_derivatives
 from jaxbl.simulate import Experiment, Run, move, trajectory
 
 STEPS = 500
@@ -59,8 +59,8 @@ def test_the_path_is_that_of_the_scan(name, observed):
         measured = {side: 0.05 * np.cumsum(rng.normal(0.0, 0.01, STEPS)) for side in one.sides}
         more = {"measured": measured, "gain": {side: np.array([0.3, 20.0 + i]) for i, side in enumerate(one.sides)}}
     expected = eqx.filter_jit(trajectory)(one, start, jnp.asarray(torque), 0.7, **jax.tree.map(jnp.asarray, more))
-    assert module._path_loop(module._Plant.of(one, start), tuple(sorted(more.get("gain", ())))) is not None
-    found = path(one, start, torque, 0.7, **more)
+    assert module._path_loop(module._PlantStructure.of(one, start), tuple(sorted(more.get("gain", ())))) is not None
+    found = simulate_plant(one, start, torque, 0.7, **more)
     assert jax.tree.structure(found) == jax.tree.structure(expected)
     for have, want in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert have.shape == (STEPS,)
@@ -82,10 +82,10 @@ def test_slopes_are_those_of_differences(name):
     one = MODELS[name]()
     start, torque, _ = record(one)
     time = 1e-3 * np.arange(STEPS)
-    states = path(one, start, torque)
+    states = simulate_plant(one, start, torque)
     ways = directions(one, start)
-    assert module._slopes_loop(module._Plant.of(one, start)) is not None
-    changes, new = slopes(one, states, torque, time, ways)
+    assert module._slopes_loop(module._PlantStructure.of(one, start)) is not None
+    changes, new = step_derivatives(one, states, torque, time, ways)
     assert changes.shape == (len(ways), len(jax.tree.leaves(start)), STEPS)
 
     def whole(way):
@@ -123,14 +123,14 @@ class _Tabled(SideEffect):
 def test_what_a_loop_cannot_do_is_left_to_the_scan():
     one = experiment(["motor.viscous_friction"], extra=(_Tabled(side="motor", table=jnp.linspace(0.0, 1.0, 30)),))
     start, torque, _ = record(one)
-    plant = module._Plant.of(one, start)
+    plant = module._PlantStructure.of(one, start)
     assert module._path_loop(plant, ()) is None
     assert module._slopes_loop(plant) is None
     expected = eqx.filter_jit(trajectory)(one, start, jnp.asarray(torque))
-    found = path(one, start, torque)
+    found = simulate_plant(one, start, torque)
     for side in one.sides:
         assert found.position[side] == pytest.approx(np.asarray(expected.position[side]), rel=1e-12)
-    changes, new = slopes(one, found, torque, 1e-3 * np.arange(STEPS), [Direction(torque=1.0)])
+    changes, new = step_derivatives(one, found, torque, 1e-3 * np.arange(STEPS), [Direction(torque=1.0)])
     assert changes.shape == (1, 4, STEPS)
     inertia = float(one.drive.motor_inertia)
     motor = sorted(one.sides).index("motor") + 2
@@ -144,24 +144,27 @@ def test_tables_that_no_step_reads_are_no_obstacle():
     start, torque, _ = record(one)
     recorded = as_arrays(Recorded(np.arange(3.0), np.arange(3.0)), np.float64)
     other = eqx.tree_at(lambda e: e.excitation, one, recorded)
-    assert module._path_loop(module._Plant.of(other, start), ()) is not None
-    assert module._slopes_loop(module._Plant.of(other, start)) is not None
-    expected, found = path(one, start, torque), path(other, start, torque)
+    assert module._path_loop(module._PlantStructure.of(other, start), ()) is not None
+    assert module._slopes_loop(module._PlantStructure.of(other, start)) is not None
+    expected, found = simulate_plant(one, start, torque), simulate_plant(other, start, torque)
     assert np.array_equal(found.position["motor"], expected.position["motor"])
     ways = [directions(e, start)[:6] for e in (one, other)]
-    both = [slopes(e, expected, torque, 1e-3 * np.arange(STEPS), way)[0] for e, way in zip((one, other), ways, strict=True)]
+    both = [
+        step_derivatives(e, expected, torque, 1e-3 * np.arange(STEPS), way)[0]
+        for e, way in zip((one, other), ways, strict=True)
+    ]
     assert np.array_equal(*both)
 
 
 def test_columns_of_other_lengths_are_refused():
     one = experiment([])
     start, torque, _ = record(one)
-    states = path(one, start, torque)
+    states = simulate_plant(one, start, torque)
     with pytest.raises(ValueError, match="of a loop needs"):
-        slopes(one, states, torque[:-1], 1e-3 * np.arange(STEPS - 1), directions(one, start))
+        step_derivatives(one, states, torque[:-1], 1e-3 * np.arange(STEPS - 1), directions(one, start))
     gain = dict.fromkeys(one.sides, np.array([0.3, 20.0]))
     with pytest.raises(ValueError, match="of a loop needs"):
-        path(one, start, torque, 0.0, dict.fromkeys(one.sides, torque[:-5]), gain)
+        simulate_plant(one, start, torque, 0.0, dict.fromkeys(one.sides, torque[:-5]), gain)
 
 
 def test_other_numbers_need_no_other_loop_and_loops_come_and_go():
@@ -171,11 +174,11 @@ def test_other_numbers_need_no_other_loop_and_loops_come_and_go():
     for inertia in (0.02, 0.04):
         other = set_leaves(one, {"drive.motor_inertia": jnp.asarray(inertia)})
         before = module._path_loop.cache_info().misses
-        runs.append(path(other, start, torque).position["motor"])
+        runs.append(simulate_plant(other, start, torque).position["motor"])
     assert module._path_loop.cache_info().misses == before
     assert np.ptp(runs[0] - runs[1]) > 0.0
     # made, used and dropped many times in one process
     for _ in range(5):
         module._path_loop.cache_clear()
         gc.collect()
-        assert np.array_equal(path(one, start, torque).position["motor"], runs[0])
+        assert np.array_equal(simulate_plant(one, start, torque).position["motor"], runs[0])

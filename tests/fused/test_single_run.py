@@ -12,7 +12,7 @@ from jaxbl.drive import Encoders, Initial, TwoInertia, as_arrays
 from jaxbl.drive.effects import make_effect
 from jaxbl.drive.excitation import Multisine, Prbs
 from jaxbl.drive.transmission import DeadZone
-from jaxbl.fused.single_run import recorded
+from jaxbl.fused.single_run import record_run
 from jaxbl.observer import EquivalentControl, Identifier, ImplicitSuperTwisting, Observers
 from jaxbl.simulate import Experiment, Reducer, Run, scan
 from jaxbl.sweeps.metrics import METRICS
@@ -67,7 +67,7 @@ def scanned(excitation):
 )
 def test_figures_and_record_are_those_of_the_scan(excitation, every, reducers):
     whole, figures, record = scanned(excitation)
-    found, kept = recorded(whole, 3, reducers, row, every)
+    found, kept = record_run(whole, 3, reducers, row, every)
     assert list(kept) == ["u", "torque", "moving", "t"]
     assert set(found) == set(figures) - (set() if ODD in reducers else {"odd", "sum"})
     for name, column in kept.items():
@@ -80,7 +80,7 @@ def test_figures_and_record_are_those_of_the_scan(excitation, every, reducers):
 def test_a_run_in_single_precision():
     with jax.enable_x64(False):
         whole = experiment(Multisine(5.0, 0.8), 500, "float32")
-        found, kept = recorded(whole, 3, (METRICS,), row)
+        found, kept = record_run(whole, 3, (METRICS,), row)
         figures, record = jax.jit(lambda seed: scan(whole, seed, (METRICS,), row))(jnp.asarray(3, jnp.uint32))
     assert {column.dtype.name for column in kept.values()} == {"float32", "bool"}
     np.testing.assert_allclose(kept["torque"], record["torque"], atol=1e-3 * np.ptp(record["torque"]))

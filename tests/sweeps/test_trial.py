@@ -137,7 +137,7 @@ def test_backends(monkeypatch):
     def unsupported(*_):
         raise Unsupported("a step of its own")
 
-    monkeypatch.setattr("jaxbl.fused.single_run.recorded", unsupported)
+    monkeypatch.setattr("jaxbl.fused.single_run.record_run", unsupported)
     with pytest.raises(
         InputError, match=r"backend: the fused loop does not know a step of its own; use 'scan', or leave it out"
     ):

@@ -54,7 +54,7 @@ WHOLE = 64
 """Lanes, or samples: whole vectors of the widest registers there are, two of them."""
 
 
-class Native:
+class CppChain:
     """One workload, ready to run; arrays are the kernel's, so that a run allocates nothing. `own`: it makes input and noise
     by itself, of another seed each time; else they are given."""
 

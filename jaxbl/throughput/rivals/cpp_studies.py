@@ -39,7 +39,7 @@ class _Study(ctypes.Structure):
     _fields_ = [(name, ctypes.c_double) for name in _NUMBERS] + [(name, ctypes.c_int64) for name in _COUNTS]
 
 
-class NativeStudy:
+class CppStudy:
     """A study, ready to run by so many threads, `vectors` of lanes at a time; the input is given.
 
     `own`: it makes noise by itself, of other seeds at each call; else it is given jaxbl's, of the study's seeds.

@@ -18,7 +18,7 @@ from ..jaxbl_chain import LANES
 from ..workload import FIGURES, Chunked, Workload
 
 
-class Diffrax(Chunked):
+class DiffraxChain(Chunked):
     """One workload, compiled."""
 
     def __init__(self, workload: Workload):

@@ -16,7 +16,7 @@ WIDTH = 64
 """Lanes of a block: several registers of the widest vectors, and a state that stays in the first cache."""
 
 
-class Compiled:
+class NumbaChain:
     """One workload; `blocked` chooses the form that vectorises."""
 
     def __init__(self, workload: Workload, threads: int, blocked: bool):

@@ -21,7 +21,7 @@ def numbers_of(kind: Callable[[float], Any]) -> tuple[Any, ...]:
     return tuple(kind(value) for value in (*constants().values(), 0.0, 0.5, 4.0))
 
 
-class Plain:
+class PythonChain:
     """One workload as a loop over time.
 
     Args:
