@@ -148,7 +148,7 @@ BAD = {
     "no such backend": (["sweep", "study.toml", "--backend", "gpu"], "--backend: there is no 'gpu'; one of fused, scan"),
     "seeds alone, fused": (
         ["sweep", "seeds.toml", "--backend", "fused"],
-        "seeds.toml: --backend fused: the fused loop does not know lanes that differ in nothing but their seed; "
+        "seeds.toml: --backend fused: the fused loop does not support lanes that differ only in their seed; "
         "use --backend scan",
     ),
     "no such backend for gains": (

@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 
-SCAN_MESSAGE = "Scanned, and slower for it: the fused loop does not know %s."
+SCAN_MESSAGE = "The fused loop does not support %s; the slower scan is used."
 """Said of what is left to XLA."""
 
 
@@ -24,7 +24,7 @@ class Unsupported(Exception):
 
 
 @contextmanager
-def raising_unsupported(what: str = f"how to compile with JAX {jax.__version__}") -> Iterator[None]:
+def raising_unsupported(what: str = f"compilation with JAX {jax.__version__}") -> Iterator[None]:
     """Around the making of a loop: whatever goes wrong is `Unsupported`, as JAX and LLVM change from version to version."""
     try:
         yield

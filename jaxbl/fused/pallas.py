@@ -71,7 +71,7 @@ class Kernel:
 
     def compiled(self) -> Callable[..., list[Array]]:
         """For the device at hand. Raises `Unsupported` where there is no such kernel."""
-        with raising_unsupported("how to compile for this device"):
+        with raising_unsupported("compilation for this device"):
             return jax.jit(self.run).lower(*self.arguments).compile()
 
     def run(self, values: list[Array], inputs: tuple[list[Array], list[Array], list[Array]]) -> list[Array]:

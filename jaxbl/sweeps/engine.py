@@ -120,7 +120,7 @@ class Engine:
     def _faster(self) -> Backend:
         """By the study, however it is cut: roundings differ between backends."""
         if not self._varied:
-            # lanes that differ in nothing but their seed
+            # lanes that differ only in their seed
             return "scan"
         layouts: dict[Backend, Layout] = {backend: self._layout(backend, None) for backend in BACKENDS}
         steps = sum(group.config.run.steps for group in self.points.groups)

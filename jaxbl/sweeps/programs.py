@@ -84,7 +84,7 @@ class Layout(NamedTuple):
 class Program(NamedTuple):
     """What runs a chunk: `run` maps values by path `(points,)` and seeds `(seeds,)` to figures `(seeds, points)` and gains,
     which have these axes or fit them; it takes `megabytes` of memory. Where the scan takes the fused loop's place, `instead`
-    says what the loop does not know."""
+    says what the loop does not support."""
 
     run: Callable[[dict[str, np.ndarray], np.ndarray], tuple[dict[str, Any], dict[str, ObserverGains]]]
     megabytes: float
@@ -131,7 +131,7 @@ def compile_program(
                     return _fused(experiment, layout, devices, tuple(columns), names)
             except Unsupported as why:
                 if insist:
-                    raise InputError(f"--backend fused: the fused loop does not know {why}; use --backend scan") from None
+                    raise InputError(f"--backend fused: the fused loop does not support {why}; use --backend scan") from None
                 return _scanned(experiment, layout, devices, columns)._replace(instead=str(why))
         return _scanned(experiment, layout, devices, columns)
 
@@ -141,7 +141,7 @@ def compile_program(
 
 def _fused(experiment: Experiment, layout: Layout, devices: list[Any], paths: tuple[str, ...], names: Names) -> Program:
     if not paths:
-        raise Unsupported("lanes that differ in nothing but their seed")
+        raise Unsupported("lanes that differ only in their seed")
     from jaxbl.fused.lane_simulator import DeviceSimulator, HostSimulator
 
     if devices[0].platform == "cpu":

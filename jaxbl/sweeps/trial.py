@@ -91,7 +91,7 @@ def _recorded(experiment: Experiment, seed: int, every: int, *, insist: bool) ->
             return record_run(experiment, seed, _REDUCERS, partial(_row, experiment), every)
     except Unsupported as why:
         if insist:
-            raise InputError(f"backend: the fused loop does not know {why}; use 'scan', or leave it out") from None
+            raise InputError(f"backend: the fused loop does not support {why}; use 'scan', or leave it out") from None
         warn_of_scan(str(why))
         return _scanned(experiment, seed, every)
 

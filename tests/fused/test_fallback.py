@@ -37,9 +37,9 @@ def moved(monkeypatch):
 
 
 UNKNOWN = {
-    renamed: r"how to compile with JAX [\d.]+ \(UnknownForm: \w+ without new_\w+( or new_call_jaxpr)?\)",
-    unread: r"how to compile with JAX [\d.]+ \(RuntimeError: LLVM IR parsing error\)",
-    moved: r"how to compile with JAX [\d.]+ \(ModuleNotFoundError: import of jaxbl\.fused\.\w+ halted.*\)",
+    renamed: r"compilation with JAX [\d.]+ \(UnknownForm: \w+ without new_\w+( or new_call_jaxpr)?\)",
+    unread: r"compilation with JAX [\d.]+ \(RuntimeError: LLVM IR parsing error\)",
+    moved: r"compilation with JAX [\d.]+ \(ModuleNotFoundError: import of jaxbl\.fused\.\w+ halted.*\)",
 }
 
 
@@ -73,7 +73,9 @@ def test_a_sweep_is_scanned(swept, unknown, caplog):
     (why,) = result.scanned
     np.testing.assert_array_equal(result.frame[NAME], swept[NAME])
     assert re.fullmatch(said, why)
-    with pytest.raises(jaxbl.InputError, match=f"^--backend fused: the fused loop does not know {said}; use --backend scan"):
+    with pytest.raises(
+        jaxbl.InputError, match=f"^--backend fused: the fused loop does not support {said}; use --backend scan"
+    ):
         jaxbl.sweep(SWEPT, backend="fused")
     assert not caplog.messages
 

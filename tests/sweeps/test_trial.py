@@ -139,7 +139,7 @@ def test_backends(monkeypatch):
 
     monkeypatch.setattr("jaxbl.fused.single_run.record_run", unsupported)
     with pytest.raises(
-        InputError, match=r"backend: the fused loop does not know a step of its own; use 'scan', or leave it out"
+        InputError, match=r"backend: the fused loop does not support a step of its own; use 'scan', or leave it out"
     ):
         run(study, backend="fused")
     pd.testing.assert_frame_equal(run(study).trace, both[1].trace)
