@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from jaxbl.workers import cores, start_jax
+from jaxbl.workers import count_cores, start_jax
 
 start_jax()
 
@@ -38,7 +38,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--seconds", type=float, default=1.0)
     parser.add_argument("--real-time", action="store_true")
-    parser.add_argument("--threads", type=int, default=cores())
+    parser.add_argument("--threads", type=int, default=count_cores())
     given = parser.parse_args()
     print(f"{given.steps} samples, {given.threads} threads; microseconds a run")
     print("precision  lanes   C++ own  fused own  ratio   C++ given  fused kept  ratio")

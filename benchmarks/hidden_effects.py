@@ -44,9 +44,9 @@ def _files(logs: Sequence[Log], holdout: Log, folder: Path) -> tuple[list[Path],
 def package(logs: Sequence[Log], model: Mapping[str, Any], holdout: Log) -> Mapping[str, Any]:
     """`jaxbl.diagnose`."""
     import jaxbl
-    from jaxbl.workers import forget_programs
+    from jaxbl.workers import clear_programs_if_needed
 
-    forget_programs()
+    clear_programs_if_needed()
     with tempfile.TemporaryDirectory() as folder:
         paths, other = _files(logs, holdout, Path(folder))
         found = jaxbl.diagnose(paths if len(paths) > 1 else paths[0], model, holdout=other)

@@ -8,11 +8,11 @@ import pandas as pd
 
 from .cluster import Scheduler, connected
 from .errors import InputError
-from .files import make_folder, results_of
-from .lines import described
+from .files import make_folder, run_or_read
+from .lines import format_descriptions
 from .records.files import is_log, log_endings
 from .report.diagnose import probability, rms_text
-from .workers import Progress, each, forget_programs, worth
+from .workers import Progress, clear_programs_if_needed, map_jobs, useful_processes
 
 
 class LogJob(NamedTuple):
@@ -70,10 +70,10 @@ def run_batch(
     make_folder(out)
     progress(0, len(work))
     rows = []
-    processes = worth(len(work)) if processes is None else min(processes, len(work))
+    processes = useful_processes(len(work)) if processes is None else min(processes, len(work))
     with connected(scheduler) as cluster:
         if cluster is None:
-            found = each(_diagnosed, work, processes)
+            found = map_jobs(_diagnosed, work, processes)
         else:
             found = cluster.each(_diagnosed, [job.absolute() for job in work])
         for row in found:
@@ -88,11 +88,11 @@ def _diagnosed(job: LogJob) -> dict[str, Any]:
     from .diagnosis.diagnose import read_diagnosis_task, run_diagnosis
     from .report.diagnose import write_diagnosis_report
 
-    forget_programs()
+    clear_programs_if_needed()
     try:
         task = read_diagnosis_task(job.log, job.model, holdout=job.holdout)
         file = job.folder / "diagnosis.json"
-        return batch_row(job.log, results_of(task, file, run_diagnosis, write_diagnosis_report, overwrite=job.overwrite))
+        return batch_row(job.log, run_or_read(task, file, run_diagnosis, write_diagnosis_report, overwrite=job.overwrite))
     except InputError as error:
         return batch_row(job.log, None, str(error))
 
@@ -125,4 +125,4 @@ def batch_lines(rows: list[dict[str, Any]]) -> list[str]:
             gap = " -> ".join(rms_text(row[f"theta_e_{when}"]) for when in ("before", "after"))
             verdict, text = row["verdict"].replace("_", " "), f"{named}  theta_e {gap} ({rms_text(row['theta_e_floor'])})"
         cells.append((row["log"], verdict.ljust(_LONGEST_VERDICT), text))
-    return described(cells)
+    return format_descriptions(cells)

@@ -14,7 +14,7 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any, TypeVar, Union
 
 from .errors import InputError, NoResult
-from .workers import cores, doing, start_jax
+from .workers import announce, count_cores, start_jax
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -205,13 +205,13 @@ def _local(count: int) -> "Iterator[Client]":
     from dask import config
     from distributed import Client, LocalCluster
 
-    doing("starting workers")
+    announce("starting workers")
     # a process that was forked would share the locks of this one's compiler
     with (
         config.set({"distributed.worker.multiprocessing-method": "spawn"}),
         LocalCluster(
             n_workers=count,
-            threads_per_worker=max(cores() // count, 1),
+            threads_per_worker=max(count_cores() // count, 1),
             processes=True,
             # any free port: with None it would be 8787, open to the network
             dashboard_address="127.0.0.1:0",

@@ -16,7 +16,7 @@ from .errors import InputError, NoResult
 from .fused import Unsupported
 from .sweeps.sweep import sweep
 from .sweeps.trial import run
-from .workers import PROGRAMS, cores, doing
+from .workers import PROGRAMS_VARIABLE, announce, count_cores
 
 
 class Finding(NamedTuple):
@@ -40,7 +40,7 @@ def examine() -> list[Finding]:
         _folder(Path()),
     ]
     for name, test in (("one run", _one_run), ("two backends", _two_backends)):
-        doing(f"testing {name}")
+        announce(f"testing {name}")
         try:
             findings.append(test(name))
         except (InputError, NoResult, Unsupported, RuntimeError) as error:
@@ -85,12 +85,12 @@ def _devices() -> str:
     devices = jax.devices()
     kinds = sorted({device.device_kind for device in devices})
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    return f"{len(devices)} {jax.default_backend()} ({', '.join(kinds)}); {cores()} cores, {memory:.0f} GiB"
+    return f"{len(devices)} {jax.default_backend()} ({', '.join(kinds)}); {count_cores()} cores, {memory:.0f} GiB"
 
 
 def _cache() -> Finding:
     """The folder of compiled programs."""
-    name = os.environ.get(PROGRAMS)
+    name = os.environ.get(PROGRAMS_VARIABLE)
     if not name:
         return Finding("cache", "compiled programs are not kept, so that every command compiles; set XDG_CACHE_HOME", False)
     folder = Path(name).parent

@@ -1,12 +1,12 @@
-"""Exceptions that the command line turns into one line: wrong input (exit 2), and no result to give (exit 1)."""
+"""The two exceptions that the command line prints as one line: wrong input (exit code 2), and no result (exit code 1)."""
 
-_LONGEST = 2000
-"""Characters of a message: a screen of text; what is longer repeats a file back to its author."""
+_MESSAGE_LENGTH = 2000
+"""Most characters of a message: a screen of text. A longer one repeats a user's file back to its author."""
 
 
-def printable(text: str) -> str:
-    """Text of any origin as one line for a terminal: line breaks, escape sequences and the like are spelt out."""
-    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+def escape_unprintable(text: str) -> str:
+    """Return text of any origin as one line for a terminal, with line breaks and escape sequences spelt out."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 class InputError(ValueError):
@@ -14,19 +14,19 @@ class InputError(ValueError):
 
     def __init__(self, message: str):
         # keys, values and file names may hold line breaks, and be of any length
-        super().__init__(printable(shortened(message, _LONGEST)))
+        super().__init__(escape_unprintable(shorten(message, _MESSAGE_LENGTH)))
 
 
 class NoResult(RuntimeError):
     """The input is valid, but there is no answer to give. The message is one line: what fails, where, by how much."""
 
     def __init__(self, message: str):
-        super().__init__(printable(shortened(message, _LONGEST)))
+        super().__init__(escape_unprintable(shorten(message, _MESSAGE_LENGTH)))
 
 
-def shortened(text: str, most: int) -> str:
-    """Text of at most so many characters: its begin and its end, if it is longer."""
-    if len(text) <= most:
+def shorten(text: str, limit: int) -> str:
+    """Return a text of at most `limit` characters; a longer one keeps its first and its last half."""
+    if len(text) <= limit:
         return text
-    half = (most - 3) // 2
-    return f"{text[: most - 3 - half]}...{text[len(text) - half :]}"
+    half = (limit - 3) // 2
+    return f"{text[: limit - 3 - half]}...{text[len(text) - half :]}"

@@ -1,4 +1,4 @@
-"""Files and folders that commands write: whole or not at all, as JSON that any program reads."""
+"""Files and folders that commands write: files appear whole or not at all, JSON has a checksum, and folders are locked."""
 
 import errno
 import hashlib
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LOG_RESULTS = ("inspection.json", "identification.json", "diagnosis.json", "watch.json")
-"""What `inspect`, `identify`, `diagnose` and `watch` write into a folder; each names the log that the results are of."""
+"""Files that `inspect`, `identify`, `diagnose` and `watch` write into a folder; each names the log of the results."""
 
 
-def place(name: str | Path) -> Path:
-    """A folder by its name: a path, or the address of an object store (`s3://bucket/folder`), which has those of a path's
-    methods that are needed here.
+def to_path(name: str | Path) -> Path:
+    """Return a folder by its name: a path, or the address of an object store (`s3://bucket/folder`), which has the methods
+    of a path that are needed here.
 
     Raises:
         InputError: a package for such addresses is missing.
@@ -36,7 +36,7 @@ def place(name: str | Path) -> Path:
     try:
         from upath import UPath
 
-        # other processes write there, too
+        # other processes write there, too, so that listings may not be cached
         return UPath(name, use_listings_cache=False)  # pyright: ignore[reportReturnType]
     except ImportError as error:
         raise InputError(
@@ -49,75 +49,84 @@ def place(name: str | Path) -> Path:
 
 
 def is_remote(path: Path) -> bool:
-    """Whether a path is in an object store: files there are always whole, there are no folders, and no locks."""
+    """True if a path is in an object store, where files are always whole, and there are no folders and no locks."""
     return not isinstance(path, Path)
 
 
-def plain(value: Any) -> Any:
-    """A value that JSON can hold: arrays and tables of numbers become lists, what is not finite becomes None."""
+def to_jsonable(value: Any) -> Any:
+    """Return a value that JSON can hold: arrays become lists, and numbers that are not finite become None.
+
+    Example:
+        >>> to_jsonable({"gap": np.array([0.1, np.nan])})
+        {'gap': [0.1, None]}
+    """
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_jsonable(member) for key, member in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    # the command line needs this module before it needs NumPy
+        return [to_jsonable(member) for member in value]
+    # imported here, since the command line starts without NumPy
     import numpy as np
 
-    value = np.asarray(value)
-    if value.ndim:
-        return [plain(item) for item in value.tolist()]
-    value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    array = np.asarray(value)
+    if array.ndim:
+        return [to_jsonable(member) for member in array.tolist()]
+    scalar = array.item()
+    return None if isinstance(scalar, float) and not math.isfinite(scalar) else scalar
 
 
-_ANEW = "begin anew with --overwrite, or choose another folder with --out"
+_BEGIN_ANEW = "begin anew with --overwrite, or choose another folder with --out"
 
 
 def checksum(content: bytes) -> str:
-    """Of some bytes: 32 hexadecimal digits."""
+    """Return the checksum of some bytes, 32 hexadecimal digits."""
     return hashlib.blake2b(content, digest_size=16).hexdigest()
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """An object from a file of ours without its checksum, which it agrees with if it has one."""
+    """Read a JSON object that a command wrote, and check it against its checksum, which is left out.
+
+    Raises:
+        InputError: the file is damaged, or not one of jaxbl's.
+    """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise InputError(f"{path}: is damaged ({error}); {_ANEW}") from None
+        raise InputError(f"{path}: is damaged ({error}); {_BEGIN_ANEW}") from None
     if not isinstance(data, dict):
         raise InputError(f"{path}: is not one of jaxbl's files; choose another folder with --out")
-    if "checksum" in data and data.pop("checksum") != _checksum_of(data):
-        raise InputError(f"{path}: is damaged (does not agree with its checksum); {_ANEW}")
+    if "checksum" in data and data.pop("checksum") != _json_checksum(data):
+        raise InputError(f"{path}: is damaged (does not agree with its checksum); {_BEGIN_ANEW}")
     return data
 
 
-def json_text(data: Mapping[str, Any]) -> str:
-    """An object as JSON with a checksum of all else in it."""
-    # keys and numbers as they are read again
-    plain_data: dict[str, Any] = json.loads(json.dumps(data))
-    return json.dumps(plain_data | {"checksum": _checksum_of(plain_data)}, indent=1, ensure_ascii=False)
+def json_with_checksum(data: Mapping[str, Any]) -> str:
+    """Return an object as JSON text, with a checksum of all its other keys."""
+    # the checksum is of the keys and numbers as they are read again
+    as_read: dict[str, Any] = json.loads(json.dumps(data))
+    return json.dumps(as_read | {"checksum": _json_checksum(as_read)}, indent=1, ensure_ascii=False)
 
 
-def _checksum_of(data: Mapping[str, Any]) -> str:
+def _json_checksum(data: Mapping[str, Any]) -> str:
     return checksum(json.dumps(data, sort_keys=True).encode())
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
-    """Write a file so that it is either there whole or not at all. Raises as :func:`written`."""
-    with written(path) as draft:
-        # names of files may hold bytes that are no UTF-8: JSON's own way of writing them
+    """Write a file so that it exists either whole or not at all. Raises as :func:`open_draft`."""
+    with open_draft(path) as draft:
+        # file names in the text may have bytes that are no UTF-8; they are escaped as JSON escapes them
         draft.write_bytes(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
 
 
-def begin_file(path: Path, content: str) -> bool:
-    """Write a file that is not there yet; returns False where another process was first. Raises as :func:`written`.
+def create_file(path: Path, content: str) -> bool:
+    """Write a file that does not exist yet. Returns False if another process was first. Raises as :func:`open_draft`.
 
-    An object store decides that by a put on condition, if it has one. Some ignore the condition: of two processes that write
-    at the same time, the later one is first then. The system's files are ours (:func:`locked`).
+    In an object store a conditional put decides which process is first. Some stores ignore the condition: of two processes
+    that write at the same time, the later one wins there. On a file system the folder is locked (:func:`lock_folder`).
     """
     if not is_remote(path):
         write_atomic(path, content)
         return True
-    with writing(path):
+    with catch_write_errors(path):
         if path.exists():
             return False
         try:
@@ -130,13 +139,13 @@ def begin_file(path: Path, content: str) -> bool:
 
 
 def write_table(path: Path, frame: "pd.DataFrame") -> None:
-    """Write a Parquet file so that it is either there whole or not at all. Raises as :func:`written`."""
-    with written(path) as draft:
+    """Write a Parquet file so that it exists either whole or not at all. Raises as :func:`open_draft`."""
+    with open_draft(path) as draft:
         frame.to_parquet(draft, index=False)
 
 
-def listed(folder: Path, pattern: str) -> list[Path]:
-    """Files and folders in a folder by a pattern of their names, sorted; none where it is not there."""
+def list_paths(folder: Path, pattern: str) -> list[Path]:
+    """List the files and folders in a folder whose names match a pattern, sorted; none if the folder does not exist."""
     try:
         return sorted(folder.glob(pattern))
     except FileNotFoundError:
@@ -144,7 +153,7 @@ def listed(folder: Path, pattern: str) -> list[Path]:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, or a folder with all that is in it; there may be none."""
+    """Remove a file, or a folder with its contents, if it exists."""
     if not path.is_dir():
         path.unlink(missing_ok=True)
     elif isinstance(path, Path):
@@ -153,7 +162,7 @@ def remove(path: Path) -> None:
         path.rmdir(recursive=True)
 
 
-def move(path: Path, target: Path) -> None:
+def rename_file(path: Path, target: Path) -> None:
     """Give a file another name in the same folder or store."""
     if is_remote(path):
         target.write_bytes(path.read_bytes())
@@ -163,11 +172,11 @@ def move(path: Path, target: Path) -> None:
 
 
 @contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Around what is written into a file or folder: one line if the system cannot.
+def catch_write_errors(path: Path) -> Iterator[None]:
+    """Turn errors of writing into a file or folder, inside the `with` block, into one line.
 
     Raises:
-        NoResult: there is no room for it, it may not be written, or the disk fails.
+        NoResult: the disk is full, access is denied, or the disk fails.
     """
     try:
         yield
@@ -179,16 +188,17 @@ def writing(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def written(path: Path) -> Iterator[Path]:
-    """A draft to be written, which takes the file's place once it is whole. Raises as :func:`writing`."""
+def open_draft(path: Path) -> Iterator[Path]:
+    """Yield the path of a draft, which takes the place of `path` when the `with` block ends. Raises as
+    :func:`catch_write_errors`."""
     if is_remote(path):
-        with TemporaryDirectory() as folder, writing(path):
+        with TemporaryDirectory() as folder, catch_write_errors(path):
             yield Path(folder) / path.name
             path.write_bytes((Path(folder) / path.name).read_bytes())
         return
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with writing(path):
+        with catch_write_errors(path):
             yield draft
             draft.replace(path)
     finally:
@@ -196,67 +206,71 @@ def written(path: Path) -> Iterator[Path]:
             draft.unlink()
 
 
-LOCK = ".lock"
-_DRAFT = re.compile(r"\.((probe|.+\.(json|toml|parquet|html|png))\.\d+|draft\..+)")
-"""Names of files and folders that a process leaves where it is killed while it writes."""
+LOCK_NAME = ".lock"
+_DRAFT_NAME = re.compile(r"\.((probe|.+\.(json|toml|parquet|html|png))\.\d+|draft\..+)")
+"""Names of files and folders that a killed process may leave behind."""
 
 
-class Busy(InputError):
-    """A folder that another process writes into."""
+class FolderInUse(InputError):
+    """Another process is writing into the folder."""
 
 
 @contextmanager
-def locked(folder: Path, *, shared: bool = False, wait: float = 0.0) -> Iterator[None]:
-    """Keep other processes from writing into a folder, which is made; with `shared`, those that do not share it.
-    Another process that has it is waited for so many seconds.
+def lock_folder(folder: Path, *, shared: bool = False, wait: float = 0.0) -> Iterator[None]:
+    """Make a folder, and keep other processes from writing into it inside the `with` block.
 
-    The system frees the lock of a process that dies, on a network file system that of a machine that is lost. A file system
-    without locks has none.
+    The system frees the lock of a process that dies, and on a network file system that of a machine that is lost. On a file
+    system without locks, and in an object store, nothing is locked.
+
+    Args:
+        folder: made if it does not exist.
+        shared: let other processes write that share it, too.
+        wait: seconds to wait for another process that has locked it.
 
     Raises:
-        Busy: another process writes into it.
-        InputError: it cannot be written to.
+        FolderInUse: another process is writing into it.
+        InputError: the folder cannot be written to.
     """
     make_folder(folder)
     if is_remote(folder):
         yield
         return
-    path = folder / LOCK
-    latest = time.monotonic() + wait
-    while (file := _taken(path, shared)) is None and time.monotonic() < latest:
+    path = folder / LOCK_NAME
+    deadline = time.monotonic() + wait
+    while (file := _acquire_lock(path, shared)) is None and time.monotonic() < deadline:
         time.sleep(0.05)
     if file is None:
-        raise Busy(
-            f"{folder}: {holder(folder) or 'another process'} is writing into it; wait until it has ended, or choose "
+        raise FolderInUse(
+            f"{folder}: {lock_holder(folder) or 'another process'} is writing into it; wait until it has ended, or choose "
             "another folder with --out"
         )
     try:
         yield
     finally:
         with suppress(OSError):
-            # those that share it still have it
-            if not shared or _lock(file, shared=False):
+            # the file stays while other processes share the lock
+            if not shared or _try_lock(file, shared=False):
                 path.unlink()
         file.close()
 
 
-def holder(folder: Path) -> str:
-    """The process that writes into a folder, its host, and since when; empty where none does."""
+def lock_holder(folder: Path) -> str:
+    """The process that has locked a folder, with its host and since when; "" if it is not locked."""
     if is_remote(folder):
         return ""
-    with suppress(OSError), (folder / LOCK).open("r+") as file:
-        return "" if _lock(file, shared=False) else file.read()
+    with suppress(OSError), (folder / LOCK_NAME).open("r+") as file:
+        return "" if _try_lock(file, shared=False) else file.read()
     return ""
 
 
-def _taken(path: Path, shared: bool) -> Any:
-    """The file of a lock that is ours now; None where another process has it."""
+def _acquire_lock(path: Path, shared: bool) -> Any:
+    """Return the open file of a lock that this process now holds; None if another process holds it."""
     while True:
         file = path.open("a+")
-        if not _lock(file, shared):
+        if not _try_lock(file, shared):
             file.close()
             return None
-        # who had it may have removed it meanwhile
+        # the process that held the lock may have removed the file meanwhile
         with suppress(FileNotFoundError):
             if os.fstat(file.fileno()).st_ino == path.stat().st_ino:
                 file.truncate(0)
@@ -266,8 +280,8 @@ def _taken(path: Path, shared: bool) -> Any:
         file.close()
 
 
-def _lock(file: Any, shared: bool) -> bool:
-    """Lock an open file. Returns whether that was possible."""
+def _try_lock(file: Any, shared: bool) -> bool:
+    """Lock an open file. Returns True if that was possible, or if the file system has no locks."""
     import fcntl
 
     try:
@@ -281,40 +295,51 @@ def _lock(file: Any, shared: bool) -> bool:
 
 
 def remove_drafts(folder: Path) -> None:
-    """Remove what processes have left in a folder of ours that were killed while they wrote."""
+    """Remove the drafts that killed processes have left in a result folder."""
     for draft in [] if is_remote(folder) else folder.rglob(".*"):
-        if _DRAFT.fullmatch(draft.name):
+        if _DRAFT_NAME.fullmatch(draft.name):
             remove(draft)
 
 
 def is_empty(folder: Path) -> bool:
-    """Whether nothing but our lock is in a folder."""
-    return all(path.name == LOCK for path in listed(folder, "*"))
+    """True if a folder contains at most a lock."""
+    return all(path.name == LOCK_NAME for path in list_paths(folder, "*"))
 
 
 @contextmanager
-def access(path: Path, how: str) -> Iterator[None]:
-    """Around what an object store is asked for. Raises `InputError` where it fails; `how` is what cannot be done then."""
+def catch_store_errors(path: Path, action: str) -> Iterator[None]:
+    """Turn any error of an object store, inside the `with` block, into an `InputError` of one line.
+
+    `action` completes the sentence "... cannot be ...", e.g. "read".
+    """
     try:
         yield
-    except Exception as error:  # of any kind: each store has its own
-        why = str(error).partition("\n")[0] or type(error).__name__
-        raise InputError(f"{path}: cannot be {how} ({why}); name another folder, or mend the access to it") from None
+    except Exception as error:  # each store has exceptions of its own
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise InputError(f"{path}: cannot be {action} ({reason}); name another folder, or mend the access to it") from None
 
 
 def has_file(folder: Path, name: str) -> bool:
-    """Whether a file is in a folder. Raises `InputError` where an object store cannot be asked."""
+    """True if a file is in a folder. Raises `InputError` if an object store cannot be read."""
     if is_remote(folder):
-        with access(folder, "read"):
+        with catch_store_errors(folder, "read"):
             return (folder / name).exists()
     return (folder / name).exists()
 
 
-def make_folder(path: Path, instead: str = "", option: str = "--out") -> None:
-    """Make a folder that can be written to. Raises `InputError` where that is not possible; `option` is what names the
-    folder, `instead` what to do where that is not to name another one."""
+def make_folder(path: Path, remedy: str = "", option: str = "--out") -> None:
+    """Make a folder, and check that it can be written to.
+
+    Args:
+        path: the folder, which may exist.
+        remedy: the end of the message; left out, it says to choose another folder with `option`.
+        option: the command-line option that names the folder.
+
+    Raises:
+        InputError: it cannot be made, or not be written to.
+    """
     if is_remote(path):
-        with access(path, "written to"):
+        with catch_store_errors(path, "written to"):
             (path / ".probe").write_bytes(b"")
             (path / ".probe").unlink()
         return
@@ -329,7 +354,7 @@ def make_folder(path: Path, instead: str = "", option: str = "--out") -> None:
         raise InputError(f"{path}: lies under a file; {option} should name a folder") from None
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be written to ({error.strerror}); {instead or f'choose another folder with {option}'}"
+            f"{path}: cannot be written to ({error.strerror}); {remedy or f'choose another folder with {option}'}"
         ) from None
 
 
@@ -337,64 +362,73 @@ def claim_log_folder(folder: Path, log: Path, *, overwrite: bool) -> None:
     """Make the folder for the results of a log.
 
     Raises:
-        InputError: it holds other files, or (unless `overwrite`) the results of another log, or cannot be written to.
+        InputError: it holds other files, or (unless `overwrite`) results of another log, or it cannot be written to.
     """
     make_folder(folder)
-    found = [folder / name for name in LOG_RESULTS if (folder / name).exists()]
-    if not found and not is_empty(folder):
+    results = [folder / name for name in LOG_RESULTS if (folder / name).exists()]
+    if not results and not is_empty(folder):
         raise InputError(f"{folder}: is not empty and holds no results of a log; choose another folder with --out")
-    for file in found:
-        other = log_named_in(file)
-        if other != str(log.resolve()) and not overwrite:
-            name = other or "an unreadable one"
+    for file in results:
+        log_path = read_log_path(file)
+        if log_path != str(log.resolve()) and not overwrite:
+            name = log_path or "an unreadable one"
             raise InputError(f"{folder}: holds results of another log ({name}); choose another with --out, or --overwrite")
-    if found:
+    if results:
         remove_drafts(folder)
 
 
-def log_named_in(file: Path) -> str | None:
-    """The log that the results in a file are of; None where that cannot be read. The rest may be damaged."""
+def read_log_path(file: Path) -> str | None:
+    """Read from a result file the path of its log; None if that cannot be read. The other keys may be damaged."""
     try:
         return str(json.loads(file.read_text(encoding="utf-8"))["file"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
-def results_of(
+def run_or_read(
     task: Any, file: Path, run: Callable[[Any], Any], write: Callable[[Any, Path], object], *, overwrite: bool
 ) -> dict[str, Any]:
-    """Do a task on a log, write its results into the folder of `file`, and return their summary. Where an earlier call left
-    the summary of the same task in `file`, that is read instead.
+    """Do a task on a log and write its results, unless an earlier call wrote the results of the same task.
+
+    Args:
+        task: has the `record` of the log, and an `identity` by which a summary of the same task is recognised.
+        file: the summary; other results are written into its folder.
+        run: does the task and returns its results, which have a `summary`.
+        write: writes the results into a folder.
+        overwrite: replace results of another log.
+
+    Returns:
+        The summary, of this call or as the earlier one wrote it.
 
     Raises:
         InputError: as :func:`claim_log_folder`, or as the task does.
     """
     folder = file.parent
-    with removed_if_empty(folder), locked(folder):
+    with remove_if_empty_on_error(folder), lock_folder(folder):
         claim_log_folder(folder, task.record.path, overwrite=overwrite)
         with suppress(OSError, InputError):
-            found = read_json(file)
-            if found.get("identity") == task.identity and _is_newest(file):
-                return found
-        done = run(task)
-        write(done, folder)
-    return done.summary
+            summary = read_json(file)
+            if summary.get("identity") == task.identity and _report_belongs_to(file):
+                return summary
+        result = run(task)
+        write(result, folder)
+    return result.summary
 
 
-def _is_newest(summary: Path) -> bool:
-    """Whether the report beside a summary is its own: it is written before, that of another command in this folder later."""
+def _report_belongs_to(summary: Path) -> bool:
+    """True if the report beside a summary belongs to it: it is then older, as another command in the folder writes later."""
     with suppress(OSError):
         return (summary.parent / "report.html").stat().st_mtime_ns <= summary.stat().st_mtime_ns
     return False
 
 
 @contextmanager
-def removed_if_empty(folder: Path) -> Iterator[None]:
-    """Remove a folder that is still empty when something goes wrong."""
+def remove_if_empty_on_error(folder: Path) -> Iterator[None]:
+    """Remove a folder that is still empty if the `with` block raises."""
     try:
         yield
     except BaseException:
-        # suppressed: it is not empty
+        # the system refuses to remove a folder that is not empty
         with suppress(OSError):
             if not is_remote(folder):
                 folder.rmdir()

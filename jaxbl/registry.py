@@ -1,4 +1,4 @@
-"""Classes and functions by name: those of this package, and those that installed packages add through entry points."""
+"""Tables of classes and functions by name: those of this package, and those that installed packages add by entry points."""
 
 import dataclasses
 import logging
@@ -8,61 +8,62 @@ from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import entry_points
 from typing import Any, TypeVar
 
-Added = TypeVar("Added", bound=type)
+Class = TypeVar("Class", bound=type)
 
 
 class Registry(Mapping[str, Any]):
-    """Name -> class or function. Entry points are loaded once, when names are first listed or one is not of this package.
+    """A mapping from names to classes or functions.
 
-    An entry that cannot be imported, or that the check refuses, is left out with one warning line (logger `jaxbl`): a
-    broken add-on never ends a command.
+    Entry points are loaded once: when all names are asked for, or a name that is not of this package. An entry that cannot
+    be imported, or that `check` refuses, is left out with one warning line (logger `jaxbl`), so that a broken add-on never
+    ends a command.
 
     Args:
         group: entry-point group, e.g. `jaxbl.transmissions`.
-        check: is given the name and the object of an entry, and raises an exception that says what is wrong with it.
+        check: called with the name and the object of each entry; raises an exception that says what is wrong with it.
     """
 
     def __init__(self, group: str, check: Callable[[str, Any], None]):
         self.group = group
         self._check = check
-        self._found: dict[str, Any] = {}
+        self._members: dict[str, Any] = {}
         self._loaded = False
 
-    def add(self, cls: Added) -> Added:
+    def add(self, cls: Class) -> Class:
         """Add a class of this package under its `name`; a decorator."""
-        self._found[cls.name] = cls  # type: ignore[attr-defined]
+        self._members[cls.name] = cls  # type: ignore[attr-defined]
         return cls
 
     def __getitem__(self, name: str) -> Any:
-        return self._found[name] if name in self._found else self._all()[name]
+        return self._members[name] if name in self._members else self._load_all()[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._all())
+        return iter(self._load_all())
 
     def __len__(self) -> int:
-        return len(self._all())
+        return len(self._load_all())
 
-    def _all(self) -> dict[str, Any]:
+    def _load_all(self) -> dict[str, Any]:
         if not self._loaded:
             self._loaded = True
-            for entry in entry_points(group=self.group):
+            for entry_point in entry_points(group=self.group):
                 try:
-                    if entry.name in self._found:
+                    if entry_point.name in self._members:
                         raise ValueError("the name is taken")
-                    found = entry.load()
-                    self._check(entry.name, found)
-                    self._found[entry.name] = found
+                    member = entry_point.load()
+                    self._check(entry_point.name, member)
+                    self._members[entry_point.name] = member
                 except (Exception, SystemExit) as error:
                     # one line a command: worker processes load the same entries again
                     if multiprocessing.parent_process() is None:
                         text = " ".join(f"{type(error).__name__}: {error}".split())
                         logging.getLogger("jaxbl").warning(
-                            f"warning: {self.group}: '{entry.name}' ({entry.value}) is left out: {text}"
+                            f"warning: {self.group}: '{entry_point.name}' ({entry_point.value}) is left out: {text}"
                         )
-        return self._found
+        return self._members
 
 
-def check_text(what: str, text: Any) -> None:
+def check_text(subject: str, text: Any) -> None:
     """Check a text that figures and pages show: one line, and nothing that figures take for mathematics.
 
     Raises:
@@ -70,32 +71,32 @@ def check_text(what: str, text: Any) -> None:
         ValueError: it has a control character, or a dollar sign.
     """
     if not isinstance(text, str):
-        raise TypeError(f"{what} should be text")
+        raise TypeError(f"{subject} should be text")
     if not text.isprintable() or "$" in text:
-        raise ValueError(f"{what} should be one line without control characters and without $, not {text!r}")
+        raise ValueError(f"{subject} should be one line without control characters and without $, not {text!r}")
 
 
-def check_subclass(name: str, found: Any, base: type) -> None:
-    """Check that an entry is a class that can be used in place of `base`, under the name that it was entered with.
+def check_subclass(name: str, cls: Any, base: type) -> None:
+    """Check that an entry point named `name` gives a class that can be used in place of `base`.
 
     Raises:
         TypeError: it is no class, not derived from `base`, lacks a method or number, or has another name.
         ValueError: the name is no lower-case word.
     """
-    if not (isinstance(found, type) and issubclass(found, base)):
+    if not (isinstance(cls, type) and issubclass(cls, base)):
         raise TypeError(f"should be a class derived from {base.__name__}")
-    if missing := {*getattr(found, "__abstractmethods__", ()), *getattr(found, "__abstractvars__", ())}:
+    if missing := {*getattr(cls, "__abstractmethods__", ()), *getattr(cls, "__abstractvars__", ())}:
         raise TypeError(f"should define {', '.join(sorted(missing))}")
-    if (own := getattr(found, "name", None)) != name:
-        raise TypeError(f"its name should be '{name}' as in the entry point, not {own!r}")
+    if (class_name := getattr(cls, "name", None)) != name:
+        raise TypeError(f"its name should be '{name}' as in the entry point, not {class_name!r}")
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise ValueError("its name should be a lower-case word of letters, digits and _")
 
 
-def check_module(name: str, found: Any, base: type) -> None:
-    """As :func:`check_subclass`, and that every number of the class is declared, as its config table needs it."""
-    check_subclass(name, found, base)
-    for field in dataclasses.fields(found):
+def check_module(name: str, cls: Any, base: type) -> None:
+    """Check as :func:`check_subclass` does, and that every number of the class is declared, as its config table needs it."""
+    check_subclass(name, cls, base)
+    for field in dataclasses.fields(cls):
         if "parameter" not in field.metadata:
             raise TypeError(f"{field.name} should be declared by parameter(...) or option(...)")
         check_text(f"{field.name}: unit", field.metadata["parameter"].unit)

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from .errors import InputError, printable
+from .errors import InputError, escape_unprintable
 from .lines import command_line
-from .workers import listening
+from .workers import subscribe
 
 if TYPE_CHECKING:
     from .workers import Progress
@@ -77,7 +77,7 @@ def running(
             raise
         state = "what is finished is kept. Go on with" if kept else "nothing was written. Start again with"
         again = command_line(*call_again(context, folder, kept=kept))
-        typer.echo(printable(f"interrupted; {state}: {again}"), err=True)
+        typer.echo(escape_unprintable(f"interrupted; {state}: {again}"), err=True)
         raise typer.Exit(INTERRUPTED) from None
     finally:
         signal.signal(signal.SIGINT, before)
@@ -176,7 +176,7 @@ def _bar(unit: str, first: str) -> "Iterator[Progress]":
             heard = True
             bar.update(task, description=what)
 
-        with listening(hear):
+        with subscribe(hear):
             yield update
 
 
@@ -228,12 +228,12 @@ def _lines(unit: str, first: str) -> "Iterator[Progress]":
     def speak() -> None:
         while not ended.wait(_LOOK):
             if line := lines.look(time.monotonic()):
-                typer.echo(printable(line), err=True)
+                typer.echo(escape_unprintable(line), err=True)
 
     speaker = threading.Thread(target=speak, name="jaxbl-progress", daemon=True)
     speaker.start()
     try:
-        with listening(lines.hear):
+        with subscribe(lines.hear):
             yield lines.update
     finally:
         ended.set()

@@ -1,103 +1,104 @@
-"""What users write, checked: files that have an end, sizes, strict tables, and one line that says what is wrong."""
+"""Checks of what users write: files, sizes of data, strict tables. Each error is one line that says what is wrong."""
 
 import difflib
 import stat
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
-from .errors import InputError, shortened
+from .errors import InputError, shorten
 
-_NAME = 200
-"""Characters of a key: file names have at most 255."""
-_TEXT = 10_000
-"""Characters of a text: remarks fill a page, not a book."""
-_DEPTH = 16
-"""Tables and arrays within one another: a study needs five."""
-_VALUES = 300_000
-"""Values of a study, some seconds of reading. More are given as start, stop and num, or by a recorded file."""
-_LISTED = 5
-"""Files that a message names."""
-_LEAST, LARGEST = 1e-30, 1e30
-"""The least positive number that may be divided by, and the largest magnitude of any: float32 ends at 1e-38 and 1e38, and no
+_KEY_LENGTH = 200
+"""Most characters of a key: file names have at most 255."""
+_TEXT_LENGTH = 10_000
+"""Most characters of a text: remarks fill a page, not a book."""
+_NESTING_DEPTH = 16
+"""Most levels of tables and arrays: a study needs five."""
+_VALUE_COUNT = 300_000
+"""Most values of a study, which take some seconds to read. Longer axes have start, stop and num; inputs, a recorded file."""
+_LISTED_FILES = 5
+"""Most files that a message names."""
+_SMALLEST, LARGEST = 1e-30, 1e30
+"""The least number that may be a divisor, and the largest magnitude of any number: float32 ends at 1e-38 and 1e38, and no
 drive has quantities near that in SI units."""
 
 
-def check_file(path: Path, most: int | None = None) -> None:
-    """Refuse what has no end or is larger than `most` bytes, before anything is read.
+def check_file(path: Path, size_limit: int | None = None) -> None:
+    """Refuse a file without an end (a pipe, a device) or of more than `size_limit` bytes, before anything is read.
 
     Raises:
-        InputError: a pipe or a device, or too large; the message is without the path.
-        OSError: it cannot be found.
+        InputError: it is a pipe or a device, or too large. The message is without the path.
+        OSError: there is no such file.
     """
-    found = path.stat()
-    if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
+    status = path.stat()
+    if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
         raise InputError("is a pipe or a device; a file is needed")
-    if most is not None and found.st_size > most:
-        raise InputError(f"has {found.st_size / 1e6:.0f} MB; it should have at most {most / 1e6:.0f} MB")
+    if size_limit is not None and status.st_size > size_limit:
+        raise InputError(f"has {status.st_size / 1e6:.0f} MB; it should have at most {size_limit / 1e6:.0f} MB")
 
 
-def _not_tiny(number: float) -> float:
-    if 0.0 < number < _LEAST:
-        raise wrong(f"should be at least {_LEAST:g}, not {number:g}")
+def _check_not_tiny(number: float) -> float:
+    if 0.0 < number < _SMALLEST:
+        raise table_error(f"should be at least {_SMALLEST:g}, not {number:g}")
     return number
 
 
-Positive = Annotated[float, AfterValidator(_not_tiny)]
-"""Type of a key that has to be above 0, as it is divided by."""
+Positive = Annotated[float, AfterValidator(_check_not_tiny)]
+"""Type of a key that has to be above 0, since it is a divisor."""
 
 
 def check_sizes(data: Any) -> None:
-    """Refuse data out of a text file, or given in its place, that are beyond what tables and terminals can take.
+    """Refuse data from a text file (or passed in its place) that are too large for tables and terminals.
 
     Raises:
-        InputError: nested too deep, too many values, a number of no possible size, a long name or text, or control
-            characters in it; the message names the key.
+        InputError: nested too deep, too many values, a number of impossible size, a long name or text, or control
+            characters in it. The message names the key.
     """
     count = 0
-    # without recursion: that is what deep data break
-    waiting = [iter([("", data)])]
-    while waiting:
-        entry = next(waiting[-1], None)
-        if entry is None:
-            waiting.pop()
+    # a stack in place of recursion, which deep data would break
+    stack = [iter([("", data)])]
+    while stack:
+        member = next(stack[-1], None)
+        if member is None:
+            stack.pop()
             continue
-        key, value = entry
+        key, value = member
         count += 1
-        if count > _VALUES:
+        if count > _VALUE_COUNT:
             raise InputError(
-                f"holds more than {_VALUES} values; give axes by start, stop and num, inputs as a recorded file"
+                f"holds more than {_VALUE_COUNT} values; give axes by start, stop and num, inputs as a recorded file"
             )
         if isinstance(value, dict | list | tuple):
-            if len(waiting) > _DEPTH:
+            if len(stack) > _NESTING_DEPTH:
                 raise InputError(
-                    f"{shortened(key, _NAME)}: tables or arrays within one another; at most {_DEPTH} are possible"
+                    f"{shorten(key, _KEY_LENGTH)}: tables or arrays within one another; "
+                    f"at most {_NESTING_DEPTH} are possible"
                 )
-            waiting.append(_entries(key, value))
-        elif fault := _fault(value):
-            raise InputError(f"{shortened(key, _NAME)}: {fault}")
+            stack.append(_iterate_members(key, value))
+        elif fault := _find_fault(value):
+            raise InputError(f"{shorten(key, _KEY_LENGTH)}: {fault}")
 
 
-def _entries(key: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """What a table or an array holds, with the key of each."""
+def _iterate_members(key: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the members of a table or an array, with the full key of each."""
     if not isinstance(value, Mapping):
-        yield from ((f"{key}[{i}]", one) for i, one in enumerate(value))
+        yield from ((f"{key}[{i}]", member) for i, member in enumerate(value))
         return
-    for name, one in value.items():
-        place = f"{key}.{name}" if key else str(name)
-        if fault := _fault(str(name), _NAME):
-            raise InputError(f"{shortened(place, _NAME)}: a key {fault}")
-        yield place, one
+    for name, member in value.items():
+        member_key = f"{key}.{name}" if key else str(name)
+        if fault := _find_fault(str(name), _KEY_LENGTH):
+            raise InputError(f"{shorten(member_key, _KEY_LENGTH)}: a key {fault}")
+        yield member_key, member
 
 
-def _fault(value: Any, longest: int = _TEXT) -> str:
-    """What is wrong with a single value; "" if nothing is."""
+def _find_fault(value: Any, text_length: int = _TEXT_LENGTH) -> str:
+    """Say what is wrong with a single value; "" if nothing is."""
     if isinstance(value, str):
-        if len(value) > longest:
-            return f"should have at most {longest} characters, not {len(value)}"
+        if len(value) > text_length:
+            return f"should have at most {text_length} characters, not {len(value)}"
         if not value.isprintable():
             bad = next(
                 (c for c in value if (c < " " and c not in "\t\n\r") or "\x7f" <= c < "\xa0" or "\ud800" <= c < "\ue000"), ""
@@ -107,17 +108,17 @@ def _fault(value: Any, longest: int = _TEXT) -> str:
         if LARGEST < abs(value) < float("inf"):
             return f"should be at most {LARGEST:g} in magnitude, not {value:g}"
     elif isinstance(value, int) and not -(2**63) <= value < 2**63:
-        return f"should be a number of 64 bits, not {shortened(hex(value), 40)}"
+        return f"should be a number of 64 bits, not {shorten(hex(value), 40)}"
     return ""
 
 
-def no_such_file(path: Path, endings: Collection[str]) -> str:
-    """What to say of a file that is not there: one beside it whose name is near, or those there are, of some endings."""
+def explain_missing_file(path: Path, endings: Collection[str]) -> str:
+    """Return a message for a file that is not there: it names the file with the nearest name, or all with those endings."""
     folder = path.parent
     if not folder.is_dir():
         return f"no such file: there is no folder {folder}"
     try:
-        names = sorted(one.name for one in folder.iterdir() if one.suffix.lower() in endings and one.is_file())
+        names = sorted(file.name for file in folder.iterdir() if file.suffix.lower() in endings and file.is_file())
     except OSError:
         names = []
     stems = {Path(name).stem: name for name in reversed(names)}
@@ -126,78 +127,78 @@ def no_such_file(path: Path, endings: Collection[str]) -> str:
     if not names:
         where = folder if folder.name else "this folder"
         return f"no such file; {where} has none of its kind"
-    return f"no such file; here are {', '.join([*names[:_LISTED], *(['...'] if len(names) > _LISTED else [])])}"
+    return f"no such file; here are {', '.join([*names[:_LISTED_FILES], *(['...'] if len(names) > _LISTED_FILES else [])])}"
 
 
-def nearest(word: str, words: Any) -> str:
-    """A hint that names the nearest valid word, or all of them where none is near."""
-    words = list(words)
-    if len(word) > _NAME:
-        return f"it should have at most {_NAME} characters"
-    close = difflib.get_close_matches(word, words, n=1, cutoff=0.6)
-    return f"did you mean '{close[0]}'?" if close else f"valid: {', '.join(words)}"
+def suggest_word(word: str, valid: Iterable[str]) -> str:
+    """Return a hint: the valid word that is nearest to `word`, or all of them if none is near."""
+    valid = list(valid)
+    if len(word) > _KEY_LENGTH:
+        return f"it should have at most {_KEY_LENGTH} characters"
+    close = difflib.get_close_matches(word, valid, n=1, cutoff=0.6)
+    return f"did you mean '{close[0]}'?" if close else f"valid: {', '.join(valid)}"
 
 
 class StrictTable(BaseModel):
-    """A table of the config: strict types, finite numbers, no unknown keys."""
+    """A table of the config, with strict types, finite numbers and no unknown keys."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, validate_default=False)
 
     @model_validator(mode="before")
     @classmethod
-    def _known_keys(cls, data: Any) -> Any:
+    def _reject_unknown_keys(cls, data: Any) -> Any:
         if isinstance(data, Mapping):
             keys = [field.alias or name for name, field in cls.model_fields.items()]
             for key in data:
                 if key not in keys:
-                    hint = nearest(str(key), keys)
+                    hint = suggest_word(str(key), keys)
                     raise PydanticCustomError("unknown_key", "unknown key '{key}'; {hint}", {"key": key, "hint": hint})
         return data
 
 
-def wrong(message: str) -> PydanticCustomError:
-    """What a table's own check raises."""
+def table_error(message: str) -> PydanticCustomError:
+    """Return the exception that a table's own check raises."""
     return PydanticCustomError("consistency", message)  # type: ignore[arg-type]
 
 
 Key = tuple[str | int, ...]
-"""Where a value lies in a config: keys of tables and positions in arrays."""
+"""The place of a value in a config: keys of tables and positions in arrays."""
 
 
-def first_error(error: ValidationError, location: list[str | int] | None = None) -> tuple[Key, str]:
-    """The first error: the key that is wrong, and one line that says so.
+def explain_first_error(error: ValidationError, location: list[str | int] | None = None) -> tuple[Key, str]:
+    """Return the key of the first error, and one line that says what is wrong with it.
 
-    `location` is the key, where pydantic's own has more in it than keys.
+    `location` is the key, if pydantic's own location contains more than keys.
     """
     first = error.errors()[0]
     location = list(first["loc"]) if location is None else location
-    key = ""
+    dotted = ""
     for part in location:
-        key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)
-    where = f"{key}: " if key else ""
-    kind, context, given = first["type"], first.get("ctx", {}), brief(first["input"])
-    place = tuple(location)
+        dotted += f"[{part}]" if isinstance(part, int) else f".{part}" if dotted else str(part)
+    prefix = f"{dotted}: " if dotted else ""
+    kind, context, value = first["type"], first.get("ctx", {}), abbreviate(first["input"])
+    key = tuple(location)
     if kind == "missing":
-        return place, f"{where}this key is missing"
+        return key, f"{prefix}this key is missing"
     if kind == "union_tag_invalid":
-        tags = [t.strip(" '") for t in context["expected_tags"].split(",")]
+        tags = [tag.strip(" '") for tag in context["expected_tags"].split(",")]
         name = context["discriminator"].strip("'")
-        return (*place, name), f"{key}.{name}: unknown {name} '{context['tag']}'; {nearest(context['tag'], tags)}"
+        return (*key, name), f"{dotted}.{name}: unknown {name} '{context['tag']}'; {suggest_word(context['tag'], tags)}"
     if kind == "union_tag_not_found":
-        return place, f"{where}the key {context['discriminator']} is missing"
+        return key, f"{prefix}the key {context['discriminator']} is missing"
     if kind in ("model_type", "model_attributes_type", "dict_type"):
-        return place, f"{where}should be a table, not {given}"
+        return key, f"{prefix}should be a table, not {value}"
     if kind == "list_type":
-        return place, f"{where}should be an array, not {given}"
+        return key, f"{prefix}should be an array, not {value}"
     message = first["msg"].removeprefix("Input ")
     if kind == "unknown_key":
-        return (*place, context["key"]), f"{where}{message}"
+        return (*key, context["key"]), f"{prefix}{message}"
     if kind == "consistency":
-        return place, f"{where}{message}"
-    return place, f"{where}{message}, not {given}"
+        return key, f"{prefix}{message}"
+    return key, f"{prefix}{message}, not {value}"
 
 
-def brief(given: Any) -> str:
-    """A value as messages show it."""
-    text = repr(given)
+def abbreviate(value: Any) -> str:
+    """Return a value as messages show it."""
+    text = repr(value)
     return text if len(text) <= 80 else f"{text[:77]}..."

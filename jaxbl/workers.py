@@ -1,4 +1,4 @@
-"""Independent jobs on all cores, in processes of their own: progress, interrupts, and memory of compiled programs."""
+"""Independent jobs in worker processes, on all cores: progress, interrupts, and memory of compiled programs."""
 
 import gc
 import multiprocessing
@@ -16,25 +16,25 @@ from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from .errors import NoResult, printable
+from .errors import NoResult, escape_unprintable
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 Progress = Callable[[int, int], None]
-"""Called with the number of finished and of all lanes."""
+"""A function called with the number of finished lanes and of all lanes."""
 
 _listeners: list[Callable[[str], None]] = []
 
-_MEMORY = 5 * 2**30
-"""Bytes that a process is granted: after twenty logs of many lengths one held 4.7e9."""
-_MOST_MAPPINGS = 30_000
-"""Half of what Linux allows a process by default."""
+_PROCESS_MEMORY = 5 * 2**30
+"""Bytes for each process: after twenty logs of many lengths one held 4.7e9."""
+_MAPPING_LIMIT = 30_000
+"""Memory mappings of a process: half of what Linux allows by default."""
 
 
 @contextmanager
-def listening(listener: Callable[[str], None]) -> Iterator[None]:
-    """Hear what is being done (:func:`doing`)."""
+def subscribe(listener: Callable[[str], None]) -> Iterator[None]:
+    """Call `listener` with each text that is announced (:func:`announce`) inside the `with` block."""
     _listeners.append(listener)
     try:
         yield
@@ -42,42 +42,49 @@ def listening(listener: Callable[[str], None]) -> Iterator[None]:
         _listeners.remove(listener)
 
 
-def doing(what: str) -> None:
-    """Say what is being done now, in a few words: the progress line of a terminal shows it."""
+def announce(activity: str) -> None:
+    """Tell all listeners what is being done now, in a few words; the progress line of a terminal shows it."""
     for listener in _listeners:
-        listener(what)
+        listener(activity)
 
 
 @contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Keep BLAS to one thread: matrices are small here, and where cores are shared threads wait longer for one another than
-    they compute."""
+def limit_blas_threads() -> Iterator[None]:
+    """Keep BLAS to one thread inside the `with` block.
+
+    Matrices are small here: on shared cores its threads wait for one another longer than they compute.
+    """
     with threadpool_limits(1, "blas"):
         yield
 
 
-def cores() -> int:
-    """Cores that this process may use."""
+def count_cores() -> int:
+    """Count the cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def worth(jobs: int) -> int:
-    """Processes that so many jobs are worth: one a core, as memory allows; an accelerator serves one alone."""
+def useful_processes(jobs: int) -> int:
+    """Return how many processes to start for some jobs: one a core, as memory allows, but one in all on an accelerator."""
     import jax
 
     if jax.default_backend() != "cpu":
         return 1
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return max(min(cores(), memory // _MEMORY, jobs), 1)
+    return max(min(count_cores(), memory // _PROCESS_MEMORY, jobs), 1)
 
 
-def each(function: Callable[[Job], Result], jobs: Sequence[Job], processes: int) -> Iterator[Result]:
-    """Results of a function (importable by name), in the order of its arguments, by so many processes; 1 is this one.
+def map_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], processes: int) -> Iterator[Result]:
+    """Yield the results of `function` for each job, in their order, as `map` does.
 
-    An interrupt reaches the jobs under way, and no further ones begin.
+    After an interrupt no further jobs begin, and those under way are interrupted, too.
+
+    Args:
+        function: importable by name, as other processes call it.
+        jobs: its arguments, one a call.
+        processes: number of worker processes; with 1, this process does all jobs.
 
     Raises:
-        NoResult: a process was killed.
+        NoResult: a worker process was killed.
     """
     if processes == 1:
         yield from map(function, jobs)
@@ -87,123 +94,127 @@ def each(function: Callable[[Job], Result], jobs: Sequence[Job], processes: int)
     # a process that was forked would share the locks of this one's compiler
     context = multiprocessing.get_context("spawn")
     cache = jax.config.values["jax_compilation_cache_dir"], jax.config.values["jax_persistent_cache_min_compile_time_secs"]
-    with ProcessPoolExecutor(processes, context, _prepare, cache) as pool:
-        futures = [pool.submit(_interruptible, function, job) for job in jobs]
+    with ProcessPoolExecutor(processes, context, _start_process, cache) as pool:
+        futures = [pool.submit(_run_job, function, job) for job in jobs]
         try:
-            for one in futures:
-                yield one.result()
+            for future in futures:
+                yield future.result()
         except BrokenProcessPool:
-            raise NoResult("a process was killed, perhaps for want of memory; --jobs 1 takes least of it") from None
+            raise NoResult("a worker process was killed, perhaps because memory ran out; --jobs 1 needs the least") from None
         finally:
-            if not all(one.done() for one in futures):
-                for one in futures:
-                    one.cancel()
+            if not all(future.done() for future in futures):
+                for future in futures:
+                    future.cancel()
                 for child in multiprocessing.active_children():
                     with suppress(ProcessLookupError):
                         os.kill(child.pid, signal.SIGINT)  # pyright: ignore[reportArgumentType]
 
 
-_busy = _stopped = False
+_job_running = _interrupted = False
 
 
-def _interrupted(number: int, frame: object) -> None:
-    """Between two jobs an interrupt would end the process with a traceback; jobs that wait in its queue must not begin."""
-    global _stopped
-    _stopped = True
-    if _busy:
+def _handle_interrupt(number: int, frame: object) -> None:
+    """Interrupt the running job, and let no further one begin.
+
+    Between two jobs nothing is raised, since that would end the process with a traceback.
+    """
+    global _interrupted
+    _interrupted = True
+    if _job_running:
         raise KeyboardInterrupt
 
 
-PROGRAMS = "JAXBL_PROGRAMS"
-"""Name of the environment variable with the folder of compiled programs (:mod:`jaxbl.fused.program_cache`). Without it, or
-where it is empty, no program is kept."""
+PROGRAMS_VARIABLE = "JAXBL_PROGRAMS"
+"""Environment variable with the folder of compiled programs (:mod:`jaxbl.fused.program_cache`). Without it, or
+where it is empty, programs are not stored."""
 
 
 def start_jax(devices: int | None = None) -> None:
-    """Use every core as a device, or so many, and keep compiled programs between runs."""
-    # matrices are small here: threads of BLAS would wait for one another longer than they compute; before NumPy is loaded
+    """Prepare JAX: `devices` CPU devices (left out: one a core), and compiled programs stored between runs."""
+    # as limit_blas_threads does; it has to be set before NumPy is loaded
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     import jax
 
-    collect_rarely()
+    collect_garbage_rarely()
     _ignore_cache_warnings()
     if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
-        # it has begun already: a later job of one worker
+        # JAX has started already in a worker process that does a second job
         with suppress(RuntimeError):
-            jax.config.update("jax_num_cpu_devices", cores() if devices is None else devices)
-    # every program's results are waited for: to hand each to another thread takes longer than many of them run
+            jax.config.update("jax_num_cpu_devices", count_cores() if devices is None else devices)
+    # the results of every program are awaited anyway, and handing it to another thread takes longer than many programs run
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     if jax.config.values["jax_compilation_cache_dir"] is None:
-        # of this Python's own: another one packs programs otherwise
-        cache = _cache()
+        # a folder for each version of Python: each packs programs in its own way
+        cache = _find_cache_folder()
         if cache is not None:
             jax.config.update("jax_compilation_cache_dir", str(cache))
-        # also what takes less than a second: a study has many of them
+        # store programs that compile in less than a second, too: a study has many of them
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    # and what was compiled is found without tracing it; processes that this one starts do so, too
+    # the package's own store finds programs without tracing them; worker processes read the same variable
     folder = jax.config.values["jax_compilation_cache_dir"]
-    os.environ.setdefault(PROGRAMS, f"{folder}/programs" if folder else "")
+    os.environ.setdefault(PROGRAMS_VARIABLE, f"{folder}/programs" if folder else "")
 
 
-def _cache() -> Path | None:
-    """The folder of compiled programs among the user's caches; None where it cannot be had, or is not only this user's."""
-    given = os.environ.get("XDG_CACHE_HOME", "")
-    # an empty or relative one says nothing, by the XDG base directory specification
+def _find_cache_folder() -> Path | None:
+    """The folder of compiled programs among the user's caches; None if it cannot be made private to this user."""
+    caches = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    # the XDG base directory specification ignores an empty or relative path
     try:
-        folder = (Path(given) if Path(given).is_absolute() else Path.home() / ".cache") / "jaxbl"
+        folder = (caches if caches.is_absolute() else Path.home() / ".cache") / "jaxbl"
     except RuntimeError:
         return None  # a user without a home
-    own = folder / sys.implementation.cache_tag
-    return own if own_folder(folder) and own_folder(own) else None
+    programs = folder / sys.implementation.cache_tag
+    return programs if make_private_folder(folder) and make_private_folder(programs) else None
 
 
-def own_folder(folder: Path) -> bool:
-    """Make a folder for what will be run as code, with access for its user alone if it is new.
+def make_private_folder(folder: Path) -> bool:
+    """Make a folder for compiled code, readable by this user alone if it is new.
 
-    Returns whether it is there, this user's, and nobody else may write into it; one line says so where it is not.
+    Returns True if it exists, belongs to this user, and nobody else may write into it. Otherwise one line is printed.
     """
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         folder.mkdir(mode=0o700, exist_ok=True)
-        found = folder.stat()
+        status = folder.stat()
     except OSError:
         return False
-    why = ""
-    if found.st_uid != os.geteuid():
-        why = "is another user's"
-    elif found.st_mode & 0o022:
-        why = "can be written to by others; remove it, to have it made anew"
-    if why and folder not in _refused:
-        _refused.add(folder)
-        print(f"jaxbl: {printable(str(folder))}: {why}; compiled programs are not kept there", file=sys.stderr)
-    return not why
+    fault = ""
+    if status.st_uid != os.geteuid():
+        fault = "is another user's"
+    elif status.st_mode & 0o022:
+        fault = "can be written to by others; remove it, to have it made anew"
+    if fault and folder not in _refused_folders:
+        _refused_folders.add(folder)
+        print(f"jaxbl: {escape_unprintable(str(folder))}: {fault}; compiled programs are not stored there", file=sys.stderr)
+    return not fault
 
 
-_refused: set[Path] = set()
-"""Folders of which that was said."""
+_refused_folders: set[Path] = set()
+"""Folders for which the line was printed."""
 
 
-def collect_rarely() -> None:
-    """Look for unreachable objects less often: what JAX makes while it traces lives on, and searching it takes a tenth of a
+def collect_garbage_rarely() -> None:
+    """Collect garbage less often: what JAX makes while it traces stays reachable, and searching it takes a tenth of a
     command's time (benchmarks/NOTES.md)."""
     gc.set_threshold(200_000, 50, 100)
 
 
 def _ignore_cache_warnings() -> None:
-    """JAX warns of a kept program that another process is still writing, and compiles it."""
+    """Silence JAX's warning about a stored program that another process is still writing; it compiles the program itself."""
     warnings.filterwarnings("ignore", "Error reading persistent compilation cache entry", UserWarning)
 
 
-def _prepare(cache: str | None, least: float) -> None:
+def _start_process(cache: str | None, compile_time: float) -> None:
+    """Prepare a worker process; programs that compile in less than `compile_time` (s) are not stored in the cache."""
     import jax
 
-    collect_rarely()
+    collect_garbage_rarely()
     _ignore_cache_warnings()
-    signal.signal(signal.SIGINT, _interrupted)
-    # nothing else tells a process that the one it works for was killed
+    signal.signal(signal.SIGINT, _handle_interrupt)
+    # nothing else tells a worker that its parent was killed
     threading.Thread(target=_end_with_parent, daemon=True).start()
     jax.config.update("jax_compilation_cache_dir", cache)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", compile_time)
 
 
 def _end_with_parent() -> None:
@@ -213,22 +224,25 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _interruptible(function: Callable[[Job], Result], job: Job) -> Result:
-    global _busy
-    if _stopped:
+def _run_job(function: Callable[[Job], Result], job: Job) -> Result:
+    global _job_running
+    if _interrupted:
         raise KeyboardInterrupt
-    _busy = True
+    _job_running = True
     try:
         return function(job)
     finally:
-        _busy = False
+        _job_running = False
 
 
-def forget_programs() -> None:
-    """Let go of compiled programs before those of logs of many lengths use up the mappings that the system allows."""
+def clear_programs_if_needed() -> None:
+    """Clear JAX's caches if this process is near the system's limit of memory mappings.
+
+    Each length of a log has programs of its own, and each program some mappings.
+    """
     import jax
 
     with suppress(OSError):
         count = Path("/proc/self/maps").read_bytes().count(b"\n")
-        if count > _MOST_MAPPINGS:
+        if count > _MAPPING_LIMIT:
             jax.clear_caches()

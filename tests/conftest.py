@@ -21,9 +21,9 @@ import pytest
 from hypothesis import settings
 from progress_lines import without_progress
 
-from jaxbl.workers import collect_rarely, forget_programs
+from jaxbl.workers import clear_programs_if_needed, collect_garbage_rarely
 
-collect_rarely()
+collect_garbage_rarely()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -45,7 +45,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def _few_programs():
     """Over many files, compiled programs would use up what the system lets a process map into memory."""
     yield
-    forget_programs()
+    clear_programs_if_needed()
 
 
 @pytest.fixture(scope="module")

@@ -31,8 +31,8 @@ from jaxbl.cli import setup
 from jaxbl.cli.next_steps import LogCall, after_diagnosis, after_identification
 from jaxbl.cli.options import folder_of
 from jaxbl.errors import InputError
-from jaxbl.files import locked
-from jaxbl.lines import lines_of, program
+from jaxbl.files import lock_folder
+from jaxbl.lines import format_steps, program_name
 from jaxbl.sweeps.engine import Engine
 
 FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
@@ -416,7 +416,7 @@ def test_shares_by_the_command_of_which_the_last_writes_the_report(call, tmp_pat
     code, lines, _ = call("sweep", "study.toml", "--share", "1/2")
     assert code == 0 and "1 of 2 parts (50 %) of 6 runs" in lines[0]
     assert lines[-1] == "When all parts are there, 'jaxbl sweep study.toml --out results/study' writes the report."
-    with locked(tmp_path / "results" / "study", shared=True):
+    with lock_folder(tmp_path / "results" / "study", shared=True):
         # another one is still at work: it is the last
         code, lines, _ = call("sweep", "study.toml", "--share", "2/2")
         assert code == 0 and "2 of 2 parts (100 %)" in lines[0] and "all parts are there" in lines[1]
@@ -1003,7 +1003,7 @@ def test_after_logs_what_is_open_by_what_was_found():
         return SimpleNamespace(record=SimpleNamespace(segments=cut), missing=frozenset(missing))
 
     def commands(steps):
-        assert all(len(line) <= 80 for line in lines_of(steps) if line.startswith("    "))
+        assert all(len(line) <= 80 for line in format_steps(steps) if line.startswith("    "))
         assert steps[-1].command == "jaxbl explore out"
         return [one.command for one in steps[:-1]]
 
@@ -1047,11 +1047,11 @@ def test_commands_are_named_as_a_shell_finds_them(tmp_path, monkeypatch):
         (folder / name).touch(0o755)
     monkeypatch.setattr(sys, "executable", str(folder / "python"))
     monkeypatch.setenv("PATH", str(folder))
-    assert program() == "jaxbl"
+    assert program_name() == "jaxbl"
     # `make demo` runs what is in a folder that the shell does not search
     monkeypatch.setenv("PATH", "/nowhere")
-    assert program() == shlex.quote(str(folder / "jaxbl"))
+    assert program_name() == shlex.quote(str(folder / "jaxbl"))
     monkeypatch.chdir(tmp_path)
-    assert program() == "'my venv/bin/jaxbl'"
+    assert program_name() == "'my venv/bin/jaxbl'"
     (folder / "jaxbl").unlink()
-    assert program() == f"{shlex.quote(str(folder / 'python'))} -m jaxbl"
+    assert program_name() == f"{shlex.quote(str(folder / 'python'))} -m jaxbl"

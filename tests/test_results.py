@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from jaxbl.errors import InputError
-from jaxbl.files import json_text, locked, read_json, results_of
+from jaxbl.files import json_with_checksum, lock_folder, read_json, run_or_read
 
 
 @pytest.fixture
@@ -16,7 +16,7 @@ def found(tmp_path):
 
     def write(result, folder):
         (folder / "report.html").write_text("its own")
-        (folder / "identification.json").write_text(json_text(result.summary))
+        (folder / "identification.json").write_text(json_with_checksum(result.summary))
 
     def call():
         def run(task):
@@ -24,7 +24,7 @@ def found(tmp_path):
             return SimpleNamespace(summary={"identity": "abc", "file": str(task.record.path)})
 
         file = tmp_path / "out" / "identification.json"
-        assert results_of(task, file, run, write, overwrite=False)["identity"] == "abc"
+        assert run_or_read(task, file, run, write, overwrite=False)["identity"] == "abc"
         return len(done)
 
     return call
@@ -59,7 +59,7 @@ def test_results_that_do_not_agree_with_their_checksum_are_made_again(found, tmp
 
 
 def test_one_process_writes_into_a_folder(found, tmp_path):
-    with locked(tmp_path / "out"), pytest.raises(InputError, match="is writing into it; wait until it has ended"):
+    with lock_folder(tmp_path / "out"), pytest.raises(InputError, match="is writing into it; wait until it has ended"):
         found()
     assert found() == 1
     assert not (tmp_path / "out" / ".lock").exists()

@@ -13,7 +13,7 @@ import pytest
 
 from jaxbl import workers
 from jaxbl.errors import NoResult
-from jaxbl.workers import _cache, doing, each, forget_programs, listening, worth
+from jaxbl.workers import _find_cache_folder, announce, clear_programs_if_needed, map_jobs, subscribe, useful_processes
 
 
 def square(x):
@@ -48,14 +48,14 @@ def alive(process):
 
 @pytest.mark.parametrize("processes", [1, 2])
 def test_results_come_in_order(processes):
-    assert list(each(square, [3, 1, 2], processes)) == [9, 1, 4]
+    assert list(map_jobs(square, [3, 1, 2], processes)) == [9, 1, 4]
     with pytest.raises(ValueError, match="not 7"):
-        list(each(fails, [7], processes))
+        list(map_jobs(fails, [7], processes))
 
 
 def test_a_killed_process_is_told():
-    with pytest.raises(NoResult, match="a process was killed"):
-        list(each(is_killed, [1, 2], 2))
+    with pytest.raises(NoResult, match="a worker process was killed"):
+        list(map_jobs(is_killed, [1, 2], 2))
 
 
 @pytest.fixture
@@ -75,7 +75,7 @@ def test_an_interrupt_reaches_the_jobs_under_way(tmp_path, heeded):
     start = time.monotonic()
     threading.Thread(target=interrupt).start()
     with pytest.raises(KeyboardInterrupt):
-        list(each(lasts, [tmp_path] * 9, 2))
+        list(map_jobs(lasts, [tmp_path] * 9, 2))
     assert (tmp_path / "interrupted").exists() and time.monotonic() - start < 50.0
     assert len(list(tmp_path.iterdir())) <= 3
 
@@ -96,25 +96,25 @@ def test_processes_end_with_the_one_they_work_for(tmp_path):
 
 
 def test_there_is_a_process_for_each_core_and_no_more_than_jobs():
-    assert worth(1) == 1
-    assert 1 <= worth(10_000) <= (os.cpu_count() or 1)
+    assert useful_processes(1) == 1
+    assert 1 <= useful_processes(10_000) <= (os.cpu_count() or 1)
 
 
 def test_programs_are_forgotten_once_they_are_many(monkeypatch):
     calls = []
     monkeypatch.setattr(jax, "clear_caches", lambda: calls.append(1))
-    forget_programs()
-    monkeypatch.setattr("jaxbl.workers._MOST_MAPPINGS", 10)
-    forget_programs()
+    clear_programs_if_needed()
+    monkeypatch.setattr("jaxbl.workers._MAPPING_LIMIT", 10)
+    clear_programs_if_needed()
     assert len(calls) == 1
 
 
 def test_what_is_being_done_is_heard_while_someone_listens():
     heard = []
-    doing("before")
-    with listening(heard.append):
-        doing("trying load.gravity")
-    doing("afterwards")
+    announce("before")
+    with subscribe(heard.append):
+        announce("trying load.gravity")
+    announce("afterwards")
     assert heard == ["trying load.gravity"]
 
 
@@ -122,7 +122,7 @@ def test_what_is_being_done_is_heard_while_someone_listens():
 def home(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setattr(workers, "_refused", set())
+    monkeypatch.setattr(workers, "_refused_folders", set())
     return tmp_path
 
 
@@ -133,30 +133,30 @@ def test_compiled_programs_are_kept_in_a_folder_of_the_user_alone(home, monkeypa
     if given is not None:
         monkeypatch.setenv("XDG_CACHE_HOME", given)
     own = home / ".cache" / "jaxbl"
-    assert _cache() == own / sys.implementation.cache_tag
-    assert [folder.stat().st_mode & 0o777 for folder in (own, _cache())] == [0o700, 0o700]
+    assert _find_cache_folder() == own / sys.implementation.cache_tag
+    assert [folder.stat().st_mode & 0o777 for folder in (own, _find_cache_folder())] == [0o700, 0o700]
     assert [path.name for path in home.iterdir()] == [".cache"]
 
 
 def test_compiled_programs_of_others_are_not_run(home, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(home / "caches"))
     own = home / "caches" / "jaxbl"
-    assert _cache() == own / sys.implementation.cache_tag
+    assert _find_cache_folder() == own / sys.implementation.cache_tag
     own.chmod(0o770)
-    assert [_cache(), _cache()] == [None, None]
+    assert [_find_cache_folder(), _find_cache_folder()] == [None, None]
     said = (
-        f"jaxbl: {own}: can be written to by others; remove it, to have it made anew; compiled programs are not kept there"
+        f"jaxbl: {own}: can be written to by others; remove it, to have it made anew; compiled programs are not stored there"
     )
     assert capsys.readouterr().err == f"{said}\n"
     own.chmod(0o700)
     monkeypatch.setattr(os, "geteuid", lambda: own.stat().st_uid + 1)
-    assert _cache() is None
+    assert _find_cache_folder() is None
 
 
 def test_a_user_without_a_home_keeps_no_programs(home, monkeypatch):
     monkeypatch.delenv("HOME")
     monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("no home")))
-    assert _cache() is None
+    assert _find_cache_folder() is None
 
 
 def test_a_program_that_another_process_is_still_writing_is_compiled_in_silence(tmp_path):

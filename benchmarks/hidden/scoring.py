@@ -155,10 +155,10 @@ def run(found: Sequence[Case], diagnose: Diagnose, oracle: Oracle | None = None,
         oracle: what the true effects can reach.
         jobs: processes that share the work; functions must then be importable.
     """
-    from jaxbl.workers import each
+    from jaxbl.workers import map_jobs
 
     results = []
-    for i, (one, model) in enumerate(each(partial(_one, diagnose=diagnose, oracle=oracle), found, jobs)):
+    for i, (one, model) in enumerate(map_jobs(partial(_one, diagnose=diagnose, oracle=oracle), found, jobs)):
         results.append((one, model))
         said = "right" if one.right and not one.spurious else "WRONG"
         print(

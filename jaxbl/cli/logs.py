@@ -9,7 +9,7 @@ import typer
 
 from jaxbl import workers
 from jaxbl.errors import InputError
-from jaxbl.lines import Step
+from jaxbl.lines import NextStep
 from jaxbl.terminal import call_again, is_quiet, running, until_asked
 
 from .next_steps import LogCall, after_diagnosis, after_identification, after_proposal, after_watch
@@ -118,7 +118,7 @@ def identify(
         if next_experiment is not None:
             raise InputError("identify: --next-experiment is for drives, not for a transmission on a test rig; leave it out")
         return _identify_element(log[0], table, gear_ratio, holdout, folder_of(log[0], out), overwrite)
-    from jaxbl.files import results_of
+    from jaxbl.files import run_or_read
     from jaxbl.identification.identify import read_identification_task, run_identification
     from jaxbl.report.identify import identification_lines, write_identification_report
 
@@ -130,11 +130,11 @@ def identify(
     folder = folder_of(log[0], out)
     given = LogCall(log, model, holdout, next_experiment)
 
-    def steps(summary: Mapping[str, Any]) -> list[Step]:
+    def steps(summary: Mapping[str, Any]) -> list[NextStep]:
         return after_identification(task, summary, call_again(context, folder), folder, given)
 
     with running(context, model, folder, unit="steps", kept=False) as progress:
-        summary = results_of(
+        summary = run_or_read(
             task,
             folder / "identification.json",
             lambda task: run_identification(task, progress),
@@ -152,13 +152,13 @@ def identify(
 def _identify_element(
     log: Path, table: "LogTable", gear_ratio: float | None, holdout: Path | None, folder: Path, overwrite: bool
 ) -> Outcome:
-    from jaxbl.files import results_of
+    from jaxbl.files import run_or_read
     from jaxbl.identification.element import read_element_task, run_element
     from jaxbl.report.element import element_lines, write_element_report
 
     task = read_element_task(log, table, gear_ratio, holdout=holdout)
     file = folder / "identification.json"
-    summary = results_of(task, file, run_element, write_element_report, overwrite=overwrite)
+    summary = run_or_read(task, file, run_element, write_element_report, overwrite=overwrite)
     return Outcome(element_lines(summary), folder, summary=summary)
 
 
@@ -205,18 +205,18 @@ def diagnose(
         raise InputError("diagnose: no model; give a study with nominal parameters: --model TOML")
     workers.start_jax()
     from jaxbl.diagnosis.diagnose import read_diagnosis_task, run_diagnosis
-    from jaxbl.files import results_of
+    from jaxbl.files import run_or_read
     from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
 
     task = read_diagnosis_task(log, model, holdout=holdout)
     folder = folder_of(log[0], out)
     given = LogCall(log, model, holdout, next_experiment)
 
-    def steps(summary: Mapping[str, Any]) -> list[Step]:
+    def steps(summary: Mapping[str, Any]) -> list[NextStep]:
         return after_diagnosis(task, summary, call_again(context, folder), folder, given)
 
     with running(context, model, folder, unit="steps", kept=False) as progress:
-        summary = results_of(
+        summary = run_or_read(
             task,
             folder / "diagnosis.json",
             lambda task: run_diagnosis(task, progress),
@@ -287,7 +287,7 @@ def watch(
 ) -> Outcome:
     """Watch a drive's gap, stiffness and friction over a log or a stream; exit code 3 if there was an alarm."""
     workers.start_jax()
-    from jaxbl.files import locked, removed_if_empty
+    from jaxbl.files import lock_folder, remove_if_empty_on_error
     from jaxbl.monitoring.watch import read_watch_task
     from jaxbl.report.watch import watch_lines, write_watch_report
 
@@ -297,7 +297,7 @@ def watch(
         found = _watched(context, task, None)
         code = ALARM if found.summary["alarm"] else 0
         return Outcome(watch_lines(found.summary), summary=found.summary, code=code, compact=True)
-    with removed_if_empty(folder), locked(folder):
+    with remove_if_empty_on_error(folder), lock_folder(folder):
         _claim_watch(folder, task, overwrite)
         found = _watched(context, task, folder)
         steps = after_watch(task, found.summary, model)
@@ -320,8 +320,8 @@ def _watched(context: typer.Context, task: "WatchTask", folder: Path | None) -> 
     import json
     from contextlib import ExitStack
 
-    from jaxbl.errors import printable
-    from jaxbl.files import plain
+    from jaxbl.errors import escape_unprintable
+    from jaxbl.files import to_jsonable
     from jaxbl.monitoring.watch import run_watch, value_line
     from jaxbl.report.watch import values_file
 
@@ -329,7 +329,7 @@ def _watched(context: typer.Context, task: "WatchTask", folder: Path | None) -> 
 
     def remark(text: str) -> None:
         if not quiet:
-            typer.echo(printable(f"jaxbl: {text}"), err=True)
+            typer.echo(escape_unprintable(f"jaxbl: {text}"), err=True)
 
     with ExitStack() as stack:
         keep = None
@@ -341,7 +341,7 @@ def _watched(context: typer.Context, task: "WatchTask", folder: Path | None) -> 
             if keep is not None:
                 keep(values)
             if as_json:
-                typer.echo(json.dumps(plain(values), ensure_ascii=False))
+                typer.echo(json.dumps(to_jsonable(values), ensure_ascii=False))
             elif not quiet:
                 typer.echo(value_line(values, task))
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jaxbl.files import is_remote
-from jaxbl.lines import Step, command_line
+from jaxbl.lines import NextStep, command_line
 
 if TYPE_CHECKING:
     from jaxbl.identification.logs import LogTask
@@ -13,36 +13,40 @@ if TYPE_CHECKING:
     from jaxbl.sweeps.sweep import StudyResult
 
 
-def after_init(file: Path) -> list[Step]:
+def after_init(file: Path) -> list[NextStep]:
     """What a first study from a data sheet can be given to."""
     name = Path("results") / file.stem
     return [
-        Step(command_line("simulate", file), "How do the drive and the estimates of its observers move? One run."),
-        Step(command_line("sweep", file, "--out", f"{name}_map"), "Which gains of the motor observer work? A map."),
-        Step(command_line("tune", file, "--out", f"{name}_gains"), "Which gains have the least error, and how large is it?"),
+        NextStep(command_line("simulate", file), "How do the drive and the estimates of its observers move? One run."),
+        NextStep(command_line("sweep", file, "--out", f"{name}_map"), "Which gains of the motor observer work? A map."),
+        NextStep(
+            command_line("tune", file, "--out", f"{name}_gains"), "Which gains have the least error, and how large is it?"
+        ),
     ]
 
 
-def after_demo(result: "StudyResult", folder: Path) -> list[Step]:
+def after_demo(result: "StudyResult", folder: Path) -> list[NextStep]:
     """As :func:`after_sweep`, and a study of one's own."""
     steps, own = after_sweep(result, folder), Path("drive.toml")
     if not own.exists():
-        steps.append(Step(command_line("init", own), "And my own drive? A study of it, from the numbers of its data sheet."))
+        steps.append(
+            NextStep(command_line("init", own), "And my own drive? A study of it, from the numbers of its data sheet.")
+        )
     return steps
 
 
-def after_sweep(result: "StudyResult", folder: Path) -> list[Step]:
+def after_sweep(result: "StudyResult", folder: Path) -> list[NextStep]:
     """What can be asked of a sweep, and of its study, which its folder has, too."""
     study = folder / "study.toml"
-    steps = [Step(command_line("explore", folder), "How do other metrics look, over other axes? Maps in the browser.")]
+    steps = [NextStep(command_line("explore", folder), "How do other metrics look, over other axes? Maps in the browser.")]
     if is_remote(study):
         return steps
     gains = {f"observer.{side}.{gain}" for side in ("motor", "load") for gain in ("lambda", "alpha")}
     if gains & {axis.path for axis in result.config.axes} and _all_converge_somewhere(result):
         answers = "Which gains have the least error, and are they better than the usual rule?"
-        steps.append(Step(command_line("tune", study, "--out", f"{folder}_gains"), answers))
+        steps.append(NextStep(command_line("tune", study, "--out", f"{folder}_gains"), answers))
     answers = "What happens over time? One run, with the numbers that the study itself has."
-    return [*steps, Step(command_line("simulate", study, "--out", f"{folder}_run"), answers)]
+    return [*steps, NextStep(command_line("simulate", study, "--out", f"{folder}_run"), answers)]
 
 
 def _all_converge_somewhere(result: "StudyResult") -> bool:
@@ -57,15 +61,15 @@ def _all_converge_somewhere(result: "StudyResult") -> bool:
     return False
 
 
-def after_proposal(log: Path, model: Path) -> list[Step]:
+def after_proposal(log: Path, model: Path) -> list[NextStep]:
     """What a proposed model is for."""
     answers = "Which numbers does the machine have, and how sure are they?"
-    return [Step(command_line("identify", log, "--model", model), answers)]
+    return [NextStep(command_line("identify", log, "--model", model), answers)]
 
 
 def after_identification(
     task: "LogTask", summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: "LogCall"
-) -> list[Step]:
+) -> list[NextStep]:
     """What is open after an identification.
 
     Args:
@@ -82,16 +86,18 @@ def after_identification(
     if not all(map(is_noise, summary["residual"].values())):
         if given.holdout is not None or can_hold_out(task.record):
             words = ("diagnose", *given.words(), "--out", f"{folder}_diagnosed")
-            steps.append(Step(command_line(*words), "What does the model lack? Its errors are larger than noise."))
+            steps.append(NextStep(command_line(*words), "What does the model lack? Its errors are larger than noise."))
     elif _runs(task):
         words = ("simulate", folder / "model.toml", "--out", f"{folder}_run")
-        steps.append(Step(command_line(*words), "How does the drive move with these numbers, and what do observers see?"))
+        steps.append(
+            NextStep(command_line(*words), "How does the drive move with these numbers, and what do observers see?")
+        )
     return [*steps, *_gap_experiment(summary, again, folder, given), _along_the_log(folder)]
 
 
 def after_diagnosis(
     task: "LogTask", summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: "LogCall"
-) -> list[Step]:
+) -> list[NextStep]:
     """What is open after a diagnosis; arguments as of :func:`after_identification`."""
     from jaxbl.diagnosis.diagnosis_summary import tied
 
@@ -99,24 +105,26 @@ def after_diagnosis(
     pair = None if "backlash" in summary or given.next_experiment else tied(summary)
     if pair is not None:
         words = (*again, "--next-experiment", f"{folder}_next.csv")
-        steps.append(Step(command_line(*words), f"Is it {pair[0]} or {pair[1]}? An input that shows it."))
+        steps.append(NextStep(command_line(*words), f"Is it {pair[0]} or {pair[1]}? An input that shows it."))
     if summary["verdict"] == "no_discrepancy":
         words = ("identify", *given.words(), "--out", f"{folder}_identified")
-        steps.append(Step(command_line(*words), "How sure are the model's numbers? 95 % intervals of each."))
+        steps.append(NextStep(command_line(*words), "How sure are the model's numbers? 95 % intervals of each."))
     if summary["findings"] and _runs(task):
         words = ("simulate", model, "--out", f"{folder}_run")
-        steps.append(Step(command_line(*words), "How does the drive move with what was found? The extended study, run."))
+        steps.append(NextStep(command_line(*words), "How does the drive move with what was found? The extended study, run."))
     return [*steps, _along_the_log(folder)]
 
 
-def after_watch(task: "WatchTask", summary: Mapping[str, Any], model: Path) -> list[Step]:
+def after_watch(task: "WatchTask", summary: Mapping[str, Any], model: Path) -> list[NextStep]:
     """What is open after a watch of a log, which can be read again."""
     if task.record is None:
         return []
     if summary["contradictions"]:
-        return [Step(command_line("diagnose", task.name, "--model", model), "Which effect does the model lack?")]
+        return [NextStep(command_line("diagnose", task.name, "--model", model), "Which effect does the model lack?")]
     if summary["alarm"]:
-        return [Step(command_line("identify", task.name, "--model", model), "How large are gap and stiffness, by a fit?")]
+        return [
+            NextStep(command_line("identify", task.name, "--model", model), "How large are gap and stiffness, by a fit?")
+        ]
     return []
 
 
@@ -133,17 +141,17 @@ class LogCall(NamedTuple):
         return [*self.logs, "--model", self.model, *(["--holdout", self.holdout] if self.holdout else [])]
 
 
-def _along_the_log(folder: Path) -> Step:
-    return Step(command_line("explore", folder), "Where along the log do model and machine differ? In the browser.")
+def _along_the_log(folder: Path) -> NextStep:
+    return NextStep(command_line("explore", folder), "Where along the log do model and machine differ? In the browser.")
 
 
-def _gap_experiment(summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: LogCall) -> list[Step]:
+def _gap_experiment(summary: Mapping[str, Any], again: Sequence[str], folder: Path, given: LogCall) -> list[NextStep]:
     """The move that would show a gap to the motor's encoder alone, where the log does not."""
     said = summary.get("backlash")
     if said is None or said["shown"] or given.next_experiment is not None:
         return []
     words = (*again, "--next-experiment", f"{folder}_next.csv")
-    return [Step(command_line(*words), "Is there a gap? A move that shows it to the motor's encoder.")]
+    return [NextStep(command_line(*words), "Is there a gap? A move that shows it to the motor's encoder.")]
 
 
 def _runs(task: "LogTask") -> bool:

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from jaxbl.errors import InputError
-from jaxbl.files import place
+from jaxbl.files import to_path
 
 ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML study", show_default=False)]
 OutOption = Annotated[
@@ -46,7 +46,7 @@ LogOverwriteOption = Annotated[
 
 def folder_of(config: Path, out: str | Path | None) -> Path:
     """The folder for the results of a study or a log."""
-    return place(out) if out is not None else Path("results") / config.stem
+    return to_path(out) if out is not None else Path("results") / config.stem
 
 
 def check_new(file: Path, option: str) -> None:

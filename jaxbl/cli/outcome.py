@@ -9,9 +9,9 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from jaxbl.errors import InputError, NoResult, printable
-from jaxbl.files import listed, read_json
-from jaxbl.lines import Step, lines_of
+from jaxbl.errors import InputError, NoResult, escape_unprintable
+from jaxbl.files import list_paths, read_json
+from jaxbl.lines import NextStep, format_steps
 from jaxbl.terminal import INTERRUPTED
 
 QuietOption = Annotated[bool, typer.Option("--quiet", help="print neither progress nor what was found, errors alone")]
@@ -36,19 +36,23 @@ class Outcome(NamedTuple):
     page: str = "report.html"
     summary: Mapping[str, Any] | str | None = None
     code: int = 0
-    steps: Sequence[Step] = ()
+    steps: Sequence[NextStep] = ()
     compact: bool = False
 
     def text(self) -> list[str]:
         """The lines, what to try next, and what is to be opened."""
         opened = [str(self.folder / self.page)] if self.folder is not None and self.page else []
-        return [printable(part) for line in [*self.lines, *lines_of(self.steps), *opened] for part in line.split("\n")]
+        return [
+            escape_unprintable(part)
+            for line in [*self.lines, *format_steps(self.steps), *opened]
+            for part in line.split("\n")
+        ]
 
     def data(self) -> dict[str, Any]:
         """The same as plain data, and the files in the folder; of a sweep's parts there may be millions."""
         found: dict[str, Any] = {"exit": self.code, "found": [line for line in self.lines if line]}
         if self.folder is not None:
-            files = [file for pattern in ("*.*", "figures/*.*") for file in listed(self.folder, pattern)]
+            files = [file for pattern in ("*.*", "figures/*.*") for file in list_paths(self.folder, pattern)]
             found["folder"] = str(self.folder)
             found["open"] = str(self.folder / self.page) if self.page else None
             found["files"] = [str(file) for file in files if not file.name.startswith(".")]
@@ -86,9 +90,11 @@ def told(command: Callable[..., Outcome]) -> Callable[..., None]:
                     typer.echo(line)
         finally:
             if json and said:
-                from jaxbl.files import plain
+                from jaxbl.files import to_jsonable
 
-                typer.echo(json_format.dumps(plain({"command": command.__name__} | said), indent=indent, ensure_ascii=False))
+                typer.echo(
+                    json_format.dumps(to_jsonable({"command": command.__name__} | said), indent=indent, ensure_ascii=False)
+                )
         if outcome.code:
             raise typer.Exit(outcome.code)
 

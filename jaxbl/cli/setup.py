@@ -10,7 +10,7 @@ from jaxbl import workers
 from jaxbl.datasheet import KINDS, NONE, Given, Item, first_study, named_items, option_of, remark
 from jaxbl.errors import InputError
 from jaxbl.files import write_atomic
-from jaxbl.lines import described
+from jaxbl.lines import format_descriptions
 from jaxbl.terminal import answers, running, working
 
 from .next_steps import after_demo, after_init
@@ -85,7 +85,7 @@ def _kind(text: str) -> str:
 def _asked_kind() -> str:
     """The kind of drive that the user names; asked again where there is no such kind."""
     typer.echo("Kinds of drives:", err=True)
-    for line in described((f"  {name}", kind.about) for name, kind in KINDS.items()):
+    for line in format_descriptions((f"  {name}", kind.about) for name, kind in KINDS.items()):
         typer.echo(line, err=True)
     return _asked("kind of this drive", next(iter(KINDS)), _kind)
 
@@ -146,7 +146,7 @@ def doctor(context: typer.Context) -> Outcome:
 
         findings = examine()
     bad = [one.name for one in findings if not one.good]
-    lines = described((one.name, one.found if one.good else f"FAILED: {one.found}") for one in findings)
+    lines = format_descriptions((one.name, one.found if one.good else f"FAILED: {one.found}") for one in findings)
     lines.append(f"Not in order: {', '.join(bad)}." if bad else "All in order.")
     return Outcome(lines, summary={"findings": [one._asdict() for one in findings]}, code=1 if bad else 0)
 
@@ -185,7 +185,7 @@ def bench(
     workers.start_jax()
     import jax
 
-    from jaxbl.files import make_folder, removed_if_empty
+    from jaxbl.files import make_folder, remove_if_empty_on_error
     from jaxbl.report.bench import write_bench_report
     from jaxbl.throughput import bench as run_bench
 
@@ -194,6 +194,6 @@ def bench(
     make_folder(out)
     if any(out.iterdir()) and not (out / "bench.json").exists():
         raise InputError(f"{out}: is not empty and holds no benchmark; choose another folder with --out")
-    with removed_if_empty(out), running(context, out, out, unit="parts", kept=False) as progress:
+    with remove_if_empty_on_error(out), running(context, out, out, unit="parts", kept=False) as progress:
         result = run_bench(quick=quick, progress=progress)
     return Outcome(write_bench_report(result, out), out, "", "bench.json", code=1 if result.failures else 0)

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from jaxbl import workers
-from jaxbl.errors import InputError, printable
-from jaxbl.files import Busy, has_file, place
-from jaxbl.lines import Step, described
+from jaxbl.errors import InputError, escape_unprintable
+from jaxbl.files import FolderInUse, has_file, to_path
+from jaxbl.lines import NextStep, format_descriptions
 from jaxbl.terminal import duration, is_quiet, naming, running, until_interrupted, working
 
 from .next_steps import after_sweep
@@ -48,14 +48,14 @@ def simulate(
 ) -> Outcome:
     """Simulate a study once: trace, figures, summary."""
     workers.start_jax()
-    from jaxbl.files import locked, removed_if_empty
+    from jaxbl.files import lock_folder, remove_if_empty_on_error
     from jaxbl.report.simulate import write_trial_report
     from jaxbl.sweeps.store import claim
     from jaxbl.sweeps.trial import run
 
     study = _read(config)
     folder = folder_of(config, out)
-    with removed_if_empty(folder), locked(folder), working(context, "simulating"):
+    with remove_if_empty_on_error(folder), lock_folder(folder), working(context, "simulating"):
         claim(folder, study, "simulate", overwrite=overwrite)
         trial = run(study, seed=seed, every=every)
         lines = write_trial_report(trial, folder)
@@ -114,7 +114,7 @@ def sweep(
         # who is last collects them
         try:
             return collect()
-        except Busy:
+        except FolderInUse:
             return _state([found])
     return collect()
 
@@ -149,7 +149,7 @@ def _state(found: "list[Status]", *more: str) -> Outcome:
 
 def _state_lines(found: "Status") -> list[str]:
     share = f"{found.parts} of {found.parts_in_all} parts ({math.floor(1000 * found.parts / found.parts_in_all) / 10:g} %)"
-    lines = [f"{found.folder}: '{printable(found.title)}', {share} of {found.runs} runs"]
+    lines = [f"{found.folder}: '{escape_unprintable(found.title)}', {share} of {found.runs} runs"]
     if found.damaged:
         lines.append(f"  {found.damaged} damaged files are kept in {found.folder / 'damaged'}")
     if found.finished and found.complete:
@@ -182,7 +182,7 @@ def _expected_cost(study: "Config", backend: "Backend | None") -> Outcome:
         ("compilation", f"about {duration(cost.compile_seconds)}"),
         ("run", f"about {duration(cost.run_seconds)} ({rate})"),
     ]
-    lines = described(rows)
+    lines = format_descriptions(rows)
     return Outcome(lines, summary=vars(cost))
 
 
@@ -233,7 +233,7 @@ def _read(config: Path) -> "Config":
 
     study = read_config(config)
     for remark in study.remarks():
-        typer.echo(printable(f"jaxbl: {config}: {remark}"), err=True)
+        typer.echo(escape_unprintable(f"jaxbl: {config}: {remark}"), err=True)
     return study
 
 
@@ -255,7 +255,7 @@ def compute(
     backend: "Backend | None",
     run: Callable[..., Any],
     command: str,
-    steps: Callable[[Any, Path], Sequence[Step]] | None = None,
+    steps: Callable[[Any, Path], Sequence[NextStep]] | None = None,
 ) -> Outcome:
     """Run a command on a study that continues where an interrupted call stopped, write its report, and say what it took.
 
@@ -296,7 +296,7 @@ def plot(
     from jaxbl.sweeps.store import Store, identity
     from jaxbl.sweeps.sweep import open_study
 
-    where, result = place(folder), open_study(folder)
+    where, result = to_path(folder), open_study(folder)
     make_folder(where, "copy it to where you may write, and plot that")
     if config is not None:
         study = read_config(config)
@@ -330,8 +330,8 @@ def explore(
     from jaxbl.report.explorer.study import study_source
 
     source = log_source(folder)
-    if source is None and not has_file(place(folder), "manifest.json"):
-        what = "is missing" if not place(folder).exists() else "holds no sweep, identification or diagnosis"
+    if source is None and not has_file(to_path(folder), "manifest.json"):
+        what = "is missing" if not to_path(folder).exists() else "holds no sweep, identification or diagnosis"
         raise InputError(f"{folder}: {what}; give a folder that 'jaxbl sweep', 'identify' or 'diagnose' wrote")
     source = source or study_source(folder)
     if static is not None:
@@ -343,7 +343,7 @@ def explore(
     with served(source, port) as server:
         # the address is what was asked for
         for line in (*([] if is_quiet(context) else source.lead), f"Open {server.url}", "Ctrl+C ends it."):
-            typer.echo(printable(line), err=True)
+            typer.echo(escape_unprintable(line), err=True)
         if browser if browser is not None else sys.stdout.isatty():
             # a browser in the terminal ends when it is left
             threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
@@ -353,15 +353,15 @@ def explore(
 
 def compare(
     context: typer.Context,
-    first: Annotated[Path, typer.Argument(metavar="DIR1", parser=place, help="folder of a sweep", show_default=False)],
-    second: Annotated[Path, typer.Argument(metavar="DIR2", parser=place, help="of another one", show_default=False)],
+    first: Annotated[Path, typer.Argument(metavar="DIR1", parser=to_path, help="folder of a sweep", show_default=False)],
+    second: Annotated[Path, typer.Argument(metavar="DIR2", parser=to_path, help="of another one", show_default=False)],
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="folder for the results [default: results/compare-DIR1-DIR2]")
     ] = None,
 ) -> Outcome:
     """Compare two sweeps: what changed in the config, and where metrics differ by more than noise."""
     workers.start_jax()
-    from jaxbl.files import is_empty, make_folder, removed_if_empty
+    from jaxbl.files import is_empty, make_folder, remove_if_empty_on_error
     from jaxbl.report.compare import write_comparison
     from jaxbl.sweeps.compare import compare as run_compare
     from jaxbl.sweeps.sweep import open_study
@@ -371,7 +371,7 @@ def compare(
     make_folder(folder)
     if not is_empty(folder) and not (folder / "comparison.json").exists():
         raise InputError(f"{folder}: is not empty and holds no comparison; choose another folder with --out")
-    with removed_if_empty(folder), working(context, "comparing"):
+    with remove_if_empty_on_error(folder), working(context, "comparing"):
         lines = write_comparison(run_compare(*studies), studies[0].config, folder)
     return Outcome(lines, folder, "comparison.json", "comparison.json")
 
@@ -386,4 +386,4 @@ def repair(folder: FolderArgument) -> Outcome:
     lines = [*(f"Damaged: {what}" for what in store.damaged), f"{whole} of {parts} parts are whole."]
     if whole < parts:
         lines.append(f"'jaxbl sweep STUDY.toml --out {folder}' with the same study computes the others.")
-    return Outcome(lines, place(folder), "", {"parts": parts, "whole": whole, "damaged": store.damaged})
+    return Outcome(lines, to_path(folder), "", {"parts": parts, "whole": whole, "damaged": store.damaged})

@@ -21,7 +21,7 @@ from jaxbl.errors import InputError
 from jaxbl.observer import DISCRETISATIONS, OBSERVERS, AbstractObserver, EquivalentControl, Identifier, Observers
 from jaxbl.records.files import read_log_file
 from jaxbl.simulate import Run
-from jaxbl.validation import wrong
+from jaxbl.validation import table_error
 
 from .tables import Table, table_for, tagged
 
@@ -138,17 +138,17 @@ class _RunTable(Table):
     @model_validator(mode="after")
     def _long_enough(self) -> "_RunTable":
         if self.sample_period > self.duration:
-            raise wrong(
+            raise table_error(
                 f"sample_period {self.sample_period} s is longer than duration {self.duration} s; "
                 "it should be a small part of it"
             )
         if self.duration / self.sample_period > _MOST_STEPS:
-            raise wrong(
+            raise table_error(
                 f"duration {self.duration} s holds more than {_MOST_STEPS:.0e} samples of {self.sample_period} s; "
                 "it should hold fewer"
             )
         if self.steps < 8:
-            raise wrong(
+            raise table_error(
                 f"duration {self.duration} s holds only {self.steps} samples of {self.sample_period} s; "
                 "at least 8 are needed"
             )

@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from jaxbl.observer import OBSERVERS
-from jaxbl.validation import nearest, wrong
+from jaxbl.validation import suggest_word, table_error
 
 from .experiment import ExcitationTable
 from .sweep import AxisTable
@@ -20,7 +20,7 @@ class _SpanTable(Table):
     @model_validator(mode="after")
     def _ordered(self) -> "_SpanTable":
         if self.start >= self.stop:
-            raise wrong(f"start {self.start} should be less than stop {self.stop}")
+            raise table_error(f"start {self.start} should be less than stop {self.stop}")
         return self
 
 
@@ -149,14 +149,14 @@ class TuneTable(Table):
     @model_validator(mode="after")
     def _consistent(self) -> "TuneTable":
         if self.alpha_ratio.stop < self.margin_alpha:
-            raise wrong(
+            raise table_error(
                 f"alpha_ratio: stop {self.alpha_ratio.stop} is below margin_alpha {self.margin_alpha}; it should be above it"
             )
         self._check_observers()
         names = [other.name for other in self.compare]
         for i, name in enumerate(names):
             if name in names[:i] or name in TUNE_NAMES:
-                raise wrong(f"compare[{i}].name: '{name}' is taken; choose another one")
+                raise table_error(f"compare[{i}].name: '{name}' is taken; choose another one")
         return self
 
     def _check_observers(self) -> None:
@@ -168,21 +168,21 @@ class TuneTable(Table):
         if not self.observers:
             for key in ("trials", "axes"):
                 if key in changed:
-                    raise wrong(f"{key} needs observers, the kinds to choose from; add them, or leave {key} out")
+                    raise table_error(f"{key} needs observers, the kinds to choose from; add them, or leave {key} out")
             return
         for i, kind in enumerate(self.observers):
             if kind not in OBSERVERS:
-                raise wrong(f"observers[{i}]: unknown kind '{kind}'; {nearest(kind, OBSERVERS)}")
+                raise table_error(f"observers[{i}]: unknown kind '{kind}'; {suggest_word(kind, OBSERVERS)}")
             if kind in self.observers[:i]:
-                raise wrong(f"observers[{i}]: '{kind}' is listed already; each kind may be listed once")
+                raise table_error(f"observers[{i}]: '{kind}' is listed already; each kind may be listed once")
         for key in ("margin_exact", "margin_alpha", "alpha_ratio", "lambda_ratio", "num", "compare", "certificate"):
             if key in changed:
-                raise wrong(f"{key} does not go with observers; leave one of them out")
+                raise table_error(f"{key} does not go with observers; leave one of them out")
         for i, axis in enumerate(self.axes):
             if axis.path.partition(".")[0] in ("observer", "equivalent_control"):
-                raise wrong(f"axes[{i}].path: '{axis.path}' is the observer's, which is searched; choose another path")
+                raise table_error(f"axes[{i}].path: '{axis.path}' is the observer's, which is searched; choose another path")
             if axis.values is None and axis.num is None:
-                raise wrong(f"axes[{i}].num is missing; how many values should the axis have?")
+                raise table_error(f"axes[{i}].num is missing; how many values should the axis have?")
 
 
 class RangeTable(_SpanTable):
@@ -224,7 +224,7 @@ class VerifyTable(Table):
     @model_validator(mode="after")
     def _possible(self) -> "VerifyTable":
         if self.alpha_ratio.start <= 1.0:
-            raise wrong(
+            raise table_error(
                 f"alpha_ratio.start {self.alpha_ratio.start} should exceed 1: no lambda converges where alpha is not above "
                 "f_plus"
             )

@@ -13,7 +13,7 @@ from jaxbl.errors import InputError
 from jaxbl.records import NominalDrive
 from jaxbl.records.reader import read_log_table
 from jaxbl.records.table import LogTable
-from jaxbl.validation import Key, brief, check_file, check_sizes, first_error, no_such_file
+from jaxbl.validation import Key, abbreviate, check_file, check_sizes, explain_first_error, explain_missing_file
 
 from .study import Config, nearest_path, numeric_paths
 
@@ -141,7 +141,7 @@ def _load(path: Path) -> dict[str, Any]:
         check_sizes(data)
         return data
     except FileNotFoundError:
-        raise InputError(f"{path}: {no_such_file(path, ['.toml'])}") from None
+        raise InputError(f"{path}: {explain_missing_file(path, ['.toml'])}") from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; a TOML file is needed") from None
     except UnicodeDecodeError:
@@ -164,7 +164,7 @@ def _included(
     files = data.pop("include", [])
     files = [files] if isinstance(files, str) else files
     if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
-        raise InputError(f"{name}: include: should be a file name or an array of them, not {brief(files)}")
+        raise InputError(f"{name}: include: should be a file name or an array of them, not {abbreviate(files)}")
     merged: dict[str, Any] = {}
     origins: Origins = {}
     for file in files:
@@ -176,7 +176,7 @@ def _included(
         try:
             path.stat()
         except OSError as error:
-            why = no_such_file(path, [".toml"]) if isinstance(error, FileNotFoundError) else error.strerror
+            why = explain_missing_file(path, [".toml"]) if isinstance(error, FileNotFoundError) else error.strerror
             raise InputError(f"{name}: include: {path}: {why}") from None
         if path.resolve() in chain:
             raise InputError(f"{name}: include: {path} includes this file in turn; files should not include one another")
@@ -236,7 +236,7 @@ def _describe(error: ValidationError) -> tuple[Key, str]:
         del location[4:]  # the member of the union that came last
     if location[:1] == ["figures"] and "where" in location:
         del location[4:]
-    return first_error(error, location)
+    return explain_first_error(error, location)
 
 
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:

@@ -23,7 +23,7 @@ from jaxbl.observer import OBSERVERS
 from jaxbl.records import NominalDrive
 from jaxbl.records.table import LogTable
 from jaxbl.simulate import Experiment, Run
-from jaxbl.validation import wrong
+from jaxbl.validation import table_error
 
 from .experiment import (
     DriveTable,
@@ -78,14 +78,14 @@ class Config(Table):
     @model_validator(mode="after")
     def _consistent(self) -> "Config":
         if self.include:
-            raise wrong("include is for read_config, which merges the files in")
+            raise table_error("include is for read_config, which merges the files in")
         _check_sides(self)
         _check_effects(self)
         _check_input(self)
         known = numeric_paths(self)
         for path in self.uncertainty.exact:
             if path not in known and path != "drive.gear_ratio" and path not in EFFECTS:
-                raise wrong(f"uncertainty.exact: unknown path '{path}'; {nearest_path(path, known)}")
+                raise table_error(f"uncertainty.exact: unknown path '{path}'; {nearest_path(path, known)}")
         return self
 
     def build(self) -> Experiment:
@@ -145,34 +145,34 @@ def _check_sides(config: Config) -> None:
     """A rigid drive has no transmission and no load; a two-inertia drive needs both, and steps that resolve the gear."""
     rigid = config.drive.kind == "rigid"
     if rigid and config.transmission is not None:
-        raise wrong("[transmission] has no meaning on a rigid drive; remove it, or use drive.kind = 'two_inertia'")
+        raise table_error("[transmission] has no meaning on a rigid drive; remove it, or use drive.kind = 'two_inertia'")
     if not rigid and config.transmission is None:
-        raise wrong("[transmission] is missing: a two_inertia drive needs one, such as law = 'dead_zone'")
+        raise table_error("[transmission] is missing: a two_inertia drive needs one, such as law = 'dead_zone'")
     others = () if config.tune is None else config.tune.compare
     gains = {"observer": config.observer} | {f"tune.compare[{i}]": other for i, other in enumerate(others)}
     for name, table in gains.items():
         if rigid and table.load is not None:
-            raise wrong(f"{name}.load has no meaning on a rigid drive; remove it")
+            raise table_error(f"{name}.load has no meaning on a rigid drive; remove it")
         if not rigid and table.load is None:
-            raise wrong(f"{name}.load is missing: a two_inertia drive has a load observer; give its lambda and alpha")
+            raise table_error(f"{name}.load is missing: a two_inertia drive has a load observer; give its lambda and alpha")
     certificate = None if config.tune is None else config.tune.certificate
     if rigid and certificate is not None and certificate.load is not None:
-        raise wrong("tune.certificate.load has no meaning on a rigid drive; remove it")
+        raise table_error("tune.certificate.load has no meaning on a rigid drive; remove it")
     for i, mark in enumerate(config.verify.marks):
         if rigid and mark.side == "load":
-            raise wrong(f"verify.marks[{i}].side: 'load' has no meaning on a rigid drive; it should be 'motor'")
+            raise table_error(f"verify.marks[{i}].side: 'load' has no meaning on a rigid drive; it should be 'motor'")
     if config.transmission is not None:
         rate = config.transmission.build().stiffness
         rate *= 1.0 / config.drive.motor_inertia + config.drive.gear_ratio**2 / config.drive.load_inertia
         # the scheme is stable while step * frequency < 2
         least = math.floor(config.run.sample_period * math.sqrt(rate) / 2.0) + 1
         if least > _MOST_SUBSTEPS:
-            raise wrong(
+            raise table_error(
                 f"drive, transmission: inertias and stiffness make an oscillation of {math.sqrt(rate):.3g} rad/s, which "
                 f"{_MOST_SUBSTEPS} plant steps a sample cannot resolve; check their units"
             )
         if config.run.substeps < least:
-            raise wrong(
+            raise table_error(
                 f"run.substeps: {config.run.substeps} plant steps a sample are unstable for this stiffness and "
                 f"sample_period; at least {least} are needed, ten times as many for accuracy"
             )
@@ -184,18 +184,18 @@ def _check_effects(config: Config) -> None:
     for i, effect in enumerate(config.effects):
         place = effect.kind.partition(".")[0]
         if rigid and (place == "transmission" or (place == "load" and "motor" in EFFECTS[effect.kind].places)):
-            raise wrong(
+            raise table_error(
                 f"effects[{i}]: {effect.kind} has no meaning on a rigid drive; motor.* and actuator.* effects act on it"
             )
         if fault := EFFECTS[effect.kind].fault(effect.model_dump(), config.run.sample_period):
-            raise wrong(f"effects[{i}]: {effect.kind}: {fault}")
+            raise table_error(f"effects[{i}]: {effect.kind}: {fault}")
     for side in ("motor",) if rigid else ("motor", "load"):
         nominal = getattr(config.drive, f"{side}_inertia")
         heavier = [effect for effect in config.effects if effect.kind.partition(".")[0] == side]
         added = [float(effect.build().added_inertia()) for effect in heavier]
         if (total := nominal + sum(added)) <= 0.0:
             kind = next(effect.kind for effect, inertia in zip(heavier, added, strict=True) if inertia < 0.0)
-            raise wrong(
+            raise table_error(
                 f"effects: {kind} leaves a total inertia of {total:g} on the {side}; it should stay above -{nominal:g}"
             )
 
@@ -205,7 +205,7 @@ def _check_input(config: Config) -> None:
     period, holdout = config.run.sample_period, None if config.tune is None else config.tune.holdout
     for key, table in (("excitation", config.excitation), ("tune.holdout", holdout)):
         if table is not None and (fault := EXCITATIONS[table.kind].fault(dict(table), period)):
-            raise wrong(f"{key}: {fault}")
+            raise table_error(f"{key}: {fault}")
 
 
 def numeric_paths(config: Config) -> dict[str, Parameter]:

@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from jaxbl.validation import wrong
+from jaxbl.validation import table_error
 
 from .tables import Table
 
@@ -58,16 +58,16 @@ class SweepTable(Table):
     def _complete(self) -> "SweepTable":
         for key in ("refine_metric", "refine_tolerance"):
             if self.refine is None and getattr(self, key) is not None:
-                raise wrong(f"{key} needs refine, the number of times that the grid is halved")
+                raise table_error(f"{key} needs refine, the number of times that the grid is halved")
         if self.refine_tolerance is not None and (self.refine_metric is None or is_boolean(self.refine_metric)):
-            raise wrong("refine_tolerance needs a numeric refine_metric, e.g. 'motor.velocity_rmse'")
+            raise table_error("refine_tolerance needs a numeric refine_metric, e.g. 'motor.velocity_rmse'")
         if self.metrics is not None and not self.metrics:
-            raise wrong("metrics should name at least one, e.g. 'converged'; leave it out for all")
+            raise table_error("metrics should name at least one, e.g. 'converged'; leave it out for all")
         for name in self.metrics or ():
             if self.metrics is not None and self.metrics.count(name) > 1:
-                raise wrong(f"metrics names '{name}' twice; once is enough")
+                raise table_error(f"metrics names '{name}' twice; once is enough")
         if self.refine is not None and self.design != "grid":
-            raise wrong(f"refine needs design = 'grid'; points of a {self.design} design have no neighbours")
+            raise table_error(f"refine needs design = 'grid'; points of a {self.design} design have no neighbours")
         return self
 
     @property
@@ -93,20 +93,20 @@ class AxisTable(Table):
     def _complete(self) -> "AxisTable":
         if self.values is not None:
             if self.start is not None or self.stop is not None or self.num is not None:
-                raise wrong(f"axis {self.path} has both values and start/stop/num; give one of them")
+                raise table_error(f"axis {self.path} has both values and start/stop/num; give one of them")
             if not self.values:
-                raise wrong(f"axis {self.path} is empty: values should list at least one value")
+                raise table_error(f"axis {self.path} is empty: values should list at least one value")
             if self.zip is None and len(set(self.values)) < len(self.values):
-                raise wrong(f"axis {self.path} lists a value twice; values should differ")
+                raise table_error(f"axis {self.path} lists a value twice; values should differ")
             return self
         if self.start is None or self.stop is None:
-            raise wrong(f"axis {self.path} should have values, or start and stop")
+            raise table_error(f"axis {self.path} should have values, or start and stop")
         if self.start >= self.stop:
-            raise wrong(f"axis {self.path}: start {self.start} should be less than stop {self.stop}")
+            raise table_error(f"axis {self.path}: start {self.start} should be less than stop {self.stop}")
         if self.scale == "log" and self.start <= 0.0:
-            raise wrong(f"axis {self.path}: a log scale needs start > 0, not {self.start}")
+            raise table_error(f"axis {self.path}: a log scale needs start > 0, not {self.start}")
         if self.num == 1:
-            raise wrong(f"axis {self.path}: num = 1 cannot span start ... stop; use values = [...] or num >= 2")
+            raise table_error(f"axis {self.path}: num = 1 cannot span start ... stop; use values = [...] or num >= 2")
         return self
 
     def grid(self, depth: int = 0) -> np.ndarray:
@@ -152,18 +152,18 @@ class FigureTable(Table):
     @model_validator(mode="after")
     def _complete(self) -> "FigureTable":
         if self.kind == "heatmap" and self.y is None:
-            raise wrong("a heatmap needs y, the path of its second axis")
+            raise table_error("a heatmap needs y, the path of its second axis")
         idle = {"series": "use facet", "where": "use facet", "theory": "use a line"}
         for key, hint in (idle if self.kind == "heatmap" else {"y": "use series or facet"}).items():
             if getattr(self, key) is not None:
-                raise wrong(f"a {self.kind} has no {key}; {hint}")
+                raise table_error(f"a {self.kind} has no {key}; {hint}")
         paths = [path for path in (self.x, self.y, self.facet, self.series) if path is not None]
         for path in paths:
             if paths.count(path) > 1:
-                raise wrong(f"{path} is used twice; x, y, facet and series should be different axes")
+                raise table_error(f"{path} is used twice; x, y, facet and series should be different axes")
             if path in (self.where or {}):
-                raise wrong(f"{path} is drawn and cannot be fixed by where; leave it out of one of them")
+                raise table_error(f"{path} is drawn and cannot be fixed by where; leave it out of one of them")
         gains = [{f"observer.{side}.alpha", f"observer.{side}.lambda"} for side in ("motor", "load")]
         if self.overlays and {self.x, self.y} not in gains:
-            raise wrong("overlays need a map over alpha and lambda of one observer; leave overlays out here")
+            raise table_error("overlays need a map over alpha and lambda of one observer; leave overlays out here")
         return self

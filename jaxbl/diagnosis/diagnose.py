@@ -16,11 +16,11 @@ import pandas as pd
 from jaxbl.config import Config
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
-from jaxbl.files import plain
+from jaxbl.files import to_jsonable
 from jaxbl.identification.logs import Logs, arrays, gains_for, stage_counter
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.simulate import Experiment
-from jaxbl.workers import Progress, doing, one_blas_thread
+from jaxbl.workers import Progress, announce, limit_blas_threads
 
 from .coordinates import CoordinateValues, all_coordinates
 from .diagnosis_summary import (
@@ -126,21 +126,22 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
     """
     alone = task.config.drive.kind == "two_inertia" and "load" not in task.record.positions
     done = stage_counter(_STAGES_ALONE if alone else _STAGES, progress)
-    with jax.enable_x64(True), one_blas_thread():
+    with jax.enable_x64(True), limit_blas_threads():
         if alone:
             found = diagnose_alone(task, done)
             return Diagnosis(
-                task.config, found.model, task.record, task.holdout, plain(found.summary), found.trace, {}, {}, {}, {}, {},
+                task.config, found.model, task.record, task.holdout, to_jsonable(found.summary), found.trace,
+                {}, {}, {}, {}, {},
                 replays="excitation" in task.missing,
             )  # fmt: skip
-        doing("smoothing the log")
+        announce("smoothing the log")
         setup = set_up(task)
         proof = Proof(setup)
         done()
-        doing("comparing effects")
+        announce("comparing effects")
         search, found = _explained(setup)
         done()
-        doing("testing on held-out data")
+        announce("testing on held-out data")
         (search, found, accepted, controls), expected = _proved(proof, search, found)
         fitted, after = accepted.fitted, accepted.after
         done()
@@ -152,7 +153,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         judgement = judged(found, fitted, *errors, expected, controls, setup.prior, share, accepted.gains, bool(apart))
         found = judgement.found
         done()
-        doing("running the observers")
+        announce("running the observers")
         missing = _missing(setup, proof, accepted, controls)
         lacking_after, _ = missing["missing_after"]
         on_log, on_holdout = _paired(setup.lacking, lacking_after), _paired(proof.before.torques, after.torques)
@@ -189,7 +190,8 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         for side in on_log
     }
     return Diagnosis(
-        task.config, model, task.record, task.holdout, plain(summary), trace, setup.lacking, observed[0], setup.coordinates,
+        task.config, model, task.record, task.holdout, to_jsonable(summary), trace, setup.lacking, observed[0],
+        setup.coordinates,
         setup.located, pairs, replays="excitation" in task.missing,
     )  # fmt: skip
 

@@ -19,7 +19,7 @@ from jaxbl.drive.parameters import set_leaves
 from jaxbl.identification.segments import Segment
 from jaxbl.identification.trajectory import WIDE, Free, free_parameters
 from jaxbl.simulate import Experiment
-from jaxbl.workers import doing
+from jaxbl.workers import announce
 
 from .candidates import SHARE, Candidate, Numbers, variants_of
 from .evidence import Evidence, evidence_of
@@ -517,7 +517,7 @@ class EffectSearch:
         """A model with one effect more, in place of its special cases, refitted from the numbers of the screening."""
         numbers = {name: values for name, values in current.numbers.items() if not contains(one.name, name)}
         numbers[one.name] = one.found.numbers
-        doing(f"trying {' + '.join(numbers)}")
+        announce(f"trying {' + '.join(numbers)}")
         return self.refit(numbers, current.theta + one.found.own[: len(self.free)], predictor)
 
     def remainder(self, model: Model) -> dict[str, tuple[float, float]]:

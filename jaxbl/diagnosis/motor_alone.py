@@ -25,7 +25,7 @@ from jaxbl.identification.trajectory import Free, free_parameters
 from jaxbl.identification.unseen_load import SHOWN, Point, UnseenLoad, find_gap, fitted, is_gap, widths
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.simulate import Experiment, with_effects
-from jaxbl.workers import doing
+from jaxbl.workers import announce
 
 from .diagnosis_summary import extended_study
 from .diagnosis_task import DiagnosisTask, input_rms
@@ -134,7 +134,7 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> Found:
     if not np.isfinite(point.deviance):
         raise InputError(f"{task.record.path}: the model diverges on this log; its numbers should be nearer")
     done()
-    doing("comparing effects")
+    announce("comparing effects")
     out = [play] if gap is not None and play is not None and not gap.needed else []
     point, gains = _needed(search, point, out)
     if gap is not None and gap.needed and play is not None:
@@ -147,7 +147,7 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> Found:
         why = why_not(gap, model, np.e, task.record)
     alone = alone_of(model, point, width, slope, held, gap, why)
     done()
-    doing("testing on held-out data")
+    announce("testing on held-out data")
     summary = _summary(task, search, alone, gains, out)
     numbers = {name: _numbers(alone, name) for name in search.effects if name not in out}
     own = {one.path: alone.values[one.path] for one in _own(search)}

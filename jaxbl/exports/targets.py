@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
-from jaxbl.files import is_empty, json_text, make_folder, read_json, removed_if_empty, write_atomic
+from jaxbl.files import is_empty, json_with_checksum, make_folder, read_json, remove_if_empty_on_error, write_atomic
 from jaxbl.fused import Unsupported
 from jaxbl.sweeps.store import identity
 
@@ -198,11 +198,11 @@ def export(
     }
     summary = head | dict(made.summary)
     where = Path(folder)
-    with removed_if_empty(where):
+    with remove_if_empty_on_error(where):
         _claim(where, request.name, target)
         for file_name, content in made.contents.items():
             write_atomic(where / file_name, content)
-        write_atomic(where / SUMMARY, json_text(summary))
+        write_atomic(where / SUMMARY, json_with_checksum(summary))
     return Export(where, (*made.contents, SUMMARY), summary, made.lines)
 
 

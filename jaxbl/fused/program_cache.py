@@ -25,7 +25,7 @@ from typing import Any
 import equinox as eqx
 import jax
 
-from jaxbl.workers import PROGRAMS, own_folder
+from jaxbl.workers import PROGRAMS_VARIABLE, make_private_folder
 
 _STANDS_ON = "equinox", "jax", "jaxlib", "lineax", "llvmlite", "numpy", "optimistix"
 _OLD = 30.0
@@ -37,9 +37,9 @@ class UnknownArgument(Exception):
 
 
 def cache_folder() -> Path | None:
-    """The folder, if programs are kept: as :data:`PROGRAMS` says. Whoever sets it must not change the package while it runs,
-    as tests do."""
-    name = os.environ.get(PROGRAMS)
+    """The folder, if programs are kept: as :data:`PROGRAMS_VARIABLE` says. Whoever sets it must not change the package while
+    it runs, as tests do."""
+    name = os.environ.get(PROGRAMS_VARIABLE)
     return _folder(name) if name else None
 
 
@@ -47,7 +47,7 @@ def cache_folder() -> Path | None:
 def _folder(name: str) -> Path | None:
     own = Path(name) / _version()
     # what is in them is run
-    if not (own_folder(own.parent) and own_folder(own)):
+    if not (make_private_folder(own.parent) and make_private_folder(own)):
         return None
     try:
         os.utime(own)

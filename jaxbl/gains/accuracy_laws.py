@@ -19,8 +19,8 @@ import pandas as pd
 
 from jaxbl.config import Config, FigureTable
 from jaxbl.errors import InputError
-from jaxbl.files import plain
-from jaxbl.validation import nearest
+from jaxbl.files import to_jsonable
+from jaxbl.validation import suggest_word
 
 if TYPE_CHECKING:
     from jaxbl.sweeps.sweep import StudyResult
@@ -258,7 +258,7 @@ def fixed_values(config: Config, figure: FigureTable, index: int = 0) -> dict[st
     for path, wanted in (figure.where or {}).items():
         key = f"figures[{index}].where"
         if path not in axes:
-            hint = nearest(path, axes) if axes else "the study has no axes"
+            hint = suggest_word(path, axes) if axes else "the study has no axes"
             raise InputError(f"{key}: '{path}' is not an axis of this study; {hint}")
         axis = axes[path]
         if axis.values is None and axis.num is None:
@@ -268,7 +268,7 @@ def fixed_values(config: Config, figure: FigureTable, index: int = 0) -> dict[st
         values = axis.grid()
         if values.dtype == object:
             if wanted not in values.tolist():
-                raise InputError(f"{key}: '{path}' has no value {wanted!r}; {nearest(str(wanted), map(str, values))}")
+                raise InputError(f"{key}: '{path}' has no value {wanted!r}; {suggest_word(str(wanted), map(str, values))}")
             fixed[path] = wanted
         elif wanted in ("least", "largest"):
             fixed[path] = float(values.min() if wanted == "least" else values.max())
@@ -298,8 +298,8 @@ def _of_figure(config: Config, frame: pd.DataFrame, figure: FigureTable, index: 
     chosen = _rows(frame, fixed)
     for facet in [None] if figure.facet is None else sorted(chosen[figure.facet].unique()):
         for name in [None] if figure.series is None else sorted(chosen[figure.series].unique()):
-            where = fixed | ({} if figure.facet is None else {figure.facet: plain(facet)})
-            series = {} if figure.series is None else {figure.series: plain(name)}
+            where = fixed | ({} if figure.facet is None else {figure.facet: to_jsonable(facet)})
+            series = {} if figure.series is None else {figure.series: to_jsonable(name)}
             line = _Line(config, frame, figure, where | series)
             fit = fit_power_law(line.x, line.y, line.usable)
             yield Law(figure.value, figure.x, series, where, figure.theory, fit, line.stops(fit), line.x, line.y, index)

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxbl.config import SideCertificateTable
 from jaxbl.errors import InputError, NoResult
-from jaxbl.files import json_text, plain, read_json, write_atomic
+from jaxbl.files import json_with_checksum, read_json, to_jsonable, write_atomic
 from jaxbl.observer.conditions import convergence_time_worst, peak_ratio
 from jaxbl.observer.super_twisting import DISCRETISATIONS
 
@@ -96,7 +96,7 @@ def certify(
             f"refused: {found.violations} of {found.runs} adversarial runs went above the bound that was proven; please "
             "report this as an error of jaxbl"
         )
-    return plain({
+    return to_jsonable({
         "certified": why is None,
         "why_none": why,
         "gains": {"lambda": lambda_, "alpha": alpha},
@@ -277,7 +277,7 @@ def certificates(search: "Search", path: Path | None) -> dict[str, Any]:
         asked[side] = {"lambda_": float(best["lambda"]), "alpha": float(best["alpha"]), "runs": table.runs}
         asked[side] |= inputs_of(search, side, best["f_plus"])._asdict()
         asked[side] |= {"accuracy": own.accuracy, "reaching_time": own.reaching_time}
-    key = {"version": version("jaxbl"), "asked": plain(asked)}
+    key = {"version": version("jaxbl"), "asked": to_jsonable(asked)}
     if path is not None:
         with suppress(FileNotFoundError, InputError):
             kept = read_json(path)
@@ -290,5 +290,5 @@ def certificates(search: "Search", path: Path | None) -> dict[str, Any]:
         except NoResult as error:
             found[side] = {"certified": False, "why_none": str(error)}
     if path is not None:
-        write_atomic(path, json_text(key | {"found": found}))
+        write_atomic(path, json_with_checksum(key | {"found": found}))
     return found

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config, read_config
-from jaxbl.files import plain
+from jaxbl.files import to_jsonable
 from jaxbl.sweeps.points import Points
 
 from .stages import Stages
@@ -67,7 +67,7 @@ def _with(tables: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
         if value is None:
             table.pop(key, None)
         else:
-            table[key] = plain(value)
+            table[key] = to_jsonable(value)
     return data
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from jaxbl.files import plain
+from jaxbl.files import to_jsonable
 
 if TYPE_CHECKING:
     from .tune import Search
@@ -60,7 +60,9 @@ def limits_of(search: "Search", side: str) -> dict[str, Any]:
         gain: {name: profile[name].tolist() for name in (gain, f"{gain}_ratio", "error", "chatter", "missed")}
         for gain, profile in profiles.items()
     }
-    return plain({"constraints": constraints, "binding": binding, "range_ends": ends, "towards": towards, "profiles": shown})
+    return to_jsonable(
+        {"constraints": constraints, "binding": binding, "range_ends": ends, "towards": towards, "profiles": shown}
+    )
 
 
 def _profile(search: "Search", side: str, gain: str, best: dict[str, Any]) -> pd.DataFrame:

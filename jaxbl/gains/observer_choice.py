@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config, TuneTable, with_values
-from jaxbl.files import plain
+from jaxbl.files import to_jsonable
 from jaxbl.observer import OBSERVERS, OperatingConditions
 from jaxbl.sweeps.metrics import SIDE_METRICS, undisturbed
 from jaxbl.sweeps.points import Points
@@ -296,7 +296,7 @@ def _groups(config: Config, table: TuneTable, stages: Stages) -> list[Group]:
         columns = points.columns(np.arange(points.group_size))
         places, lanes = [], []
         for i in range(points.group_size):
-            lane = {path: plain(column[i]) for path, column in columns.items()}
+            lane = {path: to_jsonable(column[i]) for path, column in columns.items()}
             at = with_values(group.config, lane)
             scenarios = scenarios_of(at, table)
             # encoders change nothing of the plant
@@ -395,7 +395,7 @@ def _summary(search: _Search, held_out: Mapping[str, list[list[dict[str, np.ndar
     }
     if len(places) == 1:
         summary["for_both_sides"] = _for_both_sides(places[0]["sides"], table.observers)
-    return plain(summary) | {"remarks": [*config.notes, *_remarks(search, places)]}
+    return to_jsonable(summary) | {"remarks": [*config.notes, *_remarks(search, places)]}
 
 
 def _searched(side: Side, name: str) -> dict[str, Any]:

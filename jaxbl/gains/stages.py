@@ -10,7 +10,15 @@ import pandas as pd
 from jaxbl.cluster import Cluster, Scheduler, connected
 from jaxbl.config import Config
 from jaxbl.errors import InputError
-from jaxbl.files import json_text, locked, make_folder, place, read_json, removed_if_empty, write_atomic
+from jaxbl.files import (
+    json_with_checksum,
+    lock_folder,
+    make_folder,
+    read_json,
+    remove_if_empty_on_error,
+    to_path,
+    write_atomic,
+)
 from jaxbl.sweeps import parts
 from jaxbl.sweeps.programs import Backend, backend_of, sharing
 from jaxbl.sweeps.store import claim, manifest_head
@@ -29,8 +37,8 @@ def stages_in(
     """
     with ExitStack() as held:
         if out is not None:
-            held.enter_context(removed_if_empty(place(out)))
-            held.enter_context(locked(place(out)))
+            held.enter_context(remove_if_empty_on_error(to_path(out)))
+            held.enter_context(lock_folder(to_path(out)))
         held.enter_context(sharing())
         yield Stages(config, command, out, cluster=held.enter_context(connected(scheduler)), **given)
 
@@ -71,8 +79,8 @@ class Stages:
         self._kept: dict[str, Any] = {}
         if out is None:
             return
-        claim(place(out), config, command, overwrite=overwrite)
-        self.folder = place(out) / command
+        claim(to_path(out), config, command, overwrite=overwrite)
+        self.folder = to_path(out) / command
         if (self.folder / "manifest.json").exists():
             try:
                 self.found = read_json(self.folder / "manifest.json")
@@ -93,7 +101,7 @@ class Stages:
                 return
             make_folder(self.folder)
             manifest = manifest_head(self._config, self._command) | found | {"backend": self._backend}
-            write_atomic(self.folder / "manifest.json", json_text(manifest))
+            write_atomic(self.folder / "manifest.json", json_with_checksum(manifest))
 
     def place(self, *names: str) -> Path | None:
         """A path in the folder, if there is one."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from jaxbl.files import plain
+from jaxbl.files import to_jsonable
 from jaxbl.observer.conditions import judge_gains
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
@@ -91,11 +91,11 @@ class Summary:
 
     def _achieved(self, side: str) -> dict[str, Any]:
         names, rho = (name for name in COMPARED if name != "converged"), self.conditions[side]["peak_ratio"]
-        return plain({name: self.best[side][name] for name in names} | {"peak_ratio": rho})
+        return to_jsonable({name: self.best[side][name] for name in names} | {"peak_ratio": rho})
 
     def _front(self, side: str) -> list[dict[str, Any]]:
         names = ["lambda", "alpha", "lambda_ratio", "alpha_ratio", "convergence_time", "error"]
-        return plain(pareto_front(self.search.candidates[side])[names].to_dict("records"))
+        return to_jsonable(pareto_front(self.search.candidates[side])[names].to_dict("records"))
 
     def _factors(self, side: str) -> dict[str, Any]:
         """Other gains' figures over the tuned ones', on the held-out input; none for gains that do not always converge."""
@@ -217,7 +217,7 @@ def compared_figures(name: str, side: str, runs: pd.DataFrame, gains: tuple[floa
     worst = {name: figures[name].min() for name in ("margin_alpha", "margin_exact")}
     worst["convergence_time_worst"] = figures["convergence_time_worst"].max()
     row |= worst if finite.all() else dict.fromkeys(worst)
-    return plain(row | {"f_plus": bound, "peak_ratio": judge_gains(*gains, bound)["peak_ratio"]})
+    return to_jsonable(row | {"f_plus": bound, "peak_ratio": judge_gains(*gains, bound)["peak_ratio"]})
 
 
 def _ratios(window: "Window") -> dict[str, list[float]]:

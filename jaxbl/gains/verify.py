@@ -20,7 +20,7 @@ import pandas as pd
 from jaxbl.cluster import Scheduler
 from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
-from jaxbl.files import plain, write_atomic, write_table
+from jaxbl.files import to_jsonable, write_atomic, write_table
 from jaxbl.sweeps.metrics import NOTHING, undisturbed
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.programs import Backend
@@ -121,7 +121,7 @@ def _verified(config: Config, sides: list[str], stages: Stages) -> Verdict:
             found.append(counterexamples)
     every = pd.concat(found, ignore_index=True)
     true = every[every["bound"] == "true"]
-    summary = plain(
+    summary = to_jsonable(
         {
             "title": config.title,
             "q": config.verify.q,

@@ -14,7 +14,7 @@ import pandas as pd
 from jaxbl.drive.effects import CoulombFriction, Damping, Hysteresis, LoadFriction
 from jaxbl.drive.transmission import DeadZone, LinearShaft
 from jaxbl.errors import InputError
-from jaxbl.files import plain
+from jaxbl.files import to_jsonable
 from jaxbl.records import LogTable, Record, check_positions, read_log_table, read_record
 from jaxbl.records.element import Element, Number, error_on
 from jaxbl.records.inspection import displacement, element_noise, element_of
@@ -137,7 +137,7 @@ def run_element(task: ElementTask) -> ElementIdentification:
         )
     moved = displacement(record, task.gear_ratio)
     trace = pd.DataFrame({"t": record.time, "u": record.torque, "displacement": moved, "torque": found.torque})
-    return ElementIdentification(task, found, plain(_summary(task, found)), trace, _tables(found))
+    return ElementIdentification(task, found, to_jsonable(_summary(task, found)), trace, _tables(found))
 
 
 def _path(name: str) -> str:

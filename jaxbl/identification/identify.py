@@ -16,10 +16,10 @@ import pandas as pd
 
 from jaxbl.config import Config, read_model, with_values
 from jaxbl.drive.parameters import set_leaves
-from jaxbl.files import plain
+from jaxbl.files import to_jsonable
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
-from jaxbl.workers import Progress, one_blas_thread
+from jaxbl.workers import Progress, limit_blas_threads
 
 from .identification_summary import by_regression, by_trajectories, on_holdout, summary_of, torque_errors
 from .intervals import profile
@@ -118,7 +118,7 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
     assert record.torque is not None
     alone = config.drive.kind == "two_inertia" and "load" not in record.positions
     done = stage_counter(_STAGES_ALONE if alone else _STAGES, progress)
-    with jax.enable_x64(True), one_blas_thread():
+    with jax.enable_x64(True), limit_blas_threads():
         nominal = on_record(config, record)
         paths = list(settings.parameters or default_paths(config, nominal))
         free = free_parameters(nominal, paths, float(np.std(record.torque)))
@@ -155,7 +155,7 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
             summary["holdout"] = on_holdout(config, task.holdout, nominal, fitted, found.samples)
         done()
     model = with_values(config, values | gain_values)
-    return Identification(config, model, record, plain(summary), trace, "excitation" in task.missing)
+    return Identification(config, model, record, to_jsonable(summary), trace, "excitation" in task.missing)
 
 
 def _from_motor(
@@ -179,5 +179,5 @@ def _from_motor(
         summary["holdout"] = alone_on_holdout(config, task.holdout, alone)
     done()
     return Identification(
-        config, with_values(config, alone.values), record, plain(summary), trace, "excitation" in task.missing
+        config, with_values(config, alone.values), record, to_jsonable(summary), trace, "excitation" in task.missing
     )

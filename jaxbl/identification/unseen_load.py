@@ -28,7 +28,7 @@ from jaxbl.drive.parameters import set_leaves
 from jaxbl.drive.plant import PlantState, States
 from jaxbl.fused.single_plant import PlantSimulator
 from jaxbl.simulate import Experiment
-from jaxbl.workers import doing
+from jaxbl.workers import announce
 
 from .intervals import Spread, long_run
 from .prediction import kalman_gain
@@ -377,7 +377,7 @@ class UnseenLoad:
         with a longer and a shorter memory, and one with twice the plant steps, find differently counts as an error; so does
         what noise in the recorded torque, once more as much, changes.
         """
-        doing("standard errors")
+        announce("standard errors")
         fine = UnseenLoad(_stepped(self.experiment, 2), self.free, self.width, self.segments, self.rest)
         others = [fine.solve(fine.at(point.theta, point.start, point.smoothness), _FEW, held)]
         for factor in _OTHERS:
@@ -573,11 +573,11 @@ class _Search:
         return float(self.factor * self.one.scale * np.exp(theta))
 
     def run(self) -> Gap:
-        doing("trying half gaps")
+        announce("trying half gaps")
         starts = self._starts()
-        doing("fitting the gap")
+        announce("fitting the gap")
         best, spread, slope = self.model.settled(self._best(starts))
-        doing("fitting without a gap")
+        announce("fitting without a gap")
         without = self._without(best)
         worth = float(spread.inflation[self.place]) ** 2
         gain = max(without.deviance - best.deviance, 0.0) / max(worth, 1.0)

@@ -16,13 +16,13 @@ from scipy.special import stdtrit
 
 from jaxbl.config import Config, prepare, read_model
 from jaxbl.errors import InputError
-from jaxbl.files import plain
+from jaxbl.files import to_jsonable
 from jaxbl.identification.logs import on_record, read_logs, unit_on
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.records.live import Datagrams, FollowedFile, Rows, Source, Stream, check_live, needed, wrong_period
 from jaxbl.simulate import Experiment
 from jaxbl.units import on_a_line
-from jaxbl.workers import one_blas_thread
+from jaxbl.workers import limit_blas_threads
 
 from .live_chain import LiveChain
 from .window import PARTS, SETTLING, Found, Number, Window
@@ -205,7 +205,7 @@ def run_watch(
     Raises:
         InputError: as :func:`watch`.
     """
-    with jax.enable_x64(True), one_blas_thread():
+    with jax.enable_x64(True), limit_blas_threads():
         watcher = Watcher(task, on_values or (lambda values: None))
         counts: Mapping[str, int] = {}
         if task.record is not None:
@@ -224,7 +224,7 @@ def run_watch(
                 stream.source.close()
             counts = stream.counts
     values = pd.DataFrame(watcher.values, columns=watcher.columns)
-    return Watch(task, plain(_summary(task, watcher, counts, notes)), values)
+    return Watch(task, to_jsonable(_summary(task, watcher, counts, notes)), values)
 
 
 def _of_record(record: Record) -> Iterator[Rows]:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbl.errors import InputError
-from jaxbl.files import plain
+from jaxbl.files import to_jsonable
 
 Values = Float[Array, "..."]
 
@@ -338,7 +338,7 @@ def judge_gains(lambda_: float, alpha: float, f_plus: float) -> dict[str, Any]:
     """
     with jax.enable_x64(True):
         found = _judged(*(jnp.asarray(float(x)) for x in (lambda_, alpha, f_plus)))
-        least, rho, largest = plain(found)
+        least, rho, largest = to_jsonable(found)
     # a jitted function sorts the names
     least = {name: least[name] for name in CONDITIONS}
     return {

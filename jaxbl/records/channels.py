@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxbl.validation import nearest
+from jaxbl.validation import suggest_word
 
 from .files import LogFile
 from .signal_quality import resolution
@@ -74,7 +74,7 @@ def _is_recorded(file: LogFile, table: LogTable, name: str) -> bool:
         return True
     if name == "u":
         names = list(file.columns)
-        hint = "the file has no header" if all(isinstance(n, int) for n in names) else nearest("u", map(str, names))
+        hint = "the file has no header" if all(isinstance(n, int) for n in names) else suggest_word("u", map(str, names))
         raise file.wrong(f"no column 'u'; {hint}; [log] u can name it, absent = [\"u\"] says that there is none")
     given = (table.t, table.u, table.theta_e, table.theta_s, table.omega_e, table.omega_s)
     used = {t.column for t in given if t is not None}

@@ -21,9 +21,9 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import pandas as pd
 
-from jaxbl.errors import InputError, printable
+from jaxbl.errors import InputError, escape_unprintable
 from jaxbl.registry import Registry
-from jaxbl.validation import LARGEST, check_file, nearest, no_such_file
+from jaxbl.validation import LARGEST, check_file, explain_missing_file, suggest_word
 
 from .libraries import Column, Columns, read_bag, read_mcap, read_mdf, read_tdms
 
@@ -98,8 +98,8 @@ class LogFile:
         if column in self.columns:
             return column
         # a hard space or the like, which names have here as messages spell it
-        if isinstance(column, str) and printable(column) in self.columns:
-            return printable(column)
+        if isinstance(column, str) and escape_unprintable(column) in self.columns:
+            return escape_unprintable(column)
         names = list(self.columns)
         if isinstance(column, int):
             if column < len(names):
@@ -112,7 +112,7 @@ class LogFile:
                 f"no column '{column}': the file has no header; give the column's number, 0 to {len(names) - 1}"
                 + (f", as [log] {channel}" if channel else "")
             )
-        raise self.wrong(f"no column '{column}'; {nearest(column, map(str, names))}{key}")
+        raise self.wrong(f"no column '{column}'; {suggest_word(column, map(str, names))}{key}")
 
     def length(self, name: str | int) -> int:
         """Number of values of a column, which is not loaded; InputError where there are too many."""
@@ -200,12 +200,12 @@ def read_log_file(path: Path, wanted: Collection[str | int] = ()) -> LogFile:
         check_file(path)
         columns = _columns(path, wanted)
         if not all(str(name).isprintable() for name in columns):
-            named = {printable(one) if isinstance(one, str) else one: values for one, values in columns.items()}
+            named = {escape_unprintable(one) if isinstance(one, str) else one: values for one, values in columns.items()}
             columns.clear()
             columns.update(named)
         return LogFile(path, columns)
     except FileNotFoundError:
-        why = no_such_file(path, log_endings())
+        why = explain_missing_file(path, log_endings())
     except IsADirectoryError:
         why = "is a folder; a log file is needed"
     except OSError as error:

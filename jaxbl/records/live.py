@@ -16,8 +16,8 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from jaxbl.errors import InputError, shortened
-from jaxbl.validation import check_file, no_such_file
+from jaxbl.errors import InputError, shorten
+from jaxbl.validation import check_file, explain_missing_file
 
 from .channels import in_si, signed
 from .files import LogFile, TextForm, log_endings, text_form
@@ -315,7 +315,7 @@ class FollowedFile:
             check_file(path)
             self._file = path.open("rb")
         except FileNotFoundError:
-            raise InputError(f"{path}: {no_such_file(path, log_endings())}") from None
+            raise InputError(f"{path}: {explain_missing_file(path, log_endings())}") from None
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
         except OSError as error:
@@ -483,7 +483,7 @@ class Datagrams:
 
     def _unfit(self, why: str) -> bool:
         self.counts[MALFORMED] += 1
-        self.fault = f"; the last: {shortened(why, 200)}"
+        self.fault = f"; the last: {shorten(why, 200)}"
         return False
 
     def close(self) -> None:

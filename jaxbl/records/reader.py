@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from jaxbl.errors import InputError
-from jaxbl.validation import check_sizes, first_error
+from jaxbl.validation import check_sizes, explain_first_error
 
 from .alignment import NominalDrive, Skew, clock_skew, encoder_offset, windup
 from .channels import RawChannel, read_channels
@@ -109,7 +109,7 @@ def read_log_table(log: LogTable | Mapping[str, Any] | None, name: str = "") -> 
         return LogTable.model_validate({} if log is None else dict(log))
     except ValidationError as error:
         location = ["log", *error.errors()[0]["loc"]]
-        text = first_error(error, location)[1]
+        text = explain_first_error(error, location)[1]
         raise InputError(f"{name}: {text}" if name else text) from None
 
 

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from jaxbl.validation import Positive, StrictTable, wrong
+from jaxbl.validation import Positive, StrictTable, table_error
 
 
 def _is_column(value: Any) -> Any:
@@ -73,7 +73,7 @@ class TimeTable(_ColumnTable):
     @model_validator(mode="after")
     def _one_source(self) -> "TimeTable":
         if self.period is not None and self.column is not None:
-            raise wrong("has both column and period; period is for logs without time stamps")
+            raise table_error("has both column and period; period is for logs without time stamps")
         return self
 
 
@@ -117,9 +117,9 @@ class PositionTable(_ChannelTable):
     @model_validator(mode="after")
     def _counts(self) -> "PositionTable":
         if self.unit == "counts" and self.counts_per_turn is None:
-            raise wrong("unit counts needs counts_per_turn")
+            raise table_error("unit counts needs counts_per_turn")
         if self.unit != "counts" and self.counts_per_turn is not None:
-            raise wrong(f"counts_per_turn is for unit counts, not for {self.unit}")
+            raise table_error(f"counts_per_turn is for unit counts, not for {self.unit}")
         return self
 
     @property
@@ -170,7 +170,7 @@ class TorqueTable(_ChannelTable):
     @model_validator(mode="after")
     def _constant(self) -> "TorqueTable":
         if self.unit in ("V", "A", "counts") and self.factor is None:
-            raise wrong(f"unit {self.unit} needs factor, the torque in N m (or force in N) of one {self.unit}")
+            raise table_error(f"unit {self.unit} needs factor, the torque in N m (or force in N) of one {self.unit}")
         return self
 
 
@@ -232,29 +232,31 @@ class LogTable(StrictTable):
     @model_validator(mode="after")
     def _possible(self) -> "LogTable":
         if self.start is not None and self.stop is not None and self.start >= self.stop:
-            raise wrong(f"start {self.start} should be less than stop {self.stop}")
+            raise table_error(f"start {self.start} should be less than stop {self.stop}")
         absent = self.absent or []
         for name in absent:
             if getattr(self, name) is not None:
-                raise wrong(f"{name} is described and said to be absent; remove one of them")
+                raise table_error(f"{name} is described and said to be absent; remove one of them")
         for theta, omega in SPEED_CHANNELS.items():
             if getattr(self, omega) is not None and (getattr(self, theta) is not None or theta in absent):
-                raise wrong(
+                raise table_error(
                     f"{omega} stands in place of {theta}, which is described or said to be absent; remove one of them"
                 )
         if self.kind == "element":
             if "u" in absent or "theta_e" in absent:
-                raise wrong(f"absent: {ELEMENT_NEEDS}")
+                raise table_error(f"absent: {ELEMENT_NEEDS}")
             if self.omega_e is not None or self.omega_s is not None or self.transmitted is not None:
-                raise wrong("an element has a displacement (theta_e, theta_s) and a torque u, no speed and no transmitted")
+                raise table_error(
+                    "an element has a displacement (theta_e, theta_s) and a torque u, no speed and no transmitted"
+                )
         if "theta_e" in absent and "theta_s" in absent:
-            raise wrong("absent: a log without theta_e and theta_s has no position; one of them is needed")
+            raise table_error("absent: a log without theta_e and theta_s has no position; one of them is needed")
         if self.theta_e is not None and self.theta_e.skew == "estimate":
-            raise wrong(
+            raise table_error(
                 "theta_e.skew: 'estimate' is for theta_s, whose skew is found against theta_e; give that of theta_e in s"
             )
         if self.theta_s is not None and self.theta_s.skew == "estimate" and "theta_e" in absent:
-            raise wrong("theta_s.skew: 'estimate' needs theta_e, which is said to be absent; give the skew in s")
+            raise table_error("theta_s.skew: 'estimate' needs theta_e, which is said to be absent; give the skew in s")
         return self
 
     def columns(self) -> set[str | int]:

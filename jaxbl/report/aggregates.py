@@ -62,20 +62,20 @@ class Distinct:
     """Rows that differ from one another, of frames that come one after the other."""
 
     def __init__(self):
-        self._found: list[pd.DataFrame] = []
+        self._members: list[pd.DataFrame] = []
         self._known = self._new = 0
 
     def add(self, frame: pd.DataFrame) -> None:
         """Note the rows of another frame."""
-        self._found.append(frame.drop_duplicates())
-        self._new += len(self._found[-1])
+        self._members.append(frame.drop_duplicates())
+        self._new += len(self._members[-1])
         if self._new > self._known + 10_000:
             self.frame()
 
     def frame(self) -> pd.DataFrame:
         """All that differ, in the order of their first appearance."""
-        together = pd.concat(self._found, ignore_index=True).drop_duplicates(ignore_index=True)
-        self._found, self._known, self._new = [together], len(together), 0
+        together = pd.concat(self._members, ignore_index=True).drop_duplicates(ignore_index=True)
+        self._members, self._known, self._new = [together], len(together), 0
         return together
 
 

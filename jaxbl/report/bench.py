@@ -5,7 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from jaxbl.files import write_atomic
-from jaxbl.lines import table
+from jaxbl.lines import format_table
 from jaxbl.throughput.run import CEILING, OURS, PRECISIONS, SCAN, BenchResult
 
 from .figures import COLOURS, Drawn, style, subplots
@@ -76,7 +76,7 @@ def throughput_lines(result: BenchResult) -> list[str]:
     """The benchmark for the terminal."""
     lines = ["Lane-steps/s, best and median of the calls; time of the first call; deviation of the results."]
     for precision in PRECISIONS:
-        lines += ["", *table(_table(result, precision), numbers=True)]
+        lines += ["", *format_table(_table(result, precision), numbers=True)]
     machine = result.machine
     on = f"{machine['processor']}, {machine['cores']} cores; jax {machine['versions']['jax']}"
     lines.insert(0, f"{on}; {result.rows[0].steps} samples a run")
@@ -86,7 +86,7 @@ def throughput_lines(result: BenchResult) -> list[str]:
             "",
             f"A small study from nothing, {study['lanes']} lanes of {study['steps']} samples, {study['precision']}:",
         ]
-        lines += table([(f"  {row['name']}", f"{row['seconds']:.2f} s") for row in result.study], numbers=True)
+        lines += format_table([(f"  {row['name']}", f"{row['seconds']:.2f} s") for row in result.study], numbers=True)
     if result.studies:
         lines += ["", "Studies as they stand, float64, every metric, all cores; lane-steps/s:"]
     for row in result.studies:

@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from jaxbl.files import json_text, remove, write_atomic
+from jaxbl.files import json_with_checksum, remove, write_atomic
 
 from .figures import COLOURS, Drawn, style, subplots
 from .page import PageTable
@@ -28,7 +28,7 @@ def write_certificates(summary: dict[str, Any], folder: Path) -> None:
         remove(folder / "certificate.json")
         return
     data = {"title": summary["title"], "observer": "super_twisting", "assumptions": list(ASSUMPTIONS), "sides": proven}
-    write_atomic(folder / "certificate.json", json_text(data))
+    write_atomic(folder / "certificate.json", json_with_checksum(data))
 
 
 def certificate_lines(summary: dict[str, Any]) -> list[str]:

@@ -4,7 +4,7 @@ from jaxbl.config import AxisTable, Config, FigureTable
 from jaxbl.errors import InputError
 from jaxbl.gains.accuracy_laws import check_selection, sizes_for
 from jaxbl.sweeps.metrics import no_metric
-from jaxbl.validation import nearest
+from jaxbl.validation import suggest_word
 
 MOST_PARTS = 60
 """Panels or lines of a figure: twenty rows of three panels, more than anyone compares."""
@@ -27,7 +27,7 @@ def check_figures(config: Config, figures: list[FigureTable], columns: list[str]
         for key in ("x", "y", "facet", "series"):
             path = getattr(figure, key)
             if path is not None and path not in axes:
-                hint = nearest(path, axes) if axes else "the study has no axes"
+                hint = suggest_word(path, axes) if axes else "the study has no axes"
                 raise InputError(f"figures[{i}].{key}: '{path}' is not an axis of this study; {hint}")
             if path in words and key in ("x", "y"):
                 other = "facet" if figure.kind == "heatmap" else "facet or series"

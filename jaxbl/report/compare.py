@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from jaxbl.config import Config, is_boolean, numeric_paths
-from jaxbl.files import json_text, write_atomic
-from jaxbl.lines import COLUMNS, table
+from jaxbl.files import json_with_checksum, write_atomic
+from jaxbl.lines import TERMINAL_WIDTH, format_table
 from jaxbl.sweeps.compare import FALSE, Comparison, MetricChange
 from jaxbl.sweeps.metrics import metric_of
 
@@ -41,7 +41,7 @@ def write_comparison(comparison: Comparison, config: Config, folder: Path) -> li
     # of an earlier comparison
     (folder / "figures" / f"{_FIGURE}.png").unlink(missing_ok=True)
     saved = save_all(draw_comparison(comparison, config), folder)
-    write_atomic(folder / "comparison.json", json_text(comparison.to_dict()))
+    write_atomic(folder / "comparison.json", json_with_checksum(comparison.to_dict()))
     return [*comparison_lines(comparison), *(_wrapped(f"{path}: {caption}", "  ") for path, caption in saved)]
 
 
@@ -99,7 +99,7 @@ def _metric_lines(comparison: Comparison) -> list[str]:
         lines += ["", *_changed_most(comparison, numbers[0])]
     if numbers:
         head = "metric", "points", "better", "worse", "factor (99 %)"
-        lines += ["", *table([head, *map(_row, numbers[: 2 * _LISTED])])]
+        lines += ["", *format_table([head, *map(_row, numbers[: 2 * _LISTED])])]
         if len(numbers) > 2 * _LISTED:
             lines.append(f"and {len(numbers) - 2 * _LISTED} more, in comparison.json")
     for i, side in enumerate(comparison.names):
@@ -172,7 +172,7 @@ def _listed(items: list[str]) -> list[str]:
 
 
 def _wrapped(text: str, indent: str) -> str:
-    wrapped = textwrap.wrap(text, COLUMNS, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    wrapped = textwrap.wrap(text, TERMINAL_WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
     return "\n".join(wrapped)
 
 

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.identification.logs import unit_on
-from jaxbl.lines import Step
+from jaxbl.lines import NextStep
 
 from .figures import COLOURS, FAINT, MISSING, Drawn, decades, legend, stacked, style, subplots, with_unit
 from .motor_alone_figures import draw_motor_alone
@@ -23,7 +23,7 @@ _CHANNELS = {
 }  # fmt: skip
 
 
-def write_diagnosis_report(found: Diagnosis, folder: Path, steps: Sequence[Step] = ()) -> list[str]:
+def write_diagnosis_report(found: Diagnosis, folder: Path, steps: Sequence[NextStep] = ()) -> list[str]:
     """Write `diagnosis.json`, `model.toml`, `trace.parquet`, figures and report into a folder that exists.
 
     They are put there together when all are drawn; the page says what to try next (`steps`). Returns the lines for the

@@ -15,8 +15,8 @@ from matplotlib.layout_engine import TightLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import NullLocator
 
-from jaxbl.errors import printable, shortened
-from jaxbl.files import is_remote, written
+from jaxbl.errors import escape_unprintable, shorten
+from jaxbl.files import is_remote, open_draft
 
 SIDES = ("motor", "load")
 
@@ -76,7 +76,7 @@ _LONGEST_NAME = 40
 
 def literal(name: str) -> str:
     """A name that a user chose, as text of a figure: no mathematics, one line, not too long."""
-    return shortened(printable(name), _LONGEST_NAME).replace("$", r"\$")
+    return shorten(escape_unprintable(name), _LONGEST_NAME).replace("$", r"\$")
 
 
 @style()
@@ -85,7 +85,7 @@ def save(figure: Figure, path: Path) -> Path:
     if not is_remote(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     # a name may have letters that the font lacks, drawn as boxes
-    with warnings.catch_warnings(), written(path) as draft:
+    with warnings.catch_warnings(), open_draft(path) as draft:
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
         lay_out(figure)
         figure.savefig(draft, format="png")

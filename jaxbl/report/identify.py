@@ -6,14 +6,14 @@ from typing import Any
 
 from jaxbl.identification.identify import Identification
 from jaxbl.identification.search import is_noise
-from jaxbl.lines import Step
+from jaxbl.lines import NextStep
 
 from .figures import SIDES
 from .identify_figures import draw_identification
 from .page import PageTable, write_log_results
 
 
-def write_identification_report(found: Identification, folder: Path, steps: Sequence[Step] = ()) -> list[str]:
+def write_identification_report(found: Identification, folder: Path, steps: Sequence[NextStep] = ()) -> list[str]:
     """Write `identification.json`, `model.toml`, `trace.parquet`, figures and report into a folder that exists.
 
     They are put there together when all are drawn; the page says what to try next (`steps`). Returns the lines for the

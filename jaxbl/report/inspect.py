@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import tomli_w
 
-from jaxbl.files import plain, write_atomic
-from jaxbl.lines import Step, described, table
+from jaxbl.files import to_jsonable, write_atomic
+from jaxbl.lines import NextStep, format_descriptions, format_table
 from jaxbl.records import POSITION_CHANNELS, Inspection, Record
 from jaxbl.records.inspection import main_side, velocity
 from jaxbl.records.signal_quality import longest, low_passed, spectrum
@@ -28,13 +28,13 @@ _CHANNELS = {
 """Label and colour of each channel."""
 
 
-def write_inspection_report(inspection: Inspection, folder: Path, steps: Sequence[Step] = ()) -> list[str]:
+def write_inspection_report(inspection: Inspection, folder: Path, steps: Sequence[NextStep] = ()) -> list[str]:
     """Write `inspection.json`, figures and report into a folder that exists; the page says what to try next (`steps`).
 
     Returns the lines for the terminal.
     """
     record = inspection.record
-    text = json.dumps(plain(inspection.to_dict()), indent=2, ensure_ascii=False)
+    text = json.dumps(to_jsonable(inspection.to_dict()), indent=2, ensure_ascii=False)
     write_atomic(folder / "inspection.json", text)
     judgements = [(one.quantity, one.answer, one.why) for one in inspection.judgements]
     tables = [
@@ -73,8 +73,11 @@ def summary(inspection: Inspection) -> list[str]:
     record = inspection.record
     lines = [*record.warnings, f"{record.path.name}: {_headline(record)}", inspection.as_read(), ""]
     columns = list(zip(_CHANNEL_COLUMNS, *_channel_rows(record), strict=True))
-    lines += table(zip(*(column for column in columns if {*column[1:]} != {"–"}), strict=True))
-    lines += ["", *described([("identifies", "", ""), *((j.quantity, j.answer, j.why) for j in inspection.judgements)])]
+    lines += format_table(zip(*(column for column in columns if {*column[1:]} != {"–"}), strict=True))
+    lines += [
+        "",
+        *format_descriptions([("identifies", "", ""), *((j.quantity, j.answer, j.why) for j in inspection.judgements)]),
+    ]
     room = max(_LINES - len(lines) - 1, _REMARKS)
     notes = list(record.notes)
     if len(notes) > room:

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import tomli_w
 
-from jaxbl.files import json_text, write_atomic, writing
-from jaxbl.lines import Step
+from jaxbl.files import catch_write_errors, json_with_checksum, write_atomic
+from jaxbl.lines import NextStep
 
 from .figures import Drawn, save
 from .picture import Picture, picture
@@ -50,7 +50,7 @@ def write_report(
     tables: Sequence[PageTable],
     config: str,
     remarks: Sequence[str] = (),
-    steps: Sequence[Step] = (),
+    steps: Sequence[NextStep] = (),
 ) -> list[str]:
     """Write figures into `figures/`, and `report.html` with what was found (`lead`), remarks, and what to try next.
 
@@ -64,7 +64,7 @@ def write_report(
 
 def save_all(drawn: Sequence[Drawn], folder: Path) -> list[tuple[Path, str]]:
     """Write figures into the folder's `figures/`. Returns their files and captions."""
-    with writing(folder):
+    with catch_write_errors(folder):
         return [(save(one.figure, folder / "figures" / f"{one.name}.png"), one.caption) for one in drawn]
 
 
@@ -79,7 +79,7 @@ def write_log_results(
     drawn: Sequence[Drawn],
     tables: Sequence[PageTable],
     remarks: Sequence[str],
-    steps: Sequence[Step] = (),
+    steps: Sequence[NextStep] = (),
 ) -> list[str]:
     """Write the summary (`name`.json), `model.toml`, `trace.parquet`, figures and report into a folder that exists.
 
@@ -103,15 +103,15 @@ def write_results(
     drawn: Sequence[Drawn],
     tables: Sequence[PageTable],
     remarks: Sequence[str],
-    steps: Sequence[Step] = (),
+    steps: Sequence[NextStep] = (),
 ) -> list[str]:
     """As :func:`write_log_results`, of anything that has a summary, a trace and a model in TOML."""
-    with writing(folder), TemporaryDirectory(dir=folder, prefix=".draft.") as place:
+    with catch_write_errors(folder), TemporaryDirectory(dir=folder, prefix=".draft.") as place:
         draft = Path(place)
         trace.to_parquet(draft / "trace.parquet", index=False)
         (draft / "model.toml").write_text(model, encoding="utf-8")
         lines = write_report(draft, title, lead, drawn, tables, model, remarks, steps)
-        write_atomic(draft / f"{name}.json", json_text(summary))
+        write_atomic(draft / f"{name}.json", json_with_checksum(summary))
         for file in sorted(draft.rglob("*"), key=lambda one: one.name == f"{name}.json"):
             if file.is_file():
                 target = folder / file.relative_to(draft)
@@ -141,7 +141,7 @@ def html(
     pictures: Sequence[tuple[str, Picture]],
     tables: Sequence[PageTable],
     config: str,
-    steps: Sequence[Step] = (),
+    steps: Sequence[NextStep] = (),
 ) -> str:
     """The whole page. Figures have names; the first line of the lead is the answer."""
     style, *scripts = (files("jaxbl.report").joinpath(name).read_text(encoding="utf-8") for name in _PARTS)
@@ -168,8 +168,8 @@ def html(
 """
 
 
-def _step(one: Step) -> str:
-    return f"<dt>{escape(one.answers)}</dt><dd><pre>{escape(one.command)}</pre></dd>"
+def _step(one: NextStep) -> str:
+    return f"<dt>{escape(one.question)}</dt><dd><pre>{escape(one.command)}</pre></dd>"
 
 
 def _figure(name: str, shown: Picture) -> str:

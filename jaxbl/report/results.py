@@ -7,7 +7,7 @@ from typing import Any
 
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.errors import InputError
-from jaxbl.files import place, writing
+from jaxbl.files import catch_write_errors, to_path
 from jaxbl.gains.observer_choice import ObserverChoice
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.verify import Verdict
@@ -17,7 +17,7 @@ from jaxbl.monitoring.watch import Watch
 from jaxbl.records import Inspection
 from jaxbl.sweeps.sweep import StudyResult
 from jaxbl.sweeps.trial import Trial
-from jaxbl.validation import nearest
+from jaxbl.validation import suggest_word
 
 from .diagnose import draw_diagnosis, write_diagnosis_report
 from .element import draw_element, write_element_report
@@ -77,7 +77,7 @@ def draw(result: Any, *names: str) -> Drawings:
     """
     drawn = {one.name: one for one in _of(result)[0](result)}
     if unknown := [name for name in names if name not in drawn]:
-        raise InputError(f"no figure '{unknown[0]}'; {nearest(unknown[0], drawn)}")
+        raise InputError(f"no figure '{unknown[0]}'; {suggest_word(unknown[0], drawn)}")
     return Drawings(drawn[name] for name in names or drawn)
 
 
@@ -93,8 +93,8 @@ def write_report(result: Any, folder: str | Path) -> list[str]:
         NoResult: the files cannot be written.
     """
     write = writer(result)
-    where = place(folder)
-    with writing(where):
+    where = to_path(folder)
+    with catch_write_errors(where):
         where.mkdir(parents=True, exist_ok=True)
     return write(result, where)
 

@@ -15,7 +15,7 @@ import pandas as pd
 from jaxbl.config import Config, numeric_paths
 from jaxbl.files import write_atomic
 from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law, accuracy_laws
-from jaxbl.lines import Step
+from jaxbl.lines import NextStep
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
@@ -26,7 +26,7 @@ from .maps import draw
 from .page import PageTable, write_report
 
 
-def write_sweep_report(result: StudyResult, folder: Path, steps: Sequence[Step] = ()) -> list[str]:
+def write_sweep_report(result: StudyResult, folder: Path, steps: Sequence[NextStep] = ()) -> list[str]:
     """Write figures, `report.html`, and `laws.json` if figures ask for laws, into a study's folder.
 
     Args:

@@ -15,7 +15,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.lines import Line2D
 
-from jaxbl.files import plain
+from jaxbl.files import to_jsonable
 from jaxbl.gains.error_system import conditions_of
 from jaxbl.gains.verify import Verdict, judged_sides
 from jaxbl.observer.conditions import CONDITIONS
@@ -385,6 +385,6 @@ def _counterexample_table(verdict: Verdict) -> PageTable:
     keys = ["level", "side", "condition", "cause"]
     rows = []
     for key, part in sorted(found.groupby(keys, sort=False), key=lambda pair: -len(pair[1])):
-        rows.append([*key, len(part), *(plain(part[path].iloc[0]) for path in paths)])
+        rows.append([*key, len(part), *(to_jsonable(part[path].iloc[0]) for path in paths)])
     head = [*keys, "runs", *(f"e.g. {path}" for path in paths)]
     return PageTable("Counterexamples by cause (all of them, with all figures: counterexamples.parquet)", head, rows)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from jaxbl.files import json_text, write_atomic, writing, written
-from jaxbl.lines import Step
+from jaxbl.files import catch_write_errors, json_with_checksum, open_draft, write_atomic
+from jaxbl.lines import NextStep
 from jaxbl.monitoring.watch import INTERVAL, Watch, WatchTask, columns_of, counted
 
 from .figures import COLOURS, SIDE_COLOURS, SIDES, Drawn, legend, limits, outline, stacked, style
@@ -23,9 +23,9 @@ _LABELS = {
 }  # fmt: skip
 
 
-def write_watch_report(found: Watch, folder: Path, steps: list[Step] | None = None) -> list[str]:
+def write_watch_report(found: Watch, folder: Path, steps: list[NextStep] | None = None) -> list[str]:
     """Write `watch.csv`, `watch.json`, figures and report into a folder that exists. Returns the lines for the terminal."""
-    with written(folder / VALUES) as draft:
+    with open_draft(folder / VALUES) as draft:
         found.values.to_csv(draft, index=False)
     units = found.task.units
     rows = []
@@ -41,7 +41,7 @@ def write_watch_report(found: Watch, folder: Path, steps: list[Step] | None = No
     lines = write_report(
         folder, title, lead, draw_watch(found), [PageTable("Numbers", columns, rows)], config, remarks, steps or []
     )
-    write_atomic(folder / SUMMARY, json_text(found.summary))
+    write_atomic(folder / SUMMARY, json_with_checksum(found.summary))
     return lines
 
 
@@ -59,7 +59,7 @@ def values_file(folder: Path, task: WatchTask) -> Iterator[Callable[[Mapping[str
         def add(values: Mapping[str, Any]) -> None:
             nonlocal out, file
             nothing = {name: "" for name, value in values.items() if isinstance(value, float) and np.isnan(value)}
-            with writing(folder):
+            with catch_write_errors(folder):
                 if out is None:
                     file = stack.enter_context((folder / VALUES).open("w", newline="", encoding="utf-8"))
                     out = csv.DictWriter(file, columns_of(task))

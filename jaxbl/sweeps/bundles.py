@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from jaxbl.cluster import Cluster
 from jaxbl.errors import InputError
-from jaxbl.files import is_remote, locked, place
+from jaxbl.files import is_remote, lock_folder, to_path
 from jaxbl.workers import Progress
 
 from .engine import Chunk, Engine
@@ -139,10 +139,10 @@ def _wait_for(part: Path, host: str) -> None:
 
 def compute(bundle: Bundle) -> _Done:
     """Compute the chunks of a bundle that are not there, on a worker."""
-    folder, host = place(bundle.folder), socket.gethostname()
+    folder, host = to_path(bundle.folder), socket.gethostname()
     if not (folder / "manifest.json").exists():
         raise InputError(f"{folder}: is not seen by worker {host}; --out should name a folder that all machines share")
-    with locked(folder, shared=True, wait=_SEEN):
+    with lock_folder(folder, shared=True, wait=_SEEN):
         store = Store.open(folder, keeps_manifest=False)
         if store.manifest["identity"] != bundle.identity:
             raise InputError(f"{folder}: holds another study by now; begin again with another --out")
@@ -157,4 +157,4 @@ def compute(bundle: Bundle) -> _Done:
 @functools.lru_cache(maxsize=2)
 def _engine(folder: str, identity: str, layout: Layout, backend: Backend, insist: bool) -> Engine:
     """The engine of a study, with its compiled programs, from one bundle to the next."""
-    return Engine(config_of(place(folder)), layout, backend=backend, insist=insist)
+    return Engine(config_of(to_path(folder)), layout, backend=backend, insist=insist)

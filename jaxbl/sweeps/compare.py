@@ -23,7 +23,7 @@ import pandas as pd
 from scipy import stats
 
 from jaxbl.config import Config, is_boolean
-from jaxbl.files import plain
+from jaxbl.files import to_jsonable
 
 from .metrics import NOTHING, is_magnitude, metric_of
 from .store import Store
@@ -142,7 +142,7 @@ class Comparison:
         data["metrics"] = [
             dataclasses.asdict(one) | {"moved": one.moved._asdict(), "only": list(one.only)} for one in self.metrics
         ]
-        return plain(data)
+        return to_jsonable(data)
 
     def frame(self, metric: str) -> pd.DataFrame:
         """A metric at the common points: values of the axes, `first` and `second` (means over the seeds compared), and

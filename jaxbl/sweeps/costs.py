@@ -19,7 +19,7 @@ from jaxbl.config import Config, precision, prepare, read_config
 from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.fused import program_cache
 from jaxbl.simulate import Experiment, scan
-from jaxbl.workers import doing
+from jaxbl.workers import announce
 
 from .metrics import Names, metrics
 from .programs import BACKENDS, Backend, Layout, compile_program, not_put_into_cache
@@ -104,10 +104,10 @@ def costs(devices: Sequence[Any]) -> Costs:
         return _CPU
     found = program_cache.load(key)
     if found is None:
-        doing("measuring this machine")
+        announce("measuring this machine")
         found = measured(list(devices))
         program_cache.save(key, found)
-        doing("running")
+        announce("running")
     return found
 
 

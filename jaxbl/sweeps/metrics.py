@@ -22,7 +22,7 @@ from jaxbl.errors import InputError
 from jaxbl.observer import AbstractSuperTwisting, conditions
 from jaxbl.registry import Registry, check_subclass, check_text
 from jaxbl.simulate import Experiment, Number, Reducer, Signals, State, TrueSide
-from jaxbl.validation import nearest
+from jaxbl.validation import suggest_word
 
 from .elementwise import apply_elementwise
 
@@ -60,15 +60,15 @@ def _check(name: str, found: Any) -> None:
 class _Metrics(Registry):
     """Laws of installed packages may report errors of parameters of their own."""
 
-    def _all(self) -> dict[str, Any]:
+    def _load_all(self) -> dict[str, Any]:
         if not self._loaded:
-            super()._all()
+            super()._load_all()
             for law in TRANSMISSIONS.values():
                 for name, parameter in law.errors.items():
-                    if name not in self._found:
+                    if name not in self._members:
                         doc = f"relative error of the identified {parameter}"
-                        self._found[name] = IdentificationError.of(name, "", f"error of {parameter}", doc)
-        return self._found
+                        self._members[name] = IdentificationError.of(name, "", f"error of {parameter}", doc)
+        return self._members
 
 
 SIDE_METRICS = _Metrics("jaxbl.metrics", _check)
@@ -565,7 +565,7 @@ def metric_columns(
     for i, name in enumerate(wanted):
         if name not in own:
             what = "does not apply to this study" if name in SIDE_METRICS else "is no metric"
-            raise InputError(f"sweep.metrics[{i}]: '{name}' {what}; {nearest(name, own)}")
+            raise InputError(f"sweep.metrics[{i}]: '{name}' {what}; {suggest_word(name, own)}")
     return ["finite", *(f"{side}.{name}" for side in experiment.sides for name in own if name in wanted)]
 
 
@@ -573,7 +573,7 @@ def no_metric(column: str, experiment: Experiment, columns: Iterable[str]) -> st
     """What to say of a metric that is not among a study's columns."""
     if column in metric_columns(experiment):
         return f"'{column}' is not computed; add '{column.rpartition('.')[2]}' to sweep.metrics"
-    return f"'{column}' is no metric; {nearest(column, columns)}"
+    return f"'{column}' is no metric; {suggest_word(column, columns)}"
 
 
 NOTHING = {"float64": 1e-9, "float32": 1e-4}

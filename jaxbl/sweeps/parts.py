@@ -16,7 +16,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from jaxbl.files import access, checksum, has_file, is_remote, written
+from jaxbl.files import catch_store_errors, checksum, has_file, is_remote, open_draft
 
 _KEY, _SUM = b"jaxbl.part", b"jaxbl.checksum"
 """In the file's metadata: the mark as JSON, and its checksum."""
@@ -56,7 +56,7 @@ def write(path: Path, frame: pd.DataFrame, mark: Mark) -> None:
         {name: pa.array(values, from_pandas=True) for name, values in columns.items()},
         metadata={_KEY: text, _SUM: checksum(text).encode()},
     )
-    with written(path) as draft:
+    with open_draft(path) as draft:
         # dictionaries of values that hardly repeat would take most of the time
         pq.write_table(table, draft, write_page_checksum=True, use_dictionary=False)
 
@@ -101,7 +101,7 @@ def _opened(path: Path) -> Iterator[Any]:
     if is_remote(path):
         if not has_file(path.parent, path.name):
             raise FileNotFoundError(path)
-        with access(path, "read"):
+        with catch_store_errors(path, "read"):
             content = path.read_bytes()
         yield BytesIO(content)
     else:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxbl.config import KIND, TOLERANCE, AxisTable, Config, numeric_paths, with_values
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.errors import InputError
-from jaxbl.files import plain
+from jaxbl.files import to_jsonable
 from jaxbl.simulate import Experiment
 
 from .metrics import metric_columns, no_metric
@@ -93,7 +93,7 @@ class Points:
             )
         self.groups = []
         for index in range(_count_points(structural)):
-            values = {path: plain(column[0]) for path, column in _take_points(structural, np.array([index])).items()}
+            values = {path: to_jsonable(column[0]) for path, column in _take_points(structural, np.array([index])).items()}
             self.groups.append(Group(with_values(base, values), values))
 
     def __len__(self) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.errors import InputError
-from jaxbl.files import Busy, locked
+from jaxbl.files import FolderInUse, lock_folder
 from jaxbl.workers import Progress
 
 from .engine import Chunk, Engine
@@ -57,12 +57,12 @@ def joined(folder: Path, engine: Engine, *, insist: bool) -> Iterator[tuple[Engi
     and its store, which leaves the manifest alone. Raises as :func:`begun`."""
     latest = time.monotonic() + _PREPARED
     while True:
-        with suppress(Busy), locked(folder):
+        with suppress(FolderInUse), lock_folder(folder):
             begun(folder, engine, insist=insist)
         with ExitStack() as held:
             try:
-                held.enter_context(locked(folder, shared=True))
-            except Busy:
+                held.enter_context(lock_folder(folder, shared=True))
+            except FolderInUse:
                 # another one prepares it, or has it for itself
                 if time.monotonic() > latest:
                     raise

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxbl.files import holder, listed, place
+from jaxbl.files import list_paths, lock_holder, to_path
 
 from .store import Store
 
@@ -52,7 +52,7 @@ class Status:
 
 def status(folder: str | Path) -> Status:
     """How far the study in a folder is. Raises `InputError` where there is none."""
-    folder = place(folder)
+    folder = to_path(folder)
     store = Store.open(folder)
     times = np.sort([path.stat().st_mtime for path in store.existing()])
     recent = times[times > times[-1] - _RECENT] if len(times) else times
@@ -64,8 +64,8 @@ def status(folder: str | Path) -> Status:
         parts_in_all=store.manifest["parts"],
         runs=store.manifest["rows"],
         finished=store.manifest["finished"],
-        damaged=len(listed(folder / "damaged", "*")),
-        held_by=holder(folder),
+        damaged=len(list_paths(folder / "damaged", "*")),
+        held_by=lock_holder(folder),
         parts_per_second=float((len(recent) - 1) / span) if span > 0.0 else 0.0,
     )
 
@@ -73,8 +73,8 @@ def status(folder: str | Path) -> Status:
 def statuses(folder: str | Path) -> list[Status]:
     """How far the study in a folder is, and those that `verify` and `tune` run for it. Raises `InputError` where there is
     none."""
-    folder = place(folder)
-    found = (listed(folder, f"{command}/*/manifest.json") for command in ("verify", "tune"))
+    folder = to_path(folder)
+    found = (list_paths(folder, f"{command}/*/manifest.json") for command in ("verify", "tune"))
     stages = [path.parent for paths in found for path in paths]
     own = [folder] if (folder / "manifest.json").exists() or not stages else []
     return [status(one) for one in [*own, *stages]]

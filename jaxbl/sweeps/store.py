@@ -23,19 +23,19 @@ from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import (
     LOG_RESULTS,
-    Busy,
-    begin_file,
+    FolderInUse,
+    create_file,
     has_file,
     is_empty,
     is_remote,
-    json_text,
-    listed,
-    log_named_in,
+    json_with_checksum,
+    list_paths,
     make_folder,
-    move,
     read_json,
+    read_log_path,
     remove,
     remove_drafts,
+    rename_file,
     write_atomic,
 )
 
@@ -132,7 +132,7 @@ def claim(folder: Path, config: Config, command: str = "sweep", *, overwrite: bo
         return
     if not found:
         for file in (folder / name for name in LOG_RESULTS if (folder / name).exists()):
-            log = log_named_in(file)
+            log = read_log_path(file)
             log = f"see {file.name}" if log is None else f"'{Path(log).name}'"
             raise InputError(f"{folder}: holds the results of a log ({log}); choose another folder with --out")
         raise InputError(f"{folder}: is not empty and holds no study; choose another folder with --out")
@@ -155,7 +155,7 @@ def config_of(folder: Path) -> Config:
 
 def _first_mark(folder: Path) -> Mark | None:
     """What the first whole part in a folder says of itself."""
-    for path in listed(folder / "points", "part-*.parquet"):
+    for path in list_paths(folder / "points", "part-*.parquet"):
         try:
             return parts.mark_of(path)
         except (Damaged, FileNotFoundError):
@@ -221,8 +221,8 @@ class Store:
         # the manifest first: it is what makes the folder this study's
         if there:
             store.update()
-        elif not begin_file(folder / "manifest.json", json_text(store.manifest)):
-            raise Busy(f"{folder}: another process began a study there just now; run the same command again")
+        elif not create_file(folder / "manifest.json", json_with_checksum(store.manifest)):
+            raise FolderInUse(f"{folder}: another process began a study there just now; run the same command again")
         if not is_remote(folder):
             (folder / "points").mkdir(exist_ok=True)
         write_atomic(folder / "study.toml", config.to_toml())
@@ -266,7 +266,7 @@ class Store:
         """Set entries of the manifest."""
         self.manifest |= values
         begun = time.monotonic()
-        write_atomic(self.folder / "manifest.json", json_text(self.manifest))
+        write_atomic(self.folder / "manifest.json", json_with_checksum(self.manifest))
         self._saved = time.monotonic()
         # of very many parts it is long
         self._pause = max(_SAVED, 100.0 * (self._saved - begun))
@@ -318,7 +318,7 @@ class Store:
             folder.mkdir(exist_ok=True)
         names = (path.name if i == 0 else f"{path.name}.{i}" for i in count())
         target = next(folder / name for name in names if not (folder / name).exists())
-        move(path, target)
+        rename_file(path, target)
         self.damaged.append(f"{path.relative_to(self.folder)} {why}; it is kept as {target.relative_to(self.folder)}")
 
     def write(self, index: int, frame: pd.DataFrame) -> str:
@@ -337,7 +337,7 @@ class Store:
     def existing(self) -> list[Path]:
         """Files of parts, whole or damaged."""
         # a sixth digit comes after five
-        return sorted(listed(self.folder / "points", "part-*.parquet"), key=lambda path: (len(path.name), path.name))
+        return sorted(list_paths(self.folder / "points", "part-*.parquet"), key=lambda path: (len(path.name), path.name))
 
     def read_part(self, index: int, labels: dict[str, np.ndarray], columns: list[str]) -> pd.DataFrame | None:
         """Some columns of a chunk, or None where it holds other rows than those of `labels`."""

@@ -14,7 +14,7 @@ from pyarrow.parquet import filters_to_expression
 from jaxbl.cluster import Scheduler, connected
 from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
-from jaxbl.files import locked, place, remove_drafts, removed_if_empty
+from jaxbl.files import lock_folder, remove_drafts, remove_if_empty_on_error, to_path
 from jaxbl.workers import Progress
 
 from .bundles import ClusterRun, hand_over
@@ -201,12 +201,12 @@ def sweep(
         run = Run(engine, None, progress)
         run.all()
         return _result(run, run.frame())
-    folder = place(out)
+    folder = to_path(out)
     if backend == "fused" and not (folder / "manifest.json").exists():
         # refused, if it is, before anything is written
         engine.check()
-    with removed_if_empty(folder), connected(scheduler) as cluster:
-        with locked(folder, wait=0.0 if cluster is None else _LET_GO):
+    with remove_if_empty_on_error(folder), connected(scheduler) as cluster:
+        with lock_folder(folder, wait=0.0 if cluster is None else _LET_GO):
             engine, store = begun(folder, engine, insist=backend is not None, overwrite=overwrite)
             store.refuse_others()
             if verify_store:
@@ -216,9 +216,9 @@ def sweep(
                 run.all()
                 run.finish()
         if cluster is not None:
-            with locked(folder, shared=True):
+            with lock_folder(folder, shared=True):
                 run.all()
-            with locked(folder, wait=_LET_GO):
+            with lock_folder(folder, wait=_LET_GO):
                 # of workers that were lost
                 remove_drafts(folder)
                 run.finish()
@@ -250,11 +250,11 @@ def share(
         InputError: as of :func:`sweep`; a refined study, whose points depend on one another.
         NoResult: nothing can be written any more.
     """
-    config, folder = read_config(study), place(out)
+    config, folder = read_config(study), to_path(out)
     engine = Engine(config, devices=devices, backend=backend, insist=backend is not None)
     _check_independent(engine, "--share")
     number, count = which
-    with removed_if_empty(folder), joined(folder, engine, insist=backend is not None) as (engine, store):
+    with remove_if_empty_on_error(folder), joined(folder, engine, insist=backend is not None) as (engine, store):
         run = Run(engine, store, progress, engine.order()[number - 1 :: count])
         run.all()
     return status(folder)
@@ -275,10 +275,10 @@ def submit(
         InputError: as of :func:`sweep`; a refined study, whose points depend on one another, or a cluster that would end
             with this process.
     """
-    config, folder = read_config(study), place(out)
+    config, folder = read_config(study), to_path(out)
     engine = Engine(config, devices=devices, backend=backend, insist=backend is not None)
     _check_independent(engine, "--detach")
-    with removed_if_empty(folder), connected(scheduler) as cluster:
+    with remove_if_empty_on_error(folder), connected(scheduler) as cluster:
         if cluster is None or cluster.local:
             raise InputError("--detach: needs the --scheduler of a cluster that stays when this command has ended")
         with joined(folder, engine, insist=backend is not None) as (engine, store):
@@ -294,7 +294,7 @@ def _check_independent(engine: Engine, option: str) -> None:
 def open_study(folder: str | Path) -> StudyResult:
     """A study's folder, finished or not: its config, and its rows as a frame, a dataset of pyarrow or of xarray, each read
     on first use. Raises `InputError` where there is none."""
-    store = Store.open(place(folder))
+    store = Store.open(to_path(folder))
     return StudyResult(config_of(store.folder), store)
 
 
@@ -306,11 +306,11 @@ def repair(folder: str | Path) -> tuple[int, Store]:
     Raises:
         InputError: no study is there, its `study.toml` is damaged, or a part is of another one.
     """
-    folder = place(folder)
+    folder = to_path(folder)
     if not (folder / "study.toml").exists():
         raise InputError(f"{folder}: holds no study (no study.toml); run 'jaxbl sweep STUDY.toml --out {folder}'")
     config = config_of(folder)
-    with locked(folder):
+    with lock_folder(folder):
         _, store = begun(folder, Engine(config), insist=False)
         return store.verify(), store
 

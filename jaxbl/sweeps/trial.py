@@ -13,7 +13,7 @@ import pandas as pd
 
 from jaxbl.config import Config, precision, prepare, read_config, with_values
 from jaxbl.errors import InputError
-from jaxbl.files import plain
+from jaxbl.files import to_jsonable
 from jaxbl.fused import Unsupported, raising_unsupported, warn_of_scan
 from jaxbl.observer.conditions import CONDITIONS, judge_gains
 from jaxbl.records import POSITION_CHANNELS
@@ -65,8 +65,8 @@ def run(
             figures, kept = _recorded(experiment, seed, every, insist=backend == "fused")
         figures = with_conditions(figures, observer_gains(experiment))
         trace = pd.DataFrame({name: np.asarray(column, float) for name, column in kept.items()})
-    last = {name: plain(figures.pop(name)) for name in list(figures) if name.startswith("last.")}
-    metrics = {name: plain(value) for name, value in figures.items()}
+    last = {name: to_jsonable(figures.pop(name)) for name in list(figures) if name.startswith("last.")}
+    metrics = {name: to_jsonable(value) for name, value in figures.items()}
     return Trial(config, trace, _summary(config, last, metrics, seed))
 
 

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from jaxbl.errors import NoResult
-from jaxbl.workers import Progress, cores
+from jaxbl.workers import Progress, count_cores
 
 from .jaxbl_chain import FusedChain, ScanChain
 from .rivals.cpp_chain import CppChain, NoCompiler, compiler, library
@@ -145,7 +145,7 @@ def bench(*, quick: bool = False, progress: Progress | None = None) -> BenchResu
     """
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     with TemporaryDirectory() as folder, jax.default_device(jax.local_devices(backend="cpu")[0]):
-        found = _bench(Path(folder), cores(), quick, progress)
+        found = _bench(Path(folder), count_cores(), quick, progress)
     found.machine["load"] = load
     return found
 

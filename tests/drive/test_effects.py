@@ -245,7 +245,7 @@ def installed(monkeypatch):
             return [types.SimpleNamespace(name=name, value="a:b", load=lambda v=value: v) for name, value in found.items()]
 
         monkeypatch.setattr("jaxbl.registry.entry_points", entry_points)
-        monkeypatch.setattr(EFFECTS, "_found", dict(BUILT_IN))
+        monkeypatch.setattr(EFFECTS, "_members", dict(BUILT_IN))
         monkeypatch.setattr(EFFECTS, "_loaded", False)
 
     return install

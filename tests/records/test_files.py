@@ -384,7 +384,7 @@ def installed(monkeypatch):
     """Readers as of installed packages, by ending."""
 
     def install(**found):
-        monkeypatch.setattr(files.READERS, "_found", {})
+        monkeypatch.setattr(files.READERS, "_members", {})
         monkeypatch.setattr(files.READERS, "_loaded", False)
         entries = [SimpleNamespace(name=name, value="a:b", load=lambda read=read: read) for name, read in found.items()]
         monkeypatch.setattr("jaxbl.registry.entry_points", lambda group: entries if group == "jaxbl.readers" else [])

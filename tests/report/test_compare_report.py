@@ -8,7 +8,7 @@ from small_study import ALPHA, LAMBDA, listed, rigid, spaced
 
 from jaxbl import cli
 from jaxbl.config import read_config
-from jaxbl.files import json_text, read_json
+from jaxbl.files import json_with_checksum, read_json
 from jaxbl.sweeps.sweep import sweep
 
 
@@ -70,7 +70,7 @@ def test_command_writes_text_json_and_figure(folders, called):
 def test_unfinished_studies_are_compared_as_far_as_they_are(folders, tmp_path, called):
     shutil.copytree(folders / "before", tmp_path / "part")
     manifest = tmp_path / "part" / "manifest.json"
-    manifest.write_text(json_text(read_json(manifest) | {"rows": 48, "parts": 2, "finished": False}))
+    manifest.write_text(json_with_checksum(read_json(manifest) | {"rows": 48, "parts": 2, "finished": False}))
     code, output = called("compare", str(folders / "before"), str(tmp_path / "part"), "--out", str(tmp_path / "out"))
     assert code == 0, output
     assert "is not finished: 24 of 48 runs are compared." in " ".join(output.split())

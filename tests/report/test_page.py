@@ -12,7 +12,7 @@ from browser import check, needs_chromium, opened
 from small_study import ALPHA, LAMBDA, listed, made, rigid, small, spaced
 
 from jaxbl.files import write_atomic
-from jaxbl.lines import Step
+from jaxbl.lines import NextStep
 from jaxbl.report.page import PageTable, html
 from jaxbl.report.picture import Picture
 from jaxbl.report.simulate import write_trial_report
@@ -51,7 +51,9 @@ HOSTILE = "<script>alert('a')</script> & \"b\" <b>"
 def test_everything_is_escaped_and_in_its_place():
     shown = Picture(b"<svg>", (96, 48), HOSTILE, HOSTILE, [{"title": HOSTILE}])
     table = PageTable(HOSTILE, [HOSTILE, "n"], [[HOSTILE, 1.23456789], [None, True], ["x", float("nan")], ["y", 3]])
-    text = html(HOSTILE, [HOSTILE], [HOSTILE], [(HOSTILE, shown)], [table], f'title = "{HOSTILE}"', [Step(HOSTILE, HOSTILE)])
+    text = html(
+        HOSTILE, [HOSTILE], [HOSTILE], [(HOSTILE, shown)], [table], f'title = "{HOSTILE}"', [NextStep(HOSTILE, HOSTILE)]
+    )
     page = Page(text)
     # values of the figure, and the page's own
     assert page.tags.count("script") == 2
@@ -121,7 +123,7 @@ def test_page_of_a_run_and_its_files(tmp_path):
 def test_figures_say_their_values_and_zoom_and_tables_sort(tmp_path):
     axes = [spaced(ALPHA, 1.0, 50.0, 5), spaced(LAMBDA, 1.0, 20.0, 4)]
     result = made(rigid(axes=axes), motor__velocity_rmse=lambda frame: frame[ALPHA] * frame[LAMBDA])
-    long = Step(f"jaxbl explore {'a_long_folder/' * 30} --static page", "How do other metrics look?")
+    long = NextStep(f"jaxbl explore {'a_long_folder/' * 30} --static page", "How do other metrics look?")
     write_sweep_report(result, tmp_path, [long])
     with opened(tmp_path / "report.html", color_scheme="dark") as (page,):
         check(page, 1)

@@ -15,7 +15,7 @@ from jaxbl import cluster
 from jaxbl.cluster import Cluster, connected
 from jaxbl.config import read_config
 from jaxbl.errors import InputError, NoResult
-from jaxbl.files import Busy, locked
+from jaxbl.files import FolderInUse, lock_folder
 from jaxbl.gains.stages import stages_in
 from jaxbl.sweeps.bundles import Bundle, _size, compute
 from jaxbl.sweeps.programs import Layout
@@ -66,8 +66,8 @@ def test_processes_of_this_machine_give_the_same_table(tmp_path):
 
 def test_workers_of_a_client_that_was_lost_are_waited_for(tmp_path, client):
     with ExitStack() as held:
-        held.enter_context(locked(tmp_path / "study", shared=True))
-        with pytest.raises(Busy):
+        held.enter_context(lock_folder(tmp_path / "study", shared=True))
+        with pytest.raises(FolderInUse):
             sweep(thirty(), tmp_path / "study")
         Timer(1.0, held.pop_all().close).start()
         assert sweep(thirty(), tmp_path / "study", scheduler=client).cost["lanes"] == 30

@@ -7,7 +7,7 @@ from moto.server import ThreadedMotoServer
 from small_study import ALPHA, listed, parts, thirty
 
 from jaxbl.errors import InputError
-from jaxbl.files import begin_file, place
+from jaxbl.files import create_file, to_path
 from jaxbl.report.sweep import write_sweep_report
 from jaxbl.sweeps.status import status
 from jaxbl.sweeps.sweep import open_study, repair, share, sweep
@@ -75,7 +75,7 @@ def test_damage_in_a_store_is_noticed_and_healed(bucket, alone, computed):
     address = f"{bucket}/b"
     sweep(thirty(), address)
     computed.clear()
-    one, other = (place(address) / "points" / f"part-0000{index}.parquet" for index in (2, 5))
+    one, other = (to_path(address) / "points" / f"part-0000{index}.parquet" for index in (2, 5))
     one.write_bytes(one.read_bytes()[:-1000])
     other.unlink()
     with pytest.raises(InputError, match=r"part-00002\.parquet: is damaged"):
@@ -83,7 +83,7 @@ def test_damage_in_a_store_is_noticed_and_healed(bucket, alone, computed):
     assert len(sweep(thirty(), address).damaged) == 1
     assert sorted(computed) == [2, 5]
     assert "damaged/part-00002.parquet" in keys(address)
-    (place(address) / "manifest.json").unlink()
+    (to_path(address) / "manifest.json").unlink()
     with pytest.raises(InputError, match="has lost its manifest"):
         open_study(address)
     assert repair(address)[0] == 8
@@ -93,16 +93,16 @@ def test_damage_in_a_store_is_noticed_and_healed(bucket, alone, computed):
 def test_a_report_in_a_store(bucket):
     address = f"{bucket}/c"
     figure = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
-    write_sweep_report(sweep(thirty(figures=[figure]), address), place(address))
+    write_sweep_report(sweep(thirty(figures=[figure]), address), to_path(address))
     stored = keys(address)
     (name,) = [name for name in stored if name.startswith("figures/")]
     assert stored[name].startswith(b"\x89PNG") and b"Metrics over all runs" in stored["report.html"]
 
 
 def test_who_comes_second_does_not_begin(bucket):
-    path = place(f"{bucket}/d/manifest.json")
-    assert begin_file(path, "first")
-    assert not begin_file(path, "second")
+    path = to_path(f"{bucket}/d/manifest.json")
+    assert create_file(path, "first")
+    assert not create_file(path, "second")
     assert path.read_bytes() == b"first"
 
 

@@ -6,7 +6,7 @@ from small_study import ALPHA, LAMBDA, parts, spaced, thirty
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
-from jaxbl.files import locked
+from jaxbl.files import lock_folder
 from jaxbl.sweeps import run
 from jaxbl.sweeps.engine import Engine
 from jaxbl.sweeps.status import status, statuses
@@ -24,7 +24,7 @@ def test_shares_are_the_whole_study(tmp_path, computed):
     # progress of a share is of its own lanes
     assert seen[-1][0] == seen[-1][1] == sum(Engine(alone.config).lanes(index) for index in computed)
     assert (status(folder).parts, status(folder).parts_in_all, status(folder).finished) == (2, 8, False)
-    with locked(folder, shared=True):
+    with lock_folder(folder, shared=True):
         # another one is at work
         share(thirty(), folder, (1, 3))
         assert status(folder).held_by.startswith("process")
@@ -50,7 +50,7 @@ def test_a_share_leaves_the_folder_of_others_alone(tmp_path, computed, monkeypat
         share(thirty(sweep={"seeds": 3, "chunk": 4}), tmp_path / "study", (2, 2))
     monkeypatch.setattr(run, "_PREPARED", 0.2)
     with (
-        locked(tmp_path / "study"),
+        lock_folder(tmp_path / "study"),
         pytest.raises(InputError, match="is writing into it; wait until it has ended"),
     ):
         share(thirty(), tmp_path / "study", (2, 2))

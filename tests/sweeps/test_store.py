@@ -16,7 +16,7 @@ from upath import UPath
 
 from jaxbl.config import read_config
 from jaxbl.errors import InputError, NoResult
-from jaxbl.files import json_text, make_folder, read_json
+from jaxbl.files import json_with_checksum, make_folder, read_json
 from jaxbl.sweeps.engine import Engine
 from jaxbl.sweeps.parts import file_checksum
 from jaxbl.sweeps.store import Store, claim, identity
@@ -196,7 +196,7 @@ def test_a_damaged_manifest_without_parts(copy):
 
 
 def test_manifest_of_another_version(copy):
-    (copy / "manifest.json").write_text(json_text(read_json(copy / "manifest.json") | {"format": 99}))
+    (copy / "manifest.json").write_text(json_with_checksum(read_json(copy / "manifest.json") | {"format": 99}))
     with pytest.raises(InputError, match="has format 99; this version reads 4"):
         open_study(copy)
 
@@ -258,7 +258,7 @@ def test_an_edited_part_is_kept_aside(copy, finished, computed):
 def test_a_part_of_another_study_is_refused(copy, tmp_path):
     sweep(study({"drive.motor_inertia": 0.06}), tmp_path / "other")
     manifest = read_json(copy / "manifest.json")
-    (copy / "manifest.json").write_text(json_text(manifest | {"checksums": {}, "finished": False}))
+    (copy / "manifest.json").write_text(json_with_checksum(manifest | {"checksums": {}, "finished": False}))
     part = copy / "points" / "part-00001.parquet"
     part.write_bytes((tmp_path / "other" / "points" / part.name).read_bytes())
     before = files(copy)
@@ -315,7 +315,7 @@ def test_all_of_it_is_read_where_it_is_asked_for(copy, computed):
     frame.to_parquet(part, index=False)
     manifest = read_json(copy / "manifest.json")
     manifest["checksums"]["1"] = file_checksum(part)
-    (copy / "manifest.json").write_text(json_text(manifest))
+    (copy / "manifest.json").write_text(json_with_checksum(manifest))
     assert sweep(study(), copy).damaged == ()
     assert len(sweep(study(), copy, verify_store=True).damaged) == 1
     assert computed == [1]

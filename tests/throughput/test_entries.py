@@ -13,7 +13,7 @@ from jaxbl.errors import NoResult
 from jaxbl.throughput import run
 from jaxbl.throughput.run import PRECISIONS, Entry, _able, _check, _is_run, _reference, entries
 from jaxbl.throughput.workload import NAMES, RANGES, Workload
-from jaxbl.workers import cores
+from jaxbl.workers import count_cores
 
 STEPS = 1500
 
@@ -74,7 +74,7 @@ def test_the_whole_benchmark_uses_the_cores_there_are(monkeypatch):
     monkeypatch.setattr(run, "entries", only_ours)
     monkeypatch.setattr(run, "_curve", few)
     result = run.bench(quick=True, progress=lambda done, all_: parts.append((done, all_)))
-    assert set(used) == {result.machine["cores"]} == {cores()}
+    assert set(used) == {result.machine["cores"]} == {count_cores()}
     assert parts[-1][0] == parts[-1][1]
     assert all(row.lane_steps_per_second >= row.median_lane_steps_per_second > 0 for row in result.rows)
     assert asked == [2**k for k in range(6, 19, 3)]

@@ -345,7 +345,7 @@ class _Effects(Registry):
 
     def add(self, cls: type) -> type:
         for place in cls.places:
-            self._found[f"{place}.{cls.kind}"] = cls
+            self._members[f"{place}.{cls.kind}"] = cls
         return cls
 
 

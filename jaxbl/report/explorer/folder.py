@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.errors import InputError
-from jaxbl.files import is_empty, json_text, make_folder, read_json, writing
+from jaxbl.files import catch_write_errors, is_empty, json_with_checksum, make_folder, read_json
 from jaxbl.report.maps import drawn_values
 
 ROW_GROUP = 1 << 17
@@ -67,8 +67,8 @@ def write_static(source: Source, out: Path) -> Path:
         raise InputError(f"{out}: is not empty, and was not written by jaxbl explore; choose another folder")
     if marker.exists() and read_json(marker).get("of") != source.identity:
         raise InputError(f"{out}: holds the page of other results; choose another folder, or remove it")
-    with writing(out):
-        marker.write_text(json_text({"made_by": "jaxbl explore", "of": source.identity}), encoding="utf-8")
+    with catch_write_errors(out):
+        marker.write_text(json_with_checksum({"made_by": "jaxbl explore", "of": source.identity}), encoding="utf-8")
         for old in out.glob("points.*"):
             old.unlink()
         source.write(out, False)

@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from jaxbl.config import Config, numeric_paths
-from jaxbl.files import plain
+from jaxbl.files import to_jsonable
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.report.picture import packed
 from jaxbl.sweeps.points import AxisColumns, Points
@@ -64,7 +64,7 @@ def write_grid(result: StudyResult, metrics: list[str], first: str, out: Path) -
     assert dims is not None
 
     def axis(path: str, values: np.ndarray) -> dict[str, Any]:
-        return {"path": path, "unit": units[path].unit if path in units else "", "values": plain(values)}
+        return {"path": path, "unit": units[path].unit if path in units else "", "values": to_jsonable(values)}
 
     return {
         "axes": [{"paths": [axis(path, values) for path, values in one.items()]} for one in dims],

@@ -13,7 +13,7 @@ from matplotlib.colors import to_hex
 
 from jaxbl.diagnosis.coordinates import within_turn
 from jaxbl.errors import InputError
-from jaxbl.files import place, read_json
+from jaxbl.files import read_json, to_path
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.report.diagnose import diagnosis_lines
 from jaxbl.report.element import element_lines
@@ -30,7 +30,7 @@ _RESULTS = {"diagnosis.json": "Diagnosis of", "identification.json": "Identifica
 
 def _summary_file(folder: str | Path) -> Path | None:
     """The newest summary in a folder: identify and diagnose may have written into one, the trace is of the last."""
-    files = [file for name in _RESULTS if (file := place(folder) / name).is_file()]
+    files = [file for name in _RESULTS if (file := to_path(folder) / name).is_file()]
     return max(files, key=lambda one: one.stat().st_mtime_ns, default=None)
 
 

@@ -7,7 +7,7 @@ import pytest
 from browser import check, needs_chromium, opened
 
 from jaxbl.errors import InputError
-from jaxbl.files import json_text
+from jaxbl.files import json_with_checksum
 from jaxbl.report.explorer.folder import write_page, write_static
 from jaxbl.report.explorer.log import log_source, write_log
 from jaxbl.report.explorer.study import study_source
@@ -96,7 +96,7 @@ def stored(folder):
         "torque": {"element": {"rms": 1.0, "relative": 0.1, "unit": "N m"}},
         "method": {"element": {"terms": [], "gains": {}, "reversals": 4}},
     }  # fmt: skip
-    (folder / "identification.json").write_text(json_text(found))
+    (folder / "identification.json").write_text(json_with_checksum(found))
 
 
 def test_folders_without_results_and_damaged_ones(tmp_path):
