@@ -41,7 +41,7 @@ from jaxbl.identification.search import ParameterSearch  # noqa: E402
 from jaxbl.identification.segments import segments_of  # noqa: E402
 from jaxbl.identification.trajectory import free_parameters  # noqa: E402
 from jaxbl.records import read_record  # noqa: E402
-from jaxbl.simulate import trajectory  # noqa: E402
+from jaxbl.simulate import plant_trajectory  # noqa: E402
 
 PERIOD = 1e-3
 NOISE = {"motor": 1e-4, "load": 2e-5}
@@ -343,7 +343,7 @@ def twelve_log(seconds, seed, substeps=40):
     experiment = prepare(config)
     torque = inputs("multisine", samples) + 1.5 * np.sin(np.arange(samples) * PERIOD * 2.0 * np.pi * 0.11)
     start = experiment.plant.init(experiment.initial)
-    position = jax.jit(lambda u: trajectory(experiment, start, u).position)(jnp.asarray(torque))
+    position = jax.jit(lambda u: plant_trajectory(experiment, start, u).position)(jnp.asarray(torque))
     return log_of(torque, {side: np.asarray(x) for side, x in position.items()}, seed)
 
 

@@ -44,7 +44,7 @@ HALF_GAP = 0.08
 def accelerations(plant, position, velocity, torque, smoothing):
     """Acceleration of each side in rad/s^2, dry friction regularised."""
     states = tuple(effect.init() for effect in plant.effects)
-    transmitted, ratio = (0.0, 0.0) if plant.transmission is None else plant.transmitted(position, velocity, states)
+    transmitted, ratio = (0.0, 0.0) if plant.transmission is None else plant.transmitted_torque(position, velocity, states)
     result = {}
     for side in plant.drive.sides:
         motion = Motion(0.0, position[side], velocity[side])

@@ -24,7 +24,7 @@ from small_study import small
 
 from jaxbl.config import Config, precision, prepare, read_config
 from jaxbl.exports.mjcf import mjcf
-from jaxbl.simulate import Experiment, trajectory
+from jaxbl.simulate import Experiment, plant_trajectory
 
 DURATION = 10.0
 DETERMINED = 2e-3
@@ -215,7 +215,7 @@ def simulated(study: Config, finer: int = 1) -> tuple[np.ndarray, np.ndarray]:
 @eqx.filter_jit
 def _simulated(experiment: Experiment) -> tuple[jax.Array, jax.Array]:
     inputs = jax.vmap(experiment.excitation)(jnp.arange(experiment.run.steps) * experiment.run.sample_period)
-    states = trajectory(experiment, experiment.plant.init(experiment.initial), inputs)
+    states = plant_trajectory(experiment, experiment.plant.init(experiment.initial), inputs)
     columns = [one[side] for side in experiment.sides for one in (states.position, states.velocity)]
     return inputs, jnp.stack(columns, axis=1)
 

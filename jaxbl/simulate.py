@@ -1,7 +1,7 @@
 """One experiment through time: drive, encoders, observers, equivalent control and identifier in one step function.
 
-:func:`step` is the whole chain for one sample of one lane; `vmap` makes it many. One loop over time calls it, with or
-without a trace, with any reducers: :func:`scan` for simulated and :func:`replay` for recorded positions.
+:func:`step` is the whole chain for one sample of one lane; `jax.vmap` makes it many lanes. :func:`scan` repeats it over
+time for a simulated drive, :func:`replay` for recorded positions; both record traces and update reducers on the way.
 """
 
 import dataclasses
@@ -25,17 +25,17 @@ from .observer.equivalent_control import EquivalentControl
 from .observer.recursive import Identifier, IdentifierState
 
 UNROLL_SUBSTEPS = False
-# unrolled, XLA fuses each substep with copies of all before it: quadratic work (benchmarks/NOTES.md)
+# if they are unrolled, XLA fuses each substep with copies of all before it: quadratic work (benchmarks/NOTES.md)
 
-Number = Any  # an array of one number a lane: Float[Array, ""] inside a step
+Number = Any  # a number of one lane: Float[Array, ""] inside a step
 
 
 class Run(eqx.Module):
-    """Time grid and tolerances."""
+    """The grid of time, and the tolerances of the metric `converged`; `steps` is the number of samples."""
 
     sample_period: Scalar = parameter("s", "period of encoders, observers, identifier", default=1e-3, above=0.0, fixed=True)
     steps: int = eqx.field(static=True, default=20_000)
-    # the largest frequency of a drive that is still to be resolved at 1 ms is then 2e8 rad/s
+    # at 1 ms, 100 000 substeps resolve frequencies up to 2e8 rad/s
     substeps: int = option("plant steps per sample", default=10, minimum=1, maximum=100_000)
     position_tolerance: Scalar = parameter(
         "rad", "largest position error of a converged observer (load: divided by the gear ratio)", default=1e-3, above=0.0
@@ -46,7 +46,7 @@ class Run(eqx.Module):
 
 
 class Experiment(eqx.Module):
-    """A drive, its input, its sensors and what observes it. Every number is a leaf named by its config path."""
+    """A drive with its input, encoders, observers and identifier. Every number is a leaf, named by its config path."""
 
     drive: AbstractDrive
     transmission: AbstractTransmission | None
@@ -75,7 +75,14 @@ def with_effects(experiment: Experiment, effects: tuple[AbstractEffect, ...]) ->
 
 
 class State(eqx.Module):
-    """What the loop over time carries."""
+    """The state of the whole chain, which the loop carries from sample to sample.
+
+    Attributes:
+        plant: None in a replay of a record.
+        observer: by side.
+        equivalent_control: filtered equivalent control of each side, rad/s^2.
+        identifier: None if the experiment has no identifier, or no transmission.
+    """
 
     plant: PlantState | None
     observer: dict[str, ObserverState]
@@ -84,22 +91,32 @@ class State(eqx.Module):
 
 
 class Sample(NamedTuple):
-    """What a step is given: time, and either unit noise (simulation) or input and measured positions (a record).
+    """The inputs of one step: unit noise for a simulated drive, or the input and measured positions of a record.
 
-    With unit noise, an `input` (N m) takes the place of the excitation's. `known` (rad/s^2) are accelerations by side that
-    the observers add to their nominal ones, held from each sample to the next.
+    Attributes:
+        time: s.
+        noise: one draw of a standard normal distribution for the encoder of each side.
+        input: torque, N m; in a simulation it replaces the excitation, if there is one.
+        measured: position of each side, rad.
+        added_accelerations: by side, rad/s^2; the observers add them to the nominal ones, held until the next sample.
     """
 
     time: Number
     noise: dict[str, Number] | None = None
     input: Number | None = None
     measured: dict[str, Number] | None = None
-    known: dict[str, Number] | None = None
+    added_accelerations: dict[str, Number] | None = None
 
 
 class TrueSide(NamedTuple):
-    """What only the simulator knows of a side: position (rad), velocity (rad/s), the mean acceleration (rad/s^2) from
-    this sample to the next, and the right-hand side error f(x_2) - f(x_2_hat) + xi (rad/s^2) of the observer."""
+    """The true motion of a side, which only a simulator knows.
+
+    Attributes:
+        position: rad.
+        velocity: rad/s.
+        acceleration: mean from this sample to the next, rad/s^2.
+        perturbation: the error f(x_2) - f(x_2_hat) + xi of the observer's right-hand side (10), rad/s^2.
+    """
 
     position: Number
     velocity: Number
@@ -108,8 +125,16 @@ class TrueSide(NamedTuple):
 
 
 class SideSignals(NamedTuple):
-    """One side at one sample, SI units: reading, estimates, filtered equivalent control (rad/s^2), the transmitted torque
-    that this stands for (17) (N m), and the truth (None on a record)."""
+    """Signals of one side at one sample.
+
+    Attributes:
+        measured: reading of the encoder, rad.
+        position_estimate: rad.
+        velocity_estimate: rad/s.
+        equivalent_control: filtered equivalent control (15), rad/s^2.
+        torque_estimate: the transmitted torque (17) that the equivalent control stands for, N m.
+        true: None in a replay of a record.
+    """
 
     measured: Number
     position_estimate: Scalar
@@ -120,9 +145,14 @@ class SideSignals(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """All signals at one sample: time (s), input (N m), twist z (rad), transmitted torque C (N m), and the sides.
+    """All signals at one sample.
 
-    On a rigid drive `torque` is everything that resists beyond the nominal model, and `twist` is None.
+    Attributes:
+        time: s.
+        input: torque u, N m.
+        twist: z = theta_e - N_0 theta_s of the readings, rad; None on a rigid drive.
+        torque: transmitted torque C, N m; on a rigid drive, all that resists beyond the nominal model. None in a replay.
+        motor, load: signals of the sides; `load` is None on a rigid drive.
     """
 
     time: Number
@@ -137,7 +167,7 @@ class Signals(NamedTuple):
 
 
 def initial_state(experiment: Experiment, measured: dict[str, Number] | None = None) -> State:
-    """State at t = 0; for a record, from its first measured positions (rad) and standstill."""
+    """Return the state at t = 0; with `measured` positions (rad), the state of a replay that begins there, at standstill."""
     zero = jnp.zeros_like(jnp.asarray(experiment.run.sample_period))
     rest = dict.fromkeys(experiment.sides, zero)
     plant = experiment.plant.init(experiment.initial) if measured is None else None
@@ -145,52 +175,62 @@ def initial_state(experiment: Experiment, measured: dict[str, Number] | None = N
     if plant is not None:
         velocity = plant.velocity
         position = {side: experiment.plant.read(side, plant.position[side], velocity[side]) for side in experiment.sides}
-    observers = {side: getattr(experiment.observer, side) for side in experiment.sides}
-    observer = {
-        side: observer_state(experiment, side, position[side] - o.position_error, velocity[side] - o.velocity_error)
-        for side, o in observers.items()
-    }
+    observer_states = {}
+    for side in experiment.sides:
+        observer = getattr(experiment.observer, side)
+        observer_states[side] = initial_observer_state(
+            experiment, side, position[side] - observer.position_error, velocity[side] - observer.velocity_error
+        )
     identifier = None
     if experiment.identifier is not None and experiment.transmission is not None:
         identifier = experiment.identifier.init(experiment.transmission, experiment.sides, zero)
-    return State(plant, observer, rest, identifier)
+    return State(plant, observer_states, rest, identifier)
 
 
-def observer_state(experiment: Experiment, side: str, position: Scalar, velocity: Scalar) -> ObserverState:
-    """A side's observer before the first sample, for which it predicts a position (rad) and a velocity (rad/s)."""
+def initial_observer_state(experiment: Experiment, side: str, position: Scalar, velocity: Scalar) -> ObserverState:
+    """Return the state of a side's observer that predicts a position (rad) and a velocity (rad/s) for the first sample."""
 
-    def nominal(velocity: Number) -> Number:
+    def nominal_acceleration(velocity: Number) -> Number:
         return experiment.drive.acceleration(side, velocity, jnp.zeros_like(velocity))
 
-    return getattr(experiment.observer, side).start(position, velocity, nominal, experiment.run.sample_period)
+    return getattr(experiment.observer, side).start(position, velocity, nominal_acceleration, experiment.run.sample_period)
 
 
 def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, Signals]:
-    """The whole chain for one sample: sense, observe, filter, identify, and move the plant on to the next sample."""
+    """Compute the whole chain for one sample: read encoders, observe, filter, identify, and move the plant.
+
+    Args:
+        experiment: with array leaves (:func:`jaxbl.drive.as_arrays`).
+        state: of the chain before the sample.
+        sample: with `noise` the drive is simulated, without it `input` and `measured` are those of a record.
+
+    Returns:
+        The state before the next sample, and the signals at this one.
+    """
     drive, plant, period = experiment.drive, experiment.plant, experiment.run.sample_period
-    before: Any = state.plant  # None on a record
+    before: Any = state.plant  # None in a replay
     torque_in: Any = experiment.excitation(sample.time) if sample.input is None else sample.input
     if sample.noise is None:
-        measured, moved = sample.measured or {}, None
+        measured, after = sample.measured or {}, None
     else:
-        noise = {side: value.astype(jnp.result_type(period)) for side, value in sample.noise.items()}
+        noise = {side: draw.astype(jnp.result_type(period)) for side, draw in sample.noise.items()}
         measured = {
             side: experiment.encoders.measure(
                 side, plant.read(side, before.position[side], before.velocity[side]), noise[side], drive.ratio(side)
             )
             for side in drive.sides
         }
-        moved = move(plant, experiment.run, before, torque_in, sample.time)
+        after = move_plant(plant, experiment.run, before, torque_in, sample.time)
 
     observers, filtered, estimates = {}, {}, {}
     for side in drive.sides:
 
-        def nominal(velocity: Number, side: str = side) -> Number:
-            expected = drive.acceleration(side, velocity, torque_in)
-            return expected if sample.known is None else expected + sample.known[side]
+        def nominal_acceleration(velocity: Number, side: str = side) -> Number:
+            nominal = drive.acceleration(side, velocity, torque_in)
+            return nominal if sample.added_accelerations is None else nominal + sample.added_accelerations[side]
 
         observer = getattr(experiment.observer, side)
-        observers[side], estimates[side] = observer.step(state.observer[side], measured[side], nominal, period)
+        observers[side], estimates[side] = observer.step(state.observer[side], measured[side], nominal_acceleration, period)
         filtered[side] = experiment.equivalent_control.filter(
             state.equivalent_control[side], estimates[side].control, period
         )
@@ -208,29 +248,29 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
     for side in drive.sides:
         estimate = estimates[side]
         true = None
-        if moved is not None:
-            acceleration = (moved.velocity[side] - before.velocity[side]) / period
+        if after is not None:
+            acceleration = (after.velocity[side] - before.velocity[side]) / period
             perturbation = acceleration - drive.acceleration(side, estimate.velocity, torque_in)
             true = TrueSide(before.position[side], before.velocity[side], acceleration, perturbation)
         sides[side] = SideSignals(measured[side], estimate.position, estimate.velocity, filtered[side], torques[side], true)
     torque = None
-    if moved is not None and experiment.transmission is not None:
-        torque, _ = plant.transmitted(before.position, before.velocity, before.effects)
-    elif moved is not None:
-        expected = drive.acceleration("motor", before.velocity["motor"], torque_in)
-        torque = drive.inertia("motor") * (expected - sides["motor"].true.acceleration)
+    if after is not None and experiment.transmission is not None:
+        torque, _ = plant.transmitted_torque(before.position, before.velocity, before.effects)
+    elif after is not None:
+        nominal = drive.acceleration("motor", before.velocity["motor"], torque_in)
+        torque = drive.inertia("motor") * (nominal - sides["motor"].true.acceleration)
     signals = Signals(sample.time, torque_in, twist, torque, sides["motor"], sides.get("load"))
-    return State(moved, observers, filtered, identifier), signals
+    return State(after, observers, filtered, identifier), signals
 
 
-def move(plant: Plant, run: Run, state: PlantState, torque: Scalar, time: Number) -> PlantState:
-    """The plant from one sample to the next, in `substeps` steps under a held input."""
-    small = run.sample_period / run.substeps
-    effects, arriving = plant.receive(state.effects, torque, run.sample_period)
+def move_plant(plant: Plant, run: Run, state: PlantState, torque: Scalar, time: Number) -> PlantState:
+    """Move the plant from one sample (at `time`, s) to the next, in `run.substeps` steps under a held `torque` (N m)."""
+    period = run.sample_period / run.substeps
+    effects, arriving_torque = plant.receive(state.effects, torque, run.sample_period)
     state = PlantState(state.position, state.velocity, effects)
 
     def substep(i: Int[Array, ""], state: PlantState) -> PlantState:
-        return plant.advance(state, arriving(i * small, small), time + i * small, small)
+        return plant.advance(state, arriving_torque(i * period, period), time + i * period, period)
 
     if run.substeps == 1:
         return substep(jnp.asarray(0), state)
@@ -238,23 +278,27 @@ def move(plant: Plant, run: Run, state: PlantState, torque: Scalar, time: Number
 
 
 class Reducer(NamedTuple):
-    """A figure over a whole run, computed as it goes: memory does not grow with duration.
+    """Metrics of a whole run, computed sample by sample, so that memory does not grow with the duration.
 
-    `init(experiment)` gives the carry, `update(experiment, carry, index, signals)` takes in sample `index`, and
-    `result(experiment, carry, state)` gives a dict of numbers from the last carry and the last state. `done(experiment,
-    carry, state)`, where there is one, says that no further sample can change them: a lane may then stop.
+    Attributes:
+        init: `init(experiment)` returns the carry before the first sample.
+        update: `update(experiment, carry, index, signals)` returns the carry after sample `index`.
+        result: `result(experiment, carry, state)` returns the metrics by name, from the last carry and the last state.
+        done: `done(experiment, carry, state)` is True if no further sample can change the metrics, so that the lane may
+            stop. None: the reducer needs all samples.
     """
 
     init: Callable[[Experiment], Any]
     update: Callable[[Experiment, Any, Int[Array, ""], Signals], Any]
     result: Callable[[Experiment, Any, State], dict[str, Array]]
-    done: Callable[[Experiment, Any, State], Array] | None = None
+    all_done: Callable[[Experiment, Any, State], Array] | None = None
 
 
 def unit_noise(seed: Int[Array, ""], indices: Int[Array, " samples"], sides: tuple[str, ...]) -> dict[str, Array]:
-    """Common random numbers: standard normal noise of each side, a function of seed and sample index alone.
+    """Draw standard normal noise for each side, shape (samples,), which depends on seed and sample index alone.
 
-    Drawn in float32 whatever the precision of the run, so that both precisions see the same noise.
+    Runs with the same seed have common random numbers. The draws are float32 in all runs, so that both precisions see the
+    same noise.
     """
     key = jax.random.key(seed)
     keys = jax.vmap(lambda index: jax.random.fold_in(key, index))(indices)
@@ -263,57 +307,65 @@ def unit_noise(seed: Int[Array, ""], indices: Int[Array, " samples"], sides: tup
 
 
 LONGEST_BLOCK = 512
-"""Samples whose noise is drawn at once, at most."""
+"""Most samples in a block, whose noise is drawn at once."""
 
 
 def block_length(steps: int) -> int:
-    """Samples whose noise is drawn at once: the largest divisor of `steps` up to the longest block, or 256 with a rest."""
+    """Return the samples in a block: the largest divisor of `steps` up to the longest block, or 256 if there is none."""
     divisors = [n for n in range(64, LONGEST_BLOCK + 1) if steps % n == 0]
     return divisors[-1] if divisors else min(256, steps)
 
 
 Carry = tuple[State, tuple[Any, ...]]
-"""The state of the chain, and each reducer's carry."""
+"""The state of the chain, and the carry of each reducer."""
 
 
-def begin(experiment: Experiment, reducers: tuple[Reducer, ...], state: State | None = None) -> Carry:
-    """What the loop over time starts from."""
-    return initial_state(experiment) if state is None else state, tuple(r.init(experiment) for r in reducers)
+def initial_carry(experiment: Experiment, reducers: tuple[Reducer, ...], state: State | None = None) -> Carry:
+    """Return the carry before the first sample, with the given state of the chain or that at t = 0."""
+    return initial_state(experiment) if state is None else state, tuple(reducer.init(experiment) for reducer in reducers)
 
 
-def advance(
-    experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry, index: Int[Array, ""], *given: Any
+def advance_sample(
+    experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry, index: Int[Array, ""], *sample_inputs: Any
 ) -> tuple[Carry, Signals]:
-    """One sample further: state, reducers, and the signals at sample `index`. `given` is a :class:`Sample` without its time:
-    of a simulation the unit noise of each side."""
+    """Advance the carry by sample `index`, and return the signals there.
+
+    `sample_inputs` are the fields of :class:`Sample` after its time; in a simulation the unit noise is enough.
+    """
     state, totals = carry
     period = experiment.run.sample_period
-    state, signals = step(experiment, state, Sample(index.astype(jnp.result_type(period)) * period, *given))
-    return (state, tuple(r.update(experiment, t, index, signals) for r, t in zip(reducers, totals, strict=True))), signals
+    state, signals = step(experiment, state, Sample(index.astype(jnp.result_type(period)) * period, *sample_inputs))
+    totals = tuple(
+        reducer.update(experiment, total, index, signals) for reducer, total in zip(reducers, totals, strict=True)
+    )
+    return (state, totals), signals
 
 
-def end_of_block(experiment: Experiment, carry: Carry) -> Carry:
-    """What goes from one block of samples to the next: sums in float32 lose nothing over more than some thousand samples."""
+def end_block(experiment: Experiment, carry: Carry) -> Carry:
+    """Return the carry at the end of a block, with the identifier's sums compensated: long runs in float32 lose nothing."""
     state, totals = carry
     if experiment.identifier is None or state.identifier is None:
         return carry
-    return eqx.tree_at(lambda s: s.identifier, state, experiment.identifier.settle(state.identifier)), totals
+    identifier = experiment.identifier.settle(state.identifier)
+    return eqx.tree_at(lambda state: state.identifier, state, identifier), totals
 
 
-def figures(experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry) -> dict[str, Array]:
-    """The reducers' figures from the last carry."""
+def compute_metrics(experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry) -> dict[str, Array]:
+    """Compute the metrics of all reducers from the last carry, by name."""
     state, totals = carry
-    found: dict[str, Array] = {}
+    metrics: dict[str, Array] = {}
     for reducer, total in zip(reducers, totals, strict=True):
-        found |= reducer.result(experiment, total, state)
-    return found
+        metrics |= reducer.result(experiment, total, state)
+    return metrics
 
 
-def done(experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry) -> Array | None:
-    """Whether no further sample can change the figures; None where a reducer cannot know."""
+def all_done(experiment: Experiment, reducers: tuple[Reducer, ...], carry: Carry) -> Array | None:
+    """Return True if no further sample can change any metric; None if a reducer needs all samples."""
     state, totals = carry
-    each = [r.done(experiment, total, state) for r, total in zip(reducers, totals, strict=True) if r.done is not None]
-    return functools.reduce(jnp.logical_and, each) if each and len(each) == len(reducers) else None
+    if not reducers or any(reducer.done is None for reducer in reducers):
+        return None
+    flags = [reducer.done(experiment, total, state) for reducer, total in zip(reducers, totals, strict=True)]  # type: ignore[misc]
+    return functools.reduce(jnp.logical_and, flags)
 
 
 def scan(
@@ -328,18 +380,21 @@ def scan(
     Args:
         experiment: with array leaves (:func:`jaxbl.drive.as_arrays`).
         seed: seed of the encoder noise.
-        reducers: figures to compute along the run.
-        record: what to keep of every `every`-th sample; None keeps nothing.
-        every: decimation of the record.
+        reducers: the metrics to compute.
+        record: `record(state, signals)` returns what the trace has of a sample; None: no trace.
+        every: the trace has every `every`-th sample.
 
     Returns:
-        The reducers' figures, and the record with a leading time axis (None without one).
+        The metrics by name, and the trace with a leading time axis, shape (samples, ...); None without `record`.
+
+    Example:
+        >>> _, velocity = scan(experiment, 0, record=lambda state, signals: signals.motor.velocity_estimate)
     """
 
-    def samples(indices: Int[Array, " samples"]) -> tuple[dict[str, Array], ...]:
+    def draw_noise(indices: Int[Array, " samples"]) -> tuple[dict[str, Array], ...]:
         return (unit_noise(seed, indices, experiment.sides),)
 
-    return _scan(experiment, begin(experiment, reducers), experiment.run.steps, samples, reducers, record, every)
+    return _scan(experiment, initial_carry(experiment, reducers), experiment.run.steps, draw_noise, reducers, record, every)
 
 
 def replay(
@@ -350,17 +405,18 @@ def replay(
     record: Callable[[State, Signals], Any] | None = None,
     every: int = 1,
     state: State | None = None,
-    known: dict[str, Float[Array, " samples"]] | None = None,
+    added_accelerations: dict[str, Float[Array, " samples"]] | None = None,
 ) -> tuple[dict[str, Array], Any]:
-    """Run observers, filter and identifier on a record in place of the plant.
+    """Run observers, filter and identifier on a record, which takes the place of the plant.
 
     Args:
         experiment: with array leaves; its sample period is that of the record.
-        torque: input in N m.
-        measured: positions of each side in rad.
-        reducers, record, every: as of :func:`scan`.
-        state: where to begin; left out, at the first position and standstill.
-        known: of each sample, as of :class:`Sample`; the equivalent control is then what is missing beyond these, too.
+        torque: input, N m, shape (samples,).
+        measured: position of each side, rad, shape (samples,).
+        reducers, record, every: as in :func:`scan`.
+        state: before the first sample; left out, standstill at the first positions.
+        added_accelerations: by side, rad/s^2, shape (samples,): part of the model (:class:`Sample`), so that the equivalent
+            control has only what is missing beyond them.
 
     Returns:
         As :func:`scan`.
@@ -369,45 +425,47 @@ def replay(
         state = initial_state(experiment, {side: measured[side][0] for side in experiment.sides})
     state = State(None, state.observer, state.equivalent_control, state.identifier)
 
-    def samples(indices: Int[Array, " samples"]) -> tuple[Any, ...]:
-        given = torque, {side: measured[side] for side in experiment.sides}, known
-        return None, *jax.tree.map(lambda column: column[indices], given)
+    def take_samples(indices: Int[Array, " samples"]) -> tuple[Any, ...]:
+        columns = torque, {side: measured[side] for side in experiment.sides}, added_accelerations
+        return None, *jax.tree.map(lambda column: column[indices], columns)
 
-    return _scan(experiment, begin(experiment, reducers, state), len(torque), samples, reducers, record, every)
+    carry = initial_carry(experiment, reducers, state)
+    return _scan(experiment, carry, len(torque), take_samples, reducers, record, every)
 
 
 def _scan(
     experiment: Experiment,
-    start: Carry,
+    carry: Carry,
     steps: int,
-    samples: Callable[[Int[Array, " samples"]], tuple[Any, ...]],
+    sample_inputs: Callable[[Int[Array, " samples"]], tuple[Any, ...]],
     reducers: tuple[Reducer, ...],
     record: Callable[[State, Signals], Any] | None,
     every: int,
 ) -> tuple[dict[str, Array], Any]:
-    """The loop over time; `samples` gives what :func:`advance` is given for the samples of a block."""
+    """Loop over time, block by block; `sample_inputs(indices)` returns the inputs of :func:`advance_sample` for a block."""
 
-    def sample(carry: Carry, given: tuple[Array, tuple[Any, ...]]) -> tuple[Carry, Any]:
-        carry, signals = advance(experiment, reducers, carry, given[0], *given[1])
+    def run_sample(carry: Carry, inputs: tuple[Array, tuple[Any, ...]]) -> tuple[Carry, Any]:
+        carry, signals = advance_sample(experiment, reducers, carry, inputs[0], *inputs[1])
         return carry, None if record is None else record(carry[0], signals)
 
-    def block(carry: Carry, first: Array, length: int) -> tuple[Carry, Any]:
+    def run_block(carry: Carry, first: Array, length: int) -> tuple[Carry, Any]:
         indices = first + jnp.arange(length, dtype=jnp.int32)
-        carry, kept = jax.lax.scan(sample, carry, (indices, samples(indices)))
-        return end_of_block(experiment, carry), jax.tree.map(lambda x: x[::every], kept)
+        carry, trace = jax.lax.scan(run_sample, carry, (indices, sample_inputs(indices)))
+        return end_block(experiment, carry), jax.tree.map(lambda x: x[::every], trace)
 
     length = block_length(steps) if record is None or every == 1 else every
-    blocks, rest = divmod(steps, length)
-    carry, kept = jax.lax.scan(lambda carry, i: block(carry, i * length, length), start, jnp.arange(blocks, dtype=jnp.int32))
-    kept = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), kept)
-    if rest:
-        carry, last = block(carry, jnp.asarray(blocks * length, jnp.int32), rest)
-        kept = jax.tree.map(lambda *parts: jnp.concatenate(parts), kept, last)
-    return figures(experiment, reducers, carry), kept
+    blocks, remaining = divmod(steps, length)
+    starts = jnp.arange(blocks, dtype=jnp.int32)
+    carry, trace = jax.lax.scan(lambda carry, i: run_block(carry, i * length, length), carry, starts)
+    trace = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), trace)
+    if remaining:
+        carry, end = run_block(carry, jnp.asarray(blocks * length, jnp.int32), remaining)
+        trace = jax.tree.map(lambda *parts: jnp.concatenate(parts), trace, end)
+    return compute_metrics(experiment, reducers, carry), trace
 
 
-def corrected(state: PlantState, readings: dict[str, Array], gain: dict[str, Any]) -> PlantState:
-    """A state after a look at the encoders: positions (1) and velocities (1/s) moved by gains times prediction errors."""
+def correct_by_readings(state: PlantState, readings: dict[str, Array], gain: dict[str, Any]) -> PlantState:
+    """Correct positions and velocities by `gain` (1, and 1/s) times the prediction error of each side's reading (rad)."""
     errors = {side: readings[side] - state.position[side] for side in gain}
     return PlantState(
         {side: value + gain[side][0] * errors[side] if side in gain else value for side, value in state.position.items()},
@@ -416,7 +474,7 @@ def corrected(state: PlantState, readings: dict[str, Array], gain: dict[str, Any
     )
 
 
-def trajectory(
+def plant_trajectory(
     experiment: Experiment,
     start: PlantState,
     torque: Float[Array, " samples"],
@@ -424,23 +482,28 @@ def trajectory(
     measured: dict[str, Float[Array, " samples"]] | None = None,
     gain: dict[str, Float[Array, " 2"]] | None = None,
 ) -> PlantState:
-    """The plant alone under a recorded input: its states at the samples, with a leading time axis.
+    """Simulate the plant alone under a recorded input, freely or as a predictor.
 
     Args:
         experiment: with array leaves.
         start: state at the first sample.
-        torque: input in N m, held from each sample to the next.
-        time: time of the first sample in s.
-        measured: positions of each side in rad, to predict from: each state is then what follows from the samples before.
-        gain: by which a prediction error corrects position (1) and velocity (1/s) of its side; needs `measured`.
+        torque: input, N m, held from each sample to the next, shape (samples,).
+        time: of the first sample, s.
+        measured: position of each side, rad, shape (samples,). With `gain`, each state is then the prediction from the
+            samples before it.
+        gain: by side, factors of the prediction error in the corrections of position (1) and velocity (1/s).
+
+    Returns:
+        The states at the samples, with a leading time axis.
     """
     plant, run = experiment.plant, experiment.run
 
-    def sample(state: PlantState, given: tuple[Array, Array, dict[str, Array]]) -> tuple[PlantState, PlantState]:
-        index, torque, readings = given
-        at = time + index.astype(torque.dtype) * run.sample_period
-        return move(plant, run, corrected(state, readings, gain or {}), torque, at), state
+    def predict_sample(state: PlantState, inputs: tuple[Array, Array, dict[str, Array]]) -> tuple[PlantState, PlantState]:
+        index, torque, readings = inputs
+        t = time + index.astype(torque.dtype) * run.sample_period
+        return move_plant(plant, run, correct_by_readings(state, readings, gain or {}), torque, t), state
 
-    samples = jnp.arange(len(torque), dtype=jnp.int32), torque, measured if measured is not None and gain is not None else {}
-    _, states = jax.lax.scan(sample, start, samples)
+    readings = measured if measured is not None and gain is not None else {}
+    indices = jnp.arange(len(torque), dtype=jnp.int32)
+    _, states = jax.lax.scan(predict_sample, start, (indices, torque, readings))
     return states

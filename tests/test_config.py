@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from small_study import ALPHA, LAMBDA, listed, rigid, small, spaced
 
 from jaxbl.config import numeric_paths, read_config, with_values
-from jaxbl.drive import EFFECTS, EXCITATIONS, TRANSMISSIONS, get_leaf, key_of, leaf_paths, parameters
+from jaxbl.drive import EFFECTS, EXCITATIONS, TRANSMISSIONS, config_key, get_leaf, leaf_paths, parameters
 from jaxbl.drive.plant import DRIVES
 from jaxbl.errors import InputError
 from jaxbl.sweeps.points import Points
@@ -102,7 +102,7 @@ NUMBERS = {
 TABLES = {
     name: {"kind": name}
     | {
-        key_of(f.name): NUMBERS.get(f.name, 0.2)
+        config_key(f.name): NUMBERS.get(f.name, 0.2)
         for f, _ in parameters(EFFECTS[name])
         if f.default != () and f.name != "turn"
     }
@@ -363,7 +363,7 @@ def table(section, tag, name, module):
     numbers = {}
     for field, known in parameters(module):
         default = field.default if isinstance(field.default, int | float | str) else NUMBERS.get(field.name, 0.2)
-        numbers[key_of(field.name)] = default
+        numbers[config_key(field.name)] = default
         assert known.doc
     return {tag: name, **numbers}
 
@@ -381,12 +381,12 @@ def test_every_module_has_the_table_of_its_parameters(section, tag, name, module
     built = getattr(config.build(), section)
     assert type(built) is module
     for field, _ in parameters(module):
-        assert getattr(built, field.name) == given[key_of(field.name)]
+        assert getattr(built, field.name) == given[config_key(field.name)]
         low = parameters_by_name(module)[field.name]
         if low.above is not None or low.minimum is not None:
             wrong = low.above if low.above is not None else low.minimum - 1
-            with pytest.raises(InputError, match=f"{section}.{key_of(field.name)}: should be"):
-                read_config(data | {section: given | {key_of(field.name): wrong}})
+            with pytest.raises(InputError, match=f"{section}.{config_key(field.name)}: should be"):
+                read_config(data | {section: given | {config_key(field.name): wrong}})
 
 
 def parameters_by_name(module):

@@ -13,7 +13,7 @@ from jaxbl.drive import Encoders, Initial, Rigid, set_leaves
 from jaxbl.drive.effects import ConstantTorque, CoulombFriction
 from jaxbl.identification.compilation import jit
 from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, Observers
-from jaxbl.simulate import Reducer, initial_state, replay, scan, trajectory, unit_noise
+from jaxbl.simulate import Reducer, initial_state, plant_trajectory, replay, scan, unit_noise
 from jaxbl.sweeps.metrics import METRICS
 
 SEED = jnp.asarray(3)
@@ -334,7 +334,7 @@ def test_what_observers_are_told_is_not_in_their_equivalent_control():
     measured = {side: seen.side(side).measured for side in experiment.sides}
     # of the true acceleration, its mean over each sampling period
     known = {side: seen.side(side).true.perturbation for side in experiment.sides}
-    run = jit(lambda *given: replay(*given, record=everything, state=initial_state(experiment), known=known))
+    run = jit(lambda *given: replay(*given, record=everything, state=initial_state(experiment), added_accelerations=known))
     _, told = run(experiment, seen.input, measured)
     for side in experiment.sides:
         plain = seen.side(side).equivalent_control[500:]
@@ -344,7 +344,7 @@ def test_what_observers_are_told_is_not_in_their_equivalent_control():
 def test_a_trajectory_is_the_plant_of_the_whole_chain():
     experiment = paper(steps=300)
     seen = trace(experiment)
-    states = jit(lambda u: trajectory(experiment, experiment.plant.init(experiment.initial), u))(seen.input)
+    states = jit(lambda u: plant_trajectory(experiment, experiment.plant.init(experiment.initial), u))(seen.input)
     for side in experiment.sides:
         np.testing.assert_allclose(states.position[side], seen.side(side).true.position, rtol=1e-12, atol=1e-14)
         np.testing.assert_allclose(states.velocity[side], seen.side(side).true.velocity, rtol=1e-12, atol=1e-14)

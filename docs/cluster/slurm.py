@@ -24,7 +24,7 @@ def main() -> None:
     given = parser.parse_args()
     # one process a job: it uses all cores of the job, and compiles once
     with (
-        SLURMCluster(cores=given.cores, processes=1, memory=given.memory) as cluster,
+        SLURMCluster(cores=given.cores, processes=1, memory=given.has_memory) as cluster,
         Client(cluster) as client,
     ):
         # not scale(): that does not replace jobs that have ended

@@ -14,7 +14,7 @@ from pydantic import BeforeValidator, Field, create_model, model_validator
 from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.encoders import Encoders
 from jaxbl.drive.excitation import EXCITATIONS, Recorded
-from jaxbl.drive.parameters import key_of, parameters
+from jaxbl.drive.parameters import config_key, parameters
 from jaxbl.drive.plant import DRIVES, Initial
 from jaxbl.drive.transmission import TRANSMISSIONS
 from jaxbl.errors import InputError
@@ -72,7 +72,7 @@ IdentifierTable = table_for(Identifier)
 
 OTHERS = "a gain of other kinds of observer"
 """What the table of a kind says of it."""
-_GAINS = {field.name: key_of(field.name) for cls in OBSERVERS.values() for field, _ in parameters(cls)}
+_GAINS = {field.name: config_key(field.name) for cls in OBSERVERS.values() for field, _ in parameters(cls)}
 """Gains of all observers: fields and config keys."""
 
 
@@ -87,7 +87,7 @@ class _ObserverTable(Table):
     @property
     def observer(self) -> type[AbstractObserver]:
         """Class of the observers."""
-        return OBSERVERS[self.kind].discretised(self.discretisation)
+        return OBSERVERS[self.kind].select_discretisation(self.discretisation)
 
     def build(self) -> Observers:
         """The observers, without gains of other kinds."""

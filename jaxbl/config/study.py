@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.excitation import EXCITATIONS
-from jaxbl.drive.parameters import Parameter, as_arrays, key_of, parameters
+from jaxbl.drive.parameters import Parameter, as_arrays, config_key, parameters
 from jaxbl.observer import OBSERVERS
 from jaxbl.records import NominalDrive
 from jaxbl.records.table import LogTable
@@ -187,7 +187,7 @@ def _check_effects(config: Config) -> None:
             raise table_error(
                 f"effects[{i}]: {effect.kind} has no meaning on a rigid drive; motor.* and actuator.* effects act on it"
             )
-        if fault := EFFECTS[effect.kind].fault(effect.model_dump(), config.run.sample_period):
+        if fault := EFFECTS[effect.kind].find_fault(effect.model_dump(), config.run.sample_period):
             raise table_error(f"effects[{i}]: {effect.kind}: {fault}")
     for side in ("motor",) if rigid else ("motor", "load"):
         nominal = getattr(config.drive, f"{side}_inertia")
@@ -204,7 +204,7 @@ def _check_input(config: Config) -> None:
     """The samples of an input have to show it."""
     period, holdout = config.run.sample_period, None if config.tune is None else config.tune.holdout
     for key, table in (("excitation", config.excitation), ("tune.holdout", holdout)):
-        if table is not None and (fault := EXCITATIONS[table.kind].fault(dict(table), period)):
+        if table is not None and (fault := EXCITATIONS[table.kind].find_fault(dict(table), period)):
             raise table_error(f"{key}: {fault}")
 
 
@@ -237,8 +237,8 @@ def _of_other_kinds(config: Config) -> Iterator[str]:
     own = config.observer.observer
     if own is OBSERVERS[config.observer.kind]:
         yield "observer.discretisation"
-    gains = {key_of(field.name) for field, _ in parameters(own)}
-    others = {key_of(field.name) for cls in OBSERVERS.values() for field, _ in parameters(cls)} - gains
+    gains = {config_key(field.name) for field, _ in parameters(own)}
+    others = {config_key(field.name) for cls in OBSERVERS.values() for field, _ in parameters(cls)} - gains
     yield from (f"observer.{side}.{key}" for side in ("motor", "load") for key in others)
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Union
 
 from pydantic import Field, create_model
 
-from jaxbl.drive.parameters import key_of, parameters
+from jaxbl.drive.parameters import config_key, parameters
 from jaxbl.validation import Positive, StrictTable
 
 
@@ -47,7 +47,7 @@ def table_for(module: type, factory: Callable[..., Any] | None = None, base: typ
             kind | None if optional else kind,
             Field(
                 default=... if field.default is dataclasses.MISSING else [] if field.default == () else field.default,
-                alias=key_of(field.name) if key_of(field.name) != field.name else None,
+                alias=config_key(field.name) if config_key(field.name) != field.name else None,
                 description=known.doc,
                 json_schema_extra={"unit": known.unit} if known.unit else None,
                 ge=known.minimum,

@@ -125,7 +125,7 @@ def _variants(name: str, log: Scales) -> Iterator[Candidate]:
             continue
         # of one that remembers its input the first samples are the clearest mark on many a log; not where all that it
         # remembers is known
-        remembers = remembers_input(_effect(name, known)) and not EFFECTS[name].input_alone
+        remembers = remembers_input(_effect(name, known)) and not EFFECTS[name].state_from_input
         for from_rest in (False, True) if remembers else (False,):
             yield _trial(name, known, from_rest)
 
@@ -283,7 +283,7 @@ class MotionTorques:
             else:
                 found[i] = known
         for name, which in asked.items():
-            place = self.experiment.drive.place(effects[which[0]].place)
+            place = self.experiment.drive.resolve_place(effects[which[0]].place)
             # of the model's own only those in the gear matter, and only for others there: one structure, and one program
             gear = [one for one in self.experiment.effects if one.place == place == "transmission" and one.name != name]
             bare = with_effects(self.experiment, tuple(gear))
@@ -306,7 +306,7 @@ class MotionTorques:
     def _shares(self, effect: AbstractEffect) -> bool:
         """Whether an effect's torque follows from motion and input alone: not in the gear, where the model has torques of
         its own; nor where the model says how it moves, or what holds it at rest."""
-        place, own = self.experiment.drive.place(effect.place), type(effect)
+        place, own = self.experiment.drive.resolve_place(effect.place), type(effect)
         if place == "actuator":
             return True
         held = place in self.held and self.held[place].any()
@@ -346,12 +346,12 @@ def _torques(
     along = Path(part.time, part.torque, part.position, part.velocity, before=part.before)
 
     def one(effect: AbstractEffect) -> dict[int, jax.Array]:
-        place = drive.place(effect.place)
+        place = drive.resolve_place(effect.place)
         if place == "transmission":
             both = (experiment, with_effects(experiment, (*experiment.effects, effect)))
             at = part.position, part.velocity
             given = [(one.plant, effect_path(one, along)[0]) for one in both]
-            before, after = (plant.transmitted(*at, states) for plant, states in given)
+            before, after = (plant.transmitted_torque(*at, states) for plant, states in given)
             rubbed = [plant.gear_friction(states, c) for (plant, states), (c, _) in zip(given, (before, after), strict=True)]
             return {
                 0: before[0] - after[0] + (rubbed[0] - rubbed[1]) * direction,
@@ -380,7 +380,7 @@ def _needed(experiment: Experiment, part: Part) -> dict[str, jax.Array]:
     """Torque on each side that its motion does not take up, dry friction left out, N m."""
     plant = experiment.plant
     states, torque = effect_path(experiment, Path(part.time, part.torque, part.position, part.velocity, before=part.before))
-    acting = plant.torques(part.position, part.velocity, states, torque, part.time)
+    acting = plant.side_torques(part.position, part.velocity, states, torque, part.time)
     found = {}
     for side in experiment.sides:
         rest = acting[side][0] - experiment.drive.viscous(side) * part.velocity[side]

@@ -119,8 +119,8 @@ def _searched(model: _Model, passes: int, rest: bool) -> Run:
     within = _within(model) | windows.rest
     for effect, own in zip(model.experiment.effects, places.effects, strict=True):
         columns = jax.tree.leaves(own)
-        if columns and (effect.follows or effect.input_alone):
-            known[np.ix_(np.flatnonzero(within | effect.input_alone), columns)] = 0.0
+        if columns and (effect.state_from_measurement or effect.state_from_input):
+            known[np.ix_(np.flatnonzero(within | effect.state_from_input), columns)] = 0.0
     residual, slope = np.zeros((runs, samples, len(sides))), np.zeros((runs, samples, len(sides), count))
     states = [np.zeros((runs, samples)) for _ in leaves]
     cost, damping, tried = np.full(runs, np.inf), np.full(runs, RIDGE), best.copy()

@@ -74,7 +74,7 @@ def _part(experiment: Experiment, free: Sequence[Free], theta: np.ndarray, segme
     for effect, own in zip(experiment.effects, motion.effects, strict=True):
         states_of = len(jax.tree.leaves(own))
         # what is known has no error that a predictor could have
-        order += [] if effect.input_alone else range(at, at + states_of)
+        order += [] if effect.state_from_input else range(at, at + states_of)
         at += states_of
     # as they may differ from sample to sample elsewhere, where the same loop serves
     none = {path: np.zeros(size) for path in added.values()}
@@ -336,7 +336,7 @@ class Linear:
 
     def scales(self, name: str) -> Scales:
         """How large things are on the record, as an effect sees them; frequencies are sought anew each time."""
-        place = self.experiment.drive.place(name.partition(".")[0])
+        place = self.experiment.drive.resolve_place(name.partition(".")[0])
         if place not in self._scales:
             self._scales[place] = self._scales_at(place)
         found = self._scales[place]
@@ -372,7 +372,7 @@ class Linear:
         for effect in self.experiment.effects:
             roles = type(effect).roles()
             acts = any(float(getattr(effect, leaf)) != 0.0 for leaf, role in roles.items() if role.kind == "size")
-            if acts and self.experiment.drive.place(effect.place) == side:
+            if acts and self.experiment.drive.resolve_place(effect.place) == side:
                 found += [float(getattr(effect, leaf)) for leaf, role in roles.items() if role.kind == "harmonic"]
         return tuple(found)
 
@@ -384,7 +384,7 @@ class Linear:
                 count *= max(self.count * self.period * self._highest, 1.0)
             elif role.kind == "harmonic":
                 log = self.scales(name)
-                count *= max(len(role.trials(log)) if role.sought is None else role.sought(log), 1)
+                count *= max(len(role.trials(log)) if role.trial_count is None else role.trial_count(log), 1)
         return float(np.log(count))
 
     @property

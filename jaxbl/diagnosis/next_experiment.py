@@ -25,7 +25,7 @@ from jaxbl.identification.logs import LogTask, default_paths, on_record, unit_on
 from jaxbl.identification.segments import reading_noise, segments_of
 from jaxbl.identification.unseen_load import GAPS
 from jaxbl.records import Record
-from jaxbl.simulate import Experiment, trajectory
+from jaxbl.simulate import Experiment, plant_trajectory
 
 from .diagnosis_summary import tied
 from .neutral_effects import with_added
@@ -274,4 +274,4 @@ def _runs(
     rest = experiment.plant.init(experiment.initial)
     still = jax.tree.map(jnp.zeros_like, position)
     start = PlantState(position, still, rest.effects)
-    return jax.vmap(lambda torque: trajectory(experiment, start, torque).position)(torques)
+    return jax.vmap(lambda torque: plant_trajectory(experiment, start, torque).position)(torques)

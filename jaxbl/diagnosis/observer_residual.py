@@ -22,7 +22,7 @@ from jaxbl.identification.regression import Kinematics
 from jaxbl.identification.segments import Segment
 from jaxbl.observer import AbstractSuperTwisting
 from jaxbl.records.linear_filters import filtered, parzen
-from jaxbl.simulate import Experiment, Signals, State, initial_state, observer_state, replay
+from jaxbl.simulate import Experiment, Signals, State, initial_observer_state, initial_state, replay
 
 from .neutral_effects import complete
 from .residuals import Residual, beyond_nominal, narrowed
@@ -114,9 +114,9 @@ def _controls(
     def one(measured: dict[str, Array]) -> dict[str, Array]:
         begin = initial_state(experiment, {side: values[0] for side, values in measured.items()})
         motion = {side: (part.position[side][0], part.velocity[side][0]) for side in experiment.sides}
-        at = {side: observer_state(experiment, side, *found) for side, found in motion.items()}
+        at = {side: initial_observer_state(experiment, side, *found) for side, found in motion.items()}
         state = State(None, at, begin.equivalent_control, begin.identifier)
-        return replay(experiment, torque, measured, record=keep, state=state, known=known)[1]
+        return replay(experiment, torque, measured, record=keep, state=state, added_accelerations=known)[1]
 
     return jax.vmap(one)(readings)
 

@@ -170,7 +170,7 @@ class ReferenceLog:
         what was before; its friction does not jump.
         """
         experiment = at_period(experiment, self.period)
-        if experiment.plant.memory or any(one.transmitted is not None for one in self.segments):
+        if experiment.plant.has_memory or any(one.transmitted is not None for one in self.segments):
             return {}
         run, firsts = self._runs(experiment, self.samples, _STATES, {})
         pieces = []

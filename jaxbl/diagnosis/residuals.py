@@ -123,7 +123,7 @@ def _mean_around(values: Float[Array, " samples"]) -> Float[Array, " samples"]:
 def _torques(experiment: Experiment, position: dict, velocity: dict, *rest: Any) -> tuple[dict[str, Array], ...]:
     """All modelled torques on each side but for set-valued friction, and the level of that, N m; arguments as of
     :meth:`jaxbl.drive.plant.Plant.torques`."""
-    acting, drive = experiment.plant.torques(position, velocity, *rest), experiment.drive
+    acting, drive = experiment.plant.side_torques(position, velocity, *rest), experiment.drive
     total = {side: one - drive.viscous(side) * velocity[side] for side, (one, _) in acting.items()}
     return total, {side: jnp.asarray(level, velocity[side].dtype) for side, (_, level) in acting.items()}
 
@@ -141,7 +141,7 @@ def _dry(
     direction = passage * (2.0 - jnp.abs(passage))
     # what is not shown to move for a while may be held: friction is then what is missing, as far as it goes
     motion = Motion(part.time, part.position[side], velocity, torque if side == "motor" else jnp.zeros_like(torque))
-    bent, most = experiment.plant.holding(side, motion, states)
+    bent, most = experiment.plant.holding_torque(side, motion, states)
     inertia = experiment.plant.inertia(side)
     needed = jnp.clip(total + bent - inertia * acceleration, -(level + most), level + most) - bent
     friction = jnp.where(held, needed, level * direction)

@@ -28,7 +28,7 @@ class AbstractExcitation(eqx.Module):
         """Torque in N m at a time in s."""
 
     @classmethod
-    def fault(cls, numbers: Mapping[str, Any], period: float) -> str:
+    def find_fault(cls, numbers: Mapping[str, Any], period: float) -> str:
         """What is wrong with the numbers of a study whose samples are `period` seconds apart, beyond the range of each, and
         what would be right; "" if nothing is."""
         return ""
@@ -63,7 +63,7 @@ class Sine(AbstractExcitation):
     offset: Scalar = parameter("N m", "constant part", default=0.0)
 
     @classmethod
-    def fault(cls, numbers, period):
+    def find_fault(cls, numbers, period):
         return _too_fast("frequency", numbers["frequency"], period)
 
     def __call__(self, time):
@@ -85,7 +85,7 @@ class Multisine(AbstractExcitation):
     count: int = option("number of harmonics", default=8, minimum=1, maximum=10_000)
 
     @classmethod
-    def fault(cls, numbers, period):
+    def find_fault(cls, numbers, period):
         return _too_fast("the highest harmonic,", numbers["count"] * numbers["frequency"], period)
 
     def __call__(self, time):
@@ -106,7 +106,7 @@ class Chirp(AbstractExcitation):
     sweep_time: Scalar = parameter("s", "length of the sweep", above=0.0)
 
     @classmethod
-    def fault(cls, numbers, period):
+    def find_fault(cls, numbers, period):
         return _too_fast("the highest frequency,", max(numbers["start_frequency"], numbers["stop_frequency"]), period)
 
     def __call__(self, time):
@@ -137,7 +137,7 @@ class Steps(AbstractExcitation):
     seed: int = option("seed of the levels", default=0, minimum=0)
 
     @classmethod
-    def fault(cls, numbers, period):
+    def find_fault(cls, numbers, period):
         return _too_short(numbers["hold"], period)
 
     def __call__(self, time):
@@ -157,7 +157,7 @@ class Prbs(AbstractExcitation):
     order: int = option("bits of the shift register; the sequence has 2^order - 1 bits", default=10, minimum=2, maximum=20)
 
     @classmethod
-    def fault(cls, numbers, period):
+    def find_fault(cls, numbers, period):
         return _too_short(numbers["hold"], period)
 
     def __call__(self, time):

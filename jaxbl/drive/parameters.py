@@ -70,7 +70,7 @@ def parameters(module: Any) -> Iterator[tuple[dataclasses.Field, Parameter]]:
             yield field, field.metadata["parameter"]
 
 
-def key_of(field_name: str) -> str:
+def config_key(field_name: str) -> str:
     """Config key of a field: `lambda_` is a Python name for `lambda`."""
     return field_name[:-1] if field_name.endswith("_") and keyword.iskeyword(field_name[:-1]) else field_name
 
@@ -83,7 +83,7 @@ def leaf_paths(tree: Any, prefix: str = "") -> dict[str, Parameter]:
     """
     found: dict[str, Parameter] = {}
     for field in dataclasses.fields(tree):
-        value, path, known = getattr(tree, field.name), f"{prefix}{key_of(field.name)}", field.metadata
+        value, path, known = getattr(tree, field.name), f"{prefix}{config_key(field.name)}", field.metadata
         parts = {f"{path}.{key}": one for key, one in _members(value).items()} if isinstance(value, tuple) else {path: value}
         for path, part in parts.items():
             if dataclasses.is_dataclass(part):

@@ -23,9 +23,9 @@ from .effects import AbstractEffect, ActuatorEffect, EncoderEffect, Motion
 from .parameters import Scalar, parameter
 from .transmission import AbstractTransmission
 
-Sides = dict[str, Float[Array, ""]]
+SideValues = dict[str, Float[Array, ""]]
 """One number for each side of the drive: keys "motor" and, on two inertias, "load"."""
-States = tuple[Any, ...]
+EffectStates = tuple[Any, ...]
 """Each effect's own state, in the order of the effects."""
 
 
@@ -51,7 +51,7 @@ class AbstractDrive(eqx.Module):
         """Motor angle for one unit of the side's angle."""
         return 1.0
 
-    def place(self, place: str) -> str:
+    def resolve_place(self, place: str) -> str:
         """Where effects of a place act."""
         return place
 
@@ -88,7 +88,7 @@ class Rigid(AbstractDrive):
     motor_inertia: Scalar = parameter("kg m²", "inertia (a mass in kg on a linear axis)", above=0.0)
     motor_viscous: Scalar = parameter("N m s/rad", "viscous friction", minimum=0.0)
 
-    def place(self, place):
+    def resolve_place(self, place):
         return "motor" if place == "load" else place
 
 
@@ -107,9 +107,9 @@ class Initial(eqx.Module):
 class PlantState(eqx.Module):
     """Positions (rad) and velocities (rad/s) of the sides, and the effects' own states."""
 
-    position: Sides
-    velocity: Sides
-    effects: States
+    position: SideValues
+    velocity: SideValues
+    effects: EffectStates
 
 
 class Plant(eqx.Module):
@@ -131,7 +131,9 @@ class Plant(eqx.Module):
         """True inertia of a side, kg m^2."""
         # of a method of a module equinox makes a module: only of those that answer
         some = [one for one in self.effects if type(one).added_inertia is not AbstractEffect.added_inertia]
-        return self.drive.inertia(side) + sum(one.added_inertia() for one in some if self.drive.place(one.place) == side)
+        return self.drive.inertia(side) + sum(
+            one.added_inertia() for one in some if self.drive.resolve_place(one.place) == side
+        )
 
     @property
     def half_gap(self) -> float:
@@ -139,26 +141,30 @@ class Plant(eqx.Module):
         gap = 0.0 if self.transmission is None else float(self.transmission.half_gap)
         return gap + sum(float(effect.free_play()) for effect in self.effects)
 
-    def twist(self, position: Sides) -> Float[Array, ""]:
+    def twist(self, position: SideValues) -> Float[Array, ""]:
         """z = theta_e - N_0 theta_s in rad."""
         return position["motor"] - self.drive.ratio("load") * position["load"]
 
-    def transmitted(self, position: Sides, velocity: Sides, states: States) -> tuple[Float[Array, ""], Scalar]:
+    def transmitted_torque(
+        self, position: SideValues, velocity: SideValues, states: EffectStates
+    ) -> tuple[Float[Array, ""], Scalar]:
         """Transmitted torque C (N m) and the motor angle that one unit of load angle takes up (N_0 without effects)."""
         assert self.transmission is not None
-        deflection, rate, ratio = self._strained(position, velocity, states)
+        deflection, rate, ratio = self._elastic_motion(position, velocity, states)
         torque = self.transmission.torque(deflection)
-        for effect, own in self._at("transmission", states):
+        for effect, own in self._effects_at("transmission", states):
             torque = torque + effect.transmit(own, deflection, rate)
         return torque, ratio
 
-    def gear_friction(self, states: States, transmitted: Scalar) -> Scalar:
+    def gear_friction(self, states: EffectStates, transmitted: Scalar) -> Scalar:
         """Level of the dry friction that the transmitted torque (N m) causes on the motor's side, N m."""
-        return sum((effect.gear_friction(own, transmitted) for effect, own in self._at("transmission", states)), 0.0)
+        return sum((effect.gear_friction(own, transmitted) for effect, own in self._effects_at("transmission", states)), 0.0)
 
-    def _strained(self, position: Sides, velocity: Sides, states: States) -> tuple[Float[Array, ""], Scalar, Scalar]:
+    def _elastic_motion(
+        self, position: SideValues, velocity: SideValues, states: EffectStates
+    ) -> tuple[Float[Array, ""], Scalar, Scalar]:
         """Elastic deflection of the gear (rad), its rate (rad/s), and the motor angle for one unit of load angle."""
-        effects = self._at("transmission", states)
+        effects = self._effects_at("transmission", states)
         ratio = self.drive.ratio("load")
         z = self.twist(position)
         rate = velocity["motor"] - ratio * velocity["load"]
@@ -185,7 +191,7 @@ class Plant(eqx.Module):
         Effects with a memory move on with the positions: half a step before the kick and half a step after it.
         """
         states, torque = self.actuate(state.effects, torque, step)
-        states = self.remember(states, state.position, state.velocity, time, 0.5 * step)
+        states = self.advance_effects(states, state.position, state.velocity, time, 0.5 * step)
         middle = {side: state.position[side] + 0.5 * step * state.velocity[side] for side in self.drive.sides}
         middle_time = time + 0.5 * step
         velocity = self._kick(state.velocity, middle, state.velocity, states, torque, middle_time, step)
@@ -193,20 +199,22 @@ class Plant(eqx.Module):
             mean = {side: 0.5 * (state.velocity[side] + velocity[side]) for side in self.drive.sides}
             velocity = self._kick(state.velocity, middle, mean, states, torque, middle_time, step)
         position = {side: middle[side] + 0.5 * step * velocity[side] for side in self.drive.sides}
-        return PlantState(position, velocity, self.remember(states, middle, velocity, middle_time, 0.5 * step))
+        return PlantState(position, velocity, self.advance_effects(states, middle, velocity, middle_time, 0.5 * step))
 
-    def receive(self, states: States, torque: Any, period: Scalar) -> tuple[States, Callable[[Scalar, Scalar], Any]]:
+    def receive(
+        self, states: EffectStates, torque: Any, period: Scalar
+    ) -> tuple[EffectStates, Callable[[Scalar, Scalar], Any]]:
         """What the effects let arrive of a torque (N m) that is commanded for `period` seconds: their states, and
         its mean as a function of the time since the sample began and the seconds that the mean is over."""
         new, arriving = [], lambda since, step: torque
         for effect, own in zip(self.effects, states, strict=True):
             if type(effect).receive is not AbstractEffect.receive:
                 own, first, then, switch = effect.receive(own, arriving(0.0, period), period)
-                arriving = partial(_mean, first, then, switch)
+                arriving = partial(_mean_torque, first, then, switch)
             new.append(own)
         return tuple(new), arriving
 
-    def actuate(self, states: States, torque: Any, step: Scalar) -> tuple[States, Any]:
+    def actuate(self, states: EffectStates, torque: Any, step: Scalar) -> tuple[EffectStates, Any]:
         """What the effects make of a commanded torque (N m) held over `step` seconds: their states, and the torque."""
         new = []
         for effect, own in zip(self.effects, states, strict=True):
@@ -217,8 +225,8 @@ class Plant(eqx.Module):
     @property
     def input_gain(self) -> Scalar:
         """Torque on the motor for one unit of the input, which may be a voltage: of a small one that has lasted."""
-        states = tuple(effect.settled(_SMALL) for effect in self.effects)
-        return self.actuate(states, _SMALL, _LONG)[1] / _SMALL
+        states = tuple(effect.settled(_SMALL_INPUT) for effect in self.effects)
+        return self.actuate(states, _SMALL_INPUT, _LONG_TIME)[1] / _SMALL_INPUT
 
     @property
     def input_unit(self) -> str:
@@ -226,30 +234,32 @@ class Plant(eqx.Module):
         return next((one.input_unit for one in self.effects if isinstance(one, ActuatorEffect) and one.input_unit), "N m")
 
     @property
-    def memory(self) -> bool:
+    def has_memory(self) -> bool:
         """Whether some effect's own state depends on how the drive moves."""
         return any(type(effect).advance is not AbstractEffect.advance for effect in self.effects)
 
-    def remember(self, states: States, position: Sides, velocity: Sides, time: Scalar, step: Scalar) -> States:
+    def advance_effects(
+        self, states: EffectStates, position: SideValues, velocity: SideValues, time: Scalar, step: Scalar
+    ) -> EffectStates:
         """The effects' own states after `step` seconds at steady velocities (rad/s), from positions (rad) at `time` (s)."""
-        if not self.memory:
+        if not self.has_memory:
             return states
         motions = {side: Motion(time, position[side], velocity[side]) for side in self.drive.sides}
         motions["actuator"] = motions["encoder"] = motions["motor"]
         if self.transmission is not None:
             # the rate changes with the position: its mean over the step is that at the middle
             middle = {side: position[side] + 0.5 * step * velocity[side] for side in self.drive.sides}
-            motions["transmission"] = Motion(time, *self._strained(middle, velocity, states)[:2])
+            motions["transmission"] = Motion(time, *self._elastic_motion(middle, velocity, states)[:2])
         return tuple(
-            effect.advance(own, motions[self.drive.place(effect.place)], step)
+            effect.advance(own, motions[self.drive.resolve_place(effect.place)], step)
             for effect, own in zip(self.effects, states, strict=True)
         )
 
-    def torques(
+    def side_torques(
         self,
-        position: Sides,
-        velocity: Sides,
-        states: States,
+        position: SideValues,
+        velocity: SideValues,
+        states: EffectStates,
         torque: Scalar,
         time: Scalar,
         transmitted: Scalar | None = None,
@@ -262,18 +272,18 @@ class Plant(eqx.Module):
         gains: dict[str, Scalar] = {"motor": -1.0}
         through: Scalar = 0.0
         if self.transmission is not None:
-            through, gains["load"] = self.transmitted(position, velocity, states)
+            through, gains["load"] = self.transmitted_torque(position, velocity, states)
         if transmitted is not None:
             through = transmitted
         found = {}
         for side in self.drive.sides:
             driving = torque if side == "motor" else 0.0
-            for effect, own in self._at("actuator", states) if side == "motor" else ():
+            for effect, own in self._effects_at("actuator", states) if side == "motor" else ():
                 driving = driving - effect.resist(own, Motion(time, position[side], velocity[side], torque))
             total = gains[side] * through + driving
             level: Scalar = self.gear_friction(states, through) if side == "motor" else 0.0
             motion = Motion(time, position[side], velocity[side], driving)
-            for effect, own in self._at(side, states):
+            for effect, own in self._effects_at(side, states):
                 total = total - effect.resist(own, motion)
                 level = level + effect.dry_friction(own, motion)
             found[side] = total, level
@@ -282,50 +292,57 @@ class Plant(eqx.Module):
     def read(self, side: str, position: Any, velocity: Any) -> Any:
         """What the encoder of a side reads at a position (rad) and velocity (rad/s), before noise and counts; rad."""
         for effect in self.effects:
-            if isinstance(effect, EncoderEffect) and self.drive.place(effect.encoder) == side:
+            if isinstance(effect, EncoderEffect) and self.drive.resolve_place(effect.encoder) == side:
                 position = effect.read(position, velocity)
         return position
 
-    def holding(self, side: str, motion: Motion, states: States) -> tuple[Scalar, Scalar]:
+    def holding_torque(self, side: str, motion: Motion, states: EffectStates) -> tuple[Scalar, Scalar]:
         """Torque (N m) of a side's frictions with a memory that may hold it, and the level up to which they do so while it
         is not seen to move."""
         torque: Scalar = 0.0
         level: Scalar = 0.0
-        for effect, own in self._at(side, states):
+        for effect, own in self._effects_at(side, states):
             if type(effect).holds is not AbstractEffect.holds:
                 torque, level = torque + effect.resist(own, motion), level + effect.holds()
         return torque, level
 
     def _kick(
-        self, velocity: Sides, position: Sides, seen: Sides, states: States, torque: Scalar, time: Scalar, step: Scalar
-    ) -> Sides:
+        self,
+        velocity: SideValues,
+        position: SideValues,
+        seen: SideValues,
+        states: EffectStates,
+        torque: Scalar,
+        time: Scalar,
+        step: Scalar,
+    ) -> SideValues:
         """Velocities after `step`; `seen` are the velocities at which velocity-dependent effects are evaluated."""
         new = {}
-        for side, (total, level) in self.torques(position, seen, states, torque, time).items():
+        for side, (total, level) in self.side_torques(position, seen, states, torque, time).items():
             mass = self.inertia(side) / step
             drag = 0.5 * self.drive.viscous(side)
             free = ((mass - drag) * velocity[side] + total) / (mass + drag)
             if not isinstance(level, float):
-                free = _rubbed(velocity[side], free, level / (mass + drag))
+                free = _apply_dry_friction(velocity[side], free, level / (mass + drag))
             new[side] = free
         return new
 
-    def _at(self, place: str, states: States) -> list[tuple[AbstractEffect, Any]]:
+    def _effects_at(self, place: str, states: EffectStates) -> list[tuple[AbstractEffect, Any]]:
         """Effects of a place, each with its own state."""
         pairs = zip(self.effects, states, strict=True)
-        return [(effect, own) for effect, own in pairs if self.drive.place(effect.place) == place]
+        return [(effect, own) for effect, own in pairs if self.drive.resolve_place(effect.place) == place]
 
 
-_SMALL, _LONG = 1e-6, 1e9
+_SMALL_INPUT, _LONG_TIME = 1e-6, 1e9
 """Input below every limit, and a time in s after which nothing lags behind."""
 
 
-def _mean(first: Scalar, then: Scalar, switch: Scalar, since: Scalar, step: Scalar) -> Scalar:
+def _mean_torque(first: Scalar, then: Scalar, switch: Scalar, since: Scalar, step: Scalar) -> Scalar:
     """Mean over `step` seconds, from `since`, of a torque that changes once, at `switch`."""
     return then + (first - then) * jnp.clip((switch - since) / step, 0.0, 1.0)
 
 
-def _rubbed(before: Float[Array, ""], free: Scalar, stop: Scalar) -> Float[Array, ""]:
+def _apply_dry_friction(before: Float[Array, ""], free: Scalar, stop: Scalar) -> Float[Array, ""]:
     """Velocity after a step under set-valued friction, from that before, that which it would `free` reach without friction,
     and what friction takes from it in a whole step of motion; all rad/s."""
     direction = jnp.where(before != 0.0, jnp.sign(before), -jnp.sign(free))

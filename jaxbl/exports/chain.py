@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxbl.config import Config
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths, parameters, set_leaves
-from jaxbl.simulate import LONGEST_BLOCK, Experiment, Run, Sample, State, end_of_block, initial_state, step
+from jaxbl.simulate import LONGEST_BLOCK, Experiment, Run, Sample, State, end_block, initial_state, step
 
 from .block import Block, Known, Quantity, traced_block
 from .lowering import with_x64
@@ -78,7 +78,7 @@ def observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
         out |= _identified(own, new)
         # sums lose nothing over some hundred samples
         full = state.unsettled >= LONGEST_BLOCK - 1
-        settled = jax.lax.cond(full, lambda state: end_of_block(own, (state, ()))[0], lambda state: state, new)
+        settled = jax.lax.cond(full, lambda state: end_block(own, (state, ()))[0], lambda state: state, new)
         samples = jnp.minimum(state.samples, LAST - 1) + 1
         return _chain(settled, samples, jnp.where(full, 0, state.unsettled + 1).astype(jnp.int32)), out
 

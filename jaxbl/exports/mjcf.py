@@ -75,7 +75,7 @@ def _collected(experiment: Experiment, slides: tuple[str, ...]) -> tuple[MujocoP
     names = [effect.name for effect in experiment.effects]
     # first those that make the gap: what others are depends on it
     for i, effect in sorted(enumerate(experiment.effects), key=lambda one: float(one[1].free_play()) == 0.0):
-        path, place = f"effects.{effect.name if names.count(effect.name) == 1 else i}", drive.place(effect.place)
+        path, place = f"effects.{effect.name if names.count(effect.name) == 1 else i}", drive.resolve_place(effect.place)
         said[path] = one = effect.to_mujoco(parts, place if place in sides else "motor")
         if one.how != "not said":
             notes.setdefault(place, []).append(_note(path, effect, one, place in slides))

@@ -1,4 +1,4 @@
-"""The drive as it moves, as one block: plant and integrator of :func:`jaxbl.simulate.move`, from sample to sample."""
+"""The drive as it moves, as one block: plant and integrator of :func:`jaxbl.simulate.move_plant`, from sample to sample."""
 
 import re
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from jaxbl.config import Config
 from jaxbl.drive.parameters import Parameter, as_arrays, get_leaf, leaf_paths, set_leaves
 from jaxbl.drive.plant import PlantState
 from jaxbl.fused import Unsupported
-from jaxbl.simulate import Experiment, move
+from jaxbl.simulate import Experiment, move_plant
 
 from .block import Program, Quantity, program_of, traced_block
 from .chain import LAST, PERIOD, known_numbers
@@ -112,7 +112,7 @@ def _traced(
     def step(known: dict[str, Any], state: Moving, given: dict[str, Any]) -> tuple[Moving, dict[str, Any]]:
         mine = own(known, given)
         time = state.samples.astype(dtype) * mine.run.sample_period
-        moved = move(mine.plant, mine.run, state.plant, given[_INPUT], time)
+        moved = move_plant(mine.plant, mine.run, state.plant, given[_INPUT], time)
         samples = jnp.minimum(state.samples, LAST - 1) + 1
         return Moving(moved, samples), _outputs(mine, state.plant, moved, given[_INPUT])
 
@@ -139,7 +139,11 @@ def _outputs(
         }
     if experiment.transmission is not None:
         out["z"] = plant.twist(state.position), "rad", "twist: motor position less gear ratio times load position"
-        out["torque"] = plant.transmitted(state.position, state.velocity, state.effects)[0], "N m", "transmitted torque"
+        out["torque"] = (
+            plant.transmitted_torque(state.position, state.velocity, state.effects)[0],
+            "N m",
+            "transmitted torque",
+        )
         return out
     about = "what resists beyond the nominal model: mean over the sample that ends here; 0 at the start"
     resisting = jnp.zeros_like(period)

@@ -12,7 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.drive.parameters import set_leaves
-from jaxbl.simulate import Experiment, Reducer, advance, begin, block_length, done, end_of_block, figures
+from jaxbl.simulate import (
+    Experiment,
+    Reducer,
+    advance_sample,
+    all_done,
+    block_length,
+    compute_metrics,
+    end_block,
+    initial_carry,
+)
 
 from .dependence import Dependence, LoopHooks, carry_dependences, split_by_lane
 from .llvm import AddressedArrays, ArrayRows, Loop, LoopArrays, vector_lanes
@@ -37,7 +46,7 @@ class SharedInputs(NamedTuple):
     handed: AddressedArrays
     last: AddressedArrays
     ends: list[np.ndarray] | None
-    figures: list[np.ndarray]
+    compute_metrics: list[np.ndarray]
 
     @property
     def size(self) -> int:
@@ -70,17 +79,17 @@ class LaneSimulator(abc.ABC):
             return set_leaves(experiment, dict(zip(paths, values, strict=True)))
 
         def start(values: list[Any], *_: Any) -> Any:
-            return begin(own(values), reducers)
+            return initial_carry(own(values), reducers)
 
         def sample(values: list[Any], carry: Any, given: Any) -> Any:
-            return advance(own(values), reducers, carry, *given)[0]
+            return advance_sample(own(values), reducers, carry, *given)[0]
 
         def settle(values: list[Any], carry: Any, given: Any) -> Any:
-            carry = end_of_block(own(values), carry)
-            return carry, done(own(values), reducers, carry)
+            carry = end_block(own(values), carry)
+            return carry, all_done(own(values), reducers, carry)
 
         def result(values: list[Any], carry: Any, given: Any) -> dict[str, Any]:
-            return figures(own(values), reducers, carry)
+            return compute_metrics(own(values), reducers, carry)
 
         values = [jax.ShapeDtypeStruct((), dtype)] * len(paths)
         given = jax.ShapeDtypeStruct((), jnp.int32), dict.fromkeys(experiment.sides, jax.ShapeDtypeStruct((), jnp.float32))

@@ -1,8 +1,8 @@
 """A plant alone under a recorded input: its path, and the derivatives of its steps, by loops for this machine's processor.
 
-The same as :func:`jaxbl.simulate.trajectory` and `jax.jvp` of :func:`jaxbl.simulate.move` compute, many times as fast: XLA
-starts some twenty kernels for a step of a single plant, and passes what they compute through memory. What the loops cannot
-do (effects that read tables) is left to XLA. In float64, under `jax.enable_x64`.
+The same as :func:`jaxbl.simulate.plant_trajectory` and `jax.jvp` of :func:`jaxbl.simulate.move_plant` compute, many times
+as fast: XLA starts some twenty kernels for a step of a single plant, and passes what they compute through memory. What the
+loops cannot do (effects that read tables) is left to XLA. In float64, under `jax.enable_x64`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.drive.plant import PlantState
-from jaxbl.simulate import Experiment, corrected, move
+from jaxbl.simulate import Experiment, correct_by_readings, move_plant
 
 from . import Unsupported, in_threads, program_cache, raising_unsupported, warn_of_scan
 
@@ -41,7 +41,7 @@ def simulate_plant(
     measured: dict[str, np.ndarray] | None = None,
     gain: dict[str, np.ndarray] | None = None,
 ) -> PlantState:
-    """The plant's states at the samples, with a leading time axis; arguments as of :func:`jaxbl.simulate.trajectory`."""
+    """The plant's states at the samples, with a leading time axis; arguments of :func:`jaxbl.simulate.plant_trajectory`."""
     starts, torques, readings = jax.tree.map(lambda x: np.asarray(x)[None], (start, torque, measured or {}))
     found = simulate_plants(experiment, starts, torques, np.array([time], float), readings, gain)
     return jax.tree.map(lambda x: x[0], found)
@@ -212,7 +212,7 @@ def _scanned(
     def sample(state: PlantState, given: Any) -> tuple[PlantState, PlantState]:
         index, torque, readings, numbers = given
         at, one = time + index * experiment.run.sample_period, set_leaves(experiment, numbers)
-        return move(one.plant, one.run, corrected(state, readings, gain or {}), torque, at), state
+        return move_plant(one.plant, one.run, correct_by_readings(state, readings, gain or {}), torque, at), state
 
     samples = jnp.arange(len(torque)).astype(float), torque, measured, varying
     return jax.lax.scan(sample, jax.tree.map(lambda x: jnp.asarray(x, float), start), samples)[1]
@@ -229,7 +229,7 @@ def _pushed(
 ) -> tuple[PlantState, PlantState]:
     def step(state: PlantState, torque: jax.Array, time: jax.Array, numbers: Any) -> tuple[PlantState, PlantState]:
         def moved(experiment: Experiment, state: PlantState, torque: jax.Array) -> PlantState:
-            return move(experiment.plant, experiment.run, state, torque, time)
+            return move_plant(experiment.plant, experiment.run, state, torque, time)
 
         given = set_leaves(experiment, numbers), state, torque
         changes = jax.tree.map(lambda one, change: jnp.broadcast_to(change, one.shape).astype(one.dtype), given, direction)
@@ -290,7 +290,7 @@ class _PlantStructure(NamedTuple):
         return self.structure.unflatten(leaves)
 
     def step(self, experiment: Experiment, state: Sequence[Any], torque: Any, time: Any) -> list[Any]:
-        new = move(experiment.plant, experiment.run, self.shape.unflatten(state), torque, time)
+        new = move_plant(experiment.plant, experiment.run, self.shape.unflatten(state), torque, time)
         return jax.tree.leaves(new)
 
 
@@ -360,7 +360,7 @@ def _path_loop(plant: _PlantStructure, sides: tuple[str, ...] = (), varying: tup
         torque, *readings = inputs[: 1 + len(sides)]
         experiment = plant.put(numbers, dict(zip(varying, inputs[1 + len(sides) :], strict=True)))
         gain = {side: gains[2 * i : 2 * i + 2] for i, side in enumerate(sides)}
-        seen = corrected(plant.shape.unflatten(state), dict(zip(sides, readings, strict=True)), gain)
+        seen = correct_by_readings(plant.shape.unflatten(state), dict(zip(sides, readings, strict=True)), gain)
         time = first + index.astype(torque.dtype) * experiment.run.sample_period
         return plant.step(experiment, jax.tree.leaves(seen), torque, time), state
 

@@ -11,7 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.simulate import Experiment, Reducer, Signals, State, advance, begin, block_length, end_of_block, figures
+from jaxbl.simulate import (
+    Experiment,
+    Reducer,
+    Signals,
+    State,
+    advance_sample,
+    block_length,
+    compute_metrics,
+    end_block,
+    initial_carry,
+)
 
 from . import Unsupported
 from .jaxprs import trace_inlined
@@ -30,26 +40,26 @@ def record_run(
     """Simulate one experiment, in its precision: the reducers' figures `()` and the record `(samples,)`, both by name.
     Arguments as of :func:`jaxbl.simulate.scan`."""
     with jax.default_device(host_device()):
-        start = jax.eval_shape(lambda: begin(experiment, reducers))
+        start = jax.eval_shape(lambda: initial_carry(experiment, reducers))
         tree, leaves = jax.tree.structure(start), jax.tree.leaves(start)
         names: list[str] = []
 
         def sample(state: Any, given: Any) -> tuple[list[Any], list[Any]]:
-            carry, signals = advance(experiment, reducers, tree.unflatten(state), *given)
+            carry, signals = advance_sample(experiment, reducers, tree.unflatten(state), *given)
             row = record(carry[0], signals)
             names[:] = row
             return jax.tree.leaves(carry), list(row.values())
 
         def settle(state: Any, _: Any) -> tuple[list[Any], list[Any]]:
-            return jax.tree.leaves(end_of_block(experiment, tree.unflatten(state))), []
+            return jax.tree.leaves(end_block(experiment, tree.unflatten(state))), []
 
         def result(*state: Any) -> dict[str, Any]:
-            return figures(experiment, reducers, tree.unflatten(state))
+            return compute_metrics(experiment, reducers, tree.unflatten(state))
 
         steps = experiment.run.steps
         shared = SharedPart(sample, settle, leaves, experiment.sides, steps, block_length(steps))
         ahead = compile_shared_part(shared)
-        state, columns = _once(lambda: jax.tree.leaves(begin(experiment, reducers))), [[] for _ in names]
+        state, columns = _once(lambda: jax.tree.leaves(initial_carry(experiment, reducers))), [[] for _ in names]
         for first in range(0, steps, shared.stretch):
             state, _, handed = ahead(state, seed, first, min(shared.stretch, steps - first))
             for column, part in zip(columns, handed, strict=True):

@@ -204,7 +204,7 @@ class _Search:
             encoders = at.encoders
             noise = math.hypot(encoders.noise, _WHITE * getattr(encoders, f"{side}_resolution"))
             period = at.run.sample_period
-            ranges = OBSERVERS[kind].search(OperatingConditions(bound, period, noise))
+            ranges = OBSERVERS[kind].gain_ranges(OperatingConditions(bound, period, noise))
             limits = {f"observer.{side}.{gain}": ends for gain, ends in ranges.items()}
             if self.table.objective == "torque":
                 limits[TIME_CONSTANT] = period / 3.0, 1e3 * period

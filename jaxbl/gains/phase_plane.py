@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.observer.conditions import arc_of, least_lambda_davila_fridman
+from jaxbl.observer.conditions import arc_integral, least_lambda_davila_fridman
 
 
 def error_slope(error: np.ndarray, rate: np.ndarray, lambda_: float) -> np.ndarray:
@@ -68,7 +68,7 @@ def worst_half_cycle(lambda_: float, alpha: float, f_plus: float, points: int = 
         angle = np.linspace(first, last, points)
         sine, cosine = np.sin(angle), np.cos(angle)
         with jax.enable_x64(True):
-            arc = np.asarray(arc_of(jnp.asarray(sine + half * cosine), jnp.asarray(cosine), jnp.asarray(c - half**2)))
+            arc = np.asarray(arc_integral(jnp.asarray(sine + half * cosine), jnp.asarray(cosine), jnp.asarray(c - half**2)))
         # the first point out has an arc of zero; where the arc is endless, the path has ended at the origin
         level = size * np.exp(-half * (arc - arc[0]))
         form = np.where(level > 0.0, sine**2 + lambda_ * sine * cosine + c * cosine**2, 1.0)

@@ -231,7 +231,7 @@ def _checked(config: Config, record: Record) -> Record:
     for effect in config.effects:
         if issubclass(cls := EFFECTS[effect.kind], EncoderEffect):
             raise InputError(f"{record.path}: {effect.kind} has no place in a model of a log: {cls.in_log}")
-        if fault := EFFECTS[effect.kind].fault(effect.model_dump(), record.sample_period):
+        if fault := EFFECTS[effect.kind].find_fault(effect.model_dump(), record.sample_period):
             raise InputError(f"{record.path}: {effect.kind}: {fault}")
     if record.torque is None:
         if not any(path.endswith("inertia") for path in config.uncertainty.exact):

@@ -214,10 +214,10 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
             put(f"load.modelled_{name}", segment, getattr(one, name)["load"])
         k = segment.kinematics
         one = jax.tree.map(jnp.asarray, one)
-        through = jax.vmap(plant.transmitted)(one.position, one.velocity, one.effects)[0]
+        through = jax.vmap(plant.transmitted_torque)(one.position, one.velocity, one.effects)[0]
         position, velocity = one.position | k.position, one.velocity | k.velocity
         none = jnp.zeros_like(through)
-        total, level = jax.vmap(plant.torques)(position, velocity, one.effects, k.torque, k.time, none)["motor"]
+        total, level = jax.vmap(plant.side_torques)(position, velocity, one.effects, k.torque, k.time, none)["motor"]
         resisting = fitted.drive.viscous("motor") * k.velocity["motor"] + level * jnp.sign(k.velocity["motor"])
         put("torque", segment, through)
         put("torque_by_motor", segment, total - resisting - plant.inertia("motor") * k.acceleration["motor"])

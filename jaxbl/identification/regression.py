@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbl.drive.effects import AbstractEffect
-from jaxbl.drive.plant import Plant, PlantState, States
+from jaxbl.drive.plant import EffectStates, Plant, PlantState
 from jaxbl.records.linear_filters import low_pass_taps
 from jaxbl.simulate import Experiment, with_effects
 
@@ -101,7 +101,7 @@ def balance(experiment: Experiment, kinematics: Kinematics) -> dict[str, Balance
     found = {}
     if k.transmitted is not None and plant.transmission is not None:
         found["transmission"] = Balance(k.transmitted - _transmitted(plant, k, states), k.transmitted)
-    acting = jax.vmap(plant.torques)(k.position, k.velocity, states, torque, k.time, k.transmitted)
+    acting = jax.vmap(plant.side_torques)(k.position, k.velocity, states, torque, k.time, k.transmitted)
     through = k.transmitted
     if through is None and plant.transmission is not None:
         through = _transmitted(plant, k, states)
@@ -127,8 +127,8 @@ def model_torques(
         found["transmission"] = _transmitted(plant, k, states)
         loaded = plant.gear_friction(states, found["transmission"])
     none = jnp.zeros_like(k.torque)
-    acting = jax.vmap(plant.torques)(k.position, k.velocity, states, torque, k.time, none)
-    places = {plant.drive.place(effect.place) for effect in plant.effects}
+    acting = jax.vmap(plant.side_torques)(k.position, k.velocity, states, torque, k.time, none)
+    places = {plant.drive.resolve_place(effect.place) for effect in plant.effects}
     if not isinstance(loaded, float):
         places.add("motor")
     for side, (total, level) in acting.items():
@@ -148,11 +148,11 @@ def transmitted(experiment: Experiment, k: Kinematics) -> Float[Array, " samples
     return _transmitted(gear.plant, k, effect_path(gear, k)[0])
 
 
-def _transmitted(plant: Plant, k: Kinematics, states: States) -> Float[Array, " samples"]:
-    return jax.vmap(plant.transmitted)(k.position, k.velocity, states)[0]
+def _transmitted(plant: Plant, k: Kinematics, states: EffectStates) -> Float[Array, " samples"]:
+    return jax.vmap(plant.transmitted_torque)(k.position, k.velocity, states)[0]
 
 
-def settled(experiment: Experiment, torque: Float[Array, ""]) -> States:
+def settled(experiment: Experiment, torque: Float[Array, ""]) -> EffectStates:
     """The effects' own states after an input (N m) that has lasted."""
     # as of their classes: of a method of a module equinox makes a module
     return tuple(type(effect).settled(effect, torque) for effect in experiment.effects)
@@ -169,7 +169,7 @@ def begun(
     torque: Float[Array, " samples"],
     before: Float[Array, " earlier"] | None = None,
     from_rest: bool = False,
-) -> States:
+) -> EffectStates:
     """The effects' own states at the first sample.
 
     Args:
@@ -185,7 +185,7 @@ def begun(
     if before is None or not any(map(remembers_input, plant.effects)):
         return start
 
-    def sample(states: States, torque: Array) -> tuple[States, None]:
+    def sample(states: EffectStates, torque: Array) -> tuple[EffectStates, None]:
         new, arriving = plant.receive(states, torque, period)
         return plant.actuate(new, arriving(0.0, period), period)[0], None
 
@@ -193,35 +193,39 @@ def begun(
 
 
 @jit
-def effect_path(experiment: Experiment, path: Path, from_rest: bool = False) -> tuple[States, Float[Array, " samples"]]:
+def effect_path(
+    experiment: Experiment, path: Path, from_rest: bool = False
+) -> tuple[EffectStates, Float[Array, " samples"]]:
     """The effects' own states at each sample of a known motion, and the torque (N m) that acts; they begin as
     :func:`begun` says."""
     plant, period = experiment.plant, experiment.run.sample_period
     speeds = {side: speed[0] for side, speed in path.velocity.items()}
     start = tuple(
-        type(effect).moved(effect, own, speeds[place]) if (place := plant.drive.place(effect.place)) in speeds else own
+        type(effect).set_in_motion(effect, own, speeds[place])
+        if (place := plant.drive.resolve_place(effect.place)) in speeds
+        else own
         for effect, own in zip(plant.effects, begun(experiment, path.torque, path.before, from_rest), strict=True)
     )
-    moving = any(effect.place == "actuator" for effect in plant.effects) or plant.memory
+    moving = any(effect.place == "actuator" for effect in plant.effects) or plant.has_memory
     if not moving:
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (len(path.torque), *x.shape)), start), path.torque
     # memory follows the way covered
-    steps = {side: jnp.diff(x, append=x[-1:]) / period for side, x in path.position.items()} if plant.memory else {}
-    motion = (path.time, path.position, steps) if plant.memory else None
+    steps = {side: jnp.diff(x, append=x[-1:]) / period for side, x in path.position.items()} if plant.has_memory else {}
+    motion = (path.time, path.position, steps) if plant.has_memory else None
 
-    def sample(states: States, given: tuple[Any, Any]) -> tuple[States, tuple[States, Array]]:
+    def sample(states: EffectStates, given: tuple[Any, Any]) -> tuple[EffectStates, tuple[EffectStates, Array]]:
         torque, motion = given
         new, arriving = plant.receive(states, torque, period)
         new, acting = plant.actuate(new, arriving(0.0, period), period)
         if motion is not None:
             time, position, rate = motion
-            new = plant.remember(new, position, rate, time, period)
+            new = plant.advance_effects(new, position, rate, time, period)
         return new, (states, acting)
 
     return jax.lax.scan(sample, start, (path.torque, motion))[1]
 
 
-def effect_states(experiment: Experiment, path: Path) -> States:
+def effect_states(experiment: Experiment, path: Path) -> EffectStates:
     """The effects' own states at each sample of a known motion, by :func:`effect_path` unless there are none."""
     none = settled(experiment, path.torque[0])
     return effect_path(experiment, path)[0] if jax.tree.leaves(none) else none

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbl.drive.effects import KEPT, AbstractEffect, Motion
-from jaxbl.drive.plant import PlantState, States
+from jaxbl.drive.effects import DELAY_SAMPLES, AbstractEffect, Motion
+from jaxbl.drive.plant import EffectStates, PlantState
 from jaxbl.records import Record
 from jaxbl.simulate import Experiment
 
@@ -84,8 +84,8 @@ def led_in(record: Record, rest: bool) -> Record:
     """A log whose segments begin later by as many samples as a dead time may last, where what was commanded before them is
     not known; but for short ones. `rest`: whether the log begins at rest, with no input before."""
     parts = tuple(
-        slice(part.start + KEPT, part.stop)
-        if _before(record, part, rest) is None and part.stop - part.start >= _LONG * KEPT
+        slice(part.start + DELAY_SAMPLES, part.stop)
+        if _before(record, part, rest) is None and part.stop - part.start >= _LONG * DELAY_SAMPLES
         else part
         for part in record.segments
     )
@@ -93,13 +93,13 @@ def led_in(record: Record, rest: bool) -> Record:
 
 
 def _before(record: Record, part: slice, rest: bool) -> np.ndarray | None:
-    """Input before a part of a log, N m, shape (KEPT,), where it is known."""
+    """Input before a part of a log, N m, shape (DELAY_SAMPLES,), where it is known."""
     assert record.torque is not None
     # nothing is commanded of a drive that moves freely
     if not record.torque.any() or (rest and any(part.start == rows.start for _, rows in record.logs)):
-        return np.zeros(KEPT)
-    first = part.start - KEPT
-    apart = KEPT * record.sample_period
+        return np.zeros(DELAY_SAMPLES)
+    first = part.start - DELAY_SAMPLES
+    apart = DELAY_SAMPLES * record.sample_period
     if first < 0 or abs(record.time[part.start] - record.time[first] - apart) > 0.5 * record.sample_period:
         return None
     return record.torque[first : part.start]
@@ -137,12 +137,12 @@ def long_enough(segments: Sequence[Segment], factor: int) -> list[Kinematics]:
 
 
 @jit
-def _torques(experiment: Experiment, k: Kinematics, states: States) -> dict[str, Any]:
+def _torques(experiment: Experiment, k: Kinematics, states: EffectStates) -> dict[str, Any]:
     """Torques along a segment, as of :meth:`jaxbl.drive.plant.Plant.torques`."""
-    return jax.vmap(experiment.plant.torques)(k.position, k.velocity, states, k.torque, k.time)
+    return jax.vmap(experiment.plant.side_torques)(k.position, k.velocity, states, k.torque, k.time)
 
 
-def _held(experiment: Experiment, segment: Segment, states: States) -> States:
+def _held(experiment: Experiment, segment: Segment, states: EffectStates) -> EffectStates:
     """States of effects along a segment; where a side is not seen to move, those of frictions with a memory that hold it.
 
     Their state follows from the way covered, and there that is less than readings show.
@@ -153,11 +153,11 @@ def _held(experiment: Experiment, segment: Segment, states: States) -> States:
         return states
     acting = _torques(experiment, k, states)
     for i in holding:
-        side = plant.drive.place(plant.effects[i].place)
+        side = plant.drive.resolve_place(plant.effects[i].place)
         motion = Motion(
             k.time, k.position[side], k.velocity[side], k.torque if side == "motor" else jnp.zeros_like(k.torque)
         )
-        rest = acting[side][0] + plant.holding(side, motion, states)[0] - plant.inertia(side) * k.acceleration[side]
+        rest = acting[side][0] + plant.holding_torque(side, motion, states)[0] - plant.inertia(side) * k.acceleration[side]
         still = segment.smoothed[side].held(segment.period)
         found[i] = jax.tree.map(partial(jnp.where, still), plant.effects[i].bent(rest), states[i])
     return tuple(found)

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxbl.drive.parameters import Parameter, get_leaf, leaf_paths, set_leaves
 from jaxbl.errors import InputError
-from jaxbl.simulate import Experiment, PlantState, trajectory
+from jaxbl.simulate import Experiment, PlantState, plant_trajectory
 
 from .compilation import jit
 
@@ -121,7 +121,8 @@ class Windows(eqx.Module):
         start: a guess of the state at each window's first sample, leaves of shape (windows,).
         noise: standard deviation of each side's readings (of its prediction errors, with a gain), rad.
         rest: whether a window begins at rest: velocities as guessed, not fitted; shape (windows,).
-        gain: of the predictor (:func:`jaxbl.simulate.trajectory`) of each side, shape (2,); None: free runs, output error.
+        gain: of the predictor (:func:`jaxbl.simulate.plant_trajectory`) of each side, shape (2,);
+            None: free runs, output error.
         weight: of each window's residuals, shape (windows,); 0 where a window only fills up; None: 1.
     """
 
@@ -192,7 +193,7 @@ def with_fitted(experiment: Experiment, free: Sequence[Free], theta: Array | np.
 
 @eqx.filter_jit
 def _residual(experiment: Experiment, start: PlantState, window: Windows) -> Float[Array, "samples sides"]:
-    simulated = trajectory(experiment, start, window.torque, window.time, window.measured, window.gain).position
+    simulated = plant_trajectory(experiment, start, window.torque, window.time, window.measured, window.gain).position
     sides = [(window.measured[side] - simulated[side]) / window.noise[side] for side in experiment.sides]
     return jnp.stack(sides, axis=-1) * (1.0 if window.weight is None else window.weight)
 
@@ -229,7 +230,7 @@ def _eliminate(experiment: Experiment, window: Windows, passes: int, rest: bool)
     moving = jax.tree.map(lambda one: jnp.where(window.rest, 0.0, one), free.velocity)
     # others follow from numbers that are still to be found
     effects = tuple(
-        jax.tree.map(jnp.zeros_like, one) if effect.input_alone else one
+        jax.tree.map(jnp.zeros_like, one) if effect.state_from_input else one
         for effect, one in zip(experiment.effects, free.effects, strict=True)
     )
     known, _ = ravel_pytree(PlantState(free.position, moving, effects))

@@ -25,7 +25,7 @@ from scipy.special import chdtri
 
 from jaxbl.drive.effects import AbstractEffect
 from jaxbl.drive.parameters import set_leaves
-from jaxbl.drive.plant import PlantState, States
+from jaxbl.drive.plant import EffectStates, PlantState
 from jaxbl.fused.single_plant import PlantSimulator
 from jaxbl.simulate import Experiment
 from jaxbl.workers import announce
@@ -225,7 +225,7 @@ class UnseenLoad:
         return np.stack([np.sign(column) if i == 2 else np.zeros(len(column)) for i, column in enumerate(start.T)], axis=1)
 
     @cached_property
-    def _settled(self) -> list[States]:
+    def _settled(self) -> list[EffectStates]:
         """States of effects that each segment begins with."""
         found = [begun(self.experiment, one.torque[:1], one.before) for one in self.segments]
         return jax.tree.map(float, found)
@@ -641,7 +641,7 @@ class _Search:
         met = []
         for one, skip in zip(self.model.states(point.theta, point.start, point.smoothness), self.model.skipped, strict=True):
             motion = jax.tree.map(jnp.asarray, (one.position, one.velocity, one.effects))
-            met.append(np.asarray(jax.vmap(plant.transmitted)(*motion)[0])[skip:])
+            met.append(np.asarray(jax.vmap(plant.transmitted_torque)(*motion)[0])[skip:])
         return bool(np.sqrt(np.mean(np.concatenate(met) ** 2)) < _TOUCH * self.model.torque)
 
     def _at_most(self, without: Point, worth: float) -> float:

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxbl.drive.parameters import Scalar, key_of, parameter, parameters
+from jaxbl.drive.parameters import Scalar, config_key, parameter, parameters
 from jaxbl.registry import Registry, check_module
 
 Acceleration = Callable[[Scalar], Scalar]
@@ -25,7 +25,7 @@ class ObserverState(NamedTuple):
 
     position: Scalar
     velocity: Scalar
-    further: tuple[Scalar, ...] = ()
+    extra_states: tuple[Scalar, ...] = ()
 
 
 class Estimate(NamedTuple):
@@ -54,20 +54,20 @@ class AbstractObserver(eqx.Module):
     velocity_error: Scalar = parameter("rad/s", "velocity error x - x_hat at t = 0", default=0.0, kw_only=True)
 
     @classmethod
-    def discretised(cls, discretisation: str) -> type[Self]:
+    def select_discretisation(cls, discretisation: str) -> type[Self]:
         """The class for a key `discretisation` of the config: one class for all, unless the observer has several."""
         return cls
 
     @classmethod
     @abc.abstractmethod
-    def search(cls, at: OperatingConditions) -> Mapping[str, tuple[float, float]]:
+    def gain_ranges(cls, conditions: OperatingConditions) -> Mapping[str, tuple[float, float]]:
         """Least and largest value of each gain that a search for gains should try, positive, by its config key; the same
         twice for one that it takes for given."""
 
     def gains(self) -> dict[str, float]:
         """Gains of this observer by config key."""
         names = [field.name for field, _ in parameters(self) if not field.kw_only]
-        return {key_of(name): float(getattr(self, name)) for name in names}
+        return {config_key(name): float(getattr(self, name)) for name in names}
 
     @abc.abstractmethod
     def start(self, position: Scalar, velocity: Scalar, acceleration: Acceleration, period: Scalar) -> ObserverState:
@@ -93,7 +93,7 @@ class AbstractObserver(eqx.Module):
         """
 
 
-def predicted(
+def predict_next(
     position: Scalar, velocity: Scalar, acceleration: Acceleration, period: Scalar, held: Any = 0.0, missing: Any = 0.0
 ) -> tuple[Scalar, Scalar]:
     """Position and velocity one sampling period later.

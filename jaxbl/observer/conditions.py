@@ -20,11 +20,11 @@ from jaxbl.files import to_jsonable
 Values = Float[Array, "..."]
 
 
-def _above(alpha: Values, f_plus: Values, value: Values) -> Values:
+def _infinite_unless_above(alpha: Values, f_plus: Values, value: Values) -> Values:
     return jnp.where(alpha > f_plus, value, jnp.where(alpha <= f_plus, jnp.inf, jnp.nan))
 
 
-def _margin(alpha: Values, f_plus: Values) -> Values:
+def _safe_excess(alpha: Values, f_plus: Values) -> Values:
     """alpha - f_plus where that is positive, else one: what stands below a fraction."""
     return jnp.where(alpha > f_plus, alpha - f_plus, 1.0)
 
@@ -39,17 +39,19 @@ def least_lambda_davila_fridman(alpha: Values, f_plus: Values, q: float = 0.0) -
     """
     if not 0.0 <= q < 1.0:
         raise InputError(f"q: condition (32) needs 0 < q < 1 (or 0 for the limit), not {q}")
-    return _above(alpha, f_plus, jnp.sqrt(2.0 / _margin(alpha, f_plus)) * (alpha + f_plus) * (1.0 + q) / (1.0 - q))
+    return _infinite_unless_above(
+        alpha, f_plus, jnp.sqrt(2.0 / _safe_excess(alpha, f_plus)) * (alpha + f_plus) * (1.0 + q) / (1.0 - q)
+    )
 
 
 def least_lambda_levant(alpha: Values, f_plus: Values) -> Values:
     """lambda^2 > 4 f (alpha + f) / (alpha - f). Reference: A. Levant, Automatica 34 (1998)."""
-    return _above(alpha, f_plus, 2.0 * jnp.sqrt(f_plus * (alpha + f_plus) / _margin(alpha, f_plus)))
+    return _infinite_unless_above(alpha, f_plus, 2.0 * jnp.sqrt(f_plus * (alpha + f_plus) / _safe_excess(alpha, f_plus)))
 
 
 def least_lambda_seeber_horn(alpha: Values, f_plus: Values) -> Values:
     """lambda > sqrt(alpha + f). Reference: R. Seeber, M. Horn, Automatica 84 (2017)."""
-    return _above(alpha, f_plus, jnp.sqrt(alpha + f_plus))
+    return _infinite_unless_above(alpha, f_plus, jnp.sqrt(alpha + f_plus))
 
 
 def least_lambda_moreno_osorio(alpha: Values, f_plus: Values) -> Values:
@@ -66,10 +68,12 @@ def least_lambda_moreno_osorio(alpha: Values, f_plus: Values) -> Values:
     """
     ratio = jnp.where(alpha > f_plus, f_plus / jnp.where(alpha > f_plus, alpha, 1.0), 0.0)
     # alpha - sqrt(alpha^2 - f^2) without cancellation
-    return _above(alpha, f_plus, 2.0 * jnp.sqrt(f_plus * ratio / (1.0 + jnp.sqrt((1.0 - ratio) * (1.0 + ratio)))))
+    return _infinite_unless_above(
+        alpha, f_plus, 2.0 * jnp.sqrt(f_plus * ratio / (1.0 + jnp.sqrt((1.0 - ratio) * (1.0 + ratio))))
+    )
 
 
-def arc_of(h: Values, y: Values, discriminant: Values) -> Values:
+def arc_integral(h: Values, y: Values, discriminant: Values) -> Values:
     """int dq / (q^2 + lambda q + c) from p = v / y to infinity, with h = v + lambda y / 2 and discriminant c - lambda^2 / 4.
 
     `inf` where a real root lies on the way. Complex, real, and nearly double roots.
@@ -101,17 +105,17 @@ def peak_ratio(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
     """
     log = _log_peak_ratio(lambda_, alpha, f_plus)
     direct = lambda_**2 >= 8.0 * (alpha + f_plus)
-    return _above(alpha, f_plus, jnp.where(direct, 0.0, jnp.exp(jnp.where(direct, 0.0, log))))
+    return _infinite_unless_above(alpha, f_plus, jnp.where(direct, 0.0, jnp.exp(jnp.where(direct, 0.0, log))))
 
 
 def _log_peak_ratio(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
     """log rho where alpha > f and lambda^2 < 4 c2; any finite number elsewhere."""
-    c1, c2 = 2.0 * _margin(alpha, f_plus), 2.0 * (alpha + f_plus)
+    c1, c2 = 2.0 * _safe_excess(alpha, f_plus), 2.0 * (alpha + f_plus)
     half, one = 0.5 * lambda_, jnp.ones_like(0.5 * lambda_)
     below = jnp.where(c2 > half**2, c2 - half**2, 1.0)
     # log(c2 / c1) without cancellation where alpha is far above f_plus
-    gain = 0.5 * jnp.log1p(2.0 * f_plus / _margin(alpha, f_plus))
-    return gain - half * (arc_of(half, one, c1 - half**2) + arc_of(-half, one, below))
+    gain = 0.5 * jnp.log1p(2.0 * f_plus / _safe_excess(alpha, f_plus))
+    return gain - half * (arc_integral(half, one, c1 - half**2) + arc_integral(-half, one, below))
 
 
 def bisect(holds: Callable[[Values], Values], high: Values, halvings: int) -> tuple[Values, Values]:
@@ -126,7 +130,7 @@ def bisect(holds: Callable[[Values], Values], high: Values, halvings: int) -> tu
     return jax.lax.scan(halve, (jnp.zeros_like(high), high), length=halvings)[0]
 
 
-_HALVINGS, _NEWTON = 12, 2
+_HALVINGS, _NEWTON_STEPS = 12, 2
 """Bisection until Newton's method converges, and its steps up to rounding; a last one carries the derivatives."""
 
 
@@ -150,12 +154,12 @@ def least_lambda_exact(alpha: Values, f_plus: Values) -> Values:
         return least - value / jax.lax.stop_gradient(slope)
 
     least = jax.lax.stop_gradient(0.5 * (low + high))
-    for _ in range(_NEWTON):
+    for _ in range(_NEWTON_STEPS):
         least = jax.lax.stop_gradient(jnp.clip(newton(least, fixed), low, high))
     least = newton(least, ratio)
     # the root's derivative is infinite at zero
     bound = jnp.where(known, f_plus, 1.0)
-    return _above(alpha, f_plus, jnp.where(known, jnp.sqrt(bound) * least, 0.0))
+    return _infinite_unless_above(alpha, f_plus, jnp.where(known, jnp.sqrt(bound) * least, 0.0))
 
 
 def convergence_time_bound(
@@ -175,35 +179,35 @@ def convergence_time_bound(
     return jnp.where(holds, peak / safe, jnp.inf)
 
 
-def _passage(lambda_: Values, alpha: Values, f_plus: Values, y: Values, x2: Values, ray: Values) -> tuple[Values, Values]:
+def _half_cycle(lambda_: Values, alpha: Values, f_plus: Values, y: Values, x2: Values, ray: Values) -> tuple[Values, Values]:
     """Time from x1 = y^2 to the axis x = 0, and speed |x2| there (0 where it ends at the origin); ray <= 0, alpha > f.
 
     d = +f until x1' = ray sqrt(x1), and d = -f from there on. Along an arc of constant d, sqrt(v^2 + lambda v y + c y^2)
     falls by exp(-(lambda / 2) arc), and x2 linearly in time.
     """
-    c1, c2 = 2.0 * _margin(alpha, f_plus), 2.0 * (alpha + f_plus)
+    c1, c2 = 2.0 * _safe_excess(alpha, f_plus), 2.0 * (alpha + f_plus)
     half = 0.5 * lambda_
     v = x2 - lambda_ * y
     before = v > ray * y
     # out to the ray, if the point lies before it; at the root's ray, d = +f holds on to the origin
     eps = jnp.finfo(jnp.result_type(half)).eps
-    ends = before & _at_root(lambda_, c1, ray, 64.0)
+    ends = before & _is_root_ray(lambda_, c1, ray, 64.0)
     turns = before & ~ends
     start, end = (jnp.where(turns, x, 1.0) for x in (v + half * y, ray + half))
     start_y, one, d1 = jnp.where(turns, y, 0.0), jnp.ones_like(end), jnp.where(turns, c1 - half**2, 1.0)
     # q^2 + lambda q + c = (q + lambda / 2)^2 + c - lambda^2 / 4
     norms = jnp.sqrt((start**2 + d1 * start_y**2) / jnp.maximum(end**2 + d1, eps * end**2))
-    y_ray = norms * jnp.exp(-half * (arc_of(end, one, d1) - arc_of(start, start_y, d1)))
+    y_ray = norms * jnp.exp(-half * (arc_integral(end, one, d1) - arc_integral(start, start_y, d1)))
     y_turn = jnp.where(turns, y_ray, jnp.where(ends, 0.0, y))
     x2_turn = jnp.where(turns, (ray + lambda_) * y_ray, jnp.where(ends, 0.0, x2))
     # home
     away, d2 = y_turn > 0.0, c2 - half**2
     h = jnp.where(away, half * y_turn - x2_turn, 1.0)
-    arc = arc_of(h, jnp.where(away, y_turn, 0.0), d2)
+    arc = arc_integral(h, jnp.where(away, y_turn, 0.0), d2)
     homes = away & jnp.isfinite(arc)
     level = jnp.where(homes, h**2 + d2 * y_turn**2, 1.0)
     speed = jnp.where(homes, jnp.sqrt(level) * jnp.exp(-half * jnp.where(homes, arc, 0.0)), 0.0)
-    time = (x2 - x2_turn) / _margin(alpha, f_plus) + (x2_turn + speed) / (alpha + f_plus)
+    time = (x2 - x2_turn) / _safe_excess(alpha, f_plus) + (x2_turn + speed) / (alpha + f_plus)
     return time, speed
 
 
@@ -214,7 +218,7 @@ def _lowest_ray(lambda_: Values, c1: Values) -> Values:
     return jnp.where(real, -c1 / (half + jnp.sqrt(jnp.where(real, half**2 - c1, 0.0))), -jnp.inf)
 
 
-def _at_root(lambda_: Values, c1: Values, ray: Values, eps: float) -> Values:
+def _is_root_ray(lambda_: Values, c1: Values, ray: Values, eps: float) -> Values:
     """Whether a ray is the root's or below, to some eps of the squares whose difference p^2 + lambda p + c1 is."""
     half = 0.5 * lambda_
     square, least = (ray + half) ** 2, half**2 - c1
@@ -222,7 +226,7 @@ def _at_root(lambda_: Values, c1: Values, ray: Values, eps: float) -> Values:
     return (least >= 0.0) & ((ray <= _lowest_ray(lambda_, c1)) | near)
 
 
-_RAYS, _ROUNDS = 17, 5
+_GRID_RAYS, _GRID_ROUNDS = 17, 5
 """Of a grid, and grids: the last one's step is 1 / 65 536 of the range of rays, and the time is stationary in them."""
 
 
@@ -237,7 +241,7 @@ def slowest_ray(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
     shape = jnp.broadcast_shapes(jnp.shape(lambda_), jnp.shape(alpha), jnp.shape(f_plus))
     dtype = jnp.result_type(lambda_, alpha, f_plus, float)
     lambda_, alpha, f_plus = (jnp.broadcast_to(jnp.asarray(x, dtype), shape) for x in (lambda_, alpha, f_plus))
-    c1 = 2.0 * _margin(alpha, f_plus)
+    c1 = 2.0 * _safe_excess(alpha, f_plus)
     lowest = _lowest_ray(lambda_, c1)
     real = jnp.isfinite(lowest)
     root = jnp.where(real, lowest, -1.0)
@@ -251,24 +255,24 @@ def slowest_ray(lambda_: Values, alpha: Values, f_plus: Values) -> Values:
         return jnp.where(real, near, -jnp.sqrt(c1) * depth)
 
     def time(share: Values) -> Values:
-        time, speed = _passage(lambda_, alpha, f_plus, jnp.zeros_like(lambda_), jnp.ones_like(lambda_), ray(share))
+        time, speed = _half_cycle(lambda_, alpha, f_plus, jnp.zeros_like(lambda_), jnp.ones_like(lambda_), ray(share))
         return time / jnp.maximum(1.0 - speed, jnp.finfo(dtype).tiny)
 
-    grid = jnp.linspace(0.0, 1.0, _RAYS, dtype=dtype)
+    grid = jnp.linspace(0.0, 1.0, _GRID_RAYS, dtype=dtype)
 
     def zoom(bounds: tuple[Values, Values], _: None) -> tuple[tuple[Values, Values], Values]:
         low, high = bounds
         shares, times = jax.vmap(lambda at: ((share := low + (high - low) * at), time(share)))(grid)
         best = jnp.argmax(times, axis=0, keepdims=True)
         found = jnp.take_along_axis(shares, best, axis=0)[0]
-        step = (high - low) / (_RAYS - 1)
+        step = (high - low) / (_GRID_RAYS - 1)
         return (jnp.maximum(found - step, 0.0), jnp.minimum(found + step, 1.0)), found
 
     ends = jnp.zeros(shape, dtype), jnp.ones(shape, dtype)
-    _, found = jax.lax.scan(zoom, ends, length=_ROUNDS)
+    _, found = jax.lax.scan(zoom, ends, length=_GRID_ROUNDS)
     # rounding must not choose between the root's ray and what lies by it, nor what is left of x below exp(-9) and nothing
     share, near = found[-1], ray(found[-1])
-    near = jnp.where(real & ((share > 0.9) | _at_root(lambda_, c1, near, 1e3)), root, near)
+    near = jnp.where(real & ((share > 0.9) | _is_root_ray(lambda_, c1, near, 1e3)), root, near)
     return jnp.where(peak_ratio(lambda_, alpha, f_plus) < 1.0, near, 0.0)
 
 
@@ -284,18 +288,18 @@ def convergence_time_worst(
     """
     zero = jnp.zeros_like(jnp.asarray(lambda_ * alpha * f_plus * 1.0))
     ray = jax.lax.stop_gradient(slowest_ray(lambda_, alpha, f_plus))  # the time is stationary in it
-    time, speed = _passage(lambda_, alpha, f_plus, zero, zero + 1.0, ray)
+    time, speed = _half_cycle(lambda_, alpha, f_plus, zero, zero + 1.0, ray)
     converges = peak_ratio(lambda_, alpha, f_plus) < 1.0
     a_peak = time / jnp.where(converges & (speed < 1.0), 1.0 - speed, 1.0)
     # the half planes mirror each other
     x2 = jnp.where(position_error == 0.0, jnp.abs(velocity_error), jnp.sign(position_error) * velocity_error)
     away = position_error != 0.0
     y = jnp.where(away, jnp.sqrt(jnp.where(away, jnp.abs(position_error), 1.0)), 0.0)
-    first, speed = _passage(lambda_, alpha, f_plus, y + zero, x2 + zero, ray)
+    first, speed = _half_cycle(lambda_, alpha, f_plus, y + zero, x2 + zero, ray)
     # a start beyond the faster root's ray, x2 = (p + lambda) sqrt(x1), returns to it under d = +f, and holds on to the
     # origin; p + lambda is minus the slower one's root
-    slides = x2 + zero > -_lowest_ray(lambda_, 2.0 * _margin(alpha, f_plus)) * y
-    longest = jnp.maximum(first + speed * a_peak, jnp.where(slides, x2 / _margin(alpha, f_plus), 0.0))
+    slides = x2 + zero > -_lowest_ray(lambda_, 2.0 * _safe_excess(alpha, f_plus)) * y
+    longest = jnp.maximum(first + speed * a_peak, jnp.where(slides, x2 / _safe_excess(alpha, f_plus), 0.0))
     moving = (x2 != 0.0) | away
     return jnp.where(converges, jnp.where(moving, longest, 0.0), jnp.inf)
 
@@ -325,7 +329,7 @@ def largest_f_plus_exact(lambda_: Values, alpha: Values) -> Values:
 
 
 @jax.jit
-def _judged(lambda_: Values, alpha: Values, f_plus: Values) -> tuple[dict[str, Values], Values, Values]:
+def _evaluate_conditions(lambda_: Values, alpha: Values, f_plus: Values) -> tuple[dict[str, Values], Values, Values]:
     least = {name: condition.least_lambda(alpha, f_plus) for name, condition in CONDITIONS.items()}
     return least, peak_ratio(lambda_, alpha, f_plus), largest_f_plus_exact(lambda_, alpha)
 
@@ -337,7 +341,7 @@ def judge_gains(lambda_: float, alpha: float, f_plus: float) -> dict[str, Any]:
     (rad/s^2), up to which the exact condition holds.
     """
     with jax.enable_x64(True):
-        found = _judged(*(jnp.asarray(float(x)) for x in (lambda_, alpha, f_plus)))
+        found = _evaluate_conditions(*(jnp.asarray(float(x)) for x in (lambda_, alpha, f_plus)))
         least, rho, largest = to_jsonable(found)
     # a jitted function sorts the names
     least = {name: least[name] for name in CONDITIONS}

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from jaxbl.drive.parameters import Scalar, parameter
 
-from .base import OBSERVERS, AbstractObserver, Acceleration, Estimate, ObserverState, OperatingConditions, predicted
+from .base import OBSERVERS, AbstractObserver, Acceleration, Estimate, ObserverState, OperatingConditions, predict_next
 from .super_twisting import ImplicitSuperTwisting
 
 COEFFICIENTS: Mapping[int, tuple[float, ...]] = {
@@ -32,11 +32,11 @@ COEFFICIENTS: Mapping[int, tuple[float, ...]] = {
 }
 """k_1 ... k_(n+1) by order n, of the correction of each state from the position on."""
 
-_ROUNDS = 10
+_NEWTON_STEPS = 10
 """Newton steps: they reach rounding for innovations of 1e-20 to 1e20 times those of the sliding set (a test)."""
 
 
-def _powers_from(base: Any, count: int) -> list[Any]:
+def _powers(base: Any, count: int) -> list[Any]:
     """1, base, base^2, ..."""
     found = [jnp.ones_like(base)]
     for _ in range(count):
@@ -44,7 +44,7 @@ def _powers_from(base: Any, count: int) -> list[Any]:
     return found
 
 
-def _root_above(value: Any, power: int) -> Any:
+def _bound_root(value: Any, power: int) -> Any:
     """A number not below the root of this power of a non-negative value, near it, from square roots alone."""
     half = jnp.sqrt(value)
     quarter = jnp.sqrt(half)
@@ -66,11 +66,11 @@ def solve_correction(coefficients: Sequence[float], value: Any) -> Any:
     order = len(coefficients) - 1
     whole = (1.0, *coefficients[:order])
     # each term alone is not above the value
-    bounds = [_root_above(value / whole[i], order + 1 - i) for i in range(order + 1)]
+    bounds = [_bound_root(value / whole[i], order + 1 - i) for i in range(order + 1)]
     rho = bounds[0]
     for bound in bounds[1:]:
         rho = jnp.minimum(rho, bound)
-    for _ in range(_ROUNDS):
+    for _ in range(_NEWTON_STEPS):
         total, slope = whole[0] * rho + whole[1], jnp.full_like(rho, whole[0])
         # Horner's rule with its derivative; the constant term is zero
         for k in whole[2:]:
@@ -82,7 +82,7 @@ def solve_correction(coefficients: Sequence[float], value: Any) -> Any:
     return rho
 
 
-def _stirling(n: int) -> list[int]:
+def _stirling_numbers(n: int) -> list[int]:
     """Coefficients of x (x + 1) ... (x + n - 1), lowest power first."""
     row = [1]
     for k in range(n):
@@ -90,7 +90,7 @@ def _stirling(n: int) -> list[int]:
     return row
 
 
-def _weights(order: int) -> list[list[float]]:
+def _correction_weights(order: int) -> list[list[float]]:
     """What the correction of state j adds to state i <= j over a period, both from 1 on, in units of h^(j - i + 1).
 
     In the sliding set, with these alone, the errors of a polynomial of that degree vanish after as many samples: the states
@@ -98,7 +98,7 @@ def _weights(order: int) -> list[list[float]]:
     """
     found = [[0.0] * (order + 1) for _ in range(order + 1)]
     for j in range(1, order + 2):
-        row = _stirling(j)
+        row = _stirling_numbers(j)
         for i in range(1, j + 1):
             found[i - 1][j - 1] = factorial(i - 1) * row[i] / factorial(j - 1)
     return found
@@ -116,10 +116,10 @@ class AbstractDifferentiator(AbstractObserver):
     lipschitz: eqx.AbstractVar[Scalar]  # pyright: ignore[reportGeneralTypeIssues]
 
     @classmethod
-    def search(cls, at: OperatingConditions) -> Mapping[str, tuple[float, float]]:
+    def gain_ranges(cls, conditions: OperatingConditions) -> Mapping[str, tuple[float, float]]:
         # f_plus times as many derivatives, of motions from slow to as fast as samples
-        slow, fast = (rate ** (cls.order - 1) for rate in (1e-3 / at.period, 1.0 / at.period))
-        return {"lipschitz": (0.01 * at.f_plus * slow, 100.0 * at.f_plus * fast)}
+        slow, fast = (rate ** (cls.order - 1) for rate in (1e-3 / conditions.period, 1.0 / conditions.period))
+        return {"lipschitz": (0.01 * conditions.f_plus * slow, 100.0 * conditions.f_plus * fast)}
 
     def start(self, position, velocity, acceleration, period):
         zero = jnp.zeros_like(jnp.asarray(position + velocity))
@@ -127,7 +127,7 @@ class AbstractDifferentiator(AbstractObserver):
 
     def step(self, state, measured, acceleration, period):
         n, coefficients = self.order, COEFFICIENTS[self.order]
-        steps = _powers_from(period, n + 1)
+        steps = _powers(period, n + 1)
         unit = steps[n + 1] * self.lipschitz
         innovation = measured - state.position
         reach = coefficients[n] * unit
@@ -136,23 +136,23 @@ class AbstractDifferentiator(AbstractObserver):
         # a gain of zero corrects nothing
         least = jnp.finfo(unit.dtype).tiny
         rho = solve_correction(coefficients, jnp.abs(beyond) / jnp.maximum(unit, least))
-        rhos, signed = _powers_from(rho, n + 1), jnp.sign(beyond) * unit
+        rhos, signed = _powers(rho, n + 1), jnp.sign(beyond) * unit
         # h^j times the correction of state j
         corrections = [k * rhos[n + 1 - j] * signed for j, k in enumerate(coefficients[:n], 1)] + [sliding]
-        weights = _weights(n)
-        states = [state.position, state.velocity, *state.further]
+        weights = _correction_weights(n)
+        states = [state.position, state.velocity, *state.extra_states]
         new = [x + sum(weights[i][j] * corrections[j] for j in range(i, n + 1)) / steps[i] for i, x in enumerate(states)]
         position, velocity, *rest = new
-        return _ahead(position, velocity, rest, acceleration, steps), Estimate(position, velocity, rest[0])
+        return _predict_taylor(position, velocity, rest, acceleration, steps), Estimate(position, velocity, rest[0])
 
 
-def _ahead(
+def _predict_taylor(
     position: Any, velocity: Any, disturbance: list[Any], acceleration: Acceleration, steps: list[Any]
 ) -> ObserverState:
     """The state predicted for the next sample, the disturbance by its Taylor series; `steps` are powers of the period."""
     period = steps[1]
     mean = sum(d * steps[m] / factorial(m + 1) for m, d in enumerate(disturbance))
-    at, speed = predicted(position, velocity, acceleration, period, held=mean)
+    at, speed = predict_next(position, velocity, acceleration, period, held=mean)
     # what a disturbance that changes moves otherwise than its mean
     for m, d in enumerate(disturbance[1:], 1):
         at = at + d * steps[m + 2] * (1.0 / factorial(m + 2) - 0.5 / factorial(m + 1))
@@ -169,7 +169,7 @@ class _FirstOrder(AbstractDifferentiator):
         return observer.step(state, measured, acceleration, period)
 
 
-def _of_order(n: int, unit: str) -> type[AbstractDifferentiator]:
+def _make_differentiator(n: int, unit: str) -> type[AbstractDifferentiator]:
     base: Any = _FirstOrder if n == 1 else AbstractDifferentiator
 
     @OBSERVERS.add
@@ -183,5 +183,5 @@ def _of_order(n: int, unit: str) -> type[AbstractDifferentiator]:
     return Differentiator
 
 
-DIFFERENTIATORS = {n: _of_order(n, f"rad/s{power}") for n, power in enumerate("²³⁴⁵⁶", 1)}
+DIFFERENTIATORS = {n: _make_differentiator(n, f"rad/s{power}") for n, power in enumerate("²³⁴⁵⁶", 1)}
 """By order."""

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from jaxbl.drive.parameters import Scalar, parameter
 
-from .base import OBSERVERS, AbstractObserver, Acceleration, Estimate, ObserverState, OperatingConditions, predicted
+from .base import OBSERVERS, AbstractObserver, Acceleration, Estimate, ObserverState, OperatingConditions, predict_next
 
 _SLOWEST, _FASTEST = 1e-3, 3.0
 """Bandwidths worth a search, rad/s times the sampling period: poles at 0.999 and 0.05."""
@@ -40,7 +40,7 @@ class AbstractLinearObserver(AbstractObserver):
         return ObserverState(position, velocity, (jnp.zeros_like(jnp.asarray(position + velocity)), *shares))
 
     def step(self, state, measured, acceleration, period):
-        disturbance, *shares = state.further
+        disturbance, *shares = state.extra_states
         share = Correction(*shares)
         innovation = measured - state.position
         position = state.position + share.position * innovation
@@ -48,10 +48,10 @@ class AbstractLinearObserver(AbstractObserver):
         disturbance = disturbance + share.disturbance * innovation
         if self.has_disturbance:
             control = disturbance
-            new = predicted(position, velocity, acceleration, period, held=disturbance)
+            new = predict_next(position, velocity, acceleration, period, held=disturbance)
         else:
             control = share.velocity * innovation / period
-            new = predicted(position, velocity, acceleration, period, missing=control)
+            new = predict_next(position, velocity, acceleration, period, missing=control)
         return ObserverState(*new, (disturbance, *share)), Estimate(position, velocity, control)
 
     has_disturbance: ClassVar[bool] = True
@@ -72,8 +72,8 @@ class Luenberger(AbstractLinearObserver):
     damping: Scalar = parameter("", "damping ratio of the observer's poles", default=1.0, above=0.0)
 
     @classmethod
-    def search(cls, at: OperatingConditions) -> Mapping[str, tuple[float, float]]:
-        return {"bandwidth": (_SLOWEST / at.period, _FASTEST / at.period), "damping": (0.003, 10.0)}
+    def gain_ranges(cls, conditions: OperatingConditions) -> Mapping[str, tuple[float, float]]:
+        return {"bandwidth": (_SLOWEST / conditions.period, _FASTEST / conditions.period), "damping": (0.003, 10.0)}
 
     def correction(self, acceleration, period):
         reach = self.bandwidth * period
@@ -100,8 +100,8 @@ class ExtendedState(AbstractLinearObserver):
     bandwidth: Scalar = parameter("rad/s", "natural frequency of the observer's poles", above=0.0)
 
     @classmethod
-    def search(cls, at: OperatingConditions) -> Mapping[str, tuple[float, float]]:
-        return {"bandwidth": (_SLOWEST / at.period, _FASTEST / at.period)}
+    def gain_ranges(cls, conditions: OperatingConditions) -> Mapping[str, tuple[float, float]]:
+        return {"bandwidth": (_SLOWEST / conditions.period, _FASTEST / conditions.period)}
 
     def correction(self, acceleration, period):
         left = -jnp.expm1(-self.bandwidth * period)
@@ -128,11 +128,11 @@ class Kalman(AbstractLinearObserver):
     )
 
     @classmethod
-    def search(cls, at: OperatingConditions) -> Mapping[str, tuple[float, float]]:
+    def gain_ranges(cls, conditions: OperatingConditions) -> Mapping[str, tuple[float, float]]:
         # only ratios matter: an ideal encoder may have any noise. Without the other noise, a bandwidth w needs a density of
         # position_noise sqrt(h) w^3, or w^2
-        noise = max(at.noise, 1e-9)
-        size, slow, fast = noise * at.period**0.5, _SLOWEST / at.period, _FASTEST / at.period
+        noise = max(conditions.noise, 1e-9)
+        size, slow, fast = noise * conditions.period**0.5, _SLOWEST / conditions.period, _FASTEST / conditions.period
         return {
             "position_noise": (noise, noise),
             "disturbance_noise": (size * slow**3, size * fast**3),
@@ -141,11 +141,11 @@ class Kalman(AbstractLinearObserver):
 
     def correction(self, acceleration, period):
         zero = jnp.zeros_like(jnp.asarray(period + self.position_noise))
-        still = predicted(zero, zero, acceleration, period)
+        still = predict_next(zero, zero, acceleration, period)
 
         def column(velocity: Any, control: Any) -> list[Any]:
             # states are position, velocity times h, disturbance times h^2, over the position's noise: numbers near one
-            moved = predicted(zero, velocity / period, acceleration, period, held=control / (period * period))
+            moved = predict_next(zero, velocity / period, acceleration, period, held=control / (period * period))
             return [moved[0] - still[0], (moved[1] - still[1]) * period, control]
 
         one = zero + 1.0
@@ -159,7 +159,7 @@ class Kalman(AbstractLinearObserver):
             [slow / 8.0 + fast / 2.0, slow / 3.0 + fast, slow / 2.0],
             [slow / 6.0, slow / 2.0, slow],
         ]
-        covariance = _riccati(turned, q)
+        covariance = _solve_riccati(turned, q)
         total = covariance[0][0] + 1.0
         return Correction(
             covariance[0][0] / total, covariance[1][0] / (total * period), covariance[2][0] / (total * period * period)
@@ -173,7 +173,7 @@ _DOUBLINGS = 32
 """2^32 samples: any filter that is of use is stationary by then."""
 
 
-def _riccati(turned: Matrix, q: Matrix) -> Matrix:
+def _solve_riccati(turned: Matrix, q: Matrix) -> Matrix:
     """Covariance p of the predicted state, of x' = a x + w with covariance q of w, whose first number is measured with unit
     noise: the solution of p = a p (1 + g p)^-1 a' + q, by doubling. `turned` is a'."""
     zero = 0.0 * q[0][0]
@@ -181,12 +181,12 @@ def _riccati(turned: Matrix, q: Matrix) -> Matrix:
 
     def doubled(_: Any, carry: tuple[Matrix, Matrix, Matrix]) -> tuple[Matrix, Matrix, Matrix]:
         b, g, p = carry
-        shrunk = _inverse(_sum(_identity(zero), _product(g, p)))
-        back, forward = _transposed(b), _product(b, shrunk)
+        shrunk = _invert(_add(_identity(zero), _multiply(g, p)))
+        back, forward = _transpose(b), _multiply(b, shrunk)
         return (
-            _product(forward, b),
-            _symmetric(_sum(g, _product(_product(forward, g), back))),
-            _symmetric(_sum(p, _product(_product(_product(back, p), shrunk), b))),
+            _multiply(forward, b),
+            _symmetrise(_add(g, _multiply(_multiply(forward, g), back))),
+            _symmetrise(_add(p, _multiply(_multiply(_multiply(back, p), shrunk), b))),
         )
 
     return jax.lax.fori_loop(0, _DOUBLINGS, doubled, (turned, g, q))[2]
@@ -196,24 +196,24 @@ def _identity(zero: Any) -> Matrix:
     return [[zero + float(i == j) for j in range(3)] for i in range(3)]
 
 
-def _product(a: Matrix, b: Matrix) -> Matrix:
+def _multiply(a: Matrix, b: Matrix) -> Matrix:
     return [[sum((a[i][k] * b[k][j] for k in range(1, 3)), a[i][0] * b[0][j]) for j in range(3)] for i in range(3)]
 
 
-def _sum(a: Matrix, b: Matrix) -> Matrix:
+def _add(a: Matrix, b: Matrix) -> Matrix:
     return [[x + y for x, y in zip(left, right, strict=True)] for left, right in zip(a, b, strict=True)]
 
 
-def _transposed(a: Matrix) -> Matrix:
+def _transpose(a: Matrix) -> Matrix:
     return [list(row) for row in zip(*a, strict=True)]
 
 
-def _symmetric(a: Matrix) -> Matrix:
+def _symmetrise(a: Matrix) -> Matrix:
     """Rounding would make it lopsided, more with each doubling."""
     return [[0.5 * (a[i][j] + a[j][i]) for j in range(3)] for i in range(3)]
 
 
-def _inverse(a: Matrix) -> Matrix:
+def _invert(a: Matrix) -> Matrix:
     """By cofactors."""
 
     def cofactor(i: int, j: int) -> Any:
@@ -237,8 +237,8 @@ class DirtyDerivative(AbstractObserver):
     time_constant: Scalar = parameter("s", "time constant of the low-pass on each difference", minimum=0.0)
 
     @classmethod
-    def search(cls, at: OperatingConditions) -> Mapping[str, tuple[float, float]]:
-        return {"time_constant": (at.period / _FASTEST, at.period / _SLOWEST)}
+    def gain_ranges(cls, conditions: OperatingConditions) -> Mapping[str, tuple[float, float]]:
+        return {"time_constant": (conditions.period / _FASTEST, conditions.period / _SLOWEST)}
 
     def start(self, position, velocity, acceleration, period):
         zero = jnp.zeros_like(jnp.asarray(position + velocity))
@@ -246,7 +246,7 @@ class DirtyDerivative(AbstractObserver):
         return ObserverState(position, velocity, (position - period * velocity, velocity + zero, zero, zero, zero, zero))
 
     def step(self, state, measured, acceleration, period):
-        before, velocity_before, earlier, last, given, disturbance = state.further
+        before, velocity_before, earlier, last, given, disturbance = state.extra_states
         share = period / (self.time_constant + period)
         velocity = velocity_before + share * ((measured - before) / period - velocity_before)
         # a difference of two differences spans two periods: the input is the mean of theirs, behind the velocity's low-pass
@@ -254,6 +254,6 @@ class DirtyDerivative(AbstractObserver):
         still = acceleration(jnp.zeros_like(velocity))
         friction = acceleration(0.5 * (velocity + velocity_before)) - still
         disturbance = disturbance + share * ((velocity - velocity_before) / period - given - friction - disturbance)
-        new = predicted(measured, velocity, acceleration, period, held=disturbance)
+        new = predict_next(measured, velocity, acceleration, period, held=disturbance)
         further = measured, velocity, last, still, given, disturbance
         return ObserverState(*new, further), Estimate(measured, velocity, disturbance)

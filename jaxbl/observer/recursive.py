@@ -51,7 +51,7 @@ class IdentifierState(NamedTuple):
 
     regressors: tuple[Number, ...]
     information: tuple[RunningSum, ...]
-    right: dict[str, tuple[RunningSum, ...]]
+    moments: dict[str, tuple[RunningSum, ...]]
     weight: Number
 
 
@@ -71,7 +71,7 @@ class Identifier(eqx.Module):
         return IdentifierState(
             regressors=(zero,) * n,
             information=(empty,) * (n * (n + 1) // 2),
-            right=dict.fromkeys(sides, (empty,) * n),
+            moments=dict.fromkeys(sides, (empty,) * n),
             weight=jnp.ones_like(zero),
         )
 
@@ -101,7 +101,7 @@ class Identifier(eqx.Module):
         )
         right = {
             side: tuple(total.add(self.forgetting, w * torque[side]) for total, w in zip(totals, weighted, strict=True))
-            for side, totals in state.right.items()
+            for side, totals in state.moments.items()
         }
         return IdentifierState(filtered, information, right, self.forgetting * state.weight)
 
@@ -109,7 +109,7 @@ class Identifier(eqx.Module):
         """The same sums, ready for further samples without loss; :func:`jaxbl.simulate.scan` calls it block by block."""
         settled = jax.tree.map(
             lambda total: total.settle(state.weight),
-            (state.information, state.right),
+            (state.information, state.moments),
             is_leaf=lambda node: isinstance(node, RunningSum),
         )
         return IdentifierState(state.regressors, *settled, weight=jnp.ones_like(state.weight))
@@ -126,35 +126,37 @@ class Identifier(eqx.Module):
 
     def solution(self, state: IdentifierState) -> dict[str, tuple[Number, tuple[Number, ...]]]:
         """Of each side, whether the excitation so far determines the coefficients theta, and theta: finite in any case."""
-        information = _values(state, state.information)
-        return {side: _solve(information, _values(state, totals)) for side, totals in state.right.items()}
+        information = _sum_values(state, state.information)
+        return {
+            side: _solve_normal_equations(information, _sum_values(state, totals)) for side, totals in state.moments.items()
+        }
 
     def excitation(self, state: IdentifierState) -> Number:
         """Smallest eigenvalue of the information matrix scaled to unit diagonal: 0 undetermined, 1 orthogonal."""
-        information = _values(state, state.information)
+        information = _sum_values(state, state.information)
         if len(information) == 1:
             return (information[0] > 0.0).astype(information[0].dtype)
-        return 1.0 - jnp.abs(_correlation(information))
+        return 1.0 - jnp.abs(_regressor_correlation(information))
 
 
-def _values(state: IdentifierState, sums: tuple[RunningSum, ...]) -> tuple[Number, ...]:
+def _sum_values(state: IdentifierState, sums: tuple[RunningSum, ...]) -> tuple[Number, ...]:
     return tuple(total.value(state.weight) for total in sums)
 
 
-def _correlation(information: tuple[Number, ...]) -> Number:
+def _regressor_correlation(information: tuple[Number, ...]) -> Number:
     first, both, second = information
     size = jnp.sqrt(first) * jnp.sqrt(second)
     return jnp.where(size > 0.0, both / jnp.where(size > 0.0, size, 1.0), 1.0)
 
 
-def _solve(information: tuple[Number, ...], right: tuple[Number, ...]) -> tuple[Number, tuple[Number, ...]]:
+def _solve_normal_equations(information: tuple[Number, ...], right: tuple[Number, ...]) -> tuple[Number, tuple[Number, ...]]:
     """Whether the scaled normal equations for n = 1 or 2 have a solution, and it; elementwise over lanes."""
     if len(right) == 1:
         total = information[0]
         determined = total > 0.0
         return determined, (right[0] / jnp.where(determined, total, 1.0),)
     first, second = jnp.sqrt(information[0]), jnp.sqrt(information[2])
-    correlation = _correlation(information)
+    correlation = _regressor_correlation(information)
     determinant = 1.0 - correlation * correlation
     determined = determinant > 4.0 * jnp.finfo(determinant.dtype).eps
     first, second, determinant = (jnp.where(determined, x, 1.0) for x in (first, second, determinant))

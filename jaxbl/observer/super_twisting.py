@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from jaxbl.drive.parameters import Scalar, parameter
 
-from .base import OBSERVERS, AbstractObserver, Estimate, ObserverState, OperatingConditions, predicted
+from .base import OBSERVERS, AbstractObserver, Estimate, ObserverState, OperatingConditions, predict_next
 
 
 class AbstractSuperTwisting(AbstractObserver):
@@ -20,14 +20,14 @@ class AbstractSuperTwisting(AbstractObserver):
     alpha: Scalar = parameter("rad/s²", "gain alpha of the switching term (8)", minimum=0.0)
 
     @classmethod
-    def discretised(cls, discretisation):
+    def select_discretisation(cls, discretisation):
         return DISCRETISATIONS[discretisation]
 
     @classmethod
-    def search(cls, at: OperatingConditions) -> Mapping[str, tuple[float, float]]:
-        root = at.f_plus**0.5
+    def gain_ranges(cls, conditions: OperatingConditions) -> Mapping[str, tuple[float, float]]:
+        root = conditions.f_plus**0.5
         # below f_plus it follows no faster disturbance exactly, and may still have less noise
-        return {"lambda": (0.01 * root, 1e3 * root), "alpha": (0.01 * at.f_plus, 1e3 * at.f_plus)}
+        return {"lambda": (0.01 * root, 1e3 * root), "alpha": (0.01 * conditions.f_plus, 1e3 * conditions.f_plus)}
 
     def start(self, position, velocity, acceleration, period):
         return ObserverState(position, velocity)
@@ -78,7 +78,7 @@ class ImplicitSuperTwisting(AbstractSuperTwisting):
         control = sliding / (period * period)
         position = measured - error
         velocity = state.velocity + period * control
-        new = ObserverState(*predicted(position, velocity, acceleration, period, missing=control))
+        new = ObserverState(*predict_next(position, velocity, acceleration, period, missing=control))
         return new, Estimate(position, velocity, control)
 
 

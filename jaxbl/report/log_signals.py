@@ -118,7 +118,7 @@ class LogSignals:
             rest = {side: jnp.asarray(0.0) for side in SIDES}
             states = tuple(effect.init() for effect in effects)
             position = {"motor": jnp.asarray(twist), "load": jnp.zeros(len(twist))}
-            found, _ = jax.vmap(lambda at: plant.transmitted(at, rest, states))(position)
+            found, _ = jax.vmap(lambda at: plant.transmitted_torque(at, rest, states))(position)
         return np.asarray(found)
 
     def effects(self, side: str) -> Array | None:

@@ -18,7 +18,7 @@ from hidden_effects import left
 from jaxbl.config import read_model
 from jaxbl.drive import Initial, Plant, as_arrays, effects
 from jaxbl.records import read_record
-from jaxbl.simulate import Run, move
+from jaxbl.simulate import Run, move_plant
 
 DURATION = 0.6
 GAP = {
@@ -148,7 +148,7 @@ def _package(plant, initial, torques, period, substeps=20):
     def positions(plant, state, torques):
         def over(carry, torque):
             state, start = carry
-            after = move(plant, Run(jnp.asarray(period), 1, substeps), state, torque, start)
+            after = move_plant(plant, Run(jnp.asarray(period), 1, substeps), state, torque, start)
             return (after, start + period), state.position["motor"]
 
         return jax.lax.scan(over, (plant.init(state), jnp.asarray(0.0)), torques)[1]

@@ -18,14 +18,14 @@ from jaxbl.diagnosis.next_experiment import next_experiment, write_next_experime
 from jaxbl.diagnosis.observer_residual import observed_torques
 from jaxbl.diagnosis.proof import is_better
 from jaxbl.diagnosis.setup import set_up
-from jaxbl.drive.effects import KEPT
+from jaxbl.drive.effects import DELAY_SAMPLES
 from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.errors import InputError
 from jaxbl.files import read_json
 from jaxbl.records import read_record
 from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
 
-FIRST, LAST = slice(1500), slice(1500 - KEPT, 2000)
+FIRST, LAST = slice(1500), slice(1500 - DELAY_SAMPLES, 2000)
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def test_the_gap_shrinks_to_the_noise_on_what_was_held_out(found):
 def test_what_is_held_out_keeps_its_times_and_is_not_fitted(logs, found):
     whole = read_record(logs / "axis.csv")
     task = read_diagnosis_task(logs / "axis.csv", model())
-    assert len(task.record.time) == 1500 and task.record.segments == (slice(KEPT, 1500),)
+    assert len(task.record.time) == 1500 and task.record.segments == (slice(DELAY_SAMPLES, 1500),)
     assert task.holdout.segments == (slice(1500, 2000),)
     np.testing.assert_array_equal(task.holdout.time, whole.time)
     parts = dataclasses.replace(whole, segments=(slice(0, 700), slice(800, 1200), slice(1300, 2000)))
@@ -109,12 +109,12 @@ def test_what_is_held_out_keeps_its_times_and_is_not_fitted(logs, found):
     assert first.segments == (slice(0, 700), slice(800, 1200), slice(1300, 1550))
     assert last.segments == (slice(1550, 2000),) and len(first.time) == 1550
     trace = found.trace
-    assert trace["held_out"].sum() == 500 and trace["motor.missing_before"][KEPT:].notna().all()
+    assert trace["held_out"].sum() == 500 and trace["motor.missing_before"][DELAY_SAMPLES:].notna().all()
     assert trace["motor.missing_after"].std() < trace["motor.missing_before"].std()
 
 
 def test_what_an_effect_takes_off_is_its_torque(found):
-    trace = found.trace[KEPT:]
+    trace = found.trace[DELAY_SAMPLES:]
     taken = trace["motor.missing_without.motor.coulomb_friction"] - trace["motor.missing_after"]
     # away from reversals, where the smoother rounds the jump
     fast = trace["motor.velocity"].abs() > 0.5 * trace["motor.velocity"].abs().max()
@@ -131,7 +131,7 @@ def test_the_observers_are_a_second_witness(found):
     trace, (one,) = found.trace, found.observed["motor"]
     known = trace["motor.observed_before"].notna()
     # the beginnings of both parts are left out
-    first = KEPT + one.skipped
+    first = DELAY_SAMPLES + one.skipped
     assert not known[:first].any() and known[first:1500].all()
     assert not known[1500 : 1500 + one.skipped].any() and known[1500 + one.skipped :].all()
     assert (trace["motor.observed_noise"].notna() == known).all()

@@ -14,7 +14,7 @@ from jaxbl.diagnosis import motor_alone
 from jaxbl.diagnosis.diagnose import diagnose, read_diagnosis_task, run_diagnosis
 from jaxbl.diagnosis.motor_alone import sought
 from jaxbl.diagnosis.next_experiment import with_gap
-from jaxbl.drive.effects import KEPT
+from jaxbl.drive.effects import DELAY_SAMPLES
 from jaxbl.report.diagnose import diagnosis_lines, write_diagnosis_report
 
 STUDY = {
@@ -66,7 +66,7 @@ def test_nothing_is_named_where_nothing_is_missing(tmp_path):
     found = run_diagnosis(task, lambda *counted: done.append(counted))
     assert (found.summary["verdict"], found.summary["findings"]) == ("no_discrepancy", [])
     assert found.summary["explained_share"] is None
-    first = 50 + KEPT
+    first = 50 + DELAY_SAMPLES
     assert np.isnan(found.trace["torque"][:first]).all() and np.isfinite(found.trace["torque"][first:]).all()
     assert done == [(1, 3), (2, 3), (3, 3)]
 

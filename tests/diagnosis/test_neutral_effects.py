@@ -10,7 +10,7 @@ from jaxbl.diagnosis.neutral_effects import bucket, candidates, complete, has_st
 from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.parameters import as_arrays, parameters
 from jaxbl.identification.compilation import jit
-from jaxbl.simulate import trajectory
+from jaxbl.simulate import plant_trajectory
 
 GIVEN_ONLY = {"actuator.back_emf", "motor.tabulated", "load.tabulated"} | {
     name for name in EFFECTS if name.startswith("encoder.")
@@ -33,7 +33,7 @@ def test_neutral_effects_do_nothing(sides):
     runs = []
     for one in (bare, every):
         start = one.plant.init(one.initial)
-        runs.append(jit(trajectory)(one, start, torque))
+        runs.append(jit(plant_trajectory)(one, start, torque))
     for side in bare.sides:
         assert np.ptp(runs[0].position[side]) > 0.0
         for name in ("position", "velocity"):

@@ -13,7 +13,7 @@ import jaxbl.diagnosis.observer_residual as under_test
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
 from jaxbl.diagnosis.observer_residual import compared, observed_torques
 from jaxbl.diagnosis.residuals import narrowed, residual_torques
-from jaxbl.drive.effects import KEPT
+from jaxbl.drive.effects import DELAY_SAMPLES
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.identification.logs import on_record
 from jaxbl.identification.segments import segments_of
@@ -72,13 +72,13 @@ def test_observers_see_what_the_smoother_sees_on_both_sides(logs):
     for side, friction in zip(("motor", "load"), FRICTIONS, strict=True):
         (one,) = found[side]
         assert one.converged and one.stuck < 0.02
-        assert len(one.residual.time) + one.skipped == 1500 - KEPT and 50 <= one.skipped < 60
+        assert len(one.residual.time) + one.skipped == 1500 - DELAY_SAMPLES and 50 <= one.skipped < 60
         about = compared(experiment, found[side], residuals[side], 30.0)
         assert about["correlation"] > 0.99
         assert about["rms"] == pytest.approx(about["smoother_rms"], rel=0.03) and about["rms"] > 10.0 * about["noise"]
         assert about["bandwidth"] == pytest.approx(1.0 / (2.0 * np.pi * LOW))
         # what is missing, with its sign and late by the low-pass: the truth that neither of them knows
-        missing = late(-friction["torque"] * np.sign(logs[1][side]), 2e-3)[KEPT + one.skipped : 1500]
+        missing = late(-friction["torque"] * np.sign(logs[1][side]), 2e-3)[DELAY_SAMPLES + one.skipped : 1500]
         low, _ = narrowed(one.residual, 10.0)
         true, _ = narrowed(replace(one.residual, torque=missing), 10.0)
         assert np.corrcoef(low.torque, true.torque)[0, 1] > 0.99

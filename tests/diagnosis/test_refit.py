@@ -17,7 +17,7 @@ from jaxbl.identification.logs import default_paths, on_record
 from jaxbl.identification.regression import settled
 from jaxbl.identification.segments import segments_of
 from jaxbl.identification.trajectory import free_parameters, with_fitted
-from jaxbl.simulate import trajectory
+from jaxbl.simulate import plant_trajectory
 
 NAME = "motor.coulomb_friction"
 
@@ -48,7 +48,7 @@ def test_prediction_errors_are_least(setting):
     def predicted(given):
         one = with_fitted(experiment, free, given[2:] * 0.01)
         start = PlantState({"motor": given[0]}, {"motor": given[1]}, settled(one, torque[0]))
-        return trajectory(one, start, torque, 0.0, {"motor": reading}, gain).position["motor"]
+        return plant_trajectory(one, start, torque, 0.0, {"motor": reading}, gain).position["motor"]
 
     def cost(given):
         errors = np.asarray(reading - predicted(jnp.asarray(given)))

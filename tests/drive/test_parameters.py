@@ -18,8 +18,8 @@ from jaxbl.drive import (
     SigmoidBacklash,
     TwoInertia,
     as_arrays,
+    config_key,
     get_leaf,
-    key_of,
     leaf_paths,
     parameters,
     set_leaves,
@@ -104,7 +104,7 @@ def test_a_leaf_with_a_batch_dimension_is_a_grid_axis():
 
 @pytest.mark.parametrize(("field", "key"), [("lambda_", "lambda"), ("torque_", "torque_"), ("slope", "slope")])
 def test_keys_of_fields(field, key):
-    assert key_of(field) == key
+    assert config_key(field) == key
 
 
 def test_every_number_of_the_package_is_declared_with_a_text():

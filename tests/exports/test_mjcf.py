@@ -81,7 +81,7 @@ def test_accelerations_are_those_of_the_plant(case):
         velocity = {"motor": jnp.asarray(5.0 * speed + rate), "load": jnp.asarray(speed)}
         states, torque = plant.actuate(tuple(one.settled(u) for one in plant.effects), u, 1e-4)
         expected = []
-        for side, (total, level) in plant.torques(position, velocity, states, torque, 0.0).items():
+        for side, (total, level) in plant.side_torques(position, velocity, states, torque, 0.0).items():
             own = total - plant.drive.viscous(side) * velocity[side]
             expected.append((own - level * jnp.sign(velocity[side])) / plant.inertia(side))
         mujoco.mj_resetData(model, data)

@@ -14,7 +14,7 @@ from jaxbl.drive.effects import SideEffect, make_effect
 from jaxbl.drive.excitation import Recorded, Sine
 from jaxbl.fused import single_plant as module
 from jaxbl.fused.single_plant import Direction, simulate_plant, step_derivatives
-from jaxbl.simulate import Experiment, Run, move, trajectory
+from jaxbl.simulate import Experiment, Run, move_plant, plant_trajectory
 
 STEPS = 500
 OTHERS = ["transmission.backlash", "motor.stribeck_friction", "load.quadratic_drag"]
@@ -58,7 +58,7 @@ def test_the_path_is_that_of_the_scan(name, observed):
     if observed:
         measured = {side: 0.05 * np.cumsum(rng.normal(0.0, 0.01, STEPS)) for side in one.sides}
         more = {"measured": measured, "gain": {side: np.array([0.3, 20.0 + i]) for i, side in enumerate(one.sides)}}
-    expected = eqx.filter_jit(trajectory)(one, start, jnp.asarray(torque), 0.7, **jax.tree.map(jnp.asarray, more))
+    expected = eqx.filter_jit(plant_trajectory)(one, start, jnp.asarray(torque), 0.7, **jax.tree.map(jnp.asarray, more))
     assert module._path_loop(module._PlantStructure.of(one, start), tuple(sorted(more.get("gain", ())))) is not None
     found = simulate_plant(one, start, torque, 0.7, **more)
     assert jax.tree.structure(found) == jax.tree.structure(expected)
@@ -97,7 +97,7 @@ def test_slopes_are_those_of_differences(name):
     @jax.vmap
     def moved(way, by):
         own, *given = jax.tree.map(lambda x, c: x + by * c, (one, states, torque), way)
-        return jnp.stack(jax.tree.leaves(jax.vmap(lambda *x: move(own.plant, own.run, *x))(*given, time)))
+        return jnp.stack(jax.tree.leaves(jax.vmap(lambda *x: move_plant(own.plant, own.run, *x))(*given, time)))
 
     numbers, every = jax.tree.leaves((one, states, torque)), [whole(way) for way in ways]
     # of the number's own size
@@ -126,7 +126,7 @@ def test_what_a_loop_cannot_do_is_left_to_the_scan():
     plant = module._PlantStructure.of(one, start)
     assert module._path_loop(plant, ()) is None
     assert module._slopes_loop(plant) is None
-    expected = eqx.filter_jit(trajectory)(one, start, jnp.asarray(torque))
+    expected = eqx.filter_jit(plant_trajectory)(one, start, jnp.asarray(torque))
     found = simulate_plant(one, start, torque)
     for side in one.sides:
         assert found.position[side] == pytest.approx(np.asarray(expected.position[side]), rel=1e-12)

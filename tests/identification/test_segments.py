@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 
 from jaxbl.config import read_model
 from jaxbl.diagnosis.reference_log import ReferenceLog
-from jaxbl.drive.effects import KEPT
+from jaxbl.drive.effects import DELAY_SAMPLES
 from jaxbl.identification.logs import on_record
 from jaxbl.identification.regression import Path, effect_path
 from jaxbl.identification.segments import led_in, reading_noise, segments_of, windows_of
@@ -51,14 +51,14 @@ def test_a_segment_gives_up_its_beginning_for_the_inputs_before_it(setting):
     assert led_in(record, False).segments == record.segments
     record = replace(record, time=whole.time + 0.5 * (np.arange(2000) >= 1000))
     led = led_in(record, False)
-    assert led.segments == (slice(0, 100), slice(100, 900), slice(1000 + KEPT, 2000)) == led_in(led, False).segments
+    assert led.segments == (slice(0, 100), slice(100, 900), slice(1000 + DELAY_SAMPLES, 2000)) == led_in(led, False).segments
     first, second, third = segments_of(led, ["motor"])
     assert first.before is None and record.torque is not None
-    np.testing.assert_array_equal(second.before, record.torque[100 - KEPT : 100])
-    np.testing.assert_array_equal(third.before, record.torque[1000 : 1000 + KEPT])
+    np.testing.assert_array_equal(second.before, record.torque[100 - DELAY_SAMPLES : 100])
+    np.testing.assert_array_equal(third.before, record.torque[1000 : 1000 + DELAY_SAMPLES])
     # at rest nothing had been commanded
-    assert led_in(whole, True).segments == whole.segments and led_in(whole, False).segments == (slice(KEPT, 2000),)
-    np.testing.assert_array_equal(segments_of(whole, ["motor"], True)[0].before, np.zeros(KEPT))
+    assert led_in(whole, True).segments == whole.segments and led_in(whole, False).segments == (slice(DELAY_SAMPLES, 2000),)
+    np.testing.assert_array_equal(segments_of(whole, ["motor"], True)[0].before, np.zeros(DELAY_SAMPLES))
     free = replace(whole, torque=np.zeros(2000))
     assert led_in(free, False).segments == whole.segments
 

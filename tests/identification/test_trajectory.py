@@ -19,7 +19,7 @@ from jaxbl.identification.compilation import jit
 from jaxbl.identification.intervals import refusals, spread
 from jaxbl.identification.smoother import smooth
 from jaxbl.identification.trajectory import Fit, _Point, _solve, cut, fit, free_parameters, with_fitted
-from jaxbl.simulate import replay, trajectory
+from jaxbl.simulate import plant_trajectory, replay
 
 TRUE = {
     "drive.motor_inertia": 0.05,
@@ -115,7 +115,7 @@ def test_agrees_with_one_least_squares_problem_over_parameters_and_states():
 
         def one(x, u, motor, load):
             start = PlantState({"motor": x[0], "load": x[1]}, {"motor": x[2], "load": x[3]}, ())
-            simulated = trajectory(at, start, u).position
+            simulated = plant_trajectory(at, start, u).position
             return jnp.stack([(motor - simulated["motor"]) / noise["motor"], (load - simulated["load"]) / noise["load"]], -1)
 
         each = jax.vmap(one)(starts, windows.torque, windows.measured["motor"], windows.measured["load"])
@@ -189,7 +189,7 @@ def test_scales_that_one_record_cannot_part_are_refused():
     t = PERIOD * np.arange(1000)
     torque = 0.1 * np.sin(9.0 * t) + 0.05 * np.sin(31.0 * t)
     rest = experiment.plant.init(experiment.initial)
-    simulated = trajectory(experiment, rest, jnp.asarray(torque)).position["motor"]
+    simulated = plant_trajectory(experiment, rest, jnp.asarray(torque)).position["motor"]
     readings = {"motor": simulated + 1e-5 * jax.random.normal(jax.random.key(2), (1000,))}
     paths = ["drive.motor_inertia", "drive.motor_viscous", "effects.motor.coulomb_friction.torque"]
     paths.append("effects.actuator.gain_error.relative")

@@ -86,8 +86,8 @@ def test_wrong_observers_get_one_line(observer, message):
 @pytest.mark.parametrize("kind", OBSERVERS)
 def test_every_kind_says_what_a_search_should_try(kind):
     """Gains of the class, positive, and a study with them runs."""
-    cls = OBSERVERS[kind].discretised("implicit")
-    found = cls.search(OperatingConditions(f_plus=3.0, period=1e-3, noise=1e-5))
+    cls = OBSERVERS[kind].select_discretisation("implicit")
+    found = cls.gain_ranges(OperatingConditions(f_plus=3.0, period=1e-3, noise=1e-5))
     assert found
     assert all(0.0 < least <= largest < np.inf for least, largest in found.values())
     middle = {key: (least * largest) ** 0.5 for key, (least, largest) in found.items()}

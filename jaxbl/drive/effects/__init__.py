@@ -21,7 +21,7 @@ from .loads import (
 )
 from .tables import Tabulated
 from .gear import Backlash, Hardening, Damping, Hysteresis, Eccentricity, LoadFriction
-from .actuator import KEPT, Delay, GainError, Saturation, Lag, BackEmf
+from .actuator import DELAY_SAMPLES, Delay, GainError, Saturation, Lag, BackEmf
 from .encoders import Offset, Skew, EncoderEccentricity
 from .base import (
     EFFECTS,

@@ -10,7 +10,7 @@ from .base import EFFECTS, ActuatorEffect, shape, size
 
 _LIMITS = 0.98, 0.95, 0.92, 0.88, 0.84, 0.8, 0.75, 0.7, 0.65, 0.6, 0.55, 0.5, 0.45, 0.4, 0.35, 0.3
 """Limits tried, over the largest commanded torque."""
-KEPT = 16
+DELAY_SAMPLES = 16
 """Samples that a delay may last: each is a state. Of buses and controllers, few last longer than 4."""
 _DELAYS = 0.5, 1.0, 2.0, 4.0, 8.0
 """Delays tried, in samples."""
@@ -23,23 +23,23 @@ class Delay(ActuatorEffect):
     """Dead time of the torque, exact for an input held from sample to sample: u(t - T); before t = 0 it was zero."""
 
     kind: ClassVar[str] = "delay"
-    input_alone: ClassVar[bool] = True
+    state_from_input: ClassVar[bool] = True
     rank: ClassVar[int] = 0
     delay: Scalar = shape(
         "s", "dead time T", lambda log: [samples * log.period for samples in _DELAYS], neutral=1e-30, minimum=0.0
     )
 
     def init(self):
-        return (jnp.zeros_like(self.delay),) * KEPT
+        return (jnp.zeros_like(self.delay),) * DELAY_SAMPLES
 
     def settled(self, torque):
-        return (jnp.zeros_like(self.delay) + torque,) * KEPT
+        return (jnp.zeros_like(self.delay) + torque,) * DELAY_SAMPLES
 
     def receive(self, state, torque, period):
         commanded = (torque, *state)
-        late = jnp.clip(self.delay / period, 0.0, KEPT)
+        late = jnp.clip(self.delay / period, 0.0, DELAY_SAMPLES)
         # of the commands kept, the last to have arrived when the sample begins, and the next one
-        whole = jnp.minimum(jnp.floor(late), KEPT - 1.0)
+        whole = jnp.minimum(jnp.floor(late), DELAY_SAMPLES - 1.0)
         first, then = (
             sum(jnp.where(whole == k, one, 0.0) for k, one in enumerate(some)) for some in (commanded[1:], commanded[:-1])
         )
@@ -50,9 +50,9 @@ class Delay(ActuatorEffect):
         return nearly(f"delay of the actuator: exact to one time step, at most {parts.step:.2g} s")
 
     @classmethod
-    def fault(cls, numbers, period):
-        longest = KEPT * period
-        text = f"delay: {numbers['delay']:g} s is longer than {KEPT} samples; it should be at most {longest:g} s"
+    def find_fault(cls, numbers, period):
+        longest = DELAY_SAMPLES * period
+        text = f"delay: {numbers['delay']:g} s is longer than {DELAY_SAMPLES} samples; it should be at most {longest:g} s"
         return text if numbers["delay"] > longest * (1.0 + 1e-9) else ""
 
 
@@ -95,7 +95,7 @@ class Lag(ActuatorEffect):
     """First-order lag of the torque: T du_a/dt = u - u_a, advanced exactly for a held u; starts at zero torque."""
 
     kind: ClassVar[str] = "lag"
-    follows: ClassVar[bool] = True
+    state_from_measurement: ClassVar[bool] = True
     rank: ClassVar[int] = 3
     time_constant: Scalar = shape(
         "s", "time constant T", lambda log: [samples * log.period for samples in _LAGS], neutral=1e-30, above=0.0

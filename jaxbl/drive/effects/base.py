@@ -87,7 +87,7 @@ class Role(NamedTuple):
     neutral: float
     trials: Callable[[Scales], Sequence[float]]
     width: float = 1.0
-    sought: Callable[[Scales], int] | None = None
+    trial_count: Callable[[Scales], int] | None = None
 
 
 def size(unit: str, doc: str, *, trial: Callable[[Scales], float] = lambda log: 1.0, **limits: Any) -> Any:
@@ -108,7 +108,7 @@ def harmonic(
     **limits: Any,
 ) -> Any:
     """Declare a number of periods a turn."""
-    return parameter("1/turn", doc, above=0.0, role=Role("harmonic", 1.0, trials, sought=sought), **limits)
+    return parameter("1/turn", doc, above=0.0, role=Role("harmonic", 1.0, trials, trial_count=sought), **limits)
 
 
 def frequency(doc: str) -> Any:
@@ -154,8 +154,8 @@ class AbstractEffect(eqx.Module):
     kind: ClassVar[str]
     places: ClassVar[tuple[str, ...]]
     velocity_dependent: ClassVar[bool] = False
-    input_alone: ClassVar[bool] = False
-    follows: ClassVar[bool] = False
+    state_from_input: ClassVar[bool] = False
+    state_from_measurement: ClassVar[bool] = False
     in_time: ClassVar[bool] = False
     corrects: ClassVar[str | None] = None
     exclusive: ClassVar[str | None] = None
@@ -179,7 +179,7 @@ class AbstractEffect(eqx.Module):
         """The own state after a commanded torque (N m) that has lasted; at t = 0 unless the effect says otherwise."""
         return type(self).init(self)
 
-    def moved(self, state: Any, velocity: Value) -> Any:
+    def set_in_motion(self, state: Any, velocity: Value) -> Any:
         """The own state :meth:`init` on a side that moves (rad/s) when a log begins, as far as that says anything."""
         return state
 
@@ -280,7 +280,7 @@ class AbstractEffect(eqx.Module):
         return all(least is None or numbers[name] > least for name, least in limits.items())
 
     @classmethod
-    def fault(cls, numbers: Mapping[str, Any], period: float) -> str:
+    def find_fault(cls, numbers: Mapping[str, Any], period: float) -> str:
         """What is wrong with the numbers of a study whose samples are `period` seconds apart, beyond the range of each, and
         what would be right; "" if nothing is."""
         return ""

@@ -202,7 +202,7 @@ class Flexibility(SideEffect):
     kind: ClassVar[str] = "flexibility"
     places: ClassVar[tuple[str, ...]] = ("load",)
     velocity_dependent: ClassVar[bool] = True
-    follows: ClassVar[bool] = True
+    state_from_measurement: ClassVar[bool] = True
     # behind a stiff spring
     special_cases: ClassVar = {"inertia": lambda one: {"inertia": one["inertia"]}}
     inertia: Scalar = size("kg m²", "inertia J behind the spring", minimum=0.0)
@@ -222,7 +222,7 @@ class Flexibility(SideEffect):
         # twist of the spring, rad, and velocity of the inertia, rad/s
         return (jnp.zeros_like(self.frequency), jnp.zeros_like(self.frequency))
 
-    def moved(self, state, velocity):
+    def set_in_motion(self, state, velocity):
         return (state[0], state[1] + velocity)
 
     def advance(self, state, motion, step):

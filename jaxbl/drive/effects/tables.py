@@ -40,7 +40,7 @@ class Tabulated(SideEffect):
         return exactly("springs of the joint, slack up to the points of a table over position; one over speed is not said")
 
     @classmethod
-    def fault(cls, numbers: Mapping[str, Any], period: float) -> str:
+    def find_fault(cls, numbers: Mapping[str, Any], period: float) -> str:
         for points, torques in (("positions", "position_torques"), ("speeds", "speed_torques")):
             given = numbers[points]
             if len(given) != len(numbers[torques]):

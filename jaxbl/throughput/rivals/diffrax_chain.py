@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxbl.drive import set_leaves
-from jaxbl.simulate import advance, begin, figures
+from jaxbl.simulate import advance_sample, compute_metrics, initial_carry
 
 from ..jaxbl_chain import LANES
 from ..workload import FIGURES, Chunked, Workload
@@ -31,12 +31,12 @@ class DiffraxChain(Chunked):
 
         def lane(values: dict[str, Any]) -> dict[str, Any]:
             own = set_leaves(experiment, values)
-            start, tree = jax.tree.flatten(begin(own, (FIGURES,)))
+            start, tree = jax.tree.flatten(initial_carry(own, (FIGURES,)))
 
             def rates(t: Any, y: tuple[Any, ...], args: Any) -> tuple[Any, ...]:
                 index = jnp.round(t / period).astype(jnp.int32)
                 noise = dict(zip(own.sides, units[index], strict=True))
-                new, _ = advance(own, (FIGURES,), tree.unflatten(y), index, noise)
+                new, _ = advance_sample(own, (FIGURES,), tree.unflatten(y), index, noise)
                 return tuple((after - before) / period for after, before in zip(jax.tree.leaves(new), y, strict=True))
 
             solution = diffrax.diffeqsolve(
@@ -51,6 +51,6 @@ class DiffraxChain(Chunked):
                 adjoint=diffrax.ForwardMode(),
             )
             last: Any = solution.ys
-            return figures(own, (FIGURES,), tree.unflatten([x[0] for x in last]))
+            return compute_metrics(own, (FIGURES,), tree.unflatten([x[0] for x in last]))
 
         super().__init__(jax.vmap(lane), workload, LANES)
