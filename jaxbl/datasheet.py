@@ -1,7 +1,7 @@
 """A first study from what a drive's data sheet says: the function behind `jaxbl init`.
 
 Numbers are read in the units of data sheets and written in SI, each beside what was given. Observer gains are the usual rule
-(:func:`jaxbl.gains.tune.usual_rule`) at the bound f⁺ that a pilot run of the study finds.
+(:func:`jaxbl.gains.gain_search.usual_rule`) at the bound f⁺ that a pilot run of the study finds.
 """
 
 import math
@@ -279,8 +279,8 @@ def first_study(kind: Kind, given: Mapping[str, Given], title: str) -> tuple[str
         NoResult: the drive diverges.
     """
     from .config import TuneTable, read_config, read_model
+    from .gains.gain_search import usual_rule
     from .gains.pilot import Scenarios, pilot
-    from .gains.tune import usual_rule
 
     given = by_key(kind, given)
     text = _drive(kind, given, title)

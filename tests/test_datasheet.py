@@ -11,7 +11,7 @@ from jaxbl import read_config
 from jaxbl.cli import setup
 from jaxbl.datasheet import KINDS, Given, first_study, named_items
 from jaxbl.errors import InputError
-from jaxbl.gains.tune import usual_rule
+from jaxbl.gains.gain_search import usual_rule
 
 ITEMS = {kind: {item.name: item for item in about.items} for kind, about in KINDS.items()}
 BY_NAME = ITEMS["geared"]

@@ -7,7 +7,7 @@ import math
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,10 +20,8 @@ from jaxbl.observer.conditions import convergence_time_worst, peak_ratio
 from jaxbl.observer.super_twisting import DISCRETISATIONS
 
 from .adversary import search
+from .gain_search import GainSearch
 from .invariant_set import ErrorSystem, Proof, prove
-
-if TYPE_CHECKING:
-    from .tune import Search
 
 SETTLED = 1.05
 """Velocity bound that a reaching time leads to, over the bound of all later times; where no other one is asked for."""
@@ -203,7 +201,7 @@ def _limits(inputs: Inputs, proven: _Proven, accuracy: float | None, reaching_ti
     return found
 
 
-def inputs_of(search: "Search", side: str, f_plus: float) -> Inputs:
+def inputs_of(search: GainSearch, side: str, f_plus: float) -> Inputs:
     """Assumptions for a side of a study that is tuned: those of `[tune.certificate]`, else what the study and its pilot run
     have; `f_plus` is the largest along the runs, rad/s^2."""
     config, pilot, own = search.scenarios.config, search.pilot[side], _asked(search, side)
@@ -225,7 +223,7 @@ def inputs_of(search: "Search", side: str, f_plus: float) -> Inputs:
     )
 
 
-def _asked(search: "Search", side: str) -> SideCertificateTable:
+def _asked(search: GainSearch, side: str) -> SideCertificateTable:
     table = search.table.certificate
     assert table is not None
     return getattr(table, side) or SideCertificateTable()
@@ -235,7 +233,7 @@ _MOST_TRIED = 50
 """Gains of a side that are tried one after the other, best first, where limits are asked for."""
 
 
-def choose_certified(search: "Search") -> dict[str, int]:
+def choose_certified(search: GainSearch) -> dict[str, int]:
     """Take gains out of the feasible ones that do not meet the limits of `[tune.certificate]`, until the best ones do.
 
     Returns how many were taken out on each side; none where no gains tried meet the limits.
@@ -249,7 +247,7 @@ def choose_certified(search: "Search") -> dict[str, int]:
         for tried in range(_MOST_TRIED):
             if not frame["feasible"].any():
                 break
-            best = search.best(side)
+            best = search.best_candidate(side)
             inputs = inputs_of(search, side, best["f_plus"])
             with suppress(NoResult):
                 proven = _prove(best["lambda"], best["alpha"], inputs, own.accuracy)
@@ -264,7 +262,7 @@ def choose_certified(search: "Search") -> dict[str, int]:
     return out
 
 
-def certificates(search: "Search", path: Path | None) -> dict[str, Any]:
+def certificates(search: GainSearch, path: Path | None) -> dict[str, Any]:
     """Certificates of the best gains of each side, as plain data by side; kept in a file and read again.
 
     A side of which nothing is proven has `certified` false and `why_none`.
@@ -273,7 +271,7 @@ def certificates(search: "Search", path: Path | None) -> dict[str, Any]:
     assert table is not None
     asked = {}
     for side in search.sides:
-        best, own = search.best(side), _asked(search, side)
+        best, own = search.best_candidate(side), _asked(search, side)
         asked[side] = {"lambda_": float(best["lambda"]), "alpha": float(best["alpha"]), "runs": table.runs}
         asked[side] |= inputs_of(search, side, best["f_plus"])._asdict()
         asked[side] |= {"accuracy": own.accuracy, "reaching_time": own.reaching_time}

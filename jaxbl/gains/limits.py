@@ -3,15 +3,14 @@
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportReturnType=false
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from jaxbl.files import to_jsonable
 
-if TYPE_CHECKING:
-    from .tune import Search
+from .gain_search import GainSearch
 
 WORTH = 0.01
 """Relative differences of the error below this count for nothing: another noise makes as much."""
@@ -30,7 +29,7 @@ _SAME = 1e-9
 """Relative difference of a gain that is the same, but for rounding."""
 
 
-def limits_of(search: "Search", side: str) -> dict[str, Any]:
+def limits_of(search: GainSearch, side: str) -> dict[str, Any]:
     """Plain data of what limits a side's gains (`limits` in `tuning.json`).
 
     `profiles`: for each gain, the error along it with the other gain held at the optimum, and which constraints are missed
@@ -39,7 +38,7 @@ def limits_of(search: "Search", side: str) -> dict[str, Any]:
     `binding`: the constraints that forbid a smaller error beside the optimum. `range_ends`: where the range searched ends at
     the optimum.
     """
-    best = search.best(side)
+    best = search.best_candidate(side)
     profiles = {gain: _profile(search, side, gain, best) for gain in GAINS}
     towards = {
         gain: {way: _towards(search, profile, best, gain, sign) for way, sign in (("smaller", -1), ("larger", 1))}
@@ -65,7 +64,7 @@ def limits_of(search: "Search", side: str) -> dict[str, Any]:
     )
 
 
-def _profile(search: "Search", side: str, gain: str, best: dict[str, Any]) -> pd.DataFrame:
+def _profile(search: GainSearch, side: str, gain: str, best: dict[str, Any]) -> pd.DataFrame:
     """Candidates along one gain with the other at its optimum, in the order of the gain; between two rows of a map,
     interpolated. Of maps that overlap the finer one counts."""
     other = GAINS[1 - GAINS.index(gain)]
@@ -82,7 +81,7 @@ def _profile(search: "Search", side: str, gain: str, best: dict[str, Any]) -> pd
     line = pd.concat(lines)
     line = line[(line[gain] / best[gain] - 1.0).abs() > _SAME]
     line = pd.concat([line, pd.DataFrame([best])[line.columns]]).sort_values(gain, ignore_index=True)
-    kept = search.kept(line)
+    kept = search.constraints_met(line)
     return line.assign(missed=[[name for name, good in kept.items() if not good[i]] for i in range(len(line))])
 
 
@@ -107,7 +106,7 @@ def _between(part: pd.DataFrame, gain: str, other: str, at: float) -> pd.DataFra
 _COLUMNS = ["lambda", "alpha", "lambda_ratio", "alpha_ratio", "error", "chatter", *PLACES.values()]
 
 
-def _towards(search: "Search", profile: pd.DataFrame, best: dict[str, Any], gain: str, sign: int) -> dict[str, Any]:
+def _towards(search: GainSearch, profile: pd.DataFrame, best: dict[str, Any], gain: str, sign: int) -> dict[str, Any]:
     """What a smaller (sign -1) or larger gain meets, up to the first value at least a cell of the coarse map away.
 
     `limit` is `constraint` where constraints forbid a smaller error (by more than `WORTH`): `missed` are those met first.
@@ -123,7 +122,7 @@ def _towards(search: "Search", profile: pd.DataFrame, best: dict[str, Any], gain
             return {"limit": "constraint", "missed": ["margin_alpha"], "at": None, "change": None, "by": None}
         return {"limit": "range", "missed": [], "at": None, "change": None, "by": None}
     distance = sign * np.log(line[gain] / best[gain]).to_numpy()
-    cell = np.log(search.coarse_cell(gain)) * (1.0 - 1e-6)
+    cell = np.log(search.coarse_cell_ratio(gain)) * (1.0 - 1e-6)
     near = line.iloc[: int(np.searchsorted(distance, cell)) + 1]
     forbidden = near[near["missed"].map(bool)]
     if len(forbidden) and forbidden["error"].min() < (1.0 - WORTH) * best["error"]:
@@ -138,7 +137,7 @@ def _towards(search: "Search", profile: pd.DataFrame, best: dict[str, Any], gain
     return found | {"by": _part(search, best, last) if grows else None}
 
 
-def _part(search: "Search", best: dict[str, Any], last: pd.Series) -> str | None:
+def _part(search: GainSearch, best: dict[str, Any], last: pd.Series) -> str | None:
     """The part of the velocity error that most of its growth is due to, by mean squares."""
     squares = [(row["error"] ** 2, row["chatter"] ** 2) for row in (best, last)]
     if search.table.objective != "velocity" or not all(chatter <= error for error, chatter in squares):

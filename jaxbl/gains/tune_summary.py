@@ -4,7 +4,7 @@
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportReturnType=false
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,23 +13,8 @@ from jaxbl.files import to_jsonable
 from jaxbl.observer.conditions import judge_gains
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
+from .gain_search import GAIN_METRICS, GainSearch, Window
 from .limits import WORTH, limits_of
-
-if TYPE_CHECKING:
-    from .tune import Search, Window
-
-COMPARED = (
-    "converged",
-    "convergence_time",
-    "convergence_time_worst",
-    "velocity_rmse",
-    "torque_rmse",
-    "chatter",
-    "margin_alpha",
-    "margin_exact",
-    "f_plus",
-)
-"""Metrics of a side that gains are judged by."""
 
 _FLAT = 0.05  # errors that differ by less are as good in practice
 
@@ -42,13 +27,15 @@ def pareto_front(candidates: pd.DataFrame) -> pd.DataFrame:
 
 
 class Summary:
-    """Plain data of a finished search, as in `tuning.json`; with a row (:func:`compared_figures`) for each of the gains
+    """Plain data of a finished search, as in `tuning.json`; with a row (:func:`summarise_runs`) for each of the gains
     compared and each side, on the study's own runs (`named`) and on the held-out ones."""
 
-    def __init__(self, search: "Search", named: list[dict[str, Any]], held_out: list[dict[str, Any]]):
+    def __init__(self, search: GainSearch, named: list[dict[str, Any]], held_out: list[dict[str, Any]]):
         self.search, self.table, self.config = search, search.table, search.scenarios.config
-        self.best = {side: search.best(side) for side in search.sides}
-        self.conditions = {side: judge_gains(row["lambda"], row["alpha"], row["f_plus"]) for side, row in self.best.items()}
+        self.best_candidates = {side: search.best_candidate(side) for side in search.sides}
+        self.conditions = {
+            side: judge_gains(row["lambda"], row["alpha"], row["f_plus"]) for side, row in self.best_candidates.items()
+        }
         self.limits = {side: limits_of(search, side) for side in search.sides}
         self.named, self.rows = named, held_out
         self.held_out = {side: {row["name"]: row for row in held_out if row["side"] == side} for side in search.sides}
@@ -69,7 +56,7 @@ class Summary:
             "f_plus": search.f_plus,
             "pilot": search.pilot,
             "margins": {"exact": table.margin_exact, "alpha": table.margin_alpha},
-            "gains": {side: {key: float(self.best[side][key]) for key in keys} for side in sides},
+            "gains": {side: {key: float(self.best_candidates[side][key]) for key in keys} for side in sides},
             "achieved": {side: self._achieved(side) for side in sides},
             "limits": self.limits,
             "conditions": self.conditions,
@@ -90,8 +77,8 @@ class Summary:
         }
 
     def _achieved(self, side: str) -> dict[str, Any]:
-        names, rho = (name for name in COMPARED if name != "converged"), self.conditions[side]["peak_ratio"]
-        return to_jsonable({name: self.best[side][name] for name in names} | {"peak_ratio": rho})
+        names, rho = (name for name in GAIN_METRICS if name != "converged"), self.conditions[side]["peak_ratio"]
+        return to_jsonable({name: self.best_candidates[side][name] for name in names} | {"peak_ratio": rho})
 
     def _front(self, side: str) -> list[dict[str, Any]]:
         names = ["lambda", "alpha", "lambda_ratio", "alpha_ratio", "convergence_time", "error"]
@@ -145,7 +132,7 @@ class Summary:
         return lines
 
     def _about_optimum(self, side: str) -> list[str]:
-        search, row, lines = self.search, self.best[side], []
+        search, row, lines = self.search, self.best_candidates[side], []
         labels = {"alpha": "alpha / f⁺", "lambda": "lambda / √f⁺"}
         for way, gain in map(str.split, self.limits[side]["range_ends"]):
             end = search.limits[gain][way == "larger"]
@@ -154,7 +141,7 @@ class Summary:
                 "beyond it may be better gains."
             )
         found = search.candidates[side]
-        kept = search.kept(found)
+        kept = search.constraints_met(found)
         for key in kept:
             # gains that miss this constraint alone
             missed = found[~kept[key] & np.logical_and.reduce([values for name, values in kept.items() if name != key])]
@@ -201,26 +188,7 @@ def called_gains(name: str) -> str:
     return {"usual rule": "the usual rule's gains", "config": "the study's own gains"}.get(name, f"the gains '{name}'")
 
 
-def compared_figures(name: str, side: str, runs: pd.DataFrame, gains: tuple[float, float]) -> dict[str, Any]:
-    """Figures of some gains over all runs of a side: a row of the comparison."""
-    figures = {figure: runs[f"{side}.{figure}"] for figure in COMPARED}
-    converged, finite = figures["converged"].astype(bool), runs["finite"].astype(bool)
-    bound = figures["f_plus"].max() if finite.all() else math.nan
-    row: dict[str, Any] = {
-        "name": name, "side": side, "lambda": gains[0], "alpha": gains[1], "runs": len(runs),
-        "converged": float(converged.mean()), "finite": float(finite.mean()),
-    }  # fmt: skip
-    for figure in ("velocity_rmse", "torque_rmse", "convergence_time"):
-        whole = converged.all() if figure == "convergence_time" else finite.all()
-        row[figure] = {"worst": figures[figure].max() if whole else None, "median": figures[figure].median()}
-    # the worst that a disturbance within f_plus could make of convergence, too
-    worst = {name: figures[name].min() for name in ("margin_alpha", "margin_exact")}
-    worst["convergence_time_worst"] = figures["convergence_time_worst"].max()
-    row |= worst if finite.all() else dict.fromkeys(worst)
-    return to_jsonable(row | {"f_plus": bound, "peak_ratio": judge_gains(*gains, bound)["peak_ratio"]})
-
-
-def _ratios(window: "Window") -> dict[str, list[float]]:
+def _ratios(window: Window) -> dict[str, list[float]]:
     return {f"{gain}_ratio": list(ends) for gain, ends in window.items()}
 
 

@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 
 from jaxbl.config import TuneTable
+from jaxbl.gains.gain_search import GainSearch
 from jaxbl.gains.limits import limits_of
-from jaxbl.gains.tune import Search
 
 RANGE = (1.0, 100.0)
 NUM = 9
@@ -17,14 +17,14 @@ NUM = 9
 def searched(error, *, chatter=lambda x, a: 0.0 * x, time=lambda x, a: 0.0 * x, exact=lambda x, a: 10.0 + 0.0 * x, **table):
     """A search for lambda and alpha from 1 to 100, f_plus = 1, with one zoom; errors, their chatter, convergence times and
     margins to the exact condition are functions of both gains."""
-    found = Search.__new__(Search)
+    found = GainSearch.__new__(GainSearch)
     found.table = TuneTable.model_validate({"num": NUM, "margin_alpha": 1.001} | table)
     found.sides, found.f_plus, found.limits = ("motor",), {"motor": 1.0}, {"lambda": RANGE, "alpha": RANGE}
     found.scenarios = SimpleNamespace()
     found.windows, found.candidates = [{"motor": found.limits}], {}
     for stage in range(2):
         if stage:
-            found.windows.append({"motor": found._zoomed("motor")})
+            found.windows.append({"motor": found._zoom_in("motor")})
         values = {gain: np.geomspace(*found.windows[-1]["motor"][gain], NUM) for gain in ("lambda", "alpha")}
         x, a = (axis.ravel() for axis in np.meshgrid(*values.values()))
         frame = pd.DataFrame({
@@ -32,7 +32,9 @@ def searched(error, *, chatter=lambda x, a: 0.0 * x, time=lambda x, a: 0.0 * x, 
             "convergence_time": time(x, a), "margin_alpha": 1.02 * a, "margin_exact": exact(x, a), "stage": stage,
         })  # fmt: skip
         frame["converged"] = np.isfinite(frame["velocity_rmse"])
-        found.candidates["motor"] = pd.concat([*found.candidates.values(), found._judge("motor", frame)], ignore_index=True)
+        found.candidates["motor"] = pd.concat(
+            [*found.candidates.values(), found._mark_feasible("motor", frame)], ignore_index=True
+        )
     return found
 
 
@@ -121,7 +123,7 @@ def test_a_margin_at_the_end_of_the_range_binds_without_runs_beyond_it():
 def test_between_two_rows_of_the_coarse_map_errors_are_interpolated():
     search = searched(lambda x, a: np.sqrt(np.log(x / 13.0) ** 2 + np.log(a / 10.0) ** 2 + 1.0))
     line = pd.DataFrame(limits_of(search, "motor")["profiles"]["alpha"])
-    best = search.best("motor")["lambda"]
+    best = search.best_candidate("motor")["lambda"]
     exact = np.sqrt(np.log(best / 13.0) ** 2 + np.log(line["alpha"] / 10.0) ** 2 + 1.0)
     assert best not in search.candidates["motor"].query("stage == 0")["lambda"].to_numpy()
     # a chord of a parabola lies above it by a quarter of its squared width at most

@@ -275,7 +275,7 @@ def test_without_a_table_the_defaults_are_taken():
     study = one_side()
     study.pop("tune")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jaxbl.gains.tune.Search.run", lambda search: pytest.skip(f"{search.table.num}"))
+        patch.setattr("jaxbl.gains.gain_search.GainSearch.run", lambda search: pytest.skip(f"{search.table.num}"))
         with pytest.raises(pytest.skip.Exception, match="16"):
             tune(study)
 
