@@ -3,6 +3,7 @@
 import ast
 import builtins
 import dis
+import graphlib
 import importlib
 import inspect
 import re
@@ -18,7 +19,13 @@ from jaxbl.sweeps.points import Points
 
 ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / "jaxbl").rglob("*.py"))
-MODULES = [".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for file in FILES]
+
+
+def module_name(file, root=ROOT):
+    return ".".join(file.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
+
+
+MODULES = [module_name(file) for file in FILES]
 
 # the floors of the house: a part imports from those below it, and nothing from beside it
 FLOORS = [
@@ -55,17 +62,43 @@ def test_public_names_resolve_and_are_documented():
     assert declared - {None} == set(dir(jaxbl))
 
 
-def imported(file):
-    """Modules of the package that a file imports, wherever in it."""
-    package = ["jaxbl", *file.relative_to(ROOT / "jaxbl").parent.parts]
-    for node in ast.walk(ast.parse(file.read_text())):
+def list_imports(file, root=ROOT):
+    """Dotted names that a file imports: at its head, inside functions, and for type checkers only."""
+    package = file.relative_to(root).parent.parts
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names if alias.name.split(".")[0] == "jaxbl")
+            yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            base = package[: len(package) + 1 - node.level] if node.level else []
-            base = [*base, *(node.module.split(".") if node.module else [])]
-            if base[0] == "jaxbl":
-                yield from (".".join([*base, alias.name]) for alias in node.names)
+            base = package[: len(package) + 1 - node.level] if node.level else ()
+            yield from (".".join([*base, *filter(None, [node.module]), alias.name]) for alias in node.names)
+
+
+def find_import_circle(root, *folders):
+    """Modules of a circle of imports among the files of some folders, or an empty list."""
+    files = {module_name(file, root): file for folder in folders for file in sorted((root / folder).rglob("*.py"))}
+    graph = {}
+    for module, file in files.items():
+        # an imported name is a module, or something in one
+        names = [name if name in files else name.rpartition(".")[0] for name in list_imports(file, root)]
+        graph[module] = {name for name in names if name in files}
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        return error.args[1]
+    return []
+
+
+def test_no_imports_run_in_a_circle():
+    assert find_import_circle(ROOT, "jaxbl") == []
+    assert find_import_circle(ROOT / "benchmarks", ".") == []
+
+
+@pytest.mark.parametrize("late", ["def f():\n    from .first import f", "if TYPE_CHECKING:\n    import package.first"])
+def test_the_check_for_circles_sees_late_imports(tmp_path, late):
+    (tmp_path / "package").mkdir()
+    (tmp_path / "package" / "first.py").write_text("from . import second")
+    (tmp_path / "package" / "second.py").write_text(late)
+    assert {"package.first", "package.second"} == set(find_import_circle(tmp_path, "package"))
 
 
 @pytest.mark.parametrize(
@@ -73,14 +106,14 @@ def imported(file):
 )
 def test_imports_run_downward(file):
     part = file.relative_to(ROOT / "jaxbl").with_suffix("").parts[0]
-    for name in imported(file):
+    for name in (name for name in list_imports(file) if name.startswith("jaxbl.")):
         target = name.split(".")[1]
         assert target == part or target in BELOW[part], f"{part} imports {name}"
 
 
 def test_the_import_check_sees_imports():
-    assert "jaxbl.errors.InputError" in set(imported(ROOT / "jaxbl" / "sweeps" / "store.py"))
-    assert "jaxbl.sweeps.sweep.StudyResult" in set(imported(ROOT / "jaxbl" / "report" / "sweep.py"))
+    assert "jaxbl.errors.InputError" in set(list_imports(ROOT / "jaxbl" / "sweeps" / "store.py"))
+    assert "jaxbl.sweeps.sweep.StudyResult" in set(list_imports(ROOT / "jaxbl" / "report" / "sweep.py"))
 
 
 def globals_of(code):

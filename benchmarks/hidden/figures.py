@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from jaxbl.report.figures import COLOURS, save, style
 
 from .effects import LEVELS
-from .scoring import TARGETS, Outcome, calibration, calibration_error, confusion, wilson
+from .outcomes import TARGETS, Outcome, calibration, calibration_error, confusion, wilson_interval
 
 
 def draw(outcomes: Sequence[Outcome], folder: Path) -> list[Path]:
@@ -57,8 +58,6 @@ def _confusion(outcomes: Sequence[Outcome]) -> Figure | None:
 
 
 def _frame(x: float, y: float, colour: str):
-    from matplotlib.patches import Rectangle
-
     return Rectangle((x, y), 1.0, 1.0, fill=False, edgecolor=colour, linewidth=1.2, zorder=3)
 
 
@@ -71,7 +70,7 @@ def _calibration(outcomes: Sequence[Outcome]) -> Figure | None:
     axes.plot([0, 1], [0, 1], color="#888888", linestyle="--", label="calibrated")
     x = [row["confidence"] for row in rows]
     y = np.array([row["right"] for row in rows])
-    bounds = np.array([wilson(round(row["right"] * row["count"]), int(row["count"])) for row in rows])
+    bounds = np.array([wilson_interval(round(row["right"] * row["count"]), int(row["count"])) for row in rows])
     errors = np.maximum([y - bounds[:, 0], bounds[:, 1] - y], 0.0)
     axes.errorbar(x, y, errors, marker="o", capsize=3, color=COLOURS[0], label="findings, 95 %")
     axes.set_ylabel("share that is right")
@@ -100,8 +99,8 @@ def _sizes(outcomes: Sequence[Outcome]) -> Figure | None:
             group = [one for one in ones if one.level == level]
             if not group:
                 continue
-            hits = sum(one.right for one in group)
-            low, high = wilson(hits, len(group))
+            hits = sum(one.is_right for one in group)
+            low, high = wilson_interval(hits, len(group))
             x, rate = i + (k - 1) * width, hits / len(group)
             colour = (COLOURS[5], COLOURS[0], COLOURS[6])[k]
             axes.bar(x, rate, 0.9 * width, color=colour, label=f"{100 * level:g} % of the torque" if not i else None)

@@ -22,106 +22,25 @@ import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .cases import ALONE, KINDS, Case, Log
-from .effects import EFFECTS, NEW, UNKNOWN
-from .proof import proofs
+from jaxbl.workers import map_jobs
 
-Diagnose = Callable[[list[Log], dict[str, Any], Log], Mapping[str, Any]]
-"""diagnose(logs, model, holdout) -> what stands in diagnosis.json; `model`, the extended study, lets the bench prove it."""
+from .cases import ALONE, KINDS, Case, Log
+from .figures import draw
+from .outcomes import TARGETS, Outcome, calibration, calibration_error, confusion, wilson_interval
+from .proof import proofs
 
 VERDICTS = ("explained", "no_discrepancy", "unknown_effect")
 CONFIDENT = 0.9
-BINS = 10
-
-TARGETS = {
-    "single": (0.97, True),
-    "weak": (0.93, True),
-    "new": (0.97, True),
-    "hard": (0.88, True),
-    "pairs": (0.93, True),
-    "pairs_spurious": (0.05, False),
-    "false_alarms": (0.01, False),
-    "abstentions": (0.92, True),
-    "confidently_wrong": (0.03, False),
-    "gap_reduction": (0.99, True),
-    "oracle_ratio": (1.5, False),
-    "worse": (0.0, False),
-    "proved": (0.99, True),
-    "proved_worse": (0.0, False),
-    "calibration_error": (0.05, False),
-}
-"""What must hold, and whether more is better."""
-
-
-@dataclass
-class Outcome:
-    """What a diagnosis said about a case, beside the truth.
-
-    Attributes:
-        clutter: small effects that are there besides.
-        findings: effect, confidence and alternatives of each, as they were ordered.
-        reduction, worse, ratio: of the held-out gap by its own account; None where it was not given.
-        reachable: reduction by the oracle, by the same account.
-        proved, proved_worse: reduction of the gap by the bench's account, and whether there is more of it.
-        error: why there is no diagnosis.
-    """
-
-    name: str
-    kind: str
-    level: float
-    weak: bool
-    hidden: list[str]
-    unknown: str
-    conditions: dict[str, Any]
-    verdict: str
-    clutter: list[str] = field(default_factory=list)
-    findings: list[tuple[str, float, list[str]]] = field(default_factory=list)
-    reduction: float | None = None
-    worse: bool | None = None
-    ratio: float | None = None
-    reachable: float | None = None
-    proved: float | None = None
-    proved_worse: bool | None = None
-    seconds: float = 0.0
-    error: str = ""
-
-    @property
-    def named(self) -> list[str]:
-        """Effects that are said to be there."""
-        return [effect for effect, _, _ in self.findings] if self.verdict == "explained" or self.kind == "clutter" else []
-
-    @property
-    def said(self) -> str:
-        """The first finding, or the verdict without one."""
-        return (self.named or [self.verdict])[0]
-
-    @property
-    def right(self) -> bool:
-        if self.kind == "none":
-            return self.verdict == "no_discrepancy"
-        if self.kind == "unknown":
-            return self.verdict == "unknown_effect"
-        if self.kind == "pairs":
-            return set(self.hidden) <= set(self.named)
-        return self.said in self.hidden
-
-    @property
-    def tied(self) -> bool:
-        """Whether the hidden effect is the first finding or among its alternatives."""
-        offered = {self.said, *(self.findings[0][2] if self.named else ())}
-        return bool(offered & set(self.hidden))
-
-    @property
-    def spurious(self) -> list[str]:
-        return [effect for effect in self.named if effect not in (*self.hidden, *self.clutter)]
+Diagnose = Callable[[list[Log], dict[str, Any], Log], Mapping[str, Any]]
+"""diagnose(logs, model, holdout) -> what stands in diagnosis.json; `model`, the extended study, lets the bench prove it."""
 
 
 Oracle = Callable[[Case], Mapping[str, float]]
@@ -155,12 +74,10 @@ def run(found: Sequence[Case], diagnose: Diagnose, oracle: Oracle | None = None,
         oracle: what the true effects can reach.
         jobs: processes that share the work; functions must then be importable.
     """
-    from jaxbl.workers import map_jobs
-
     results = []
     for i, (one, model) in enumerate(map_jobs(partial(_one, diagnose=diagnose, oracle=oracle), found, jobs)):
         results.append((one, model))
-        said = "right" if one.right and not one.spurious else "WRONG"
+        said = "right" if one.is_right and not one.spurious_effects else "WRONG"
         print(
             f"{i + 1} of {len(found)}: {one.name} {said} ({_tells(one)}), {one.seconds:.0f} s", file=sys.stderr, flush=True
         )
@@ -245,53 +162,6 @@ def _gap(
     result.ratio = float(np.median(ratios)) if ratios else None
 
 
-def wilson(hits: int, count: int) -> tuple[float, float]:
-    """95 % interval of a rate."""
-    if count == 0:
-        return 0.0, 1.0
-    z, rate = 1.96, hits / count
-    middle, spread = rate + z * z / (2 * count), z * math.sqrt(rate * (1 - rate) / count + z * z / (4 * count * count))
-    return max(0.0, (middle - spread) / (1 + z * z / count)), min(1.0, (middle + spread) / (1 + z * z / count))
-
-
-def calibration(outcomes: Iterable[Outcome]) -> list[dict[str, float]]:
-    """Findings by confidence, in `BINS` bins of equal width: `confidence` and `right` are means, `count` how many."""
-    bets = [
-        (confidence, effect in (*one.hidden, *one.clutter))
-        for one in outcomes
-        for effect, confidence, _ in one.findings
-        if one.named
-    ]
-    rows = []
-    for i in range(BINS):
-        inside = [(c, r) for c, r in bets if min(int(c * BINS), BINS - 1) == i]
-        if inside:
-            confidence, right = np.mean(inside, axis=0)
-            rows.append({"confidence": float(confidence), "right": float(right), "count": len(inside)})
-    return rows
-
-
-def calibration_error(rows: Sequence[Mapping[str, float]]) -> float | None:
-    """Expected calibration error: mean of |right - confidence| over all findings."""
-    total = sum(row["count"] for row in rows)
-    return sum(row["count"] * abs(row["right"] - row["confidence"]) for row in rows) / total if total else None
-
-
-def confusion(outcomes: Sequence[Outcome]) -> tuple[list[str], list[str], np.ndarray]:
-    """Rows: what is hidden in cases with one thing or nothing; columns: what was said; counts."""
-    ones = [one for one in outcomes if one.kind != "pairs"]
-    truths = [one.hidden[0] if one.hidden else one.unknown or "no_discrepancy" for one in ones]
-    every = *EFFECTS, *NEW
-    rows = [name for name in (*every, *UNKNOWN, "no_discrepancy") if name in truths]
-    said = {one.said for one in ones}
-    columns = [name for name in (*every, "unknown_effect", "no_discrepancy", "failed") if name in said | set(rows)]
-    columns += sorted(said - set(columns))
-    counts = np.zeros((len(rows), len(columns)), int)
-    for truth, one in zip(truths, ones, strict=True):
-        counts[rows.index(truth), columns.index(one.said)] += 1
-    return rows, columns, counts
-
-
 def scores(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """All figures; rates as `{"value", "count", "interval"}`, None where there is no such case."""
 
@@ -299,7 +169,7 @@ def scores(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         hits = sum(hit(one) for one in group)
         if not group:
             return None
-        return {"value": hits / len(group), "count": len(group), "interval": wilson(hits, len(group))}
+        return {"value": hits / len(group), "count": len(group), "interval": wilson_interval(hits, len(group))}
 
     def number(values: list[float]) -> dict[str, Any] | None:
         return {"value": float(np.median(values)), "count": len(values)} if values else None
@@ -310,26 +180,26 @@ def scores(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     curve = calibration(outcomes)
     error = calibration_error(curve)
     return {
-        "single": rate(by["single"], lambda one: one.right),
-        "single_strong": rate([one for one in by["single"] if not one.weak], lambda one: one.right),
-        "weak": rate(weak, lambda one: one.right),
-        "single_tied": rate(by["single"], lambda one: one.tied),
-        "single_spurious": rate(by["single"], lambda one: bool(one.hidden and one.right and one.spurious)),
-        "new": rate(by["new"], lambda one: one.right),
-        "new_tied": rate(by["new"], lambda one: one.tied),
-        "clutter": rate(by["clutter"], lambda one: one.right),
-        "clutter_spurious": rate(by["clutter"], lambda one: bool(one.spurious)),
-        "clutter_overstated": rate(by["clutter"], lambda one: bool(one.spurious) and one.verdict == "explained"),
-        "hard": rate(by["hard"], lambda one: one.right),
-        "hard_weak": rate([one for one in by["hard"] if one.weak], lambda one: one.right),
-        "hard_tied": rate(by["hard"], lambda one: one.tied),
-        "pairs": rate(by["pairs"], lambda one: one.right),
-        "pairs_one": rate(by["pairs"], lambda one: bool(set(one.hidden) & set(one.named))),
-        "pairs_spurious": rate(by["pairs"], lambda one: bool(one.spurious)),
-        "false_alarms": rate(by["none"], lambda one: not one.right),
-        "abstentions": rate(by["unknown"], lambda one: one.right),
+        "single": rate(by["single"], lambda one: one.is_right),
+        "single_strong": rate([one for one in by["single"] if not one.weak], lambda one: one.is_right),
+        "weak": rate(weak, lambda one: one.is_right),
+        "single_tied": rate(by["single"], lambda one: one.is_tied),
+        "single_spurious": rate(by["single"], lambda one: bool(one.hidden and one.is_right and one.spurious_effects)),
+        "new": rate(by["new"], lambda one: one.is_right),
+        "new_tied": rate(by["new"], lambda one: one.is_tied),
+        "clutter": rate(by["clutter"], lambda one: one.is_right),
+        "clutter_spurious": rate(by["clutter"], lambda one: bool(one.spurious_effects)),
+        "clutter_overstated": rate(by["clutter"], lambda one: bool(one.spurious_effects) and one.verdict == "explained"),
+        "hard": rate(by["hard"], lambda one: one.is_right),
+        "hard_weak": rate([one for one in by["hard"] if one.weak], lambda one: one.is_right),
+        "hard_tied": rate(by["hard"], lambda one: one.is_tied),
+        "pairs": rate(by["pairs"], lambda one: one.is_right),
+        "pairs_one": rate(by["pairs"], lambda one: bool(set(one.hidden) & set(one.named_effects))),
+        "pairs_spurious": rate(by["pairs"], lambda one: bool(one.spurious_effects)),
+        "false_alarms": rate(by["none"], lambda one: not one.is_right),
+        "abstentions": rate(by["unknown"], lambda one: one.is_right),
         "unknown_missed": rate(by["unknown"], lambda one: one.verdict == "no_discrepancy"),
-        "confidently_wrong": rate(by["unknown"], lambda one: bool(one.named) and one.findings[0][1] >= CONFIDENT),
+        "confidently_wrong": rate(by["unknown"], lambda one: bool(one.named_effects) and one.findings[0][1] >= CONFIDENT),
         "gap_reduction": number([one.reduction for one in known if one.reduction is not None]),
         "reachable": number([one.reachable for one in known if one.reachable is not None]),
         "oracle_ratio": number([one.ratio for one in known if one.ratio is not None]),
@@ -412,7 +282,7 @@ def markdown(outcomes: Sequence[Outcome], heading: str = "") -> str:
         for (truth, said), times in wrong.most_common():
             lines.append(f"| {truth} | {said} | {times} | {counts[rows.index(truth)].sum()} |")
     lines += _by_condition([one for one in outcomes if one.kind in ("single", "hard")])
-    missed = [one for one in outcomes if not one.right]
+    missed = [one for one in outcomes if not one.is_right]
     if missed:
         lines += ["", "Wrong: " + "; ".join(f"{one.name} ({_tells(one)})" for one in missed)]
     return "\n".join(lines) + "\n"
@@ -424,7 +294,11 @@ def _agrees(truth: str, said: str) -> bool:
 
 def _tells(one: Outcome) -> str:
     truth = " + ".join(one.hidden) or one.unknown or "nothing"
-    said = " + ".join(f"{effect} {confidence:.2f}" for effect, confidence, _ in one.findings) if one.named else one.verdict
+    said = (
+        " + ".join(f"{effect} {confidence:.2f}" for effect, confidence, _ in one.findings)
+        if one.named_effects
+        else one.verdict
+    )
     return f"{truth}, said {said}{': ' + one.error if one.error else ''}"
 
 
@@ -434,15 +308,13 @@ def _by_condition(ones: Sequence[Outcome]) -> list[str]:
         values = sorted({str(one.conditions[key]) for one in ones})
         for value in values:
             group = [one for one in ones if str(one.conditions[key]) == value]
-            right = sum(one.right for one in group)
+            right = sum(one.is_right for one in group)
             lines.append(f"| {key} | {value} | {100 * right / len(group):.0f} % | {len(group)} |")
     return ["", "| single and hard, by | | right | cases |", "| --- | --- | ---: | ---: |", *lines] if lines else []
 
 
 def write(outcomes: Sequence[Outcome], folder: Path, heading: str = "") -> list[Path]:
     """Leave scores.md, scores.json, outcomes.json and the figures in a folder. Returns the figures' paths."""
-    from .figures import draw
-
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "scores.md").write_text(markdown(outcomes, heading), encoding="utf-8")
     figures = {"scores": scores(outcomes), "calibration": calibration(outcomes)}

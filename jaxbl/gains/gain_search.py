@@ -1,7 +1,7 @@
 """The search for lambda and alpha behind `jaxbl tune`: a coarse map of both gains, then zooms around the best point."""
 
 # pandas' own annotations are wider than what its methods return
-# pyright: reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
 
 import math
 from typing import Any

@@ -61,7 +61,7 @@ class Summary:
             "limits": self.limits,
             "conditions": self.conditions,
             "range": _ratios(search.limits) | {"num": table.num},
-            "resolution": {side: {key: ratio - 1.0 for key, ratio in search.cells(side).items()} for side in sides},
+            "resolution": {side: {key: ratio - 1.0 for key, ratio in search.cell_ratios(side).items()} for side in sides},
             "stages": [{side: _ratios(window) for side, window in windows.items()} for windows in search.windows],
             "named": self.named,
             "holdout": {

@@ -64,7 +64,7 @@ def test_clutter_is_there_and_small_and_its_name_is_not_spurious(found):
     case = found[-1]
     said = [{"effect": name, "confidence": 0.9} for name in (*case.truth["effects"], "motor.cogging", "motor.inertia")]
     one = outcome(case, {"verdict": "unknown_effect", "findings": said})
-    assert one.right and one.spurious == ["motor.inertia"]
+    assert one.is_right and one.spurious_effects == ["motor.inertia"]
     assert sum(row["right"] * row["count"] for row in calibration([one])) == 2
 
 
@@ -197,7 +197,7 @@ def test_a_wrong_answer_is_counted_where_it_belongs(found):
     findings = [{"effect": name, "confidence": 0.8} for name in (*pair.hidden, wrong)]
     gap = {"holdout_rmse_before": {"theta_e": 1.0}, "holdout_rmse_after": {"theta_e": 1.1}, "noise_floor": {"theta_e": 0.1}}
     told = outcome(pair, {"verdict": "explained", "findings": findings, "gap": gap})
-    assert told.right and told.spurious == [wrong] and told.worse
+    assert told.is_right and told.spurious_effects == [wrong] and told.worse
     assert told.reduction < 0.0 and told.reachable is None
     assert outcome(pair, {"verdict": "explained", "gap": gap}, {"theta_e": 0.1}).reachable == pytest.approx(1.0)
     assert outcome(pair, {"verdict": "explained", "gap": gap}, {}).reachable is None
@@ -283,7 +283,7 @@ def test_files_are_read_by_the_package_and_scored_from_a_batch(found, oracle, tm
     truth = json.loads((tmp_path / "logs" / "truth.json").read_text())
     assert set(truth) == {case.name for case in some}
     outcomes = left(found[:4], tmp_path / "found")
-    assert [one.right for one in outcomes] == [True, True, True, False]
+    assert [one.is_right for one in outcomes] == [True, True, True, False]
     made = write(outcomes, tmp_path / "out", "A seed")
     assert {path.name for path in made} == {"confusion.png", "calibration.png", "sizes.png", "gap.png"}
     assert (tmp_path / "out" / "scores.md").read_text().startswith("## A seed")
