@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test lint docs versions clean
+.PHONY: demo test goldens lint docs versions clean
 
 demo: .venv/installed
 	$(BIN)/jaxbl demo
@@ -10,6 +10,10 @@ demo: .venv/installed
 # one worker a core: more threads of linear algebra would only wait for one another
 test: .venv/installed-dev
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+
+# results of the tree beside those of the base commit, and what moved: make goldens ONLY="export_code tune"
+goldens: .venv/installed-dev
+	$(BIN)/python benchmarks/goldens.py $(if $(ONLY),--only $(ONLY))
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .

@@ -1,0 +1,1 @@
+"""Goldens: results of one commit beside those of the working tree. Run by benchmarks/goldens.py."""
